@@ -1,0 +1,48 @@
+# The commands a person types. Everything is installed into .venv from requirements.lock; nothing else is touched.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(CURDIR)/$(VENV)/bin
+PORT ?= 5000
+DONE := $(VENV)/.installed
+# Stages are started by DVC as plain `python`; this makes it the one in .venv.
+export PATH := $(BIN):$(PATH)
+export PYTHONUNBUFFERED := 1
+export HF_HUB_OFFLINE := 1
+
+.PHONY: install repro test lint dashboard bench standins clean
+
+install: $(DONE)
+
+$(DONE): requirements.lock pyproject.toml
+	"$(PYTHON)" -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "Python 3.11 or newer is needed; set PYTHON=...")'
+	"$(PYTHON)" -m venv $(VENV)
+	python -m pip install --quiet --disable-pip-version-check --requirement requirements.lock
+	python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	touch $(DONE)
+
+repro: install
+	dvc repro
+	@python -c 'from pipeline.config import load_params; print(f"\nTables and figures: reports/{load_params().report_name}/README.md")'
+	@echo "Dashboard:          make dashboard, then open http://127.0.0.1:$(PORT)"
+
+test: install
+	python -m pytest
+
+lint: install
+	ruff check .
+	ruff format --check .
+	mypy
+
+dashboard: install
+	@mkdir -p mlruns
+	mlflow ui --backend-store-uri "sqlite:///$(CURDIR)/mlruns/mlflow.db" --host 127.0.0.1 --port $(PORT)
+
+bench: install
+	@test -n "$(SECTION)" || { echo "make bench: name a section, as in make bench SECTION=startup"; exit 1; }
+	python -m pipeline.benchmarks $(SECTION)
+
+standins: install
+	dvc repro standins/dvc.yaml
+
+clean:
+	rm -rf data runs checkpoints mlruns .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,0 +1,166 @@
+"""Atomic reading and writing of everything that stages exchange.
+
+A file appears under its name only when it is whole: it is written beside its place and then renamed.
+Tables are Parquet with one column a field, dialogues are JSON lines, weights are safetensors.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import types
+import typing
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from pydantic import ValidationError
+
+from pipeline.errors import UserError
+from pipeline.records import Record
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    import torch
+
+R = TypeVar("R", bound=Record)
+
+
+@contextmanager
+def atomic(path: Path) -> Iterator[Path]:
+    """Give a temporary path beside `path` that becomes `path` if the block succeeds."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write `text` as UTF-8, atomically."""
+    with atomic(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_json(path: Path, value: object) -> None:
+    """Write `value` as indented JSON with a final newline, atomically."""
+    write_text(path, json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file; raise UserError where it is missing or broken."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file; `dvc repro` makes it") from None
+    except json.JSONDecodeError as error:
+        raise UserError(f"{path}: not JSON ({error}); delete it and run `dvc repro`") from None
+
+
+def write_jsonl(path: Path, records: Iterable[Record]) -> None:
+    """Write one record a line, atomically."""
+    with atomic(path) as temporary, temporary.open("w", encoding="utf-8") as stream:
+        for record in records:
+            stream.write(record.model_dump_json() + "\n")
+
+
+def read_jsonl(path: Path, model: type[R]) -> list[R]:
+    """Read records written by `write_jsonl`; a bad line is a UserError that names it."""
+    records = []
+    try:
+        with path.open(encoding="utf-8") as stream:
+            for number, line in enumerate(stream, 1):
+                try:
+                    records.append(model.model_validate_json(line))
+                except ValidationError as error:
+                    raise UserError(
+                        f"{path}, line {number}: not a {model.__name__} ({_first(error)}); "
+                        "delete the file and run `dvc repro`"
+                    ) from None
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file; `dvc repro` makes it") from None
+    return records
+
+
+def write_table(path: Path, model: type[R], records: Iterable[R]) -> None:
+    """Write records as a Parquet table with the schema of `model`, atomically."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    rows = [record.model_dump(mode="json") for record in records]
+    table = pa.Table.from_pylist(rows, schema=_schema(model))
+    with atomic(path) as temporary:
+        pq.write_table(table, temporary, compression="zstd")
+
+
+def read_table(path: Path, model: type[R]) -> list[R]:
+    """Read records written by `write_table`; raise UserError where the schema does not fit."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        table = pq.read_table(path, partitioning=None)
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file; `dvc repro` makes it") from None
+    except (pa.ArrowInvalid, OSError) as error:
+        raise UserError(f"{path}: not a readable table ({error}); delete it and run `dvc repro`") from None
+    if table.schema.names != list(model.model_fields):
+        raise UserError(
+            f"{path}: columns {table.schema.names}, expected {list(model.model_fields)}; delete it and run `dvc repro`"
+        )
+    return [model.model_validate(row) for row in table.to_pylist()]
+
+
+def save_tensors(path: Path, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, str] | None = None) -> None:
+    """Write named tensors as safetensors, atomically."""
+    from safetensors.torch import save_file
+
+    with atomic(path) as temporary:
+        save_file({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, temporary, dict(metadata or {}))
+
+
+def load_tensors(path: Path) -> dict[str, torch.Tensor]:
+    """Read a safetensors file; a missing file or another format (a pickle, say) is a UserError."""
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    if not path.is_file():
+        raise UserError(f"{path}: no such file; `dvc repro` makes it")
+    try:
+        tensors: dict[str, torch.Tensor] = load_file(path)
+    except SafetensorError as error:
+        raise UserError(
+            f"{path}: not a safetensors file ({error}); pickled checkpoints are refused because they can run "
+            "code: convert it with safetensors.torch.save_file, or run `dvc repro` again"
+        ) from None
+    return tensors
+
+
+def _schema(model: type[Record]) -> pa.Schema:
+    import pyarrow as pa
+
+    hints = typing.get_type_hints(model)
+    return pa.schema([(name, _arrow(hints[name])) for name in model.model_fields])
+
+
+def _arrow(hint: Any) -> pa.DataType:
+    import pyarrow as pa
+
+    origin = typing.get_origin(hint)
+    if origin is tuple:
+        return pa.list_(_arrow(typing.get_args(hint)[0]))
+    if origin is typing.Literal or (isinstance(hint, type) and issubclass(hint, Enum)):
+        return pa.string()
+    if origin is types.UnionType:
+        return _arrow(next(a for a in typing.get_args(hint) if a is not type(None)))
+    simple: dict[Any, pa.DataType] = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
+    return simple[hint]
+
+
+def _first(error: ValidationError) -> str:
+    detail = error.errors(include_url=False)[0]
+    return f"{'.'.join(map(str, detail['loc']))}: {detail['msg']}"

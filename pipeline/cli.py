@@ -1,0 +1,68 @@
+"""The command `octopi`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline.errors import UserError
+
+app = typer.Typer(
+    help="Teach a language model the sense of touch.", no_args_is_help=True, pretty_exceptions_enable=False
+)
+data_app = typer.Typer(help="Look at a folder of tactile videos.", no_args_is_help=True)
+app.add_typer(data_app, name="data")
+
+
+@app.command()
+def scale(
+    name: Annotated[str, typer.Argument(help="smoke, small, paper-7b or paper-13b (or a file you added to conf/).")],
+    overrides: Annotated[list[str] | None, typer.Argument(help="key=value, for example split.name=kfold.")] = None,
+) -> None:
+    """Choose what `dvc repro` runs: write params.yaml from conf/NAME.yaml and the overrides."""
+    from pipeline.scales import check_inputs, compose, prune, write_params
+
+    params = compose(name, overrides or ())
+    check_inputs(params)
+    changed = write_params(params)
+    prune(params.plan, Path("data"))
+    typer.echo(f"params.yaml {'written' if changed else 'unchanged'}: {name}, {len(params.plan.variants)} variants")
+    typer.echo(f"`dvc repro` runs it; its tables go to reports/{params.report_name}/")
+
+
+@data_app.command()
+def check(
+    folder: Annotated[Path, typer.Argument(help="Folder with the videos.")],
+    catalogue: Annotated[Path, typer.Option(help="Folder with objects.csv and properties.yaml.")] = Path(
+        "pipeline/physiclear"
+    ),
+) -> None:
+    """Look at every video of a folder and list all that is wrong with it; status 1 where something must be mended."""
+    from pipeline.physiclear.catalogue import load_catalogue
+    from pipeline.videos import inspect
+
+    findings = inspect(folder, load_catalogue(catalogue))
+    for finding in findings:
+        typer.echo(f"{finding.severity:8} {finding.item}: {finding.message}")
+    if any(f.severity == "error" for f in findings):
+        raise typer.Exit(1)
+
+
+@app.command()
+def publish() -> None:
+    """Show the reproduction in params.yaml and dvc.lock in MLflow; a second time adds nothing."""
+    from pipeline.config import load_params
+    from pipeline.tracking.publishing import publish as publish_runs
+
+    typer.echo(str(publish_runs(load_params(), Path())))
+
+
+def main() -> None:
+    """Run the command; bad input ends it with one line and status 1."""
+    try:
+        app()
+    except UserError as error:
+        typer.echo(f"octopi: {error}", err=True)
+        raise SystemExit(1) from None

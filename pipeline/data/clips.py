@@ -1,0 +1,111 @@
+"""Clips for the encoder: a few frames of each video, freshly drawn in each epoch of training."""
+
+from __future__ import annotations
+
+import random
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch.utils.data import Dataset
+
+from pipeline.artifacts import read_table
+from pipeline.errors import UserError
+from pipeline.frames import sample_evaluation, sample_training
+from pipeline.records import Frame
+from pipeline.runtime import derive_seed
+
+
+class FrameStore:
+    """The salient frames of all videos, memory-mapped; only what is drawn is read."""
+
+    def __init__(self, folder: Path) -> None:
+        self.index = read_table(folder / "frames.parquet", Frame)
+        self.pixels: np.ndarray = np.load(folder / "frames.npy", mmap_mode="r")
+        """uint8, frames x side x side x RGB."""
+        if len(self.index) != len(self.pixels):
+            raise UserError(f"{folder}: frames.parquet and frames.npy differ in length; run `dvc repro extract_frames`")
+        self._rows: dict[str, list[int]] = defaultdict(list)
+        for frame in self.index:
+            self._rows[frame.video_id].append(frame.row)
+
+    @property
+    def size(self) -> int:
+        """Side of a frame in pixels."""
+        return int(self.pixels.shape[1])
+
+    def rows(self, video_id: str) -> list[int]:
+        """Rows of a video's salient frames, in time order."""
+        return self._rows[video_id]
+
+
+@dataclass(frozen=True)
+class LabelledVideo:
+    """A video and its classes, in the catalogue's order of properties."""
+
+    video_id: str
+    labels: tuple[int, ...]
+
+
+class ClipDataset(Dataset[dict[str, torch.Tensor]]):
+    """Items `frames` (uint8, k x side x side x RGB) and `labels` (int64, properties).
+
+    What is drawn depends on seed, epoch and video alone, so a resumed training sees what an uninterrupted one does.
+
+    Args:
+        store: The frames.
+        videos: What to draw from.
+        per_video: k, frames a clip.
+        seed: Of the draws; None gives the evaluation clip (uniform intervals, no flips).
+        flip_probability: Chance of a horizontal and, independently, of a vertical flip of the whole clip.
+    """
+
+    def __init__(
+        self,
+        store: FrameStore,
+        videos: Sequence[LabelledVideo],
+        *,
+        per_video: int,
+        seed: int | None = None,
+        flip_probability: float = 0.0,
+    ) -> None:
+        self.store = store
+        self.videos = videos
+        self.per_video = per_video
+        self.seed = seed
+        self.flip_probability = flip_probability
+        self.epoch = 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """Called by the Trainer's data loader at the start of each epoch."""
+        self.epoch = epoch
+
+    def __len__(self) -> int:
+        return len(self.videos)
+
+    def __getitem__(self, index: int) -> dict[str, torch.Tensor]:
+        video = self.videos[index]
+        rows = self.store.rows(video.video_id)
+        flips: tuple[int, ...] = ()
+        if self.seed is None:
+            positions = sample_evaluation(len(rows), self.per_video)
+        else:
+            rng = random.Random(derive_seed(self.seed, self.epoch, video.video_id))
+            positions = sample_training(len(rows), self.per_video, rng)
+            # Axes of frames x height x width: 2 mirrors left and right, 1 top and bottom.
+            flips = tuple(axis for axis in (2, 1) if rng.random() < self.flip_probability)
+        frames = self.store.pixels[[rows[p] for p in positions]]
+        frames = np.flip(frames, flips) if flips else frames
+        return {
+            "frames": torch.from_numpy(np.ascontiguousarray(frames)),
+            "labels": torch.tensor(video.labels, dtype=torch.int64),
+        }
+
+
+def collate_clips(items: Iterable[dict[str, torch.Tensor]]) -> dict[str, torch.Tensor]:
+    """Stack clips of equal length."""
+    items = list(items)
+    return {name: torch.stack([item[name] for item in items]) for name in items[0]}

@@ -1,0 +1,62 @@
+"""Seeds, devices and number formats: the only place that decides where a tensor lives."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import random
+from typing import TYPE_CHECKING, Literal
+
+from pipeline.errors import UserError
+
+if TYPE_CHECKING:
+    import torch
+
+DeviceName = Literal["auto", "cpu", "cuda", "mps"]
+DtypeName = Literal["float32", "bfloat16", "float16"]
+
+
+def derive_seed(*parts: object) -> int:
+    """A 63-bit seed from any printable parts: equal on every machine and in every process."""
+    digest = hashlib.sha256("\x1f".join(map(str, parts)).encode()).digest()
+    return int.from_bytes(digest[:8], "big") >> 1
+
+
+def seed_everything(seed: int) -> None:
+    """Seed Python, NumPy and torch."""
+    import numpy as np
+    import torch
+
+    random.seed(seed)
+    np.random.seed(seed % 2**32)
+    torch.manual_seed(seed)
+
+
+def resolve_device(name: DeviceName) -> torch.device:
+    """The device of that name; `auto` takes CUDA, then Apple's MPS, then the CPU."""
+    import torch
+
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "mps" if torch.backends.mps.is_available() else "cpu"
+    elif name == "cuda" and not torch.cuda.is_available():
+        raise UserError("runtime.device: cuda is asked for but torch sees no CUDA device; use auto or cpu")
+    elif name == "mps" and not torch.backends.mps.is_available():
+        raise UserError("runtime.device: mps is asked for but torch sees no MPS device; use auto or cpu")
+    return torch.device(name)
+
+
+def resolve_dtype(name: DtypeName) -> torch.dtype:
+    """The torch dtype of that name."""
+    import torch
+
+    dtypes: dict[str, torch.dtype] = {
+        "float32": torch.float32,
+        "bfloat16": torch.bfloat16,
+        "float16": torch.float16,
+    }
+    return dtypes[name]
+
+
+def cores() -> int:
+    """Processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

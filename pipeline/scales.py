@@ -1,0 +1,103 @@
+"""Choosing a scale: composes conf/ into params.yaml, whole or not at all."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+import yaml
+
+from pipeline.artifacts import write_text
+from pipeline.config import PARAMS_FILE, Params, resolve
+from pipeline.errors import UserError
+from pipeline.models import weights
+from pipeline.physiclear.catalogue import load_catalogue
+from pipeline.plan import Plan
+
+CONF = Path("conf")
+HEADER = "# Written by `octopi scale`; change it with that command, or edit conf/ and run it again.\n"
+
+
+def shipped_scales(conf: Path = CONF) -> list[str]:
+    """Names of the scales that conf/ holds."""
+    return sorted(f.stem for f in conf.glob("*.yaml") if f.stem != "base")
+
+
+def compose(name: str, overrides: Sequence[str] = (), conf: Path = CONF) -> Params:
+    """Compose a scale with `key=value` overrides by Hydra and validate the result.
+
+    Raises:
+        UserError: for an unknown scale or key, a value out of range, or an override that is not `key=value`.
+    """
+    from hydra import compose as hydra_compose
+    from hydra import initialize_config_dir
+    from hydra.errors import HydraException
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    scales = shipped_scales(conf)
+    if name not in scales:
+        raise UserError(f"scale {name!r} is not known; allowed: {', '.join(scales)}")
+    for override in overrides:
+        if "=" not in override:
+            raise UserError(f"{override!r} is no override; write key=value, for example split.name=development")
+    # Every key may be set here; whether it exists is the validation's matter, since that knows what is allowed.
+    forced = [o if o.startswith(("+", "~")) else f"++{o}" for o in overrides]
+    try:
+        with initialize_config_dir(str(conf.resolve()), version_base=None):
+            values = OmegaConf.to_container(hydra_compose(name, overrides=forced), resolve=True)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(f"scale {name}: {' '.join(str(error).split())}") from None
+    assert isinstance(values, dict)
+    return resolve({str(k): v for k, v in values.items()}, f"scale {name}")
+
+
+def check_inputs(params: Params) -> None:
+    """Raise UserError where something that the scale needs is not there: videos, catalogue, objects, weights."""
+    catalogue = load_catalogue(Path(params.data.catalogue))
+    folder = Path(params.data.dir)
+    if params.data.source == "videos" and not folder.is_dir():
+        raise UserError(
+            f"data.dir: {folder} does not exist; import the public data set (README, section Real videos) or name the "
+            "folder with data.dir=..."
+        )
+    unknown = [o for o in params.scenes.objects if o not in catalogue.objects]
+    if unknown:
+        raise UserError(f"scenes.objects: {unknown[0]} is not in {params.data.catalogue}/objects.csv")
+    weights.check_encoder(Path(params.encoder.weights), params.frames.size)
+    weights.check_language(Path(params.language.weights))
+
+
+def write_params(params: Params, path: Path = PARAMS_FILE) -> bool:
+    """Write params.yaml if that changes it; return whether it did."""
+    text = HEADER + yaml.safe_dump(params.model_dump(mode="json"), sort_keys=False, allow_unicode=True, width=120)
+    if path.is_file() and path.read_text(encoding="utf-8") == text:
+        return False
+    write_text(path, text)
+    return True
+
+
+def prune(plan: Plan, data: Path) -> None:
+    """Remove outputs of variants outside the plan from `data`; DVC's cache brings them back when they are asked for.
+
+    Stages that read a whole folder (the report) would otherwise take them for their own.
+    """
+    keep = {
+        "encoder": {str(s) for s in plan.encoder_seeds},
+        "embeddings": set(plan.embeddings),
+        "align": set(plan.align),
+        "lora": set(plan.lora),
+        "answers": set(plan.variants),
+        "scores": set(plan.variants),
+    }
+    for folder, keys in keep.items():
+        for entry in (data / folder).glob("*"):
+            if entry.name not in keys:
+                shutil.rmtree(entry)
+    stages = {"answers": "answer", "scores": "grade", "embeddings": "embed", "encoder": "finetune_encoder"}
+    named = {f"{stages.get(folder, folder)}@{key}" for folder, keys in keep.items() for key in keys}
+    named |= {f"synthesize@{key}" for key in plan.scenes}
+    for file in (data / "metrics").glob("*@*.json"):
+        if file.stem not in named:
+            file.unlink()

@@ -1,0 +1,131 @@
+"""What a task is: it builds its questions and grades its answers, side by side in one module."""
+
+from __future__ import annotations
+
+import random
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from pipeline.physiclear.catalogue import Catalogue, Property
+from pipeline.records import Dialogue, Gold, Opd, Part, Prediction, Question, Score, Task, Turn
+
+LETTERS = "abc"
+ORDINALS = ("First", "Second")
+
+
+@dataclass(frozen=True)
+class Pool:
+    """The videos that questions of one part of the split may draw from."""
+
+    part: Part
+    catalogue: Catalogue
+    videos: Mapping[str, Sequence[str]]
+    """Object id to its video ids; objects without videos are absent."""
+
+    @property
+    def objects(self) -> list[str]:
+        """Object ids in a fixed order."""
+        return sorted(self.videos)
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A question before it has its number."""
+
+    videos: tuple[str, ...]
+    objects: tuple[str, ...]
+    dialogues: tuple[Dialogue, ...]
+    gold: Gold
+
+
+class TaskDefinition(Protocol):
+    """One of the tasks. `strata` are balanced: question i of a set asks for stratum i modulo their number."""
+
+    task: Task
+    trained: bool
+    """Whether the task's questions are also used for training (PSR's are not)."""
+
+    def strata(self, catalogue: Catalogue) -> int: ...
+
+    def draft(self, pool: Pool, stratum: int, rng: random.Random) -> Draft | None:
+        """Draw a question of a stratum; None where this draw found none (the caller tries again)."""
+        ...
+
+    def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]: ...
+
+    def chance(self, catalogue: Catalogue) -> dict[str, float]:
+        """Accuracy of a uniform guess, by measure."""
+        ...
+
+
+def draw_videos(pool: Pool, objects: Sequence[str], rng: random.Random) -> tuple[str, ...]:
+    """One random video of each object."""
+    return tuple(rng.choice(list(pool.videos[o])) for o in objects)
+
+
+def gold(pool: Pool, objects: Sequence[str], choice: str, properties: Sequence[str]) -> Gold:
+    """The structured answer about these objects."""
+    return Gold(choice=choice, labels=tuple(map(pool.catalogue.labels, objects)), properties=tuple(properties))
+
+
+def descriptions(
+    catalogue: Catalogue, objects: Sequence[str], prefixes: Sequence[str], only: Sequence[str] = ()
+) -> str:
+    """The description of each object behind its prefix; only the properties named, or everything."""
+    texts = []
+    for prefix, object_id in zip(prefixes, objects, strict=True):
+        text = (
+            " ".join(catalogue.describe_one(object_id, name) for name in only)
+            if only
+            else catalogue.describe(object_id)
+        )
+        texts.append(f"{prefix} {text}")
+    return " ".join(texts)
+
+
+def single_turn(user: Mapping[Opd, str], assistant: Mapping[Opd, str]) -> tuple[Dialogue, ...]:
+    """One-turn dialogues, one for each OPD mode that both mappings name."""
+    return tuple(Dialogue(opd=m, turns=(Turn(user=user[m], assistant=assistant[m]),)) for m in Opd if m in user)
+
+
+def lettered(count: int) -> str:
+    """`a) {tactile}, b) {tactile}, ...` as the paper writes a list of videos."""
+    return ", ".join(f"{LETTERS[i]}) {{tactile}}" for i in range(count))
+
+
+def conclusion(text: str) -> str:
+    """What an answer says after its last "Conclusion:", or all of it where it has none."""
+    return re.split(r"conclusion\s*:", text, flags=re.IGNORECASE)[-1].strip()
+
+
+def find_level(text: str, prop: Property) -> int | None:
+    """The one class of `prop` that `text` names as a whole phrase; None where it names none or several."""
+    # Longest first, so that "moderately hard" is not read as "hard", whatever stands between its words.
+    names = [_plain(level) for level in prop.levels]
+    either = "|".join(re.escape(name) for name in sorted(names, key=len, reverse=True))
+    levels = {names.index(name) for name in re.findall(rf"\b(?:{either})\b", _plain(text))}
+    return levels.pop() if len(levels) == 1 else None
+
+
+def _plain(text: str) -> str:
+    """In small letters, with one space wherever spaces, line breaks or hyphens stood."""
+    return " ".join(re.split(r"[\s-]+", text.lower()))
+
+
+def choice_score(question: Question, prediction: Prediction, predicted: str | None) -> list[Score]:
+    """The score of a question with one right choice; `predicted` is None where no choice could be read."""
+    return [
+        Score(
+            question_id=question.question_id,
+            task=question.task,
+            measure="choice",
+            correct=predicted == question.gold.choice,
+            parsed=predicted is not None,
+            truncated=prediction.truncated,
+            expected=question.gold.choice,
+            predicted=predicted or "",
+            objects=question.objects,
+        )
+    ]

@@ -1,0 +1,77 @@
+"""Object Property Description: describe one tactile video by its properties."""
+
+from __future__ import annotations
+
+import math
+import random
+import re
+
+from pipeline.physiclear.catalogue import Catalogue
+from pipeline.records import Opd, Prediction, Question, Score, Task
+from pipeline.tasks.base import Draft, Pool, draw_videos, find_level, gold, single_turn
+
+TEMPLATES = ("Describe the physical properties of {tactile}.", "How does this tactile video {tactile} feel?")
+
+
+class ObjectPropertyDescription:
+    """Trained and evaluated; has no `none` mode, since without descriptions there is no task."""
+
+    task = Task.OPD
+    trained = True
+
+    def strata(self, catalogue: Catalogue) -> int:
+        return len(catalogue.objects)
+
+    def draft(self, pool: Pool, stratum: int, rng: random.Random) -> Draft | None:
+        # A stratum is an object of the catalogue: those without videos here fall out, the others come equally often.
+        object_id = sorted(pool.catalogue.objects)[stratum % len(pool.catalogue.objects)]
+        if object_id not in pool.videos:
+            return None
+        user, answer = rng.choice(TEMPLATES), pool.catalogue.describe(object_id)
+        modes = (Opd.NEEDED, Opd.ALL)
+        return Draft(
+            videos=draw_videos(pool, [object_id], rng),
+            objects=(object_id,),
+            dialogues=single_turn(dict.fromkeys(modes, user), dict.fromkeys(modes, answer)),
+            gold=gold(pool, [object_id], "", pool.catalogue.property_names),
+        )
+
+    def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
+        """One score a property, read from the closing "Overall" sentence, and `combined` for all at once."""
+        # Before that sentence an answer describes freely, in words that may name a class in passing.
+        closing = "".join(re.split(r"\boverall\b", prediction.outputs[0], flags=re.IGNORECASE)[1:][-1:])
+        expected = question.gold.labels[0]
+        predicted = [find_level(closing, p) for p in catalogue.properties]
+        scores = [
+            self._score(question, prediction, p.name, p.levels[e], "" if g is None else p.levels[g])
+            for p, e, g in zip(catalogue.properties, expected, predicted, strict=True)
+        ]
+        complete = all(s.parsed for s in scores)
+        scores.append(
+            self._score(
+                question,
+                prediction,
+                "combined",
+                ", ".join(s.expected for s in scores),
+                ", ".join(s.predicted for s in scores) if complete else "",
+            )
+        )
+        return scores
+
+    def chance(self, catalogue: Catalogue) -> dict[str, float]:
+        single = {p.name: 1 / len(p.levels) for p in catalogue.properties}
+        return {**single, "combined": math.prod(single.values())}
+
+    @staticmethod
+    def _score(question: Question, prediction: Prediction, measure: str, expected: str, predicted: str) -> Score:
+        return Score(
+            question_id=question.question_id,
+            task=question.task,
+            measure=measure,
+            correct=predicted == expected,
+            parsed=bool(predicted),
+            truncated=prediction.truncated,
+            expected=expected,
+            predicted=predicted,
+            objects=question.objects,
+        )

@@ -1,0 +1,81 @@
+"""Property Comparison: does a comparative hold between two videos?"""
+
+from __future__ import annotations
+
+import random
+import re
+
+from pipeline.physiclear.catalogue import Catalogue
+from pipeline.records import Opd, Prediction, Question, Score, Task
+from pipeline.tasks.base import (
+    ORDINALS,
+    Draft,
+    Pool,
+    choice_score,
+    conclusion,
+    descriptions,
+    draw_videos,
+    gold,
+    single_turn,
+)
+
+TEMPLATES = (
+    "Is the object in the tactile video {tactile} COMPARATIVE than the one in {tactile}?",
+    "Is the object in {tactile} COMPARATIVE than the object in {tactile}?",
+)
+CHOICES = ("yes", "no", "same")
+
+
+class PropertyComparison:
+    """Three answers are possible (yes, no, the same), hence the paper's chance of one third."""
+
+    task = Task.PC
+    trained = True
+
+    def strata(self, catalogue: Catalogue) -> int:
+        return len(CHOICES) * len(catalogue.properties) * 2
+
+    def draft(self, pool: Pool, stratum: int, rng: random.Random) -> Draft | None:
+        if len(pool.objects) < 2:
+            return None
+        choice = CHOICES[stratum % 3]
+        index, rising = divmod(stratum // 3 % (2 * len(pool.catalogue.properties)), 2)
+        prop = pool.catalogue.properties[index]
+        objects = rng.sample(pool.objects, 2)
+        first, second = (pool.catalogue.labels(o)[index] for o in objects)
+        actual = "same" if first == second else "yes" if (first > second) == bool(rising) else "no"
+        if actual != choice:
+            return None
+        comparative = prop.more if rising else prop.less
+        ask = rng.choice(TEMPLATES).replace("COMPARATIVE", comparative)
+        verdict = {
+            "yes": f"Yes, the first object is {comparative}.",
+            "no": f"No, the second object is {comparative}.",
+            "same": f"Both objects have the same {prop.name}.",
+        }[choice]
+        prefixes = [f"{o} object:" for o in ORDINALS]
+        user = {
+            Opd.NONE: ask,
+            Opd.NEEDED: f"{ask} Describe the {prop.name} of both objects before answering.",
+            Opd.ALL: f"{ask} Describe both objects before answering.",
+        }
+        answer = {
+            Opd.NONE: verdict,
+            Opd.NEEDED: f"{descriptions(pool.catalogue, objects, prefixes, [prop.name])} Conclusion: {verdict}",
+            Opd.ALL: f"{descriptions(pool.catalogue, objects, prefixes)} Conclusion: {verdict}",
+        }
+        return Draft(
+            videos=draw_videos(pool, objects, rng),
+            objects=tuple(objects),
+            dialogues=single_turn(user, answer),
+            gold=gold(pool, objects, choice, [prop.name]),
+        )
+
+    def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
+        """Read from how the conclusion begins: "Yes", "No" or "Both"."""
+        match = re.match(r"(yes|no|both)\b", conclusion(prediction.outputs[0]), flags=re.IGNORECASE)
+        read = {"yes": "yes", "no": "no", "both": "same"}
+        return choice_score(question, prediction, read[match[1].lower()] if match else None)
+
+    def chance(self, catalogue: Catalogue) -> dict[str, float]:
+        return {"choice": 1 / 3}

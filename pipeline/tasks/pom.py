@@ -1,0 +1,76 @@
+"""Property-object Matching: which of three videos is of which of three named objects?"""
+
+from __future__ import annotations
+
+import itertools
+import random
+import re
+
+from pipeline.physiclear.catalogue import Catalogue
+from pipeline.records import Opd, Prediction, Question, Score, Task
+from pipeline.tasks.base import (
+    LETTERS,
+    Draft,
+    Pool,
+    choice_score,
+    conclusion,
+    descriptions,
+    draw_videos,
+    gold,
+    lettered,
+    single_turn,
+)
+
+OPENINGS = ("Given three tactile videos: {videos}.", "You have tactile videos of one object each: {videos}.")
+REQUEST = "atch each video to one of the following objects in alphabetical order: {options}."
+ORDERS = tuple("".join(order) for order in itertools.permutations("123"))
+
+
+class PropertyObjectMatching:
+    """The three objects differ in at least one property each, or touch could not tell them apart."""
+
+    task = Task.POM
+    trained = True
+
+    def strata(self, catalogue: Catalogue) -> int:
+        return len(ORDERS)
+
+    def draft(self, pool: Pool, stratum: int, rng: random.Random) -> Draft | None:
+        if len(pool.objects) < 3:
+            return None
+        catalogue = pool.catalogue
+        drawn = rng.sample(pool.objects, 3)
+        if len({catalogue.labels(o) for o in drawn}) < 3:
+            return None
+        options = sorted(drawn, key=lambda o: catalogue.objects[o].name.lower())
+        order = ORDERS[stratum % len(ORDERS)]
+        objects = [options[int(number) - 1] for number in order]
+        opening = rng.choice(OPENINGS).format(videos=lettered(3))
+        listed = ", ".join(f"{i}) {catalogue.objects[o].name}" for i, o in enumerate(options, 1))
+        request = REQUEST.format(options=listed)
+        names = [f"{letter}) is {catalogue.objects[o].name}" for letter, o in zip(LETTERS, objects, strict=True)]
+        verdict = f"{names[0]}, {names[1]} and {names[2]}."
+        described = f"{descriptions(catalogue, objects, [f'{x})' for x in LETTERS])} Conclusion: {verdict}"
+        asked = f"{opening} Describe the object in each video, then m{request}"
+        # Every property may tell the objects apart, so `needed` is `all`.
+        user = {Opd.NONE: f"{opening} M{request}", Opd.NEEDED: asked, Opd.ALL: asked}
+        answer = {Opd.NONE: verdict, Opd.NEEDED: described, Opd.ALL: described}
+        return Draft(
+            videos=draw_videos(pool, objects, rng),
+            objects=tuple(objects),
+            dialogues=single_turn(user, answer),
+            gold=gold(pool, objects, order, catalogue.property_names),
+        )
+
+    def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
+        """Read from "a) is NAME": each letter must name exactly one option, and no option twice."""
+        names = sorted((catalogue.objects[o].name for o in question.objects), key=str.lower)
+        text = conclusion(prediction.outputs[0])
+        said = "|".join(re.escape(name) for name in sorted(names, key=len, reverse=True))
+        pairs = re.findall(rf"\b([abc])\) is ({said})(?!['\w])", text, flags=re.IGNORECASE)
+        read = {letter.lower(): [n.lower() for n in names].index(name.lower()) + 1 for letter, name in pairs}
+        whole = len(pairs) == 3 and sorted(read) == list(LETTERS) and sorted(read.values()) == [1, 2, 3]
+        return choice_score(question, prediction, "".join(str(read[x]) for x in LETTERS) if whole else None)
+
+    def chance(self, catalogue: Catalogue) -> dict[str, float]:
+        return {"choice": 1 / 6}

@@ -1,0 +1,90 @@
+"""Property Scenario Reasoning: which of two videos suits a situation? Evaluation only, in two turns."""
+
+from __future__ import annotations
+
+import random
+import re
+from collections.abc import Mapping
+
+from pipeline.physiclear.catalogue import Catalogue, Scenario
+from pipeline.records import Dialogue, Opd, Prediction, Question, Score, Task, Turn
+from pipeline.tasks.base import LETTERS, Draft, Pool, choice_score, descriptions, draw_videos, gold, lettered
+
+BASED = " based on physical property descriptions of the two objects"
+REQUEST = (
+    "{question} Select only one most appropriate object for this scenario{based}. "
+    "Use the format 'The most suitable object is x), because xxx'."
+)
+
+
+class PropertyScenarioReasoning:
+    """With OPD the objects are described in a first turn; without, the one turn asks at once."""
+
+    task = Task.PSR
+    trained = False
+
+    def strata(self, catalogue: Catalogue) -> int:
+        return 2 * len(catalogue.language.scenarios)
+
+    def draft(self, pool: Pool, stratum: int, rng: random.Random) -> Draft | None:
+        catalogue = pool.catalogue
+        position, number = stratum % 2, stratum // 2 % len(catalogue.language.scenarios)
+        scenario = catalogue.language.scenarios[number]
+        targets, others = _candidates(pool, scenario)
+        if not targets or not others:
+            return None
+        objects = [rng.choice(targets), rng.choice(others)]
+        if position == 1:
+            objects.reverse()
+        names = [p for p in catalogue.property_names if p in scenario.target or p in scenario.other]
+        prefixes = [f"{letter})" for letter in LETTERS[:2]]
+        verdict = f"The most suitable object is {LETTERS[position]}), because of its {' and '.join(scenario.target)}."
+        with_opd = REQUEST.format(question=scenario.question, based=BASED)
+        second = Turn(user=with_opd, assistant=verdict)
+        first = {
+            Opd.NEEDED: Turn(
+                user=f"Describe the {' and '.join(names)} of these two tactile videos: {lettered(2)}.",
+                assistant=descriptions(catalogue, objects, prefixes, names),
+            ),
+            Opd.ALL: Turn(
+                user=f"Describe these two tactile videos: {lettered(2)}.",
+                assistant=descriptions(catalogue, objects, prefixes),
+            ),
+        }
+        bare = REQUEST.format(question=scenario.question, based="")
+        none = Turn(user=f"Given two tactile videos: {lettered(2)}. {bare}", assistant=verdict)
+        return Draft(
+            videos=draw_videos(pool, objects, rng),
+            objects=tuple(objects),
+            dialogues=(
+                Dialogue(opd=Opd.NONE, turns=(none,)),
+                *(Dialogue(opd=mode, turns=(turn, second)) for mode, turn in first.items()),
+            ),
+            gold=gold(pool, objects, LETTERS[position], names),
+        )
+
+    def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
+        """Read from "The most suitable object is x)"; two different letters there, or "x) or y)", are no answer."""
+        pattern = r"most suitable object is\s+\(?([a-z])\)(?:,?\s*(?:or|and|/)\s*\(?([a-z])\))?"
+        said = re.findall(pattern, prediction.outputs[-1], flags=re.IGNORECASE)
+        letters = {letter.lower() for pair in said for letter in pair if letter}
+        predicted = letters.pop() if len(letters) == 1 else None
+        return choice_score(question, prediction, predicted if predicted in {"a", "b"} else None)
+
+    def chance(self, catalogue: Catalogue) -> dict[str, float]:
+        return {"choice": 1 / 2}
+
+
+def _candidates(pool: Pool, scenario: Scenario) -> tuple[list[str], list[str]]:
+    """Objects that suit the scenario, and objects that do not."""
+    named = scenario.object
+    suited = [named] if named is not None and named in pool.videos else _matching(pool, scenario.target)
+    return suited, [o for o in _matching(pool, scenario.other) if o not in suited]
+
+
+def _matching(pool: Pool, classes: Mapping[str, tuple[int, ...]]) -> list[str]:
+    def fits(object_id: str) -> bool:
+        labels = pool.catalogue.labels(object_id)
+        return all(labels[pool.catalogue.property_index(name)] in allowed for name, allowed in classes.items())
+
+    return [o for o in pool.objects if fits(o)]

@@ -1,0 +1,79 @@
+"""Property Superlative Selection: which of three videos is the extreme one?"""
+
+from __future__ import annotations
+
+import random
+import re
+
+from pipeline.physiclear.catalogue import Catalogue
+from pipeline.records import Opd, Prediction, Question, Score, Task
+from pipeline.tasks.base import (
+    LETTERS,
+    Draft,
+    Pool,
+    choice_score,
+    conclusion,
+    descriptions,
+    draw_videos,
+    gold,
+    lettered,
+    single_turn,
+)
+
+TEMPLATES = (
+    ("Given three tactile videos: {videos}.", "select the {superlative}."),
+    ("You have tactile videos of one object each: {videos}.", "select the {superlative} object."),
+    ("Given these tactile videos: {videos}.", "select the {superlative}."),
+)
+
+
+class PropertySuperlativeSelection:
+    """The right video is the only one of its class, so that the answer is never a matter of taste."""
+
+    task = Task.PSS
+    trained = True
+
+    def strata(self, catalogue: Catalogue) -> int:
+        return 3 * 2 * len(catalogue.properties)
+
+    def draft(self, pool: Pool, stratum: int, rng: random.Random) -> Draft | None:
+        if len(pool.objects) < 3:
+            return None
+        position = stratum % 3
+        index, most = divmod(stratum // 3 % (2 * len(pool.catalogue.properties)), 2)
+        prop = pool.catalogue.properties[index]
+        objects = rng.sample(pool.objects, 3)
+        levels = [pool.catalogue.labels(o)[index] for o in objects]
+        extreme = max(levels) if most else min(levels)
+        if levels.count(extreme) != 1 or levels[position] != extreme:
+            return None
+        superlative = prop.most if most else prop.least
+        opening, request = rng.choice(TEMPLATES)
+        opening = opening.format(videos=lettered(3))
+        request = request.format(superlative=superlative)
+        verdict = f"{LETTERS[position]}) is the {superlative}."
+        prefixes = [f"{letter})" for letter in LETTERS]
+        user = {
+            Opd.NONE: f"{opening} {request[0].upper()}{request[1:]}",
+            Opd.NEEDED: f"{opening} Describe the {prop.name} of each object and then {request}",
+            Opd.ALL: f"{opening} Describe each object and then {request}",
+        }
+        answer = {
+            Opd.NONE: verdict,
+            Opd.NEEDED: f"{descriptions(pool.catalogue, objects, prefixes, [prop.name])} Conclusion: {verdict}",
+            Opd.ALL: f"{descriptions(pool.catalogue, objects, prefixes)} Conclusion: {verdict}",
+        }
+        return Draft(
+            videos=draw_videos(pool, objects, rng),
+            objects=tuple(objects),
+            dialogues=single_turn(user, answer),
+            gold=gold(pool, objects, LETTERS[position], [prop.name]),
+        )
+
+    def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
+        """Read from the one letter that the conclusion calls the superlative."""
+        letters = set(re.findall(r"\b([abc])\) is the\b", conclusion(prediction.outputs[0]), flags=re.IGNORECASE))
+        return choice_score(question, prediction, letters.pop().lower() if len(letters) == 1 else None)
+
+    def chance(self, catalogue: Catalogue) -> dict[str, float]:
+        return {"choice": 1 / 3}

@@ -1,0 +1,56 @@
+"""Embeddings of all salient frames by the frozen encoder, once for every later stage."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from pipeline.data.clips import FrameStore
+from pipeline.data.embeddings import FLIPS
+from pipeline.errors import UserError
+from pipeline.models.tactile_encoder import TactileEncoder
+from pipeline.records import Assignment, Embedding, Flip, Part
+
+AXES: dict[Flip, tuple[int, ...]] = {"none": (), "horizontal": (2,), "vertical": (1,), "both": (1, 2)}
+"""Axes of frames x height x width that a flip reverses."""
+
+
+@torch.inference_mode()
+def embed_videos(
+    encoder: TactileEncoder,
+    store: FrameStore,
+    assignments: Sequence[Assignment],
+    *,
+    batch_size: int,
+    device: torch.device,
+) -> tuple[torch.Tensor, list[Embedding]]:
+    """Embed each salient frame of each used video; training videos also mirrored in all the ways that training draws.
+
+    Returns:
+        The embeddings (float32, rows x dim) and what each row is.
+
+    Raises:
+        UserError: naming the video, where an embedding is not finite.
+    """
+    encoder = encoder.to(device).eval()
+    blocks: list[torch.Tensor] = []
+    index: list[Embedding] = []
+    used = [a for a in assignments if a.part != Part.UNUSED]
+    for assignment in tqdm(used, desc="embed", unit="video", disable=None):
+        rows = store.rows(assignment.video_id)
+        pixels = np.asarray(store.pixels[rows])
+        flips = FLIPS if assignment.part == Part.TRAIN else FLIPS[:1]
+        # All mirrored versions in one tensor: larger batches cost less a frame.
+        frames = torch.from_numpy(np.concatenate([np.flip(pixels, AXES[flip]) for flip in flips]))
+        block = torch.cat([encoder(batch.to(device)).float().cpu() for batch in frames.split(batch_size)])
+        if not block.isfinite().all():
+            raise UserError(f"{assignment.video_id}: its embedding is not finite; check the video and the encoder")
+        for flip in flips:
+            for row in rows:
+                frame = store.index[row].frame_index
+                index.append(Embedding(video_id=assignment.video_id, frame_index=frame, flip=flip, row=len(index)))
+        blocks.append(block)
+    return torch.cat(blocks), index

@@ -1,0 +1,136 @@
+"""What both trainings share: the Trainer, its arguments, checkpoints that survive a kill, and the recorded curve."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import shutil
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from pydantic import BaseModel
+from transformers import PrinterCallback, Trainer, TrainerCallback, TrainerControl, TrainerState, TrainingArguments
+from transformers.trainer_utils import get_last_checkpoint
+
+from pipeline.errors import UserError
+from pipeline.models.tactile_encoder import trainable_state
+from pipeline.records import Measurement
+
+Log = Callable[[int, dict[str, float]], None]
+"""Receives step and values while a training runs."""
+
+CHECKPOINTS = Path("checkpoints")
+
+
+class TrainableTrainer(Trainer):
+    """A Trainer whose checkpoints hold only what is trained, and whose parts may learn at rates of their own.
+
+    The frozen base would otherwise be written again with each checkpoint (13 GB for Vicuna-7b).
+    """
+
+    def __init__(self, *args: Any, rates: Mapping[str, float] | None = None, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.remove_callback(PrinterCallback)
+        self._rates = rates
+        self.optimizer: torch.optim.Optimizer | None
+
+    def create_optimizer(self, model: torch.nn.Module | None = None) -> torch.optim.Optimizer:
+        """AdamW with one group a prefix of `rates`, or the Trainer's own without."""
+        if self._rates is None:
+            return cast(torch.optim.Optimizer, super().create_optimizer(model))
+        if self.optimizer is None:
+            # By name, not by identity: distributed wrappers replace the parameters and prefix their names.
+            trained = [(n, p) for n, p in (model or self.model).named_parameters() if p.requires_grad]
+            groups = [
+                {"params": [p for n, p in trained if f".{prefix}." in f".{n}"], "lr": rate}
+                for prefix, rate in self._rates.items()
+            ]
+            self.optimizer = torch.optim.AdamW(groups, weight_decay=self.args.weight_decay)
+        return self.optimizer
+
+    def _save(self, output_dir: str | None = None, state_dict: dict[str, Any] | None = None) -> None:
+        trained = trainable_state(self.accelerator.unwrap_model(self.model))
+        if state_dict is not None:
+            # Gathered by the distributed backend: take the gathered values.
+            trained = {name: state_dict[name] for name in trained}
+        super()._save(output_dir, {name: value.contiguous() for name, value in trained.items()})
+
+
+class Watch(TrainerCallback):
+    """Hands each logged value on, tells a log file how far it is, and stops where the loss is no number any more."""
+
+    def __init__(self, log: Log | None) -> None:
+        self.log = log
+        self._said = 0
+
+    def on_log(
+        self,
+        args: TrainingArguments,
+        state: TrainerState,
+        control: TrainerControl,
+        logs: dict[str, float] | None = None,
+        **_: Any,
+    ) -> None:
+        """Called by the Trainer after each logging step."""
+        values = {k: float(v) for k, v in (logs or {}).items() if isinstance(v, (int, float))}
+        bad = [name for name in ("loss", "grad_norm") if not math.isfinite(values.get(name, 0.0))]
+        if bad:
+            raise UserError(
+                f"{bad[0]} is {values[bad[0]]} at step {state.global_step}: the training diverged; lower the learning "
+                "rate (earlier checkpoints are kept)"
+            )
+        if not state.is_world_process_zero:
+            return
+        if self.log:
+            self.log(state.global_step, values)
+        tenth = 10 * state.global_step // max(1, state.max_steps)
+        if args.disable_tqdm and "loss" in values and tenth > self._said:
+            self._said = tenth
+            print(f"step {state.global_step}/{state.max_steps}, loss {values['loss']:.3f}", flush=True)
+
+
+def progress_bar_off() -> bool:
+    """A bar is for a person at a terminal; a log file gets a line now and then."""
+    return not sys.stderr.isatty()
+
+
+def fingerprint(*parts: BaseModel | str | int | Path) -> str:
+    """A short hash of settings and input files: checkpoints of one training are never taken for another's."""
+    digest = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, BaseModel):
+            digest.update(json.dumps(part.model_dump(mode="json"), sort_keys=True).encode())
+        elif isinstance(part, Path):
+            digest.update(hashlib.sha256(part.read_bytes()).digest())
+        else:
+            digest.update(str(part).encode())
+        digest.update(b"\0")
+    return digest.hexdigest()[:16]
+
+
+def checkpoint_dir(stage: str, mark: str) -> Path:
+    """Where a training keeps its checkpoints, outside DVC's reach (DVC deletes a killed stage's outputs)."""
+    return CHECKPOINTS / stage / mark
+
+
+def train(trainer: Trainer) -> list[Measurement]:
+    """Train to the end, from the last checkpoint where there is one; return the whole curve and tidy up."""
+    folder = Path(str(trainer.args.output_dir))
+    last = get_last_checkpoint(str(folder)) if folder.is_dir() else None
+    trainer.train(resume_from_checkpoint=last)
+    history = [
+        Measurement(step=entry["step"], name=name.removeprefix("eval_"), value=float(value))
+        for entry in trainer.state.log_history
+        for name, value in entry.items()
+        if isinstance(value, (int, float)) and name not in NOT_MEASURED and not name.endswith(("_runtime", "_second"))
+    ]
+    if trainer.is_world_process_zero():
+        shutil.rmtree(folder, ignore_errors=True)
+    return history
+
+
+NOT_MEASURED = {"step", "epoch", "total_flos", "train_loss"}

@@ -1,0 +1,37 @@
+"""Let one variant answer the evaluation questions."""
+
+import sys
+from pathlib import Path
+
+from pipeline.artifacts import read_jsonl, write_jsonl
+from pipeline.data.embeddings import EmbeddingStore
+from pipeline.evaluation.generate import Asking, answer
+from pipeline.models.octopi import build_octopi, load_octopi
+from pipeline.records import Question
+from pipeline.runtime import resolve_device
+from pipeline.stage import DATA, stage
+
+
+def main() -> None:
+    key = sys.argv[1]
+    with stage("answer", key) as run:
+        params, variant = run.params, run.params.plan.variants[key]
+        store = EmbeddingStore(DATA / "embeddings" / variant.embeddings)
+        model = build_octopi(params.language, store.dim)
+        load_octopi(model, Path(variant.model_dir))
+        asking = Asking(
+            system_prompt=params.language.system_prompt,
+            per_video=params.frames.per_video,
+            max_new_tokens=params.language.max_new_tokens,
+            batch_size=params.language.generation_batch_size,
+        )
+        questions = read_jsonl(DATA / "questions" / "evaluation.jsonl", Question)
+        predictions = answer(model.to(resolve_device(params.runtime.device)), store, questions, variant.opd, asking)
+        write_jsonl(DATA / "answers" / key / "predictions.jsonl", predictions)
+        run.metrics["answers"] = len(predictions)
+        run.metrics["tokens"] = sum(p.tokens for p in predictions)
+        run.metrics["truncated"] = sum(p.truncated for p in predictions)
+
+
+if __name__ == "__main__":
+    main()

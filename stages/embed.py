@@ -1,0 +1,48 @@
+"""Compute the embeddings of one encoder, base or fine-tuned."""
+
+import sys
+from pathlib import Path
+
+from pipeline.artifacts import read_table, save_tensors, write_table
+from pipeline.data.clips import FrameStore
+from pipeline.data.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE
+from pipeline.models.tactile_encoder import base_encoder, load_trainable, property_classifier
+from pipeline.models.weights import check_encoder
+from pipeline.physiclear.catalogue import load_catalogue
+from pipeline.plan import Encoder
+from pipeline.records import Assignment, Embedding
+from pipeline.runtime import resolve_device
+from pipeline.stage import DATA, stage
+from pipeline.training.embed import embed_videos
+
+
+def main() -> None:
+    key = sys.argv[1]
+    with stage("embed", key) as run:
+        params = run.params
+        weights = Path(params.encoder.weights)
+        check_encoder(weights, params.frames.size)
+        job = params.plan.embeddings[key]
+        if job.encoder is Encoder.BASE:
+            encoder = base_encoder(weights)
+        else:
+            classes = [len(p.levels) for p in load_catalogue(Path(params.data.catalogue)).properties]
+            classifier = property_classifier(weights, params.encoder.prompts, classes)
+            load_trainable(classifier, Path(job.encoder_dir) / "encoder.safetensors")
+            encoder = classifier.encoder
+        tensor, index = embed_videos(
+            encoder,
+            FrameStore(DATA / "frames"),
+            read_table(DATA / "splits.parquet", Assignment),
+            batch_size=params.encoder.embed_batch_size,
+            device=resolve_device(params.runtime.device),
+        )
+        out = DATA / "embeddings" / key
+        save_tensors(out / TENSOR_FILE, {TENSOR: tensor})
+        write_table(out / INDEX_FILE, Embedding, index)
+        run.metrics["rows"] = len(index)
+        run.metrics["norm"] = float(tensor.norm(dim=1).mean())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,49 @@
+"""Fine-tune the encoder on property classification."""
+
+import sys
+from pathlib import Path
+
+from pipeline.artifacts import read_table, write_table
+from pipeline.data.clips import FrameStore
+from pipeline.models.tactile_encoder import save_trainable
+from pipeline.models.weights import check_encoder
+from pipeline.physiclear.catalogue import load_catalogue
+from pipeline.records import Assignment, Classification, Measurement, Part
+from pipeline.runtime import resolve_device
+from pipeline.stage import DATA, stage
+from pipeline.tracking import live_run
+from pipeline.training.encoder import EncoderData, classify, finetune
+
+
+def main() -> None:
+    seed = int(sys.argv[1])
+    with stage("finetune_encoder", str(seed)) as run:
+        params = run.params
+        check_encoder(Path(params.encoder.weights), params.frames.size)
+        data = EncoderData(
+            store=FrameStore(DATA / "frames"),
+            catalogue=load_catalogue(Path(params.data.catalogue)),
+            assignments=read_table(DATA / "splits.parquet", Assignment),
+            per_video=params.frames.per_video,
+        )
+        inputs = [DATA / "frames" / "frames.parquet", DATA / "splits.parquet"]
+        with live_run(params, run.name, Path()) as live:
+            model, history = finetune(
+                data, params.encoder, params.runtime, seed=params.seed + seed, inputs=inputs, log=live.log
+            )
+        device = resolve_device(params.runtime.device)
+        judged = classify(model, data, [Part.VALIDATION, Part.TEST], params.encoder.batch_size, device)
+        out = DATA / "encoder" / str(seed)
+        save_trainable(model, out / "encoder.safetensors")
+        write_table(out / "history.parquet", Measurement, history)
+        write_table(out / "classifications.parquet", Classification, judged)
+        run.finish_training(history)
+        for part in (Part.VALIDATION, Part.TEST):
+            chosen = [c for c in judged if c.part == part]
+            for name in dict.fromkeys(c.property for c in chosen):
+                right = [c.expected == c.predicted for c in chosen if c.property == name]
+                run.metrics[f"{part}.{name}.accuracy"] = sum(right) / len(right)
+
+
+if __name__ == "__main__":
+    main()

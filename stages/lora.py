@@ -1,0 +1,49 @@
+"""Fine-tune the aligned model end to end, the language model through low-rank adapters."""
+
+import sys
+from pathlib import Path
+
+from pipeline.artifacts import read_jsonl, write_table
+from pipeline.data.embeddings import TENSOR_FILE, EmbeddingStore
+from pipeline.models.octopi import CONNECTOR_FILE, load_octopi, save_octopi
+from pipeline.records import Measurement, Question
+from pipeline.stage import DATA, stage
+from pipeline.tracking import live_run
+from pipeline.training.language import Job, Material, add_lora, assemble, finetune_lora
+from pipeline.training.trainer import fingerprint
+
+
+def main() -> None:
+    key = sys.argv[1]
+    with stage("lora", key) as run:
+        params, plan = run.params, run.params.plan.lora[key]
+        inputs = (
+            DATA / "questions" / "train.jsonl",
+            DATA / "embeddings" / plan.embeddings / TENSOR_FILE,
+            DATA / "align" / key / CONNECTOR_FILE,
+        )
+        material = Material(
+            questions=read_jsonl(inputs[0], Question),
+            store=EmbeddingStore(inputs[1].parent),
+            opd=plan.opd,
+            language=params.language,
+            per_video=params.frames.per_video,
+            flip_probability=params.encoder.flip_probability,
+            seed=params.seed + plan.seed,
+        )
+        model, data = assemble(material, params.lora.samples, "lora")
+        load_octopi(model, inputs[2].parent)
+        add_lora(model, params.lora)
+        mark = fingerprint(params.lora, params.language, params.frames, params.encoder, plan, params.seed, *inputs)
+        with live_run(params, run.name, Path()) as live:
+            history = finetune_lora(
+                model, data, params.lora, params.runtime, Job(run.name, mark, material.seed, live.log)
+            )
+        run.finish_training(history)
+        out = DATA / "lora" / key
+        save_octopi(model, out)
+        write_table(out / "history.parquet", Measurement, history)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,29 @@
+"""Build the training and evaluation questions, the same for every variant."""
+
+from pathlib import Path
+
+from pipeline.artifacts import read_table, write_jsonl
+from pipeline.physiclear.catalogue import load_catalogue
+from pipeline.questions import build_questions, pool_of
+from pipeline.records import Assignment, Part
+from pipeline.stage import DATA, stage
+
+
+def main() -> None:
+    with stage("questions") as run:
+        config = run.params.questions
+        catalogue = load_catalogue(Path(run.params.data.catalogue))
+        assignments = read_table(DATA / "splits.parquet", Assignment)
+        for name, part, counts, distinct in (
+            ("train", Part.TRAIN, config.train, False),
+            ("evaluation", Part.TEST, config.evaluation, True),
+        ):
+            pool = pool_of(part, assignments, catalogue)
+            questions = build_questions(pool, counts.by_task(), seed=config.seed, distinct=distinct)
+            write_jsonl(DATA / "questions" / f"{name}.jsonl", questions)
+            for task in counts.by_task():
+                run.metrics[f"{name}.{task}"] = sum(q.task == task for q in questions)
+
+
+if __name__ == "__main__":
+    main()

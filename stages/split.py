@@ -1,0 +1,25 @@
+"""Assign each object, and with it its videos, to training, validation or test."""
+
+from pathlib import Path
+
+from pipeline.artifacts import read_table, write_table
+from pipeline.physiclear.catalogue import load_catalogue
+from pipeline.records import Assignment, Part, Video
+from pipeline.splits import assign, check_leakage
+from pipeline.stage import DATA, stage
+
+
+def main() -> None:
+    with stage("split") as run:
+        catalogue = load_catalogue(Path(run.params.data.catalogue))
+        videos = read_table(DATA / "videos.parquet", Video)
+        split = assign(catalogue, videos, run.params.split)
+        check_leakage(split.assignments, videos)
+        write_table(DATA / "splits.parquet", Assignment, split.assignments)
+        for part in Part:
+            run.metrics[f"{part}_videos"] = sum(a.part == part for a in split.assignments)
+            run.metrics[f"{part}_objects"] = len({a.object_id for a in split.assignments if a.part == part})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,149 @@
+"""Scales: each shipped one is valid, and a wrong value is named with its key and what is allowed."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+import yaml
+
+from pipeline.config import load_params
+from pipeline.errors import UserError
+from pipeline.plan import resolve_plan
+from pipeline.records import Opd
+from pipeline.scales import check_inputs, compose, prune, shipped_scales, write_params
+from tests.closure import ROOT
+
+CONF = ROOT / "conf"
+
+
+@pytest.mark.parametrize("scale", ["smoke", "small", "paper-7b", "paper-13b"])
+def test_shipped_scale_is_valid_and_survives_writing(scale: str, tmp_path: Path) -> None:
+    params = compose(scale, conf=CONF)
+    assert write_params(params, tmp_path / "params.yaml")
+    assert load_params(tmp_path / "params.yaml") == params
+    assert not write_params(params, tmp_path / "params.yaml"), "an unchanged file is not written again"
+
+
+def test_no_other_scale_is_shipped() -> None:
+    assert shipped_scales(CONF) == ["paper-13b", "paper-7b", "small", "smoke"]
+
+
+def test_committed_params_are_the_default_scale() -> None:
+    assert load_params(ROOT / "params.yaml") == compose("smoke", conf=CONF)
+
+
+@pytest.mark.parametrize("scale", ["paper-7b", "paper-13b"])
+def test_paper_scales_have_the_papers_hyper_parameters(scale: str) -> None:
+    p = compose(scale, conf=CONF)
+    assert (p.frames.salient_fraction, p.frames.per_video, p.frames.size) == (0.3, 5, 224)
+    assert (p.encoder.prompts, p.encoder.epochs, p.encoder.batch_size, p.encoder.learning_rate) == (8, 30, 32, 1e-3)
+    assert (p.encoder.weight_decay, p.align.weight_decay, p.lora.weight_decay) == (0, 0, 0)
+    assert (p.align.samples, p.align.projection_learning_rate, p.align.batch_size) == (8000, 2e-5, 16)
+    assert (p.lora.samples, p.lora.projection_learning_rate, p.lora.learning_rate, p.lora.batch_size) == (
+        3000, 2e-5, 2e-4, 16,
+    )  # fmt: skip
+    assert (p.lora.rank, p.lora.alpha, p.lora.dropout) == (128, 256, 0.05)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["frames.per_vido=1"], ["frames.per_vido", "did you mean per_video"]),
+        (["nothing=1"], ["nothing", "allowed here"]),
+        (["frames.per_video=0"], ["frames.per_video", "greater than or equal to 1"]),
+        (["frames.salient_fraction=1.5"], ["frames.salient_fraction", "less than or equal to 1"]),
+        (["split.name=sideways"], ["split.name", "'paper', 'release', 'development' or 'kfold'"]),
+        (["split.fold=7"], ["split", "0 to 4"]),
+        (["ablation.seeds=[1,1]"], ["ablation", "repeats"]),
+        (["align.batch_size=10"], ["align", "does not divide"]),
+        (["questions.train.psr=3"], ["questions", "must be 0"]),
+        (["data.dir=elsewhere"], ["data.dir", "data/scenes/videos"]),
+        (["lora.target_modules=[]"], ["lora.target_modules"]),
+        (["encoder.learning_rate=nan"], ["encoder.learning_rate"]),
+        (["runtime.device=tpu"], ["runtime.device", "'cuda'"]),
+        (["justaword"], ["key=value"]),
+        (["a b=[1"], ["a b"]),
+    ],
+)
+def test_wrong_override_is_one_line_with_key_and_mend(overrides: list[str], words: list[str]) -> None:
+    with pytest.raises(UserError) as caught:
+        compose("smoke", overrides, conf=CONF)
+    message = str(caught.value)
+    assert "\n" not in message
+    for word in words:
+        assert word in message
+
+
+def test_unknown_scale_names_the_known() -> None:
+    with pytest.raises(UserError, match="paper-7b, small, smoke"):
+        compose("huge", conf=CONF)
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [("", "octopi scale smoke"), ("scale: [", "not YAML"), ("scale: smoke\n", "missing"), (None, "no such file")],
+)
+def test_broken_params_file(text: str | None, word: str, tmp_path: Path) -> None:
+    path = tmp_path / "params.yaml"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(UserError, match=word):
+        load_params(path)
+
+
+def test_edited_plan_is_refused(tmp_path: Path) -> None:
+    values = compose("smoke", conf=CONF).model_dump(mode="json")
+    values["plan"]["encoder_seeds"] = [0, 1]
+    (tmp_path / "params.yaml").write_text(yaml.safe_dump(values))
+    with pytest.raises(UserError, match="octopi scale"):
+        load_params(tmp_path / "params.yaml")
+
+
+def test_missing_inputs_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    with pytest.raises(UserError, match="data.dir"):
+        check_inputs(compose("small", ["data.source=videos", f"data.dir={tmp_path}/none"]))
+    with pytest.raises(UserError, match="hf download timm"):
+        check_inputs(compose("smoke", [f"encoder.weights={tmp_path}/none"]))
+    with pytest.raises(UserError, match="hf download lmsys"):
+        check_inputs(compose("smoke", [f"language.weights={tmp_path}/none"]))
+    with pytest.raises(UserError, match="scenes.objects"):
+        check_inputs(compose("smoke", ["scenes.objects=[unicorn]"]))
+    with pytest.raises(UserError, match="frames.size"):
+        check_inputs(compose("smoke", ["frames.size=128"]))
+
+
+def test_plan_names() -> None:
+    paper, factorial = resolve_plan("scenes", "paper", [0]), resolve_plan("videos", "factorial", [0, 1])
+    assert list(paper.variants) == [
+        "finetuned-with-all-0",
+        "finetuned-with-none-0",
+        "base-with-all-0",
+        "finetuned-without-all-0",
+    ]
+    assert len(factorial.variants) == 2 * 12
+    assert set(factorial.embeddings) == {"base", "finetuned-0", "finetuned-1"}, "the base encoder has no seed"
+    assert len(factorial.align) == 2 * 2 * len(Opd) == len(factorial.lora)
+    assert not factorial.scenes
+    assert paper.scenes
+
+
+def test_prune_keeps_the_plan_and_removes_the_rest(tmp_path: Path) -> None:
+    plan = resolve_plan("scenes", "paper", [0])
+    for name in ("align/base-all-0", "align/base-all-1", "scores/finetuned-with-all-0", "scores/old", "encoder/3"):
+        (tmp_path / name).mkdir(parents=True)
+    (tmp_path / "metrics").mkdir()
+    for name in ("align@base-all-0", "align@base-all-1", "split", "synthesize@scenes", "grade@old"):
+        (tmp_path / "metrics" / f"{name}.json").touch()
+    prune(plan, tmp_path)
+    assert sorted(str(p.relative_to(tmp_path)) for p in tmp_path.glob("*/*")) == [
+        "align/base-all-0",
+        "metrics/align@base-all-0.json",
+        "metrics/split.json",
+        "metrics/synthesize@scenes.json",
+        "scores/finetuned-with-all-0",
+    ]
+    shutil.rmtree(tmp_path)
+    prune(plan, tmp_path)

@@ -1,0 +1,323 @@
+"""The language side: embeddings in their places, masks, adapters, checkpoints, answers."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from pipeline.artifacts import save_tensors, write_table
+from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig, TrainConfig
+from pipeline.data.conversations import ConversationCollator
+from pipeline.data.embeddings import FLIPS, INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
+from pipeline.errors import UserError
+from pipeline.evaluation.generate import Asking, answer
+from pipeline.models.llm import load_llm
+from pipeline.models.octopi import Octopi, build_octopi, load_octopi, save_octopi
+from pipeline.physiclear.catalogue import load_catalogue
+from pipeline.prompts import IGNORE_INDEX, TACT_FRAME
+from pipeline.questions import build_questions, pool_of
+from pipeline.records import Assignment, Embedding, Opd, Part, Question, Task
+from pipeline.runtime import seed_everything
+from pipeline.training import trainer as shared
+from pipeline.training.language import Job, Material, add_lora, align, assemble, finetune_lora
+from tests.checkpoints import write_llama
+from tests.closure import ROOT
+
+FRAMES, DIM = 2, 6
+
+
+@pytest.fixture(scope="module")
+def language(tmp_path_factory: pytest.TempPathFactory) -> LanguageConfig:
+    folder = write_llama(tmp_path_factory.mktemp("llama"))
+    return LanguageConfig(weights=str(folder), max_new_tokens=12, generation_batch_size=4)
+
+
+@pytest.fixture(scope="module")
+def questions() -> list[Question]:
+    catalogue = load_catalogue(ROOT / "pipeline" / "physiclear")
+    videos = [Assignment(video_id=f"{o}_0", object_id=o, part=Part.TRAIN) for o in list(catalogue.objects)[::4]]
+    counts = {Task.OPD: 4, Task.PC: 4, Task.PSS: 3, Task.PSR: 3}
+    return build_questions(pool_of(Part.TRAIN, videos, catalogue), counts, seed=0, distinct=False)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory, questions: list[Question]) -> EmbeddingStore:
+    folder = tmp_path_factory.mktemp("embeddings")
+    videos = sorted({v for q in questions for v in q.videos})
+    index = [Embedding(video_id=v, frame_index=f, flip=flip, row=0) for v in videos for flip in FLIPS for f in range(3)]
+    index = [entry.model_copy(update={"row": row}) for row, entry in enumerate(index)]
+    write_table(folder / INDEX_FILE, Embedding, index)
+    save_tensors(folder / TENSOR_FILE, {TENSOR: torch.randn(len(index), DIM, generator=torch.manual_seed(0))})
+    return EmbeddingStore(folder)
+
+
+def material(language: LanguageConfig, questions: list[Question], store: EmbeddingStore) -> Material:
+    trained = [q for q in questions if q.task is not Task.PSR]
+    return Material(trained, store, Opd.ALL, language, per_video=FRAMES, flip_probability=0.5, seed=3)
+
+
+@pytest.fixture
+def model(language: LanguageConfig) -> Octopi:
+    seed_everything(1)
+    return build_octopi(language, DIM).eval()
+
+
+def test_tactile_embeddings_stand_where_the_frames_are(model: Octopi) -> None:
+    words = model.llm.get_input_embeddings().weight
+    ids = torch.tensor([[5, model.start_id, model.frame_id, model.frame_id, model.end_id, 7], [8, 9, 10, 11, 12, 13]])
+    features = torch.randn(2, 2, DIM)
+    features[1] = float("nan")  # padding of a row without frames: must never be read
+    output = model.embed(ids, features)
+    expected = torch.stack(
+        [
+            words[5],
+            model.connector.delimiters[0],
+            model.connector.projection(features[0, 0]),
+            model.connector.projection(features[0, 1]),
+            model.connector.delimiters[1],
+            words[7],
+        ]
+    )
+    torch.testing.assert_close(output[0], expected)
+    assert torch.equal(output[1], words[ids[1]])
+
+
+def test_only_connector_is_trained_and_only_two_words_are_new(model: Octopi) -> None:
+    trained = {name for name, p in model.named_parameters() if p.requires_grad}
+    assert all(name.startswith("connector.") for name in trained)
+    assert model.connector.delimiters.shape == (2, 32)
+
+
+def test_loss_is_over_answers_only(
+    model: Octopi, language: LanguageConfig, questions: list[Question], store: EmbeddingStore
+) -> None:
+    _, data = assemble(material(language, questions, store), 4, "test")
+    batch = ConversationCollator(0)([data[0]])
+    output = model(**batch)
+    logits, labels = output.logits[0, :-1].double(), batch["labels"][0, 1:]
+    used = labels != IGNORE_INDEX
+    reference = -logits.log_softmax(-1)[used, labels[used]].mean()
+    torch.testing.assert_close(output.loss.double(), reference, atol=1e-5, rtol=0)
+    frames = batch["input_ids"] == model.frame_id
+    assert (batch["labels"][frames] == IGNORE_INDEX).all()
+
+
+def test_padding_changes_no_logit(
+    model: Octopi, language: LanguageConfig, questions: list[Question], store: EmbeddingStore
+) -> None:
+    _, data = assemble(material(language, questions, store), 6, "test")
+    samples = [data[i] for i in range(len(data))]
+    batch = ConversationCollator(0)(samples)
+    together = model(**batch).logits
+    for row, sample in enumerate(samples):
+        alone = model(**ConversationCollator(0)([sample])).logits[0]
+        torch.testing.assert_close(together[row, : len(alone)], alone, atol=2e-5, rtol=0)
+
+
+def test_same_draws_for_same_epoch_and_others_for_another(
+    language: LanguageConfig, questions: list[Question], store: EmbeddingStore
+) -> None:
+    _, data = assemble(material(language, questions, store), 6, "test")
+    first = [data[i]["features"] for i in range(len(data))]
+    assert all(torch.equal(a, data[i]["features"]) for i, a in enumerate(first))
+    data.set_epoch(1)
+    assert not all(torch.equal(a, data[i]["features"]) for i, a in enumerate(first))
+
+
+def test_fresh_adapter_changes_nothing_and_reloads_exactly(
+    model: Octopi, language: LanguageConfig, tmp_path: Path
+) -> None:
+    ids = torch.tensor([[5, model.start_id, model.frame_id, model.end_id, 7]])
+    call = {"input_ids": ids, "attention_mask": torch.ones_like(ids), "features": torch.randn(1, 1, DIM)}
+    before = model(**call).logits
+    add_lora(model, LoraTrainConfig(samples=1, rank=128, alpha=256))
+    model.eval()
+    torch.testing.assert_close(model(**call).logits, before, atol=0, rtol=0)
+    for name, parameter in model.named_parameters():
+        if "lora_B" in name:
+            torch.nn.init.normal_(parameter, std=0.05)
+    changed = model(**call).logits
+    assert not torch.allclose(changed, before)
+    save_octopi(model, tmp_path)
+    other = build_octopi(language, DIM).eval()
+    load_octopi(other, tmp_path)
+    assert torch.equal(other(**call).logits, changed)
+    merged = other.llm.merge_and_unload()
+    torch.testing.assert_close(
+        merged(inputs_embeds=other.embed(ids, call["features"])).logits, changed, atol=1e-4, rtol=0
+    )
+
+
+def test_unknown_target_module_is_named(model: Octopi) -> None:
+    with pytest.raises(UserError, match="no layer q_projection"):
+        add_lora(model, LoraTrainConfig(samples=1, target_modules=("q_projection",)))
+
+
+def asking(batch_size: int, tokens: int = 12) -> Asking:
+    return Asking(system_prompt="", per_video=FRAMES, max_new_tokens=tokens, batch_size=batch_size)
+
+
+@pytest.mark.parametrize("opd", list(Opd))
+def test_batch_size_changes_no_answer(
+    model: Octopi, questions: list[Question], store: EmbeddingStore, opd: Opd
+) -> None:
+    one = answer(model, store, questions, opd, asking(1))
+    many = answer(model, store, questions, opd, asking(5))
+    assert one == many
+    turns = {q.question_id: len(d.turns) for q in questions if (d := q.dialogue(opd))}
+    assert {p.question_id: len(p.outputs) for p in one} == turns
+    if opd is Opd.NONE:
+        assert not [p for p in one if p.task is Task.OPD], "without descriptions there is nothing to ask"
+
+
+def test_running_into_the_limit_is_said(model: Octopi, questions: list[Question], store: EmbeddingStore) -> None:
+    predictions = answer(model, store, questions[:2], Opd.ALL, asking(2, tokens=1))
+    assert all(p.truncated for p in predictions)
+    assert all(p.tokens == len(p.outputs) for p in predictions)
+
+
+def test_answers_equal_generation_by_hand(model: Octopi, questions: list[Question], store: EmbeddingStore) -> None:
+    from pipeline.data.conversations import evaluation_features
+    from pipeline.prompts import encode, render
+
+    question = next(q for q in questions if q.task is Task.PC)
+    dialogue = question.dialogue(Opd.ALL)
+    assert dialogue is not None
+    ids = list(
+        encode(
+            render(dialogue.turns, system_prompt="", frames=FRAMES, eos="</s>", complete=False), model.tokenizer
+        ).input_ids
+    )
+    features = evaluation_features(question, store, FRAMES)[None]
+    said: list[int] = []
+    for _ in range(12):  # the whole sequence anew for each token, without cache or padding
+        x = torch.tensor([ids + said])
+        said.append(int(model(x, torch.ones_like(x), features).logits[0, -1].argmax()))
+        if said[-1] == model.tokenizer.eos_token_id:
+            break
+    expected = model.tokenizer.decode(said, skip_special_tokens=True).strip()
+    assert answer(model, store, [question], Opd.ALL, asking(1))[0].outputs == (expected,)
+
+
+SMALL = TrainConfig(samples=8, epochs=2, batch_size=4, micro_batch_size=2, projection_learning_rate=1e-3)
+
+
+class Killed(Exception):
+    """Stands in for a kill at some step."""
+
+
+@pytest.mark.parametrize("kill_at", [None, 2, 3])
+def test_killed_training_ends_like_an_uninterrupted_one(
+    kill_at: int | None,
+    language: LanguageConfig,
+    questions: list[Question],
+    store: EmbeddingStore,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(shared, "CHECKPOINTS", tmp_path)
+    config = LoraTrainConfig(**SMALL.model_dump(), rank=4, alpha=8, learning_rate=1e-3, dropout=0.1)
+    runtime = RuntimeConfig(device="cpu", save_steps=1)
+
+    def run(mark: str, stop: int | None) -> tuple[dict[str, torch.Tensor], list[float]]:
+        def log(step: int, values: dict[str, float]) -> None:
+            if step == stop:
+                raise Killed
+
+        model, data = assemble(material(language, questions, store), 8, "test")
+        add_lora(model, config)
+        history = finetune_lora(model, data, config, runtime, Job("lora", mark, 0, log))
+        state = {n: p.detach().clone() for n, p in model.named_parameters() if p.requires_grad}
+        return state, [m.value for m in history if m.name == "loss"]
+
+    reference, curve = run("reference", None)
+    if kill_at is not None:
+        with pytest.raises(Killed):
+            run("killed", kill_at)
+        assert list((tmp_path / "lora" / "killed").glob("checkpoint-*")), "there must be something to resume from"
+    state, again = run("killed", None)
+    assert again == curve
+    for name, value in reference.items():
+        assert torch.equal(value, state[name]), name
+    assert not (tmp_path / "lora" / "killed").exists(), "checkpoints go when the training is done"
+
+
+def test_each_part_learns_at_its_own_rate(
+    language: LanguageConfig,
+    questions: list[Question],
+    store: EmbeddingStore,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(shared, "CHECKPOINTS", tmp_path)
+    config = LoraTrainConfig(
+        **{**SMALL.model_dump(), "projection_learning_rate": 1e-9}, rank=4, alpha=8, learning_rate=1e-2
+    )
+    model, data = assemble(material(language, questions, store), 8, "test")
+    add_lora(model, config)
+    before = {n: p.detach().clone() for n, p in model.named_parameters()}
+    finetune_lora(model, data, config, RuntimeConfig(device="cpu"), Job("lora", "x", 0))
+    moved = {n: float((p - before[n]).abs().max()) for n, p in model.named_parameters()}
+    assert max(v for n, v in moved.items() if n.startswith("connector.")) < 1e-6
+    assert min(v for n, v in moved.items() if "lora_B" in n) > 1e-3
+    assert max(v for n, v in moved.items() if "base_layer" in n or "embed_tokens" in n) == 0
+
+
+def test_diverging_training_stops_with_the_mend(
+    language: LanguageConfig,
+    questions: list[Question],
+    store: EmbeddingStore,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(shared, "CHECKPOINTS", tmp_path)
+    model, data = assemble(material(language, questions, store), 8, "test")
+    with torch.no_grad():
+        model.connector.delimiters.fill_(float("inf"))
+    with pytest.raises(UserError, match="lower the learning rate"):
+        align(model, data, SMALL, RuntimeConfig(device="cpu"), Job("align", "x", 0))
+
+
+def test_checkpoint_of_another_model_is_refused(language: LanguageConfig, tmp_path: Path) -> None:
+    folder = write_llama(tmp_path)
+    config = folder / "config.json"
+    config.write_text(config.read_text().replace('"num_hidden_layers": 2', '"num_hidden_layers": 3'))
+    with pytest.raises(UserError, match="does not fit its config.json"):
+        load_llm(folder, torch.float32)
+
+
+def test_pickle_in_place_of_safetensors_is_refused(language: LanguageConfig, tmp_path: Path) -> None:
+    model = build_octopi(language, DIM)
+    torch.save(model.connector.state_dict(), tmp_path / "connector.safetensors")
+    with pytest.raises(UserError, match="not a safetensors file"):
+        load_octopi(model, tmp_path)
+    save_file({"projection.0.weight": torch.zeros(1)}, tmp_path / "connector.safetensors")
+    with pytest.raises(UserError, match="does not fit the model"):
+        load_octopi(model, tmp_path)
+
+
+def test_frame_token_never_comes_out_as_text(model: Octopi) -> None:
+    assert model.frame_id >= model.llm.get_input_embeddings().num_embeddings
+    assert TACT_FRAME not in model.tokenizer.decode(range(model.llm.config.vocab_size))
+
+
+def test_accumulated_batches_weigh_every_token_alike(
+    language: LanguageConfig,
+    questions: list[Question],
+    store: EmbeddingStore,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(shared, "CHECKPOINTS", tmp_path)
+    states = []
+    for micro in (4, 1):
+        model, data = assemble(material(language, questions, store), 8, "test")
+        random.seed(0)
+        config = SMALL.model_copy(update={"micro_batch_size": micro, "epochs": 1})
+        align(model, data, config, RuntimeConfig(device="cpu"), Job("align", f"x{micro}", 0))
+        states.append(model.connector.delimiters.detach().clone())
+    torch.testing.assert_close(states[0], states[1], atol=1e-5, rtol=0)
