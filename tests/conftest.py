@@ -1,0 +1,98 @@
+"""Fixtures that every room's tests share."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import settings
+
+from pipeline.physiclear.catalogue import Catalogue, load_catalogue
+from pipeline.records import Video
+
+ROOT = Path(__file__).parents[1]
+DATA_VARIABLE = "OCTOPI_DATA_DIR"
+NO_DATA = f"needs real videos: set {DATA_VARIABLE} to a folder of the PhysiCLeAR videos"
+
+# A loaded machine is no reason to fail, and a test that passes today passes tomorrow.
+settings.register_profile("house", deadline=None, derandomize=True, database=None, max_examples=60)
+settings.load_profile("house")
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    if item.get_closest_marker("real") and not os.environ.get(DATA_VARIABLE):
+        pytest.skip(NO_DATA)
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    """The folder of the real videos; skips where there is none, for tests marked `real`."""
+    if not os.environ.get(DATA_VARIABLE):
+        pytest.skip(NO_DATA)
+    return Path(os.environ[DATA_VARIABLE])
+
+
+@pytest.fixture(scope="session")
+def catalogue() -> Catalogue:
+    return load_catalogue(ROOT / "pipeline" / "physiclear")
+
+
+def write_video(path: Path, frames: Iterable[np.ndarray]) -> Path:
+    """Write BGR uint8 frames as Motion JPEG (lossy: compare with what decodes, not with what went in)."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    writer = None
+    for frame in frames:
+        if writer is None:
+            size = (frame.shape[1], frame.shape[0])
+            writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"MJPG"), 25.0, size)
+            assert writer.isOpened(), path
+        writer.write(frame)
+    if writer is not None:
+        writer.release()
+    return path
+
+
+def moving_square(count: int, seed: int = 0, width: int = 48, height: int = 36) -> list[np.ndarray]:
+    """Frames in which a bright square jumps about on a grey ground."""
+    rng = np.random.default_rng(seed)
+    frames = []
+    for _ in range(count):
+        frame = np.full((height, width, 3), 90, np.uint8)
+        x, y = rng.integers(0, width - 8), rng.integers(0, height - 8)
+        frame[y : y + 8, x : x + 8] = rng.integers(0, 256, 3)
+        frames.append(frame)
+    return frames
+
+
+@pytest.fixture(scope="session")
+def tiny_videos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with seven small videos of three objects, one of them in a subfolder with a space in its name."""
+    folder = tmp_path_factory.mktemp("tiny videos")
+    for seed, (name, count) in enumerate(
+        [("baseball_0", 12), ("baseball_1", 1), ("baseball_10", 3), ("potato_0", 20), ("potato_2", 9), ("rug_0", 31)]
+    ):
+        write_video(folder / f"{name}.avi", moving_square(count, seed))
+    write_video(folder / "sub folder é" / "rug_1.AVI", moving_square(7, 99))
+    return folder
+
+
+def fake_videos(objects: Iterable[str], per_object: int = 3) -> list[Video]:
+    """Records of videos that do not exist, each with its own content."""
+    return [
+        Video(
+            video_id=f"{o}_{i}",
+            object_id=o,
+            path=f"{o}_{i}.avi",
+            sha256=f"sha of {o}_{i}",
+            frames=10,
+            fps=25,
+            width=32,
+            height=24,
+        )
+        for o in objects
+        for i in range(per_object)
+    ]
