@@ -35,6 +35,7 @@ lint: install
 
 dashboard: install
 	@mkdir -p mlruns
+	MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false \
 	mlflow ui --backend-store-uri "sqlite:///$(CURDIR)/mlruns/mlflow.db" --host 127.0.0.1 --port $(PORT)
 
 bench: install

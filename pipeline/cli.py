@@ -28,6 +28,10 @@ def scale(
     check_inputs(params)
     changed = write_params(params)
     prune(params.plan, Path("data"))
+    if changed:
+        # What stages of another run cost would be shown as the cost of this one's.
+        for file in Path("runs").glob("*.json"):
+            file.unlink()
     typer.echo(f"params.yaml {'written' if changed else 'unchanged'}: {name}, {len(params.plan.variants)} variants")
     typer.echo(f"`dvc repro` runs it; its tables go to reports/{params.report_name}/")
 

@@ -189,7 +189,7 @@ class AblationConfig(Section):
     """Which variants of the system are trained and compared."""
 
     plan: PlanName = "paper"
-    """`paper`: the four variants of the paper's tables. `factorial`: encoder x LoRA x OPD."""
+    """`paper`: the four variants of the paper's tables. `factorial`: encoder x LoRA x OPD. `single`: no ablation."""
     seeds: tuple[Seed, ...] = Field(default=(0,), min_length=1)
 
     @model_validator(mode="after")
@@ -217,6 +217,8 @@ class RuntimeConfig(Section):
     device: DeviceName = "auto"
     launcher: str = "python"
     """What starts a training stage: `python`, or `accelerate launch` with its configuration for several GPUs."""
+    threads: Annotated[int, Field(ge=0, le=1024)] = 0
+    """CPU threads of torch; 0 leaves it to torch. Sums depend on it in their last bits, so fix it to compare runs."""
     save_steps: Annotated[int, Field(ge=0)] = 0
     """Optimiser steps between checkpoints that a killed training resumes from; 0 writes none."""
     gradient_checkpointing: bool = False

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict
 
 from pipeline.records import Opd
 
-PlanName = Literal["paper", "factorial"]
+PlanName = Literal["paper", "factorial", "single"]
 
 
 class Encoder(StrEnum):
@@ -82,11 +82,15 @@ def variant_axes(plan: PlanName) -> list[tuple[Encoder, Lora, Opd]]:
     """The variants of a plan, without seeds.
 
     `paper`: the full system and, one at a time, without OPD, without the fine-tuned encoder, without LoRA.
+    `single`: the full system alone. `factorial`: every combination.
     """
     if plan == "factorial":
         return list(itertools.product(Encoder, Lora, Opd))
+    full = (Encoder.FINETUNED, Lora.WITH, Opd.ALL)
+    if plan == "single":
+        return [full]
     return [
-        (Encoder.FINETUNED, Lora.WITH, Opd.ALL),
+        full,
         (Encoder.FINETUNED, Lora.WITH, Opd.NONE),
         (Encoder.BASE, Lora.WITH, Opd.ALL),
         (Encoder.FINETUNED, Lora.WITHOUT, Opd.ALL),

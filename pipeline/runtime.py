@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import random
+import sys
 from typing import TYPE_CHECKING, Literal
 
 from pipeline.errors import UserError
@@ -55,6 +56,14 @@ def resolve_dtype(name: DtypeName) -> torch.dtype:
         "float16": torch.float16,
     }
     return dtypes[name]
+
+
+def limit_threads(count: int) -> None:
+    """Let torch use this many CPU threads, where it is in use at all; 0 leaves it as it is."""
+    if count and "torch" in sys.modules:
+        import torch
+
+        torch.set_num_threads(count)
 
 
 def cores() -> int:

@@ -19,6 +19,7 @@ from pipeline.artifacts import write_json
 from pipeline.config import Params, load_params
 from pipeline.errors import UserError
 from pipeline.records import Measurement
+from pipeline.runtime import limit_threads
 
 DATA = Path("data")
 RUNS = Path("runs")
@@ -52,6 +53,7 @@ def stage(name: str, key: str | None = None) -> Iterator[Stage]:
     try:
         with _alone(full):
             running = Stage(full, load_params())
+            limit_threads(running.params.runtime.threads)
             yield running
             if _main_process():
                 write_json(DATA / "metrics" / f"{full}.json", running.metrics)

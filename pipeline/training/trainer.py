@@ -76,7 +76,7 @@ class Watch(TrainerCallback):
         **_: Any,
     ) -> None:
         """Called by the Trainer after each logging step."""
-        values = {k: float(v) for k, v in (logs or {}).items() if isinstance(v, (int, float))}
+        values = _measured(logs or {})
         bad = [name for name in ("loss", "grad_norm") if not math.isfinite(values.get(name, 0.0))]
         if bad:
             raise UserError(
@@ -123,14 +123,23 @@ def train(trainer: Trainer) -> list[Measurement]:
     last = get_last_checkpoint(str(folder)) if folder.is_dir() else None
     trainer.train(resume_from_checkpoint=last)
     history = [
-        Measurement(step=entry["step"], name=name.removeprefix("eval_"), value=float(value))
+        Measurement(step=entry["step"], name=name, value=value)
         for entry in trainer.state.log_history
-        for name, value in entry.items()
-        if isinstance(value, (int, float)) and name not in NOT_MEASURED and not name.endswith(("_runtime", "_second"))
+        for name, value in _measured(entry).items()
     ]
     if trainer.is_world_process_zero():
         shutil.rmtree(folder, ignore_errors=True)
     return history
 
 
-NOT_MEASURED = {"step", "epoch", "total_flos", "train_loss"}
+def _measured(entry: Mapping[str, object]) -> dict[str, float]:
+    """What of a log entry is a figure of the training: not its bookkeeping, nor wall-clock times."""
+    names = {name: "validation_loss" if name == "eval_loss" else name.removeprefix("eval_") for name in entry}
+    return {
+        names[name]: float(value)
+        for name, value in entry.items()
+        if isinstance(value, (int, float)) and name not in BOOKKEEPING and not name.endswith(("_runtime", "_second"))
+    }
+
+
+BOOKKEEPING = {"step", "epoch", "total_flos", "train_loss"}

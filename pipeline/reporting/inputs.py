@@ -1,0 +1,106 @@
+"""Everything that a report is made from, read once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.artifacts import read_jsonl, read_table
+from pipeline.config import Params
+from pipeline.physiclear.catalogue import Catalogue, load_catalogue
+from pipeline.plan import Encoder, Lora
+from pipeline.records import Assignment, Classification, Opd, Part, Question, Score, Task, Video
+from pipeline.splits import assign
+
+Axes = tuple[Encoder, Lora, Opd]
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What the stages before the report have left on disk; a file that is not there is an absent key."""
+
+    params: Params
+    catalogue: Catalogue
+    videos: Sequence[Video]
+    assignments: Sequence[Assignment]
+    missing: tuple[str, ...]
+    """Objects that the split would test on but that have no video."""
+    questions: Mapping[str, Task]
+    """Evaluation questions about test videos: id to task."""
+    scores: Mapping[str, Sequence[Score]]
+    """By variant; only of `questions`."""
+    classifications: Mapping[int, Sequence[Classification]]
+    """By encoder seed: what the heads say about test videos."""
+
+    @property
+    def axes(self) -> list[Axes]:
+        """The plan's variants without their seeds."""
+        return list(dict.fromkeys((v.encoder, v.lora, v.opd) for v in self.params.plan.variants.values()))
+
+    def variants(self, axes: Axes) -> dict[int, str]:
+        """Seed to key of the variants with these axes; empty where the plan has none."""
+        return {v.seed: key for key, v in self.params.plan.variants.items() if (v.encoder, v.lora, v.opd) == axes}
+
+    @property
+    def test_objects(self) -> list[str]:
+        """Objects with test videos, sorted."""
+        return sorted({a.object_id for a in self.assignments if a.part == Part.TEST})
+
+
+def read_inputs(params: Params, root: Path) -> Inputs:
+    """Read what there is below `root`.
+
+    Raises:
+        UserError: where the videos, the split or the questions are missing, or a file is broken.
+    """
+    data = root / "data"
+    catalogue = load_catalogue(root / params.data.catalogue)
+    videos = read_table(data / "videos.parquet", Video)
+    asked = {
+        q.question_id: q.task
+        for q in read_jsonl(data / "questions" / "evaluation.jsonl", Question)
+        if q.part == Part.TEST
+    }
+    files = {key: data / "scores" / key / "scores.parquet" for key in params.plan.variants}
+    judged = {seed: data / "encoder" / str(seed) / "classifications.parquet" for seed in params.plan.encoder_seeds}
+    return Inputs(
+        params=params,
+        catalogue=catalogue,
+        videos=videos,
+        assignments=read_table(data / "splits.parquet", Assignment),
+        missing=assign(catalogue, videos, params.split).missing[Part.TEST],
+        questions=asked,
+        scores={
+            key: [s for s in read_table(file, Score) if s.question_id in asked]
+            for key, file in files.items()
+            if file.is_file()
+        },
+        classifications={
+            seed: [c for c in read_table(file, Classification) if c.part == Part.TEST]
+            for seed, file in judged.items()
+            if file.is_file()
+        },
+    )
+
+
+def why_empty(inputs: Inputs, axes: Axes, task: Task) -> str:
+    """Why a variant has no score in a task."""
+    keys = inputs.variants(axes)
+    if task is Task.OPD and axes[2] is Opd.NONE:
+        return "OPD questions are not put to a system that never describes"
+    if not keys:
+        return f"variant not in the plan `{inputs.params.ablation.plan}`"
+    absent = [key for key in keys.values() if key not in inputs.scores]
+    if absent:
+        return f"not graded yet: {', '.join(absent)}"
+    if not inputs.test_objects:
+        return no_test_videos(inputs)
+    if inputs.params.questions.evaluation.by_task()[task] == 0:
+        return f"questions.evaluation.{task.lower()} is 0"
+    return f"the test objects with videos ({', '.join(inputs.test_objects)}) allow no {task} question"
+
+
+def no_test_videos(inputs: Inputs) -> str:
+    """The sentence for everything that wants test videos where there are none."""
+    return f"no video of any test object: {', '.join(inputs.missing) or 'the split names none'}"

@@ -1,0 +1,293 @@
+"""The report: measured cells come from scores alone, empty ones say why, equal input gives equal bytes."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from pipeline.artifacts import read_table
+from pipeline.config import Params
+from pipeline.errors import UserError
+from pipeline.physiclear.catalogue import load_catalogue
+from pipeline.plan import Encoder, Lora
+from pipeline.records import Assignment, Opd, Part, Score, Task
+from pipeline.reporting import write_report
+from pipeline.reporting.figures import project
+from pipeline.reporting.inputs import read_inputs, why_empty
+from pipeline.reporting.provenance import provenance
+from pipeline.reporting.published import find, published
+from tests.closure import ROOT
+from tests.fake_chain import fake_params, write_chain
+
+TABLES = {
+    "all_variants",
+    "annotator_agreement",
+    "confusion_matrices",
+    "encoder_property",
+    "encoder_understanding",
+    "lora_property",
+    "lora_understanding",
+    "property_combinations",
+    "property_counts",
+    "property_description",
+    "scenario_reasoning",
+    "understanding",
+    "video_lengths",
+}
+TRAINING_OBJECTS = ("baseball", "cotton_ball", "pillow", "potato", "rug")
+
+
+def report(root: Path, params: Params) -> Path:
+    write_report(params, root)
+    return root / "reports" / params.report_name
+
+
+def rows(folder: Path, table: str) -> list[dict[str, str]]:
+    with (folder / "tables" / f"{table}.csv").open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+@pytest.fixture(scope="module")
+def params() -> Params:
+    return fake_params()
+
+
+@pytest.fixture(scope="module")
+def chain(tmp_path_factory: pytest.TempPathFactory, params: Params) -> Path:
+    """A finished chain with its report; tests that change it copy it."""
+    root = tmp_path_factory.mktemp("chain")
+    write_chain(root, params)
+    report(root, params)
+    return root
+
+
+@pytest.fixture
+def copy(chain: Path, tmp_path: Path) -> Path:
+    shutil.copytree(chain, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+def test_every_table_and_figure_is_there(chain: Path, params: Params) -> None:
+    folder = chain / "reports" / params.report_name
+    written = set(files(folder))
+    assert written == {
+        *(f"tables/{name}.{ending}" for name in TABLES for ending in ("csv", "md")),
+        *(f"figures/{name}.png" for name in ("confusion_matrices", "embedding_map", "training_curves")),
+        *("README.md", "metrics.json", "params.yaml", "provenance.json"),
+    }
+    page = (folder / "README.md").read_text()
+    linked = re.findall(r"\]\(([^)#]+)\)", page)
+    assert linked
+    assert set(linked) <= written
+    assert "prove nothing but that the chain runs" in page
+    assert "Test objects without videos: clothes_peg, hairbrush_handle, microfiber_cloth." in page
+    headings = {
+        h.lower().replace(" ", "-").replace(":", "").replace("'", "") for h in re.findall(r"^## (.+)$", page, re.M)
+    }
+    assert set(re.findall(r"\]\(#([^)]+)\)", page)) <= headings
+
+
+def test_markdown_tables_are_rectangular(chain: Path, params: Params) -> None:
+    for file in (chain / "reports" / params.report_name / "tables").glob("*.md"):
+        lines = [line for line in file.read_text().splitlines() if line.startswith("|")]
+        assert len({line.count(" | ") for line in lines}) == 1, file.name
+
+
+def test_measured_cells_are_what_the_scores_say(chain: Path, params: Params) -> None:
+    folder = chain / "reports" / params.report_name
+    scores = read_table(chain / "data" / "scores" / "finetuned-with-all-0" / "scores.parquet", Score)
+    metrics = json.loads((folder / "metrics.json").read_text())
+    for task in (Task.PC, Task.PSS, Task.POM):
+        graded = [s for s in scores if s.task == task]
+        row = next(r for r in rows(folder, "understanding") if (r["row"], r["system"]) == (task, "Octopi"))
+        right = sum(s.correct for s in graded)
+        assert (float(row["k"]), int(row["n"])) == (right, len(graded))
+        assert float(row["value"]) == pytest.approx(100 * right / len(graded), abs=1e-3)
+        assert metrics[f"finetuned-with-all.{task}"] == pytest.approx(right / len(graded), abs=1e-6)
+        assert float(row["unparsed"]) == pytest.approx(100 - float(row["value"]), abs=1e-3)
+        assert float(row["low"]) <= float(row["value"]) <= float(row["high"])
+        assert row["note"] == ""
+
+
+def test_majority_is_learnt_from_training_objects(chain: Path, params: Params) -> None:
+    catalogue = load_catalogue(Path(params.data.catalogue))
+    assignments = read_table(chain / "data" / "splits.parquet", Assignment)
+    trained = sorted({a.object_id for a in assignments if a.part == Part.TRAIN})
+    levels = [catalogue.labels(o)[0] for o in trained]
+    mode = max(range(3), key=lambda level: (levels.count(level), -level))
+    tested = [catalogue.labels(a.object_id)[0] for a in assignments if a.part == Part.TEST]
+    table = rows(chain / "reports" / params.report_name, "property_description")
+    row = next(r for r in table if (r["row"], r["system"]) == ("hardness", "Majority class"))
+    assert (float(row["k"]), int(row["n"])) == (tested.count(mode), len(tested))
+
+
+def test_no_scores_leave_cells_empty_with_a_note(copy: Path, params: Params) -> None:
+    shutil.rmtree(copy / "data" / "scores" / "finetuned-with-none-0")
+    shutil.rmtree(copy / "data" / "encoder")
+    folder = report(copy, params)
+    for row in rows(folder, "understanding"):
+        empty = row["system"] == "Octopi (no OPD)"
+        assert (row["note"] == "not graded yet: finetuned-with-none-0") == empty
+        assert all((row[c] == "") == empty for c in ("value", "k", "n", "low", "high", "unparsed", "seeds"))
+        assert row["published_7b"] != ""
+    heads = [r for r in rows(folder, "property_description") if r["system"] == "FT CLIP"]
+    assert all(r["value"] == "" and r["note"].startswith("no classifications") for r in heads)
+    assert not (folder / "figures" / "confusion_matrices.png").exists()
+    assert not any(
+        key.startswith(("finetuned-with-none", "ft-clip")) for key in json.loads((folder / "metrics.json").read_text())
+    )
+
+
+def test_without_test_videos_every_accuracy_is_empty(copy: Path, params: Params, tmp_path: Path) -> None:
+    root = tmp_path / "training only"
+    write_chain(root, params, objects=TRAINING_OBJECTS)
+    shutil.copytree(copy / "reports", root / "reports")
+    folder = report(root, params)
+    for name in TABLES:
+        for row in rows(folder, name):
+            if "chance" in row:
+                assert (row["value"], row["n"]) == ("", "")
+                assert row["note"].startswith(("no video of any test object: bath_towel, clothes_peg", "OPD questions"))
+    assert [f.name for f in (folder / "figures").iterdir()] == ["training_curves.png"]
+    assert "Not drawn: no video of any test object" in (folder / "README.md").read_text()
+    assert json.loads((folder / "metrics.json").read_text()) == {}
+
+
+def test_reasons_for_empty_cells(chain: Path, params: Params) -> None:
+    inputs = read_inputs(params, chain)
+    assert why_empty(inputs, (Encoder.BASE, Lora.WITHOUT, Opd.ALL), Task.PC) == "variant not in the plan `paper`"
+    silent = (Encoder.FINETUNED, Lora.WITH, Opd.NONE)
+    assert why_empty(inputs, silent, Task.OPD) == "OPD questions are not put to a system that never describes"
+    assert "allow no PC question" in why_empty(inputs, silent, Task.PC)
+    (chain / "nothing").mkdir(exist_ok=True)
+    with pytest.raises(UserError, match=r"videos\.parquet: no such file"):
+        read_inputs(params, chain / "nothing")
+
+
+def test_several_seeds_are_pooled_by_question(tmp_path: Path, params: Params) -> None:
+    several = fake_params("ablation.seeds=[0,3]", "ablation.plan=factorial")
+    write_chain(tmp_path, several)
+    folder = report(tmp_path, several)
+    graded = {
+        seed: [
+            s.correct
+            for s in read_table(tmp_path / "data" / "scores" / f"finetuned-with-all-{seed}" / "scores.parquet", Score)
+            if s.task == Task.PC
+        ]
+        for seed in (0, 3)
+    }
+    row = next(r for r in rows(folder, "understanding") if (r["row"], r["system"]) == ("PC", "Octopi"))
+    shares = [100 * sum(values) / len(values) for values in graded.values()]
+    assert int(row["n"]) == len(graded[0])
+    assert float(row["value"]) == pytest.approx(sum(shares) / 2, abs=1e-3)
+    assert (row["seeds"], row["seed_values"]) == ("2", f"0: {shares[0]:.2f}, 3: {shares[1]:.2f}")
+    assert float(row["seed_sd"]) == pytest.approx(float(np.std(shares, ddof=1)), abs=1e-3)
+    assert len(rows(folder, "all_variants")) == 12 * 8
+
+
+def test_equal_input_gives_equal_bytes(copy: Path, chain: Path, params: Params) -> None:
+    shutil.rmtree(copy / "reports")
+    code = (
+        "import sys; from pathlib import Path; from pipeline.config import load_params;"
+        "from pipeline.reporting import write_report;"
+        "root = Path(sys.argv[1]); write_report(load_params(root / 'params.yaml'), root)"
+    )
+    environment = {**os.environ, "PYTHONHASHSEED": "7", "OMP_NUM_THREADS": "1"}
+    subprocess.run([sys.executable, "-c", code, str(copy)], check=True, cwd=ROOT, env=environment)
+    first, second = (files(root / "reports" / params.report_name) for root in (chain, copy))
+    assert first == second
+
+
+def test_importing_is_quick() -> None:
+    heavy = {"torch", "pandas", "matplotlib", "sklearn", "scipy", "mlflow", "pyarrow", "numpy"}
+    code = f"import sys, pipeline.reporting; print(sorted({heavy!r} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT, capture_output=True, text=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(("count", "method"), [(2, "PCA"), (4, "PCA"), (5, "t-SNE"), (40, "t-SNE")])
+def test_few_videos_are_projected_otherwise(count: int, method: str) -> None:
+    features = np.random.default_rng(0).normal(size=(count, 8))
+    places, used = project(features)
+    assert used == method
+    assert places.shape == (count, 2)
+    assert np.isfinite(places).all()
+
+
+@pytest.mark.parametrize(
+    ("cell", "value", "n"),
+    [
+        (("understanding", "PC", "octopi", "7b"), 48.10, 158),
+        (("understanding", "PSS", "no_opd", "13b"), 39.88, 163),
+        (("understanding", "POM", "random"), 16.67, None),
+        (("scenario_reasoning", "PSR", "no_opd", "13b"), 39.13, 46),
+        (("property_description", "combined", "ft_clip"), 57.89, 38),
+        (("encoder_property", "hardness", "base_clip", "7b"), 81.58, 38),
+        (("encoder_understanding", "PSR", "base_clip", "13b"), 45.65, 46),
+        (("lora_property", "hardness", "without_lora", "13b"), 36.84, 38),
+        (("lora_understanding", "POM", "without_lora", "7b"), 12.30, 187),
+        (("property_counts", "moderately hard", "percent"), 18.92, 74),
+        (("property_combinations", "hard, smooth, no bumps", "count"), 17, 74),
+        (("video_lengths", "maximum", "frames"), 126, 408),
+        (("annotator_agreement", "bumpiness", "icc3k"), 0.792, 74),
+    ],
+)
+def test_published_cells(cell: tuple[str, ...], value: float, n: int | None) -> None:
+    found = find(*cell)
+    assert found is not None
+    assert (found.value, found.n) == (value, n)
+
+
+def test_published_accuracies_are_whole_numbers_of_answers() -> None:
+    accuracies = [p for p in published() if p.n and p.system not in ("count", "percent", "frames", "icc3k")]
+    assert len(accuracies) == 92
+    for cell in accuracies:
+        assert cell.n is not None
+        right = round(cell.value * cell.n / 100)
+        assert 100 * right / cell.n == pytest.approx(cell.value, abs=0.0051), cell
+        interval = cell.wilson
+        assert interval is not None
+        assert interval.low < cell.value < interval.high
+
+
+def test_provenance_names_the_code_not_the_report(tmp_path: Path, params: Params) -> None:
+    (tmp_path / "params.yaml").write_text("a: 1\n")
+    assert provenance(params, [], tmp_path).revision == "unknown"
+
+    def git(*arguments: str) -> None:
+        who = ["-c", "user.name=n", "-c", "user.email=e@e", "-c", "commit.gpgsign=false"]
+        subprocess.run(["git", *who, *arguments], cwd=tmp_path, check=True, capture_output=True)
+
+    for folder in ("pipeline", "reports"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "file").write_text("1")
+    git("init")
+    git("add", "pipeline")
+    git("commit", "-m", "code")
+    committed = provenance(params, [], tmp_path)
+    assert re.fullmatch("[0-9a-f]{40}", committed.revision)
+    git("add", "reports")
+    git("commit", "-m", "report")
+    assert provenance(params, [], tmp_path) == committed
+    assert committed.dirty is False
+    (tmp_path / "pipeline" / "file").write_text("2")
+    assert provenance(params, [], tmp_path).dirty is True
+
+
+def test_the_params_beside_the_report_are_the_runs(chain: Path, params: Params) -> None:
+    copied = (chain / "reports" / params.report_name / "params.yaml").read_text()
+    assert Params.model_validate(yaml.safe_load(copied)) == params

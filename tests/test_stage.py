@@ -1,0 +1,148 @@
+"""Around a stage: one line for bad input, one process at a time, whole files or none."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from pathlib import Path
+
+import pytest
+from filelock import FileLock
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.artifacts import (
+    atomic,
+    load_tensors,
+    read_json,
+    read_jsonl,
+    read_table,
+    write_json,
+    write_jsonl,
+    write_table,
+)
+from pipeline.errors import UserError
+from pipeline.records import Assignment, Measurement, Part, Score, Task, Video
+from pipeline.scales import compose, write_params
+from pipeline.stage import stage
+from tests.closure import ROOT
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    write_params(compose("smoke", conf=ROOT / "conf"), tmp_path / "params.yaml")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_metrics_and_cost_are_written_apart(here: Path) -> None:
+    with stage("align", "x") as run:
+        run.finish_training([Measurement(step=1, name="loss", value=2.0), Measurement(step=5, name="loss", value=1.5)])
+    assert json.loads((here / "data/metrics/align@x.json").read_text()) == {"loss": 1.5, "steps": 5}
+    cost = json.loads((here / "runs/align@x.json").read_text())
+    assert cost["seconds"] >= 0
+    assert cost["startup_seconds"] >= 0
+    assert cost["peak_memory_mb"] > 0
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (UserError("x.mov: does not decode; export it again"), "split: x.mov: does not decode"),
+        (MemoryError(), "lower the batch sizes"),
+        (OSError(errno.ENOSPC, "No space left on device", "data/frames"), "no space left on the disk (data/frames)"),
+    ],
+)
+def test_bad_end_is_one_line_and_leaves_no_metrics(here: Path, error: Exception, words: str) -> None:
+    with pytest.raises(SystemExit) as caught, stage("split"):
+        raise error
+    assert words in str(caught.value.code)
+    assert "\n" not in str(caught.value.code)
+    assert not (here / "data" / "metrics").exists()
+
+
+def test_a_bug_keeps_its_traceback(here: Path) -> None:
+    with pytest.raises(ZeroDivisionError), stage("split"):
+        _ = 1 / 0
+
+
+def test_stage_runs_once_at_a_time(here: Path) -> None:
+    (here / "runs/locks").mkdir(parents=True)
+    with FileLock(here / "runs/locks/split.lock"):
+        with pytest.raises(SystemExit, match="still running"), stage("split"):
+            pass
+        with stage("grade", "another"):
+            pass
+    with stage("split"):
+        pass
+
+
+def test_missing_params_name_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match="octopi scale smoke"), stage("split"):
+        pass
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    target = tmp_path / "a.json"
+    write_json(target, {"old": 1})
+    with pytest.raises(RuntimeError), atomic(target) as temporary:  # noqa: PT012
+        temporary.write_text("half")
+        raise RuntimeError
+    assert read_json(target) == {"old": 1}
+    assert os.listdir(tmp_path) == ["a.json"]
+    with pytest.raises(ValueError, match="JSON"):
+        write_json(target, {"x": float("nan")})
+    assert read_json(target) == {"old": 1}
+
+
+SCORE = Score(
+    question_id="q", task=Task.PC, measure="choice", correct=True, parsed=True, truncated=False, expected="yes",
+    predicted="yes", objects=("a", "b"),
+)  # fmt: skip
+
+
+def test_tables_come_back_as_they_went(tmp_path: Path) -> None:
+    for model, records in (
+        (Score, [SCORE, SCORE.model_copy(update={"objects": ()})]),
+        (Assignment, [Assignment(video_id="ä b", object_id="x", part=Part.TEST)]),
+        (Assignment, []),
+    ):
+        write_table(tmp_path / "t.parquet", model, records)
+        assert read_table(tmp_path / "t.parquet", model) == records
+        write_jsonl(tmp_path / "t.jsonl", records)
+        assert read_jsonl(tmp_path / "t.jsonl", model) == records
+
+
+@given(st.lists(st.floats(allow_nan=False, width=64), max_size=5))
+def test_floats_survive_exactly(tmp_path_factory: pytest.TempPathFactory, values: list[float]) -> None:
+    path = tmp_path_factory.mktemp("t") / "t.parquet"
+    records = [Measurement(step=i, name="x", value=v) for i, v in enumerate(values)]
+    write_table(path, Measurement, records)
+    assert read_table(path, Measurement) == records
+
+
+def test_same_records_same_bytes(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        write_table(tmp_path / name, Score, [SCORE] * 3)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_bad_files_are_named_with_the_mend(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="dvc repro"):
+        read_table(tmp_path / "none.parquet", Video)
+    write_table(tmp_path / "t.parquet", Score, [SCORE])
+    with pytest.raises(UserError, match="columns"):
+        read_table(tmp_path / "t.parquet", Video)
+    (tmp_path / "half.parquet").write_bytes((tmp_path / "t.parquet").read_bytes()[:40])
+    with pytest.raises(UserError, match="half.parquet"):
+        read_table(tmp_path / "half.parquet", Score)
+    (tmp_path / "q.jsonl").write_text(SCORE.model_dump_json() + "\n{}\n")
+    with pytest.raises(UserError, match="line 2"):
+        read_jsonl(tmp_path / "q.jsonl", Score)
+    (tmp_path / "x.safetensors").write_bytes(b"\x80\x04 a pickle, say")
+    with pytest.raises(UserError, match="not a safetensors file"):
+        load_tensors(tmp_path / "x.safetensors")
+    with pytest.raises(UserError, match="no such file"):
+        load_tensors(tmp_path / "y.safetensors")

@@ -1,0 +1,219 @@
+"""The stand-ins load offline, keep within their limits, and were taught what they may be taught."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import random
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.prompts import add_tactile_tokens, encode, render
+from pipeline.records import Opd, Part, Turn
+from pipeline.tasks import TASKS
+from pipeline.tasks.base import Pool
+from standins.curriculum import FORMATS
+from standins.images import TOPICS, caption, draw, draw_scene
+from standins.outputs import wilson
+from standins.settings import FOLDER, load_settings
+from standins.text import draw_draft
+from standins.vocabulary import EOS
+from standins.world import combinations, forbidden_descriptions, make_world, questions, real_catalogue
+
+MEGABYTE = 2**20
+TEXT = st.characters(exclude_categories=["Cs"])
+FIRST_BYTE, LAST_BYTE = 3, 258
+"""Ids of the single bytes, between the special tokens and the words."""
+
+
+@pytest.fixture(autouse=True)
+def offline(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+
+
+@cache
+def llama_tokenizer() -> Any:
+    from transformers import AutoTokenizer
+
+    tokenizer = AutoTokenizer.from_pretrained(FOLDER / "llama")
+    add_tactile_tokens(tokenizer)
+    return tokenizer
+
+
+def corpus(seed: int, count: int = 40) -> list[str]:
+    rng = random.Random(seed)
+    world = make_world(combinations(load_settings().llama.held_out, held=False), questions("training"), rng)
+    return [f.write(world, rng).text for f in FORMATS for _ in range(count)]
+
+
+def pipeline_texts() -> list[str]:
+    """Conversations about the real catalogue: every task, every mode."""
+    real, rng = real_catalogue(), random.Random(3)
+    pool = Pool(part=Part.TRAIN, catalogue=real, videos={o: [f"{o}_0"] for o in real.objects})
+    drafts = [t.draft(pool, i, rng) for t in TASKS.values() for i in range(t.strata(real)) for _ in range(3)]
+    dialogues = [d for draft in drafts if draft is not None for d in draft.dialogues]
+    return [render(d.turns, system_prompt="", frames=2, eos=EOS, complete=True).text for d in dialogues]
+
+
+def test_folder_is_small() -> None:
+    sizes = {p: p.stat().st_size for p in FOLDER.rglob("*") if p.is_file() and "__pycache__" not in p.parts}
+    assert sum(sizes.values()) <= 10 * MEGABYTE
+    assert sizes[FOLDER / "llama" / "model.safetensors"] <= 4.5 * MEGABYTE
+    assert sizes[FOLDER / "clip" / "open_clip_model.safetensors"] <= 5 * MEGABYTE
+
+
+def test_clip_loads_as_float32_and_reads_and_sees() -> None:
+    import open_clip
+    import torch
+
+    name = f"local-dir:{FOLDER / 'clip'}"
+    model, _, preprocess = open_clip.create_model_and_transforms(name, precision="fp32")
+    assert {p.dtype for p in model.parameters()} == {torch.float32}
+    size = load_settings().clip.image_size
+    ids = open_clip.get_tokenizer(name)(["a red striped circle", "unheard-of words"])
+    with torch.no_grad():
+        image, text = model.encode_image(torch.zeros(2, 3, size, size)), model.encode_text(ids)
+    assert image.shape == text.shape == (2, load_settings().clip.embed_dim)
+    assert torch.isfinite(image).all()
+    assert torch.isfinite(text).all()
+    from PIL import Image
+
+    assert preprocess(Image.new("RGB", (320, 240))).shape == (3, size, size)
+
+
+def test_llama_loads_in_both_precisions_and_generates() -> None:
+    import torch
+    from transformers import AutoModelForCausalLM
+
+    model = AutoModelForCausalLM.from_pretrained(FOLDER / "llama")
+    assert model.dtype == torch.bfloat16
+    model = AutoModelForCausalLM.from_pretrained(FOLDER / "llama", dtype=torch.float32).eval()
+    tokenizer = llama_tokenizer()
+    assert len({tokenizer.bos_token_id, tokenizer.eos_token_id, tokenizer.pad_token_id}) == 3
+    assert model.generation_config.eos_token_id == tokenizer.eos_token_id
+    batch = tokenizer(["USER: Describe this. ASSISTANT:"], return_tensors="pt")
+    assert model.generate(**batch, max_new_tokens=4, do_sample=False).shape[1] > batch["input_ids"].shape[1]
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.text(TEXT, max_size=60))
+def test_any_text_comes_back_exactly_with_right_offsets(text: str) -> None:
+    tokenizer = llama_tokenizer()
+    batch = tokenizer(text, return_offsets_mapping=True, add_special_tokens=False)
+    assert tokenizer.decode(batch["input_ids"]) == text
+    covered = 0
+    for start, stop in batch["offset_mapping"]:
+        # The bytes of one character share its place; otherwise tokens follow each other without a gap.
+        assert start in (covered, covered - 1) and start < stop
+        covered = stop
+    assert covered == len(text)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.text(TEXT, max_size=30), st.text(TEXT, max_size=30))
+def test_prompt_tokens_begin_the_whole_conversation(question: str, answer: str) -> None:
+    tokenizer = llama_tokenizer()
+    turns = [Turn(user=question, assistant=answer)]
+    prompt = render(turns, system_prompt="", frames=2, eos=EOS, complete=False).text
+    whole = render(turns, system_prompt="", frames=2, eos=EOS, complete=True).text
+    ids = tokenizer(prompt)["input_ids"]
+    assert tokenizer(whole)["input_ids"][: len(ids)] == ids
+
+
+def test_words_of_the_catalogue_and_the_tasks_are_whole_tokens() -> None:
+    tokenizer = llama_tokenizer()
+    texts = [f" {o.name}" for o in real_catalogue().objects.values()] + pipeline_texts()
+    for text in texts:
+        tokens = [i for i in tokenizer(text, add_special_tokens=False)["input_ids"] if FIRST_BYTE <= i <= LAST_BYTE]
+        spelt = {tokenizer.decode([i]) for i in tokens if len(tokenizer.decode([i])) == 1}
+        # Articles and the letters of a list are words of one letter.
+        assert not {c for c in spelt if c.isalnum()} - set("abcxs0123456789AI"), text
+
+
+def test_property_words_are_single_tokens() -> None:
+    tokenizer = llama_tokenizer()
+    for p in real_catalogue().properties:
+        for word in (*p.levels, p.more, p.less, p.most, p.least):
+            assert len(tokenizer(f" {word}", add_special_tokens=False)["input_ids"]) == 1, word
+
+
+def test_tactile_tokens_can_be_added_and_answers_are_labelled() -> None:
+    from transformers import AutoTokenizer
+
+    tokenizer = AutoTokenizer.from_pretrained(FOLDER / "llama")
+    size = len(tokenizer)
+    add_tactile_tokens(tokenizer)
+    assert len(tokenizer) == size + 3
+    turns = [Turn(user="How does {tactile} feel?", assistant="It is hard."), Turn(user="Really?", assistant="Yes.")]
+    encoded = encode(render(turns, system_prompt="", frames=2, eos=EOS, complete=True), tokenizer)
+    assert tokenizer.decode([i for i in encoded.labels if i >= 0]) == f" It is hard.{EOS} Yes.{EOS}"
+
+
+def test_generators_are_deterministic() -> None:
+    assert corpus(5) == corpus(5) != corpus(6)
+    first, second = (draw_scene(random.Random(1), held_out=False) for _ in range(2))
+    assert first == second
+    assert (draw(first, 32) == draw(second, 32)).all()
+    assert caption(first) == caption(second)
+
+
+def test_pictures_are_in_range_and_held_out_pairs_stay_out() -> None:
+    rng = random.Random(2)
+    for held_out, _ in itertools.product((False, True), range(20)):
+        scene = draw_scene(rng, held_out=held_out)
+        picture = draw(scene, 64)
+        assert scene.held_out == held_out
+        assert picture.shape == (64, 64, 3)
+        assert 0 <= picture.min() <= picture.max() <= 1
+        assert caption(scene, TOPICS) != caption(scene, ())
+
+
+def test_training_text_holds_nothing_of_the_evaluation() -> None:
+    text = "\n".join(corpus(7, 150))
+    assert not [s.question for s in real_catalogue().language.scenarios if s.question in text]
+    assert not [d for d in forbidden_descriptions() if d in text]
+    held_out = load_settings().llama.held_out
+    assert not set(combinations(held_out, held=False)) & set(held_out)
+    asked = {s.question for s in questions("training")}
+    assert not asked & {s.question for kind in ("seen", "unseen") for s in questions(kind)}  # type: ignore[arg-type]
+    assert not [q for kind in ("seen", "unseen") for q in questions(kind) if q.question in text]  # type: ignore[arg-type]
+
+
+def test_a_draft_of_every_task_can_be_drawn_from_the_held_out_combinations() -> None:
+    rng = random.Random(4)
+    world = make_world(combinations(load_settings().llama.held_out, held=True), questions("seen"), rng)
+    for task in TASKS:
+        assert any(d.opd == Opd.ALL for d in draw_draft(world, task, rng).dialogues)
+
+
+def test_gate_and_zero_shot_tables_are_whole() -> None:
+    gate = list(csv.DictReader((FOLDER / "gate.csv").open(encoding="utf-8")))
+    assert list(gate[0]) == ["task", "accuracy", "low", "high", "n"]
+    assert {"PC", "PSS", "POM"} <= {row["task"] for row in gate}
+    zero_shot = list(csv.DictReader((FOLDER / "clip_zero_shot.csv").open(encoding="utf-8")))
+    assert list(zero_shot[0]) == ["question", "accuracy", "low", "high", "n", "chance"]
+    for row in (*gate, *zero_shot):
+        assert 0 <= float(row["low"]) <= float(row["accuracy"]) <= float(row["high"]) <= 1
+        assert int(row["n"]) >= 200
+
+
+def test_wilson_interval_against_a_published_example() -> None:
+    # Newcombe 1998, table I: 81 of 263.
+    share, low, high = wilson(81, 263)
+    assert (round(share, 4), round(low, 4), round(high, 4)) == (0.308, 0.2553, 0.3662)
+    assert wilson(0, 20)[1] == 0
+    assert wilson(20, 20)[2] == 1
+
+
+def test_settings_name_the_wrong_key(tmp_path: Path) -> None:
+    from pipeline.errors import UserError
+
+    broken = tmp_path / "params.yaml"
+    broken.write_text((FOLDER / "params.yaml").read_text().replace("warmup_steps", "warmup"))
+    with pytest.raises(UserError, match="warmup"):
+        load_settings(broken)

@@ -1,0 +1,158 @@
+"""Statistics against closed forms, brute force and published worked examples."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import random
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.evaluation.statistics import (
+    Interval,
+    Outcome,
+    Spread,
+    clustered,
+    compositions,
+    confusion,
+    icc3k,
+    proportion,
+    wilson,
+)
+from pipeline.physiclear.catalogue import load_catalogue
+from tests.closure import ROOT
+
+SHROUT_FLEISS = [[9, 2, 5, 8], [6, 1, 3, 2], [8, 4, 6, 8], [7, 1, 2, 6], [10, 5, 6, 9], [6, 2, 4, 7]]
+"""Shrout and Fleiss 1979, table 2: six targets, four judges."""
+
+
+@given(n=st.integers(1, 500), data=st.data())
+@settings(deadline=None, max_examples=60)
+def test_wilson_is_the_closed_form(n: int, data: st.DataObject) -> None:
+    k = data.draw(st.integers(0, n))
+    z, p = 1.959963984540054, k / n
+    centre = (p + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    interval = wilson(k, n)
+    assert interval.low == pytest.approx(max(0.0, centre - half), abs=1e-9)
+    assert interval.high == pytest.approx(min(1.0, centre + half), abs=1e-9)
+
+
+def test_wilson_worked_example() -> None:
+    """Newcombe 1998, table I: 81 of 263, method 3."""
+    interval = wilson(81, 263)
+    assert (round(interval.low, 4), round(interval.high, 4)) == (0.2553, 0.3662)
+
+
+def test_wilson_takes_the_nearest_whole_number() -> None:
+    assert wilson(7.5, 10) == wilson(8, 10)
+    with pytest.raises(ValueError, match="n"):
+        wilson(0, 0)
+
+
+def brute_force(outcomes: Sequence[Outcome]) -> Interval:
+    """All m**m equally likely ordered resamples, one by one."""
+    objects = sorted({o for outcome in outcomes for o in outcome.objects})
+    accuracies = []
+    for drawn in itertools.product(objects, repeat=len(objects)):
+        weights = [math.prod(drawn.count(o) for o in outcome.objects) for outcome in outcomes]
+        if sum(weights):
+            right = sum(w * o.correct for w, o in zip(weights, outcomes, strict=True))
+            accuracies.append(right / sum(weights))
+    accuracies.sort()
+    low, high = (math.ceil(share * len(accuracies) - 1e-6) - 1 for share in (0.025, 0.975))
+    return Interval(accuracies[low], accuracies[high])
+
+
+@pytest.mark.parametrize("about", [1, 2, 3])
+@pytest.mark.parametrize("seed", range(5))
+def test_clustered_equals_brute_force(about: int, seed: int) -> None:
+    rng = random.Random(seed)
+    objects = [f"object {i}" for i in range(5)]
+    outcomes = [Outcome(rng.choice([0, 1, 0.5]), tuple(rng.sample(objects, about))) for _ in range(17)]
+    ours, reference = clustered(outcomes), brute_force(outcomes)
+    assert ours is not None
+    assert ours.low == pytest.approx(reference.low, abs=1e-9)
+    assert ours.high == pytest.approx(reference.high, abs=1e-9)
+
+
+@pytest.mark.parametrize("clusters", range(1, 9))
+def test_every_distinct_resample_is_enumerated_once(clusters: int) -> None:
+    every = list(compositions(clusters, clusters))
+    assert len(every) == len(set(every)) == math.comb(2 * clusters - 1, clusters)
+    assert all(sum(counts) == clusters for counts in every)
+
+
+def test_seven_objects_have_1716_resamples() -> None:
+    assert sum(1 for _ in compositions(7, 7)) == 1716
+
+
+def test_many_objects_are_drawn_and_close_to_normal_theory() -> None:
+    """Forty objects of one question each: the bootstrap of a mean, standard error sqrt(p (1 - p) / n)."""
+    outcomes = [Outcome(float(i < 20), (f"object {i}",)) for i in range(40)]
+    interval = clustered(outcomes, seed=3)
+    assert interval is not None
+    assert interval == clustered(outcomes, seed=3)
+    half = 1.96 * math.sqrt(0.25 / 40)
+    assert interval.low == pytest.approx(0.5 - half, abs=0.03)
+    assert interval.high == pytest.approx(0.5 + half, abs=0.03)
+
+
+def test_one_object_has_nothing_to_resample() -> None:
+    assert clustered([Outcome(1, ("a",)), Outcome(0, ("a",))]) is None
+    assert proportion([Outcome(1, ("a",))]).clustered is None
+
+
+def test_all_right_is_one() -> None:
+    result = proportion([Outcome(1, (o,)) for o in "abcabc"])
+    assert result.value == 1
+    assert result.clustered == Interval(1, 1)
+    assert result.wilson.high == pytest.approx(1)
+    assert result.wilson.low < 0.7
+
+
+def test_order_of_questions_does_not_matter() -> None:
+    outcomes = [Outcome(float(i % 3 == 0), ("abcdefg"[i % 7], "abcdefg"[(i * 3 + 1) % 7])) for i in range(38)]
+    assert proportion(outcomes) == proportion(outcomes[::-1])
+
+
+def test_no_questions_no_accuracy() -> None:
+    with pytest.raises(ValueError, match="at least one"):
+        proportion([])
+
+
+def test_icc3k_of_shrout_and_fleiss() -> None:
+    value = icc3k(SHROUT_FLEISS)
+    assert value is not None
+    assert round(value, 2) == 0.91
+
+
+def test_icc3k_ignores_a_rater_who_is_always_stricter() -> None:
+    value = icc3k([[x, x + 2, x + 5] for x in (1, 2, 4, 8)])
+    assert value == pytest.approx(1)
+
+
+@pytest.mark.parametrize("ratings", [[], [[1, 2, 3]], [[1], [2]], [[1, 2], [1, 2], [1, 2]], [[2, 2], [2, 2]]])
+def test_icc3k_undefined(ratings: list[list[float]]) -> None:
+    assert icc3k(ratings) is None
+
+
+def test_icc3k_of_the_papers_ratings() -> None:
+    catalogue = load_catalogue(ROOT / Path("pipeline/physiclear"))
+    values = [icc3k([o.ratings[i] for o in catalogue.objects.values()]) for i in range(3)]
+    assert [round(v, 3) for v in values if v is not None] == [0.893, 0.979, 0.773]
+
+
+def test_confusion_counts_rows_as_expected() -> None:
+    assert confusion([0, 0, 1, 2], [0, 1, 1, 0], 3) == ((1, 1, 0), (0, 1, 0), (1, 0, 0))
+    with pytest.raises(ValueError, match="zip"):
+        confusion([0], [], 3)
+
+
+def test_spread_of_seeds() -> None:
+    assert Spread((1.0, 3.0)).deviation == pytest.approx(math.sqrt(2))
+    assert Spread((1.0,)).deviation is None
