@@ -34,7 +34,12 @@ class Stage:
     metrics: dict[str, float] = field(default_factory=dict)
 
     def finish_training(self, history: Sequence[Measurement]) -> None:
-        """Put the last value of each curve among the metrics."""
+        """Put the last value of each curve among the metrics.
+
+        In a distributed training only the main process goes on from here: the others have nothing to write.
+        """
+        if not _main_process():
+            sys.exit(0)
         self.metrics |= {m.name: m.value for m in history}
         self.metrics["steps"] = max((m.step for m in history), default=0)
 

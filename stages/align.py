@@ -30,11 +30,11 @@ def main() -> None:
         model, data = assemble(material, params.align.samples, "align")
         mark = fingerprint(params.align, params.language, params.frames, params.encoder, plan, params.seed, *inputs)
         with live_run(params, run.name, Path()) as live:
-            history = align(model, data, params.align, params.runtime, Job(run.name, mark, material.seed, live.log))
-        run.finish_training(history)
+            trained = align(model, data, params.align, params.runtime, Job(run.name, mark, material.seed, live.log))
+        run.finish_training(trained.history)
         out = DATA / "align" / key
-        save_octopi(model, out)
-        write_table(out / "history.parquet", Measurement, history)
+        save_octopi(model, trained.state, out)
+        write_table(out / "history.parquet", Measurement, trained.history)
 
 
 if __name__ == "__main__":

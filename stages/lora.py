@@ -36,13 +36,13 @@ def main() -> None:
         add_lora(model, params.lora)
         mark = fingerprint(params.lora, params.language, params.frames, params.encoder, plan, params.seed, *inputs)
         with live_run(params, run.name, Path()) as live:
-            history = finetune_lora(
+            trained = finetune_lora(
                 model, data, params.lora, params.runtime, Job(run.name, mark, material.seed, live.log)
             )
-        run.finish_training(history)
+        run.finish_training(trained.history)
         out = DATA / "lora" / key
-        save_octopi(model, out)
-        write_table(out / "history.parquet", Measurement, history)
+        save_octopi(model, trained.state, out)
+        write_table(out / "history.parquet", Measurement, trained.history)
 
 
 if __name__ == "__main__":

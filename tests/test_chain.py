@@ -9,7 +9,9 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 import yaml
+from safetensors.torch import load_file
 
 from tests.closure import ROOT
 
@@ -96,6 +98,23 @@ def test_same_seed_gives_identical_results(project: Project) -> None:
     before = yaml.safe_load((project.folder / "dvc.lock").read_text())
     project.run("dvc", "repro", "--force")
     assert yaml.safe_load((project.folder / "dvc.lock").read_text()) == before
+
+
+def test_two_processes_train_like_one(project: Project) -> None:
+    """The shipped FSDP configuration, on two CPU processes."""
+    text = (project.folder / "conf/accelerate/fsdp.yaml").read_text()
+    (project.folder / "fsdp.yaml").write_text(
+        text.replace("mixed_precision: bf16", "mixed_precision: 'no'\nuse_cpu: true")
+    )
+    results = []
+    project.run("octopi", "scale", *REDUCED, "align.micro_batch_size=8")
+    for launcher in (["python"], ["accelerate", "launch", "--config_file", "fsdp.yaml"]):
+        project.run(*launcher, "stages/align.py", "finetuned-all-0")
+        results.append(load_file(project.folder / "data/align/finetuned-all-0/connector.safetensors"))
+    project.run("octopi", "scale", *REDUCED)
+    assert results[0].keys() == results[1].keys()
+    for name, value in results[0].items():
+        torch.testing.assert_close(value, results[1][name], atol=1e-6, rtol=1e-5)
 
 
 def test_going_back_to_a_scale_restores_it(project: Project) -> None:

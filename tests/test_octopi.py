@@ -17,6 +17,7 @@ from pipeline.errors import UserError
 from pipeline.evaluation.generate import Asking, answer
 from pipeline.models.llm import load_llm
 from pipeline.models.octopi import Octopi, build_octopi, load_octopi, save_octopi
+from pipeline.models.tactile_encoder import trainable_state
 from pipeline.physiclear.catalogue import load_catalogue
 from pipeline.prompts import IGNORE_INDEX, TACT_FRAME
 from pipeline.questions import build_questions, pool_of
@@ -142,7 +143,7 @@ def test_fresh_adapter_changes_nothing_and_reloads_exactly(
             torch.nn.init.normal_(parameter, std=0.05)
     changed = model(**call).logits
     assert not torch.allclose(changed, before)
-    save_octopi(model, tmp_path)
+    save_octopi(model, trainable_state(model), tmp_path)
     other = build_octopi(language, DIM).eval()
     load_octopi(other, tmp_path)
     assert torch.equal(other(**call).logits, changed)
@@ -230,9 +231,8 @@ def test_killed_training_ends_like_an_uninterrupted_one(
 
         model, data = assemble(material(language, questions, store), 8, "test")
         add_lora(model, config)
-        history = finetune_lora(model, data, config, runtime, Job("lora", mark, 0, log))
-        state = {n: p.detach().clone() for n, p in model.named_parameters() if p.requires_grad}
-        return state, [m.value for m in history if m.name == "loss"]
+        trained = finetune_lora(model, data, config, runtime, Job("lora", mark, 0, log))
+        return trained.state, [m.value for m in trained.history if m.name == "loss"]
 
     reference, curve = run("reference", None)
     if kill_at is not None:

@@ -17,12 +17,12 @@ from pipeline.prompts import add_tactile_tokens, encode, render
 from pipeline.records import Opd, Part, Turn
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool
-from standins.curriculum import FORMATS
+from standins.curriculum import FORMATS, phrases, vocabulary
 from standins.images import TOPICS, caption, draw, draw_scene
 from standins.outputs import wilson
 from standins.settings import FOLDER, load_settings
 from standins.text import draw_draft
-from standins.vocabulary import EOS
+from standins.vocabulary import EOS, build_tokenizer
 from standins.world import combinations, forbidden_descriptions, make_world, questions, real_catalogue
 
 MEGABYTE = 2**20
@@ -217,3 +217,10 @@ def test_settings_name_the_wrong_key(tmp_path: Path) -> None:
     broken.write_text((FOLDER / "params.yaml").read_text().replace("warmup_steps", "warmup"))
     with pytest.raises(UserError, match="warmup"):
         load_settings(broken)
+
+
+def test_committed_tokenizer_is_the_recipes() -> None:
+    from transformers import AutoTokenizer
+
+    made = build_tokenizer(vocabulary(), phrases())
+    assert AutoTokenizer.from_pretrained(FOLDER / "llama").get_vocab() == made.get_vocab()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -9,9 +10,10 @@ import torch
 from torch import nn
 from transformers import PreTrainedModel, PreTrainedTokenizerBase
 
+from pipeline.artifacts import read_json, save_tensors, write_json
 from pipeline.config import LanguageConfig
 from pipeline.models.llm import load_llm, load_tokenizer
-from pipeline.models.tactile_encoder import load_trainable, save_trainable
+from pipeline.models.tactile_encoder import load_trainable
 from pipeline.prompts import TACTILE_TOKENS
 from pipeline.runtime import resolve_dtype
 
@@ -107,14 +109,27 @@ def has_adapter(folder: Path) -> bool:
     return (folder / ADAPTER_DIR).is_dir()
 
 
-def save_octopi(model: Octopi, folder: Path) -> None:
-    """Write the connector and, where there is one, the adapter in PEFT's own format."""
+def save_octopi(model: Octopi, state: Mapping[str, torch.Tensor], folder: Path) -> None:
+    """Write the connector and, where there is one, the adapter in PEFT's own format.
+
+    Args:
+        state: The trained parameters by name; the model's own may be sharded over processes.
+    """
     from peft import PeftModel
 
     folder.mkdir(parents=True, exist_ok=True)
-    save_trainable(model.connector, folder / CONNECTOR_FILE)
+    save_tensors(folder / CONNECTOR_FILE, _below("connector", state))
     if isinstance(model.llm, PeftModel):
-        model.llm.save_pretrained(str(folder / ADAPTER_DIR))
+        model.llm.save_pretrained(str(folder / ADAPTER_DIR), state_dict=_below("llm", state))
+        # PEFT writes a set, whose order differs from process to process, and an empty model card.
+        config = folder / ADAPTER_DIR / "adapter_config.json"
+        values = read_json(config)
+        write_json(config, {**values, "target_modules": sorted(values["target_modules"])})
+        (folder / ADAPTER_DIR / "README.md").unlink(missing_ok=True)
+
+
+def _below(prefix: str, state: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    return {name.removeprefix(f"{prefix}."): v for name, v in state.items() if name.startswith(f"{prefix}.")}
 
 
 def load_octopi(model: Octopi, folder: Path) -> None:

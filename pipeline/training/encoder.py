@@ -19,7 +19,16 @@ from pipeline.models.tactile_encoder import PropertyClassifier, property_classif
 from pipeline.physiclear.catalogue import Catalogue
 from pipeline.records import Assignment, Classification, Measurement, Part
 from pipeline.runtime import seed_everything
-from pipeline.training.trainer import Log, TrainableTrainer, Watch, checkpoint_dir, fingerprint, progress_bar_off, train
+from pipeline.training.trainer import (
+    Log,
+    TrainableTrainer,
+    Watch,
+    checkpoint_dir,
+    fingerprint,
+    one_device,
+    progress_bar_off,
+    train,
+)
 
 
 @dataclass(frozen=True)
@@ -95,15 +104,14 @@ def finetune(
     )
     trainer = TrainableTrainer(
         model=model,
-        args=arguments,
+        args=one_device(arguments),
         train_dataset=train_set,
         eval_dataset=ClipDataset(data.store, validation, per_video=data.per_video) if validation else None,
         data_collator=collate_clips,
         compute_metrics=lambda prediction: accuracies(prediction, data.catalogue),
         callbacks=[Watch(log)],
     )
-    history = train(trainer)
-    return model, history
+    return model, train(trainer).history
 
 
 def accuracies(prediction: EvalPrediction, catalogue: Catalogue) -> dict[str, float]:

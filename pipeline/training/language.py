@@ -15,9 +15,18 @@ from pipeline.data.conversations import ConversationCollator, ConversationDatase
 from pipeline.data.embeddings import EmbeddingStore
 from pipeline.errors import UserError
 from pipeline.models.octopi import Octopi, build_octopi
-from pipeline.records import Measurement, Opd, Question
+from pipeline.records import Opd, Question
 from pipeline.runtime import derive_seed, seed_everything
-from pipeline.training.trainer import Log, TrainableTrainer, Watch, checkpoint_dir, progress_bar_off, train
+from pipeline.training.trainer import (
+    Log,
+    TrainableTrainer,
+    Trained,
+    Watch,
+    checkpoint_dir,
+    one_device,
+    progress_bar_off,
+    train,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -89,16 +98,14 @@ class Job:
     log: Log | None = None
 
 
-def align(
-    model: Octopi, data: ConversationDataset, config: TrainConfig, runtime: RuntimeConfig, job: Job
-) -> list[Measurement]:
+def align(model: Octopi, data: ConversationDataset, config: TrainConfig, runtime: RuntimeConfig, job: Job) -> Trained:
     """Train the projection and the two new tokens; the language model stays frozen."""
     return _fit(model, data, config, runtime, job, {"connector": config.projection_learning_rate})
 
 
 def finetune_lora(
     model: Octopi, data: ConversationDataset, config: LoraTrainConfig, runtime: RuntimeConfig, job: Job
-) -> list[Measurement]:
+) -> Trained:
     """Train adapters, projection and new tokens, each at its own rate."""
     rates = {"connector": config.projection_learning_rate, "llm": config.learning_rate}
     return _fit(model, data, config, runtime, job, rates)
@@ -111,7 +118,7 @@ def _fit(
     runtime: RuntimeConfig,
     job: Job,
     rates: Mapping[str, float],
-) -> list[Measurement]:
+) -> Trained:
     if runtime.gradient_checkpointing:
         model.llm.gradient_checkpointing_enable(gradient_checkpointing_kwargs={"use_reentrant": False})
     seed_everything(job.seed)
@@ -140,7 +147,7 @@ def _fit(
     )
     trainer = TrainableTrainer(
         model=model,
-        args=arguments,
+        args=one_device(arguments),
         train_dataset=data,
         data_collator=ConversationCollator(int(model.tokenizer.pad_token_id)),
         callbacks=[Watch(job.log)],

@@ -8,6 +8,7 @@ import math
 import shutil
 import sys
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -58,6 +59,14 @@ class TrainableTrainer(Trainer):
             # Gathered by the distributed backend: take the gathered values.
             trained = {name: state_dict[name] for name in trained}
         super()._save(output_dir, {name: value.contiguous() for name, value in trained.items()})
+
+    def _issue_warnings_after_load(self, load_result: Any) -> None:
+        # The frozen base is missing in each checkpoint by design; only what the model does not know is a mistake.
+        if load_result.unexpected_keys:
+            raise UserError(
+                f"{self.args.output_dir}: its checkpoint has {load_result.unexpected_keys[0]}, which the model lacks; "
+                "delete the folder and run again"
+            )
 
 
 class Watch(TrainerCallback):
@@ -117,8 +126,23 @@ def checkpoint_dir(stage: str, mark: str) -> Path:
     return CHECKPOINTS / stage / mark
 
 
-def train(trainer: Trainer) -> list[Measurement]:
-    """Train to the end, from the last checkpoint where there is one; return the whole curve and tidy up."""
+@dataclass(frozen=True)
+class Trained:
+    """What a training leaves: its curve, and the trained parameters by name, whole even where they were sharded."""
+
+    history: list[Measurement]
+    state: dict[str, torch.Tensor]
+
+
+def one_device(arguments: TrainingArguments) -> TrainingArguments:
+    """Keep the Trainer from spreading one process over several GPUs; that is accelerate's task, one process a GPU."""
+    if arguments.device.type == "cuda":
+        arguments._n_gpu = 1
+    return arguments
+
+
+def train(trainer: Trainer) -> Trained:
+    """Train to the end, from the last checkpoint where there is one, and tidy up."""
     folder = Path(str(trainer.args.output_dir))
     last = get_last_checkpoint(str(folder)) if folder.is_dir() else None
     trainer.train(resume_from_checkpoint=last)
@@ -127,9 +151,11 @@ def train(trainer: Trainer) -> list[Measurement]:
         for entry in trainer.state.log_history
         for name, value in _measured(entry).items()
     ]
+    whole = trainer.accelerator.get_state_dict(trainer.model_wrapped)
+    names = trainable_state(trainer.accelerator.unwrap_model(trainer.model))
     if trainer.is_world_process_zero():
         shutil.rmtree(folder, ignore_errors=True)
-    return history
+    return Trained(history, {name: whole[name] for name in names if name in whole})
 
 
 def _measured(entry: Mapping[str, object]) -> dict[str, float]:
