@@ -109,7 +109,8 @@ def test_any_text_comes_back_exactly_with_right_offsets(text: str) -> None:
     covered = 0
     for start, stop in batch["offset_mapping"]:
         # The bytes of one character share its place; otherwise tokens follow each other without a gap.
-        assert start in (covered, covered - 1) and start < stop
+        assert start in (covered, covered - 1)
+        assert start < stop
         covered = stop
     assert covered == len(text)
 

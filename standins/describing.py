@@ -1,0 +1,53 @@
+"""How the generated text describes objects, from bare classes to the pipeline's full description."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterable
+from enum import IntEnum
+
+from pipeline.physiclear.catalogue import Catalogue, Property
+from standins.world import Labels, World
+
+FILLERS = (" It presents", " The surface feels", " Overall,", " There are", " It is")
+
+
+class Style(IntEnum):
+    """How an object is described."""
+
+    SHORT = 0
+    FILLED = 1
+    STRUCTURED = 2
+    FULL = 3
+
+
+def short(catalogue: Catalogue, labels: Labels) -> str:
+    """The classes alone, e.g. "hard, smooth, no bumps"."""
+    return ", ".join(p.levels[level] for p, level in zip(catalogue.properties, labels, strict=True))
+
+
+def described(world: World, object_id: str, style: Style, rng: random.Random) -> str:
+    """An object in one of the styles, ending in a full stop."""
+    catalogue = world.catalogue
+    labels = catalogue.labels(object_id)
+    match style:
+        case Style.SHORT:
+            return f"{short(catalogue, labels)}."
+        case Style.FILLED:
+            return "".join([*rng.choices(FILLERS, k=rng.randint(0, 2)), f" {short(catalogue, labels)}."]).strip()
+        case Style.STRUCTURED:
+            return catalogue.structured(labels)
+    return catalogue.describe(object_id)
+
+
+def told_facts(world: World, objects: Iterable[str], rng: random.Random) -> str:
+    """What each object is like, in random order."""
+    catalogue = world.catalogue
+    facts = [f"{short(catalogue, catalogue.labels(o))} is {catalogue.objects[o].name}." for o in objects]
+    return " ".join(rng.sample(facts, len(facts)))
+
+
+def property_words(properties: Iterable[Property]) -> list[str]:
+    """The words of several words that become one token: classes, comparatives, superlatives."""
+    said = [w for p in properties for w in (*p.levels, p.more, p.less, p.most, p.least)]
+    return [w for w in said if " " in w]
