@@ -135,6 +135,8 @@ class EncoderConfig(Section):
     weight_decay: Annotated[float, Field(ge=0, lt=1)] = 0.0
     flip_probability: Annotated[float, Field(ge=0, le=1)] = 0.5
     """Chance of each of the two flips in training."""
+    standardize: bool = False
+    """Shift and scale embeddings to mean 0 and deviation 1 over the training frames (the paper does not)."""
     embed_batch_size: Positive = 64
     """Frames at a time when embeddings are computed."""
 

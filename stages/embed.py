@@ -10,10 +10,10 @@ from pipeline.models.tactile_encoder import base_encoder, load_trainable, proper
 from pipeline.models.weights import check_encoder
 from pipeline.physiclear.catalogue import load_catalogue
 from pipeline.plan import Encoder
-from pipeline.records import Assignment, Embedding
+from pipeline.records import Assignment, Embedding, Part
 from pipeline.runtime import resolve_device
 from pipeline.stage import DATA, stage
-from pipeline.training.embed import embed_videos
+from pipeline.training.embed import embed_videos, standardize
 
 
 def main() -> None:
@@ -30,13 +30,16 @@ def main() -> None:
             classifier = property_classifier(weights, params.encoder.prompts, classes)
             load_trainable(classifier, Path(job.encoder_dir) / "encoder.safetensors")
             encoder = classifier.encoder
+        assignments = read_table(DATA / "splits.parquet", Assignment)
         tensor, index = embed_videos(
             encoder,
             FrameStore(DATA / "frames"),
-            read_table(DATA / "splits.parquet", Assignment),
+            assignments,
             batch_size=params.encoder.embed_batch_size,
             device=resolve_device(params.runtime.device),
         )
+        if params.encoder.standardize:
+            tensor = standardize(tensor, index, {a.video_id for a in assignments if a.part == Part.TRAIN})
         out = DATA / "embeddings" / key
         save_tensors(out / TENSOR_FILE, {TENSOR: tensor})
         write_table(out / INDEX_FILE, Embedding, index)

@@ -19,6 +19,8 @@ from pipeline.models.tactile_encoder import (
     trainable_state,
 )
 from pipeline.models.weights import check_encoder, check_language
+from pipeline.records import Embedding
+from pipeline.training.embed import standardize
 from tests.checkpoints import write_clip, write_llama
 
 
@@ -113,6 +115,27 @@ def test_batch_of_one_equals_batch_of_many(weights: Path, frames: torch.Tensor) 
 def test_constant_frames_are_finite(weights: Path, value: int) -> None:
     frames = torch.full((1, 5, 32, 32, 3), value, dtype=torch.uint8)
     assert property_classifier(weights, prompts=2, classes=[3])(frames)["logits"].isfinite().all()
+
+
+def test_standardized_by_training_frames_alone() -> None:
+    index = [
+        Embedding(video_id=video, frame_index=f, flip=flip, row=0)
+        for video in ("train_0", "train_1", "test_0")
+        for flip in ("none", "both")
+        for f in range(4)
+    ]
+    index = [entry.model_copy(update={"row": row}) for row, entry in enumerate(index)]
+    raw = torch.randn(len(index), 3, generator=torch.manual_seed(0)) * torch.tensor([1e-3, 1.0, 0.0]) + 1e3
+    rows = [e.row for e in index if e.video_id.startswith("train") and e.flip == "none"]
+    done = standardize(raw, index, {"train_0", "train_1"})
+    reference = (raw.numpy() - raw[rows].numpy().astype(float).mean(0)) / np.array(
+        [*raw[rows].numpy().astype(float).std(0)[:2], 1.0]
+    )
+    np.testing.assert_allclose(done.numpy(), reference, rtol=1e-6)
+    assert done.isfinite().all(), "a constant dimension is only shifted"
+    moved = raw.clone()
+    moved[[e.row for e in index if e.video_id == "test_0"]] += 5
+    assert torch.equal(standardize(moved, index, {"train_0", "train_1"})[rows], done[rows])
 
 
 class TestBadWeights:

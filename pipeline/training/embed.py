@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 import torch
@@ -54,3 +54,14 @@ def embed_videos(
                 index.append(Embedding(video_id=assignment.video_id, frame_index=frame, flip=flip, row=len(index)))
         blocks.append(block)
     return torch.cat(blocks), index
+
+
+def standardize(embeddings: torch.Tensor, index: Sequence[Embedding], training: Collection[str]) -> torch.Tensor:
+    """Mean 0 and deviation 1 in each dimension, by the statistics of the training videos' unmirrored frames alone.
+
+    A dimension that never changes there is only shifted.
+    """
+    rows = [e.row for e in index if e.video_id in training and e.flip == "none"]
+    mean, deviation = embeddings[rows].double().mean(0), embeddings[rows].double().std(0, correction=0)
+    scale = torch.where(deviation > 0, deviation, torch.ones_like(deviation))
+    return ((embeddings.double() - mean) / scale).float()
