@@ -111,6 +111,12 @@ def slots(world: World, rng: random.Random) -> Document:
     return converse(world, task, mode, rng, style=Style.SHORT, slots=True, weight=0.3)
 
 
+def described(world: World, rng: random.Random) -> Document:
+    """One object: its classes stand in the question, and the answer says them as a description."""
+    style = rng.choice((Style.STRUCTURED, Style.FULL))
+    return converse(world, Task.OPD, rng.choice((Opd.ALL, Opd.NEEDED)), rng, style=style, slots=True, weight=1.0)
+
+
 def restated(world: World, rng: random.Random) -> Document:
     """The same, described before the conclusion; with situations and their facts."""
     if rng.random() < 0.1:
@@ -170,6 +176,7 @@ FORMATS = (
     Format("chat", chat, COMPARING),
     Format("structured", structured, COMPARING),
     Format("slots", slots, COMPARING),
+    Format("described", mixed((0.7, described), (0.3, slots)), (Task.OPD,)),
     Format("restated", restated, (*COMPARING, Task.PSR)),
     Format("question first", mixed((0.5, question_first), (0.5, restated)), COMPARING),
     Format("names", mixed((0.4, full), (0.45, match_names), (0.15, repeat)), (Task.POM,)),

@@ -174,7 +174,11 @@ def _answer(builder: Builder, text: str, task: Task, last: bool, weight: float) 
     if marker:
         builder.said(body + marker, weight)
         conclude(builder, verdict.strip(), weight=MAIN)
-    elif task == Task.OPD or not last:
+    elif task == Task.OPD:
+        free, overall, closing = text.rpartition(" Overall,")
+        builder.said(free, weight)
+        builder.decided(overall + closing + EOS, weight)
+    elif not last:
         builder.said(text + EOS, weight)
     else:
         conclude(builder, text.strip(), weight=MAIN)
