@@ -12,7 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.evaluation.statistics import (
+from pipeline.physiclear.catalogue import load_catalogue
+from pipeline.statistics import (
     Interval,
     Outcome,
     Spread,
@@ -20,10 +21,10 @@ from pipeline.evaluation.statistics import (
     compositions,
     confusion,
     icc3k,
+    icc3k_interval,
     proportion,
     wilson,
 )
-from pipeline.physiclear.catalogue import load_catalogue
 from tests.closure import ROOT
 
 SHROUT_FLEISS = [[9, 2, 5, 8], [6, 1, 3, 2], [8, 4, 6, 8], [7, 1, 2, 6], [10, 5, 6, 9], [6, 2, 4, 7]]
@@ -139,6 +140,95 @@ def test_icc3k_ignores_a_rater_who_is_always_stricter() -> None:
 @pytest.mark.parametrize("ratings", [[], [[1, 2, 3]], [[1], [2]], [[1, 2], [1, 2], [1, 2]], [[2, 2], [2, 2]]])
 def test_icc3k_undefined(ratings: list[list[float]]) -> None:
     assert icc3k(ratings) is None
+    assert icc3k_interval(ratings) is None
+
+
+def f_quantile(share: float, first: int, second: int) -> float:
+    """The F distribution's quantile, by the inverse of the incomplete beta function."""
+    from scipy.special import betaincinv
+
+    x = float(betaincinv(first / 2, second / 2, share))
+    return second * x / (first * (1 - x))
+
+
+def anova(ratings: Sequence[Sequence[float]]) -> tuple[float, int, int]:
+    """F of targets over error and its degrees of freedom, from the residuals of the two-way model."""
+    import numpy as np
+
+    table = np.array(ratings, dtype=float)
+    targets, raters = table.shape
+    fitted = table.mean(1, keepdims=True) + table.mean(0, keepdims=True) - table.mean()
+    error = ((table - fitted) ** 2).sum() / ((targets - 1) * (raters - 1))
+    return float(raters * table.mean(1).var(ddof=1) / error), targets - 1, (targets - 1) * (raters - 1)
+
+
+def test_icc3k_interval_of_shrout_and_fleiss() -> None:
+    """F(5, 15) = 11.03 (their table 3: 11.24 / 1.02)."""
+    ratio, targets, errors = anova(SHROUT_FLEISS)
+    assert (round(ratio, 2), targets, errors) == (11.03, 5, 15)
+    interval = icc3k_interval(SHROUT_FLEISS)
+    assert interval is not None
+    # A quantile's reciprocal is the other tail's quantile with the degrees of freedom exchanged.
+    assert interval.low == pytest.approx(1 - f_quantile(0.975, 5, 15) / ratio, rel=1e-9)
+    assert interval.high == pytest.approx(1 - f_quantile(0.025, 5, 15) / ratio, rel=1e-9)
+    assert (round(interval.low, 2), round(interval.high, 2)) == (0.68, 0.99)
+
+
+def test_icc3k_interval_covers_the_truth() -> None:
+    """Two-way data with variance 1 between targets and of the error: the agreement of 3 raters is 3 / (3 + 1)."""
+    rng = random.Random(4)
+    covered = 0
+    for _ in range(400):
+        severity = [rng.gauss(0, 2) for _ in range(3)]
+        targets = [rng.gauss(0, 1) for _ in range(12)]
+        interval = icc3k_interval([[t + s + rng.gauss(0, 1) for s in severity] for t in targets])
+        assert interval is not None
+        covered += interval.low <= 0.75 <= interval.high
+    assert 0.92 <= covered / 400 <= 0.98
+
+
+def test_icc3k_interval_of_perfect_agreement_has_no_width() -> None:
+    assert icc3k_interval([[0, 0, 0], [1, 1, 1], [2, 2, 2]]) == Interval(1, 1)
+    assert icc3k_interval([[x, x + 0.1, x + 0.7] for x in (0.1, 0.2, 0.7)]) == Interval(1, 1)
+
+
+def test_icc3k_interval_of_two_objects_and_two_raters() -> None:
+    """The fewest that there is an interval of: F(1, 1), whose quantiles are squared tangents."""
+    ratings = [[0, 1], [3, 2]]
+    ratio, targets, errors = anova(ratings)
+    assert (ratio, targets, errors) == (pytest.approx(4), 1, 1)
+    interval = icc3k_interval(ratings)
+    assert interval is not None
+    quantile = math.tan(math.pi / 2 * 0.975) ** 2
+    assert interval.low == pytest.approx(1 - quantile / 4)
+    assert interval.high == pytest.approx(1 - 1 / (4 * quantile))
+
+
+@st.composite
+def rating_tables(draw: st.DrawFn) -> list[list[int]]:
+    raters = draw(st.integers(2, 5))
+    row = st.lists(st.integers(0, 4), min_size=raters, max_size=raters)
+    return draw(st.lists(row, min_size=2, max_size=9))
+
+
+@given(ratings=rating_tables(), strict=st.lists(st.integers(-9, 9), min_size=5, max_size=5))
+def test_icc3k_is_of_consistency_and_lies_in_its_interval(ratings: list[list[int]], strict: list[int]) -> None:
+    value, interval = icc3k(ratings), icc3k_interval(ratings)
+    assert (value is None) == (interval is None)
+    shifted = [[r + s for r, s in zip(row, strict, strict=False)] for row in ratings]
+    if value is None or interval is None:
+        assert icc3k(shifted) is None
+        return
+    assert interval.low <= value + 1e-9
+    assert value - 1e-9 <= interval.high <= 1
+    assert value <= 1
+    assert icc3k(shifted) == pytest.approx(value, rel=1e-6, abs=1e-6)
+    other = icc3k_interval(shifted)
+    assert other is not None
+    assert other.low == pytest.approx(interval.low, rel=1e-6, abs=1e-6)
+    if value < 1 - 1e-9:
+        ratio = anova(ratings)[0]
+        assert value == pytest.approx(1 - 1 / ratio, rel=1e-6, abs=1e-9)
 
 
 def test_icc3k_of_the_papers_ratings() -> None:

@@ -140,6 +140,29 @@ def icc3k(ratings: Sequence[Sequence[float]]) -> float | None:
     Returns:
         At most 1; None where it is undefined: fewer than two targets or raters, or targets that do not differ.
     """
+    squares = _mean_squares(ratings)
+    return None if squares is None else (squares[0] - squares[1]) / squares[0]
+
+
+def icc3k_interval(ratings: Sequence[Sequence[float]]) -> Interval | None:
+    """The 95 % interval of `icc3k` (Shrout and Fleiss 1979: F of targets over error); None where that is undefined."""
+    from scipy.stats import f
+
+    squares = _mean_squares(ratings)
+    if squares is None:
+        return None
+    between, error = squares
+    if error <= 1e-12:
+        return Interval(1.0, 1.0)
+    targets, errors = len(ratings) - 1, (len(ratings) - 1) * (len(ratings[0]) - 1)
+    tail = (1 + LEVEL) / 2
+    low = 1 - error / between * float(f.ppf(tail, targets, errors))
+    high = 1 - error / between / float(f.ppf(tail, errors, targets))
+    return Interval(low, high)
+
+
+def _mean_squares(ratings: Sequence[Sequence[float]]) -> tuple[float, float] | None:
+    """Mean squares between targets and of the error; None where an ICC is undefined."""
     n, k = len(ratings), len(ratings[0]) if ratings else 0
     if n < 2 or k < 2:
         return None
@@ -150,7 +173,8 @@ def icc3k(ratings: Sequence[Sequence[float]]) -> float | None:
     between = rows / (n - 1)
     if between <= 1e-12:
         return None
-    return (between - (total - rows - columns) / ((n - 1) * (k - 1))) / between
+    # Perfect agreement may end a rounding error below 0.
+    return between, max(0.0, total - rows - columns) / ((n - 1) * (k - 1))
 
 
 def confusion(expected: Sequence[int], predicted: Sequence[int], classes: int) -> tuple[tuple[int, ...], ...]:

@@ -1,0 +1,230 @@
+"""The sections of params.yaml: every key with its range and meaning.
+
+A function receives its own section, never the root.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from pipeline.plan import PlanName
+from pipeline.records import Task
+from pipeline.runtime import DeviceName, DtypeName
+
+Fraction = Annotated[float, Field(gt=0, le=1)]
+Positive = Annotated[int, Field(ge=1)]
+Rate = Annotated[float, Field(gt=0, lt=10)]
+Seed = Annotated[int, Field(ge=0, lt=2**31)]
+
+Selection = Literal["salient", "release", "uniform", "contact", "adaptive"]
+
+SCENES_DIR = Path("data/scenes/videos")
+"""Where the chain puts the videos that it makes itself."""
+
+
+class Section(BaseModel):
+    """A frozen part of the configuration; unknown keys are errors."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class DataConfig(Section):
+    """Where the videos come from."""
+
+    source: Literal["scenes", "videos"]
+    """`scenes`: synthetic, made by the chain. `videos`: files named `<object>_<number>` in `dir`."""
+    dir: str = Field(min_length=1)
+    """Folder of the videos; for scenes, where the chain puts them."""
+    catalogue: str = "pipeline/physiclear"
+    """Folder with objects.csv and properties.yaml (and, optionally, descriptions.csv)."""
+
+
+class ScenesConfig(Section):
+    """Synthetic videos (used where data.source is scenes)."""
+
+    objects: tuple[str, ...] = ()
+    """Object ids; empty stands for all of the catalogue."""
+    videos_per_object: Positive = 5
+    frames: Annotated[int, Field(ge=2, le=1000)] = 100
+    """Frames a video."""
+    fps: Annotated[float, Field(gt=0, le=240)] = 25.0
+    width: Annotated[int, Field(ge=32, le=1280)] = 320
+    height: Annotated[int, Field(ge=24, le=960)] = 240
+    seed: Seed = 0
+
+
+class FramesConfig(Section):
+    """Which frames of a video are kept for the encoder, and how large."""
+
+    selection: Selection = "salient"
+    """`salient`: the largest differences to the frame before (paper). `release`: the published code's rule. `uniform`:
+    equal distances in time. `contact`: the largest differences to the no-contact reference. `adaptive`: of those,
+    only as many as differ from each other."""
+    fraction: Fraction = 0.3
+    """Share of a video's frames that is kept (paper: 30 %); `adaptive` keeps at most that."""
+    per_video: Annotated[int, Field(ge=1, le=64)] = 5
+    """Frames drawn of those that are kept (paper: 5)."""
+    tolerance: Annotated[float, Field(ge=0, le=10)] = 0.8
+    """`adaptive`: what a further frame must add to be kept, as a share of the strongest contact."""
+    size: Annotated[int, Field(ge=16, le=1024)] = 224
+    """Side of the square that frames are stored at; must be the encoder's input size."""
+    fit: Literal["crop", "squash"] = "crop"
+    """`crop`: the centre, then to `size`. `squash`: the whole frame, aspect lost."""
+
+
+class SplitConfig(Section):
+    """Which objects are for training, validation and test."""
+
+    name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")] = "paper"
+    """`kfold`, `development`, or what stands behind `split_` in a column of the catalogue's objects.csv."""
+    seed: Seed = 0
+    """Used by development and kfold."""
+    test_objects: Positive = 7
+    """Test objects of the development split."""
+    folds: Annotated[int, Field(ge=3, le=50)] = 5
+    fold: Annotated[int, Field(ge=0)] = 0
+    missing: Literal["report", "error"] = "report"
+    """What to do about validation or test objects without videos: go on and leave cells empty, or stop."""
+
+    @model_validator(mode="after")
+    def _fold_exists(self) -> Self:
+        if self.fold >= self.folds:
+            raise ValueError(f"split.fold is {self.fold}, allowed: 0 to {self.folds - 1}")
+        return self
+
+
+class QuestionCounts(Section):
+    """Questions a task."""
+
+    opd: Annotated[int, Field(ge=0)]
+    pc: Annotated[int, Field(ge=0)]
+    pss: Annotated[int, Field(ge=0)]
+    pom: Annotated[int, Field(ge=0)]
+    psr: Annotated[int, Field(ge=0)] = 0
+
+    def by_task(self) -> dict[Task, int]:
+        """The counts keyed by task."""
+        return {task: getattr(self, task.lower()) for task in Task}
+
+
+class QuestionsConfig(Section):
+    """How many questions are built; fewer come where the objects allow no more without repeating."""
+
+    seed: Seed = 0
+    train: QuestionCounts
+    evaluation: QuestionCounts
+
+    @model_validator(mode="after")
+    def _psr_is_not_trained(self) -> Self:
+        if self.train.psr:
+            raise ValueError("questions.train.psr must be 0: scenarios are for evaluation only")
+        return self
+
+
+class EncoderConfig(Section):
+    """The CLIP encoder and its fine-tuning (paper: visual prompts, three heads, AdamW, cosine)."""
+
+    weights: str
+    """Folder in open_clip's format: open_clip_config.json and open_clip_model.safetensors."""
+    prompts: Annotated[int, Field(ge=1, le=256)] = 8
+    """Learnable prompts at each layer."""
+    epochs: Positive = 30
+    batch_size: Positive = 32
+    learning_rate: Rate = 1e-3
+    weight_decay: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    flip_probability: Annotated[float, Field(ge=0, le=1)] = 0.5
+    """Chance of each of the two flips in training."""
+    reference: Literal["none", "subtract"] = "none"
+    """`subtract`: show each frame's difference to the video's no-contact reference in place of the frame."""
+    standardize: bool = False
+    """Shift and scale embeddings to mean 0 and deviation 1 over the training frames (the paper does not)."""
+    embed_batch_size: Positive = 64
+    """Frames at a time when embeddings are computed."""
+
+
+class LanguageConfig(Section):
+    """The language model and its generation."""
+
+    weights: str
+    """Folder in transformers' format with a Llama-like model (safetensors) and a fast tokenizer."""
+    dtype: DtypeName = "float32"
+    """Number format of the frozen weights; whatever is trained stays in float32."""
+    system_prompt: str = ""
+    """Put before each conversation (Vicuna has one; the stand-in was made without)."""
+    max_new_tokens: Annotated[int, Field(ge=1, le=4096)] = 256
+    generation_batch_size: Positive = 32
+
+
+class TrainConfig(Section):
+    """One stage of language training (AdamW, cosine)."""
+
+    samples: Positive
+    """Questions trained on (paper: 8k for alignment, 3k end to end)."""
+    epochs: Positive = 1
+    batch_size: Positive = 16
+    """Questions an update, over all devices."""
+    micro_batch_size: Positive = 16
+    """Questions at a time on one device; the rest is accumulated."""
+    projection_learning_rate: Rate = 2e-5
+    warmup_ratio: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    weight_decay: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    max_grad_norm: Annotated[float, Field(gt=0)] = 1.0
+
+    @model_validator(mode="after")
+    def _batches_divide(self) -> Self:
+        if self.batch_size % self.micro_batch_size:
+            raise ValueError(f"micro_batch_size {self.micro_batch_size} does not divide batch_size {self.batch_size}")
+        return self
+
+
+class LoraTrainConfig(TrainConfig):
+    """End-to-end fine-tuning with low-rank adapters."""
+
+    learning_rate: Rate = 2e-4
+    rank: Annotated[int, Field(ge=1, le=1024)] = 128
+    alpha: Annotated[float, Field(gt=0)] = 256
+    dropout: Annotated[float, Field(ge=0, lt=1)] = 0.05
+    target_modules: tuple[str, ...] = Field(default=("q_proj", "k_proj"), min_length=1)
+    """Linear layers that get an adapter (the paper does not say; the published code: q_proj and k_proj)."""
+
+
+class AblationConfig(Section):
+    """Which variants of the system are trained and compared."""
+
+    plan: PlanName = "paper"
+    """`paper`: the four variants of the paper's tables. `factorial`: encoder x LoRA x OPD. `single`: no ablation."""
+    seeds: tuple[Seed, ...] = Field(default=(0,), min_length=1)
+
+    @model_validator(mode="after")
+    def _seeds_differ(self) -> Self:
+        if len(set(self.seeds)) < len(self.seeds):
+            raise ValueError(f"ablation.seeds {list(self.seeds)} repeats a seed")
+        return self
+
+
+class TrackingConfig(Section):
+    """MLflow."""
+
+    uri: str = ""
+    """Tracking server; empty stands for the local database mlruns/mlflow.db."""
+    experiment: str = "octopi"
+    live: bool = True
+    """Log trainings while they run (importing MLflow costs each of them seconds), or only when all is done."""
+    timeout_seconds: Annotated[int, Field(ge=1, le=600)] = 10
+    """After how long an unanswered call counts as a dead server."""
+
+
+class RuntimeConfig(Section):
+    """The machine."""
+
+    device: DeviceName = "auto"
+    launcher: str = "python"
+    """What starts a training stage: `python`, or `accelerate launch` with its configuration for several GPUs."""
+    threads: Annotated[int, Field(ge=0, le=1024)] = 0
+    """CPU threads of torch; 0 leaves it to torch. Sums depend on it in their last bits, so fix it to compare runs."""
+    save_steps: Annotated[int, Field(ge=0)] = 0
+    """Optimiser steps between checkpoints that a killed training resumes from; 0 writes none."""
+    gradient_checkpointing: bool = False
