@@ -6,16 +6,18 @@ import random
 from collections import defaultdict
 from collections.abc import Collection, Sequence
 
-from pipeline.config import SplitConfig
 from pipeline.errors import UserError
-from pipeline.physiclear.catalogue import Catalogue
+from pipeline.physiclear.catalogue import RULED_SPLITS, Catalogue
 from pipeline.records import Assignment, Part, Record, Video
 from pipeline.runtime import derive_seed
+from pipeline.sections import SplitConfig
 
 CANDIDATES = 2000
 """Random sets of test objects that the development split chooses the best balanced one from."""
 FEWEST_TRAINING_OBJECTS = 3
 """A superlative or a matching question needs three objects."""
+ORIGIN = "paper"
+"""The split of the catalogue that the development split is made from."""
 
 
 class Split(Record):
@@ -29,14 +31,15 @@ class Split(Record):
 def assign(catalogue: Catalogue, videos: Sequence[Video], config: SplitConfig) -> Split:
     """Put every video into a part of the split, by its object.
 
-    `paper` and `release` follow the catalogue's columns. `development` tests on some of the paper's training objects
-    and leaves the paper's test objects unused. `kfold` deals all objects that have videos into folds: fold `fold` is
-    for test, the next one for validation, so that over all folds every object is tested once.
+    `development` tests on some of the paper's training objects and leaves the paper's test objects unused. `kfold`
+    deals all objects that have videos into folds: fold `fold` is for test, the next one for validation, so that over
+    all folds every object is tested once. Any other name is that of a `split_` column of the catalogue.
 
     Raises:
-        UserError: if no training video remains, there are too few objects for the test objects or folds asked for,
-            or (with `missing: error`) a validation or test object has no video.
+        UserError: if there is no such split, no training video remains, there are too few objects for the test
+            objects or folds asked for, or (with `missing: error`) a validation or test object has no video.
     """
+    check_split(catalogue, config.name)
     present = {video.object_id for video in videos}
     if config.name == "kfold":
         parts = _deal(present, config)
@@ -62,31 +65,17 @@ def assign(catalogue: Catalogue, videos: Sequence[Video], config: SplitConfig) -
     return Split(assignments=assignments, missing=missing)
 
 
-def check_leakage(assignments: Sequence[Assignment], videos: Sequence[Video]) -> None:
-    """Make sure that no object and no file content stands in two parts; unused videos do not count.
+def check_split(catalogue: Catalogue, name: str) -> None:
+    """Make sure that the catalogue allows a split of this name.
 
     Raises:
-        UserError: naming the object, or the two files of equal content, and the parts.
+        UserError: listing the names that it allows.
     """
-    used = [a for a in assignments if a.part != Part.UNUSED]
-    part_of_object: dict[str, Part] = {}
-    for assignment in used:
-        part = part_of_object.setdefault(assignment.object_id, assignment.part)
-        if part != assignment.part:
-            raise UserError(
-                f"split: object {assignment.object_id} stands in {part} and in {assignment.part}; put all its videos "
-                "into one part"
-            )
-    by_id = {video.video_id: video for video in videos}
-    first: dict[str, Assignment] = {}
-    for assignment in used:
-        video = by_id[assignment.video_id]
-        twin = first.setdefault(video.sha256, assignment)
-        if twin.part != assignment.part:
-            raise UserError(
-                f"split: {by_id[twin.video_id].path} ({twin.part}) and {video.path} ({assignment.part}) have the same "
-                "content; remove one of them"
-            )
+    columns = catalogue.split_names
+    ruled = [rule for rule in RULED_SPLITS if rule != "development" or ORIGIN in columns]
+    if name not in (*columns, *ruled):
+        why = f" needs the column split_{ORIGIN}" if name in RULED_SPLITS else " is no split of the catalogue"
+        raise UserError(f"split.name={name}{why}; allowed: {', '.join((*columns, *ruled))} (see objects.csv)")
 
 
 def _deal(present: Collection[str], config: SplitConfig) -> dict[str, Part]:
@@ -101,7 +90,7 @@ def _deal(present: Collection[str], config: SplitConfig) -> dict[str, Part]:
 
 def _develop(catalogue: Catalogue, present: Collection[str], config: SplitConfig) -> dict[str, Part]:
     """The paper's split with its test objects unused and a balanced choice of its training objects for test."""
-    paper = {o.object_id: o.splits["paper"] for o in catalogue.objects.values()}
+    paper = {o.object_id: o.splits[ORIGIN] for o in catalogue.objects.values()}
     candidates = sorted(o for o, part in paper.items() if part == Part.TRAIN and o in present)
     most = len(candidates) - FEWEST_TRAINING_OBJECTS
     if config.test_objects > most:

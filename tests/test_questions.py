@@ -6,10 +6,10 @@ from collections import Counter
 
 import pytest
 
-from pipeline.config import SplitConfig
 from pipeline.physiclear.catalogue import load_catalogue
 from pipeline.questions import build_questions, pool_of
 from pipeline.records import Part, Question, Task
+from pipeline.sections import SplitConfig
 from pipeline.splits import assign
 from pipeline.tasks.base import Pool
 from tests.conftest import ROOT, fake_videos

@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.config import SplitConfig
 from pipeline.errors import UserError
-from pipeline.physiclear.catalogue import load_catalogue
-from pipeline.records import Assignment, Part
-from pipeline.splits import Split, assign, check_leakage
+from pipeline.physiclear.catalogue import Catalogue, load_catalogue
+from pipeline.records import Part
+from pipeline.sections import SplitConfig
+from pipeline.splits import Split, assign, check_split
 from tests.conftest import ROOT, fake_videos
 
 CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")
@@ -37,7 +37,8 @@ def test_every_video_has_one_part_and_every_object_too(name: str, seed: int, obj
     for a in split.assignments:
         parts[a.object_id].add(a.part)
     assert all(len(p) == 1 for p in parts.values())
-    check_leakage(split.assignments, videos)
+    parts = {o: {a.part for a in split.assignments if a.object_id == o} for o in objects}
+    assert all(len(where) == 1 for where in parts.values())
     assert split == assign(CATALOGUE, videos, config)
     present = {v.object_id for v in videos}
     for part, missing in split.missing.items():
@@ -117,34 +118,45 @@ def test_missing_objects_are_reported_or_refused() -> None:
         assert words in str(caught.value)
 
 
+def renamed(**columns: str) -> Catalogue:
+    """The catalogue with other split columns: new name to old."""
+    objects = {
+        o.object_id: o.model_copy(update={"splits": {new: o.splits[old] for new, old in columns.items()}})
+        for o in CATALOGUE.objects.values()
+    }
+    return CATALOGUE.model_copy(update={"objects": objects})
+
+
+def test_a_column_of_any_name_is_a_split() -> None:
+    mine, videos = renamed(mine="paper"), fake_videos(OBJECTS)
+    assert assign(mine, videos, SplitConfig(name="mine")) == assign(CATALOGUE, videos, SplitConfig(name="paper"))
+
+
+@pytest.mark.parametrize(
+    ("columns", "name", "words"),
+    [
+        ({}, "paper", "split.name=paper is no split of the catalogue; allowed: kfold "),
+        ({}, "development", "split.name=development needs the column split_paper; allowed: kfold "),
+        ({"mine": "paper"}, "sideways", "allowed: mine, kfold "),
+        ({"paper": "paper"}, "mine", "allowed: paper, development, kfold "),
+    ],
+)
+def test_a_split_that_is_not_there_is_refused(columns: dict[str, str], name: str, words: str) -> None:
+    other = renamed(**columns)
+    for attempt in (
+        lambda: check_split(other, name),
+        lambda: assign(other, fake_videos(OBJECTS), SplitConfig(name=name)),
+    ):
+        with pytest.raises(UserError) as caught:
+            attempt()
+        assert words in str(caught.value)
+    check_split(other, "kfold")
+    assert assign(other, fake_videos(OBJECTS), SplitConfig(name="kfold")).assignments
+
+
 @pytest.mark.parametrize("name", ["paper", "development"])
 def test_nothing_to_train_on(name: str) -> None:
     with pytest.raises(UserError, match="train"):
         assign(CATALOGUE, fake_videos(["denim", "ice_block"]), SplitConfig(name=name))
     with pytest.raises(UserError):
         assign(CATALOGUE, [], SplitConfig(name=name))
-
-
-def test_an_object_in_two_parts_is_found() -> None:
-    videos = fake_videos(["rug", "potato"], 2)
-    parts = [Part.TRAIN, Part.TEST, Part.TRAIN, Part.TRAIN]
-    assignments = [
-        Assignment(video_id=v.video_id, object_id=v.object_id, part=p) for v, p in zip(videos, parts, strict=True)
-    ]
-    with pytest.raises(UserError, match="object rug stands in train and in test"):
-        check_leakage(assignments, videos)
-
-
-@pytest.mark.parametrize(("other", "leaks"), [(Part.TEST, True), (Part.TRAIN, False), (Part.UNUSED, False)])
-def test_equal_content_in_two_parts_is_found(other: Part, leaks: bool) -> None:
-    first, second = fake_videos(["rug", "potato"], 1)
-    second = second.model_copy(update={"sha256": first.sha256})
-    assignments = [
-        Assignment(video_id=first.video_id, object_id="rug", part=Part.TRAIN),
-        Assignment(video_id=second.video_id, object_id="potato", part=other),
-    ]
-    if not leaks:
-        check_leakage(assignments, [first, second])
-        return
-    with pytest.raises(UserError, match=r"rug_0\.avi \(train\) and potato_0\.avi \(test\) have the same content"):
-        check_leakage(assignments, [first, second])

@@ -1,92 +1,49 @@
 """The catalogue of a data set: its properties, its objects, the annotators' ratings and the words for all of it.
 
-A catalogue is a folder with `objects.csv` and `properties.yaml`. The one beside this module is PhysiCLeAR's, from
-the tables of the paper (names, ratings, materials, parts, splits).
+A catalogue is a folder with `objects.csv` and `properties.yaml`, and, where its publishers described the objects,
+`descriptions.csv` (docs/data.md explains every column and key). The one beside this module is PhysiCLeAR's, from the
+tables of the paper (names, ratings, materials, parts, splits).
 """
 
 from __future__ import annotations
 
-import csv
 import math
+import re
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Self
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import ValidationError
 
 from pipeline.errors import UserError
+from pipeline.physiclear.language import Entry, Language, Property, Scenario
+from pipeline.physiclear.sheet import Row, read_sheet
 from pipeline.records import Part
 from pipeline.runtime import derive_seed
 
-FIXED_COLUMNS = ("object_id", "name", "material", "part_of", "part", "split_paper", "split_release")
+__all__ = ["RULED_SPLITS", "Catalogue", "Language", "Object", "Property", "Scenario", "load_catalogue"]
+
+OBJECTS, PROPERTIES, DESCRIPTIONS = "objects.csv", "properties.yaml", "descriptions.csv"
+RULED_SPLITS = ("development", "kfold")
+"""Splits that are made by rule; no column may bear their names."""
 
 
-class _Entry(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class Property(_Entry):
-    """One physical property with its ordered classes and the words for them."""
-
-    name: str = Field(pattern=r"^[a-z][a-z_]*$")
-    levels: tuple[str, ...] = Field(min_length=2)
-    more: str
-    less: str
-    most: str
-    least: str
-    alone: str
-    phrases: tuple[tuple[str, ...], ...]
-
-    @model_validator(mode="after")
-    def _phrases_fit(self) -> Self:
-        if len(self.phrases) != len(self.levels) or not all(self.phrases):
-            raise ValueError(f"{self.name}: phrases need one non-empty list a level")
-        return self
-
-
-class Scenario(_Entry):
-    """A situation and the classes that suit it (PSR)."""
-
-    name: str
-    question: str
-    object: str | None = None
-    target: dict[str, tuple[int, ...]] = Field(min_length=1)
-    other: dict[str, tuple[int, ...]] = Field(min_length=1)
-
-
-class Language(_Entry):
-    """Everything in properties.yaml."""
-
-    properties: tuple[Property, ...] = Field(min_length=1)
-    unstructured: str
-    structured: str
-    scenarios: tuple[Scenario, ...] = ()
-
-    @model_validator(mode="after")
-    def _names_fit(self) -> Self:
-        names = {p.name for p in self.properties}
-        for scenario in self.scenarios:
-            unknown = (scenario.target.keys() | scenario.other.keys()) - names
-            if unknown:
-                raise ValueError(f"scenario {scenario.name}: unknown property {', '.join(sorted(unknown))}")
-        for template in (self.unstructured, self.structured):
-            missing = [name for name in names if f"{{{name}}}" not in template]
-            if missing:
-                raise ValueError(f"template {template!r} does not name {', '.join(sorted(missing))}")
-        return self
-
-
-class Object(_Entry):
-    """One object (or part of one) with its ratings, one tuple a property in the catalogue's order."""
+class Object(Entry):
+    """One object (or part of one); tuples have one entry a property, in the catalogue's order."""
 
     object_id: str
     name: str
-    material: str
-    part_of: str
-    part: str
+    material: str = ""
+    part_of: str = ""
+    part: str = ""
     splits: dict[str, Part]
+    """By the name of the split."""
     ratings: tuple[tuple[int, ...], ...]
+    stated: tuple[int | None, ...] = ()
+    """The final labels that the publishers state; None where they state none. `labels` never depends on them."""
+    description: str = ""
+    """In the publishers' words; empty where there is none."""
 
     @property
     def labels(self) -> tuple[int, ...]:
@@ -94,7 +51,7 @@ class Object(_Entry):
         return tuple(math.floor(sum(r) / len(r) + 0.5) for r in self.ratings)
 
 
-class Catalogue(_Entry):
+class Catalogue(Entry):
     """A data set's objects and the language for them."""
 
     language: Language
@@ -109,6 +66,11 @@ class Catalogue(_Entry):
     def property_names(self) -> tuple[str, ...]:
         """Their names, in the same order."""
         return tuple(p.name for p in self.properties)
+
+    @property
+    def split_names(self) -> tuple[str, ...]:
+        """The splits that objects.csv has columns for, in the columns' order."""
+        return tuple(next(iter(self.objects.values())).splits)
 
     def labels(self, object_id: str) -> tuple[int, ...]:
         """The class of each property of one object."""
@@ -143,62 +105,115 @@ class Catalogue(_Entry):
 
 
 def load_catalogue(folder: Path) -> Catalogue:
-    """Read `folder/properties.yaml` and `folder/objects.csv`.
+    """Read `properties.yaml`, `objects.csv` and, where it is there, `descriptions.csv` of a folder.
 
     Raises:
-        UserError: naming the file, line and mend, for a missing file or column, an object listed twice, a rating
-            outside the classes or an unknown part of a split.
+        UserError: naming the file, line and mend, for a missing file or column, an object listed twice, two objects
+            of one name, a rating or stated label outside the classes, an unknown part of a split, or a description of
+            an object that is not listed.
     """
-    language_file, objects_file = folder / "properties.yaml", folder / "objects.csv"
-    for file in (language_file, objects_file):
-        if not file.is_file():
+    for name in (PROPERTIES, OBJECTS):
+        if not (folder / name).is_file():
             raise UserError(
-                f"{file}: no such file; data.catalogue must name a folder with objects.csv and properties.yaml"
+                f"{folder / name}: no such file; data.catalogue must name a folder with {OBJECTS} and {PROPERTIES}"
             )
-    try:
-        language = Language.model_validate(yaml.safe_load(language_file.read_text(encoding="utf-8")))
-    except (ValidationError, yaml.YAMLError) as error:
-        raise UserError(f"{language_file}: {' '.join(str(error).split())[:300]}") from None
+    language = _read_language(folder / PROPERTIES)
+    header, rows = read_sheet(folder / OBJECTS, ["object_id", "name", *(p.name for p in language.properties)])
+    splits = _split_columns(folder / OBJECTS, header, language)
+    entries = [(where, _read_object(row, language, splits, where)) for where, row in rows]
+    if not entries:
+        raise UserError(f"{folder / OBJECTS}: lists no object; add one line an object")
     objects: dict[str, Object] = {}
-    with objects_file.open(encoding="utf-8", newline="") as stream:
-        reader = csv.DictReader(stream)
-        wanted = [*FIXED_COLUMNS, *(p.name for p in language.properties)]
-        missing = [c for c in wanted if c not in (reader.fieldnames or ())]
-        if missing:
-            raise UserError(f"{objects_file}: column {', '.join(missing)} is missing; expected {', '.join(wanted)}")
-        for number, row in enumerate(reader, 2):
-            entry = _read_object(row, language, f"{objects_file}, line {number}")
-            if entry.object_id in objects:
-                raise UserError(
-                    f"{objects_file}, line {number}: {entry.object_id} is listed twice, so it could stand in two "
-                    "splits; keep one line an object"
-                )
-            objects[entry.object_id] = entry
-    if not objects:
-        raise UserError(f"{objects_file}: lists no object; add one line an object")
+    names: dict[str, str] = {}
+    for where, entry in entries:
+        if entry.object_id in objects:
+            raise UserError(
+                f"{where}: {entry.object_id} is listed twice, so it could stand in two splits; keep one line an object"
+            )
+        objects[entry.object_id] = entry
+        twin = names.setdefault(entry.name.lower(), entry.object_id)
+        if twin != entry.object_id:
+            raise UserError(
+                f"{where}: {entry.name!r} is also the name of {twin}; give each object a name of its own, since "
+                "matching questions tell objects apart by name"
+            )
+    for object_id, text in _read_descriptions(folder / DESCRIPTIONS, objects).items():
+        objects[object_id] = objects[object_id].model_copy(update={"description": text})
     return Catalogue(language=language, objects=objects)
 
 
-def _read_object(row: dict[str, str], language: Language, where: str) -> Object:
-    ratings = []
-    for p in language.properties:
-        try:
-            values = tuple(int(word) for word in row[p.name].split())
-        except (ValueError, AttributeError):
-            values = ()
-        if not values or not all(0 <= v < len(p.levels) for v in values):
+def _read_language(file: Path) -> Language:
+    try:
+        return Language.model_validate(yaml.safe_load(file.read_text(encoding="utf-8")))
+    except ValidationError as error:
+        detail = error.errors(include_url=False)[0]
+        key = ".".join(str(part) for part in detail["loc"])
+        message = detail["msg"].removeprefix("Value error, ")
+        raise UserError(f"{file}: {f'{key}: ' if key else ''}{' '.join(message.split())}") from None
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        raise UserError(f"{file}: {' '.join(str(error).split())[:300]}") from None
+
+
+def _split_columns(file: Path, header: Sequence[str], language: Language) -> dict[str, str]:
+    """Column to split; `label_` columns are looked at too, so that no misspelt one is passed over in silence."""
+    names = [p.name for p in language.properties]
+    for column in header:
+        if column.startswith("label_") and column.removeprefix("label_") not in names:
+            raise UserError(f"{file}: column {column} names no property; allowed: label_ and {', '.join(names)}")
+    splits = {column: column.removeprefix("split_") for column in header if column.startswith("split_")}
+    for column, name in splits.items():
+        if name in RULED_SPLITS or not re.fullmatch(r"[a-z][a-z0-9_]*", name):
             raise UserError(
-                f"{where}: {p.name} is {row[p.name]!r}; write the annotators' ratings as numbers from 0 to "
-                f"{len(p.levels) - 1} separated by spaces"
+                f"{file}: column {column}: a split's name begins with a small letter, goes on with those, digits or _, "
+                f"and is neither {' nor '.join(RULED_SPLITS)}; rename it"
+            )
+    return splits
+
+
+def _read_object(row: Row, language: Language, splits: dict[str, str], where: str) -> Object:
+    if not row["object_id"] or not row["name"]:
+        raise UserError(f"{where}: object_id and name must not be empty")
+    ratings, stated = [], []
+    for p in language.properties:
+        most = len(p.levels) - 1
+        values = _classes(row[p.name], most)
+        if not values:
+            raise UserError(
+                f"{where}: {p.name} is {row[p.name]!r}; write the annotators' ratings as numbers from 0 to {most} "
+                "separated by spaces"
             )
         ratings.append(values)
-    splits = {}
-    for column in ("split_paper", "split_release"):
+        label = row.get(f"label_{p.name}", "")
+        final = _classes(label, most)
+        if label and len(final) != 1:
+            raise UserError(f"{where}: label_{p.name} is {label!r}; write one number from 0 to {most}, or nothing")
+        stated.append(final[0] if final else None)
+    parts = {}
+    for column, name in splits.items():
         value = row[column] or Part.UNUSED
         if value not in set(Part):
             raise UserError(f"{where}: {column} is {value!r}; allowed: {', '.join(Part)}")
-        splits[column.removeprefix("split_")] = Part(value)
-    if not row["object_id"] or not row["name"]:
-        raise UserError(f"{where}: object_id and name must not be empty")
-    fields = {key: row[key] for key in ("object_id", "name", "material", "part_of", "part")}
-    return Object(**fields, splits=splits, ratings=tuple(ratings))
+        parts[name] = Part(value)
+    fields = {key: row.get(key, "") for key in ("object_id", "name", "material", "part_of", "part")}
+    return Object(**fields, splits=parts, ratings=tuple(ratings), stated=tuple(stated))
+
+
+def _classes(text: str, most: int) -> tuple[int, ...]:
+    """The numbers of a cell; empty where one is none, or no class."""
+    words = text.split()
+    values = tuple(int(word) for word in words if re.fullmatch(r"[0-9]+", word))
+    return values if len(values) == len(words) and all(v <= most for v in values) else ()
+
+
+def _read_descriptions(file: Path, objects: dict[str, Object]) -> dict[str, str]:
+    """Object id to its publishers' description; nothing where there is no such file."""
+    described: dict[str, str] = {}
+    rows = read_sheet(file, ["object_id", "description"])[1] if file.is_file() else []
+    for where, row in rows:
+        object_id = row["object_id"]
+        if object_id not in objects:
+            raise UserError(f"{where}: {object_id!r} is not in {file.with_name(OBJECTS)}; correct or remove the line")
+        if object_id in described:
+            raise UserError(f"{where}: {object_id} is described twice; keep one line an object")
+        described[object_id] = row["description"]
+    return described

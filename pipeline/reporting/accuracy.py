@@ -10,24 +10,23 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from pipeline.evaluation.statistics import Outcome, Spread, proportion
 from pipeline.records import Score
-from pipeline.reporting.published import MODELS, Published, find
+from pipeline.reporting.published import Published
 from pipeline.reporting.table import number, span
+from pipeline.statistics import Outcome, Spread, proportion
 
 
 @dataclass(frozen=True)
 class Cell:
     """Where a row stands and what it is measured against."""
 
-    table: str
     row: str
     system: str
-    """Name in published.csv."""
-    label: str
     """Name for reading."""
     chance: float
     """Accuracy of a uniform guess, from 0 to 1."""
+    published: tuple[Published | None, Published | None]
+    """The paper's cells for its 7b and its 13b model."""
 
 
 @dataclass(frozen=True)
@@ -99,14 +98,13 @@ def accuracy_row(cell: Cell, by_seed: Mapping[int, Sequence[Score]], note: str =
     """
     graded = {seed: scores for seed, scores in by_seed.items() if scores}
     every = [score for scores in graded.values() for score in scores]
-    # A published figure without a model (the fine-tuned CLIP) stands under both, since both were built on it.
-    one, two = (find(cell.table, cell.row, cell.system, m) or find(cell.table, cell.row, cell.system) for m in MODELS)
+    one, two = cell.published
     measured = proportion(_outcomes(every)) if every else None
     spread = Spread(tuple(_share(s.correct for s in scores) for scores in graded.values())) if every else None
     clustered = measured.clustered if measured else None
     return AccuracyRow(
         row=cell.row,
-        system=cell.label,
+        system=cell.system,
         value=100 * measured.value if measured else None,
         k=round(measured.correct, 2) if measured else None,
         n=measured.n if measured else None,

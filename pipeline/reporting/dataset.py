@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from statistics import fmean, median
 
-from pipeline.evaluation.statistics import confusion, icc3k
 from pipeline.records import Part
 from pipeline.reporting.inputs import Inputs, no_test_videos
-from pipeline.reporting.published import find
 from pipeline.reporting.table import Table, number
+from pipeline.statistics import confusion, icc3k
+
+OF_PAPER = (
+    " The paper's printed counts do not follow from its own printed ratings.",
+    "; the published ones are of the real videos",
+    " that the paper prints",
+)
+"""What captions add (counts, lengths, ratings) where the paper's figures stand beside the measured ones."""
+MOST_COMBINATIONS = 256
+"""Up to so many combinations of classes the table lists all of them, beyond only those that an object has."""
 
 
 @dataclass(frozen=True)
@@ -109,12 +118,12 @@ class ConfusionRow:
 
 def dataset_tables(inputs: Inputs) -> list[Table]:
     """All tables of this module."""
+    counts, lengths, ratings = OF_PAPER if inputs.of_paper else ("", "", " in objects.csv")
     return [
         Table(
             "property_counts",
             "Property categories",
-            "Objects a class: the rounded mean of the annotators' ratings, over the whole catalogue. The paper's "
-            "printed counts do not follow from its own printed ratings.",
+            f"Objects a class: the rounded mean of the annotators' ratings, over the whole catalogue.{counts}",
             _counts(inputs),
         ),
         Table(
@@ -126,13 +135,13 @@ def dataset_tables(inputs: Inputs) -> list[Table]:
         Table(
             "video_lengths",
             "Video lengths",
-            "Frames that really decode, over the videos of this run; the published ones are of the real videos.",
+            f"Frames that really decode, over the videos of this run{lengths}.",
             _lengths(inputs),
         ),
         Table(
             "annotator_agreement",
             "Annotator agreement",
-            "ICC(3,k), recomputed from the ratings that the paper prints; n: objects.",
+            f"ICC(3,k), recomputed from the ratings{ratings}; n: objects.",
             _agreement(inputs),
         ),
         Table(
@@ -161,7 +170,7 @@ def _counts(inputs: Inputs) -> list[CountRow]:
         for level, name in enumerate(p.levels):
             members = [o for o in catalogue.objects if catalogue.labels(o)[index] == level]
             of_part = Counter(parts.get(o) for o in members)
-            count, percent = (find("property_counts", name, what) for what in ("count", "percent"))
+            count, percent = (inputs.published("property_counts", name, what) for what in ("count", "percent"))
             rows.append(
                 CountRow(
                     property=p.name,
@@ -185,9 +194,12 @@ def _combinations(inputs: Inputs) -> list[CombinationRow]:
     every = Counter(map(catalogue.labels, catalogue.objects))
     filmed = Counter(catalogue.labels(o) for o in catalogue.objects if o in present)
     rows = []
-    for levels in itertools.product(*(range(len(p.levels)) for p in catalogue.properties)):
+    # With many properties most combinations have no object, and a row each would bury the others.
+    few = math.prod(len(p.levels) for p in catalogue.properties) <= MOST_COMBINATIONS
+    possible = itertools.product(*(range(len(p.levels)) for p in catalogue.properties))
+    for levels in possible if few else sorted(every):
         words = ", ".join(p.levels[level] for p, level in zip(catalogue.properties, levels, strict=True))
-        printed = find("property_combinations", words, "count")
+        printed = inputs.published("property_combinations", words, "count")
         rows.append(CombinationRow(words, every[levels], filmed[levels], printed.value if printed else None))
     return rows
 
@@ -200,7 +212,9 @@ def _lengths(inputs: Inputs) -> list[FigureRow]:
         "minimum": float(min(lengths)),
         "maximum": float(max(lengths)),
     }
-    return [_figure("video_lengths", row, "frames", value, len(lengths), "frames") for row, value in values.items()]
+    return [
+        _figure(inputs, "video_lengths", row, "frames", value, len(lengths), "frames") for row, value in values.items()
+    ]
 
 
 def _agreement(inputs: Inputs) -> list[FigureRow]:
@@ -213,7 +227,7 @@ def _agreement(inputs: Inputs) -> list[FigureRow]:
         note = (
             "" if value is not None else "undefined: objects differ in their number of ratings, or not in their ratings"
         )
-        rows.append(_figure("annotator_agreement", name, "icc3k", value, len(objects), "ICC(3,k)", note))
+        rows.append(_figure(inputs, "annotator_agreement", name, "icc3k", value, len(objects), "ICC(3,k)", note))
     return rows
 
 
@@ -228,6 +242,8 @@ def _confusions(inputs: Inputs) -> list[ConfusionRow]:
     ]
 
 
-def _figure(table: str, row: str, system: str, value: float | None, n: int, unit: str, note: str = "") -> FigureRow:
-    printed = find(table, row, system)
+def _figure(
+    inputs: Inputs, table: str, row: str, system: str, value: float | None, n: int, unit: str, note: str = ""
+) -> FigureRow:
+    printed = inputs.published(table, row, system)
     return FigureRow(row, value, n, unit, printed.value if printed else None, printed.n if printed else None, note)

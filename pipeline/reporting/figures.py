@@ -25,6 +25,8 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 FEWEST_FOR_TSNE = 5
 LARGEST_PERPLEXITY = 30
 DPI = 150
+MOST_ACROSS = 4
+"""Panels in a row; further ones go below."""
 MOST_MARKED = 40
 """Points up to which a curve shows them."""
 
@@ -55,7 +57,8 @@ def draw_confusion(
     """One matrix a property (rated down, predicted across); numbers are videos, shades the share of the row."""
     import numpy as np
 
-    figure, panels = _panels(len(properties), 3.9, 3.7)
+    most = max(len(p.levels) for p in properties)
+    figure, panels = _panels(len(properties), max(3.9, 0.95 * most), max(3.7, 0.9 * most))
     for axes, p, matrix in zip(panels, properties, map(np.array, counts), strict=True):
         shares = matrix / np.maximum(matrix.sum(axis=1, keepdims=True), 1)
         axes.imshow(shares, cmap="Blues", vmin=0, vmax=1)
@@ -91,8 +94,8 @@ def draw_embedding_map(
             axes.scatter(
                 places[chosen, 0],
                 places[chosen, 1],
-                c=COLOURS[level % len(COLOURS)],
-                marker=MARKERS[level % len(MARKERS)],
+                c=_colour(level),
+                marker=_marker(level),
                 s=42,
                 edgecolors="white",
                 linewidths=0.5,
@@ -131,10 +134,10 @@ def draw_curves(path: Path, panels: Sequence[Panel], footer: str) -> None:
     figure, places = _panels(len(panels), 3.9, 3.9)
     for axes, panel in zip(places, panels, strict=True):
         labels = list(dict.fromkeys(curve.label for curve in panel.curves))
-        colours = {label: COLOURS[i % len(COLOURS)] for i, label in enumerate(labels)}
+        colours = {label: _colour(i) for i, label in enumerate(labels)}
         # Hollow shapes show lines that lie on each other, and a curve of one point.
         marked = max((len(curve.points) for curve in panel.curves), default=0) <= MOST_MARKED
-        shapes = {label: MARKERS[i % len(MARKERS)] if marked else "" for i, label in enumerate(labels)}
+        shapes = {label: _marker(i) if marked else "" for i, label in enumerate(labels)}
         for curve in panel.curves:
             steps, values = [m.step for m in curve.points], [m.value for m in curve.points]
             style, marker, colour = "--" if curve.dashed else "-", shapes[curve.label], colours[curve.label]
@@ -191,9 +194,23 @@ def _panels(count: int, width: float, height: float) -> tuple[Figure, Sequence[A
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width * count, height), layout="constrained")
+    across = min(count, MOST_ACROSS)
+    down = -(-count // across)
+    figure = Figure(figsize=(width * across, height * down), layout="constrained")
     FigureCanvasAgg(figure)
-    return figure, figure.subplots(1, count, squeeze=False)[0]
+    panels = list(figure.subplots(down, across, squeeze=False).flat)
+    for unused in panels[count:]:
+        unused.remove()
+    return figure, panels[:count]
+
+
+def _colour(number: int) -> str:
+    return COLOURS[number % len(COLOURS)]
+
+
+def _marker(number: int) -> str:
+    # Shifted by one each time that the colours begin anew, so that no pair of colour and shape soon comes again.
+    return MARKERS[(number + number // len(COLOURS)) % len(MARKERS)]
 
 
 def _save(figure: Figure, path: Path, footer: str) -> None:

@@ -6,11 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.artifacts import read_jsonl, read_table
+from pipeline.artifacts import read_csv, read_jsonl, read_table
 from pipeline.config import Params
 from pipeline.physiclear.catalogue import Catalogue, load_catalogue
 from pipeline.plan import Encoder, Lora
-from pipeline.records import Assignment, Classification, Opd, Part, Question, Score, Task, Video
+from pipeline.records import Assignment, Classification, Finding, Opd, Part, Question, Score, Task, Video
+from pipeline.reporting.published import DATASET, Published, find
 from pipeline.splits import assign
 
 Axes = tuple[Encoder, Lora, Opd]
@@ -32,6 +33,17 @@ class Inputs:
     """By variant; only of `questions`."""
     classifications: Mapping[int, Sequence[Classification]]
     """By encoder seed: what the heads say about test videos."""
+    findings: Sequence[Finding]
+    """The data audit's."""
+
+    @property
+    def of_paper(self) -> bool:
+        """Whether the catalogue is of the data set that the paper's figures are about."""
+        return self.catalogue.language.dataset == DATASET
+
+    def published(self, table: str, row: str, system: str, model: str = "") -> Published | None:
+        """The paper's cell, or None where it has none or is about another data set."""
+        return find(table, row, system, model) if self.of_paper else None
 
     @property
     def axes(self) -> list[Axes]:
@@ -63,6 +75,7 @@ def read_inputs(params: Params, root: Path) -> Inputs:
         if q.part == Part.TEST
     }
     files = {key: data / "scores" / key / "scores.parquet" for key in params.plan.variants}
+    audit = data / "audit" / "audit.csv"
     judged = {seed: data / "encoder" / str(seed) / "classifications.parquet" for seed in params.plan.encoder_seeds}
     return Inputs(
         params=params,
@@ -81,6 +94,7 @@ def read_inputs(params: Params, root: Path) -> Inputs:
             for seed, file in judged.items()
             if file.is_file()
         },
+        findings=read_csv(audit, Finding) if audit.is_file() else (),
     )
 
 
@@ -98,6 +112,8 @@ def why_empty(inputs: Inputs, axes: Axes, task: Task) -> str:
         return no_test_videos(inputs)
     if inputs.params.questions.evaluation.by_task()[task] == 0:
         return f"questions.evaluation.{task.lower()} is 0"
+    if task is Task.PSR and not inputs.catalogue.language.scenarios:
+        return "properties.yaml lists no scenario"
     return f"the test objects with videos ({', '.join(inputs.test_objects)}) allow no {task} question"
 
 

@@ -22,9 +22,11 @@ READING = """\
 - **Chance** is a uniform guess; **Majority** the best constant answer in hindsight, on the same questions.
 - **Unparsed %** are answers that no choice could be read from; they count as wrong. **Truncated %** ran into the
   limit of `language.max_new_tokens`.
+{published}- An empty cell was not measured; *Note* says why.
+"""
+PUBLISHED = """\
 - **Published** are the paper's figures with the n that they fit and its Wilson interval. They were measured with other
   models on other questions: they stand beside the measured figures and are no part of them.
-- An empty cell was not measured; *Note* says why.
 """
 SMOKE = "\n> **Scale `smoke`: its figures prove nothing but that the chain runs.**\n"
 
@@ -60,7 +62,7 @@ def render_page(inputs: Inputs, origin: Provenance, tables: Sequence[Table], pic
             f"# Report: scale {origin.scale}, source {origin.source}, split {origin.split}\n{smoke}",
             _test_set(inputs),
             f"## Contents\n\n{contents}",
-            f"## How to read it\n\n{READING}",
+            f"## How to read it\n\n{READING.format(published=PUBLISHED if inputs.of_paper else '')}",
             *sections,
             f"## Provenance\n\n{_origin(origin)}",
         ]

@@ -11,8 +11,10 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from pipeline.evaluation.statistics import Interval, wilson
+from pipeline.statistics import Interval, wilson
 
+DATASET = "PhysiCLeAR"
+"""The data set of the paper's figures, as properties.yaml names it; beside those of another they would mislead."""
 FILE = Path(__file__).with_name("published.csv")
 MODELS = ("7b", "13b")
 

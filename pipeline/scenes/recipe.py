@@ -53,7 +53,8 @@ def recipe_of(object_id: str, catalogue: Catalogue, seed: int) -> Recipe:
     """The parameters of an object of the catalogue.
 
     Raises:
-        UserError: where the catalogue's properties are not the three that scenes are made from.
+        UserError: where the catalogue lacks one of the three properties that scenes are made from, or has it with
+            other than three classes. Further properties leave no trace in a scene.
     """
     levels = dict(zip(catalogue.property_names, catalogue.labels(object_id), strict=True))
     three = {p.name for p in catalogue.properties if len(p.levels) == 3}

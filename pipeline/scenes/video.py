@@ -16,7 +16,6 @@ import numpy as np
 import numpy.typing as npt
 from tqdm import tqdm
 
-from pipeline.config import ScenesConfig
 from pipeline.errors import UserError
 from pipeline.physiclear.catalogue import Catalogue
 from pipeline.runtime import cores, derive_seed
@@ -24,6 +23,7 @@ from pipeline.scenes.contact import indentation, press
 from pipeline.scenes.geometry import IMAGE_MM, Heights, heights
 from pipeline.scenes.light import Image, Sensor, make_sensor, shade
 from pipeline.scenes.recipe import Recipe, recipe_of
+from pipeline.sections import ScenesConfig
 
 cv2.setNumThreads(1)  # Videos are what runs in parallel.
 

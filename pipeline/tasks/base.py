@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from pipeline.physiclear.catalogue import Catalogue, Property
+from pipeline.physiclear.words import mentioned, plain
 from pipeline.records import Dialogue, Gold, Opd, Part, Prediction, Question, Score, Task, Turn
 
 LETTERS = "abc"
@@ -102,16 +103,8 @@ def conclusion(text: str) -> str:
 
 def find_level(text: str, prop: Property) -> int | None:
     """The one class of `prop` that `text` names as a whole phrase; None where it names none or several."""
-    # Longest first, so that "moderately hard" is not read as "hard", whatever stands between its words.
-    names = [_plain(level) for level in prop.levels]
-    either = "|".join(re.escape(name) for name in sorted(names, key=len, reverse=True))
-    levels = {names.index(name) for name in re.findall(rf"\b(?:{either})\b", _plain(text))}
-    return levels.pop() if len(levels) == 1 else None
-
-
-def _plain(text: str) -> str:
-    """In small letters, with one space wherever spaces, line breaks or hyphens stood."""
-    return " ".join(re.split(r"[\s-]+", text.lower()))
+    named = mentioned(text, prop.levels)
+    return list(map(plain, prop.levels)).index(named[0]) if len(named) == 1 else None
 
 
 def choice_score(question: Question, prediction: Prediction, predicted: str | None) -> list[Score]:

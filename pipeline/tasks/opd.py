@@ -7,6 +7,7 @@ import random
 import re
 
 from pipeline.physiclear.catalogue import Catalogue
+from pipeline.physiclear.language import OPENING
 from pipeline.records import Opd, Prediction, Question, Score, Task
 from pipeline.tasks.base import Draft, Pool, draw_videos, find_level, gold, single_turn
 
@@ -37,9 +38,9 @@ class ObjectPropertyDescription:
         )
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
-        """One score a property, read from the closing "Overall" sentence, and `combined` for all at once."""
+        """One score a property, read from the closing sentence ("Overall ..."), and `combined` for all at once."""
         # Before that sentence an answer describes freely, in words that may name a class in passing.
-        closing = "".join(re.split(r"\boverall\b", prediction.outputs[0], flags=re.IGNORECASE)[1:][-1:])
+        closing = "".join(re.split(rf"\b{OPENING}\b", prediction.outputs[0], flags=re.IGNORECASE)[1:][-1:])
         expected = question.gold.labels[0]
         predicted = [find_level(closing, p) for p in catalogue.properties]
         scores = [

@@ -51,12 +51,12 @@ class PropertyComparison:
         verdict = {
             "yes": f"Yes, the first object is {comparative}.",
             "no": f"No, the second object is {comparative}.",
-            "same": f"Both objects have the same {prop.name}.",
+            "same": f"Both objects have the same {prop.spoken}.",
         }[choice]
         prefixes = [f"{o} object:" for o in ORDINALS]
         user = {
             Opd.NONE: ask,
-            Opd.NEEDED: f"{ask} Describe the {prop.name} of both objects before answering.",
+            Opd.NEEDED: f"{ask} Describe the {prop.spoken} of both objects before answering.",
             Opd.ALL: f"{ask} Describe both objects before answering.",
         }
         answer = {

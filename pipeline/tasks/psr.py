@@ -37,13 +37,15 @@ class PropertyScenarioReasoning:
         if position == 1:
             objects.reverse()
         names = [p for p in catalogue.property_names if p in scenario.target or p in scenario.other]
+        spoken = {p.name: p.spoken for p in catalogue.properties}
+        reasons, aspects = (" and ".join(spoken[p] for p in chosen) for chosen in (scenario.target, names))
         prefixes = [f"{letter})" for letter in LETTERS[:2]]
-        verdict = f"The most suitable object is {LETTERS[position]}), because of its {' and '.join(scenario.target)}."
+        verdict = f"The most suitable object is {LETTERS[position]}), because of its {reasons}."
         with_opd = REQUEST.format(question=scenario.question, based=BASED)
         second = Turn(user=with_opd, assistant=verdict)
         first = {
             Opd.NEEDED: Turn(
-                user=f"Describe the {' and '.join(names)} of these two tactile videos: {lettered(2)}.",
+                user=f"Describe the {aspects} of these two tactile videos: {lettered(2)}.",
                 assistant=descriptions(catalogue, objects, prefixes, names),
             ),
             Opd.ALL: Turn(

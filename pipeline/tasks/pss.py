@@ -55,7 +55,7 @@ class PropertySuperlativeSelection:
         prefixes = [f"{letter})" for letter in LETTERS]
         user = {
             Opd.NONE: f"{opening} {request[0].upper()}{request[1:]}",
-            Opd.NEEDED: f"{opening} Describe the {prop.name} of each object and then {request}",
+            Opd.NEEDED: f"{opening} Describe the {prop.spoken} of each object and then {request}",
             Opd.ALL: f"{opening} Describe each object and then {request}",
         }
         answer = {

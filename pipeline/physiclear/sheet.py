@@ -1,0 +1,47 @@
+"""CSV files that people write by hand or in a spreadsheet, read with the place of every line."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from itertools import zip_longest
+from pathlib import Path
+
+from pipeline.errors import UserError
+
+Row = dict[str, str]
+
+
+def read_sheet(file: Path, needed: Sequence[str]) -> tuple[list[str], list[tuple[str, Row]]]:
+    """The header, and each line with its place as an error names it.
+
+    Cells are stripped and absent ones empty; empty lines are passed over, and other columns than `needed` are kept.
+
+    Raises:
+        UserError: naming the file (and line) and mend, for a missing or repeated column, a line with more fields than
+            columns, or a file that is no CSV in UTF-8.
+    """
+    rows = []
+    # Spreadsheets put a byte order mark before their UTF-8, and commas alone on lines that once held something.
+    with file.open(encoding="utf-8-sig", newline="") as stream:
+        reader = csv.reader(stream)
+        try:
+            header = [cell.strip() for cell in next(reader, [])]
+            missing = [c for c in needed if c not in header]
+            if missing:
+                expected = f"expected {', '.join(needed)}, separated by commas"
+                raise UserError(f"{file}: column {', '.join(missing)} is missing; {expected}")
+            twice = [c for c in header if c and header.count(c) > 1]
+            if twice:
+                raise UserError(f"{file}: column {twice[0]} stands twice; remove one")
+            for cells in reader:
+                where = f"{file}, line {reader.line_num}"
+                if len(cells) > len(header):
+                    fields = f"{len(cells)} fields for {len(header)} columns"
+                    raise UserError(f"{where}: {fields}; put a text that has commas between quotation marks")
+                stripped = [cell.strip() for cell in cells]
+                if any(stripped):
+                    rows.append((where, dict(zip_longest(header, stripped, fillvalue=""))))
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise UserError(f"{file}: no CSV in UTF-8 ({error}); save it as such") from None
+    return header, rows
