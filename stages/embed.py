@@ -4,8 +4,8 @@ import sys
 from pathlib import Path
 
 from pipeline.artifacts import read_table, save_tensors, write_table
-from pipeline.data.clips import FrameStore
 from pipeline.data.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE
+from pipeline.frames.store import FrameStore
 from pipeline.models.tactile_encoder import base_encoder, load_trainable, property_classifier
 from pipeline.models.weights import check_encoder
 from pipeline.physiclear.catalogue import load_catalogue
@@ -33,7 +33,7 @@ def main() -> None:
         assignments = read_table(DATA / "splits.parquet", Assignment)
         tensor, index = embed_videos(
             encoder,
-            FrameStore(DATA / "frames"),
+            FrameStore(DATA / "frames", params.encoder.reference),
             assignments,
             batch_size=params.encoder.embed_batch_size,
             device=resolve_device(params.runtime.device),

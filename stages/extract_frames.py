@@ -1,18 +1,30 @@
-"""Keep each video's salient frames."""
+"""Decode every video once: list what decodes, keep the frames that matter, measure for the audit."""
 
 from pathlib import Path
 
-from pipeline.artifacts import read_table
-from pipeline.frames import extract_frames
+from pipeline.artifacts import write_table
+from pipeline.frames.extract import extract_frames
+from pipeline.physiclear.catalogue import load_catalogue
 from pipeline.records import Video
+from pipeline.runtime import CHECKPOINTS
 from pipeline.stage import DATA, stage
 
 
 def main() -> None:
     with stage("extract_frames") as run:
-        videos = read_table(DATA / "videos.parquet", Video)
-        frames = extract_frames(videos, Path(run.params.data.dir), run.params.frames, DATA / "frames")
-        run.metrics["salient_frames"] = len(frames)
+        data = run.params.data
+        found = extract_frames(
+            Path(data.dir),
+            load_catalogue(Path(data.catalogue)),
+            run.params.frames,
+            DATA / "frames",
+            CHECKPOINTS / "extract_frames",
+        )
+        write_table(DATA / "videos.parquet", Video, found.videos)
+        run.metrics["videos"] = len(found.videos)
+        run.metrics["objects"] = len({v.object_id for v in found.videos})
+        run.metrics["frames"] = sum(v.frames for v in found.videos)
+        run.metrics["kept_frames"] = len(found.frames)
 
 
 if __name__ == "__main__":

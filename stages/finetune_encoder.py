@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 from pipeline.artifacts import read_table, write_table
-from pipeline.data.clips import FrameStore
+from pipeline.frames.store import FrameStore
 from pipeline.models.tactile_encoder import save_trainable
 from pipeline.models.weights import check_encoder
 from pipeline.physiclear.catalogue import load_catalogue
@@ -21,7 +21,7 @@ def main() -> None:
         params = run.params
         check_encoder(Path(params.encoder.weights), params.frames.size)
         data = EncoderData(
-            store=FrameStore(DATA / "frames"),
+            store=FrameStore(DATA / "frames", params.encoder.reference),
             catalogue=load_catalogue(Path(params.data.catalogue)),
             assignments=read_table(DATA / "splits.parquet", Assignment),
             per_video=params.frames.per_video,

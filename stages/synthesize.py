@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from pipeline.config import SCENES_DIR
 from pipeline.physiclear.catalogue import load_catalogue
 from pipeline.scenes.video import synthesize
+from pipeline.sections import SCENES_DIR
 from pipeline.stage import stage
 
 
