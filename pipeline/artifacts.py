@@ -6,6 +6,7 @@ Tables are Parquet with one column a field, dialogues are JSON lines, weights ar
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import types
@@ -113,6 +114,25 @@ def read_table(path: Path, model: type[R]) -> list[R]:
             f"{path}: columns {table.schema.names}, expected {list(model.model_fields)}; delete it and run `dvc repro`"
         )
     return [model.model_validate(row) for row in table.to_pylist()]
+
+
+def write_csv(path: Path, model: type[R], records: Iterable[R]) -> None:
+    """Write records of plain fields as CSV, one column a field, atomically."""
+    with atomic(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.DictWriter(stream, fieldnames=list(model.model_fields), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(record.model_dump(mode="json") for record in records)
+
+
+def read_csv(path: Path, model: type[R]) -> list[R]:
+    """Read what `write_csv` wrote; a missing file or a row that is no `model` is a UserError."""
+    try:
+        with path.open(encoding="utf-8", newline="") as stream:
+            return [model.model_validate(row) for row in csv.DictReader(stream)]
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file; `dvc repro` makes it") from None
+    except ValidationError as error:
+        raise UserError(f"{path}: not a table of {model.__name__} ({_first(error)}); run `dvc repro`") from None
 
 
 def save_tensors(path: Path, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, str] | None = None) -> None:

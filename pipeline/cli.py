@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pipeline.errors import UserError
+
+if TYPE_CHECKING:
+    from pipeline.records import Finding
 
 app = typer.Typer(
     help="Teach a language model the sense of touch.", no_args_is_help=True, pretty_exceptions_enable=False
@@ -36,20 +40,47 @@ def scale(
     typer.echo(f"`dvc repro` runs it; its tables go to reports/{params.report_name}/")
 
 
+CATALOGUE = typer.Option(help="Folder with objects.csv and properties.yaml.")
+
+
 @data_app.command()
 def check(
     folder: Annotated[Path, typer.Argument(help="Folder with the videos.")],
-    catalogue: Annotated[Path, typer.Option(help="Folder with objects.csv and properties.yaml.")] = Path(
-        "pipeline/physiclear"
-    ),
+    catalogue: Annotated[Path, CATALOGUE] = Path("pipeline/physiclear"),
 ) -> None:
-    """Look at every video of a folder and list all that is wrong with it; status 1 where something must be mended."""
+    """List every file of a folder that is wrong or odd; status 1 where something must be mended."""
+    from pipeline.audit.run import check_folder
     from pipeline.physiclear.catalogue import load_catalogue
-    from pipeline.videos import inspect
 
-    findings = inspect(folder, load_catalogue(catalogue))
-    for finding in findings:
-        typer.echo(f"{finding.severity:8} {finding.item}: {finding.message}")
+    _show(check_folder(folder, load_catalogue(catalogue)))
+
+
+@data_app.command()
+def audit(
+    folder: Annotated[Path, typer.Argument(help="Folder with the videos.")],
+    catalogue: Annotated[Path, CATALOGUE] = Path("pipeline/physiclear"),
+    split: Annotated[str, typer.Option(help="Also look for leaks between the parts of this split.")] = "",
+    out: Annotated[Path, typer.Option(help="Where all findings go.")] = Path("audit.csv"),
+) -> None:
+    """Measure what can be trusted: files, contact, labels, copies, sessions, leaks; status 1 where errors are found."""
+    from pipeline.artifacts import write_csv
+    from pipeline.audit.run import audit_folder
+    from pipeline.physiclear.catalogue import load_catalogue
+    from pipeline.records import Finding
+    from pipeline.sections import SplitConfig
+
+    # Not validated: a name that no split can have is a finding, like one that this catalogue's splits do not.
+    config = SplitConfig.model_construct(name=split) if split else None
+    findings = audit_folder(folder, load_catalogue(catalogue), config)
+    write_csv(out, Finding, findings)
+    typer.echo(f"{len(findings)} findings in {out}")
+    _show(findings)
+
+
+def _show(findings: Sequence[Finding]) -> None:
+    for f in findings:
+        expected = f" (expected: {f.expected})" if f.expected else ""
+        typer.echo(f"{f.severity:8} {f.check}: {f.item}: {f.measured}{expected}")
     if any(f.severity == "error" for f in findings):
         raise typer.Exit(1)
 

@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 from safetensors.numpy import save_file
 
-from pipeline.artifacts import write_json, write_jsonl, write_table
+from pipeline.artifacts import write_csv, write_json, write_jsonl, write_table
 from pipeline.config import Params
 from pipeline.physiclear.catalogue import Catalogue, load_catalogue
 from pipeline.plan import Variant
@@ -19,11 +19,13 @@ from pipeline.records import (
     Assignment,
     Classification,
     Embedding,
+    Finding,
     Measurement,
     Part,
     Prediction,
     Question,
     Score,
+    Severity,
     Video,
 )
 from pipeline.scales import compose
@@ -59,6 +61,7 @@ def write_chain(root: Path, params: Params, *, objects: Sequence[str] = (), skil
     data = root / "data"
     write_table(data / "videos.parquet", Video, videos)
     write_table(data / "splits.parquet", Assignment, assignments)
+    write_csv(data / "audit" / "audit.csv", Finding, _audit(videos))
     pool = pool_of(Part.TEST, assignments, catalogue)
     questions = build_questions(pool, params.questions.evaluation.by_task(), seed=0, distinct=True)
     write_jsonl(data / "questions" / "evaluation.jsonl", questions)
@@ -112,6 +115,19 @@ def _video(object_id: str, number: int, rng: random.Random) -> Video:
         width=160,
         height=120,
     )
+
+
+def _audit(videos: Sequence[Video]) -> list[Finding]:
+    """A warning that all videos share, one of its own, and what is as it should be."""
+    warning, info = Severity.WARNING, Severity.INFO
+    shared = [
+        Finding(
+            check="contact", item=v.path, measured="not found: strength 0.10", expected="over 0.50", severity=warning
+        )
+        for v in videos
+    ]
+    alone = Finding(check="stated label", item="rug: hardness", measured="soft | low", severity=warning)
+    return [*shared, alone, Finding(check="same content", item="all", measured="0 files", severity=info)]
 
 
 def _classify(a: Assignment, catalogue: Catalogue, skill: float, rng: random.Random) -> list[Classification]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import subprocess
 import sys
 from pathlib import Path
@@ -59,18 +60,97 @@ def test_bad_input_is_one_line_on_stderr_with_status_1(project: Path) -> None:
     assert "did you mean size" in done.stderr
 
 
-def test_data_check_lists_everything(project: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "videos"
-    folder.mkdir()
-    write_video(folder / "baseball_0.avi", moving_square(8))
-    good = RUNNER.invoke(app, ["data", "check", str(folder)])
-    assert good.exit_code == 0, good.output
-    (folder / "potato_0.avi").write_bytes(b"")
-    write_video(folder / "baseball_0.mp4", moving_square(8))
-    bad = RUNNER.invoke(app, ["data", "check", str(folder)])
-    assert bad.exit_code == 1
-    assert "potato_0.avi" in bad.output
-    assert "baseball_0.mp4" in bad.output
+def lines(output: str, severity: str) -> list[str]:
+    return [line for line in output.splitlines() if line.startswith(f"{severity} ")]
+
+
+@pytest.fixture
+def folder(project: Path) -> Path:
+    """Two videos that decode."""
+    for seed, name in enumerate(("baseball_0", "potato_0")):
+        write_video(project / "videos" / f"{name}.avi", moving_square(8, seed))
+    return project / "videos"
+
+
+def test_data_check_passes_what_decodes(folder: Path) -> None:
+    result = RUNNER.invoke(app, ["data", "check", str(folder)])
+    assert result.exit_code == 0, result.output
+    assert lines(result.output, "error") == []
+    assert "resolution: 48x36: 2 videos" in result.output
+    assert "agreement" not in result.output, "labels and leaks are the audit's"
+    assert not Path("audit.csv").exists()
+
+
+def test_data_check_lists_every_error_first(folder: Path) -> None:
+    (folder / "rug_0.avi").write_bytes(b"")
+    (folder / "rug_1.mov").write_bytes(b"no video")
+    (folder / "nameless.avi").write_bytes(b"x")
+    write_video(folder / "baseball_0.mp4.avi", moving_square(8)).rename(folder / "baseball_0.mkv")
+    result = RUNNER.invoke(app, ["data", "check", str(folder)])
+    assert result.exit_code == 1
+    errors = lines(result.output, "error")
+    assert result.output.splitlines()[: len(errors)] == errors
+    assert [line.split(": ")[1] for line in errors] == ["nameless.avi", "baseball_0.avi", "rug_0.avi", "rug_1.mov"]
+    assert "decodes: rug_0.avi: empty (0 bytes); copy it again, or remove it" in errors[2]
+
+
+@pytest.mark.parametrize("command", ["check", "audit"])
+def test_an_empty_folder_is_an_error(project: Path, command: str) -> None:
+    (project / "videos").mkdir()
+    result = RUNNER.invoke(app, ["data", command, "videos"])
+    assert result.exit_code == 1
+    assert len(lines(result.output, "error")) == 1
+    assert "holds no video" in result.output
+
+
+def audited(*arguments: str) -> tuple[int, str, list[dict[str, str]]]:
+    """Status, what was printed, and audit.csv."""
+    result = RUNNER.invoke(app, ["data", "audit", "videos", *arguments, "--out", "found/audit.csv"])
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.output
+    with Path("found/audit.csv").open(newline="", encoding="utf-8") as stream:
+        reader = csv.DictReader(stream)
+        rows = list(reader)
+        assert reader.fieldnames == ["check", "item", "measured", "expected", "severity"]
+    return result.exit_code, result.output, rows
+
+
+def test_data_audit_writes_all_it_shows(folder: Path) -> None:
+    status, output, rows = audited("--split", "paper")
+    assert status == 0
+    assert output.startswith(f"{len(rows)} findings in found/audit.csv")
+    assert len(output.splitlines()) == len(rows) + 1
+    assert {row["severity"] for row in rows} == {"warning", "info"}
+    for check in ("videos per object", "agreement, ICC(3,k)", "same content", "object in two parts", "session"):
+        assert check in {row["check"] for row in rows}
+    for row, line in zip(rows, output.splitlines()[1:], strict=True):
+        assert line.startswith(f"{row['severity']:8} {row['check']}: {row['item']}: {row['measured']}")
+        assert line.endswith(f"(expected: {row['expected']})" if row["expected"] else row["measured"])
+
+
+def test_data_audit_ends_with_status_1_where_parts_share_a_video(folder: Path) -> None:
+    (folder / "bath_towel_0.avi").write_bytes((folder / "baseball_0.avi").read_bytes())
+    status, output, rows = audited("--split", "paper")
+    assert status == 1
+    assert [(row["check"], row["severity"]) for row in rows[:2]] == [
+        ("same content", "error"),
+        ("agreement, ICC(3,k)", "warning"),
+    ]
+    assert len(lines(output, "error")) == 1
+    assert audited()[0] == 0, "without a split it is a warning"
+
+
+@pytest.mark.parametrize("split", ["nonsense", "Not a name!"])
+def test_an_unknown_split_is_a_finding(folder: Path, split: str) -> None:
+    status, _, rows = audited("--split", split)
+    assert status == 1
+    assert [(row["check"], row["item"]) for row in rows if row["severity"] == "error"] == [("split", split)]
+    assert "allowed: paper, release, development, kfold" in rows[0]["measured"]
+
+
+def test_a_missing_catalogue_is_refused(folder: Path) -> None:
+    result = RUNNER.invoke(app, ["data", "audit", str(folder), "--catalogue", "nowhere"])
+    assert isinstance(result.exception, UserError)
+    assert "properties.yaml" in str(result.exception)
 
 
 @pytest.mark.real

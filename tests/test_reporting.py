@@ -15,13 +15,14 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.artifacts import read_table
+from pipeline.artifacts import read_csv, read_table
 from pipeline.config import Params
 from pipeline.errors import UserError
 from pipeline.physiclear.catalogue import load_catalogue
 from pipeline.plan import Encoder, Lora
-from pipeline.records import Assignment, Opd, Part, Score, Task
+from pipeline.records import Assignment, Finding, Opd, Part, Score, Severity, Task
 from pipeline.reporting import write_report
+from pipeline.reporting.audit import MOST_ALIKE, audit_table
 from pipeline.reporting.figures import project
 from pipeline.reporting.inputs import read_inputs, why_empty
 from pipeline.reporting.provenance import provenance
@@ -32,6 +33,7 @@ from tests.fake_chain import fake_params, write_chain
 TABLES = {
     "all_variants",
     "annotator_agreement",
+    "audit",
     "confusion_matrices",
     "encoder_property",
     "encoder_understanding",
@@ -176,6 +178,59 @@ def test_reasons_for_empty_cells(chain: Path, params: Params) -> None:
     (chain / "nothing").mkdir(exist_ok=True)
     with pytest.raises(UserError, match=r"videos\.parquet: no such file"):
         read_inputs(params, chain / "nothing")
+
+
+def test_the_audit_stands_on_the_page_grouped_and_whole_in_the_csv(chain: Path, params: Params) -> None:
+    folder = chain / "reports" / params.report_name
+    findings = read_csv(chain / "data" / "audit" / "audit.csv", Finding)
+    columns = ("check", "item", "measured", "expected", "severity")
+    assert [tuple(row) for row in rows(folder, "audit")] == [columns] * len(findings)
+    assert [Finding.model_validate(row) for row in rows(folder, "audit")] == findings
+    section = (folder / "README.md").read_text().split("\n## Data audit\n")[1].split("\n## ")[0]
+    assert f"0 errors (they stop the chain), {len(findings) - 1} warnings, 1 other findings" in section
+    shown = [line for line in section.splitlines() if line.startswith("| warning")]
+    assert len(shown) == 2
+    contact = [f for f in findings if f.check == "contact"]
+    assert len(contact) > MOST_ALIKE
+    assert f"| {len(contact)} items: {', '.join(f.item for f in contact[:MOST_ALIKE])}, ... |" in shown[0]
+    assert "the first: not found: strength 0.10" in shown[0]
+    assert "soft \\| low" in shown[1]
+    assert "same content" not in section
+
+
+def finding(check: str, item: str, severity: Severity = Severity.WARNING) -> Finding:
+    return Finding(check=check, item=item, measured=f"measured {item}", severity=severity)
+
+
+@pytest.mark.parametrize(("count", "shown"), [(1, 1), (MOST_ALIKE, MOST_ALIKE), (MOST_ALIKE + 1, 1)])
+def test_only_many_findings_of_one_check_are_grouped(count: int, shown: int) -> None:
+    table = audit_table([finding("contact", f"rug_{i}.avi") for i in range(count)])
+    assert len(table.rows) == count
+    assert table.markdown().count("\n| warning") == shown
+
+
+def test_errors_come_first_and_are_never_grouped_with_warnings() -> None:
+    many = [finding("same content", f"rug_{i}.avi") for i in range(MOST_ALIKE)]
+    table = audit_table([*many, finding("same content", "potato_0.avi", Severity.ERROR)])
+    lines = table.markdown().splitlines()[2:]
+    assert len(lines) == MOST_ALIKE + 1
+    assert lines[0].startswith("| error")
+    assert "1 errors (they stop the chain), 12 warnings, 0 other findings" in table.caption
+
+
+def test_an_audit_without_warnings_says_so() -> None:
+    table = audit_table([finding("contact", "all", Severity.INFO)])
+    assert table.markdown() == "Nothing.\n"
+    assert table.csv().splitlines() == ["check,item,measured,expected,severity", "contact,all,measured all,,info"]
+
+
+def test_a_chain_that_was_not_audited_has_no_audit_section(copy: Path, params: Params) -> None:
+    (copy / "data" / "audit" / "audit.csv").unlink()
+    folder = report(copy, params)
+    assert "Data audit" not in (folder / "README.md").read_text()
+    (copy / "data" / "audit" / "audit.csv").write_text("check,item\na,b\n")
+    with pytest.raises(UserError, match=r"audit\.csv: not a table of Finding"):
+        report(copy, params)
 
 
 def test_several_seeds_are_pooled_by_question(tmp_path: Path, params: Params) -> None:

@@ -9,6 +9,7 @@ from pipeline.artifacts import read_table, write_json, write_text
 from pipeline.config import PARAMS_FILE, Params
 from pipeline.plan import Encoder
 from pipeline.records import Embedding, Measurement, Part
+from pipeline.reporting.audit import audit_table
 from pipeline.reporting.dataset import confusion_counts, dataset_tables
 from pipeline.reporting.figures import Curve, draw_confusion, draw_curves, draw_embedding_map, training_panels
 from pipeline.reporting.inputs import Inputs, no_test_videos, read_inputs
@@ -28,7 +29,8 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     """
     inputs = read_inputs(params, root)
     folder = root / "reports" / params.report_name
-    tables = [*result_tables(inputs), *dataset_tables(inputs)]
+    audit = [audit_table(inputs.findings)] if inputs.findings else []
+    tables = [*result_tables(inputs), *dataset_tables(inputs), *audit]
     for table in tables:
         write_text(folder / "tables" / f"{table.name}.csv", table.csv())
         write_text(folder / "tables" / f"{table.name}.md", f"# {table.title}\n\n{table.caption}\n\n{table.markdown()}")

@@ -28,6 +28,8 @@ class Table:
     title: str
     caption: str
     rows: Sequence[Row]
+    shown: Sequence[Row] | None = None
+    """Those that a person reads, where that is not all of them."""
 
     def csv(self) -> str:
         """All fields of all rows; None is an empty cell."""
@@ -40,7 +42,9 @@ class Table:
 
     def markdown(self) -> str:
         """The table in GitHub's Markdown; columns that are empty in every row are left out, numbers to the right."""
-        shown = [row.display() for row in self.rows]
+        shown = [row.display() for row in (self.rows if self.shown is None else self.shown)]
+        if not shown:
+            return "Nothing.\n"
         columns = [name for name in shown[0] if any(row[name] for row in shown)]
         numeric = [all(not row[name] or row[name].lstrip("-")[:1].isdigit() for row in shown) for name in columns]
         lines = [

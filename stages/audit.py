@@ -1,0 +1,32 @@
+"""Measure what can be trusted in the data; errors stop the chain here."""
+
+from pathlib import Path
+
+from pipeline.artifacts import read_table, write_csv, write_text
+from pipeline.audit.run import AUDIT_FILE, audit_chain, stop_on_errors, summary
+from pipeline.frames.store import PROBES_FILE
+from pipeline.physiclear.catalogue import load_catalogue
+from pipeline.records import Assignment, Finding, Probe, Video
+from pipeline.stage import DATA, stage
+
+
+def main() -> None:
+    with stage("audit") as run:
+        findings = audit_chain(
+            Path(run.params.data.dir),
+            read_table(DATA / "frames" / PROBES_FILE, Probe),
+            read_table(DATA / "videos.parquet", Video),
+            read_table(DATA / "splits.parquet", Assignment),
+            load_catalogue(Path(run.params.data.catalogue)),
+            synthetic=run.params.data.source == "scenes",
+        )
+        out = DATA / "audit"
+        write_csv(out / AUDIT_FILE, Finding, findings)
+        stop_on_errors(findings, out / AUDIT_FILE)
+        # What later stages depend on: always the same bytes, so that a new warning retrains nothing.
+        write_text(out / "passed", "no errors\n")
+        run.metrics.update(summary(findings))
+
+
+if __name__ == "__main__":
+    main()
