@@ -1,16 +1,26 @@
-"""The benchmark of starting up, on a toy, and its command."""
+"""The benchmarks, on toys, and their command."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from pipeline.benchmarks import BenchRow
+from pipeline.baseline.features import video_features
+from pipeline.benchmarks import BenchRow, frames, selection
 from pipeline.benchmarks.__main__ import SECTIONS, main
+from pipeline.benchmarks.pareto import front
 from pipeline.benchmarks.startup import BASELINE, measure, top_imports
+from pipeline.decoding import decode
 from pipeline.errors import UserError
+from pipeline.frames.selection import uniform_indices
+from pipeline.videos import VideoFile
+from tests.closure import ROOT
+from tests.conftest import moving_square, write_video
 
 
 def write_stage(root: Path, text: str) -> Path:
@@ -49,5 +59,44 @@ def test_command_writes_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 @pytest.mark.parametrize("arguments", [[], ["nonsense"], ["startup", "more"]])
 def test_unknown_section_names_the_allowed(arguments: list[str]) -> None:
-    with pytest.raises(SystemExit, match="allowed sections: startup"):
+    with pytest.raises(SystemExit, match="allowed sections: frames, selection, startup"):
         main(arguments)
+
+
+def row(case: str, cost: float, error: float | None) -> BenchRow:
+    return BenchRow(case=case, cost=cost, unit="ms", baseline=case, ratio=1, error=error, low=0, high=1)
+
+
+@given(st.lists(st.tuples(st.integers(1, 9), st.integers(0, 9)), max_size=12))
+def test_the_front_holds_what_nothing_beats(points: list[tuple[int, int]]) -> None:
+    rows = [row(f"{i}", cost, error / 10) for i, (cost, error) in enumerate(points)]
+    beaten = {(a, b) for a, b in points for c, d in points if (c <= a and d < b) or (c < a and d <= b)}
+    found = front([*rows, row("no error", 1, None)])
+    assert {(int(r.cost), round(10 * (r.error or 0))) for r in found} == set(points) - beaten
+    assert [r.cost for r in found] == sorted(r.cost for r in found)
+
+
+def test_frames_are_timed_on_any_videos(tiny_videos: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("OCTOPI_DATA_DIR", str(tiny_videos))
+    monkeypatch.setattr(frames, "REPEATS", 1)
+    rows = frames.measure(ROOT)
+    assert {r.baseline for r in rows} == {frames.BARE, frames.PUBLISHED, "peak memory, 1 videos"}
+    for r in rows:
+        if r.case.startswith(r.baseline):
+            assert r.ratio == 1
+    frames._publish_one(tiny_videos / "rug_0.avi", tmp_path / "published")
+    assert len(list((tmp_path / "published").iterdir())) == int(0.3 * 31)
+
+
+def test_a_setting_sees_the_frames_that_the_pipeline_draws(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "rug_0.avi", moving_square(24, width=64, height=48))
+    sample = selection._look(VideoFile(path, path.name, "rug", "rug_0"))
+    assert sample is not None
+    pictures = list(decode(path))
+    cases = [s.case for s in selection.settings()]
+    reference = np.mean(pictures[:2], axis=0, dtype=np.float32)
+    kept = uniform_indices(24, 8)
+    for name, positions in (("uniform, 1 frame", [0]), ("uniform, 3 frames", [0, 2, 5])):
+        expected = video_features([pictures[kept[p]] for p in positions], reference)
+        np.testing.assert_array_equal(sample.features[cases.index(name)], expected)
+    assert sample.frames[cases.index("salient, 5 frames")] == 5

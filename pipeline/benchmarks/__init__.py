@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
+
 from pydantic import Field
 
+from pipeline.config import load_params
+from pipeline.physiclear.catalogue import Catalogue, load_catalogue
 from pipeline.records import Record
 
 
@@ -24,3 +29,12 @@ class BenchRow(Record):
     """Lower end of the error's interval; of the repeats' costs where there is no error."""
     high: float
     """Upper end, likewise."""
+
+
+DATA_VARIABLE = "OCTOPI_DATA_DIR"
+
+
+def bench_videos(root: Path) -> tuple[Path, Catalogue]:
+    """The videos to measure with: the folder that OCTOPI_DATA_DIR names, else the chain's own."""
+    data = load_params(root / "params.yaml").data
+    return Path(os.environ.get(DATA_VARIABLE) or root / data.dir), load_catalogue(root / data.catalogue)

@@ -7,10 +7,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from pipeline.artifacts import write_json
-from pipeline.benchmarks import BenchRow, startup
+from pipeline.benchmarks import BenchRow, frames, selection, startup
 from pipeline.errors import UserError
 
-SECTIONS: dict[str, Callable[[Path], list[BenchRow]]] = {"startup": startup.measure}
+SECTIONS: dict[str, Callable[[Path], Sequence[BenchRow]]] = {
+    "frames": frames.measure,
+    "selection": selection.measure,
+    "startup": startup.measure,
+}
 """To add a section: write its module with a `measure(root)` beside this one and list it here."""
 
 

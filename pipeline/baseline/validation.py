@@ -1,0 +1,216 @@
+"""How good the baseline is on objects that it has never touched: grouped cross-validation and what it shows.
+
+All videos of an object are in one fold, as videos of one object look alike. Intervals draw objects anew: they hold
+the chance of which objects were measured, not that of how folds and trees fell. The spread over repeats shows the
+latter; more repeats average it out.
+
+Source: Cohen 1968 (weighted kappa).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import fmean
+
+import numpy as np
+
+from pipeline.baseline.predictor import Features, Labels, PropertyPredictor, check_labels
+from pipeline.runtime import derive_seed
+from pipeline.statistics import Interval, Outcome, Spread, clustered, confusion
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What was predicted of one video by models that had seen no video of its object."""
+
+    object_id: str
+    expected: tuple[int, ...]
+    """A class for each property."""
+    predicted: tuple[tuple[int, ...], ...]
+    """Repeats x properties."""
+
+    def correct(self, position: int | None) -> float:
+        """The share of the repeats in which one property, or with None every property, is right."""
+        if position is None:
+            return fmean(p == self.expected for p in self.predicted)
+        return fmean(p[position] == self.expected[position] for p in self.predicted)
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """How often something was right, each repeat counting alike; all but the spread's deviation from 0 to 1."""
+
+    spread: Spread
+    """One accuracy a repeat; its mean is the figure."""
+    interval: Interval | None
+    """Object-clustered, 95 %; None for fewer than two objects."""
+    majority: float
+    """The share of the most frequent answer among the same videos: what the best constant answer reaches."""
+    chance: float
+    """What guessing evenly reaches."""
+
+    @property
+    def value(self) -> float:
+        """The mean over the repeats."""
+        return self.spread.mean
+
+
+@dataclass(frozen=True)
+class PropertySummary:
+    """How well one property is told."""
+
+    accuracy: Accuracy
+    absolute_error: float
+    """Mean distance of the predicted from the expected class, in classes."""
+    kappa: float | None
+    """Quadratically weighted, pooled over the repeats; None where all is expected and predicted as one class."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a cross-validation shows."""
+
+    combined: Accuracy
+    """Every property of a video right at once."""
+    properties: tuple[PropertySummary, ...]
+    videos: int
+    objects: int
+
+
+@dataclass(frozen=True)
+class Difference:
+    """How much more often the second of two settings has everything right, from -1 to 1."""
+
+    value: float
+    interval: Interval | None
+    """Object-clustered, 95 %, of the paired difference; None for fewer than two objects."""
+
+
+def deal(objects: Sequence[str], folds: int, seed: int) -> list[frozenset[str]]:
+    """Deal the distinct objects, shuffled, into folds whose numbers of objects differ by at most one.
+
+    Raises:
+        ValueError: for fewer than two folds, or fewer objects than folds.
+    """
+    names = sorted(set(objects))
+    if not 2 <= folds <= len(names):
+        raise ValueError(f"{len(names)} objects cannot be dealt into {folds} folds; 2 to {len(names)} can")
+    order = np.random.default_rng(seed).permutation(len(names))
+    return [frozenset(names[i] for i in order[fold::folds]) for fold in range(folds)]
+
+
+def cross_validate(
+    features: Features,
+    labels: Labels,
+    objects: Sequence[str],
+    classes: Sequence[int],
+    *,
+    folds: int = 5,
+    repeats: int = 3,
+    seed: int = 0,
+    jobs: int | None = None,
+) -> tuple[Verdict, ...]:
+    """Predict every video once a repeat, by a model that saw no video of its object.
+
+    Folds depend only on the objects' names and the seed: settings compared with one seed share them.
+
+    Args:
+        features: Videos x features, finite.
+        labels: Videos x properties, equal for all videos of an object.
+        objects: Each video's object.
+        classes: How many classes each property has.
+        folds: Groups of objects, each predicted from all others.
+        repeats: How often the folds are dealt anew.
+        seed: Of the folds and the trees.
+        jobs: Cores that grow trees; None takes all that this process may use.
+
+    Returns:
+        A verdict a video, in the order of `features`.
+
+    Raises:
+        ValueError: if the arguments do not fit each other.
+    """
+    check_labels(labels, objects, classes)
+    if len(features) != len(objects) or repeats < 1:
+        raise ValueError(f"{len(features)} rows of features for {len(objects)} videos, {repeats} repeats")
+    predicted = np.empty((len(objects), repeats, len(classes)), np.int64)
+    for repeat in range(repeats):
+        for number, held_out in enumerate(deal(objects, folds, derive_seed(seed, "folds", repeat))):
+            tested = np.array([o in held_out for o in objects])
+            model = PropertyPredictor(classes, seed=derive_seed(seed, "trees", repeat, number), jobs=jobs)
+            model.fit(features[~tested], labels[~tested], [o for o in objects if o not in held_out])
+            predicted[tested, repeat] = model.predict(features[tested])
+    return tuple(
+        Verdict(name, tuple(expected), tuple(map(tuple, answers)))
+        for name, expected, answers in zip(objects, labels.tolist(), predicted.tolist(), strict=True)
+    )
+
+
+def summarise(verdicts: Sequence[Verdict], classes: Sequence[int], seed: int = 0) -> Summary:
+    """All figures of a cross-validation; `seed` is that of the intervals.
+
+    Raises:
+        ValueError: without any verdict.
+    """
+    if not verdicts:
+        raise ValueError("a summary needs at least one verdict")
+    return Summary(
+        combined=_accuracy(verdicts, None, math.prod(classes), seed),
+        properties=tuple(_property(verdicts, position, count, seed) for position, count in enumerate(classes)),
+        videos=len(verdicts),
+        objects=len({v.object_id for v in verdicts}),
+    )
+
+
+def compare(first: Sequence[Verdict], second: Sequence[Verdict], seed: int = 0) -> Difference:
+    """The second setting's combined accuracy less the first's, on the same videos in the same order.
+
+    The interval holds nothing of how folds and trees fell: with few repeats a small difference may be just that.
+
+    Raises:
+        ValueError: if the verdicts are not about the same videos, or there are none.
+    """
+    if not first or [(v.object_id, v.expected) for v in first] != [(v.object_id, v.expected) for v in second]:
+        raise ValueError("only verdicts on the same videos in the same order can be compared")
+    gains = [b.correct(None) - a.correct(None) for a, b in zip(first, second, strict=True)]
+    # Moved from [-1, 1] to [0, 1] a mean difference is a proportion; its interval is moved back.
+    halves = [Outcome((gain + 1) / 2, (v.object_id,)) for gain, v in zip(gains, first, strict=True)]
+    interval = clustered(halves, seed)
+    moved = interval and Interval(2 * interval.low - 1, 2 * interval.high - 1)
+    return Difference(fmean(gains), moved)
+
+
+def quadratic_kappa(expected: Sequence[int], predicted: Sequence[int], classes: int) -> float | None:
+    """1 - (mean squared distance) / (the same if both were paired at random); None where the latter is 0."""
+    counts = np.array(confusion(expected, predicted, classes), dtype=np.float64)
+    distance = np.subtract.outer(np.arange(classes), np.arange(classes)) ** 2
+    random = np.outer(counts.sum(axis=1), counts.sum(axis=0)) / counts.sum()
+    unexpected = float((distance * random).sum())
+    return 1 - float((distance * counts).sum()) / unexpected if unexpected > 0 else None
+
+
+def _property(verdicts: Sequence[Verdict], position: int, count: int, seed: int) -> PropertySummary:
+    expected = [v.expected[position] for v in verdicts for _ in v.predicted]
+    predicted = [p[position] for v in verdicts for p in v.predicted]
+    return PropertySummary(
+        accuracy=_accuracy(verdicts, position, count, seed),
+        absolute_error=fmean(abs(e - p) for e, p in zip(expected, predicted, strict=True)),
+        kappa=quadratic_kappa(expected, predicted, count),
+    )
+
+
+def _accuracy(verdicts: Sequence[Verdict], position: int | None, answers: int, seed: int) -> Accuracy:
+    def part(labels: tuple[int, ...]) -> tuple[int, ...]:
+        return labels if position is None else labels[position : position + 1]
+
+    repeats = range(len(verdicts[0].predicted))
+    common = Counter(part(v.expected) for v in verdicts).most_common(1)[0][1]
+    return Accuracy(
+        spread=Spread(tuple(fmean(part(v.predicted[r]) == part(v.expected) for v in verdicts) for r in repeats)),
+        interval=clustered([Outcome(v.correct(position), (v.object_id,)) for v in verdicts], seed),
+        majority=common / len(verdicts),
+        chance=1 / answers,
+    )
