@@ -63,14 +63,78 @@ class Video(Record):
     """Pixels."""
 
 
+class Probe(Record):
+    """What one decode of a video measured on the side, for the audit. Brightness is in 8-bit steps."""
+
+    video_id: str
+    object_id: str
+    path: str
+    session: str
+    """The recording session as videos.csv names it; empty where it does not."""
+    header_frames: int
+    """Frames that the file's header promises."""
+    frames: int
+    fps: float
+    width: int
+    height: int
+    rotation: int
+    """Degrees against the clock by which the metadata turn the picture; done already in what is kept."""
+    irregular: float
+    """Longest over shortest distance of the probed frames' time stamps, a frame; 1 for an even rate, 0 unknown."""
+    kept: int
+    """Frames that the selection kept."""
+    brightness: float
+    """Mean of the reference, by its brightness plane, as all of these."""
+    brightness_step: float
+    """Largest change of the mean brightness between neighbouring probed frames."""
+    saturated: float
+    """Share of values at 0 or 255 where contact is strongest."""
+    contact: float
+    """Largest strength of contact in a probed frame (`pipeline.frames.reference.strength`)."""
+    quiet: float
+    """Smallest strength in a probed frame after the reference: what noise alone gives in a quiet part of a video."""
+    contact_end: float
+    """Strength of contact in the last frame."""
+    starts_touching: bool
+    """Whether the reference had to be taken from the end."""
+    texture_start: float
+    """Deviation of the detail in the first frames' picture: contact adds detail."""
+    texture_end: float
+    thumbnail: tuple[float, ...]
+    """The reference, 6 x 8 x (brightness, two colour differences), flattened."""
+    signature: tuple[float, ...]
+    """Mean difference in brightness to the reference where contact is strongest, 18 x 24, flattened; mean 0, norm 1."""
+
+
+class Severity(StrEnum):
+    """What a finding of the audit means for the chain: errors stop it, warnings go to the report."""
+
+    ERROR = "error"
+    WARNING = "warning"
+    INFO = "info"
+
+
+class Finding(Record):
+    """One result of the audit: a row of audit.csv."""
+
+    check: str
+    item: str
+    """What it is about: a file (relative to the data folder), an object, a class, or the whole folder."""
+    measured: str
+    expected: str = ""
+    severity: Severity
+
+
 class Frame(Record):
-    """One salient frame; row `row` of the frame tensor (uint8, frames x size x size x RGB)."""
+    """One kept frame; row `row` of the frame tensor (uint8, frames x size x size x RGB)."""
 
     video_id: str
     frame_index: int = Field(ge=0)
     """Position in the video, in decoding order."""
     score: float = Field(ge=0)
-    """Sum of absolute differences to the frame before, over pixels and channels (8-bit steps)."""
+    """What the selection went by: `salient` sums absolute differences in brightness to the frame before, over all
+    pixels (8-bit steps); `release` counts changed grey pixels; `contact` and `adaptive` take the strength of contact;
+    0 where there was nothing to choose by."""
     row: int = Field(ge=0)
 
 

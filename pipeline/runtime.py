@@ -6,12 +6,16 @@ import hashlib
 import os
 import random
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from pipeline.errors import UserError
 
 if TYPE_CHECKING:
     import torch
+
+CHECKPOINTS = Path("checkpoints")
+"""Where unfinished work waits to be resumed, outside DVC's reach: DVC deletes the outputs of a killed stage."""
 
 DeviceName = Literal["auto", "cpu", "cuda", "mps"]
 DtypeName = Literal["float32", "bfloat16", "float16"]

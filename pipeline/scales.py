@@ -14,6 +14,7 @@ from pipeline.errors import UserError
 from pipeline.models import weights
 from pipeline.physiclear.catalogue import load_catalogue
 from pipeline.plan import Plan
+from pipeline.splits import check_split
 
 CONF = Path("conf")
 HEADER = "# Written by `octopi scale`; change it with that command, or edit conf/ and run it again.\n"
@@ -56,6 +57,7 @@ def compose(name: str, overrides: Sequence[str] = (), conf: Path = CONF) -> Para
 def check_inputs(params: Params) -> None:
     """Raise UserError where something that the scale needs is not there: videos, catalogue, objects, weights."""
     catalogue = load_catalogue(Path(params.data.catalogue))
+    check_split(catalogue, params.split.name)
     folder = Path(params.data.dir)
     if params.data.source == "videos" and not folder.is_dir():
         raise UserError(

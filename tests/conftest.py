@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from fractions import Fraction
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -53,6 +55,32 @@ def write_video(path: Path, frames: Iterable[np.ndarray]) -> Path:
         writer.write(frame)
     if writer is not None:
         writer.release()
+    return path
+
+
+def encode(
+    path: Path,
+    frames: Iterable[np.ndarray],
+    codec: str = "ffv1",
+    pixels: str = "yuv444p",
+    given: str = "bgr24",
+    milliseconds: Sequence[int] = (),
+) -> Path:
+    """Write frames (in PyAV's format `given`) by any codec, at any time stamps; FFV1 gives back what went in."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=25)
+        stream.pix_fmt = pixels
+        for index, frame in enumerate(frames):
+            video_frame = av.VideoFrame.from_ndarray(frame, format=given)
+            if index == 0:
+                stream.width, stream.height = video_frame.width, video_frame.height
+                if milliseconds:
+                    stream.codec_context.time_base = Fraction(1, 1000)
+            if milliseconds:
+                video_frame.pts, video_frame.time_base = milliseconds[index], Fraction(1, 1000)
+            container.mux(stream.encode(video_frame))
+        container.mux(stream.encode(None))
     return path
 
 

@@ -37,7 +37,7 @@ def test_committed_params_are_the_default_scale() -> None:
 @pytest.mark.parametrize("scale", ["paper-7b", "paper-13b"])
 def test_paper_scales_have_the_papers_hyper_parameters(scale: str) -> None:
     p = compose(scale, conf=CONF)
-    assert (p.frames.salient_fraction, p.frames.per_video, p.frames.size) == (0.3, 5, 224)
+    assert (p.frames.fraction, p.frames.per_video, p.frames.size) == (0.3, 5, 224)
     assert (p.encoder.prompts, p.encoder.epochs, p.encoder.batch_size, p.encoder.learning_rate) == (8, 30, 32, 1e-3)
     assert (p.encoder.weight_decay, p.align.weight_decay, p.lora.weight_decay) == (0, 0, 0)
     assert (p.align.samples, p.align.projection_learning_rate, p.align.batch_size) == (8000, 2e-5, 16)
@@ -53,8 +53,8 @@ def test_paper_scales_have_the_papers_hyper_parameters(scale: str) -> None:
         (["frames.per_vido=1"], ["frames.per_vido", "did you mean per_video"]),
         (["nothing=1"], ["nothing", "allowed here"]),
         (["frames.per_video=0"], ["frames.per_video", "greater than or equal to 1"]),
-        (["frames.salient_fraction=1.5"], ["frames.salient_fraction", "less than or equal to 1"]),
-        (["split.name=sideways"], ["split.name", "'paper', 'release', 'development' or 'kfold'"]),
+        (["frames.fraction=1.5"], ["frames.fraction", "less than or equal to 1"]),
+        (["split.name='Side ways'"], ["split.name", "Side ways", "pattern"]),
         (["split.fold=7"], ["split", "0 to 4"]),
         (["ablation.seeds=[1,1]"], ["ablation", "repeats"]),
         (["align.batch_size=10"], ["align", "does not divide"]),

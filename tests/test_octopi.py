@@ -10,7 +10,6 @@ import torch
 from safetensors.torch import save_file
 
 from pipeline.artifacts import save_tensors, write_table
-from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig, TrainConfig
 from pipeline.data.conversations import ConversationCollator
 from pipeline.data.embeddings import FLIPS, INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
 from pipeline.errors import UserError
@@ -23,6 +22,7 @@ from pipeline.prompts import IGNORE_INDEX, TACT_FRAME
 from pipeline.questions import build_questions, pool_of
 from pipeline.records import Assignment, Embedding, Opd, Part, Question, Task
 from pipeline.runtime import seed_everything
+from pipeline.sections import LanguageConfig, LoraTrainConfig, RuntimeConfig, TrainConfig
 from pipeline.training import trainer as shared
 from pipeline.training.language import Job, Material, add_lora, align, assemble, finetune_lora
 from tests.checkpoints import write_llama

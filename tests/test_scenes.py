@@ -12,15 +12,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.config import ScenesConfig
 from pipeline.errors import UserError
+from pipeline.frames.scan import Scan, scan
 from pipeline.physiclear.catalogue import Catalogue
 from pipeline.scenes.contact import GEL_MODULUS_MPA, GEL_THICKNESS_MM, indentation, press, series
 from pipeline.scenes.geometry import IMAGE_MM, Heights, Surface, bumps, grain, heights
 from pipeline.scenes.light import make_sensor, shade
 from pipeline.scenes.recipe import BUMP_SHARE, GRAIN_MM, MODULUS_MPA, Recipe, recipe_of
 from pipeline.scenes.video import FORCE_N, make_motion, render, synthesize
-from pipeline.videos import catalogue_videos
+from pipeline.sections import FramesConfig, ScenesConfig
+from pipeline.videos import list_videos
 
 PITCH = IMAGE_MM[0] / 160
 SMALL = ScenesConfig(objects=("rug",), videos_per_object=2, frames=8, width=64, height=48)
@@ -210,8 +211,11 @@ def test_files_are_equal_for_equal_seeds(catalogue: Catalogue, tmp_path: Path) -
     assert sorted(p.name for p in folders[0].iterdir()) == ["rug_0.avi", "rug_1.avi"], "nothing else is left there"
     assert [p.read_bytes() for p in first] == [p.read_bytes() for p in second]
     assert first[0].read_bytes() != first[1].read_bytes()
-    videos = catalogue_videos(folders[0], catalogue)
-    assert [(v.frames, v.width, v.height, v.fps) for v in videos] == [(8, 64, 48, 25.0)] * 2
+    for file in list_videos(folders[0], catalogue).files:
+        found = scan(file, FramesConfig(size=16))
+        assert isinstance(found, Scan)
+        video = found.video
+        assert (video.frames, video.width, video.height, video.fps) == (8, 64, 48, 25.0)
 
 
 def test_an_unknown_object_is_named(catalogue: Catalogue, tmp_path: Path) -> None:

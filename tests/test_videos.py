@@ -1,11 +1,9 @@
-"""What a folder of videos may hold, and every way in which it may be wrong."""
+"""Which videos a folder holds, by names or by its videos.csv, and every way in which that may be wrong."""
 
 from __future__ import annotations
 
-import hashlib
-import logging
-import os
 import shutil
+import unicodedata
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,180 +11,229 @@ import pytest
 
 from pipeline.errors import UserError
 from pipeline.physiclear.catalogue import Catalogue
-from pipeline.videos import Finding, catalogue_videos, decode, inspect
-from tests.conftest import moving_square, write_video
+from pipeline.records import Severity
+from pipeline.videos import LIST_FILE, Listing, list_videos, raise_errors
 
 
-def errors(folder: Path, catalogue: Catalogue) -> list[Finding]:
-    return [f for f in inspect(folder, catalogue) if f.severity == "error"]
+def touch(folder: Path, *names: str) -> Path:
+    """Files are not opened to list them: empty ones will do."""
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+    return folder
+
+
+def ids(listing: Listing) -> list[str]:
+    return [f.video_id for f in listing.files]
+
+
+def errors(listing: Listing) -> list[tuple[str, str]]:
+    return [(f.item, f.measured) for f in listing.findings if f.severity is Severity.ERROR]
+
+
+def warnings(listing: Listing) -> list[str]:
+    return [f.measured for f in listing.findings if f.severity is Severity.WARNING]
 
 
 def test_a_good_folder(tiny_videos: Path, catalogue: Catalogue) -> None:
-    videos = catalogue_videos(tiny_videos, catalogue)
-    assert [v.video_id for v in videos] == [
-        *("baseball_0", "baseball_1", "baseball_10", "potato_0", "potato_2", "rug_0", "rug_1")
-    ], "sorted by object, then by number"
-    assert [v.frames for v in videos] == [12, 1, 3, 20, 9, 31, 7]
-    assert videos[-1].path == "sub folder é/rug_1.AVI"
-    for video in videos:
-        assert (video.width, video.height, video.fps) == (48, 36, 25.0)
-        assert video.sha256 == hashlib.sha256((tiny_videos / video.path).read_bytes()).hexdigest()
-    assert catalogue_videos(tiny_videos, catalogue) == videos
-
-
-def test_only_the_objects_asked_for(tiny_videos: Path, catalogue: Catalogue) -> None:
-    assert {v.object_id for v in catalogue_videos(tiny_videos, catalogue, ["rug", "potato"])} == {"rug", "potato"}
+    listing = list_videos(tiny_videos, catalogue)
+    assert ids(listing) == [*("baseball_0", "baseball_1", "baseball_10", "potato_0", "potato_2", "rug_0", "rug_1")], (
+        "sorted by object, then by number"
+    )
+    assert [f.relative for f in listing.files][-1] == "sub folder é/rug_1.AVI"
+    assert str(listing.files[-1]) == "sub folder é/rug_1.AVI"
+    assert all(f.path == tiny_videos / f.relative for f in listing.files)
+    assert {f.session for f in listing.files} == {""}
+    assert (listing.findings, listing.strangers) == ((), ())
+    assert list_videos(tiny_videos, catalogue) == listing
 
 
 def test_hidden_and_other_files_do_not_count(tmp_path: Path, catalogue: Catalogue) -> None:
-    write_video(tmp_path / "rug_0.mp4.avi", moving_square(3)).rename(tmp_path / "rug_0.MKV")
-    (tmp_path / "readme.txt").write_text("x")
-    (tmp_path / "._rug_0.mov").write_bytes(b"")
-    (tmp_path / ".cache").mkdir()
-    (tmp_path / ".cache" / "rug_0.mov").write_bytes(b"")
+    touch(tmp_path, "rug_0.MKV", "rug_1.Mp4", "readme.txt", "._rug_0.mov", ".cache/rug_0.mov", "rug_2.mp3")
     (tmp_path / "rug_7.mov").mkdir()
-    assert [v.path for v in catalogue_videos(tmp_path, catalogue)] == ["rug_0.MKV"]
+    listing = list_videos(tmp_path, catalogue)
+    assert [f.relative for f in listing.files] == ["rug_0.MKV", "rug_1.Mp4"]
+    assert listing.findings == ()
 
 
-def test_objects_outside_the_catalogue_are_left_out_with_one_line(
-    tiny_videos: Path, tmp_path: Path, catalogue: Catalogue, caplog: pytest.LogCaptureFixture
-) -> None:
-    shutil.copy(tiny_videos / "rug_0.avi", tmp_path)
-    for name in ("yoyo_0", "yoyo_1", "kite_0"):
-        shutil.copy(tiny_videos / "potato_0.avi", tmp_path / f"{name}.avi")
-    with caplog.at_level(logging.WARNING):
-        assert [v.video_id for v in catalogue_videos(tmp_path, catalogue)] == ["rug_0"]
-    assert len(caplog.records) == 1
+def test_accents_are_one_however_they_are_written(tmp_path: Path, catalogue: Catalogue) -> None:
+    """A Mac writes an accent as a character of its own."""
+    decomposed = unicodedata.normalize("NFD", "café_0.mov")
+    assert decomposed != "café_0.mov"
+    listing = list_videos(touch(tmp_path, decomposed, "rug_0.mov"), catalogue)
+    assert listing.strangers == ("café",)
+    (tmp_path / LIST_FILE).write_text("file,object_id\ncafé_0.mov,rug\n")
+    (file,) = list_videos(tmp_path, catalogue).files
+    assert (file.video_id, file.path) == ("rug_0", tmp_path / decomposed)
+
+
+def test_objects_outside_the_catalogue_are_left_out_with_one_line(tmp_path: Path, catalogue: Catalogue) -> None:
+    listing = list_videos(touch(tmp_path, "rug_0.mov", "yoyo_0.mov", "yoyo_1.mov", "kite_0.mov"), catalogue)
+    assert (ids(listing), listing.strangers) == (["rug_0"], ("kite", "yoyo"))
+    (message,) = warnings(listing)
     for words in ("3 videos", "2 objects", "kite, yoyo", "objects.csv"):
-        assert words in caplog.text
+        assert words in message
 
 
-Make = Callable[[Path, Path], None]
+def test_a_dead_link_is_listed_so_that_reading_it_says_so(tmp_path: Path, catalogue: Catalogue) -> None:
+    (tmp_path / "rug_0.mov").symlink_to(tmp_path / "gone.mov")
+    assert ids(list_videos(tmp_path, catalogue)) == ["rug_0"]
 
 
-def missing(folder: Path, good: Path) -> None:
-    folder.rmdir()
-
-
-def nothing(folder: Path, good: Path) -> None:
-    (folder / "notes.txt").write_text("no video")
-
-
-def strangers(folder: Path, good: Path) -> None:
-    shutil.copy(good, folder / "yoyo_0.avi")
-
-
-def badly_named(folder: Path, good: Path) -> None:
-    shutil.copy(good, folder / "rug.avi")
-
-
-def zero_bytes(folder: Path, good: Path) -> None:
-    (folder / "rug_0.mov").touch()
-
-
-def text_as_video(folder: Path, good: Path) -> None:
-    (folder / "rug_0.mov").write_text("not a video at all" * 50)
-
-
-def header_alone(folder: Path, good: Path) -> None:
-    (folder / "rug_0.avi").write_bytes(good.read_bytes()[:600])
-
-
-def dead_link(folder: Path, good: Path) -> None:
-    (folder / "rug_0.mov").symlink_to(folder / "gone.mov")
-
-
-def rivals(folder: Path, good: Path) -> None:
-    (folder / "sub").mkdir()
-    shutil.copy(good, folder / "rug_0.avi")
-    shutil.copy(good, folder / "sub" / "rug_00.mp4")
+Make = Callable[[Path], object]
 
 
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (missing, ["no such folder", "data.dir"]),
-        (nothing, ["no video", ".mov", "data.dir"]),
-        (strangers, ["no video of an object", "yoyo", "objects.csv"]),
-        (badly_named, ["rug.avi", "<object>_<number>", "rename"]),
-        (zero_bytes, ["rug_0.mov", "0 bytes", "copy it again"]),
-        (text_as_video, ["rug_0.mov", "no frame decodes", "convert"]),
-        (header_alone, ["rug_0.avi", "no frame decodes"]),
-        (dead_link, ["rug_0.mov", "unreadable", "copy it again"]),
-        (rivals, ["rug_0.avi", "sub/rug_00.mp4", "keep one"]),
+        (lambda folder: folder.rmdir(), ["no such folder", "data.dir"]),
+        (lambda folder: touch(folder, "notes.txt"), ["no video", ".mov", "data.dir"]),
+        (lambda folder: touch(folder, "yoyo_0.mov"), ["no video of an object", "yoyo", "objects.csv"]),
+        (lambda folder: touch(folder, "rug.avi"), ["rug.avi", "<object>_<number>", "rename", "videos.csv"]),
+        (lambda folder: touch(folder, "rug_٣.avi"), ["<object>_<number>"]),
+        (lambda folder: touch(folder, "rug_0.avi", "sub/rug_00.mp4"), ["rug_0.avi", "sub/rug_00.mp4", "keep one"]),
     ],
-    ids=lambda value: getattr(value, "__name__", ""),
+    ids=["no folder", "no video", "strangers", "no number", "digits of another script", "rivals"],
 )
-def test_bad_input_is_one_line_with_its_mend(
-    tiny_videos: Path, tmp_path: Path, catalogue: Catalogue, make: Make, words: list[str]
+def test_bad_names_are_one_line_with_their_mend(
+    tmp_path: Path, catalogue: Catalogue, make: Make, words: list[str]
 ) -> None:
     folder = tmp_path / "my videos"
     folder.mkdir()
-    make(folder, tiny_videos / "rug_0.avi")
+    make(folder)
+    listing = list_videos(folder, catalogue)
     with pytest.raises(UserError) as caught:
-        catalogue_videos(folder, catalogue)
+        raise_errors(folder, listing.findings)
     message = str(caught.value)
     assert "\n" not in message
     assert message.startswith(str(folder))
     assert all(word in message for word in words), message
-    (found,) = errors(folder, catalogue)
-    assert found.message in message
+    assert len(errors(listing)) == 1
 
 
-@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="nothing is forbidden to this user")
-def test_a_file_without_access_is_named(tiny_videos: Path, tmp_path: Path, catalogue: Catalogue) -> None:
-    path = Path(shutil.copy(tiny_videos / "rug_0.avi", tmp_path))
-    path.chmod(0)
-    with pytest.raises(UserError, match=r"rug_0\.avi: unreadable"):
-        catalogue_videos(tmp_path, catalogue)
+def test_all_errors_are_listed_and_the_first_is_raised(tmp_path: Path, catalogue: Catalogue) -> None:
+    folder = touch(tmp_path, "egg.mov", "rug_1.mov", "rug_01.mov", "rug 3.mov", "potato_0.mov")
+    listing = list_videos(folder, catalogue)
+    assert [item for item, _ in errors(listing)] == ["egg.mov", "rug 3.mov", "rug_01.mov"]
+    with pytest.raises(UserError, match=r"egg\.mov"):
+        raise_errors(folder, listing.findings)
+    raise_errors(folder, [f for f in listing.findings if f.severity is not Severity.ERROR])
 
 
-def test_a_cut_off_video_keeps_what_decodes_and_warns(
-    tiny_videos: Path, tmp_path: Path, catalogue: Catalogue, caplog: pytest.LogCaptureFixture
-) -> None:
-    whole = (tiny_videos / "rug_0.avi").read_bytes()
-    path = tmp_path / "rug_0.avi"
-    path.write_bytes(whole[: len(whole) * 2 // 3])
-    with caplog.at_level(logging.WARNING):
-        (video,) = catalogue_videos(tmp_path, catalogue)
-    assert 5 < video.frames < 31
-    assert video.frames == len(list(decode(path)))
-    assert "rug_0.avi" in caplog.text
-    assert "31 frames in its header" in caplog.text
+def listed(folder: Path, text: str, *names: str) -> Path:
+    touch(folder, *(names or ("a.mov", "b c.mp4", "tag 3/é.avi")))
+    (folder / LIST_FILE).write_text(text, encoding="utf-8")
+    return folder
 
 
-def test_inspection_lists_everything_at_once(tiny_videos: Path, tmp_path: Path, catalogue: Catalogue) -> None:
-    folder = tmp_path / "all"
-    shutil.copytree(tiny_videos, folder)
-    (folder / "egg_0.mov").touch()
-    (folder / "egg.mov").touch()
-    shutil.copy(tiny_videos / "potato_0.avi", folder / "yoyo_0.avi")
-    shutil.copy(tiny_videos / "potato_0.avi", folder / "potato_2.mkv")
-    shutil.copy(tiny_videos / "potato_0.avi", folder / "egg_3.avi")
-    findings = inspect(folder, catalogue)
-    severities = [f.severity for f in findings]
-    assert severities == sorted(severities, key=["error", "warning", "info"].index)
-    assert sorted(f.item for f in findings if f.severity == "error") == ["egg.mov", "egg_0.mov", "potato_2.avi"]
-    warnings = {f.item: f.message for f in findings if f.severity == "warning" and f.item != str(folder)}
-    assert "1 frame only" in warnings["baseball_1.avi"]
-    assert "3 frames only" in warnings["baseball_10.avi"]
-    assert "same content" in warnings["potato_0.avi"], "twins are named under the second in order"
-    about_folder = " ".join(f.message for f in findings if f.item == str(folder))
-    assert "yoyo" in about_folder
-    assert "no video of 70 objects" in about_folder
-    assert "9 videos of 4 objects" in about_folder
+def test_a_list_names_files_of_any_name(tmp_path: Path, catalogue: Catalogue) -> None:
+    """Numbers count up within an object in the list's order; names that look like numbers mean nothing."""
+    text = "file,object_id,session\nrug_7.mov,potato,s1\ntag 3/é.avi,rug,s1\nb c.mp4,potato,s2\na.mov,rug,\n"
+    listing = list_videos(listed(tmp_path, text, "rug_7.mov", "tag 3/é.avi", "b c.mp4", "a.mov"), catalogue)
+    assert [(f.video_id, f.object_id, f.relative, f.session) for f in listing.files] == [
+        ("potato_0", "potato", "rug_7.mov", "s1"),
+        ("potato_1", "potato", "b c.mp4", "s2"),
+        ("rug_0", "rug", "tag 3/é.avi", "s1"),
+        ("rug_1", "rug", "a.mov", ""),
+    ]
+    assert listing.findings == ()
+
+
+def test_more_than_ten_videos_are_sorted_by_number(tmp_path: Path, catalogue: Catalogue) -> None:
+    names = [f"{letter}.mov" for letter in "zyxwvutsrqpo"]
+    text = "object_id,file\n" + "".join(f"rug,{name}\n" for name in names)
+    listing = list_videos(listed(tmp_path, text, *names), catalogue)
+    assert [f.relative for f in listing.files] == names
+    assert ids(listing) == [f"rug_{i}" for i in range(12)]
+
+
+def test_what_a_list_lacks_is_left_out_with_one_line(tmp_path: Path, catalogue: Catalogue) -> None:
+    listing = list_videos(listed(tmp_path, "file,object_id\na.mov,rug\n"), catalogue)
+    assert ids(listing) == ["rug_0"]
+    assert warnings(listing) == ["2 videos of the folder are not listed and are left out"]
+    assert errors(listing) == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "\ufefffile,object_id\na.mov,rug\nb c.mp4,potato\n",
+        "file , object_id\n a.mov , rug \n\n,\nb c.mp4,potato\n",
+        'object_id,note,file\nrug,"one, two",a.mov\npotato,,b c.mp4',
+        "file,object_id\r\na.mov,rug\r\nb c.mp4,potato\r\n",
+        "file,object_id,session\na.mov,rug\nb c.mp4,potato,\n",
+    ],
+    ids=["byte order mark", "spaces and empty lines", "other columns", "Windows", "short lines"],
+)
+def test_lists_are_read_as_people_write_them(tmp_path: Path, catalogue: Catalogue, text: str) -> None:
+    folder = listed(tmp_path, "", "a.mov", "b c.mp4")
+    (folder / LIST_FILE).write_bytes(text.encode())
+    listing = list_videos(folder, catalogue)
+    assert [(f.relative, f.video_id, f.session) for f in listing.files] == [
+        ("b c.mp4", "potato_0", ""),
+        ("a.mov", "rug_0", ""),
+    ]
+    assert listing.findings == ()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("name,object_id\na.mov,rug\n", "column file is missing"),
+        ("name,object\na.mov,rug\n", "column file, object_id is missing"),
+        ("", "column file, object_id is missing"),
+        ("file,object_id\n", "lists no video; add a line for each"),
+        ("file,object_id,file\na.mov,rug,b\n", "column file stands twice"),
+        ("file,object_id\na.mov,rug\ngone.mov,rug\n", "line 3: no video 'gone.mov' in the folder; correct the line"),
+        ("file,object_id\na.mov,rug\n\na.mov,potato\n", "line 4: a.mov is listed twice; keep one line"),
+        ("file,object_id\na.mov,\n", "line 2: a.mov has no object_id"),
+        ("file,object_id\n,rug\n", "line 2: no video '' in the folder"),
+        ("file,object_id\na.mov,rug,s,t\n", "line 2: 4 fields for 2 columns"),
+        ("file,object_id\n../a.mov,rug\n", "line 2: no video '../a.mov' in the folder"),
+        ("file,object_id\na.mov,yoyo\n", "no video of an object of the catalogue"),
+    ],
+)
+def test_bad_lists_are_one_line_with_their_mend(tmp_path: Path, catalogue: Catalogue, text: str, words: str) -> None:
+    listing = list_videos(listed(tmp_path, text), catalogue)
+    ((item, message),) = errors(listing)
+    assert item == (str(tmp_path) if "catalogue" in words else LIST_FILE)
+    assert message.startswith(words) or "catalogue" in words
+    assert words in message
+    with pytest.raises(UserError) as caught:
+        raise_errors(tmp_path, listing.findings)
+    assert str(caught.value).count(str(tmp_path)) == 1
+    assert "\n" not in str(caught.value)
+
+
+def test_a_list_in_another_encoding_is_named(tmp_path: Path, catalogue: Catalogue) -> None:
+    folder = listed(tmp_path, "")
+    (folder / LIST_FILE).write_bytes("file,object_id\né.avi,rug\n".encode("latin-1"))
+    ((item, message),) = errors(list_videos(folder, catalogue))
+    assert (item, "no CSV in UTF-8" in message) == (LIST_FILE, True)
+
+
+def test_all_bad_lines_of_a_list_are_found_at_once(tmp_path: Path, catalogue: Catalogue) -> None:
+    listing = list_videos(listed(tmp_path, "file,object_id\nx.mov,rug\na.mov,rug\na.mov,rug\ny.mov,rug\n"), catalogue)
+    assert [message.split(":")[0] for _, message in errors(listing)] == ["line 2", "line 4", "line 5"]
+    assert warnings(listing) == [], "what else is not listed matters once the list is right"
+
+
+def test_strangers_in_a_list(tmp_path: Path, catalogue: Catalogue) -> None:
+    listing = list_videos(listed(tmp_path, "file,object_id\na.mov,yoyo\nb c.mp4,rug\ntag 3/é.avi,yoyo\n"), catalogue)
+    assert (ids(listing), listing.strangers) == (["rug_0"], ("yoyo",))
+    (message,) = warnings(listing)
+    assert "2 videos of 1 objects" in message
+
+
+def test_without_its_list_a_folder_goes_by_names(tiny_videos: Path, tmp_path: Path, catalogue: Catalogue) -> None:
+    shutil.copytree(tiny_videos, tmp_path / "v")
+    (tmp_path / "v" / "sub folder é" / LIST_FILE).write_text("file,object_id\nrug_1.AVI,potato\n")
+    assert ids(list_videos(tmp_path / "v", catalogue))[-1] == "rug_1", "a list counts in the folder itself"
 
 
 @pytest.mark.real
 def test_real_videos(real_data: Path, catalogue: Catalogue) -> None:
-    videos = catalogue_videos(real_data, catalogue)
-    objects = {v.object_id for v in videos}
-    assert (len(videos), len(objects)) in {(370, 67), (408, 74)}, "all labelled videos, or those without the test set"
-    by_id = {v.video_id: v for v in videos}
-    assert by_id["hairbrush_bristles_side_4"].frames == 3
-    assert by_id["tv_remote_back_3"].frames == 7
-    assert {v.fps for v in videos} == {10.0, 25.0}
-    assert sum(v.frames for v in videos if catalogue.objects[v.object_id].splits["paper"] != "test") == 41352
-    unlabelled = real_data / "mandarin_orange_small_4.mov"
-    if unlabelled.exists():
-        assert len(list(decode(unlabelled))) == 3
+    listing = list_videos(real_data, catalogue)
+    objects = {f.object_id for f in listing.files}
+    assert (len(listing.files), len(objects)) in {(370, 67), (408, 74)}, "all labelled videos, or all but the test set"
+    assert errors(listing) == []

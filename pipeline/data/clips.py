@@ -3,43 +3,16 @@
 from __future__ import annotations
 
 import random
-from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
 from torch.utils.data import Dataset
 
-from pipeline.artifacts import read_table
-from pipeline.errors import UserError
-from pipeline.frames import sample_evaluation, sample_training
-from pipeline.records import Frame
+from pipeline.frames.sampling import sample_evaluation, sample_training
+from pipeline.frames.store import FrameStore
 from pipeline.runtime import derive_seed
-
-
-class FrameStore:
-    """The salient frames of all videos, memory-mapped; only what is drawn is read."""
-
-    def __init__(self, folder: Path) -> None:
-        self.index = read_table(folder / "frames.parquet", Frame)
-        self.pixels: np.ndarray = np.load(folder / "frames.npy", mmap_mode="r")
-        """uint8, frames x side x side x RGB."""
-        if len(self.index) != len(self.pixels):
-            raise UserError(f"{folder}: frames.parquet and frames.npy differ in length; run `dvc repro extract_frames`")
-        self._rows: dict[str, list[int]] = defaultdict(list)
-        for frame in self.index:
-            self._rows[frame.video_id].append(frame.row)
-
-    @property
-    def size(self) -> int:
-        """Side of a frame in pixels."""
-        return int(self.pixels.shape[1])
-
-    def rows(self, video_id: str) -> list[int]:
-        """Rows of a video's salient frames, in time order."""
-        return self._rows[video_id]
 
 
 @dataclass(frozen=True)
@@ -97,7 +70,7 @@ class ClipDataset(Dataset[dict[str, torch.Tensor]]):
             positions = sample_training(len(rows), self.per_video, rng)
             # Axes of frames x height x width: 2 mirrors left and right, 1 top and bottom.
             flips = tuple(axis for axis in (2, 1) if rng.random() < self.flip_probability)
-        frames = self.store.pixels[[rows[p] for p in positions]]
+        frames = self.store.pictures(video.video_id, positions)
         frames = np.flip(frames, flips) if flips else frames
         return {
             "frames": torch.from_numpy(np.ascontiguousarray(frames)),

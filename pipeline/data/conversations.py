@@ -11,7 +11,7 @@ from torch.utils.data import Dataset
 from transformers import PreTrainedTokenizerBase
 
 from pipeline.data.embeddings import FLIPS, EmbeddingStore
-from pipeline.frames import sample_evaluation, sample_training
+from pipeline.frames.sampling import sample_evaluation, sample_training
 from pipeline.prompts import IGNORE_INDEX, Encoded, encode, render
 from pipeline.records import Opd, Question
 from pipeline.runtime import derive_seed

@@ -1,150 +1,237 @@
-"""Which frames of a video matter, and how samples are drawn from them.
-
-Paper, "Data Processing": salient are the frames with the top 30 % total intensity difference to the frame before;
-training draws five of them at random, evaluation takes five at uniform intervals from the first.
-"""
+"""The kept frames and references of a folder of videos, as files that later stages map into memory."""
 
 from __future__ import annotations
 
-import heapq
-import math
-import random
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from fractions import Fraction
-from itertools import accumulate
+import io
+import json
+import logging
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Self
 
-import cv2
 import numpy as np
-from tqdm import tqdm
+from pydantic import ValidationError
 
-from pipeline.artifacts import atomic, write_table
-from pipeline.config import FramesConfig
+from pipeline import decoding
+from pipeline.artifacts import write_table
 from pipeline.errors import UserError
-from pipeline.records import Frame, Video
-from pipeline.runtime import cores
-from pipeline.videos import Image, decode
+from pipeline.frames.scan import scan
+from pipeline.frames.store import FRAMES_FILE, PROBES_FILE, REFERENCES_FILE, TABLE_FILE
+from pipeline.parallel import run_parallel
+from pipeline.physiclear.catalogue import Catalogue
+from pipeline.records import Finding, Frame, Probe, Record, Video
+from pipeline.sections import FramesConfig
+from pipeline.videos import VideoFile, list_videos, raise_errors
 
-FRAMES_FILE = "frames.npy"
-TABLE_FILE = "frames.parquet"
-
-Scored = tuple[int, int, Image]
-"""Score, frame index, fitted frame."""
-
-
-def salient_count(frames: int, fraction: float) -> int:
-    """How many frames of a video are salient: the fraction of its differences, rounded up, and at least one.
-
-    The fraction is taken as the decimal that was written, so that 0.07 of 100 is 7 and not 7.000000000000001.
-    """
-    return max(1, math.ceil(Fraction(str(fraction)) * (frames - 1)))
+log = logging.getLogger(__name__)
 
 
-def difference(frame: Image, before: Image) -> int:
-    """Sum of |frame - before| over pixels and channels, exact: OpenCV adds up blocks of integers in a double."""
-    return int(cv2.norm(frame, before, cv2.NORM_L1))
+@dataclass(frozen=True)
+class Extraction:
+    """What was found in a folder; videos and references go by the same order."""
+
+    videos: tuple[Video, ...]
+    """With frames to show: the published selection leaves very short videos out."""
+    probes: tuple[Probe, ...]
+    """Of all videos that decode."""
+    frames: tuple[Frame, ...]
 
 
-def fit(frame: Image, config: FramesConfig) -> Image:
-    """A BGR frame as size x size x RGB: its central square (`crop`) or all of it (`squash`), resized.
+class _Done(Record):
+    """A finished video: a line of `done.jsonl`, whose pixels lie in the pile at this line's place."""
 
-    CLIP's own way resizes first and crops then, which is the same picture to a fraction of a pixel for more work.
-    """
-    height, width = frame.shape[:2]
-    if config.fit == "crop":
-        side = min(height, width)
-        top, left = (height - side) // 2, (width - side) // 2
-        frame = frame[top : top + side, left : left + side]
-    grows = config.size > min(frame.shape[:2])
-    resized = cv2.resize(frame, (config.size, config.size), interpolation=cv2.INTER_CUBIC if grows else cv2.INTER_AREA)
-    rgb: Image = cv2.cvtColor(resized, cv2.COLOR_BGR2RGB)
-    return rgb
+    stamp: tuple[str, str, str, str, int, int]
+    """What the file was listed as, its size and time of change."""
+    video: Video
+    probe: Probe
+    places: tuple[tuple[int, float], ...]
+    """Index and score of each kept frame."""
 
 
-def salient_frames(frames: Iterator[Image], count: int, config: FramesConfig) -> tuple[list[Scored], int]:
-    """The `count` frames that differ most from the frame before, in time order, and how many frames came in all.
+@dataclass(frozen=True)
+class _Job:
+    file: VideoFile
+    config: FramesConfig
+    work: Path
 
-    One pass that holds two raw frames and at most `count` fitted ones. Equal scores go to the earlier frame. The
-    first frame has no predecessor: it does not compete, and is kept (with score 0) only where it is alone.
-    """
-    best: list[tuple[int, int, Image]] = []  # A heap whose smallest entry, (score, -index), is the next to go.
-    first = before = next(frames, None)
-    if first is None or before is None:
-        return [], 0
-    index = 0
-    for index, frame in enumerate(frames, 1):
-        score = difference(frame, before)
-        before = frame
-        if len(best) < count:
-            heapq.heappush(best, (score, -index, fit(frame, config)))
-        elif (score, -index) > best[0][:2]:
-            heapq.heapreplace(best, (score, -index, fit(frame, config)))
-    if not best:
-        return [(0, 0, fit(first, config))], 1
-    return sorted(((score, -back, image) for score, back, image in best), key=lambda s: s[1]), index + 1
+    def __str__(self) -> str:
+        return str(self.file)
+
+    @property
+    def pixels(self) -> Path:
+        """Where the process that scans leaves the reference and the kept frames."""
+        return self.work / f"{self.file.video_id}.bin"
+
+    def stamp(self) -> tuple[str, str, str, str, int, int]:
+        """What tells whether the file, or what videos.csv says of it, has changed; a file that is gone has size -1."""
+        file = self.file
+        try:
+            status = file.path.stat()
+        except OSError:
+            return file.relative, file.video_id, file.object_id, file.session, -1, 0
+        return file.relative, file.video_id, file.object_id, file.session, status.st_size, status.st_mtime_ns
 
 
-def extract_frames(videos: Sequence[Video], folder: Path, config: FramesConfig, out: Path) -> list[Frame]:
-    """Write the salient frames of all videos to `out/frames.npy` and `out/frames.parquet`.
+def extract_frames(folder: Path, catalogue: Catalogue, config: FramesConfig, out: Path, partial: Path) -> Extraction:
+    """Decode every video of a folder once, several at a time, and write what is kept.
 
-    The array is uint8, frames x size x size x RGB, and opens with `np.load(mmap_mode="r")`; row `row` of it is the
-    frame that the table says. Each video's place is known from its frame count, so threads write into the file
-    directly: memory does not grow with the number of videos, and the result does not depend on their order.
+    `out/frames.npy` is uint8, frames x size x size x RGB, row by row as `out/frames.parquet` says;
+    `out/references.npy` likewise, one row for each video of the table of videos. Both open with
+    `np.load(mmap_mode="r")`. What is finished waits in `partial`, so a killed extraction goes on where it was; memory
+    does not grow with the number of videos, and results do not depend on how many processes there are.
 
     Raises:
-        UserError: if there is no video, or one no longer decodes to the frames that were counted.
+        UserError: for the first file that is wrong, naming it and the mend; all of them are listed by
+            `octopi data audit`.
     """
-    if not videos:
-        raise UserError(f"{folder}: no videos to take frames from; see `octopi data check {folder}`")
-    counts = [salient_count(video.frames, config.salient_fraction) for video in videos]
-    starts = [0, *accumulate(counts)]
-    with atomic(out / FRAMES_FILE) as temporary:
-        offset = _allocate(temporary, (starts[-1], config.size, config.size, 3))
+    listing = list_videos(folder, catalogue)
+    raise_errors(folder, listing.findings)
+    for finding in listing.findings:
+        log.warning("%s: %s", finding.item, finding.measured)
+    work = partial / _fingerprint(folder, config)
+    jobs = [_Job(file, config, work) for file in listing.files]
+    with _Pile(work, config.size) as pile:
+        done = pile.resume(jobs)
+        rest = jobs[len(done) :]
+        for job, result in zip(rest, run_parallel(_work, rest, "videos", "video"), strict=True):
+            if isinstance(result, Finding):
+                raise_errors(folder, [result])
+            else:
+                pile.add(job, result)
+                done.append(result)
+                _warn(job.file, result.probe)
+        used = [d for d in done if d.places]
+        if not used:
+            raise UserError(f"{folder}: no video has a frame to keep; choose another frames.selection")
+        frames: list[Frame] = []
+        for d in used:
+            for index, score in d.places:
+                frames.append(Frame(video_id=d.video.video_id, frame_index=index, score=score, row=len(frames)))
+        pile.finish(out, frames=len(frames), references=len(used))
+    write_table(out / TABLE_FILE, Frame, frames)
+    write_table(out / PROBES_FILE, Probe, [d.probe for d in done])
+    shutil.rmtree(work)
+    return Extraction(tuple(d.video for d in used), tuple(d.probe for d in done), tuple(frames))
 
-        def extract(position: int) -> list[Frame]:
-            video, row = videos[position], starts[position]
-            scored, decoded = salient_frames(decode(folder / video.path), counts[position], config)
-            if decoded != video.frames:
-                raise UserError(
-                    f"{folder / video.path}: {decoded} frames decode where {video.frames} were counted; it has changed "
-                    "since: run `dvc repro` again"
-                )
-            with temporary.open("r+b") as stream:
-                stream.seek(offset + row * config.size * config.size * 3)
-                stream.writelines(image.data for _, _, image in scored)
-            return [
-                Frame(video_id=video.video_id, frame_index=index, score=score, row=row + number)
-                for number, (score, index, _) in enumerate(scored)
-            ]
 
-        with ThreadPoolExecutor(cores()) as pool:
-            mapped = pool.map(extract, range(len(videos)))
-            progress: Any = tqdm(mapped, total=len(videos), desc="frames", unit="video", disable=None)
+class _Pile:
+    """The pixels of finished videos, one behind the other, and the list of what they are.
+
+    The list is written after the pixels: what a kill left over behind the last line is cut off when it is resumed.
+    """
+
+    def __init__(self, work: Path, size: int) -> None:
+        work.mkdir(parents=True, exist_ok=True)
+        self.size = size
+        self.files = (work / FRAMES_FILE, work / REFERENCES_FILE)
+        self.list_file = work / "done.jsonl"
+        for file in (*self.files, self.list_file):
+            file.touch()
+        self.frames, self.references = (file.open("r+b") for file in self.files)
+        self.list = self.list_file.open("r+", encoding="utf-8")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for stream in (self.frames, self.references, self.list):
+            stream.close()
+
+    def resume(self, jobs: Sequence[_Job]) -> list[_Done]:
+        """Take over what is finished of the first jobs, as far as their files are unchanged; drop everything else."""
+        done: list[_Done] = []
+        lines = 0
+        for job, line in zip(jobs, self.list_file.read_bytes().splitlines(keepends=True), strict=False):
             try:
-                frames = [frame for rows in progress for frame in rows]
-            except BaseException:
-                pool.shutdown(wait=True, cancel_futures=True)
-                raise
-        write_table(out / TABLE_FILE, Frame, frames)
-    return frames
+                entry = _Done.model_validate_json(line)
+            except ValidationError:  # A line that was being written when the process died.
+                break
+            if entry.stamp != job.stamp() or not line.endswith(b"\n"):
+                break
+            done.append(entry)
+            lines += len(line)
+        kept = sum(len(d.places) for d in done), sum(bool(d.places) for d in done)
+        ends = [HEADER_BYTES + count * self.size * self.size * 3 for count in kept]
+        streams = (self.frames, self.references)
+        if done and any(stream.seek(0, io.SEEK_END) < end for stream, end in zip(streams, ends, strict=True)):
+            # The pixels are gone: moved to their place already, or lost with the machine's power.
+            done, lines, ends = [], 0, [HEADER_BYTES] * 2
+        for stream, end in zip(streams, ends, strict=True):
+            stream.truncate(end)
+            stream.seek(end)
+        self.list.truncate(lines)
+        self.list.seek(0, io.SEEK_END)
+        return done
+
+    def add(self, job: _Job, done: _Done) -> None:
+        """Put a video on top, and remove the file that it came in."""
+        with job.pixels.open("rb") as pixels:
+            reference = pixels.read(self.size * self.size * 3)
+            if done.places:
+                self.references.write(reference)
+                shutil.copyfileobj(pixels, self.frames, 1 << 20)
+        for stream in (self.references, self.frames):
+            stream.flush()
+        self.list.write(done.model_dump_json() + "\n")
+        self.list.flush()
+        job.pixels.unlink()
+
+    def finish(self, out: Path, frames: int, references: int) -> None:
+        """Write the headers, which need the counts, and move both files to their place."""
+        out.mkdir(parents=True, exist_ok=True)
+        for stream, file, count in zip((self.frames, self.references), self.files, (frames, references), strict=True):
+            stream.seek(0)
+            stream.write(_header((count, self.size, self.size, 3)))
+            stream.flush()
+            shutil.move(file, out / file.name)  # Which may be on another disk.
 
 
-def _allocate(path: Path, shape: tuple[int, ...]) -> int:
-    """Create a .npy file of zeros (sparse where the disk allows); return where its data begin, in bytes.
+def _work(job: _Job) -> _Done | Finding:
+    """Scan one video in a process of its own."""
+    stamp = job.stamp()
+    result = scan(job.file, job.config)
+    if isinstance(result, Finding):
+        return result
+    with job.pixels.open("wb") as stream:
+        stream.write(result.reference.data)
+        stream.writelines(kept.image.data for kept in result.kept)
+    return _Done(
+        stamp=stamp,
+        video=result.video,
+        probe=result.probe,
+        places=tuple((kept.index, kept.score) for kept in result.kept),
+    )
 
-    The data are then written as to any file: pages of a memory map would count as this process's memory.
-    """
-    return int(np.lib.format.open_memmap(path, mode="w+", dtype=np.uint8, shape=shape).offset)
+
+def _header(shape: tuple[int, ...]) -> bytes:
+    """A .npy header; NumPy pads it so that the first dimension may grow without making it longer."""
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(stream, {"descr": "|u1", "fortran_order": False, "shape": shape})
+    return stream.getvalue()
 
 
-def sample_training(count: int, k: int, rng: random.Random) -> tuple[int, ...]:
-    """`k` random positions in a list of `count` salient frames, sorted; repeated only where there are fewer than k."""
-    chosen = rng.sample(range(count), k) if count >= k else rng.choices(range(count), k=k)
-    return tuple(sorted(chosen))
+HEADER_BYTES = len(_header((0, 64, 64, 3)))
 
 
-def sample_evaluation(count: int, k: int) -> tuple[int, ...]:
-    """`k` positions at uniform intervals from the first of `count` salient frames."""
-    return tuple(i * count // k for i in range(k))
+def _warn(file: VideoFile, probe: Probe) -> None:
+    if probe.header_frames > probe.frames:
+        log.warning(
+            "%s: %d of the %d frames in its header decode; is it cut off? The %d are used",
+            file.relative,
+            probe.frames,
+            probe.header_frames,
+            probe.frames,
+        )
+    if probe.kept == 0:
+        log.warning("%s: %d frames are too few for frames.selection=release; left out", file.relative, probe.frames)
+
+
+def _fingerprint(folder: Path, config: FramesConfig) -> str:
+    """What a finished video depends on besides its file: the parameters and the code that decodes and measures."""
+    sources = [*sorted(Path(__file__).parent.glob("*.py")), Path(decoding.__file__)]
+    code = b"".join(path.read_bytes() for path in sources)
+    text = json.dumps([str(folder.resolve()), config.model_dump(mode="json")])
+    return sha256(code + text.encode()).hexdigest()[:16]

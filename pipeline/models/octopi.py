@@ -11,11 +11,11 @@ from torch import nn
 from transformers import PreTrainedModel, PreTrainedTokenizerBase
 
 from pipeline.artifacts import read_json, save_tensors, write_json
-from pipeline.config import LanguageConfig
 from pipeline.models.llm import load_llm, load_tokenizer
 from pipeline.models.tactile_encoder import load_trainable
 from pipeline.prompts import TACTILE_TOKENS
 from pipeline.runtime import resolve_dtype
+from pipeline.sections import LanguageConfig
 
 CONNECTOR_FILE = "connector.safetensors"
 ADAPTER_DIR = "adapter"

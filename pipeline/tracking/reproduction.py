@@ -54,7 +54,7 @@ def planned_stages(plan: Plan) -> list[PlannedStage]:
     """The stages of a plan in the order they run, without `publish` itself."""
     return [
         *(PlannedStage("synthesize", key) for key in plan.scenes),
-        *(PlannedStage(name) for name in ("catalogue", "extract_frames", "split", "questions")),
+        *(PlannedStage(name) for name in ("extract_frames", "split", "audit", "questions")),
         *(
             PlannedStage(
                 "finetune_encoder", str(s), _axes(encoder=Encoder.FINETUNED.value, seed=s), f"data/encoder/{s}"

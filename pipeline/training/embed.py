@@ -1,4 +1,4 @@
-"""Embeddings of all salient frames by the frozen encoder, once for every later stage."""
+"""Embeddings of all kept frames by the frozen encoder, once for every later stage."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from pipeline.data.clips import FrameStore
 from pipeline.data.embeddings import FLIPS
 from pipeline.errors import UserError
+from pipeline.frames.store import FrameStore
 from pipeline.models.tactile_encoder import TactileEncoder
 from pipeline.records import Assignment, Embedding, Flip, Part
 
@@ -27,7 +27,7 @@ def embed_videos(
     batch_size: int,
     device: torch.device,
 ) -> tuple[torch.Tensor, list[Embedding]]:
-    """Embed each salient frame of each used video; training videos also mirrored in all the ways that training draws.
+    """Embed each kept frame of each used video; training videos also mirrored in all the ways that training draws.
 
     Returns:
         The embeddings (float32, rows x dim) and what each row is.
@@ -41,7 +41,7 @@ def embed_videos(
     used = [a for a in assignments if a.part != Part.UNUSED]
     for assignment in tqdm(used, desc="embed", unit="video", disable=None):
         rows = store.rows(assignment.video_id)
-        pixels = np.asarray(store.pixels[rows])
+        pixels = store.pictures(assignment.video_id)
         flips = FLIPS if assignment.part == Part.TRAIN else FLIPS[:1]
         # All mirrored versions in one tensor: larger batches cost less a frame.
         frames = torch.from_numpy(np.concatenate([np.flip(pixels, AXES[flip]) for flip in flips]))

@@ -13,12 +13,13 @@ from torch.nn import functional as F
 from torch.utils.data import DataLoader
 from transformers import EvalPrediction, TrainingArguments
 
-from pipeline.config import EncoderConfig, RuntimeConfig
-from pipeline.data.clips import ClipDataset, FrameStore, LabelledVideo, collate_clips
+from pipeline.data.clips import ClipDataset, LabelledVideo, collate_clips
+from pipeline.frames.store import FrameStore
 from pipeline.models.tactile_encoder import PropertyClassifier, property_classifier
 from pipeline.physiclear.catalogue import Catalogue
 from pipeline.records import Assignment, Classification, Measurement, Part
 from pipeline.runtime import seed_everything
+from pipeline.sections import EncoderConfig, RuntimeConfig
 from pipeline.training.trainer import (
     Log,
     TrainableTrainer,

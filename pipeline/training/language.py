@@ -10,13 +10,13 @@ from dataclasses import dataclass
 
 from transformers import TrainingArguments
 
-from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig, TrainConfig
 from pipeline.data.conversations import ConversationCollator, ConversationDataset
 from pipeline.data.embeddings import EmbeddingStore
 from pipeline.errors import UserError
 from pipeline.models.octopi import Octopi, build_octopi
 from pipeline.records import Opd, Question
 from pipeline.runtime import derive_seed, seed_everything
+from pipeline.sections import LanguageConfig, LoraTrainConfig, RuntimeConfig, TrainConfig
 from pipeline.training.trainer import (
     Log,
     TrainableTrainer,

@@ -20,11 +20,10 @@ from transformers.trainer_utils import get_last_checkpoint
 from pipeline.errors import UserError
 from pipeline.models.tactile_encoder import trainable_state
 from pipeline.records import Measurement
+from pipeline.runtime import CHECKPOINTS
 
 Log = Callable[[int, dict[str, float]], None]
 """Receives step and values while a training runs."""
-
-CHECKPOINTS = Path("checkpoints")
 
 
 class TrainableTrainer(Trainer):

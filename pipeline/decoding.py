@@ -1,0 +1,148 @@
+"""Decoding: frames as the codec leaves them, and pictures of those that are looked at.
+
+PyAV hands out what the codec decoded, brightness and colour in planes of their own. Differences in brightness need no
+more than the first plane; turning a frame into BGR costs as much as decoding it and is left to frames that are kept.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Self
+
+import av
+import cv2
+import numpy as np
+import numpy.typing as npt
+from av.video.reformatter import VideoReformatter
+
+cv2.setNumThreads(1)  # The files are what runs in parallel.
+av.logging.set_level(av.logging.PANIC)  # Broken files are reported in a line of our own.
+
+Image = npt.NDArray[np.uint8]
+PLANAR = frozenset(f"yuv{j}{kind}p" for j in ("", "j") for kind in ("420", "422", "444", "440", "411", "410"))
+"""Formats whose first plane is brightness and whose second and third are colour, 8 bits each."""
+FULL_RANGE, BT709 = 2, 1
+"""As FFmpeg numbers colour ranges and colour spaces."""
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a file says of itself."""
+
+    frames: int = 0
+    """Promised; from the duration where no number is given; 0 where neither is."""
+    fps: float = 0.0
+    """0 where unknown."""
+
+
+class Decoder:
+    """A video file, decoded once from its beginning. A file that is no video has no frames."""
+
+    def __init__(self, path: Path) -> None:
+        self._container: av.container.InputContainer | None = None
+        self.header = Header()
+        try:
+            self._container = av.open(str(path))
+            stream = self._container.streams.video[0]
+        except (av.FFmpegError, IndexError, ValueError):
+            return
+        stream.thread_type = "NONE"
+        stream.codec_context.thread_count = 1
+        fps = float(stream.average_rate or 0)
+        seconds = float(stream.duration * stream.time_base) if stream.duration and stream.time_base else 0.0
+        valid = math.isfinite(fps) and fps > 0
+        self.header = Header(stream.frames or (round(seconds * fps) if valid else 0), fps if valid else 0.0)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._container is not None:
+            self._container.close()
+
+    def frames(self) -> Iterator[av.VideoFrame]:
+        """The frames that decode, in order; what is damaged is left out, as players do."""
+        if self._container is None or not self._container.streams.video:
+            return
+        packets = self._container.demux(video=0)
+        while True:
+            try:
+                packet = next(packets, None)
+                decoded = [] if packet is None else packet.decode()
+            except (av.FFmpegError, ValueError):
+                continue
+            if packet is None:
+                return
+            for frame in decoded:
+                yield frame if frame.format.name in PLANAR else _reformatter().reformat(frame, format="yuv444p")
+
+
+def decode(path: Path) -> Iterator[Image]:
+    """Yield the frames that decode as pictures: uint8, height x width x BGR; nothing where the file is no video."""
+    with Decoder(path) as decoder:
+        for frame in decoder.frames():
+            yield picture(frame)
+
+
+def picture(frame: av.VideoFrame) -> Image:
+    """A frame as uint8, height x width x BGR, turned as its metadata say."""
+    image = np.asarray(_reformatter().reformat(frame, format="bgr24", threads=1).to_ndarray(), dtype=np.uint8)
+    return np.ascontiguousarray(np.rot90(image, turns(frame)))
+
+
+def to_rgb(yuv: Image, frame: av.VideoFrame) -> Image:
+    """Turn brightness and colour differences (uint8, height x width x 3) of a frame into RGB, as its format says.
+
+    ITU-R BT.601, or BT.709 where the stream names it; brightness from 16 to 235 unless the stream says full range.
+    """
+    full = frame.format.name.startswith("yuvj") or frame.color_range == FULL_RANGE
+    rgb: Image = cv2.transform(yuv, _colours(full, frame.colorspace == BT709))
+    return rgb
+
+
+def turns(frame: av.VideoFrame) -> int:
+    """Quarter turns against the clock that the metadata ask for."""
+    return round(frame.rotation / 90) % 4
+
+
+def brightness(frame: av.VideoFrame) -> Image:
+    """The first plane of a frame, uint8, height x width: a view that keeps the frame alive."""
+    return _plane(frame.planes[0])
+
+
+def planes(frame: av.VideoFrame) -> tuple[Image, ...]:
+    """Brightness and the two colour differences, as `brightness`; each has a height and width of its own."""
+    return tuple(_plane(plane) for plane in frame.planes)
+
+
+def _plane(plane: av.video.plane.VideoPlane) -> Image:
+    padded: Image = np.frombuffer(memoryview(plane), np.uint8).reshape(plane.height, plane.line_size)
+    return padded[:, : plane.width]
+
+
+@cache
+def _colours(full: bool, bt709: bool) -> npt.NDArray[np.float64]:
+    """The 3 x 4 matrix from (Y, U, V, 1) to (R, G, B) in 8-bit steps."""
+    red, blue = (0.2126, 0.0722) if bt709 else (0.299, 0.114)
+    green = 1 - red - blue
+    matrix = np.array(
+        [
+            [1, 0, 2 * (1 - red)],
+            [1, -2 * blue * (1 - blue) / green, -2 * red * (1 - red) / green],
+            [1, 2 * (1 - blue), 0],
+        ]
+    )
+    scale = np.ones(3) if full else np.array([255 / 219, 255 / 224, 255 / 224])
+    matrix = matrix * scale
+    shift = -matrix @ np.array([0 if full else 16, 128, 128])
+    return np.column_stack([matrix, shift])
+
+
+@cache
+def _reformatter() -> VideoReformatter:
+    """One a process: it keeps its tables from frame to frame."""
+    return VideoReformatter()
