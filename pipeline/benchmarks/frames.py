@@ -1,8 +1,9 @@
 """Extracting frames: against bare decoding, and against what the published code does.
 
 The published code (github.com/clear-nus/octopi, utils/process_dataset.py) decodes each video twice, in one process,
-and writes every chosen frame as a JPEG of its own. Bare decoding reads all frames and does nothing with them, in as
-many processes as the extraction uses. All cases take turns within a repeat, so that a busy machine slows all alike.
+and writes every chosen frame as a JPEG of its own. Bare decoding makes a BGR picture of every frame and does nothing
+with it, in as many processes as the extraction uses. All cases take turns within a repeat, so that a busy machine slows
+all alike.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import multiprocessing.connection
 import resource
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
@@ -21,7 +22,7 @@ from typing import get_args
 import cv2
 
 from pipeline.benchmarks import BenchRow, bench_videos
-from pipeline.decoding import decode
+from pipeline.decoding import Image, decode
 from pipeline.frames.extract import extract_frames
 from pipeline.frames.selection import changed_pixels
 from pipeline.parallel import run_parallel
@@ -46,6 +47,7 @@ def measure(root: Path) -> list[BenchRow]:
     folder, catalogue = bench_videos(root)
     count = len(list_videos(folder, catalogue).files)
     cases: dict[str, Callable[[], object]] = {BARE: lambda: _bare(folder, catalogue)}
+    cases |= {"bare decoding by OpenCV": lambda: _bare(folder, catalogue, _decode_by_opencv)}
     cases |= {PUBLISHED: lambda: _published(folder, catalogue)}
     for name in get_args(Selection):
         cases[f"{name}, {SIZE} pixels"] = lambda name=name: _extract(folder, catalogue, name, SIZE)  # type: ignore[misc]
@@ -120,12 +122,26 @@ def _extract(folder: Path, catalogue: Catalogue, selection: Selection, size: int
         extract_frames(folder, catalogue, config, Path(out) / "frames", Path(out) / "partial")
 
 
-def _bare(folder: Path, catalogue: Catalogue) -> None:
-    list(run_parallel(_decode_all, [f.path for f in list_videos(folder, catalogue).files], "bare", "video"))
+def _bare(folder: Path, catalogue: Catalogue, way: Callable[[Path], int] | None = None) -> None:
+    list(run_parallel(way or _decode_all, [f.path for f in list_videos(folder, catalogue).files], "bare", "video"))
 
 
 def _decode_all(path: Path) -> int:
     return sum(1 for _ in decode(path))
+
+
+def _decode_by_opencv(path: Path) -> int:
+    return sum(1 for _ in _opencv(path))
+
+
+def _opencv(path: Path) -> Iterator[Image]:
+    """The frames by OpenCV's own decoder, as the published code reads them."""
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, 1])
+    while True:
+        found, frame = capture.read()
+        if not found:
+            return
+        yield frame
 
 
 def _published(folder: Path, catalogue: Catalogue) -> None:
@@ -137,13 +153,13 @@ def _published(folder: Path, catalogue: Catalogue) -> None:
 def _publish_one(path: Path, out: Path) -> None:
     """Score in a first decode, write JPEGs in a second."""
     scores, before, count = [], None, 0
-    for index, frame in enumerate(decode(path)):
+    for index, frame in enumerate(_opencv(path)):
         grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
         if before is not None:
             scores.append((-changed_pixels(grey, before), index))
         before, count = grey, index + 1
     chosen = {index for _, index in sorted(scores)[: int(FRACTION * count)]}
     out.mkdir(parents=True)
-    for index, frame in enumerate(decode(path), 1):
+    for index, frame in enumerate(_opencv(path), 1):
         if index in chosen:
             cv2.imwrite(str(out / f"{index:010d}.jpg"), frame)
