@@ -82,7 +82,7 @@ def test_frames_are_timed_on_any_videos(tiny_videos: Path, monkeypatch: pytest.M
     rows = frames.measure(ROOT)
     assert {r.baseline for r in rows} == {frames.BARE, frames.PUBLISHED, "peak memory, 1 videos"}
     for r in rows:
-        if r.case.startswith(r.baseline):
+        if r.case.split(",")[0] == r.baseline:
             assert r.ratio == 1
     frames._publish_one(tiny_videos / "rug_0.avi", tmp_path / "published")
     assert len(list((tmp_path / "published").iterdir())) == int(0.3 * 31)
