@@ -101,3 +101,6 @@ def main() -> None:
     except UserError as error:
         typer.echo(f"octopi: {error}", err=True)
         raise SystemExit(1) from None
+    except OSError as error:
+        typer.echo(f"octopi: {error.filename or 'a file'}: {error.strerror}; choose another place", err=True)
+        raise SystemExit(1) from None

@@ -65,12 +65,15 @@ def encode(
     pixels: str = "yuv444p",
     given: str = "bgr24",
     milliseconds: Sequence[int] = (),
+    bits: int = 0,
 ) -> Path:
     """Write frames (in PyAV's format `given`) by any codec, at any time stamps; FFV1 gives back what went in."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=25)
         stream.pix_fmt = pixels
+        if bits:
+            stream.bit_rate = bits
         for index, frame in enumerate(frames):
             video_frame = av.VideoFrame.from_ndarray(frame, format=given)
             if index == 0:
@@ -106,6 +109,12 @@ def tiny_videos(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_video(folder / f"{name}.avi", moving_square(count, seed))
     write_video(folder / "sub folder é" / "rug_1.AVI", moving_square(7, 99))
     return folder
+
+
+@pytest.fixture
+def few_permutations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few permutations in the audit of leakage, where they are not what is tested."""
+    monkeypatch.setattr("pipeline.audit.leakage.PERMUTATIONS", 50)
 
 
 def fake_videos(objects: Iterable[str], per_object: int = 3) -> list[Video]:

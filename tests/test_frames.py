@@ -1,38 +1,28 @@
-"""Which frames are kept, by every rule, against slow second implementations; how they are fitted, stored and drawn."""
+"""Which frames are kept, by every rule, against slow second implementations."""
 
 from __future__ import annotations
 
 import itertools
 import math
-import random
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 
 import av
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from PIL import Image as Pillow
 
-from pipeline.decoding import Decoder, Header, picture, planes
-from pipeline.errors import UserError
+from pipeline.decoding import Decoder, Header, picture
 from pipeline.frames import selection
 from pipeline.frames.course import Course, run_pass
-from pipeline.frames.extract import extract_frames
 from pipeline.frames.fit import fit
 from pipeline.frames.reference import reference_indices, strength, thumbnail
-from pipeline.frames.sampling import sample_evaluation, sample_training
 from pipeline.frames.selection import TOUCHING, Kept, Pool, difference, kept_count, thin, uniform_indices
-from pipeline.frames.store import FrameStore
-from pipeline.frames.subtraction import subtract
-from pipeline.physiclear.catalogue import Catalogue
 from pipeline.sections import FramesConfig
 from tests.conftest import encode, moving_square, write_video
-
-CONFIG = FramesConfig(size=16)
+from tests.frame_rules import CONFIG, constant, frames_of, luma, pillow, pressing, published, salience
 
 
 def flashing(count: int) -> list[np.ndarray]:
@@ -40,48 +30,8 @@ def flashing(count: int) -> list[np.ndarray]:
     return [np.full((30, 40, 3), 255 * (i % 2), np.uint8) for i in range(count)]
 
 
-def constant(count: int, value: int = 77) -> list[np.ndarray]:
-    return [np.full((30, 40, 3), value, np.uint8)] * count
-
-
-def pressing(count: int, seed: int = 0, width: int = 80, height: int = 60) -> list[np.ndarray]:
-    """Still for a fifth of the time, then bumps of changing place and depth come and go."""
-    rng = np.random.default_rng(seed)
-    ground = 90 + 20 * np.mgrid[0:height, 0:width][1] / width
-    y, x = np.mgrid[0:height, 0:width]
-    frames = []
-    for i in range(count):
-        depth = 60 * max(0.0, math.sin(math.pi * (i / count - 0.2) / 0.8))
-        phase = 2 * math.pi * (i // 4) / 7
-        bump = depth * np.sin(x / 3 + phase) * np.exp(-(((x - width / 2) / 18) ** 2) - ((y - height / 2) / 14) ** 2)
-        noise = rng.normal(0, 0.7, (height, width))
-        grey = np.clip(ground + bump + noise, 0, 255)
-        frames.append(np.repeat(grey[..., None], 3, axis=2).astype(np.uint8))
-    return frames
-
-
-def frames_of(path: Path) -> list[av.VideoFrame]:
-    with Decoder(path) as decoder:
-        return list(decoder.frames())
-
-
 def chosen(course: Course) -> list[tuple[int, float]]:
     return [(k.index, k.score) for k in course.kept]
-
-
-def salience(frames: Sequence[np.ndarray], fraction: str) -> list[tuple[int, float]]:
-    """The paper's rule in plain int64 arithmetic and a stable sort, from planes of brightness."""
-    stack = np.stack(frames).astype(np.int64)
-    scores = np.abs(stack[1:] - stack[:-1]).sum(axis=(1, 2))
-    if len(scores) == 0:
-        return [(0, 0)]
-    count = -(-Fraction(fraction) * len(scores) // 1)
-    best = sorted(np.argsort(-scores, kind="stable")[: int(count)])
-    return [(int(i) + 1, int(scores[i])) for i in best]
-
-
-def luma(path: Path) -> list[np.ndarray]:
-    return [planes(frame)[0].copy() for frame in frames_of(path)]
 
 
 @pytest.mark.parametrize(
@@ -166,23 +116,6 @@ def test_as_many_as_the_fraction_rounded_up(frames: int, fraction: float, name: 
     candidates = frames - (name == "salient")
     assert 1 <= count <= candidates
     assert count - 1 < Fraction(str(fraction)) * candidates <= count
-
-
-def published(path: Path, promised: int) -> list[tuple[int, int]]:
-    """utils/process_dataset.py again: (frame saved, changed pixels), from OpenCV's frames and the header's count."""
-    capture = cv2.VideoCapture(str(path))
-    there, before = capture.read()
-    earlier = cv2.cvtColor(before, cv2.COLOR_BGR2GRAY)
-    scores = []
-    for i in range(1, promised):
-        there, frame = capture.read()
-        if not there:
-            break
-        grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-        scores.append((i, int(np.count_nonzero(cv2.absdiff(grey, earlier)))))
-        earlier = grey
-    best = sorted(scores, key=lambda item: item[1], reverse=True)[: int(0.3 * promised)]
-    return sorted((i - 1, score) for i, score in best) if len(best) >= 5 else []
 
 
 @pytest.mark.parametrize("count", [1, 3, 16, 17, 40])
@@ -329,127 +262,6 @@ def test_a_header_without_a_number_of_frames(tmp_path: Path) -> None:
     for name in ("salient", "uniform", "contact", "adaptive"):
         assert len(run_pass(path, FramesConfig(size=16, selection=name)).kept) == 1
     assert run_pass(path, FramesConfig(size=16, selection="release")).kept == []
-
-
-def pillow(image: np.ndarray, size: int, mode: str) -> np.ndarray:
-    """The central square or all of a picture, by PIL's antialiased bicubic filter."""
-    height, width = image.shape[:2]
-    side = min(height, width)
-    top, left = (height - side) // 2, (width - side) // 2
-    if mode == "crop":
-        image = image[top : top + side, left : left + side]
-    return np.asarray(Pillow.fromarray(np.ascontiguousarray(image)).resize((size, size), Pillow.Resampling.BICUBIC))
-
-
-def scene(height: int, width: int) -> np.ndarray:
-    """About four waves a side in BGR: whatever it is resized to, pixels are small against them."""
-    y, x = np.mgrid[0:height, 0:width] * 240 / min(height, width)
-    waves = [120 + 60 * np.sin(x / 9 + c) * np.cos(y / 11) + 25 * np.sin((x + y) / 40) for c in range(3)]
-    return np.stack(waves, axis=2).astype(np.uint8)
-
-
-@pytest.mark.parametrize(
-    ("height", "width", "size"),
-    [(240, 320, 64), (240, 320, 224), (480, 640, 224), (321, 241, 64), (97, 130, 48), (480, 640, 48), (1080, 600, 112)],
-)
-@pytest.mark.parametrize("mode", ["crop", "squash"])
-@pytest.mark.parametrize("pixels", ["yuv420p", "yuv422p", "yuv444p", "yuv411p", "yuv440p"])
-def test_fitted_frames_are_near_a_bicubic_resize(
-    tmp_path: Path, height: int, width: int, size: int, mode: str, pixels: str
-) -> None:
-    """At most 2 of 255 steps apart on average; 4 where odd sides shift a small picture's colour by half a pixel."""
-    (frame,) = frames_of(encode(tmp_path / "v.mkv", [scene(height, width)], "ffv1", pixels))
-    expected = pillow(picture(frame)[..., ::-1], size, mode).astype(int)
-    found = fit(frame, FramesConfig(size=size, fit=mode)).astype(int)
-    assert np.abs(found - expected).mean() <= (4 if height == 97 else 2)
-    assert np.quantile(np.abs(found - expected), 0.99) <= 16
-
-
-@pytest.mark.parametrize(
-    ("height", "width"), [(36, 48), (48, 36), (17, 97), (240, 321), (5, 5), (1, 9), (1, 1), (2, 2), (3, 200)]
-)
-@pytest.mark.parametrize("pixels", ["yuv420p", "yuv422p", "yuv444p", "yuv410p", "yuv411p", "yuv440p"])
-@pytest.mark.parametrize("mode", ["crop", "squash"])
-def test_one_colour_fills_every_square(height: int, width: int, pixels: str, mode: str) -> None:
-    frame = av.VideoFrame(width, height, pixels)
-    for plane, value in zip(frame.planes, (100, 90, 200), strict=True):
-        plane.update(bytes([value]) * plane.buffer_size)
-    expected = (1.164 * 84 + 1.596 * 72, 1.164 * 84 + 0.392 * 38 - 0.813 * 72, 1.164 * 84 - 2.017 * 38)
-    for size in (16, 64):
-        image = fit(frame, FramesConfig(size=size, fit=mode))
-        assert (image.shape, image.dtype) == ((size, size, 3), np.uint8)
-        assert np.abs(image - np.array(expected)).max() <= 1
-
-
-@pytest.mark.parametrize("pixels", ["yuv420p", "yuv422p", "yuv444p", "yuv411p"])
-def test_crop_takes_the_centre_and_squash_takes_all(tmp_path: Path, pixels: str) -> None:
-    """In colour as in brightness, also where colour is halved one way only."""
-    image = np.zeros((32, 96, 3), np.uint8)
-    image[:, 32:64] = (30, 40, 250)
-    (frame,) = frames_of(encode(tmp_path / "v.mkv", [image], "ffv1", pixels))
-    cropped = fit(frame, FramesConfig(size=32, fit="crop"))
-    assert np.abs(cropped[:, 4:-4].astype(int) - (250, 40, 30)).max() <= 8
-    squashed = fit(frame, FramesConfig(size=24, fit="squash"))
-    assert squashed[..., 0].mean() == pytest.approx(250 / 3, abs=4)
-    assert squashed[12, 12, 0] > 230 > 20 > squashed[12, 2, 0]
-
-
-@given(st.integers(1, 400), st.integers(1, 64), st.integers(0, 2**32))
-def test_training_samples(count: int, k: int, seed: int) -> None:
-    drawn = sample_training(count, k, random.Random(seed))
-    assert len(drawn) == k
-    assert list(drawn) == sorted(drawn)
-    assert set(drawn) <= set(range(count))
-    assert len(set(drawn)) == k or count < k
-    assert drawn == sample_training(count, k, random.Random(seed))
-
-
-@given(st.integers(1, 400), st.integers(1, 64))
-def test_evaluation_samples_are_uniform_from_the_first(count: int, k: int) -> None:
-    drawn = sample_evaluation(count, k)
-    assert len(drawn) == k
-    assert drawn[0] == 0
-    assert drawn[-1] < count
-    gaps = [b - a for a, b in itertools.pairwise(drawn)]
-    assert all(between in (count // k, -(-count // k)) for between in gaps)
-
-
-def test_every_kept_frame_is_drawn_equally_often() -> None:
-    rng = random.Random(0)
-    counts = np.zeros(10)
-    for _ in range(4000):
-        counts[list(sample_training(10, 5, rng))] += 1
-    assert counts == pytest.approx(2000, rel=0.08)
-
-
-def test_the_store_gives_pictures_with_and_without_the_reference(
-    tiny_videos: Path, tmp_path: Path, catalogue: Catalogue
-) -> None:
-    found = extract_frames(tiny_videos, catalogue, CONFIG, tmp_path, tmp_path / "partial")
-    plain, subtracted = FrameStore(tmp_path), FrameStore(tmp_path, "subtract")
-    assert plain.size == subtracted.size == 16
-    references = np.load(tmp_path / "references.npy")
-    for place, video in enumerate(found.videos):
-        rows = [f.row for f in found.frames if f.video_id == video.video_id]
-        assert plain.rows(video.video_id) == rows
-        np.testing.assert_array_equal(plain.pictures(video.video_id), plain.pixels[rows])
-        np.testing.assert_array_equal(
-            subtracted.pictures(video.video_id), subtract(np.asarray(plain.pixels[rows]), references[place])
-        )
-        drawn = sample_evaluation(len(rows), 5)
-        np.testing.assert_array_equal(
-            subtracted.pictures(video.video_id, drawn), subtracted.pictures(video.video_id)[list(drawn)]
-        )
-
-
-@pytest.mark.parametrize(("file", "reference"), [("frames.npy", "none"), ("references.npy", "subtract")])
-def test_a_store_with_a_row_too_few_is_an_error(
-    tiny_videos: Path, tmp_path: Path, catalogue: Catalogue, file: str, reference: str
-) -> None:
-    extract_frames(tiny_videos, catalogue, CONFIG, tmp_path, tmp_path / "partial")
-    np.save(tmp_path / file, np.load(tmp_path / file)[:-1])
-    with pytest.raises(UserError, match="differ in length; run"):
-        FrameStore(tmp_path, "subtract" if reference == "subtract" else "none")
 
 
 @pytest.mark.real

@@ -1,0 +1,123 @@
+"""Made-up measurements and catalogues for the tests of the audit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.audit.leakage import check_leakage, evidence
+from pipeline.frames.scan import Scan, scan
+from pipeline.physiclear.catalogue import Catalogue, load_catalogue
+from pipeline.records import Assignment, Finding, Part, Probe, Severity, Video
+from pipeline.runtime import derive_seed
+from pipeline.scenes.light import make_sensor
+from pipeline.scenes.recipe import recipe_of
+from pipeline.scenes.video import render
+from pipeline.sections import FramesConfig, ScenesConfig
+from pipeline.videos import VideoFile
+from tests.closure import ROOT
+
+ERROR, WARNING, INFO = Severity.ERROR, Severity.WARNING, Severity.INFO
+PHYSICLEAR = load_catalogue(ROOT / "pipeline" / "physiclear")
+OBJECTS = ("baseball", "cotton_ball", "pillow", "potato", "rug", "millet", "lemon", "orange")
+GOOD_SPLIT = {o: (Part.TRAIN, Part.VALIDATION, Part.TEST)[i % 3] for i, o in enumerate(OBJECTS)}
+SCENE = ScenesConfig(frames=40, width=160, height=120)
+OTHER = Catalogue(
+    language=PHYSICLEAR.language.model_copy(update={"dataset": ""}),
+    objects={o: PHYSICLEAR.objects[o] for o in OBJECTS},
+)
+"""Eight objects of a data set that the paper says nothing about."""
+
+
+def probe(video_id: str = "rug_0", **changes: object) -> Probe:
+    """What a flawless video measures; its contact and its untouched picture are its own."""
+    rng = np.random.default_rng(derive_seed(video_id))
+    contact = rng.normal(size=24 * 18)
+    good: dict[str, object] = {
+        "video_id": video_id,
+        "object_id": video_id.rpartition("_")[0],
+        "path": f"{video_id}.mov",
+        "session": "",
+        "header_frames": 126,
+        "frames": 126,
+        "fps": 25.0,
+        "width": 320,
+        "height": 240,
+        "rotation": 0,
+        "irregular": 1.0,
+        "kept": 37,
+        "brightness": 90.0,
+        "brightness_step": 0.4,
+        "saturated": 0.0,
+        "contact": 1.4,
+        "quiet": 0.25,
+        "contact_end": 0.3,
+        "starts_touching": False,
+        "texture_start": 2.0,
+        "texture_end": 2.0,
+        "thumbnail": tuple(rng.normal(90, 1, 6 * 8 * 3)),
+        "signature": tuple(contact / np.linalg.norm(contact)),
+    }
+    return Probe.model_validate({**good, **changes})
+
+
+def probes(videos: int = 3, objects: Sequence[str] = OBJECTS) -> list[Probe]:
+    return [probe(f"{o}_{i}") for o in objects for i in range(videos)]
+
+
+def video(of: Probe, sha256: str = "") -> Video:
+    return Video(
+        video_id=of.video_id,
+        object_id=of.object_id,
+        path=of.path,
+        sha256=sha256 or f"sha of {of.path}",
+        frames=of.frames,
+        fps=of.fps,
+        width=of.width,
+        height=of.height,
+    )
+
+
+def assigned(found: Sequence[Probe], parts: dict[str, Part]) -> list[Assignment]:
+    """Parts by video id, else by object."""
+    return [
+        Assignment(
+            video_id=p.video_id,
+            object_id=p.object_id,
+            part=parts.get(p.video_id, parts.get(p.object_id, Part.UNUSED)),
+        )
+        for p in found
+    ]
+
+
+def odd(findings: Sequence[Finding] | Iterator[Finding]) -> list[Finding]:
+    return [f for f in findings if f.severity is not INFO]
+
+
+def of(findings: Sequence[Finding] | Iterator[Finding], check: str) -> list[Finding]:
+    return [f for f in findings if f.check == check]
+
+
+def leaks(found: Sequence[Probe], parts: dict[str, Part], catalogue: Catalogue, **sha256: str) -> list[Finding]:
+    videos = [video(p, sha256.get(p.video_id, "")) for p in found]
+    return list(check_leakage(evidence(found, videos, assigned(found, parts)), catalogue))
+
+
+def relabelled(catalogue: Catalogue, **changes: object) -> Catalogue:
+    """Objects of `catalogue` that all have the same changes."""
+    objects = {o: entry.model_copy(update=changes) for o, entry in catalogue.objects.items()}
+    return Catalogue(language=catalogue.language, objects=objects)
+
+
+def recorded(object_id: str, seed: int, sensor: int = 0) -> list[np.ndarray]:
+    """A synthetic press of an object."""
+    look = make_sensor(SCENE.width, SCENE.height, sensor)
+    return list(render(recipe_of(object_id, PHYSICLEAR, 0), SCENE, look, seed))
+
+
+def look_at(path: Path, video_id: str) -> tuple[Probe, Video]:
+    found = scan(VideoFile(path, path.name, video_id.rpartition("_")[0], video_id), FramesConfig(size=16))
+    assert isinstance(found, Scan)
+    return found.probe, found.video

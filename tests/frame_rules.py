@@ -1,0 +1,108 @@
+"""Small videos, slow second implementations of the rules, and a place to extract frames to."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+from PIL import Image as Pillow
+
+from pipeline.decoding import Decoder, planes
+from pipeline.frames.extract import Extraction, extract_frames
+from pipeline.physiclear.catalogue import Catalogue
+from pipeline.sections import FramesConfig
+
+CONFIG = FramesConfig(size=16)
+FILES = ("frames.npy", "references.npy", "frames.parquet", "probes.parquet")
+
+
+def constant(count: int, value: int = 77) -> list[np.ndarray]:
+    return [np.full((30, 40, 3), value, np.uint8)] * count
+
+
+def pressing(count: int, seed: int = 0, width: int = 80, height: int = 60) -> list[np.ndarray]:
+    """Still for a fifth of the time, then bumps of changing place and depth come and go."""
+    rng = np.random.default_rng(seed)
+    ground = 90 + 20 * np.mgrid[0:height, 0:width][1] / width
+    y, x = np.mgrid[0:height, 0:width]
+    frames = []
+    for i in range(count):
+        depth = 60 * max(0.0, math.sin(math.pi * (i / count - 0.2) / 0.8))
+        phase = 2 * math.pi * (i // 4) / 7
+        bump = depth * np.sin(x / 3 + phase) * np.exp(-(((x - width / 2) / 18) ** 2) - ((y - height / 2) / 14) ** 2)
+        noise = rng.normal(0, 0.7, (height, width))
+        grey = np.clip(ground + bump + noise, 0, 255)
+        frames.append(np.repeat(grey[..., None], 3, axis=2).astype(np.uint8))
+    return frames
+
+
+def frames_of(path: Path) -> list[av.VideoFrame]:
+    with Decoder(path) as decoder:
+        return list(decoder.frames())
+
+
+def salience(frames: Sequence[np.ndarray], fraction: str) -> list[tuple[int, float]]:
+    """The paper's rule in plain int64 arithmetic and a stable sort, from planes of brightness."""
+    stack = np.stack(frames).astype(np.int64)
+    scores = np.abs(stack[1:] - stack[:-1]).sum(axis=(1, 2))
+    if len(scores) == 0:
+        return [(0, 0)]
+    count = -(-Fraction(fraction) * len(scores) // 1)
+    best = sorted(np.argsort(-scores, kind="stable")[: int(count)])
+    return [(int(i) + 1, int(scores[i])) for i in best]
+
+
+def luma(path: Path) -> list[np.ndarray]:
+    return [planes(frame)[0].copy() for frame in frames_of(path)]
+
+
+def published(path: Path, promised: int) -> list[tuple[int, int]]:
+    """utils/process_dataset.py again: (frame saved, changed pixels), from OpenCV's frames and the header's count."""
+    capture = cv2.VideoCapture(str(path))
+    there, before = capture.read()
+    earlier = cv2.cvtColor(before, cv2.COLOR_BGR2GRAY)
+    scores = []
+    for i in range(1, promised):
+        there, frame = capture.read()
+        if not there:
+            break
+        grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+        scores.append((i, int(np.count_nonzero(cv2.absdiff(grey, earlier)))))
+        earlier = grey
+    best = sorted(scores, key=lambda item: item[1], reverse=True)[: int(0.3 * promised)]
+    return sorted((i - 1, score) for i, score in best) if len(best) >= 5 else []
+
+
+def pillow(image: np.ndarray, size: int, mode: str) -> np.ndarray:
+    """The central square or all of a picture, by PIL's antialiased bicubic filter."""
+    height, width = image.shape[:2]
+    side = min(height, width)
+    top, left = (height - side) // 2, (width - side) // 2
+    if mode == "crop":
+        image = image[top : top + side, left : left + side]
+    return np.asarray(Pillow.fromarray(np.ascontiguousarray(image)).resize((size, size), Pillow.Resampling.BICUBIC))
+
+
+class Place:
+    """A folder of videos, and where its frames go."""
+
+    def __init__(self, folder: Path, root: Path, catalogue: Catalogue) -> None:
+        self.folder, self.catalogue = folder, catalogue
+        self.out, self.partial, self.log = root / "out é", root / "partial", root / "decoded.txt"
+
+    def extract(self, config: FramesConfig = CONFIG) -> Extraction:
+        return extract_frames(self.folder, self.catalogue, config, self.out, self.partial)
+
+    def bytes(self) -> list[bytes]:
+        return [(self.out / name).read_bytes() for name in FILES]
+
+    def decoded(self) -> list[str]:
+        """Which videos were scanned since the last look, as the processes that did it noted."""
+        names = self.log.read_text().split() if self.log.exists() else []
+        self.log.unlink(missing_ok=True)
+        return sorted(names)
