@@ -48,11 +48,20 @@ class ScenesConfig(Section):
     objects: tuple[str, ...] = ()
     """Object ids; empty stands for all of the catalogue."""
     videos_per_object: Positive = 5
-    frames: Annotated[int, Field(ge=2, le=1000)] = 100
-    """Frames a video."""
+    frames: Annotated[int, Field(ge=2, le=1000)] | Literal["recorded"] = 100
+    """Frames a video; `recorded` draws them, and the rate, as often as the public videos have them."""
     fps: Annotated[float, Field(gt=0, le=240)] = 25.0
-    width: Annotated[int, Field(ge=32, le=1280)] = 320
-    height: Annotated[int, Field(ge=24, le=960)] = 240
+    """Frames a second, where `frames` is a number."""
+    tier: Literal["auto", "winkler", "layer", "half_space"] = "auto"
+    """How a contact is computed: on springs, with the gel as an elastic layer or as a half-space; `auto` takes what is
+    cheapest within `tolerance`."""
+    cells: Annotated[int, Field(ge=32, le=1024)] = 256
+    """`layer`, `half_space`: grid across the pressed patch."""
+    tolerance: Annotated[float, Field(gt=0, le=1)] = 0.2
+    """`auto`: estimated relative error in the slopes of the gel's skin."""
+    width: Annotated[int, Field(ge=32, le=1280, multiple_of=2)] = 320
+    height: Annotated[int, Field(ge=24, le=960, multiple_of=2)] = 240
+    """Even, as the videos' codec wants it."""
     seed: Seed = 0
 
 

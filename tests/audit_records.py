@@ -14,7 +14,7 @@ from pipeline.records import Assignment, Finding, Part, Probe, Severity, Video
 from pipeline.runtime import derive_seed
 from pipeline.scenes.light import make_sensor
 from pipeline.scenes.recipe import recipe_of
-from pipeline.scenes.video import render
+from pipeline.scenes.render import make_scene, render
 from pipeline.sections import FramesConfig, ScenesConfig
 from pipeline.videos import VideoFile
 from tests.closure import ROOT
@@ -114,7 +114,8 @@ def relabelled(catalogue: Catalogue, **changes: object) -> Catalogue:
 def recorded(object_id: str, seed: int, sensor: int = 0) -> list[np.ndarray]:
     """A synthetic press of an object."""
     look = make_sensor(SCENE.width, SCENE.height, sensor)
-    return list(render(recipe_of(object_id, PHYSICLEAR, 0), SCENE, look, seed))
+    scene = make_scene(recipe_of(object_id, PHYSICLEAR, 0), SCENE, int(SCENE.frames), seed)
+    return list(render(scene, SCENE, look, seed))
 
 
 def look_at(path: Path, video_id: str) -> tuple[Probe, Video]:

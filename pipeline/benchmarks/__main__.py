@@ -7,11 +7,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from pipeline.artifacts import write_json
-from pipeline.benchmarks import BenchRow, frames, selection, startup
+from pipeline.benchmarks import BenchRow, frames, realism, scenes, selection, startup
 from pipeline.errors import UserError
 
 SECTIONS: dict[str, Callable[[Path], Sequence[BenchRow]]] = {
     "frames": frames.measure,
+    "realism": realism.measure,
+    "scenes": scenes.measure,
     "selection": selection.measure,
     "startup": startup.measure,
 }

@@ -1,32 +1,38 @@
-"""What a catalogue's labels mean in millimetres and megapascals: the physical parameters of every object.
+"""What an object is made of, as physics sees it: listed in a catalogue's `scenes.yaml`, or drawn from its labels.
 
-The classes are the annotators' (paper, "Dataset Collection"): hardness by how far an object yields, roughness by its
-grain, bumpiness by the size of what sticks out, against a quarter of the image. Each object draws its parameters from
-its classes' ranges by its own seed, so that objects of one class differ and all videos of an object share them.
+Each listed object has a few lines of YAML (docs/scenes.md). One that is not listed draws its parameters from its
+classes' ranges by its own seed, so that objects of one class differ. All videos of an object share its recipe.
 """
 
 from __future__ import annotations
 
 import math
 import random
-from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from pipeline.errors import UserError
 from pipeline.physiclear.catalogue import Catalogue, Object
 from pipeline.runtime import derive_seed
-from pipeline.scenes.geometry import IMAGE_MM, BumpShape, Surface
+from pipeline.scenes.bumps import Domes, Ridges
+from pipeline.scenes.geometry import IMAGE_MM, Body, Flat, Round, Surface
+from pipeline.scenes.relief import AnyLayer, Rough
 
+SCENES = "scenes.yaml"
 Range = tuple[float, float]
 
 MODULUS_MPA: tuple[Range, ...] = ((0.02, 0.08), (0.15, 0.6), (10.0, 1000.0))
 """Reduced modulus E* by hardness: foam and down; rubber, fruit and cloth; wood, hard plastic and metal."""
-GRAIN_MM: tuple[Range, ...] = ((0.0003, 0.001), (0.009, 0.016), (0.03, 0.05))
-"""Root mean square height of the grain by roughness."""
-GRAIN_LENGTH_MM: tuple[Range, ...] = ((0.3, 0.6), (0.35, 0.6), (0.7, 1.2))
-"""Longest wavelength of the grain by roughness."""
-BUMP_SHARE: tuple[Range, ...] = ((0.0, 0.0), (0.07, 0.16), (0.29, 0.5))
+ROUGH_RMS_MM: tuple[Range, ...] = ((0.0003, 0.001), (0.007, 0.01), (0.028, 0.04))
+"""Root mean square height of the roughness."""
+ROUGH_LONGEST_MM: Range = (0.4, 0.6)
+"""Its longest wavelength, below what counts as shape (`measure.TEXTURE_MM`)."""
+BUMP_SHARE: tuple[Range, ...] = ((0.0, 0.0), (0.15, 0.19), (0.45, 0.6))
 """Width of a bump by bumpiness, as a share of the image's height; the paper's border is 1/4."""
-BUMP_STEEPNESS: Range = (0.1, 0.18)
+BUMP_STEEPNESS: Range = (0.14, 0.19)
 """Height of a bump over its width."""
 RADII_MM: dict[str, tuple[Range, Range]] = {
     "flat": ((40.0, 120.0), (40.0, 120.0)),
@@ -35,22 +41,40 @@ RADII_MM: dict[str, tuple[Range, Range]] = {
 }
 """Radii of curvature across and along a body."""
 LIMP = ("fabric", "paper")
-"""Materials that lie flat; of these, fabric is woven."""
+"""Materials that lie flat."""
 HELD = ("handle", "barrel", "grip")
 """Parts that are thicker in no direction but one."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Recipe:
+class Recipe(BaseModel):
     """An object as physics sees it."""
 
-    modulus: float
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    modulus: Annotated[float, Field(ge=0.001, le=1e6)]
     """Reduced modulus E / (1 - nu^2) in MPa."""
-    surface: Surface
+    body: Body = Flat(kind="flat")
+    relief: tuple[AnyLayer, ...] = ()
+
+    @property
+    def surface(self) -> Surface:
+        """Its shape."""
+        return Surface(body=self.body, relief=self.relief)
+
+
+def load_recipes(folder: Path, catalogue: Catalogue, seed: int) -> dict[str, Recipe]:
+    """A recipe for every object of the catalogue: listed in the folder's `scenes.yaml`, else drawn by `recipe_of`.
+
+    Raises:
+        UserError: naming file, object and key, for what is no YAML, an unknown object, a missing, unknown or
+            impossible value; and as `recipe_of` where an object has to be drawn.
+    """
+    listed = _read(folder / SCENES, catalogue) if (folder / SCENES).is_file() else {}
+    return {o: listed[o] if o in listed else recipe_of(o, catalogue, seed) for o in catalogue.objects}
 
 
 def recipe_of(object_id: str, catalogue: Catalogue, seed: int) -> Recipe:
-    """The parameters of an object of the catalogue.
+    """A recipe drawn from the labels of an object of the catalogue, whether or not it is listed in `scenes.yaml`.
 
     Raises:
         UserError: where the catalogue lacks one of the three properties that scenes are made from, or has it with
@@ -65,20 +89,54 @@ def recipe_of(object_id: str, catalogue: Catalogue, seed: int) -> Recipe:
             "data.source=videos for a catalogue with others"
         )
     rng = random.Random(derive_seed(seed, "object", object_id))
-    described = catalogue.objects[object_id]
-    across, along = RADII_MM[_body(described, rng)]
-    width = rng.uniform(*BUMP_SHARE[levels["bumpiness"]]) * IMAGE_MM[1]
-    shape: BumpShape = "weave" if described.material == "fabric" else rng.choice(("domes", "domes", "ridges"))
-    surface = Surface(
-        radii=(_log_uniform(rng, across), _log_uniform(rng, along)),
-        bump_shape=shape,
-        bump_width=width,
-        bump_height=width * rng.uniform(*BUMP_STEEPNESS),
-        bump_spacing=width * rng.uniform(1.15, 1.7),
-        grain=_log_uniform(rng, GRAIN_MM[levels["roughness"]]),
-        grain_length=rng.uniform(*GRAIN_LENGTH_MM[levels["roughness"]]),
+    across, along = RADII_MM[_body(catalogue.objects[object_id], rng)]
+    width = max(rng.uniform(*BUMP_SHARE[levels["bumpiness"]]) * IMAGE_MM[1], 0.01)
+    height, spacing = width * rng.uniform(*BUMP_STEEPNESS), width * rng.uniform(1.15, 1.7)
+    bumps: AnyLayer = (
+        Domes(kind="domes", height=height, width=width, spacing=spacing)
+        if rng.random() < 0.5
+        else Ridges(kind="ridges", height=height, width=width, spacing=spacing)
     )
-    return Recipe(modulus=_log_uniform(rng, MODULUS_MPA[levels["hardness"]]), surface=surface)
+    rough = Rough(
+        kind="rough",
+        rms=_log_uniform(rng, ROUGH_RMS_MM[levels["roughness"]]),
+        longest=rng.uniform(*ROUGH_LONGEST_MM),
+    )
+    return Recipe(
+        modulus=_log_uniform(rng, MODULUS_MPA[levels["hardness"]]),
+        body=Round(kind="round", radii=(_log_uniform(rng, across), _log_uniform(rng, along))),
+        relief=(bumps, rough) if levels["bumpiness"] > 0 else (rough,),
+    )
+
+
+def _read(file: Path, catalogue: Catalogue) -> dict[str, Recipe]:
+    try:
+        loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+        entries = yaml.load(file.read_text(encoding="utf-8"), Loader=loader) or {}
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        raise UserError(f"{file}: {' '.join(str(error).split())[:300]}; correct it, or remove it to draw") from None
+    if not isinstance(entries, dict):
+        raise UserError(f"{file}: must map object ids to recipes, like `rug: {{modulus: 0.3}}`")
+    recipes = {}
+    for object_id, entry in entries.items():
+        if object_id not in catalogue.objects:
+            raise UserError(f"{file}: {object_id} is not in objects.csv; correct or remove the entry")
+        try:
+            recipes[object_id] = Recipe.model_validate(entry)
+        except ValidationError as error:
+            raise UserError(f"{file}: {object_id}: {_explain(error)}") from None
+    return recipes
+
+
+def _explain(error: ValidationError) -> str:
+    """The first problem in one line: key, what it is, what it should be."""
+    detail = error.errors(include_url=False)[0]
+    key = ".".join(str(part) for part in detail["loc"]) or "recipe"
+    if detail["type"] == "extra_forbidden":
+        return f"{key} is not a key of a recipe; remove it or see docs/scenes.md for the right name"
+    if detail["type"] == "missing":
+        return f"{key} is missing; add it"
+    return f"{key} is {detail['input']!r}: {detail['msg']}; correct it"
 
 
 def _body(described: Object, rng: random.Random) -> str:

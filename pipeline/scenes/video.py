@@ -1,126 +1,95 @@
-"""From an object to video files: approach, press, twist, let go, as the real videos were recorded."""
+"""From recipes to video files, several at a time."""
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import tempfile
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from statistics import fmean
 
 import cv2
 import numpy as np
-import numpy.typing as npt
-from tqdm import tqdm
 
 from pipeline.errors import UserError
+from pipeline.parallel import run_parallel
 from pipeline.physiclear.catalogue import Catalogue
-from pipeline.runtime import cores, derive_seed
-from pipeline.scenes.contact import indentation, press
-from pipeline.scenes.geometry import IMAGE_MM, Heights, heights
-from pipeline.scenes.light import Image, Sensor, make_sensor, shade
-from pipeline.scenes.recipe import Recipe, recipe_of
+from pipeline.records import Record
+from pipeline.runtime import derive_seed
+from pipeline.scenes.film import write_film
+from pipeline.scenes.light import make_sensor
+from pipeline.scenes.motion import draw_length
+from pipeline.scenes.recipe import Recipe
+from pipeline.scenes.render import make_scene, measure_scene, render
 from pipeline.sections import ScenesConfig
 
 cv2.setNumThreads(1)  # Videos are what runs in parallel.
 
 SENSORS = 3
 """The data set was recorded with several sensors; each video draws one of these."""
-FORCE_N = (3.0, 12.0)
-"""Range of the peak force."""
-TWIST_DEGREES = (8.0, 30.0)
-OFFSET_MM = 2.5
-"""How far from the image's centre the object's centre may lie."""
-JPEG_QUALITY = 92
-
-Track = npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Motion:
-    """What the hand does, one value a frame."""
+class SceneRow(Record):
+    """How one video was made."""
 
-    force: Track
-    """In N; 0 before first touch."""
-    angle: Track
-    """Turn of the object against the sensor, in degrees."""
-    x: Track
-    """Place of the object's centre in mm, from the image's centre."""
-    y: Track
-
-
-def make_motion(frames: int, rng: np.random.Generator) -> Motion:
-    """Rest, a ramp of force, a twist under force, and letting go (not always before the video ends)."""
-    time = np.linspace(0, 1, frames)
-    touch, hold, release = rng.uniform(0.08, 0.2), rng.uniform(0.35, 0.45), rng.uniform(0.75, 0.9)
-    left = rng.uniform(0.1, 0.6)  # The share of the force that is still there at the end.
-    force = rng.uniform(*FORCE_N) * _ramp(time, touch, hold) * (1 - (1 - left) * _ramp(time, release, 1.0))
-    twist = rng.choice((-1, 1)) * rng.uniform(*TWIST_DEGREES)
-    tremor = 0.15 / np.sqrt(frames)  # A random walk of 0.15 mm in all, at any frame rate.
-    x, y = (rng.uniform(-OFFSET_MM, OFFSET_MM) + tremor * np.cumsum(rng.standard_normal(frames)) for _ in "xy")
-    return Motion(force, rng.uniform(0, 360) + twist * _ramp(time, hold, release), x, y)
-
-
-def render(recipe: Recipe, config: ScenesConfig, sensor: Sensor, seed: int) -> Iterator[Image]:
-    """The frames of one video (height x width x BGR, uint8); everything random in it follows from `seed`."""
-    rng = np.random.default_rng(seed)
-    pitch = IMAGE_MM[0] / config.width
-    motion = make_motion(config.frames, rng)
-    margin = OFFSET_MM + 1.0
-    side = int(np.hypot(config.width, config.height) + 2 * margin / pitch) | 1
-    patch = heights(recipe.surface, side, pitch, rng)
-    for number in range(config.frames):
-        force = float(motion.force[number])
-        if force > 0:
-            place = (float(motion.x[number]), float(motion.y[number]))
-            shown = _place(patch, float(motion.angle[number]), place, config, pitch)
-            contact = press(shown.max() - shown, force, recipe.modulus, pitch)
-            skin = indentation(contact, recipe.modulus, pitch)
-        else:
-            skin = np.zeros((config.height, config.width), np.float32)
-        yield shade(skin, sensor, pitch, derive_seed(seed, number))
+    video: str
+    object_id: str
+    frames: int
+    fps: float
+    force: float
+    """The largest, in N."""
+    method: str
+    """Of the contact."""
+    error: float | None
+    """`auto`'s estimate of the relative error in slopes."""
+    residual: float
+    """The contact solver's."""
+    modulus: float
+    """The object's, in MPa; with the next two what its classes are told from (`pipeline.scenes.measure`)."""
+    texture: float
+    """In mm."""
+    bump: float
+    """Over the image's height."""
+    hardness: int
+    roughness: int
+    bumpiness: int
 
 
-def synthesize(catalogue: Catalogue, config: ScenesConfig, folder: Path) -> list[Path]:
-    """Write `<object>_<number>.avi` for every object asked for, several at a time; return the files, sorted.
+def synthesize(recipes: Mapping[str, Recipe], config: ScenesConfig, folder: Path) -> list[SceneRow]:
+    """Write `<object>_<number>.mp4` for every object asked for, several at a time; return how, sorted by name.
 
-    Motion JPEG by OpenCV's own writer: it is in every build of OpenCV and writes no time stamps, so that equal
-    seeds give equal files on one machine. Processes are spawned: a script that calls this needs a main guard.
+    Equal seeds give equal files on one machine.
 
     Raises:
-        UserError: if the catalogue lacks an object asked for, or OpenCV cannot write.
+        UserError: if there is no recipe for an object asked for, or a file cannot be written.
     """
-    unknown = sorted(set(config.objects) - catalogue.objects.keys())
+    unknown = sorted(set(config.objects) - recipes.keys())
     if unknown:
         raise UserError(f"scenes.objects: {', '.join(unknown)} is not in the catalogue; take ids from objects.csv")
-    object_ids = sorted(set(config.objects) or catalogue.objects)
-    names = [(o, number) for o in object_ids for number in range(config.videos_per_object)]
     folder.mkdir(parents=True, exist_ok=True)
-    context = multiprocessing.get_context("spawn")
-    # The writer goes by the suffix, so a video waits under its own name in a hidden folder until it is whole.
+    rows = []
+    # A video waits in a hidden folder until it is whole.
     with tempfile.TemporaryDirectory(prefix=".", dir=folder) as staging:
         jobs = [
-            _Job(
-                recipe_of(o, catalogue, config.seed),
-                config,
-                derive_seed(config.seed, o, n),
-                f"{o}_{n}.avi",
-                Path(staging),
-            )
-            for o, n in names
+            _Job(recipes[o], config, derive_seed(config.seed, o, n), o, f"{o}_{n}.mp4", Path(staging))
+            for o in sorted(set(config.objects) or recipes)
+            for n in range(config.videos_per_object)
         ]
-        with ProcessPoolExecutor(min(cores(), len(jobs)), mp_context=context) as pool:
-            written: Any = pool.map(_write, jobs, chunksize=4)
-            try:
-                for path in tqdm(written, total=len(jobs), desc="scenes", unit="video", disable=None):
-                    os.replace(path, folder / path.name)
-            except BaseException:
-                pool.shutdown(wait=True, cancel_futures=True)
-                raise
-    return sorted(folder / job.name for job in jobs)
+        for row in run_parallel(_write, jobs, "scenes", "video"):
+            os.replace(Path(staging) / row.video, folder / row.video)
+            rows.append(row)
+    return sorted(rows, key=lambda row: row.video)
+
+
+def share_as_labelled(rows: Sequence[SceneRow], catalogue: Catalogue) -> float:
+    """The share of the videos whose scene measures in all classes as the catalogue labels its object."""
+
+    def measured(row: SceneRow) -> tuple[int, ...]:
+        own = catalogue.labels(row.object_id)
+        return tuple(getattr(row, p.name, label) for p, label in zip(catalogue.properties, own, strict=True))
+
+    return round(fmean(measured(row) == catalogue.labels(row.object_id) for row in rows), 4)
 
 
 @dataclass(frozen=True)
@@ -130,38 +99,33 @@ class _Job:
     recipe: Recipe
     config: ScenesConfig
     seed: int
+    object_id: str
     name: str
     staging: Path
 
 
-def _write(job: _Job) -> Path:
+def _write(job: _Job) -> SceneRow:
     config, path = job.config, job.staging / job.name
+    frames, fps = config.frames, config.fps
+    if frames == "recorded":
+        frames, fps = draw_length(np.random.default_rng(derive_seed(job.seed, "length")))
     sensor = make_sensor(config.width, config.height, derive_seed(config.seed, "sensor", job.seed % SENSORS))
-    size = (config.width, config.height)
-    writer = cv2.VideoWriter(str(path), cv2.CAP_OPENCV_MJPEG, cv2.VideoWriter.fourcc(*"MJPG"), config.fps, size)
-    if not writer.isOpened():
-        raise UserError(f"{path.parent.parent / path.name}: cannot be written; is the folder writable, the disk full?")
-    writer.set(cv2.VIDEOWRITER_PROP_QUALITY, JPEG_QUALITY)
-    for frame in render(job.recipe, config, sensor, job.seed):
-        writer.write(frame)
-    writer.release()
-    return path
-
-
-def _place(patch: Heights, angle: float, place: tuple[float, float], config: ScenesConfig, pitch: float) -> Heights:
-    """Cut the image's part out of the object's patch, turned by `angle` degrees and moved to `place` (mm)."""
-    centre = (patch.shape[0] - 1) / 2
-    turn = cv2.getRotationMatrix2D((centre, centre), angle, 1.0)
-    turn[:, 2] += (
-        (config.width - 1) / 2 - centre + place[0] / pitch,
-        (config.height - 1) / 2 - centre + place[1] / pitch,
+    scene = make_scene(job.recipe, config, frames, job.seed)
+    write_film(path, render(scene, config, sensor, job.seed), fps)
+    imprint, measured = scene.imprint, measure_scene(scene, job.recipe, config)
+    return SceneRow(
+        video=job.name,
+        object_id=job.object_id,
+        frames=frames,
+        fps=fps,
+        force=round(imprint.force, 4),
+        method=str(imprint.method),
+        error=None if imprint.error is None else round(imprint.error, 4),
+        residual=round(imprint.residual, 6),
+        modulus=job.recipe.modulus,
+        texture=round(measured.texture, 5),
+        bump=round(measured.bump, 4),
+        hardness=measured.hardness,
+        roughness=measured.roughness,
+        bumpiness=measured.bumpiness,
     )
-    size = (config.width, config.height)
-    shown: Heights = cv2.warpAffine(patch, turn, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return shown
-
-
-def _ramp(time: Track, start: float, stop: float) -> Track:
-    """0 before `start`, 1 after `stop`, smooth between (3 s^2 - 2 s^3)."""
-    s = np.clip((time - start) / (stop - start), 0, 1)
-    return s * s * (3 - 2 * s)

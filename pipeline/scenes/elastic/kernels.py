@@ -1,0 +1,174 @@
+"""How far a surface sinks under a pressure: half-space, and a layer bonded to a rigid base.
+
+Both are influence tables: the sink of every pixel's centre under a unit pressure on one pixel. A pressure is convolved
+with its table in a domain of twice the size, so that nothing wraps around (Liu, Wang & Liu 2000, Wear 243, DC-FFT).
+Lengths in mm, pressures and moduli in MPa.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.fft import next_fast_len
+from scipy.interpolate import CubicSpline
+from scipy.special import j0
+
+from pipeline.scenes.elastic.arrays import Array, array_namespace, forward, inverse, like
+
+Table = npt.NDArray[np.float64]
+DECAY = 22.0
+"""Beyond this wave number (times thickness) a layer answers as a half-space does, to 1e-16."""
+SERIES = 0.1
+"""Below this wave number the layer's response is taken from its power series, as sinh(2k) - 2k cancels."""
+
+
+@dataclass(frozen=True)
+class Gel:
+    """The sensor's elastomer, bonded to its window."""
+
+    modulus: float = 0.25
+    """Reduced modulus E / (1 - nu^2), in MPa."""
+    poisson: float = 0.48
+    """Silicone hardly changes its volume; .5 is none at all."""
+    thickness: float = 2.5
+    """In mm."""
+
+    @property
+    def shear_modulus(self) -> float:
+        """G = E / 2 (1 + nu), in MPa."""
+        return self.modulus * (1 - self.poisson) / 2
+
+    def __post_init__(self) -> None:
+        if not (self.modulus > 0 and 0 <= self.poisson <= 0.5 and self.thickness > 0):
+            raise ValueError(f"{self}: modulus and thickness must be positive, Poisson's ratio from 0 to .5")
+
+
+def layer_response(wave: npt.ArrayLike, poisson: float) -> npt.NDArray[np.float64]:
+    """How much softer than a half-space a bonded layer is to a wave of pressure: S, from 0 to about 1.
+
+    The surface sinks by 2 S(q t) / (E* q) under a pressure of wave number q, where
+    S(k) = [(3 - 4 nu) sinh 2k - 2k] / [(3 - 4 nu) cosh 2k + 2k^2 + 5 - 12 nu + 8 nu^2]
+    (Bentall & Johnson 1968, Int. J. Mech. Sci. 10; Johnson, Contact Mechanics, 5.8). S -> 1 for waves that are short
+    against the layer, and -> k (1 - 2 nu) / (2 (1 - nu)^2), springs, for long ones.
+
+    Args:
+        wave: q t, not negative.
+        poisson: The layer's Poisson's ratio.
+    """
+    k = np.asarray(wave, dtype=np.float64)
+    a = 3 - 4 * poisson
+    rest = 5 - 12 * poisson + 8 * poisson**2
+    # Multiplied by exp(-2k), so that nothing overflows.
+    e2, e4 = np.exp(-2 * k), np.exp(-4 * k)
+    over = a * (1 - e4) / 2 - 2 * k * e2
+    small = np.minimum(k, SERIES)
+    # (3 - 4 nu)(sinh 2k - 2k) + 4k (1 - 2 nu), term by term.
+    cubic = a * (8 * small**3 / 6 + 32 * small**5 / 120 + 128 * small**7 / 5040 + 512 * small**9 / 362880)
+    over = np.where(k < SERIES, (cubic + 4 * small * (1 - 2 * poisson)) * e2, over)
+    under = a * (1 + e4) / 2 + (2 * k * k + rest) * e2
+    return over / under
+
+
+def love(shape: tuple[int, int]) -> Table:
+    """A half-space's influence table for pixels of side 1 and a reduced modulus of 1, at offsets of 0 to
+    rows - 1 and 0 to columns - 1.
+
+    Love 1929, Phil. Trans. A 228; Johnson, Contact Mechanics, 3.25: with f(x, y) = x asinh(y/|x|) + y asinh(x/|y|)
+    the sink is [f(x+1/2, y+1/2) - f(x+1/2, y-1/2) - f(x-1/2, y+1/2) + f(x-1/2, y-1/2)] / pi.
+    """
+    y = np.arange(shape[0] + 1)[:, None] - 0.5
+    x = np.arange(shape[1] + 1)[None, :] - 0.5
+    corner = x * np.arcsinh(y / np.abs(x)) + y * np.arcsinh(x / np.abs(y))
+    return np.asarray(np.diff(np.diff(corner, axis=0), axis=1) / np.pi)
+
+
+def layer_correction(shape: tuple[int, int], pitch: float, gel: Gel) -> Table:
+    """What a bonded layer's influence table has in addition to the half-space's, in mm per MPa.
+
+    The inverse Hankel transform of 2 (S - 1) / (E* q), smooth on the scale of the thickness, so that it is computed
+    along a radius by Gauss's rule and interpolated; a pixel's pressure is spread over the pixel by exp(-q^2 h^2 / 24).
+
+    Raises:
+        ValueError: if the gel is thinner than two pixels, where the correction is not smooth.
+    """
+    if gel.thickness < 2 * pitch:
+        raise ValueError(f"a gel of {gel.thickness:g} mm needs pixels of at most half that, not {pitch:g} mm")
+    farthest = np.hypot(shape[0], shape[1]) * pitch / gel.thickness
+    nodes, weights = np.polynomial.legendre.leggauss(int(64 + farthest * DECAY))
+    k, weights = (nodes + 1) * DECAY / 2, weights * DECAY / 2
+    change = (layer_response(k, gel.poisson) - 1) * np.exp(-((k * pitch / gel.thickness) ** 2) / 24)
+    radii = np.linspace(0, farthest, int(32 + 24 * farthest))
+    along = j0(radii[:, None] * k[None, :]) @ (weights * change)
+    place = np.hypot(np.arange(shape[0])[:, None], np.arange(shape[1])[None, :]) * pitch / gel.thickness
+    return np.asarray(CubicSpline(radii, along)(place) * pitch**2 / (np.pi * gel.modulus * gel.thickness))
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """An influence table, ready for convolution; compliances of bodies in series add up."""
+
+    spectrum: Array
+    """Transform of the table in the doubled domain."""
+    waves: Array
+    """Transform of the table as if the field were repeated without end."""
+    own: float
+    """How far a pixel sinks under a unit pressure on itself, in mm per MPa."""
+    shape: tuple[int, int]
+    """Of the fields."""
+
+    def sink(self, pressure: Array) -> Array:
+        """How far the surface sinks, in mm, under a pressure in MPa; ... x rows x columns."""
+        rows, columns = self.shape
+        double = _quick((2 * rows, 2 * columns))
+        return inverse(forward(pressure, double) * self.spectrum, double)[..., :rows, :columns]
+
+    def press(self, sink: Array) -> Array:
+        """About the pressure that makes the surface sink so: exact where both repeat without end."""
+        rows, columns = self.shape
+        own = _quick(self.shape)
+        xp = array_namespace(self.waves)
+        # A layer that keeps its volume does not sink under even pressure at all.
+        waves = xp.clip(self.waves, float(xp.max(self.waves)) * 1e-4, None)
+        return inverse(forward(sink, own) / waves, own)[..., :rows, :columns]
+
+    def plus(self, other: Kernel, share: float) -> Kernel:
+        """With `share` times the other's compliance added."""
+        spectrum, waves = self.spectrum + other.spectrum * share, self.waves + other.waves * share
+        return Kernel(spectrum, waves, self.own + other.own * share, self.shape)
+
+
+def make_kernel(table: Table, field: Array) -> Kernel:
+    """Prepare a table of offsets for fields of the number format and device of `field`, rows x columns last."""
+    rows, columns = field.shape[-2:]
+    spectrum, waves = (_transform(table, _quick(domain)) for domain in ((2 * rows, 2 * columns), (rows, columns)))
+    return Kernel(like(spectrum, field), like(waves, field), float(table[0, 0]), (rows, columns))
+
+
+def _transform(table: Table, domain: tuple[int, int]) -> Table:
+    """Of the table, continued evenly to the left and upwards; even in both directions, it has no imaginary part."""
+    row, column = (np.minimum(np.arange(n), n - np.arange(n)) for n in domain)
+    known = (row < table.shape[0])[:, None] & (column < table.shape[1])[None, :]
+    whole = table[np.minimum(row, table.shape[0] - 1)[:, None], np.minimum(column, table.shape[1] - 1)[None, :]]
+    return np.asarray(np.fft.rfft2(np.where(known, whole, 0.0)).real)
+
+
+def _quick(shape: tuple[int, int]) -> tuple[int, int]:
+    """The next size that is quick to transform."""
+    rows, columns = (next_fast_len(n, real=True) for n in shape)
+    return rows, columns
+
+
+def half_space_table(shape: tuple[int, int], pitch: float, modulus: float) -> Table:
+    """The influence table of a half-space of this reduced modulus, rows x columns."""
+    return love(shape) * pitch / modulus
+
+
+def layer_table(shape: tuple[int, int], pitch: float, gel: Gel) -> Table:
+    """The influence table of a bonded layer, rows x columns.
+
+    Raises:
+        ValueError: if the gel is thinner than two pixels.
+    """
+    return half_space_table(shape, pitch, gel.modulus) + layer_correction(shape, pitch, gel)

@@ -1,0 +1,87 @@
+"""Pressing into a bed of springs (Winkler), the cheapest contact there is, and a blur for the gel's skin.
+
+Johnson, Contact Mechanics, 4.3: an elastic layer of thickness t and modulus E answers each point by itself with the
+pressure p = (E / t) c, where c is how far the two undeformed surfaces would overlap there. Object and gel are springs
+in series, and the camera sees the gel's share of the overlap, (E* / E_gel) c.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.scenes.elastic.kernels import Gel
+
+Heights = npt.NDArray[np.float32]
+
+MEMBRANE_SHARE = 0.75
+"""How much of the averaged indentation the skin takes up where nothing touches it."""
+MEMBRANE = 0.36
+"""How far the skin follows beyond a contact: the standard deviation of the Gaussian over the gel's thickness."""
+TOLERANCE = 1e-4
+"""Relative error of the force."""
+STEPS = 100
+
+
+@dataclass(frozen=True)
+class Springs:
+    """A contact in equilibrium."""
+
+    approach: float
+    """How far the bodies come together after first touch, in mm."""
+    overlap: Heights
+    """Shared out between gel and object, in mm; 0 outside the contact."""
+    force: float
+    """In N, from the pressure over the grid."""
+
+
+def series(first: float, second: float) -> float:
+    """The modulus of two springs in series, in the unit of both."""
+    return first * (second / (first + second))
+
+
+def press_springs(gap: Heights, force: float, modulus: float, pitch: float, gel: Gel) -> Springs:
+    """Press an object into the gel until the pressure adds up to `force`, by bisection of the approach.
+
+    Args:
+        gap: Distance of the undeformed surfaces at first touch, in mm; not negative, and 0 somewhere.
+        force: In N, not negative.
+        modulus: The object's reduced modulus, in MPa.
+        pitch: In mm a pixel.
+        gel: The sensor's.
+    """
+    if force <= 0:
+        return Springs(0.0, np.zeros_like(gap), 0.0)
+    # Force a millimetre of overlap and pixel: (E* / t) dA.
+    stiffness = series(gel.modulus, modulus) / gel.thickness * pitch * pitch
+    low, high = 0.0, float(gap.max()) + force / (stiffness * gap.size)
+    for _ in range(STEPS):
+        approach = (low + high) / 2
+        overlap = np.maximum(np.float32(approach) - gap, 0)
+        reached = stiffness * cv2.sumElems(overlap)[0]
+        if abs(reached - force) <= TOLERANCE * force:
+            break
+        low, high = (approach, high) if reached < force else (low, approach)
+    return Springs(approach, overlap, reached)
+
+
+def hang_skin(springs: Springs, modulus: float, pitch: float, gel: Gel) -> Heights:
+    """How far the gel's skin is pushed in, in mm: the gel's share, and around it a Gaussian average."""
+    held = springs.overlap * np.float32(series(gel.modulus, modulus) / gel.modulus)
+    if springs.approach == 0:
+        return held
+    skin: Heights = np.maximum(held, np.float32(MEMBRANE_SHARE) * _blur(held, MEMBRANE * gel.thickness / pitch))
+    return skin
+
+
+def _blur(image: Heights, sigma: float) -> Heights:
+    """A wide Gaussian, taken on a coarser grid where it is much wider than a pixel."""
+    step = max(1, int(sigma / 2))
+    height, width = image.shape
+    coarse = cv2.resize(image, (max(1, width // step), max(1, height // step)), interpolation=cv2.INTER_AREA)
+    blurred = cv2.GaussianBlur(coarse, (0, 0), sigma / step, borderType=cv2.BORDER_REPLICATE)
+    fine: Heights = cv2.resize(blurred, (width, height), interpolation=cv2.INTER_LINEAR)
+    return fine

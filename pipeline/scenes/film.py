@@ -1,0 +1,43 @@
+"""Writing scenes as the real videos were written: MPEG-4 part 2, a whole picture every twelve, 200 kbit/s.
+
+Coding is most of what is fine in a frame without contact: blocks of 8 x 8 pixels whose brightness is right to a step
+or two, copied from frame to frame until the next whole picture. PyAV's own libavcodec has this encoder in every build.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from fractions import Fraction
+from pathlib import Path
+
+import av
+
+from pipeline.errors import UserError
+from pipeline.scenes.light import Image
+
+KEY_EVERY = 12
+"""Frames from one whole picture to the next: in each of the public videos looked at, and libavcodec's own default."""
+BITS_A_SECOND = 200_000
+"""libavcodec's default. The public videos need 40 to 120 thousand, so that quality is at its best and not the limit."""
+
+
+def write_film(path: Path, frames: Iterable[Image], fps: float) -> None:
+    """Write frames of one size (height x width x BGR, uint8); equal frames give equal files on one machine.
+
+    Raises:
+        UserError: if the file cannot be written.
+    """
+    rate = Fraction(fps).limit_denominator(1000)
+    try:
+        with av.open(str(path), "w", options={"fflags": "+bitexact"}) as container:
+            stream = container.add_stream("mpeg4", rate=rate)
+            stream.pix_fmt, stream.bit_rate = "yuv420p", BITS_A_SECOND
+            stream.codec_context.gop_size = KEY_EVERY
+            stream.codec_context.thread_count = 1
+            for number, frame in enumerate(frames):
+                if number == 0:
+                    stream.height, stream.width = frame.shape[:2]
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="bgr24")))
+            container.mux(stream.encode(None))
+    except (OSError, av.FFmpegError) as problem:
+        raise UserError(f"{path}: cannot be written ({problem}); is the folder writable, the disk full?") from None

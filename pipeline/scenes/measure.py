@@ -1,0 +1,188 @@
+"""An object's classes measured from its scene: what a person would call it by the paper's guidelines.
+
+Paper, "Dataset Collection": hardness by the force under which an object yields; roughness by what a sliding finger
+meets; bumpiness by how large what sticks out is against a quarter of the tactile image. Here hardness is read from the
+object's modulus, roughness from the heights of the surface, bumpiness from the skin of the pressed gel. Texture and
+bumps are told apart by wavelength, so that neither counts as the other.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.errors import UserError
+from pipeline.physiclear.catalogue import Catalogue
+from pipeline.scenes.grid import Heights
+
+SOFT_BELOW_MPA = 0.12
+"""Reduced modulus under which an object yields with little force: half the gel's, so that it is the object that gives
+way, as a fingertip's flesh does (Serina et al., J. Biomech. 31 (1998) 639)."""
+HARD_ABOVE_MPA = 3.0
+"""Over twelve times the gel's modulus over 90 % of the yielding is the gel's: a pressing hand feels no give."""
+TEXTURE_MM = 1.0
+"""Shorter wavelengths are texture, longer ones shape: what a fingertip resolves (gratings and gaps of .84 to 1 mm,
+Johnson and Phillips, J. Neurophysiol. 46 (1981) 1177)."""
+ROUGH_MM = (0.003, 0.013)
+"""Root mean square height of the texture from which a surface is slightly rough, and rough."""
+VISIBLE_MM = 0.03
+"""Least prominence of a protrusion in the skin: over a flank of 1 mm it changes the light by some four 8-bit steps, a
+few times the camera's noise."""
+BIG_SHARE = 1 / 4
+"""The paper's border between small and big bumps, as a share of the image's height."""
+HALF, CAP = 0.5, math.sqrt(2)
+"""Sections are taken at half height, where neighbours do not run into each other; a paraboloid's foot is CAP
+as wide."""
+WIDEST_SHARE = 0.6
+"""What is wider is the body's shape, as a share of the image's height."""
+TOUCHED = 0.3
+"""Where the skin is pressed in by this share of its deepest place, the body's shape is fitted."""
+REACH_MM = 4.0
+"""Length over which a fingertip averages what it rests on; valleys below that are not reached."""
+ROWS = 120
+"""A finer skin is averaged to this many rows, to save time."""
+CUTOFF = 0.1873
+"""Standard deviation over cutoff wavelength of the Gaussian filter that halves it (ISO 16610-21)."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a scene shows of one object."""
+
+    modulus: float
+    """Reduced, in MPa."""
+    texture: float
+    """Root mean square height below `TEXTURE_MM`, in mm."""
+    bump: float
+    """Typical width of visible protrusions over the image's height; 0 where there is none."""
+
+    @property
+    def hardness(self) -> int:
+        """0 soft, 1 moderately hard, 2 hard."""
+        return (self.modulus >= SOFT_BELOW_MPA) + (self.modulus >= HARD_ABOVE_MPA)
+
+    @property
+    def roughness(self) -> int:
+        """0 smooth, 1 slightly rough, 2 rough."""
+        return (self.texture >= ROUGH_MM[0]) + (self.texture >= ROUGH_MM[1])
+
+    @property
+    def bumpiness(self) -> int:
+        """0 no bumps, 1 small, 2 big."""
+        return (self.bump > 0) + (self.bump > BIG_SHARE)
+
+
+def measure(modulus: float, surface: Heights, skin: Heights, pitch: float) -> Measured:
+    """All that the classes need.
+
+    Args:
+        modulus: The object's reduced modulus in MPa.
+        surface: Its undeformed heights over the image, height x width, in mm.
+        skin: Indentation of the gel in the same place, height x width, in mm.
+        pitch: Of both, in mm a pixel.
+    """
+    return Measured(modulus, texture(surface, pitch), bump_share(skin, pitch))
+
+
+def texture(surface: Heights, pitch: float) -> float:
+    """Root mean square height in mm of wavelengths below `TEXTURE_MM` where the surface stands out.
+
+    The shorter waves are what a Gaussian filter (ISO 16610-21) leaves; applied twice, nothing remains of curvature. A
+    finger meets what stands above its surroundings; valleys between cylinders are out of its reach and do not count.
+    """
+    rest = surface - _smooth(surface, TEXTURE_MM, pitch)
+    rest = rest - _smooth(rest, TEXTURE_MM, pitch)
+    upper = surface >= _smooth(surface, REACH_MM, pitch)
+    inner = round(TEXTURE_MM / pitch)  # Nearer to the border the filter lacks neighbours.
+    inside = (slice(inner, -inner), slice(inner, -inner))
+    return float(rest[inside][upper[inside]].std())
+
+
+def bump_share(skin: Heights, pitch: float) -> float:
+    """Typical width of the protrusions over the image's height; 0 where none is visible.
+
+    What rises over its own opening by a wide disc (white top hat) stands out, unless it is the body: so it must do so
+    in the skin and in what a fitted paraboloid leaves of it. A protrusion counts where it rises over `VISIBLE_MM`; its
+    width follows from the largest circle at half its height, its weight is its area, and the typical width is the
+    weighted median.
+    """
+    rows, columns = skin.shape
+    height = min(rows, ROWS)
+    coarse: Heights = cv2.resize(skin, (round(columns * height / rows), height), interpolation=cv2.INTER_AREA)
+    touched = np.asarray(coarse > TOUCHED * float(coarse.max()))
+    if not touched.any():
+        return 0.0
+    smooth = _smooth(coarse, TEXTURE_MM, pitch * rows / height)
+    body = _paraboloid(smooth, touched)
+    # Around the contact the paraboloid means nothing.
+    rest = np.where(touched, smooth - body, np.minimum(smooth - body, 0))
+    proud = np.minimum(_top_hat(smooth), _top_hat(rest))
+    widths, areas = _widths(proud)
+    if not widths:
+        return 0.0
+    order = np.argsort(widths)
+    half = np.searchsorted(np.cumsum(np.asarray(areas)[order]), sum(areas) / 2)
+    typical = float(np.asarray(widths)[order][half])
+    return typical / float(height)
+
+
+def check_recipe(object_id: str, measured: Measured, catalogue: Catalogue) -> None:
+    """Hold what a scene shows against the catalogue's labels.
+
+    Raises:
+        UserError: naming the object, the property, and the measured and expected classes.
+    """
+    borders = {
+        "hardness": f"modulus {measured.modulus:.3g} MPa, borders {SOFT_BELOW_MPA:g} and {HARD_ABOVE_MPA:g}",
+        "roughness": f"texture of {measured.texture:.2g} mm rms, borders {ROUGH_MM[0]:g} and {ROUGH_MM[1]:g}",
+        "bumpiness": f"protrusions of {measured.bump:.2f} of the image's height, borders 0 and {BIG_SHARE:g}",
+    }
+    for p, label in zip(catalogue.properties, catalogue.labels(object_id), strict=True):
+        found = getattr(measured, p.name) if p.name in borders else label
+        if found != label:
+            raise UserError(
+                f"scenes.yaml: {object_id}: its scenes measure as {p.name} {found} ({p.levels[found]}; "
+                f"{borders[p.name]}) but objects.csv says {label} ({p.levels[label]}); correct the recipe"
+            )
+
+
+def _paraboloid(skin: Heights, where: npt.NDArray[np.bool_]) -> Heights:
+    """The least-squares paraboloid through the skin within a mask."""
+    height, width = skin.shape
+    x, y = np.meshgrid(np.linspace(-1, 1, width), np.linspace(-1, 1, height))
+    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+    fit = np.linalg.lstsq(terms[where], skin[where], rcond=None)[0]
+    fitted: Heights = (terms @ fit).astype(np.float32)
+    return fitted
+
+
+def _top_hat(image: Heights) -> Heights:
+    """How far it rises over its opening by a disc of `WIDEST_SHARE`."""
+    size = round(WIDEST_SHARE * image.shape[0]) | 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    proud: Heights = cv2.morphologyEx(image, cv2.MORPH_TOPHAT, disc)
+    return proud
+
+
+def _widths(proud: Heights) -> tuple[list[float], list[float]]:
+    """Widths and areas in pixels of the protrusions that can be seen."""
+    disc = round(2 * BIG_SHARE * proud.shape[0]) | 1
+    around = cv2.dilate(proud, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (disc, disc)))
+    section = ((proud > HALF * around) & (around > VISIBLE_MM)).astype(np.uint8)
+    count, pieces, facts, _ = cv2.connectedComponentsWithStats(section, connectivity=4)
+    inside = cv2.distanceTransform(section, cv2.DIST_L2, 5)
+    peak, radius = np.zeros(count, np.float32), np.zeros(count, np.float32)
+    np.maximum.at(peak, pieces, proud)
+    np.maximum.at(radius, pieces, inside)
+    seen = [i for i in range(1, count) if peak[i] > VISIBLE_MM]
+    return [2 * CAP * float(radius[i]) for i in seen], [float(facts[i, cv2.CC_STAT_AREA]) for i in seen]
+
+
+def _smooth(image: Heights, cutoff: float, pitch: float) -> Heights:
+    """The waves longer than `cutoff` mm."""
+    smooth: Heights = cv2.GaussianBlur(image, (0, 0), CUTOFF * cutoff / pitch, borderType=cv2.BORDER_REFLECT)
+    return smooth

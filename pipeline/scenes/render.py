@@ -1,0 +1,92 @@
+"""From an object to the frames of one video: a patch of its surface, pressed once, cut out frame by frame."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from pipeline.runtime import derive_seed
+from pipeline.scenes.contact import GEL, Imprint, Method, press
+from pipeline.scenes.elastic.torsion import slip_turn, twist
+from pipeline.scenes.geometry import IMAGE_MM, Heights, heights
+from pipeline.scenes.light import Image, Sensor, shade
+from pipeline.scenes.measure import Measured, measure
+from pipeline.scenes.motion import REACH_MM, Motion, make_motion
+from pipeline.scenes.recipe import Recipe
+from pipeline.sections import ScenesConfig
+
+MARGIN_MM = REACH_MM
+"""How far a patch reaches beyond the view at every angle."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One video before it is seen: what is pressed, how, and how the hand moves."""
+
+    surface: Heights
+    """The undeformed patch, in mm."""
+    imprint: Imprint
+    motion: Motion
+    pitch: float
+    """In mm a pixel."""
+
+
+def make_scene(recipe: Recipe, config: ScenesConfig, frames: int, seed: int) -> Scene:
+    """Draw a patch and a motion, and press; everything random follows from `seed`."""
+    rng = np.random.default_rng(seed)
+    pitch = IMAGE_MM[0] / config.width
+    motion = make_motion(frames, rng)
+    # An odd side has a pixel in the middle, which is what turns.
+    side = int(np.hypot(config.width, config.height) + 2 * MARGIN_MM / pitch) | 1
+    patch = heights(recipe.surface, side, pitch, rng)
+    method = None if config.tier == "auto" else Method(config.tier, 0 if config.tier == "winkler" else config.cells)
+    force = float(motion.force.max())
+    imprint = press(patch, force, recipe.modulus, pitch, method, tolerance=config.tolerance)
+    return Scene(patch, imprint, motion, pitch)
+
+
+def measure_scene(scene: Scene, recipe: Recipe, config: ScenesConfig) -> Measured:
+    """What the object's classes can be told from, in the middle of the patch under the largest force."""
+    top, left = (scene.surface.shape[0] - config.height) // 2, (scene.surface.shape[1] - config.width) // 2
+    view = (slice(top, top + config.height), slice(left, left + config.width))
+    return measure(recipe.modulus, scene.surface[view], scene.imprint.skins[-1][view], scene.pitch)
+
+
+def render(scene: Scene, config: ScenesConfig, sensor: Sensor, seed: int) -> Iterator[Image]:
+    """The frames of one video (height x width x BGR, uint8)."""
+    motion, start = scene.motion, float(scene.motion.angle[0])
+    untouched = np.zeros((config.height, config.width), np.float32)
+    for number, force in enumerate(motion.force.tolist()):
+        noise = derive_seed(seed, number)
+        if force <= 0:
+            yield shade(untouched, sensor, scene.pitch, noise)
+            continue
+        angle = float(motion.angle[number])
+        centre = (
+            (config.width - 1) / 2 + float(motion.x[number]) / scene.pitch,
+            (config.height - 1) / 2 + float(motion.y[number]) / scene.pitch,
+        )
+        skin = _place(scene.imprint.at(force), angle, centre, config)
+        drift = None
+        if angle != start:
+            # The motion's angle is against the clock; with y downwards, from x to y is with the clock.
+            radius = scene.imprint.radius(force)
+            most = slip_turn(force, radius, GEL.shear_modulus)
+            turn = max(-most, min(most, math.radians(start - angle)))
+            drift = twist((config.height, config.width), centre, radius, turn, scene.pitch)
+        yield shade(skin, sensor, scene.pitch, noise, drift)
+
+
+def _place(patch: Heights, angle: float, centre: tuple[float, float], config: ScenesConfig) -> Heights:
+    """Cut the view out of the object's patch, turned by `angle` degrees and with its middle at `centre` (pixels)."""
+    middle = (patch.shape[0] - 1) / 2
+    turn = cv2.getRotationMatrix2D((middle, middle), angle, 1.0)
+    turn[:, 2] += (centre[0] - middle, centre[1] - middle)
+    size = (config.width, config.height)
+    # Cubic would ripple on slopes; the skin is smooth on the scale of a pixel where it is far from one.
+    shown: Heights = cv2.warpAffine(patch, turn, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return shown

@@ -1,0 +1,214 @@
+"""Choosing how to compute a contact, and what each way gives: against the finest grid, physics' order, hard cases."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.scenes.contact import LEVELS, Body, Imprint, Method, choose, press, slope_error
+from pipeline.scenes.elastic.kernels import Gel
+from pipeline.scenes.elastic.solver import NotConverged
+from pipeline.scenes.elastic.winkler import hang_skin, press_springs, series
+
+SIDE, PITCH = 121, 30.0 / 121
+WAYS = [Method("winkler"), Method("layer", 32), Method("layer"), Method("half_space", 64)]
+FINEST = Method("layer")
+
+
+def grid() -> tuple[np.ndarray, np.ndarray]:
+    axis = (np.arange(SIDE) - SIDE // 2) * PITCH
+    return axis[None, :], axis[:, None]
+
+
+def ball(radius: float = 25.0) -> np.ndarray:
+    x, y = grid()
+    return (-(x * x + y * y) / (2 * radius)).astype(np.float32)
+
+
+def rough(rms: float, seed: int = 0) -> np.ndarray:
+    """A ball with Gaussian noise of two pixels."""
+    noise = np.random.default_rng(seed).standard_normal((SIDE, SIDE))
+    spectrum = np.exp(-(np.hypot(np.fft.fftfreq(SIDE)[:, None], np.fft.rfftfreq(SIDE)[None]) ** 2) * 60)
+    noise = np.fft.irfft2(np.fft.rfft2(noise) * spectrum, s=(SIDE, SIDE))
+    return (ball() + rms * noise / noise.std()).astype(np.float32)
+
+
+def bumpy() -> np.ndarray:
+    x, y = grid()
+    return (ball() + 0.15 * (np.cos(2 * np.pi * x / 3) * np.cos(2 * np.pi * y / 3) - 1)).astype(np.float32)
+
+
+BODIES = {"ball": ball(), "rough": rough(0.02), "bumpy": bumpy(), "flat": np.zeros((SIDE, SIDE), np.float32)}
+
+
+@pytest.mark.parametrize("body", BODIES)
+def test_finer_grids_come_nearer_to_every_pixel(body: str) -> None:
+    pressed = Body(BODIES[body], 5.0, PITCH)
+    truth = pressed.press(FINEST, np.array([8.0])).skins[0]
+    errors = [
+        slope_error(pressed.press(Method("layer", cells), np.array([8.0])).skins[0], truth, PITCH)
+        for cells in (32, 64, 96)
+    ]
+    assert errors[-1] < 0.06, errors
+    assert errors[-1] <= errors[0]
+
+
+def test_fine_relief_is_pressed_in_where_it_is_flattened() -> None:
+    """In full contact, gel and object share short waves by their moduli, as the solver finds at all pixels."""
+    x, y = grid()
+    wave = 0.004 * np.cos(2 * np.pi * x / 0.9) * np.cos(2 * np.pi * y / 0.9)
+    flat_ball = (ball(200.0) + wave).astype(np.float32)
+    body = Body(flat_ball, 0.25, PITCH)
+    middle = slice(SIDE // 2 - 20, SIDE // 2 + 20)
+
+    def amplitude(method: Method) -> float:
+        skin = body.press(method, np.array([60.0])).skins[0][middle, middle]
+        pattern = wave[middle, middle]
+        return float((skin * pattern).sum() / (pattern * pattern).sum())
+
+    assert amplitude(Method("layer", 30)) == pytest.approx(0.5, rel=0.05)
+    assert amplitude(FINEST) == pytest.approx(0.5, rel=0.05)
+
+
+def test_auto_keeps_what_it_promises() -> None:
+    for heights, modulus, tolerance in itertools.product(BODIES.values(), (0.05, 5.0), (0.1, 0.3)):
+        body = Body(heights, modulus, PITCH)
+        method, estimate = choose(body, 8.0, tolerance)
+        truth = body.press(FINEST, np.array([8.0])).skins[0]
+        pressed = body.springs(8.0) if method.tier == "winkler" else body.press(method, np.array([8.0]))
+        assert slope_error(pressed.skins[0], truth, PITCH) <= 1.3 * tolerance
+        assert estimate <= tolerance or method == FINEST
+
+
+def test_auto_spends_more_on_a_tighter_tolerance_and_less_on_a_plain_body() -> None:
+    def cells(heights: np.ndarray, tolerance: float) -> int:
+        method = choose(Body(heights, 5.0, PITCH), 8.0, tolerance)[0]
+        return 0 if method.tier == "winkler" else method.cells or SIDE
+
+    for heights in BODIES.values():
+        assert cells(heights, 0.02) >= cells(heights, 0.2) >= cells(heights, 1.0)
+    assert cells(bumpy(), 0.1) > cells(np.zeros_like(ball()), 0.1)
+
+
+def test_what_nobody_could_see_is_left_to_springs() -> None:
+    method, error = choose(Body(np.zeros((SIDE, SIDE), np.float32), 0.05, PITCH), 0.5, 0.2)
+    assert method == Method("winkler")
+    assert error < 0.2
+
+
+@pytest.mark.parametrize("method", WAYS, ids=str)
+def test_harder_objects_and_larger_forces_press_deeper(method: Method) -> None:
+    depths = [float(press(bumpy(), 8.0, modulus, PITCH, method).skins[-1].max()) for modulus in (0.03, 0.1, 0.5, 50)]
+    assert all(less < more for less, more in itertools.pairwise(depths))
+    imprint = press(bumpy(), 8.0, 1.0, PITCH, method)
+    assert imprint.skins.shape == (LEVELS + 1, SIDE, SIDE)
+    assert imprint.skins.dtype == np.float32
+    assert all(a < b for a, b in itertools.pairwise(s.max() for s in imprint.skins))
+    assert all(a <= b for a, b in itertools.pairwise(imprint.radii))
+
+
+def test_frames_between_two_forces_are_near_what_pressing_gives() -> None:
+    imprint = press(bumpy(), 8.0, 1.0, PITCH, FINEST)
+    body = Body(bumpy(), 1.0, PITCH)
+    for force, bound in ((0.8, 0.3), (2.0, 0.12), (5.5, 0.1)):
+        direct = body.press(FINEST, np.array([force])).skins[0]
+        assert slope_error(imprint.at(force), direct, PITCH) < bound
+    np.testing.assert_array_equal(imprint.at(8.0), imprint.skins[-1])
+    np.testing.assert_array_equal(imprint.at(800.0), imprint.skins[-1])
+    assert not imprint.at(0.0).any()
+    assert imprint.radius(0.0) == 0
+    assert imprint.radius(8.0) == pytest.approx(imprint.radii[-1])
+
+
+@given(st.floats(0, 20), st.floats(1e-3, 10))
+def test_the_radius_grows_with_the_force(force: float, more: float) -> None:
+    imprint = Imprint(
+        np.zeros((LEVELS + 1, 2, 2), np.float32), np.sqrt(np.arange(LEVELS + 1.0)), 10.0, FINEST, None, 0.0
+    )
+    assert imprint.radius(force) <= imprint.radius(force + more) + 1e-9
+
+
+def test_torch_gives_what_numpy_gives() -> None:
+    for method in (Method("layer", 48), Method("half_space", 48)):
+        one = press(rough(0.02), 5.0, 1.0, PITCH, method)
+        other = press(rough(0.02), 5.0, 1.0, PITCH, method, device="cpu")
+        np.testing.assert_allclose(one.skins, other.skins, atol=1e-4 * float(one.skins.max()))
+
+
+def test_the_same_twice() -> None:
+    one, other = (press(rough(0.02), 5.0, 1.0, PITCH) for _ in range(2))
+    np.testing.assert_array_equal(one.skins, other.skins)
+    assert one.method == other.method
+
+
+# --- Hard cases
+
+
+@pytest.mark.parametrize("method", [*WAYS, None], ids=str)
+@pytest.mark.parametrize("force", [0.0, 1e-9, 1e6])
+def test_any_force_is_finite(method: Method | None, force: float) -> None:
+    for heights in BODIES.values():
+        imprint = press(heights, force, 1.0, PITCH, method)
+        assert np.isfinite(imprint.skins).all()
+        assert np.isfinite(imprint.radii).all()
+        if force == 0:
+            assert not imprint.skins.any()
+
+
+@pytest.mark.filterwarnings("ignore::pipeline.scenes.elastic.solver.NotConverged")
+@pytest.mark.parametrize("method", [*WAYS, None], ids=str)
+@pytest.mark.parametrize("ratio", [1e-4, 1e4])
+def test_any_modulus_is_finite(method: Method | None, ratio: float) -> None:
+    needle = np.full((SIDE, SIDE), -50.0, np.float32)
+    needle[SIDE // 2, SIDE // 2] = 0
+    for heights in (*BODIES.values(), needle):
+        imprint = press(heights, 8.0, 0.25 * ratio, PITCH, method)
+        assert np.isfinite(imprint.skins).all()
+
+
+def test_a_contact_over_the_whole_patch() -> None:
+    imprint = press(ball(3000.0), 50.0, 0.03, PITCH)
+    assert imprint.radii[-1] == pytest.approx(30 / np.sqrt(np.pi), rel=0.01)
+
+
+def test_what_does_not_converge_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.scenes.contact.RESIDUAL", 1e-12)
+    with pytest.warns(NotConverged, match="residual"):
+        assert press(rough(0.02), 8.0, 1.0, PITCH, Method("layer", 32)).residual > 0
+
+
+# --- Springs
+
+
+@given(st.floats(1e-4, 1e4), st.floats(1e-4, 1e4))
+def test_springs_in_series(first: float, second: float) -> None:
+    both = series(first, second)
+    assert both == pytest.approx(1 / (1 / first + 1 / second))
+    assert both <= min(first, second)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.sampled_from(sorted(BODIES)), st.floats(1e-3, 1e4), st.floats(1e-4, 1e4))
+def test_springs_carry_the_force(body: str, force: float, modulus: float) -> None:
+    gel, heights = Gel(), BODIES[body]
+    springs = press_springs(heights.max() - heights, force, modulus, PITCH, gel)
+    pressure = series(gel.modulus, modulus) / gel.thickness * springs.overlap.astype(np.float64)
+    assert pressure.sum() * PITCH**2 == pytest.approx(force, rel=0.01)
+    assert np.isfinite(hang_skin(springs, modulus, PITCH, gel)).all()
+
+
+def test_a_ball_on_springs_follows_theory() -> None:
+    """F = pi E* R d^2 / t for a paraboloid (Johnson, Contact Mechanics, 4.3), as long as it fits the grid."""
+    pitch, force, radius, gel = 0.02, 0.2, 20.0, Gel()
+    axis = (np.arange(501) - 250) * pitch
+    gap = ((axis[None] ** 2 + axis[:, None] ** 2) / (2 * radius)).astype(np.float32)
+    springs = press_springs(gap, force, 1.0, pitch, gel)
+    stiffness = series(gel.modulus, 1.0) / gel.thickness
+    assert springs.approach == pytest.approx(np.sqrt(force / (np.pi * stiffness * radius)), rel=2e-3)
+    assert np.count_nonzero(springs.overlap) * pitch**2 == pytest.approx(
+        2 * np.pi * radius * springs.approach, rel=0.01
+    )

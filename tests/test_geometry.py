@@ -1,0 +1,76 @@
+"""Bodies against their formulas, and a patch as the sum of what it is made of."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from pipeline.scenes.geometry import IMAGE_MM, Bar, Flat, Round, Surface, Wedge, heights
+from pipeline.scenes.grid import Grid
+from pipeline.scenes.relief import Rough
+
+PITCH = IMAGE_MM[0] / 160
+FLAT = Flat(kind="flat")
+
+
+@given(st.floats(1, 1e4), st.floats(1, 1e4), st.integers(1, 40), st.floats(0.01, 1))
+def test_a_round_body_is_its_paraboloid(across: float, along: float, half: int, pitch: float) -> None:
+    side = 2 * half + 1
+    found = heights(Surface(body=Round(kind="round", radii=(across, along))), side, pitch, np.random.default_rng(0))
+    for row, column in ((half, half), (0, half), (half, 0), (side - 1, 0)):
+        x, y = (column - half) * pitch, (row - half) * pitch
+        assert found[row, column] == pytest.approx(-x * x / 2 / across - y * y / 2 / along, rel=1e-4, abs=1e-7)
+    assert found.max() == 0
+    assert found.dtype == np.float32
+
+
+def test_a_large_ball_is_near_its_paraboloid() -> None:
+    """The paraboloid stands for a sphere, R - sqrt(R^2 - r^2), to the order r^4."""
+    radius, side = 40.0, 81
+    found = Round(kind="round", radii=(radius, radius)).sample(Grid(side, PITCH))
+    x, y = np.meshgrid(*2 * [(np.arange(side) - 40) * PITCH])
+    exact = np.sqrt(radius**2 - x**2 - y**2) - radius
+    assert np.abs(found - exact).max() < (x**2 + y**2).max() ** 2 / (8 * radius**3) * 1.1
+
+
+def test_a_bar_is_flat_and_falls_off_at_its_edges() -> None:
+    bar = Bar(kind="bar", width=10, edge=2).sample(Grid(201, 0.1))
+    x = (np.arange(201) - 100) * 0.1
+    assert not bar[:, np.abs(x) < 2.9].any()
+    assert bar[0, np.abs(x - 5).argmin()] == pytest.approx(-(2**2) / 4)
+    assert (bar == bar[:1]).all()
+
+
+def test_a_wedge_is_round_on_top_and_straight_far_from_it() -> None:
+    slope, tip = 0.5, 1.0
+    wedge = Wedge(kind="wedge", slope=slope, tip=tip).sample(Grid(4001, 0.01))[0].astype(float)
+    assert wedge[2000] == 0
+    assert np.diff(wedge, 2)[1999] / 0.01**2 == pytest.approx(-1 / tip, rel=0.02)
+    assert np.diff(wedge)[-1] / 0.01 == pytest.approx(-slope, rel=0.01)
+    np.testing.assert_allclose(wedge, wedge[::-1], atol=1e-6)
+
+
+def test_layers_add_up_in_order() -> None:
+    coarse, fine = Rough(kind="rough", rms=0.05, longest=3), Rough(kind="rough", rms=0.01, longest=0.8)
+    ball = Round(kind="round", radii=(20, 30))
+    whole = heights(Surface(body=ball, relief=(coarse, fine)), 90, PITCH, np.random.default_rng(5))
+    rng, grid = np.random.default_rng(5), Grid(90, PITCH)
+    np.testing.assert_allclose(whole, ball.sample(grid) + coarse.sample(grid, rng) + fine.sample(grid, rng), atol=1e-6)
+
+
+def test_a_patch_follows_from_its_generator() -> None:
+    surface = Surface(body=FLAT, relief=(Rough(kind="rough", rms=0.05, longest=3),))
+    first, again, other = (heights(surface, 64, PITCH, np.random.default_rng(s)) for s in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any()
+
+
+@pytest.mark.parametrize("radius", [0, -3, math.inf, math.nan])
+def test_impossible_radii_are_refused(radius: float) -> None:
+    with pytest.raises(ValidationError):
+        Round(kind="round", radii=(20, radius))

@@ -1,0 +1,169 @@
+"""How surfaces sink: against closed solutions, direct integration and each other's limits."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import dblquad, quad
+
+from pipeline.scenes.elastic.arrays import back
+from pipeline.scenes.elastic.kernels import (
+    Gel,
+    Kernel,
+    half_space_table,
+    layer_response,
+    layer_table,
+    love,
+    make_kernel,
+)
+
+
+def kernel(table: np.ndarray, side: int) -> Kernel:
+    return make_kernel(table, np.zeros((side, side)))
+
+
+def test_a_pixel_sinks_by_the_integral_of_boussinesq() -> None:
+    """u = 1 / (pi E*) times the integral of dA / r (Johnson, 3.2)."""
+    table = love((6, 6))
+    assert table[0, 0] == pytest.approx(4 * math.log(1 + math.sqrt(2)) / math.pi, rel=1e-12)
+    for row, column in ((0, 1), (2, 0), (3, 4)):
+        direct, _ = dblquad(
+            lambda y, x: 1 / (math.pi * math.hypot(x, y)), column - 0.5, column + 0.5, row - 0.5, row + 0.5
+        )
+        assert table[row, column] == pytest.approx(direct, rel=1e-9)
+
+
+def test_far_away_a_pixel_is_a_point_force() -> None:
+    """Boussinesq: u = F / (pi E* r)."""
+    table = half_space_table((901, 4), pitch=0.1, modulus=2.0)
+    for offset, bound in ((10, 1e-3), (100, 1e-5), (900, 1e-6)):
+        point = 0.1**2 / (math.pi * 2.0 * 0.1 * offset)
+        assert table[offset, 0] == pytest.approx(point, rel=bound)
+
+
+@given(st.floats(0, 1e4), st.floats(0, 0.5))
+def test_a_layers_response_is_between_springs_and_half_space(wave: float, poisson: float) -> None:
+    response = float(layer_response(wave, poisson))
+    assert math.isfinite(response)
+    assert response >= 0
+    # A layer may overshoot a half-space by little where its sides bulge.
+    assert response <= 1.1
+    if wave > 25:
+        assert response == pytest.approx(1, abs=1e-12)
+
+
+@pytest.mark.parametrize("poisson", [0.0, 0.3, 0.48])
+def test_to_long_waves_a_layer_is_springs(poisson: float) -> None:
+    """p = M c / t with the modulus M = E (1 - nu) / ((1 + nu)(1 - 2 nu)) of a layer that cannot widen."""
+    k = 1e-4
+    young = 1 - poisson**2  # E* = 1
+    oedometric = young * (1 - poisson) / ((1 + poisson) * (1 - 2 * poisson))
+    assert 2 * float(layer_response(k, poisson)) / k == pytest.approx(1 / oedometric, rel=1e-6)
+
+
+def test_the_series_meets_the_formula() -> None:
+    for poisson in (0.0, 0.3, 0.48, 0.5):
+        below, above = layer_response(np.array([0.1 - 1e-9, 0.1 + 1e-9]), poisson)
+        assert below == pytest.approx(above, rel=1e-6)
+    # Without change of volume the response begins with the cube: S -> 2 k^3 / 3 (Johnson, 5.8: thin, nu = .5).
+    assert float(layer_response(1e-5, 0.5)) == pytest.approx(2 / 3 * 1e-15, rel=1e-6)
+
+
+def test_a_thick_layer_is_a_half_space() -> None:
+    shape, pitch = (24, 24), 0.1
+    half = half_space_table(shape, pitch, 1.0)
+    last = math.inf
+    for thickness in (10.0, 100.0, 1000.0):
+        layer = layer_table(shape, pitch, Gel(modulus=1.0, poisson=0.4, thickness=thickness))
+        off = float(np.abs(layer - half).max() / half.max())
+        assert off < last / 5
+        last = off
+    assert last < 1e-4
+
+
+def test_a_wave_of_pressure_sinks_as_the_transform_says() -> None:
+    """In the middle of a wide field, away from its ends: u = 2 S(qt) / (E* q) p."""
+    side, pitch = 256, 0.15
+    gel = Gel(modulus=0.5, poisson=0.45, thickness=1.2)
+    x = (np.arange(side) - side // 2) * pitch
+    for length in (3.0, 6.0):
+        wave = np.cos(2 * np.pi * x / length)[None, :] * np.ones((side, 1))
+        sink = kernel(layer_table((side, side), pitch, gel), side).sink(wave)[side // 2]
+        q = 2 * np.pi / length
+        expected = 2 * float(layer_response(q * gel.thickness, gel.poisson)) / (gel.modulus * q)
+        inside = np.abs(x) < 6
+        np.testing.assert_allclose(sink[inside], expected * wave[0][inside], atol=0.01 * expected)
+
+
+def test_a_thin_layer_under_even_pressure_gives_way_as_springs() -> None:
+    side, pitch = 128, 0.05
+    gel = Gel(modulus=0.4, poisson=0.3, thickness=0.2)
+    sink = kernel(layer_table((side, side), pitch, gel), side).sink(np.ones((side, side)))
+    young = gel.modulus * (1 - 0.3**2)
+    oedometric = young * 0.7 / (1.3 * 0.4)
+    np.testing.assert_allclose(sink[40:88, 40:88], gel.thickness / oedometric, rtol=2e-3)
+
+
+def test_a_gel_without_change_of_volume_is_pushed_aside() -> None:
+    """What sinks under the pressure rises around it: no displacement on average."""
+    side, pitch = 256, 0.1
+    gel = Gel(poisson=0.5, thickness=1.0)
+    pressure = np.zeros((side, side))
+    pressure[112:144, 112:144] = 1.0
+    sink = kernel(layer_table((side, side), pitch, gel), side).sink(pressure)
+    assert sink.min() < 0 < sink.max()
+    assert abs(sink.sum()) < 1e-3 * np.abs(sink).sum()
+    compressible = kernel(layer_table((side, side), pitch, Gel(poisson=0.3, thickness=1.0)), side).sink(pressure)
+    assert compressible.sum() > 0.5 * np.abs(compressible).sum()
+
+
+def test_a_layers_table_is_its_hankel_transform() -> None:
+    """Direct numerical inversion at a few radii, with nothing of the table's splitting or interpolation."""
+    gel, pitch = Gel(modulus=0.25, poisson=0.48, thickness=2.5), 0.2
+    table = layer_table((40, 40), pitch, gel)
+    from scipy.special import j0
+
+    for offset in (12, 20, 30):
+        r = offset * pitch
+        # The tail of S = 1 is 1/r (half-space); what is left converges fast.
+        rest, _ = quad(
+            lambda k, r=r: (float(layer_response(k, gel.poisson)) - 1) * j0(k * r / gel.thickness), 0, 30, limit=400
+        )
+        direct = pitch**2 / (math.pi * gel.modulus) * (1 / r + rest / gel.thickness)
+        assert table[0, offset] == pytest.approx(direct, rel=2e-2, abs=2e-5 * table[0, 0])
+
+
+def test_convolution_is_the_direct_sum() -> None:
+    rng = np.random.default_rng(0)
+    rows, columns = 7, 9
+    table = half_space_table((rows, columns), 0.3, 1.5)
+    pressure = rng.random((2, rows, columns))
+    direct = np.zeros_like(pressure)
+    for i in range(rows):
+        for j in range(columns):
+            for k in range(rows):
+                for m in range(columns):
+                    direct[:, i, j] += table[abs(i - k), abs(j - m)] * pressure[:, k, m]
+    np.testing.assert_allclose(make_kernel(table, pressure).sink(pressure), direct, rtol=1e-12)
+    single = pressure.astype(np.float32)
+    found = make_kernel(table, single).sink(single)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, direct, rtol=2e-6)
+    tensor = torch.from_numpy(pressure)
+    np.testing.assert_allclose(back(make_kernel(table, tensor).sink(tensor)), direct, rtol=1e-12)
+
+
+@pytest.mark.parametrize("bad", [{"modulus": 0.0}, {"poisson": 0.6}, {"poisson": -0.1}, {"thickness": -1.0}])
+def test_impossible_gels_are_refused(bad: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="Poisson"):
+        Gel(**bad)
+
+
+def test_a_gel_thinner_than_its_pixels_is_refused() -> None:
+    with pytest.raises(ValueError, match="pixels of at most half"):
+        layer_table((8, 8), 1.0, Gel(thickness=1.5))

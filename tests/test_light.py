@@ -1,0 +1,158 @@
+"""Light on the gel's skin, against normals computed in another way, and what must not change a picture."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.scenes.light import DIRECT, NOISE, Drift, Sensor, make_sensor, shade, surface
+
+WIDTH, HEIGHT, PITCH = 96, 72, 0.2
+FLAT = np.zeros((HEIGHT, WIDTH), np.float32)
+
+
+def quiet(sensor: Sensor) -> Sensor:
+    """The same without noise and marks."""
+    return dataclasses.replace(sensor, noise=np.zeros_like(sensor.noise), marks=np.ones_like(sensor.marks))
+
+
+def even(directions: tuple[float, float, float], gain: float = 60.0, level: float = 100.0) -> Sensor:
+    """A sensor with equal lights from these directions (degrees) and an even background, without noise and marks."""
+    side = np.ones((HEIGHT, HEIGHT), np.float32)
+    gains = tuple(
+        (side * np.float32(gain * np.cos(np.radians(d))), side * np.float32(gain * np.sin(np.radians(d))))
+        for d in directions
+    )
+    return Sensor(
+        glow=np.full((HEIGHT, HEIGHT, 3), level, np.float32),
+        direct=(side * np.float32(DIRECT * level),) * 3,
+        gains=gains,
+        marks=np.ones((HEIGHT, HEIGHT, 3), np.float32),
+        noise=np.zeros((HEIGHT + HEIGHT // 2, HEIGHT + HEIGHT // 2, 3), np.float32),
+    )
+
+
+def bump(height: float, wide: float, rows: int = HEIGHT, columns: int = WIDTH) -> np.ndarray:
+    y, x = np.mgrid[:rows, :columns]
+    square = ((x - (columns - 1) / 2) ** 2 + (y - (rows - 1) / 2) ** 2) * PITCH**2
+    return (height * np.exp(-square / (2 * wide**2))).astype(np.float32)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_flat_skin_is_the_background_within_the_noise(seed: int) -> None:
+    sensor = make_sensor(WIDTH, HEIGHT, seed)
+    frame = shade(FLAT, sensor, PITCH, 7)
+    assert frame.dtype == np.uint8
+    error = frame - sensor.background
+    assert np.abs(error).max() < 6 * NOISE
+    assert error.std() == pytest.approx(NOISE, rel=0.1)
+    exact = shade(FLAT, quiet(sensor), PITCH, 7)
+    np.testing.assert_array_equal(exact, cv2.convertScaleAbs(sensor.glow))
+
+
+@pytest.mark.parametrize("curvature", [0.01, 0.05, 0.2])
+def test_lambert_on_a_paraboloid(curvature: float) -> None:
+    """Against unit normals and light vectors in float64, where a light's vector is (-g / D, 1) in any length."""
+    sensor = quiet(make_sensor(WIDTH, HEIGHT, 2))
+    y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64) * PITCH
+    x, y = x - x.mean(), y - y.mean()
+    skin = 3 - curvature * (x * x + 0.5 * x * y + 2 * y * y)
+    normals = np.stack([curvature * (2 * x + 0.5 * y), curvature * (0.5 * x + 4 * y), np.ones_like(x)], axis=-1)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    expected = []
+    for channel in range(3):
+        across, along = sensor.gains[channel]
+        vector = np.stack([-across, -along, sensor.direct[channel]], axis=-1).astype(np.float64)
+        lit = np.maximum((vector * normals).sum(axis=-1), 0)
+        expected.append(sensor.glow[..., channel] - sensor.direct[channel] + lit)
+    frame = shade(skin.astype(np.float32), sensor, PITCH, 0)
+    inner = (slice(1, -1), slice(1, -1))  # Differences at the border are one-sided.
+    error = frame[inner] - np.clip(np.stack(expected, axis=-1), 0, 255)[inner]
+    assert np.abs(error).max() < 0.51, "rounding to 8 bits"
+
+
+def test_red_comes_from_above_green_from_the_right_blue_from_below() -> None:
+    """As in the real videos: a bulge's upper flank is redder than flat skin, its lower flank bluer."""
+    sensor = quiet(make_sensor(WIDTH, HEIGHT, 0))
+    change = shade(bump(1.0, 1.5), sensor, PITCH, 0).astype(int) - shade(FLAT, sensor, PITCH, 0)
+    middle, offset = (HEIGHT // 2, WIDTH // 2), 7
+    upper, lower = change[middle[0] - offset, middle[1]], change[middle[0] + offset, middle[1]]
+    left, right = change[middle[0], middle[1] - offset], change[middle[0], middle[1] + offset]
+    assert upper[2] > 10 > -10 > lower[2]
+    assert lower[0] > 10 > -10 > upper[0]
+    assert right[1] > 10 > -10 > left[1]
+
+
+def test_a_ball_looks_alike_from_all_sides() -> None:
+    """Turning the light by a right angle turns the picture of what is round."""
+    first, second, third = np.moveaxis(shade(bump(1.5, 2, HEIGHT, HEIGHT), even((0, 90, 180)), PITCH, 0), -1, 0)
+    assert first.std() > 5
+    # From x towards y, which points down, is with the clock.
+    assert np.abs(np.rot90(first, -1).astype(int) - second).max() <= 1
+    assert np.abs(np.rot90(first, 2).astype(int) - third).max() <= 1
+
+
+@given(st.integers(0, 2**40), st.floats(-3, 3, width=32))
+def test_only_slopes_count(seed: int, depth: float) -> None:
+    sensor = make_sensor(WIDTH, HEIGHT, 1)
+    skin = bump(0.5, 2.0)
+    shifted = shade(skin + np.float32(depth), sensor, PITCH, seed).astype(int)
+    # Adding a constant rounds heights anew.
+    assert np.abs(shifted - shade(skin, sensor, PITCH, seed)).max() <= 1
+
+
+@given(st.floats(0, 1e6, width=32), st.integers(0, 100))
+def test_no_slope_is_too_steep(height: float, seed: int) -> None:
+    skin = np.float32(height) * np.random.default_rng(seed).standard_normal((HEIGHT, WIDTH)).astype(np.float32)
+    sensor = make_sensor(WIDTH, HEIGHT, 1)
+    with np.errstate(all="raise", under="ignore"):
+        frame = shade(skin, sensor, PITCH, seed)
+    shadow = sensor.background * (1 - DIRECT) - 6 * NOISE
+    assert (frame >= np.floor(np.maximum(shadow, 0)) - 1).all(), "scattered light reaches every place"
+
+
+def test_everything_follows_from_seeds() -> None:
+    skin = bump(0.5, 2.0)
+    make_sensor.cache_clear()
+    first = shade(skin, make_sensor(WIDTH, HEIGHT, 3), PITCH, 5)
+    make_sensor.cache_clear()
+    np.testing.assert_array_equal(first, shade(skin, make_sensor(WIDTH, HEIGHT, 3), PITCH, 5))
+    assert (first != shade(skin, make_sensor(WIDTH, HEIGHT, 3), PITCH, 6)).any()
+    assert (first != shade(skin, make_sensor(WIDTH, HEIGHT, 4), PITCH, 5)).any()
+
+
+def drift(x: float, y: float) -> Drift:
+    return np.full_like(FLAT, x), np.full_like(FLAT, y)
+
+
+def test_drift_carries_the_marks_and_nothing_else() -> None:
+    sensor = make_sensor(WIDTH, HEIGHT, 1)
+    sensor = dataclasses.replace(quiet(sensor), marks=sensor.marks)
+    assert (sensor.marks < 0.9).any()
+    skin = bump(0.5, 2.0)
+    still = shade(skin, sensor, PITCH, 0)
+    np.testing.assert_array_equal(shade(skin, sensor, PITCH, 0, drift(0, 0)), still)
+    moved = shade(skin, sensor, PITCH, 0, drift(4 * PITCH, -3 * PITCH))
+    assert (moved != still).any()
+    bare = shade(skin, quiet(sensor), PITCH, 0)
+    shifted = np.ones_like(sensor.marks)
+    shifted[:-3, 4:] = sensor.marks[3:, :-4]
+    assert np.abs(moved - bare * shifted).max() <= 1.01, "right and up"
+    np.testing.assert_array_equal(shade(skin, quiet(sensor), PITCH, 0, drift(1, 1)), bare)
+
+
+def test_sensors_differ_and_some_have_no_rim() -> None:
+    corners = [make_sensor(WIDTH, HEIGHT, seed).glow[-1, -1].mean() for seed in range(40)]
+    dark = np.array(corners) < 55
+    assert 0.6 < dark.mean() < 1
+    assert len(set(corners)) == 40
+
+
+def test_a_curve_is_its_polynomial() -> None:
+    x, y = np.array([0.3]), np.array([-0.7])
+    assert surface((1, 2, 3, 4, 5, 6), x, y)[0] == pytest.approx(1 + 2 * 0.3 - 3 * 0.7 + 4 * 0.09 - 5 * 0.21 + 6 * 0.49)

@@ -1,0 +1,108 @@
+"""Recipes: PhysiCLeAR's list, drawn ones, and what is refused."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from pipeline.errors import UserError
+from pipeline.physiclear.catalogue import Catalogue
+from pipeline.scenes.bumps import Domes, Ridges
+from pipeline.scenes.geometry import IMAGE_MM
+from pipeline.scenes.measure import HARD_ABOVE_MPA, SOFT_BELOW_MPA
+from pipeline.scenes.recipe import BUMP_SHARE, MODULUS_MPA, ROUGH_RMS_MM, load_recipes, recipe_of
+from pipeline.scenes.relief import Rough
+from tests.conftest import ROOT
+
+PHYSICLEAR = ROOT / "pipeline" / "physiclear"
+
+
+def test_every_object_has_a_recipe_of_its_own(catalogue: Catalogue) -> None:
+    recipes = load_recipes(PHYSICLEAR, catalogue, 0)
+    assert list(recipes) == list(catalogue.objects)
+    assert len({r.model_dump_json() for r in recipes.values()}) == len(recipes) == 74
+    assert recipes == load_recipes(PHYSICLEAR, catalogue, 1), "listed, not drawn"
+
+
+def test_what_is_not_listed_is_drawn(catalogue: Catalogue, tmp_path: Path) -> None:
+    (tmp_path / "scenes.yaml").write_text("rug: {modulus: 0.3, relief: [{kind: rough, rms: 0.02, longest: 0.9}]}\n")
+    recipes = load_recipes(tmp_path, catalogue, 3)
+    assert recipes["rug"].modulus == 0.3
+    assert recipes["rice"] == recipe_of("rice", catalogue, 3) != load_recipes(PHYSICLEAR, catalogue, 3)["rice"]
+    (tmp_path / "scenes.yaml").write_text("# nothing yet\n")
+    assert load_recipes(tmp_path, catalogue, 3)["rug"] == recipe_of("rug", catalogue, 3)
+    (tmp_path / "scenes.yaml").unlink()
+    assert load_recipes(tmp_path, catalogue, 3)["rug"] == recipe_of("rug", catalogue, 3)
+
+
+def test_drawn_recipes_follow_the_labels(catalogue: Catalogue) -> None:
+    recipes = {o: recipe_of(o, catalogue, 0) for o in catalogue.objects}
+    assert len(set(recipes.values())) == len(recipes), "objects of one class differ"
+    for object_id, recipe in recipes.items():
+        hardness, roughness, bumpiness = catalogue.labels(object_id)
+        assert MODULUS_MPA[hardness][0] <= recipe.modulus <= MODULUS_MPA[hardness][1]
+        (rough,) = (r for r in recipe.relief if isinstance(r, Rough))
+        assert ROUGH_RMS_MM[roughness][0] <= rough.rms <= ROUGH_RMS_MM[roughness][1]
+        bumps = [r for r in recipe.relief if isinstance(r, Domes | Ridges)]
+        assert len(bumps) == (bumpiness > 0)
+        for bump in bumps:
+            assert BUMP_SHARE[bumpiness][0] <= bump.width / IMAGE_MM[1] <= BUMP_SHARE[bumpiness][1]
+    assert recipe_of("rug", catalogue, 0) == recipes["rug"]
+    assert recipe_of("rug", catalogue, 1) != recipes["rug"]
+
+
+def test_classes_of_hardness_lie_on_their_side_of_the_borders() -> None:
+    soft, moderate, hard = MODULUS_MPA
+    assert soft[1] < SOFT_BELOW_MPA < moderate[0] < moderate[1] < HARD_ABOVE_MPA < hard[0]
+
+
+def test_scenes_need_their_properties(catalogue: Catalogue, tmp_path: Path) -> None:
+    language = catalogue.language.model_copy(update={"properties": catalogue.properties[1:]})
+    objects = {"rug": catalogue.objects["rug"].model_copy(update={"ratings": catalogue.objects["rug"].ratings[1:]})}
+    fewer = Catalogue.model_construct(language=language, objects=objects)
+    with pytest.raises(UserError, match=r"hardness.*three classes each.*data\.source=videos"):
+        load_recipes(tmp_path, fewer, 0)
+    shutil.copy(PHYSICLEAR / "scenes.yaml", tmp_path)
+    with pytest.raises(UserError, match=r"is not in objects\.csv; correct or remove"):
+        load_recipes(tmp_path, fewer, 0)
+    (tmp_path / "scenes.yaml").write_text("rug: {modulus: 0.3}")
+    assert load_recipes(tmp_path, fewer, 0)["rug"].modulus == 0.3, "a listed object needs no labels"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("yoyo: {modulus: 1}", r"yoyo is not in objects\.csv; correct or remove the entry"),
+        ("rug: {relief: []}", r"rug: modulus is missing; add it"),
+        ("rug:", r"rug: recipe is None: .*correct it"),
+        ("rug: {modulus: -1}", r"rug: modulus is -1: .*greater than.*correct it"),
+        ("rug: {modulus: .nan}", r"rug: modulus is nan"),
+        ("rug: {modulus: .inf}", r"rug: modulus is inf"),
+        ("rug: {modulus: soft}", r"rug: modulus is 'soft': .*number"),
+        ("rug: {modulus: 1, colour: red}", r"rug: colour is not a key of a recipe; remove it or see docs/scenes\.md"),
+        ("rug: {modulus: 1, body: {kind: cube}}", r"rug: body is .*cube.*'flat'"),
+        ("rug: {modulus: 1, body: {kind: round}}", r"rug: body\.round\.radii is missing; add it"),
+        ("rug: {modulus: 1, body: {kind: round, radii: [3, 0]}}", r"rug: body\.round\.radii\.1 is 0"),
+        ("rug: {modulus: 1, relief: [{kind: fur}]}", r"rug: relief\.0 is .*fur.*'rough'"),
+        ("rug: {modulus: 1, relief: [{kind: rough, rms: 1}]}", r"rug: relief\.0\.rough\.longest is missing; add it"),
+        ("rug: {modulus: 1, relief: [{kind: rough, rms: 1, longest: 2, x: 1}]}", r"relief\.0\.rough\.x is not a key"),
+        ("- rug", r"must map object ids to recipes"),
+        ("rug: {modulus: 1", r"correct it, or remove it"),
+        ("2: {modulus: 1}", r"2 is not in objects\.csv"),
+    ],
+)
+def test_bad_entries_are_refused_in_one_line(text: str, message: str, catalogue: Catalogue, tmp_path: Path) -> None:
+    file = tmp_path / "scenes.yaml"
+    file.write_text(text)
+    with pytest.raises(UserError, match=message) as caught:
+        load_recipes(tmp_path, catalogue, 0)
+    assert str(caught.value).startswith(f"{file}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_bytes_that_are_no_text_are_refused(catalogue: Catalogue, tmp_path: Path) -> None:
+    (tmp_path / "scenes.yaml").write_bytes(b"rug: \xff\xfe")
+    with pytest.raises(UserError, match=r"scenes\.yaml: .*correct it"):
+        load_recipes(tmp_path, catalogue, 0)
