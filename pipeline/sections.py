@@ -57,7 +57,7 @@ class ScenesConfig(Section):
     cheapest within `tolerance`."""
     cells: Annotated[int, Field(ge=32, le=1024)] = 256
     """`layer`, `half_space`: grid across the pressed patch."""
-    tolerance: Annotated[float, Field(gt=0, le=1)] = 0.2
+    tolerance: Annotated[float, Field(gt=0, le=1)] = 0.25
     """`auto`: estimated relative error in the slopes of the gel's skin."""
     width: Annotated[int, Field(ge=32, le=1280, multiple_of=2)] = 320
     height: Annotated[int, Field(ge=24, le=960, multiple_of=2)] = 240

@@ -19,6 +19,7 @@ from tests.conftest import ROOT
 WIDTH, HEIGHT, SIDE = 160, 120, 263
 PITCH = IMAGE_MM[0] / WIDTH
 FORCE_N = 8.0
+"""A firm press; a light one does not bring every bump out, which scenes.csv shows."""
 RECIPES = "pipeline/physiclear"
 
 

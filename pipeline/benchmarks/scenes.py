@@ -40,7 +40,7 @@ RADIUS, FORCES = 10.0, (0.8, 0.9, 1.0, 1.1, 1.2)
 """The ball, in mm, and forces in N on a body of 1 MPa: several, as one is as lucky as its circle fits the grid."""
 CELLS, TOLERANCES = (32, 64, 128, 256), (1e-2, 1e-4, 1e-6)
 SIZE = (160, 120)
-FRAMES, SHOWN, VIDEOS = 40, 5, 5
+FRAMES, SHOWN, VIDEOS = 40, 5, 3
 """Of a rendered video, of these looked at by the classifier, and videos an object."""
 PICTURES = ("reports/bench/scenes.png", "reports/bench/scenes_labels.png")
 PUBLIC_VIDEOS = 408

@@ -102,7 +102,7 @@ def press(
     pitch: float,
     method: Method | None = None,
     *,
-    tolerance: float = 0.2,
+    tolerance: float = 0.25,
     gel: Gel = GEL,
     device: str | None = None,
 ) -> Imprint:
@@ -118,12 +118,15 @@ def press(
         gel: The sensor's.
         device: Where torch solves; None is NumPy.
     """
-    error = None
     body = Body(heights, modulus, pitch, gel, device)
-    if method is None:
-        method, error = choose(body, force, tolerance)
     forces = force * (np.arange(1, LEVELS + 1) / LEVELS) ** 1.5
-    pressed = [body.press(method, forces)] if method.tier != "winkler" else [body.springs(f) for f in forces]
+    error = None
+    if method is None:
+        choice = choose(body, force, tolerance)
+        method, error = choice.method, choice.error
+        pressed = [body.press(method, forces[:-1]), choice.pressed]
+    else:
+        pressed = [body.press(method, forces)]
     flat = np.zeros((1, *heights.shape), np.float32)
     return Imprint(
         skins=np.concatenate([flat, *(p.skins for p in pressed)]),
@@ -135,7 +138,18 @@ def press(
     )
 
 
-def choose(body: Body, force: float, tolerance: float) -> tuple[Method, float]:
+@dataclass(frozen=True)
+class Choice:
+    """What `auto` takes."""
+
+    method: Method
+    error: float
+    """Estimated."""
+    pressed: Pressed
+    """By this method under the largest force."""
+
+
+def choose(body: Body, force: float, tolerance: float) -> Choice:
     """The cheapest method whose slopes under the largest force are near enough to those of the next finer one.
 
     An error is estimated as the distance to the next finer grid, which is larger than that to the truth as long as
@@ -146,17 +160,17 @@ def choose(body: Body, force: float, tolerance: float) -> tuple[Method, float]:
     rungs = [m for m in LADDER if m.cells < body.side]
     if len(rungs) < len(LADDER):
         rungs.append(Method("layer"))
-    coarse = body.press(rungs[0], np.array([force])).skins[0]
-    springs = body.springs(force).skins[0]
+    top = np.array([force])
+    springs, coarse = body.press(Method("winkler"), top), body.press(rungs[0], top)
     error = 0.0
     for method, finer in itertools.pairwise(rungs):
-        fine = body.press(finer, np.array([force])).skins[0]
-        for candidate, skin in ((Method("winkler"), springs), (method, coarse)):
-            error = slope_error(skin, fine, body.pitch)
+        fine = body.press(finer, top)
+        for candidate, pressed in ((Method("winkler"), springs), (method, coarse)):
+            error = slope_error(pressed.skins[0], fine.skins[0], body.pitch)
             if error <= tolerance:
-                return candidate, error
+                return Choice(candidate, error, pressed)
         coarse = fine
-    return rungs[-1], error / 2
+    return Choice(rungs[-1], error / 2, coarse)
 
 
 def slope_error(skin: Heights, reference: Heights, pitch: float) -> float:
@@ -166,7 +180,9 @@ def slope_error(skin: Heights, reference: Heights, pitch: float) -> float:
 
 
 @dataclass(frozen=True)
-class _Pressed:
+class Pressed:
+    """A body under some forces."""
+
     skins: npt.NDArray[np.float32]
     areas: npt.NDArray[np.float64]
     residual: float
@@ -182,15 +198,18 @@ class Body:
         self.side = heights.shape[0]
         self.together = series(gel.modulus, modulus)
 
-    def springs(self, force: float) -> _Pressed:
-        """By Winkler, at every pixel."""
-        pressed = press_springs(self.heights.max() - self.heights, force, self.modulus, self.pitch, self.gel)
-        area = np.count_nonzero(pressed.overlap) * self.pitch**2
-        skin = hang_skin(pressed, self.modulus, self.pitch, self.gel)
-        return _Pressed(skin[None], np.array([area]), 0.0)
+    def press(self, method: Method, forces: npt.NDArray[np.float64]) -> Pressed:
+        """Under each force, in N."""
+        return self._springs(forces) if method.tier == "winkler" else self._elastic(method, forces)
 
-    def press(self, method: Method, forces: npt.NDArray[np.float64]) -> _Pressed:
-        """As elastic bodies."""
+    def _springs(self, forces: npt.NDArray[np.float64]) -> Pressed:
+        gap = self.heights.max() - self.heights
+        found = [press_springs(gap, force, self.modulus, self.pitch, self.gel) for force in forces.tolist()]
+        skins = [hang_skin(springs, self.modulus, self.pitch, self.gel) for springs in found]
+        areas = [np.count_nonzero(springs.overlap) * self.pitch**2 for springs in found]
+        return Pressed(np.stack(skins), np.array(areas), 0.0)
+
+    def _elastic(self, method: Method, forces: npt.NDArray[np.float64]) -> Pressed:
         cells = min(method.cells or self.side, self.side)
         coarse = cv2.resize(self.heights, (cells, cells), interpolation=cv2.INTER_AREA)
         pitch = self.side * self.pitch / cells
@@ -200,7 +219,7 @@ class Body:
         sinks, pressures = back(gel.sink(solution.pressure)), back(solution.pressure)
         areas = np.count_nonzero(pressures > 0, axis=(1, 2)) * pitch**2
         if cells == self.side:
-            return _Pressed(sinks, areas, float(solution.residual.max()))
+            return Pressed(sinks, areas, float(solution.residual.max()))
         fine = self.heights - _enlarge(coarse, self.side)
         # The share of the fine part that the pressure flattens, of that what the gel and not the object gives way.
         flattened = math.sqrt(2) / (self.together * max(_rms_slope(fine, self.pitch), 1e-9))
@@ -209,7 +228,7 @@ class Body:
             _enlarge(sink, self.side) + share * erf(np.float32(flattened) * _enlarge(pressure, self.side))
             for sink, pressure in zip(sinks, pressures, strict=True)
         ]
-        return _Pressed(np.stack(skins), areas, float(solution.residual.max()))
+        return Pressed(np.stack(skins), areas, float(solution.residual.max()))
 
 
 @lru_cache(maxsize=16)
