@@ -59,7 +59,7 @@ def test_command_writes_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 @pytest.mark.parametrize("arguments", [[], ["nonsense"], ["startup", "more"]])
 def test_unknown_section_names_the_allowed(arguments: list[str]) -> None:
-    with pytest.raises(SystemExit, match="allowed sections: frames, selection, startup"):
+    with pytest.raises(SystemExit, match="allowed sections: frames, realism, scenes, selection, startup"):
         main(arguments)
 
 
