@@ -14,16 +14,19 @@ from typing import Any, Literal, Self, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError, model_validator
 
+from pipeline.contestants import CONTESTANTS
 from pipeline.errors import UserError
 from pipeline.plan import Plan, resolve_plan
 from pipeline.sections import (
     SCENES_DIR,
     AblationConfig,
+    CrossValidationConfig,
     DataConfig,
     EncoderConfig,
     FramesConfig,
     LanguageConfig,
     LoraTrainConfig,
+    PretrainConfig,
     QuestionsConfig,
     RuntimeConfig,
     ScenesConfig,
@@ -50,6 +53,8 @@ class Settings(Section):
     split: SplitConfig
     questions: QuestionsConfig
     encoder: EncoderConfig
+    pretrain: PretrainConfig
+    cross_validation: CrossValidationConfig
     language: LanguageConfig
     align: TrainConfig
     lora: LoraTrainConfig
@@ -77,16 +82,28 @@ class Params(Settings):
 
     @model_validator(mode="after")
     def _plan_is_resolved(self) -> Self:
-        if self.plan != resolve_plan(self.data.source, self.ablation.plan, self.ablation.seeds):
-            raise ValueError("plan does not follow from ablation; run `octopi scale` again instead of editing it")
+        if self.plan != plan_of(self):
+            raise ValueError(
+                "plan does not follow from ablation and encoder.recipe; run `octopi scale` again instead of editing it"
+            )
         return self
+
+
+def plan_of(settings: Settings) -> Plan:
+    """What DVC has to make stages of."""
+    return resolve_plan(
+        settings.data.source,
+        settings.ablation.plan,
+        settings.ablation.seeds,
+        pretrained=settings.encoder.recipe == "strong",
+        compared={name: CONTESTANTS[name].pretrained for name in settings.cross_validation.models},
+    )
 
 
 def resolve(values: Mapping[str, Any], origin: str) -> Params:
     """Validate composed settings and add the plan that follows from them; `origin` begins an error's line."""
     settings = _validate(Settings, values, origin)
-    plan = resolve_plan(settings.data.source, settings.ablation.plan, settings.ablation.seeds)
-    return Params(**{name: getattr(settings, name) for name in Settings.model_fields}, plan=plan)
+    return Params(**{name: getattr(settings, name) for name in Settings.model_fields}, plan=plan_of(settings))
 
 
 def load_params(path: Path = PARAMS_FILE) -> Params:

@@ -8,7 +8,7 @@ and a variant without LoRA is the alignment checkpoint, answered.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from enum import StrEnum
 from typing import Literal
 
@@ -16,6 +16,9 @@ from pydantic import BaseModel, ConfigDict
 
 from pipeline.records import Opd
 
+NOTHING = "data/videos.parquet"
+"""Stands where a stage needs nothing: DVC has no optional dependencies, and every stage comes after this table."""
+PRETRAINED = "data/pretrained/scenes"
 PlanName = Literal["paper", "factorial", "single"]
 
 
@@ -54,6 +57,13 @@ class TrainingJob(_Entry):
     seed: int
 
 
+class CrossValidationJob(_Entry):
+    """One model that is cross-validated."""
+
+    pretrained: str
+    """As the plan's."""
+
+
 class Variant(_Entry):
     """One answering system: a row or column of the paper's tables."""
 
@@ -71,6 +81,12 @@ class Plan(_Entry):
 
     scenes: tuple[str, ...]
     """One entry where scenes are the source, none otherwise."""
+    pretrain: tuple[str, ...]
+    """One entry where the encoder's recipe begins with a pretraining, none otherwise."""
+    pretrained: str
+    """What fine-tuning the encoder starts from besides CLIP's weights; where there is nothing, the table of videos."""
+    cross_validation: dict[str, CrossValidationJob]
+    """Models that are cross-validated over all objects, by name."""
     encoder_seeds: tuple[int, ...]
     embeddings: dict[str, EmbeddingJob]
     align: dict[str, TrainingJob]
@@ -97,17 +113,29 @@ def variant_axes(plan: PlanName) -> list[tuple[Encoder, Lora, Opd]]:
     ]
 
 
-def resolve_plan(source: Literal["scenes", "videos"], plan: PlanName, seeds: Sequence[int]) -> Plan:
-    """Unfold a plan over seeds into the stages that it needs."""
+def resolve_plan(
+    source: Literal["scenes", "videos"],
+    plan: PlanName,
+    seeds: Sequence[int],
+    *,
+    pretrained: bool = False,
+    compared: Mapping[str, bool] | None = None,
+) -> Plan:
+    """Unfold a plan over seeds into the stages that it needs.
+
+    Args:
+        pretrained: Whether the encoder's recipe begins with a pretraining.
+        compared: Models to cross-validate, each with whether it begins with a pretraining.
+    """
+    compared = compared or {}
     embeddings: dict[str, EmbeddingJob] = {}
     align: dict[str, TrainingJob] = {}
     lora: dict[str, TrainingJob] = {}
     variants: dict[str, Variant] = {}
     for seed, (encoder, adapter, opd) in itertools.product(seeds, variant_axes(plan)):
         embedding_key = encoder.value if encoder is Encoder.BASE else f"{encoder}-{seed}"
-        # The base encoder is loaded from its weights alone; the catalogue of videos stands in as the folder's
-        # dependency, so that both kinds fit one stage.
-        encoder_dir = "data/videos.parquet" if encoder is Encoder.BASE else f"data/encoder/{seed}"
+        # The base encoder is loaded from its weights alone.
+        encoder_dir = NOTHING if encoder is Encoder.BASE else f"data/encoder/{seed}"
         embeddings[embedding_key] = EmbeddingJob(encoder=encoder, encoder_dir=encoder_dir)
         job_key = f"{encoder}-{opd}-{seed}"
         job = TrainingJob(encoder=encoder, embeddings=embedding_key, opd=opd, seed=seed)
@@ -124,6 +152,11 @@ def resolve_plan(source: Literal["scenes", "videos"], plan: PlanName, seeds: Seq
         )
     return Plan(
         scenes=("scenes",) if source == "scenes" else (),
+        pretrain=("scenes",) if pretrained or any(compared.values()) else (),
+        pretrained=PRETRAINED if pretrained else NOTHING,
+        cross_validation={
+            name: CrossValidationJob(pretrained=PRETRAINED if wanted else NOTHING) for name, wanted in compared.items()
+        },
         encoder_seeds=_seeds(job for job in align.values()),
         embeddings=embeddings,
         align=align,

@@ -227,6 +227,17 @@ class Classification(Record):
     probabilities: tuple[float, ...]
 
 
+class Judged(Record):
+    """What a model said of one video in one repeat of a cross-validation, without having seen the video's object."""
+
+    video_id: str
+    object_id: str
+    repeat: int = Field(ge=0)
+    expected: tuple[int, ...]
+    """A class for each property, in the catalogue's order."""
+    predicted: tuple[int, ...]
+
+
 class Measurement(Record):
     """One logged value of a training: a point of a curve."""
 

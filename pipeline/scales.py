@@ -17,6 +17,7 @@ from pipeline.plan import Plan
 from pipeline.splits import check_split
 
 CONF = Path("conf")
+RECIPE = "encoder.recipe"
 HEADER = "# Written by `octopi scale`; change it with that command, or edit conf/ and run it again.\n"
 
 
@@ -45,6 +46,10 @@ def compose(name: str, overrides: Sequence[str] = (), conf: Path = CONF) -> Para
             raise UserError(f"{override!r} is no override; write key=value, for example split.name=development")
     # Every key may be set here; whether it exists is the validation's matter, since that knows what is allowed.
     forced = [o if o.startswith(("+", "~")) else f"++{o}" for o in overrides]
+    # A recipe brings its own values; they give way to what is set beside it.
+    asked = dict(o.lstrip("+").split("=", 1) for o in overrides).get(RECIPE)
+    if asked is not None and (conf / "recipe" / f"{asked}.yaml").is_file():
+        forced.insert(0, f"recipe={asked}")
     try:
         with initialize_config_dir(str(conf.resolve()), version_base=None):
             values = OmegaConf.to_container(hydra_compose(name, overrides=forced), resolve=True)
@@ -86,6 +91,8 @@ def prune(plan: Plan, data: Path) -> None:
     Stages that read a whole folder (the report) would otherwise take them for their own.
     """
     keep = {
+        "pretrained": set(plan.pretrain),
+        "cross_validation": set(plan.cross_validation),
         "encoder": {str(s) for s in plan.encoder_seeds},
         "embeddings": set(plan.embeddings),
         "align": set(plan.align),
@@ -97,7 +104,14 @@ def prune(plan: Plan, data: Path) -> None:
         for entry in (data / folder).glob("*"):
             if entry.name not in keys:
                 shutil.rmtree(entry)
-    stages = {"answers": "answer", "scores": "grade", "embeddings": "embed", "encoder": "finetune_encoder"}
+    stages = {
+        "answers": "answer",
+        "scores": "grade",
+        "embeddings": "embed",
+        "encoder": "finetune_encoder",
+        "pretrained": "pretrain",
+        "cross_validation": "cross_validate",
+    }
     named = {f"{stages.get(folder, folder)}@{key}" for folder, keys in keep.items() for key in keys}
     named |= {f"synthesize@{key}" for key in plan.scenes}
     for file in (data / "metrics").glob("*@*.json"):

@@ -8,8 +8,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from pipeline.contestants import CONTESTANTS
 from pipeline.plan import PlanName
 from pipeline.records import Task
 from pipeline.runtime import DeviceName, DtypeName
@@ -19,6 +20,7 @@ Positive = Annotated[int, Field(ge=1)]
 Rate = Annotated[float, Field(gt=0, lt=10)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
 
+Recipe = Literal["paper", "release", "strong"]
 Selection = Literal["salient", "release", "uniform", "contact", "adaptive"]
 
 SCENES_DIR = Path("data/scenes/videos")
@@ -134,24 +136,74 @@ class QuestionsConfig(Section):
 
 
 class EncoderConfig(Section):
-    """The CLIP encoder and its fine-tuning (paper: visual prompts, three heads, AdamW, cosine)."""
+    """The tactile encoder and its training on property labels."""
 
+    recipe: Recipe = "paper"
+    """`paper`: CLIP with visual prompts, three heads. `release`: the same as the published code has it. `strong`: a
+    convolutional network pretrained on scenes (section `pretrain`), whose frames vote."""
     weights: str
-    """Folder in open_clip's format: open_clip_config.json and open_clip_model.safetensors."""
+    """Folder of the CLIP in open_clip's format: open_clip_config.json and open_clip_model.safetensors. With `strong`
+    it is the ablation's base encoder only."""
     prompts: Annotated[int, Field(ge=1, le=256)] = 8
     """Learnable prompts at each layer."""
+    prompt_layers: Annotated[int, Field(ge=0)] = 0
+    """Layers, from the first, that get prompts of their own; 0 is all (paper)."""
     epochs: Positive = 30
     batch_size: Positive = 32
     learning_rate: Rate = 1e-3
     weight_decay: Annotated[float, Field(ge=0, lt=1)] = 0.0
     flip_probability: Annotated[float, Field(ge=0, le=1)] = 0.5
-    """Chance of each of the two flips in training."""
+    """Chance of each of the two flips in training. None of these from `prompts` on concerns `strong`."""
     reference: Literal["none", "subtract"] = "none"
     """`subtract`: show each frame's difference to the video's no-contact reference in place of the frame."""
     standardize: bool = False
     """Shift and scale embeddings to mean 0 and deviation 1 over the training frames (the paper does not)."""
     embed_batch_size: Positive = 64
     """Frames at a time when embeddings are computed."""
+
+    @model_validator(mode="after")
+    def _strong_sees_differences(self) -> Self:
+        if self.recipe == "strong" and self.reference != "subtract":
+            raise ValueError("encoder.recipe=strong was pretrained on differences: set encoder.reference=subtract")
+        return self
+
+
+class PretrainConfig(Section):
+    """Pretraining of the strong recipe's encoder on pictures of invented objects."""
+
+    objects: Annotated[int, Field(ge=8, le=1_000_000)] = 4000
+    """Objects that are invented; each is drawn once."""
+    presses: Annotated[int, Field(ge=1, le=64)] = 3
+    """Pictures of each, under different forces and lights."""
+    steps: Positive = 2400
+    """Updates (AdamW, cosine)."""
+    batch_size: Positive = 24
+    """Objects an update."""
+    learning_rate: Rate = 2e-3
+    weight_decay: Annotated[float, Field(ge=0, lt=1)] = 0.02
+    augment: bool = True
+    """Vary light, gain and noise of each picture, and mirror it."""
+    seed: Seed = 0
+
+
+class CrossValidationConfig(Section):
+    """Grouped cross-validation of encoders and their rivals over all objects with videos."""
+
+    models: tuple[str, ...] = ()
+    """Which, of those that `pipeline.contestants` lists; each is a stage."""
+    folds: Annotated[int, Field(ge=2, le=50)] = 5
+    """Parts that objects are dealt into; all videos of an object are in one."""
+    repeats: Positive = 3
+    """How often they are dealt anew."""
+    seed: Seed = 0
+
+    @field_validator("models")
+    @classmethod
+    def _models_are_known(cls, models: tuple[str, ...]) -> tuple[str, ...]:
+        unknown = [name for name in models if name not in CONTESTANTS]
+        if unknown:
+            raise ValueError(f"{unknown[0]} is no model; known: {', '.join(CONTESTANTS)}")
+        return models
 
 
 class LanguageConfig(Section):

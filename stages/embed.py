@@ -6,7 +6,8 @@ from pathlib import Path
 from pipeline.artifacts import read_table, save_tensors, write_table
 from pipeline.data.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE
 from pipeline.frames.store import FrameStore
-from pipeline.models.tactile_encoder import base_encoder, load_trainable, property_classifier
+from pipeline.models.recipes import base_encoder, property_classifier
+from pipeline.models.tactile_encoder import FrameEncoder, load_trainable
 from pipeline.models.weights import check_encoder
 from pipeline.physiclear.catalogue import load_catalogue
 from pipeline.plan import Encoder
@@ -24,10 +25,10 @@ def main() -> None:
         check_encoder(weights, params.frames.size)
         job = params.plan.embeddings[key]
         if job.encoder is Encoder.BASE:
-            encoder = base_encoder(weights)
+            encoder: FrameEncoder = base_encoder(params.encoder)
         else:
             classes = [len(p.levels) for p in load_catalogue(Path(params.data.catalogue)).properties]
-            classifier = property_classifier(weights, params.encoder.prompts, classes)
+            classifier = property_classifier(params.encoder, classes)
             load_trainable(classifier, Path(job.encoder_dir) / "encoder.safetensors")
             encoder = classifier.encoder
         assignments = read_table(DATA / "splits.parquet", Assignment)

@@ -4,9 +4,9 @@ import sys
 from pathlib import Path
 
 from pipeline.artifacts import read_table, write_table
-from pipeline.frames.store import FrameStore
+from pipeline.frames.store import REFERENCES_FILE, TABLE_FILE, FrameStore
 from pipeline.models.tactile_encoder import save_trainable
-from pipeline.models.weights import check_encoder
+from pipeline.models.weights import check_encoder, clip_file
 from pipeline.physiclear.catalogue import load_catalogue
 from pipeline.records import Assignment, Classification, Measurement, Part
 from pipeline.runtime import resolve_device
@@ -26,7 +26,10 @@ def main() -> None:
             assignments=read_table(DATA / "splits.parquet", Assignment),
             per_video=params.frames.per_video,
         )
-        inputs = [DATA / "frames" / "frames.parquet", DATA / "splits.parquet"]
+        inputs = [DATA / "frames" / name for name in (TABLE_FILE, REFERENCES_FILE)] + [DATA / "splits.parquet"]
+        inputs.append(clip_file(Path(params.encoder.weights)))
+        if params.plan.pretrain:
+            inputs.insert(0, Path(params.plan.pretrained) / "encoder.safetensors")
         with live_run(params, run.name, Path()) as live:
             model, history = finetune(
                 data, params.encoder, params.runtime, seed=params.seed + seed, inputs=inputs, log=live.log

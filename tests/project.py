@@ -10,7 +10,10 @@ from pathlib import Path
 
 from tests.closure import ROOT
 
-PARTS = ("pipeline", "stages", "conf", "standins", "dvc.yaml", "pyproject.toml", ".gitignore", ".dvcignore")
+PARTS = (
+    *("pipeline", "stages", "conf", "standins", "dvc.yaml", "pyproject.toml", ".gitignore", ".dvcignore"),
+    "reports/bench/encoder.json",
+)
 OBJECTS = (
     *("baseball", "controller_base", "cotton_ball", "pillow", "rug"),
     "millet",
@@ -26,6 +29,8 @@ REDUCED = (
     "questions.train={opd:12,pc:12,pss:12,pom:12}",
     "questions.evaluation={opd:4,pc:4,pss:4,pom:4,psr:4}",
     "encoder.epochs=1",
+    "cross_validation.models=[probe]",
+    "cross_validation.folds=2",
     "align.samples=16",
     "lora.samples=16",
     "language.max_new_tokens=24",

@@ -28,7 +28,7 @@ from pipeline.baseline.features import (
     video_features,
 )
 from pipeline.baseline.predictor import SMOOTHING, PropertyPredictor, decode_jointly, log_dependence
-from pipeline.baseline.validation import Verdict, compare, cross_validate, deal, quadratic_kappa, summarise
+from pipeline.baseline.validation import Verdict, compare, cross_validate, deal, forest, quadratic_kappa, summarise
 
 GREY = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
 
@@ -211,7 +211,7 @@ def test_joint_decoding_against_brute_force(seed: int, classes: list[int]) -> No
     rng = np.random.default_rng(seed)
     tables = [rng.dirichlet(np.ones(count), size=5) for count in classes]
     dependence = rng.normal(size=tuple(classes))
-    decoded = decode_jointly(tables, dependence)
+    decoded = decode_jointly([np.log(table) for table in tables], dependence)
     for video in range(5):
         best, highest = None, -math.inf
         for combination in itertools.product(*map(range, classes)):
@@ -223,7 +223,7 @@ def test_joint_decoding_against_brute_force(seed: int, classes: list[int]) -> No
 
 
 def test_dependence_overrules_weak_evidence() -> None:
-    tables = [np.array([[0.45, 0.55]]), np.array([[0.9, 0.1]])]
+    tables = [np.log([[0.45, 0.55]]), np.log([[0.9, 0.1]])]
     together = log_dependence(np.array([[0, 0], [0, 0], [1, 1], [1, 1]]), list("abcd"), (2, 2))
     assert decode_jointly(tables, together).tolist() == [[0, 0]]
     assert decode_jointly(tables, np.zeros((2, 2))).tolist() == [[1, 0]]
@@ -334,13 +334,15 @@ def test_no_video_is_predicted_from_its_object(monkeypatch: pytest.MonkeyPatch) 
             return np.zeros((len(features), 2), np.int64)
 
     monkeypatch.setattr("pipeline.baseline.validation.PropertyPredictor", Spy)
-    cross_validate(features, labels, objects, (3, 2), folds=3, repeats=2)
+    cross_validate(forest(features, labels, objects, (3, 2)), labels, objects, (3, 2), folds=3, repeats=2)
     assert set(predicted.values()) == {3 * 2}  # Videos an object, repeats.
 
 
 def test_cross_validation_finds_a_signal_and_is_repeatable() -> None:
     features, labels, objects = planted(5, objects=30, strength=8)
-    verdicts = cross_validate(features, labels, objects, (3, 2), folds=3, repeats=2, seed=7, jobs=1)
+    verdicts = cross_validate(
+        forest(features, labels, objects, (3, 2), seed=7, jobs=1), labels, objects, (3, 2), folds=3, repeats=2, seed=7
+    )
     assert [v.object_id for v in verdicts] == objects
     assert [list(v.expected) for v in verdicts] == labels.tolist()
     summary = summarise(verdicts, (3, 2))
@@ -348,7 +350,18 @@ def test_cross_validation_finds_a_signal_and_is_repeatable() -> None:
     assert summary.combined.value > 0.8
     assert summary.combined.value <= min(p.accuracy.value for p in summary.properties)
     assert all(p.kappa is not None and p.kappa > 0.8 for p in summary.properties)
-    alike = [cross_validate(features, labels, objects, (3, 2), folds=2, repeats=1, seed=7, jobs=j) for j in (1, 2)]
+    alike = [
+        cross_validate(
+            forest(features, labels, objects, (3, 2), seed=7, jobs=j),
+            labels,
+            objects,
+            (3, 2),
+            folds=2,
+            repeats=1,
+            seed=7,
+        )
+        for j in (1, 2)
+    ]
     assert alike[0] == alike[1]
 
 
@@ -360,7 +373,15 @@ def test_noise_is_told_at_chance() -> None:
         labels = np.repeat(rng.integers(0, 2, (24, 1)), 2, axis=0)
         features = rng.normal(size=(48, 5)).astype(np.float32)
         objects = [f"o{i // 2}" for i in range(48)]
-        verdicts = cross_validate(features, labels, objects, (2,), folds=3, repeats=1, seed=seed, jobs=1)
+        verdicts = cross_validate(
+            forest(features, labels, objects, (2,), seed=seed, jobs=1),
+            labels,
+            objects,
+            (2,),
+            folds=3,
+            repeats=1,
+            seed=seed,
+        )
         combined = summarise(verdicts, (2,)).combined
         assert combined.interval is not None
         held += combined.interval.low <= combined.chance == 0.5 <= combined.interval.high

@@ -70,6 +70,19 @@ def test_two_processes_train_like_one(project: Project) -> None:
         torch.testing.assert_close(value, results[1][name], atol=1e-6, rtol=1e-5)
 
 
+@pytest.mark.parametrize("recipe", ["release", "strong"])
+def test_other_recipes_go_through_to_the_embeddings(project: Project, recipe: str) -> None:
+    smaller = ("pretrain.objects=16", "pretrain.steps=3") if recipe == "strong" else ()
+    project.run("octopi", "scale", *REDUCED, f"encoder.recipe={recipe}", *smaller, "encoder.epochs=1")
+    project.run("dvc", "repro", "embed@finetuned-0", "cross_validate@probe")
+    trained = load_file(project.folder / "data" / "encoder" / "0" / "encoder.safetensors")
+    assert ("dependence" in trained) == (recipe == "strong")
+    embeddings = load_file(project.folder / "data" / "embeddings" / "finetuned-0" / "embeddings.safetensors")
+    assert all(value.isfinite().all() for value in embeddings.values())
+    project.run("octopi", "scale", *REDUCED)
+    project.run("dvc", "repro")
+
+
 def test_going_back_to_a_scale_restores_it(project: Project) -> None:
     report = project.folder / "reports" / "smoke-scenes" / "metrics.json"
     before = report.read_bytes()

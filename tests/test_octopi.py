@@ -125,7 +125,7 @@ def test_same_draws_for_same_epoch_and_others_for_another(
     _, data = assemble(material(language, questions, store), 6, "test")
     first = [data[i]["features"] for i in range(len(data))]
     assert all(torch.equal(a, data[i]["features"]) for i, a in enumerate(first))
-    data.set_epoch(1)
+    data.follow(lambda: 1)
     assert not all(torch.equal(a, data[i]["features"]) for i, a in enumerate(first))
 
 

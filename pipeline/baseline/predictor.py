@@ -89,7 +89,7 @@ class PropertyPredictor:
 
     def predict(self, features: Features) -> Labels:
         """The most probable combination of classes of each video, videos x properties."""
-        return decode_jointly(self.probabilities(features), self._prior)
+        return decode_jointly([np.log(table) for table in self.probabilities(features)], self._prior)
 
 
 def check_labels(labels: Labels, objects: Sequence[str], classes: Sequence[int]) -> None:
@@ -120,22 +120,22 @@ def log_dependence(labels: Labels, objects: Sequence[str], classes: Sequence[int
     return result
 
 
-def decode_jointly(probabilities: Sequence[Probabilities], dependence: Probabilities) -> Labels:
+def decode_jointly(evidence: Sequence[Probabilities], dependence: Probabilities) -> Labels:
     """The combination of each video that maximises the sum of log probabilities and the dependence.
 
     This is Bayes' rule where the properties' evidence is independent given the classes. Of equal combinations the
     one with the lower classes, read from the first property on, is taken.
 
     Args:
-        probabilities: Videos x classes for each property, above 0.
+        evidence: Log probabilities, videos x classes for each property.
         dependence: From `log_dependence`.
 
     Returns:
         Videos x properties.
     """
     combinations = np.array(list(itertools.product(*map(range, dependence.shape))), dtype=np.int64)
-    scores = np.broadcast_to(dependence.ravel(), (len(probabilities[0]), dependence.size)).copy()
-    for position, table in enumerate(probabilities):
-        scores += np.log(table)[:, combinations[:, position]]
+    scores = np.broadcast_to(dependence.ravel(), (len(evidence[0]), dependence.size)).copy()
+    for position, table in enumerate(evidence):
+        scores += table[:, combinations[:, position]]
     best: Labels = combinations[scores.argmax(axis=1)]
     return best

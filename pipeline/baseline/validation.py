@@ -11,13 +11,15 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 
 import numpy as np
+import numpy.typing as npt
 
 from pipeline.baseline.predictor import Features, Labels, PropertyPredictor, check_labels
+from pipeline.records import Judged
 from pipeline.runtime import derive_seed
 from pipeline.statistics import Interval, Outcome, Spread, clustered, confusion
 
@@ -37,6 +39,14 @@ class Verdict:
         if position is None:
             return fmean(p == self.expected for p in self.predicted)
         return fmean(p[position] == self.expected[position] for p in self.predicted)
+
+
+def collect(records: Iterable[Judged]) -> list[Verdict]:
+    """The verdicts that a stage has written down, in the order of the videos' names."""
+    videos: dict[str, list[Judged]] = {}
+    for record in sorted(records, key=lambda r: (r.video_id, r.repeat)):
+        videos.setdefault(record.video_id, []).append(record)
+    return [Verdict(v[0].object_id, v[0].expected, tuple(r.predicted for r in v)) for v in videos.values()]
 
 
 @dataclass(frozen=True)
@@ -102,8 +112,55 @@ def deal(objects: Sequence[str], folds: int, seed: int) -> list[frozenset[str]]:
     return [frozenset(names[i] for i in order[fold::folds]) for fold in range(folds)]
 
 
-def cross_validate(
+@dataclass(frozen=True)
+class Fold:
+    """Which videos a model may learn from, and which it is to predict."""
+
+    trained: npt.NDArray[np.bool_]
+    tested: npt.NDArray[np.bool_]
+    repeat: int
+    number: int
+
+
+Predict = Callable[[Fold], Labels]
+"""Learns from the trained videos of a fold and predicts the tested ones, in their order: tested x properties."""
+
+
+def forest(
     features: Features,
+    labels: Labels,
+    objects: Sequence[str],
+    classes: Sequence[int],
+    *,
+    seed: int = 0,
+    jobs: int | None = None,
+) -> Predict:
+    """What cross-validates the baseline predictor.
+
+    Args:
+        features: Videos x features, finite.
+        labels: Videos x properties, equal for all videos of an object.
+        objects: Each video's object.
+        classes: How many classes each property has.
+        seed: Of the trees.
+        jobs: Cores that grow trees; None takes all that this process may use.
+
+    Raises:
+        ValueError: if the arguments do not fit each other.
+    """
+    if len(features) != len(objects):
+        raise ValueError(f"{len(features)} rows of features for {len(objects)} videos")
+
+    def predict(fold: Fold) -> Labels:
+        model = PropertyPredictor(classes, seed=derive_seed(seed, "trees", fold.repeat, fold.number), jobs=jobs)
+        model.fit(features[fold.trained], labels[fold.trained], np.asarray(objects)[fold.trained].tolist())
+        return model.predict(features[fold.tested])
+
+    return predict
+
+
+def cross_validate(
+    predict: Predict,
     labels: Labels,
     objects: Sequence[str],
     classes: Sequence[int],
@@ -111,38 +168,34 @@ def cross_validate(
     folds: int = 5,
     repeats: int = 3,
     seed: int = 0,
-    jobs: int | None = None,
 ) -> tuple[Verdict, ...]:
     """Predict every video once a repeat, by a model that saw no video of its object.
 
     Folds depend only on the objects' names and the seed: settings compared with one seed share them.
 
     Args:
-        features: Videos x features, finite.
+        predict: Called once a fold.
         labels: Videos x properties, equal for all videos of an object.
         objects: Each video's object.
         classes: How many classes each property has.
         folds: Groups of objects, each predicted from all others.
         repeats: How often the folds are dealt anew.
-        seed: Of the folds and the trees.
-        jobs: Cores that grow trees; None takes all that this process may use.
+        seed: Of the folds.
 
     Returns:
-        A verdict a video, in the order of `features`.
+        A verdict a video, in the order of `labels`.
 
     Raises:
         ValueError: if the arguments do not fit each other.
     """
     check_labels(labels, objects, classes)
-    if len(features) != len(objects) or repeats < 1:
-        raise ValueError(f"{len(features)} rows of features for {len(objects)} videos, {repeats} repeats")
+    if repeats < 1:
+        raise ValueError(f"{repeats} repeats")
     predicted = np.empty((len(objects), repeats, len(classes)), np.int64)
     for repeat in range(repeats):
         for number, held_out in enumerate(deal(objects, folds, derive_seed(seed, "folds", repeat))):
             tested = np.array([o in held_out for o in objects])
-            model = PropertyPredictor(classes, seed=derive_seed(seed, "trees", repeat, number), jobs=jobs)
-            model.fit(features[~tested], labels[~tested], [o for o in objects if o not in held_out])
-            predicted[tested, repeat] = model.predict(features[tested])
+            predicted[tested, repeat] = predict(Fold(~tested, tested, repeat, number))
     return tuple(
         Verdict(name, tuple(expected), tuple(map(tuple, answers)))
         for name, expected, answers in zip(objects, labels.tolist(), predicted.tolist(), strict=True)

@@ -10,12 +10,21 @@ from pipeline.artifacts import write_json
 from pipeline.benchmarks import BenchRow, frames, realism, scenes, selection, startup
 from pipeline.errors import UserError
 
+
+def _encoder(root: Path) -> Sequence[BenchRow]:
+    # Torch is loaded for this section alone: `frames` measures the memory of processes that import this module.
+    from pipeline.benchmarks import encoder
+
+    return encoder.measure(root)
+
+
 SECTIONS: dict[str, Callable[[Path], Sequence[BenchRow]]] = {
     "frames": frames.measure,
     "realism": realism.measure,
     "scenes": scenes.measure,
     "selection": selection.measure,
     "startup": startup.measure,
+    "encoder": _encoder,
 }
 """To add a section: write its module with a `measure(root)` beside this one and list it here."""
 

@@ -20,6 +20,7 @@ import numpy as np
 
 from pipeline.artifacts import atomic
 from pipeline.baseline.features import HEIGHT, VIDEO_FEATURE_NAMES, WIDTH, Vector, video_features
+from pipeline.baseline.recordings import mean_reference
 from pipeline.baseline.validation import deal
 from pipeline.benchmarks import DATA_VARIABLE, BenchRow, bench_videos
 from pipeline.benchmarks.distance import frechet, mean_differences, principal_axes, told_apart, wasserstein
@@ -27,7 +28,6 @@ from pipeline.benchmarks.transfer import Kind, transfer
 from pipeline.config import load_params
 from pipeline.decoding import Image, decode
 from pipeline.errors import UserError
-from pipeline.frames.reference import reference_indices
 from pipeline.frames.sampling import sample_evaluation
 from pipeline.frames.scan import Scan, scan
 from pipeline.parallel import run_parallel
@@ -175,10 +175,7 @@ def _look(file: VideoFile) -> Look | None:
     if not isinstance(result, Scan):
         return None
     frames = list(decode(file.path))
-    order = reference_indices(len(frames))
-    if result.probe.starts_touching:
-        order = tuple(len(frames) - 1 - i for i in order)
-    reference = np.mean(np.stack([frames[i] for i in order]).astype(np.float32), axis=0)
+    reference = mean_reference(frames, result.probe.starts_touching)
     shown = [frames[result.kept[p].index] for p in sample_evaluation(len(result.kept), FRAMES)]
     changes = [np.abs(frame - reference) for frame in shown]
     most = int(np.argmax([change.sum() for change in changes]))

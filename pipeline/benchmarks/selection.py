@@ -16,12 +16,12 @@ from statistics import fmean, median
 import numpy as np
 
 from pipeline.baseline.features import frame_features, pool_features
-from pipeline.baseline.validation import Verdict, compare, cross_validate, summarise
+from pipeline.baseline.recordings import mean_reference
+from pipeline.baseline.validation import Verdict, compare, cross_validate, forest, summarise
 from pipeline.benchmarks import BenchRow, bench_videos
 from pipeline.benchmarks.pareto import draw_pareto
 from pipeline.decoding import decode
 from pipeline.errors import UserError
-from pipeline.frames.reference import reference_indices
 from pipeline.frames.sampling import sample_evaluation
 from pipeline.frames.scan import Scan, scan
 from pipeline.parallel import run_parallel
@@ -108,7 +108,9 @@ def measure(root: Path) -> Sequence[TradeRow]:
     verdicts: dict[str, Sequence[Verdict]] = {}
     for place, setting in enumerate(settings()):
         features = np.stack([s.features[place] for s in samples])
-        verdicts[setting.case] = cross_validate(features, labels, objects, classes, repeats=REPEATS)
+        verdicts[setting.case] = cross_validate(
+            forest(features, labels, objects, classes), labels, objects, classes, repeats=REPEATS
+        )
     rows = []
     costs = [_cost(samples, place) for place in range(len(settings()))]
     baseline = costs[[s.case for s in settings()].index(BASELINE)]
@@ -164,8 +166,7 @@ def _look(file: VideoFile) -> Sample | None:
         chosen.append(sorted({kept[p] for p in positions}))
         seconds.append(spent)
     first = next(iter(rules.values()))[0]
-    order = [len(frames) - 1 - i if first.probe.starts_touching else i for i in reference_indices(len(frames))]
-    reference = np.mean(np.stack([frames[i] for i in order]).astype(np.float32), axis=0)
+    reference = mean_reference(frames, first.probe.starts_touching)
     started = time.perf_counter()
     wanted = sorted({i for indices in chosen for i in indices})
     rows = {i: frame_features(frames[i], reference) for i in wanted}

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch.utils.data import Dataset
 
+from pipeline.data.epochs import EpochDataset
 from pipeline.frames.sampling import sample_evaluation, sample_training
 from pipeline.frames.store import FrameStore
 from pipeline.runtime import derive_seed
@@ -23,8 +23,8 @@ class LabelledVideo:
     labels: tuple[int, ...]
 
 
-class ClipDataset(Dataset[dict[str, torch.Tensor]]):
-    """Items `frames` (uint8, k x side x side x RGB) and `labels` (int64, properties).
+class ClipDataset(EpochDataset[dict[str, torch.Tensor]]):
+    """Items: `frames`, uint8, k x side x side x RGB; their numbers in the video, `moments`, int64, k; `labels`, int64.
 
     What is drawn depends on seed, epoch and video alone, so a resumed training sees what an uninterrupted one does.
 
@@ -45,16 +45,12 @@ class ClipDataset(Dataset[dict[str, torch.Tensor]]):
         seed: int | None = None,
         flip_probability: float = 0.0,
     ) -> None:
+        super().__init__()
         self.store = store
         self.videos = videos
         self.per_video = per_video
         self.seed = seed
         self.flip_probability = flip_probability
-        self.epoch = 0
-
-    def set_epoch(self, epoch: int) -> None:
-        """Called by the Trainer's data loader at the start of each epoch."""
-        self.epoch = epoch
 
     def __len__(self) -> int:
         return len(self.videos)
@@ -74,6 +70,7 @@ class ClipDataset(Dataset[dict[str, torch.Tensor]]):
         frames = np.flip(frames, flips) if flips else frames
         return {
             "frames": torch.from_numpy(np.ascontiguousarray(frames)),
+            "moments": torch.tensor([self.store.index[rows[p]].frame_index for p in positions], dtype=torch.int64),
             "labels": torch.tensor(video.labels, dtype=torch.int64),
         }
 

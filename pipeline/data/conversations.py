@@ -7,10 +7,10 @@ from collections.abc import Iterable, Sequence
 from typing import TypedDict
 
 import torch
-from torch.utils.data import Dataset
 from transformers import PreTrainedTokenizerBase
 
 from pipeline.data.embeddings import FLIPS, EmbeddingStore
+from pipeline.data.epochs import EpochDataset
 from pipeline.frames.sampling import sample_evaluation, sample_training
 from pipeline.prompts import IGNORE_INDEX, Encoded, encode, render
 from pipeline.records import Opd, Question
@@ -25,7 +25,7 @@ class Sample(TypedDict):
     features: torch.Tensor
 
 
-class ConversationDataset(Dataset[Sample]):
+class ConversationDataset(EpochDataset[Sample]):
     """Training conversations under one OPD mode.
 
     Which frames and which mirroring a video gets depends on seed, epoch, question and place alone, so that a resumed
@@ -44,12 +44,12 @@ class ConversationDataset(Dataset[Sample]):
         flip_probability: float,
         seed: int,
     ) -> None:
+        super().__init__()
         self.questions = [q for q in questions if q.dialogue(opd)]
         self.store = store
         self.per_video = per_video
         self.flip_probability = flip_probability
         self.seed = seed
-        self.epoch = 0
         self.encoded: list[Encoded] = []
         for question in self.questions:
             dialogue = question.dialogue(opd)
@@ -62,10 +62,6 @@ class ConversationDataset(Dataset[Sample]):
                 complete=True,
             )
             self.encoded.append(encode(text, tokenizer))
-
-    def set_epoch(self, epoch: int) -> None:
-        """Called by the Trainer's data loader at the start of each epoch."""
-        self.epoch = epoch
 
     def __len__(self) -> int:
         return len(self.questions)

@@ -35,6 +35,8 @@ class VisualTower:
     """Depth of the transformer."""
     patch_area: int
     """Values in a patch: pixels times channels."""
+    averages: bool
+    """Whether an embedding comes from the mean over patches, and not from the class token."""
 
 
 def load_visual_tower(folder: Path) -> VisualTower:
@@ -71,4 +73,12 @@ def load_visual_tower(folder: Path) -> VisualTower:
     with torch.inference_mode():
         dim = visual(torch.zeros(1, 3, image.size, image.size)).shape[-1]
     transformer, patch = visual.transformer, visual.patch_size
-    return VisualTower(visual, image, dim, transformer.width, len(transformer.resblocks), 3 * patch[0] * patch[1])
+    return VisualTower(
+        module=visual,
+        image=image,
+        dim=dim,
+        width=transformer.width,
+        layers=len(transformer.resblocks),
+        patch_area=3 * patch[0] * patch[1],
+        averages=visual.pool_type == "avg",
+    )

@@ -1,4 +1,4 @@
-"""The tactile encoder: frames to embeddings, and the classifier that fine-tunes it."""
+"""Tactile encoders: frames to embeddings, and the classifier that fine-tunes an encoder on property labels."""
 
 from __future__ import annotations
 
@@ -12,26 +12,58 @@ from torch.nn import functional as F
 
 from pipeline.artifacts import load_tensors, save_tensors
 from pipeline.errors import UserError
-from pipeline.models.clip import ImageFormat, VisualTower, load_visual_tower
+from pipeline.models.clip import ImageFormat, VisualTower
 from pipeline.models.vpt import VisualPrompts
 
 
-class TactileEncoder(nn.Module):
-    """CLIP's frozen visual tower, with visual prompts or (the base encoder) without."""
+class FrameEncoder(nn.Module):
+    """Embeds single frames.
 
-    def __init__(self, tower: VisualTower, prompts: int) -> None:
+    Args:
+        dim: Length of an embedding.
+    """
+
+    def __init__(self, dim: int) -> None:
         super().__init__()
+        self.dim = dim
+
+    def forward(self, frames: torch.Tensor, moments: torch.Tensor) -> torch.Tensor:
+        """Embed frames as the language model is given them.
+
+        Args:
+            frames: uint8, batch x side x side x RGB.
+            moments: int64, batch: each frame's number in its video.
+
+        Returns:
+            float32, batch x dim.
+        """
+        raise NotImplementedError
+
+    def describe(self, frames: torch.Tensor, moments: torch.Tensor) -> torch.Tensor:
+        """What the classifier is given of each frame: the same as `forward`, unless a recipe says otherwise."""
+        described: torch.Tensor = self(frames, moments)
+        return described
+
+
+class TactileEncoder(FrameEncoder):
+    """CLIP's frozen visual tower, with visual prompts or (the base encoder) without, read as CLIP reads it.
+
+    Args:
+        tower: The tower; it takes frames of its own side, or of a whole multiple, whose blocks are averaged.
+        prompts: Prompts for it, not yet attached.
+    """
+
+    def __init__(self, tower: VisualTower, prompts: VisualPrompts | None = None) -> None:
+        super().__init__(tower.dim)
         self.visual = tower.module
-        self.dim = tower.dim
         self.image: ImageFormat = tower.image
         self.mean: torch.Tensor
         self.std: torch.Tensor
         self.register_buffer("mean", torch.tensor(tower.image.mean).view(1, 3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(tower.image.std).view(1, 3, 1, 1), persistent=False)
-        self.prompts: VisualPrompts | None = None
-        if prompts:
-            self.prompts = VisualPrompts(tower.layers, prompts, tower.width, tower.patch_area)
-            self.prompts.attach(self.visual)
+        self.prompts = prompts
+        if prompts is not None:
+            prompts.attach(self.visual)
 
     def train(self, mode: bool = True) -> TactileEncoder:
         """The backbone stays in evaluation mode: frozen means that it behaves the same in training."""
@@ -39,55 +71,90 @@ class TactileEncoder(nn.Module):
         self.visual.eval()
         return self
 
-    def forward(self, frames: torch.Tensor) -> torch.Tensor:
-        """Embed frames: uint8, batch x side x side x RGB, to float32, batch x dim."""
+    def forward(self, frames: torch.Tensor, moments: torch.Tensor) -> torch.Tensor:
+        """CLIP's own embeddings: float32, batch x dim, of frames, uint8, batch x side x side x RGB."""
+        return cast(torch.Tensor, self.visual(self.pixels(frames)))
+
+    def pixels(self, frames: torch.Tensor) -> torch.Tensor:
+        """Frames as the tower takes them: batch x 3 x side x side, normalised."""
         pixels = frames.permute(0, 3, 1, 2).to(self.mean.dtype) / 255
-        return cast(torch.Tensor, self.visual((pixels - self.mean) / self.std))
+        if pixels.shape[-1] != self.image.size:
+            pixels = F.avg_pool2d(pixels, pixels.shape[-1] // self.image.size)
+        return (pixels - self.mean) / self.std
+
+
+class Heads(nn.ModuleList):
+    """One linear layer a property on a video's mean features: the paper's three classification heads."""
+
+    def __init__(self, dim: int, classes: Sequence[int]) -> None:
+        super().__init__(nn.Linear(dim, count) for count in classes)
+
+    def forward(self, features: torch.Tensor) -> list[torch.Tensor]:
+        """Logits a property, batch x classes, of features, batch x dim."""
+        return [head(features) for head in self]
 
 
 class PropertyClassifier(nn.Module):
-    """ViFi-CLIP's mean over frames (Rasheed et al. 2023), then one linear head a property."""
+    """ViFi-CLIP's mean over frames (Rasheed et al. 2023), then the properties' heads."""
 
     _keys_to_ignore_on_save = None  # read by transformers' Trainer when it reloads a checkpoint
 
-    def __init__(self, encoder: TactileEncoder, classes: Sequence[int]) -> None:
+    def __init__(self, encoder: FrameEncoder, heads: nn.Module, classes: Sequence[int]) -> None:
         super().__init__()
         self.encoder = encoder
-        self.heads = nn.ModuleList(nn.Linear(encoder.dim, count) for count in classes)
+        self.heads = heads
+        self.classes = tuple(classes)
 
-    def forward(self, frames: torch.Tensor, labels: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
+    def forward(
+        self, frames: torch.Tensor, moments: torch.Tensor, labels: torch.Tensor | None = None
+    ) -> dict[str, torch.Tensor]:
         """Classify videos.
 
         Args:
             frames: uint8, batch x frames x side x side x RGB.
+            moments: int64, batch x frames: each frame's number in its video.
             labels: int64, batch x properties.
 
         Returns:
             `logits`, batch x (classes of all properties, side by side), and with labels `loss`: the sum of the
             properties' cross-entropies, so that the heads are trained simultaneously.
         """
-        batch, count = frames.shape[:2]
-        pooled = self.encoder(frames.flatten(0, 1)).view(batch, count, -1).mean(1)
-        logits = [head(pooled) for head in self.heads]
+        features = self.encoder.describe(frames.flatten(0, 1), moments.flatten())
+        logits = self.classify(features.view(*frames.shape[:2], -1))
         output = {"logits": torch.cat(logits, dim=1)}
         if labels is not None:
             losses = [F.cross_entropy(z, y) for z, y in zip(logits, labels.unbind(1), strict=True)]
             output = {"loss": torch.stack(losses).sum(), **output}
         return output
 
+    def classify(self, features: torch.Tensor) -> list[torch.Tensor]:
+        """Logits a property, batch x classes, of the frames' features, batch x frames x dim."""
+        logits: list[torch.Tensor] = self.heads(features.mean(1))
+        return logits
+
+    def decide(self, logits: torch.Tensor) -> torch.Tensor:
+        """The class of each property: int64, batch x properties, of `forward`'s logits."""
+        return torch.stack([z.argmax(1) for z in logits.split(self.classes, dim=1)], dim=1)
+
 
 def trainable_state(module: nn.Module) -> dict[str, torch.Tensor]:
-    """The parameters that are trained, by name."""
-    return {name: p.detach() for name, p in module.named_parameters() if p.requires_grad}
+    """What is trained, by name: parameters, and the running statistics of the layers that they are in."""
+    state: dict[str, torch.Tensor] = {}
+    kept = module.state_dict()
+    for prefix, part in module.named_modules():
+        own = {n: p for n, p in part.named_parameters(prefix, recurse=False) if p.requires_grad}
+        running = {n: b for n, b in part.named_buffers(prefix, recurse=False) if own and n in kept}
+        state |= {name: value.detach() for name, value in (own | running).items()}
+    return state
 
 
 def save_trainable(module: nn.Module, path: Path) -> None:
-    """Write the trained parameters, and only those, as safetensors."""
+    """Write what is trained, and only that, as safetensors."""
     save_tensors(path, trainable_state(module))
 
 
 def load_trainable(module: nn.Module, path: Path) -> None:
-    """Read what `save_trainable` wrote; names and shapes must be exactly those of the module's trained parameters."""
+    """Read what `save_trainable` wrote; names and shapes must be exactly those of the module's `trainable_state`."""
     loaded, own = load_tensors(path), trainable_state(module)
     wrong = sorted(loaded.keys() ^ own.keys()) or [n for n in own if loaded[n].shape != own[n].shape]
     if wrong:
@@ -96,16 +163,5 @@ def load_trainable(module: nn.Module, path: Path) -> None:
             "other parameters or weights: run `dvc repro`"
         )
     with torch.no_grad():
-        for name, parameter in module.named_parameters():
-            if parameter.requires_grad:
-                parameter.copy_(loaded[name])
-
-
-def base_encoder(weights: Path) -> TactileEncoder:
-    """The off-the-shelf CLIP encoder (the ablation's base)."""
-    return TactileEncoder(load_visual_tower(weights), prompts=0)
-
-
-def property_classifier(weights: Path, prompts: int, classes: Sequence[int]) -> PropertyClassifier:
-    """The classifier to fine-tune, or to load a fine-tuned state into."""
-    return PropertyClassifier(TactileEncoder(load_visual_tower(weights), prompts), classes)
+        for name, value in own.items():
+            value.copy_(loaded[name])

@@ -19,12 +19,21 @@ GET_LLM = (
 )
 
 
+def clip_file(folder: Path) -> Path:
+    """The file with the weights, of the names that open_clip knows; the first where there is none."""
+    files = [folder / name for name in CLIP_WEIGHTS]
+    return next((file for file in files if file.is_file()), files[0])
+
+
 def check_encoder(folder: Path, size: int) -> None:
-    """Raise UserError where `folder` holds no open_clip model as safetensors that takes frames of side `size`."""
+    """Raise UserError where `folder` holds no open_clip model as safetensors that takes frames of side `size`.
+
+    A whole multiple of its own side will do: the encoder averages blocks.
+    """
     mend = GET_CLIP.format(folder=folder)
     if not (folder / CLIP_CONFIG).is_file():
         raise UserError(f"encoder.weights: {folder / CLIP_CONFIG} does not exist; {mend}")
-    if not any((folder / name).is_file() for name in CLIP_WEIGHTS):
+    if not clip_file(folder).is_file():
         raise UserError(
             f"encoder.weights: {folder} has no {CLIP_WEIGHTS[0]} (pickles are refused because they can run code); "
             f"{mend}"
@@ -34,8 +43,11 @@ def check_encoder(folder: Path, size: int) -> None:
         wanted = int(config["model_cfg"]["vision_cfg"]["image_size"])
     except (json.JSONDecodeError, KeyError, TypeError, ValueError):
         raise UserError(f"encoder.weights: {folder / CLIP_CONFIG} is no open_clip configuration; {mend}") from None
-    if size != wanted:
-        raise UserError(f"frames.size is {size} but the encoder in {folder} takes {wanted}; set frames.size={wanted}")
+    if size % wanted:
+        raise UserError(
+            f"frames.size is {size} but the encoder in {folder} takes {wanted}, or a multiple of it; set "
+            f"frames.size={wanted}"
+        )
 
 
 def check_language(folder: Path) -> None:

@@ -101,7 +101,7 @@ class FigureRow:
 
 @dataclass(frozen=True)
 class ConfusionRow:
-    """How often the fine-tuned CLIP's heads took one class for another."""
+    """How often the fine-tuned encoder's heads took one class for another."""
 
     property: str
     expected: str
@@ -146,7 +146,7 @@ def dataset_tables(inputs: Inputs) -> list[Table]:
         ),
         Table(
             "confusion_matrices",
-            "Confusion of the fine-tuned CLIP's heads",
+            "Confusion of the fine-tuned encoder's heads",
             "The figures behind the picture: test videos by rated and predicted class, summed over seeds.",
             _confusions(inputs),
         ),

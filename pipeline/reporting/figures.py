@@ -86,9 +86,10 @@ def draw_embedding_map(
         features: float, videos x dim: the mean embedding of each video; at least two videos.
         labels: one tuple of class indices a video.
     """
-    places, method = project(features)
-    figure, panels = _panels(len(properties), 3.9, 4.0)
-    for index, (axes, p) in enumerate(zip(panels, properties, strict=True)):
+    maps = project(features)
+    figure, panels = _panels(len(maps) * len(properties), 3.9, 4.0, across=len(properties))
+    rows = [(places, method, index, p) for method, places in maps.items() for index, p in enumerate(properties)]
+    for axes, (places, method, index, p) in zip(panels, rows, strict=True):
         for level, name in enumerate(p.levels):
             chosen = [i for i, label in enumerate(labels) if label[index] == level]
             axes.scatter(
@@ -110,21 +111,22 @@ def draw_embedding_map(
     _save(figure, path, footer)
 
 
-def project(features: np.ndarray) -> tuple[np.ndarray, str]:
-    """Two dimensions of videos x dim, and the name of the method: t-SNE, or PCA for fewer than five videos."""
+def project(features: np.ndarray) -> dict[str, np.ndarray]:
+    """Two dimensions of videos x dim by the method's name: PCA, and t-SNE from five videos on."""
+    import numpy as np
     from sklearn.decomposition import PCA
     from sklearn.manifold import TSNE
 
     count = len(features)
-    if count < FEWEST_FOR_TSNE:
-        # Two videos span one dimension at the most; the second is drawn as 0.
-        import numpy as np
-
-        flat = PCA(n_components=min(2, count - 1), svd_solver="full").fit_transform(features)
-        return np.pad(flat, ((0, 0), (0, 2 - flat.shape[1]))), "PCA"
-    perplexity = min(LARGEST_PERPLEXITY, (count - 1) / 3)
-    # The exact method adds in one order; Barnes-Hut adds in as many as there are threads.
-    return TSNE(perplexity=perplexity, init="pca", method="exact", random_state=0).fit_transform(features), "t-SNE"
+    # Two videos span one dimension at the most; the second is drawn as 0.
+    flat = PCA(n_components=min(2, count - 1), svd_solver="full").fit_transform(features)
+    maps = {"PCA": np.pad(flat, ((0, 0), (0, 2 - flat.shape[1])))}
+    if count >= FEWEST_FOR_TSNE:
+        perplexity = min(LARGEST_PERPLEXITY, (count - 1) / 3)
+        # The exact method adds in one order; Barnes-Hut adds in as many as there are threads.
+        exact = TSNE(perplexity=perplexity, init="pca", method="exact", random_state=0)
+        maps["t-SNE"] = exact.fit_transform(features)
+    return maps
 
 
 def draw_curves(path: Path, panels: Sequence[Panel], footer: str) -> None:
@@ -190,11 +192,11 @@ def _named(points: Sequence[Measurement], name: str) -> list[Measurement]:
     return sorted((m for m in points if m.name == name), key=lambda m: m.step)
 
 
-def _panels(count: int, width: float, height: float) -> tuple[Figure, Sequence[Axes]]:
+def _panels(count: int, width: float, height: float, across: int = MOST_ACROSS) -> tuple[Figure, Sequence[Axes]]:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    across = min(count, MOST_ACROSS)
+    across = min(count, across)
     down = -(-count // across)
     figure = Figure(figsize=(width * across, height * down), layout="constrained")
     FigureCanvasAgg(figure)

@@ -10,7 +10,7 @@ from pipeline.artifacts import read_csv, read_jsonl, read_table
 from pipeline.config import Params
 from pipeline.physiclear.catalogue import Catalogue, load_catalogue
 from pipeline.plan import Encoder, Lora
-from pipeline.records import Assignment, Classification, Finding, Opd, Part, Question, Score, Task, Video
+from pipeline.records import Assignment, Classification, Finding, Judged, Opd, Part, Question, Score, Task, Video
 from pipeline.reporting.published import DATASET, Published, find
 from pipeline.splits import assign
 
@@ -35,6 +35,8 @@ class Inputs:
     """By encoder seed: what the heads say about test videos."""
     findings: Sequence[Finding]
     """The data audit's."""
+    judged: Mapping[str, Sequence[Judged]]
+    """By model: what the cross-validation over all objects found."""
 
     @property
     def of_paper(self) -> bool:
@@ -76,6 +78,7 @@ def read_inputs(params: Params, root: Path) -> Inputs:
     }
     files = {key: data / "scores" / key / "scores.parquet" for key in params.plan.variants}
     audit = data / "audit" / "audit.csv"
+    compared = {name: data / "cross_validation" / name / "judged.parquet" for name in params.plan.cross_validation}
     judged = {seed: data / "encoder" / str(seed) / "classifications.parquet" for seed in params.plan.encoder_seeds}
     return Inputs(
         params=params,
@@ -95,6 +98,7 @@ def read_inputs(params: Params, root: Path) -> Inputs:
             if file.is_file()
         },
         findings=read_csv(audit, Finding) if audit.is_file() else (),
+        judged={name: read_table(file, Judged) for name, file in compared.items() if file.is_file()},
     )
 
 

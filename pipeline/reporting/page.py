@@ -51,7 +51,7 @@ class Picture:
 def render_page(inputs: Inputs, origin: Provenance, tables: Sequence[Table], pictures: Sequence[Picture]) -> str:
     """README.md of the report's folder."""
     sections = [
-        *(f"## {t.title}\n\n{t.caption} ([CSV](tables/{t.name}.csv))\n\n{t.markdown()}" for t in tables),
+        *(f"## {t.title}\n\n{t.caption} ([CSV]({t.folder}/{t.name}.csv))\n\n{t.markdown()}" for t in tables),
         *(f"## {p.title}\n\n{_picture(p)}" for p in pictures),
     ]
     titles = [*(t.title for t in tables), *(p.title for p in pictures)]

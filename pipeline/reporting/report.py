@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from pathlib import Path
 
-from pipeline.artifacts import read_table, write_json, write_text
+from pipeline.artifacts import read_json, read_table, write_json, write_text
 from pipeline.config import PARAMS_FILE, Params
 from pipeline.plan import Encoder
 from pipeline.records import Embedding, Measurement, Part
@@ -16,6 +16,10 @@ from pipeline.reporting.inputs import Inputs, no_test_videos, read_inputs
 from pipeline.reporting.page import Picture, render_page
 from pipeline.reporting.provenance import provenance
 from pipeline.reporting.results import headline, result_tables
+
+COSTS = Path("reports") / "bench" / "encoder.json"
+MODEL = "model, "
+"""Begins the cases of that file that are contestants of the cross-validation."""
 
 
 def write_report(params: Params, root: Path) -> dict[str, float]:
@@ -30,10 +34,16 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     inputs = read_inputs(params, root)
     folder = root / "reports" / params.report_name
     audit = [audit_table(inputs.findings)] if inputs.findings else []
-    tables = [*result_tables(inputs), *dataset_tables(inputs), *audit]
+    # NumPy comes with it, which stages that only ask for a report's name should not wait for.
+    from pipeline.reporting.encoders import encoder_tables
+
+    compared = encoder_tables(inputs.judged, inputs.catalogue, _costs(root), params.cross_validation.folds)
+    tables = [*result_tables(inputs), *compared, *dataset_tables(inputs), *audit]
     for table in tables:
-        write_text(folder / "tables" / f"{table.name}.csv", table.csv())
-        write_text(folder / "tables" / f"{table.name}.md", f"# {table.title}\n\n{table.caption}\n\n{table.markdown()}")
+        write_text(folder / table.folder / f"{table.name}.csv", table.csv())
+        write_text(
+            folder / table.folder / f"{table.name}.md", f"# {table.title}\n\n{table.caption}\n\n{table.markdown()}"
+        )
     pictures = _draw(inputs, root, folder / "figures")
     origin = provenance(params, inputs.videos, root)
     metrics = headline(inputs, tables)
@@ -42,6 +52,13 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     write_json(folder / "provenance.json", origin.model_dump())
     write_json(folder / "metrics.json", metrics)
     return metrics
+
+
+def _costs(root: Path) -> dict[str, float]:
+    """Milliseconds a video that the benchmark has measured, by model."""
+    file = root / COSTS
+    rows = read_json(file) if file.is_file() else []
+    return {row["case"].removeprefix(MODEL): row["cost"] for row in rows if row["case"].startswith(MODEL)}
 
 
 def _draw(inputs: Inputs, root: Path, folder: Path) -> list[Picture]:
@@ -70,8 +87,8 @@ def _confusion(inputs: Inputs, folder: Path, footer: str) -> Picture:
     picture = Picture(
         "confusion_matrices.png",
         "Confusion matrices",
-        f"Confusion matrices of the fine-tuned CLIP's heads on test videos. Right: {', '.join(right)}.",
-        "What the fine-tuned CLIP's heads say about test videos (summed over seeds). Numbers are videos, shades the "
+        f"Confusion matrices of the fine-tuned encoder's heads on test videos. Right: {', '.join(right)}.",
+        "What the fine-tuned encoder's heads say about test videos (summed over seeds). Numbers are videos, shades the "
         "share of a row; right answers stand on the diagonal.",
     )
     if not any(inputs.classifications.values()):
@@ -91,7 +108,8 @@ def _map(inputs: Inputs, root: Path, folder: Path, footer: str) -> Picture:
         "Map of the embeddings",
         f"Scatter plots of {len(test)} test videos by the fine-tuned encoder's embeddings, one panel a property.",
         f"Each point is a test video: the mean embedding of its salient frames by the fine-tuned encoder ({key}), in "
-        "two dimensions. Neighbours are alike; distances between groups mean nothing.",
+        "two dimensions, by principal components and by t-SNE. In t-SNE neighbours are alike; distances between groups "
+        "mean nothing.",
     )
     if len(test) < 2:
         return picture.without(no_test_videos(inputs) if not test else "one test video alone has no neighbours")
@@ -114,6 +132,13 @@ def _curves(inputs: Inputs, root: Path, folder: Path, footer: str) -> Picture:
     plan = inputs.params.plan
     encoder = {str(seed): _history(root / "data" / "encoder" / str(seed)) for seed in plan.encoder_seeds}
     stages = (("Alignment", "align", plan.align), ("LoRA", "lora", plan.lora))
+    pretrained = {
+        "Pretraining on scenes": [
+            Curve("invented objects", history)
+            for key in plan.pretrain
+            if (history := _history(root / "data" / "pretrained" / key))
+        ]
+    }
     language = {
         title: [
             Curve(f"OPD {job.opd}", history, dashed=job.encoder is Encoder.BASE)
@@ -122,7 +147,7 @@ def _curves(inputs: Inputs, root: Path, folder: Path, footer: str) -> Picture:
         ]
         for title, stage, jobs in stages
     }
-    panels = training_panels({seed: points for seed, points in encoder.items() if points}, language)
+    panels = training_panels({seed: points for seed, points in encoder.items() if points}, pretrained | language)
     picture = Picture(
         "training_curves.png",
         "Training curves",

@@ -60,8 +60,8 @@ def result_tables(inputs: Inputs) -> list[Table]:
     description = table(
         "property_description",
         "Object property description",
-        "Accuracy in describing test videos; combined: all properties of a video right. FT CLIP: the fine-tuned "
-        f"encoder with its classification heads, without a language model{once}. "
+        f"Accuracy in describing test videos; combined: all properties of a video right. {_heads(inputs)}: the "
+        f"fine-tuned encoder with its classification heads, without a language model{once}. "
         "Majority class: what is most frequent among the training objects, said of every test video.",
         properties,
         [OCTOPI],
@@ -129,7 +129,7 @@ def result_tables(inputs: Inputs) -> list[Table]:
 def headline(inputs: Inputs, tables: Iterable[Table]) -> dict[str, float]:
     """Measured accuracies (0 to 1) as flat metrics `<system>.<row>`: each variant, and the baselines."""
     chosen = {t.name: t.rows for t in tables if t.name in ("all_variants", "property_description")}
-    names = {_label(axes): "-".join(axes) for axes in inputs.axes} | dict(BASELINES.values())
+    names = {_label(axes): "-".join(axes) for axes in inputs.axes} | dict(_baseline_names(inputs).values())
     return {
         f"{names[row.system]}.{row.row}": round(row.value / 100, 6)
         for rows in chosen.values()
@@ -143,7 +143,13 @@ def classified(inputs: Inputs) -> dict[int, list[Score]]:
     return {seed: _as_scores(inputs, records) for seed, records in inputs.classifications.items()}
 
 
-BASELINES = {"majority": ("Majority class", "majority"), "ft_clip": ("FT CLIP", "ft-clip")}
+def _baseline_names(inputs: Inputs) -> dict[str, tuple[str, str]]:
+    """Label and metric of the systems without a language model, as published.csv calls them."""
+    return {"majority": ("Majority class", "majority"), "ft_clip": (_heads(inputs), "ft-clip")}
+
+
+def _heads(inputs: Inputs) -> str:
+    return "FT encoder" if inputs.params.encoder.recipe == "strong" else "FT CLIP"
 
 
 def _answered(inputs: Inputs, table: str, measure: Measure, system: System) -> AccuracyRow:
@@ -163,7 +169,7 @@ def _baselines(inputs: Inputs, properties: Sequence[Measure]) -> list[AccuracyRo
     }
     return [
         accuracy_row(
-            _cell(inputs, "property_description", measure, name, BASELINES[name][0]),
+            _cell(inputs, "property_description", measure, name, _baseline_names(inputs)[name][0]),
             {seed: [s for s in scores if s.measure == measure.name] for seed, scores in by_seed.items()},
             note,
         )

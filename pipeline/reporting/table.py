@@ -30,6 +30,8 @@ class Table:
     rows: Sequence[Row]
     shown: Sequence[Row] | None = None
     """Those that a person reads, where that is not all of them."""
+    folder: str = "tables"
+    """Below the report's folder."""
 
     def csv(self) -> str:
         """All fields of all rows; None is an empty cell."""

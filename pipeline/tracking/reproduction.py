@@ -55,6 +55,8 @@ def planned_stages(plan: Plan) -> list[PlannedStage]:
     return [
         *(PlannedStage("synthesize", key) for key in plan.scenes),
         *(PlannedStage(name) for name in ("extract_frames", "split", "audit", "questions")),
+        *(PlannedStage("pretrain", key, trained=f"data/pretrained/{key}") for key in plan.pretrain),
+        *(PlannedStage("cross_validate", name) for name in plan.cross_validation),
         *(
             PlannedStage(
                 "finetune_encoder", str(s), _axes(encoder=Encoder.FINETUNED.value, seed=s), f"data/encoder/{s}"

@@ -11,7 +11,7 @@ from tqdm import tqdm
 from pipeline.data.embeddings import FLIPS
 from pipeline.errors import UserError
 from pipeline.frames.store import FrameStore
-from pipeline.models.tactile_encoder import TactileEncoder
+from pipeline.models.tactile_encoder import FrameEncoder
 from pipeline.records import Assignment, Embedding, Flip, Part
 
 AXES: dict[Flip, tuple[int, ...]] = {"none": (), "horizontal": (2,), "vertical": (1,), "both": (1, 2)}
@@ -20,7 +20,7 @@ AXES: dict[Flip, tuple[int, ...]] = {"none": (), "horizontal": (2,), "vertical":
 
 @torch.inference_mode()
 def embed_videos(
-    encoder: TactileEncoder,
+    encoder: FrameEncoder,
     store: FrameStore,
     assignments: Sequence[Assignment],
     *,
@@ -45,7 +45,9 @@ def embed_videos(
         flips = FLIPS if assignment.part == Part.TRAIN else FLIPS[:1]
         # All mirrored versions in one tensor: larger batches cost less a frame.
         frames = torch.from_numpy(np.concatenate([np.flip(pixels, AXES[flip]) for flip in flips]))
-        block = torch.cat([encoder(batch.to(device)).float().cpu() for batch in frames.split(batch_size)])
+        moments = torch.tensor([store.index[row].frame_index for row in rows] * len(flips))
+        batches = zip(frames.split(batch_size), moments.split(batch_size), strict=True)
+        block = torch.cat([encoder(some.to(device), when.to(device)).float().cpu() for some, when in batches])
         if not block.isfinite().all():
             raise UserError(f"{assignment.video_id}: its embedding is not finite; check the video and the encoder")
         for flip in flips:

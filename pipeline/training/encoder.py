@@ -1,7 +1,12 @@
-"""Fine-tuning of the encoder: visual prompts and property heads on a frozen CLIP (the paper's section III-A)."""
+"""Training of the tactile encoder on property labels.
+
+`paper` and `release` learn visual prompts and heads on a frozen CLIP by gradients (the paper's section III-A); `strong`
+fits heads to the frozen features of an encoder that scenes have pretrained.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,14 +16,17 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 from torch.utils.data import DataLoader
-from transformers import EvalPrediction, TrainingArguments
+from transformers import EvalPrediction
 
 from pipeline.data.clips import ClipDataset, LabelledVideo, collate_clips
+from pipeline.errors import UserError
 from pipeline.frames.store import FrameStore
-from pipeline.models.tactile_encoder import PropertyClassifier, property_classifier
+from pipeline.models.frame_votes import FrameVotes
+from pipeline.models.recipes import property_classifier
+from pipeline.models.tactile_encoder import FrameEncoder, PropertyClassifier, load_trainable
 from pipeline.physiclear.catalogue import Catalogue
 from pipeline.records import Assignment, Classification, Measurement, Part
-from pipeline.runtime import seed_everything
+from pipeline.runtime import resolve_device, seed_everything
 from pipeline.sections import EncoderConfig, RuntimeConfig
 from pipeline.training.trainer import (
     Log,
@@ -26,10 +34,10 @@ from pipeline.training.trainer import (
     Watch,
     checkpoint_dir,
     fingerprint,
-    one_device,
-    progress_bar_off,
     train,
+    training_arguments,
 )
+from pipeline.training.votes import Clips, choose_strength, fit_votes
 
 
 @dataclass(frozen=True)
@@ -62,15 +70,51 @@ def finetune(
     inputs: Sequence[Path],
     log: Log | None = None,
 ) -> tuple[PropertyClassifier, list[Measurement]]:
-    """Train prompts and heads; the epoch of best combined validation accuracy is kept (ties: the first).
-
-    Without validation videos there is nothing to choose by, and the last epoch is kept.
+    """Train the classifier of the recipe.
 
     Args:
-        inputs: Files that the training depends on, for the checkpoints' fingerprint.
+        inputs: Files that the training depends on, for the checkpoints' fingerprint; for `strong` the first is the
+            pretrained encoder.
+
+    Returns:
+        The classifier, and its training's curve.
     """
     seed_everything(seed)
-    model = property_classifier(Path(config.weights), config.prompts, data.classes)
+    model = property_classifier(config, data.classes)
+    if isinstance(model, FrameVotes):
+        load_trainable(model.encoder, inputs[0])
+        return model, fit_heads(model, data, config, runtime, seed)
+    return model, train_classifier(model, data, config, runtime, seed=seed, inputs=inputs, log=log)
+
+
+def fit_heads(
+    model: FrameVotes, data: EncoderData, config: EncoderConfig, runtime: RuntimeConfig, seed: int
+) -> list[Measurement]:
+    """Fit a strong classifier's heads to the evaluation clips of the training videos."""
+    videos = data.videos(Part.TRAIN)
+    clips = describe_clips(model.encoder, data, videos, config.embed_batch_size, resolve_device(runtime.device))
+    labels = np.array([video.labels for video in videos])
+    owners = {a.video_id: a.object_id for a in data.assignments}
+    objects = [owners[video.video_id] for video in videos]
+    strength, curve = choose_strength(clips, labels, objects, data.classes, seed)
+    fit_votes(clips, labels, objects, data.classes, strength).put_into(model)
+    return curve
+
+
+def train_classifier(
+    model: PropertyClassifier,
+    data: EncoderData,
+    config: EncoderConfig,
+    runtime: RuntimeConfig,
+    *,
+    seed: int,
+    inputs: Sequence[Path | str],
+    log: Log | None = None,
+) -> list[Measurement]:
+    """Train what is not frozen; the epoch of best combined validation accuracy is kept (ties: the first).
+
+    Without validation videos there is nothing to choose by, and the last epoch is kept.
+    """
     train_set = ClipDataset(
         data.store,
         data.videos(Part.TRAIN),
@@ -79,40 +123,34 @@ def finetune(
         flip_probability=config.flip_probability,
     )
     validation = data.videos(Part.VALIDATION)
-    arguments = TrainingArguments(
-        output_dir=str(checkpoint_dir(f"finetune_encoder-{seed}", fingerprint(config, seed, data.per_video, *inputs))),
+    mark = fingerprint(config, seed, data.per_video, *inputs)
+    arguments = training_arguments(
+        checkpoint_dir(f"finetune_encoder-{seed}", mark),
+        runtime,
+        seed,
         num_train_epochs=config.epochs,
         per_device_train_batch_size=config.batch_size,
         per_device_eval_batch_size=config.batch_size,
         learning_rate=config.learning_rate,
         weight_decay=config.weight_decay,
-        lr_scheduler_type="cosine",
-        optim="adamw_torch",
         eval_strategy="epoch" if validation else "no",
         save_strategy="epoch",
         save_total_limit=2,
         load_best_model_at_end=bool(validation),
         metric_for_best_model="validation_combined" if validation else None,
         logging_strategy="epoch",
-        logging_nan_inf_filter=False,
-        label_names=["labels"],
-        remove_unused_columns=False,
-        dataloader_pin_memory=False,
-        report_to="none",
-        disable_tqdm=progress_bar_off(),
-        seed=seed,
-        use_cpu=runtime.device == "cpu",
     )
     trainer = TrainableTrainer(
         model=model,
-        args=one_device(arguments),
+        args=arguments,
         train_dataset=train_set,
         eval_dataset=ClipDataset(data.store, validation, per_video=data.per_video) if validation else None,
         data_collator=collate_clips,
         compute_metrics=lambda prediction: accuracies(prediction, data.catalogue),
         callbacks=[Watch(log)],
+        wave=math.ceil(len(train_set) / config.batch_size) if config.recipe == "release" else None,
     )
-    return model, train(trainer).history
+    return train(trainer).history
 
 
 def accuracies(prediction: EvalPrediction, catalogue: Catalogue) -> dict[str, float]:
@@ -123,6 +161,21 @@ def accuracies(prediction: EvalPrediction, catalogue: Catalogue) -> dict[str, fl
     right = guesses == labels
     single = {f"validation_{p.name}": float(r.mean()) for p, r in zip(catalogue.properties, right.T, strict=True)}
     return {**single, "validation_combined": float(right.all(1).mean())}
+
+
+@torch.inference_mode()
+def describe_clips(
+    encoder: FrameEncoder, data: EncoderData, videos: Sequence[LabelledVideo], batch_size: int, device: torch.device
+) -> Clips:
+    """What the encoder says of the frames of each video's evaluation clip: float32, videos x frames x features."""
+    encoder = encoder.to(device).eval()
+    clips = ClipDataset(data.store, videos, per_video=data.per_video)
+    features = []
+    for batch in DataLoader(clips, batch_size=max(1, batch_size // data.per_video), collate_fn=collate_clips):
+        frames, moments = batch["frames"].to(device), batch["moments"].to(device)
+        described = encoder.describe(frames.flatten(0, 1), moments.flatten())
+        features.append(described.view(*frames.shape[:2], -1).float().cpu().numpy())
+    return np.concatenate(features)
 
 
 @torch.inference_mode()
@@ -137,14 +190,17 @@ def classify(
         videos = data.videos(part)
         clips = ClipDataset(data.store, videos, per_video=data.per_video)
         outputs = [
-            model(batch["frames"].to(device))["logits"].cpu()
+            model(batch["frames"].to(device), batch["moments"].to(device))["logits"].cpu()
             for batch in DataLoader(clips, batch_size=batch_size, collate_fn=collate_clips)
         ]
         if not outputs:
             continue
+        logits = torch.cat(outputs)
+        _check_finite(logits, videos)
+        decided = model.decide(logits)
         for index, property_ in enumerate(data.catalogue.properties):
-            logits = torch.cat(outputs).split(data.classes, dim=1)[index]
-            for video, row in zip(videos, F.softmax(logits.double(), dim=1), strict=True):
+            rows = F.softmax(logits.split(data.classes, dim=1)[index].double(), dim=1)
+            for video, row, classes in zip(videos, rows, decided.tolist(), strict=True):
                 records.append(
                     Classification(
                         video_id=video.video_id,
@@ -152,8 +208,16 @@ def classify(
                         part=part,
                         property=property_.name,
                         expected=video.labels[index],
-                        predicted=int(row.argmax()),
+                        predicted=classes[index],
                         probabilities=tuple(row.tolist()),
                     )
                 )
     return records
+
+
+def _check_finite(logits: torch.Tensor, videos: Sequence[LabelledVideo]) -> None:
+    for video, finite in zip(videos, logits.isfinite().all(1).tolist(), strict=True):
+        if not finite:
+            raise UserError(
+                f"{video.video_id}: what the encoder says of it is not finite; check the video and encoder.weights"
+            )

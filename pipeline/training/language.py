@@ -8,8 +8,6 @@ import random
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from transformers import TrainingArguments
-
 from pipeline.data.conversations import ConversationCollator, ConversationDataset
 from pipeline.data.embeddings import EmbeddingStore
 from pipeline.errors import UserError
@@ -23,9 +21,8 @@ from pipeline.training.trainer import (
     Trained,
     Watch,
     checkpoint_dir,
-    one_device,
-    progress_bar_off,
     train,
+    training_arguments,
 )
 
 logger = logging.getLogger(__name__)
@@ -123,31 +120,21 @@ def _fit(
         model.llm.gradient_checkpointing_enable(gradient_checkpointing_kwargs={"use_reentrant": False})
     seed_everything(job.seed)
     steps = config.epochs * -(-len(data) // config.batch_size)
-    arguments = TrainingArguments(
-        output_dir=str(checkpoint_dir(job.stage, job.mark)),
+    arguments = training_arguments(
+        checkpoint_dir(job.stage, job.mark),
+        runtime,
+        job.seed,
         num_train_epochs=config.epochs,
         per_device_train_batch_size=config.micro_batch_size,
         gradient_accumulation_steps=_accumulation(config),
         weight_decay=config.weight_decay,
         warmup_steps=round(config.warmup_ratio * steps),
-        lr_scheduler_type="cosine",
         max_grad_norm=config.max_grad_norm,
         logging_steps=max(1, steps // 50),
-        logging_nan_inf_filter=False,
-        save_strategy="steps" if runtime.save_steps else "no",
-        save_steps=runtime.save_steps or 500,
-        save_total_limit=1,
-        label_names=["labels"],
-        remove_unused_columns=False,
-        dataloader_pin_memory=False,
-        report_to="none",
-        disable_tqdm=progress_bar_off(),
-        seed=job.seed,
-        use_cpu=runtime.device == "cpu",
     )
     trainer = TrainableTrainer(
         model=model,
-        args=one_device(arguments),
+        args=arguments,
         train_dataset=data,
         data_collator=ConversationCollator(int(model.tokenizer.pad_token_id)),
         callbacks=[Watch(job.log)],

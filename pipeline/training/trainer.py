@@ -17,25 +17,42 @@ from pydantic import BaseModel
 from transformers import PrinterCallback, Trainer, TrainerCallback, TrainerControl, TrainerState, TrainingArguments
 from transformers.trainer_utils import get_last_checkpoint
 
+from pipeline.data.epochs import EpochDataset
 from pipeline.errors import UserError
 from pipeline.models.tactile_encoder import trainable_state
 from pipeline.records import Measurement
 from pipeline.runtime import CHECKPOINTS
+from pipeline.sections import RuntimeConfig
 
 Log = Callable[[int, dict[str, float]], None]
 """Receives step and values while a training runs."""
+
+
+LOWEST = 0.01
+"""Share of the rate at the bottom of a wave."""
 
 
 class TrainableTrainer(Trainer):
     """A Trainer whose checkpoints hold only what is trained, and whose parts may learn at rates of their own.
 
     The frozen base would otherwise be written again with each checkpoint (13 GB for Vicuna-7b).
+
+    Args:
+        rates: Learning rate of the parameters under each name.
+        wave: Updates after which the rate has fallen to a hundredth, to rise again in as many, for ever: the published
+            code gives its cosine the length of one epoch. By default one cosine spans the training.
     """
 
-    def __init__(self, *args: Any, rates: Mapping[str, float] | None = None, **kwargs: Any) -> None:
+    def __init__(
+        self, *args: Any, rates: Mapping[str, float] | None = None, wave: int | None = None, **kwargs: Any
+    ) -> None:
         super().__init__(*args, **kwargs)
         self.remove_callback(PrinterCallback)
         self._rates = rates
+        self._wave = wave
+        if isinstance(self.train_dataset, EpochDataset):
+            # The state's epoch has a fraction for the steps within one.
+            self.train_dataset.follow(lambda: int(self.state.epoch or 0))
         self.optimizer: torch.optim.Optimizer | None
 
     def create_optimizer(self, model: torch.nn.Module | None = None) -> torch.optim.Optimizer:
@@ -51,6 +68,20 @@ class TrainableTrainer(Trainer):
             ]
             self.optimizer = torch.optim.AdamW(groups, weight_decay=self.args.weight_decay)
         return self.optimizer
+
+    def create_scheduler(
+        self, num_training_steps: int, optimizer: torch.optim.Optimizer | None = None
+    ) -> torch.optim.lr_scheduler.LRScheduler:
+        """The Trainer's own, or the wave."""
+        wave, stepped = self._wave, optimizer or self.optimizer
+        if wave is None or stepped is None:
+            return cast(torch.optim.lr_scheduler.LRScheduler, super().create_scheduler(num_training_steps, optimizer))
+
+        def rate(step: int) -> float:
+            return LOWEST + (1 - LOWEST) * (1 + math.cos(math.pi * step / wave)) / 2
+
+        self.lr_scheduler = torch.optim.lr_scheduler.LambdaLR(stepped, rate)
+        return self.lr_scheduler
 
     def _save(self, output_dir: str | None = None, state_dict: dict[str, Any] | None = None) -> None:
         trained = trainable_state(self.accelerator.unwrap_model(self.model))
@@ -101,11 +132,6 @@ class Watch(TrainerCallback):
             print(f"step {state.global_step}/{state.max_steps}, loss {values['loss']:.3f}", flush=True)
 
 
-def progress_bar_off() -> bool:
-    """A bar is for a person at a terminal; a log file gets a line now and then."""
-    return not sys.stderr.isatty()
-
-
 def fingerprint(*parts: BaseModel | str | int | Path) -> str:
     """A short hash of settings and input files: checkpoints of one training are never taken for another's."""
     digest = hashlib.sha256()
@@ -113,7 +139,8 @@ def fingerprint(*parts: BaseModel | str | int | Path) -> str:
         if isinstance(part, BaseModel):
             digest.update(json.dumps(part.model_dump(mode="json"), sort_keys=True).encode())
         elif isinstance(part, Path):
-            digest.update(hashlib.sha256(part.read_bytes()).digest())
+            with part.open("rb") as stream:
+                digest.update(hashlib.file_digest(stream, "sha256").digest())
         else:
             digest.update(str(part).encode())
         digest.update(b"\0")
@@ -133,9 +160,28 @@ class Trained:
     state: dict[str, torch.Tensor]
 
 
-def one_device(arguments: TrainingArguments) -> TrainingArguments:
-    """Keep the Trainer from spreading one process over several GPUs; that is accelerate's task, one process a GPU."""
+def training_arguments(folder: Path, runtime: RuntimeConfig, seed: int, **own: Any) -> TrainingArguments:
+    """What all trainings share: AdamW, a cosine, checkpoints every `runtime.save_steps`; `own` adds and overrides."""
+    shared: dict[str, Any] = {
+        "output_dir": str(folder),
+        "seed": seed,
+        "optim": "adamw_torch",
+        "lr_scheduler_type": "cosine",
+        "save_strategy": "steps" if runtime.save_steps else "no",
+        "save_steps": runtime.save_steps or 500,
+        "save_total_limit": 1,
+        "label_names": ["labels"],
+        "logging_nan_inf_filter": False,
+        "remove_unused_columns": False,
+        "dataloader_pin_memory": False,
+        "report_to": "none",
+        # A bar is for a person at a terminal; a log file gets a line now and then.
+        "disable_tqdm": not sys.stderr.isatty(),
+        "use_cpu": runtime.device == "cpu",
+    }
+    arguments = TrainingArguments(**shared | own)
     if arguments.device.type == "cuda":
+        # One process must not spread over several GPUs; that is accelerate's task, one process a GPU.
         arguments._n_gpu = 1
     return arguments
 

@@ -1,0 +1,38 @@
+"""Cross-validate one encoder or rival over all objects with videos."""
+
+import sys
+from pathlib import Path
+
+from pipeline.artifacts import read_table, write_table
+from pipeline.contestants import CONTESTANTS
+from pipeline.models.weights import check_encoder
+from pipeline.physiclear.catalogue import load_catalogue
+from pipeline.records import Judged, Video
+from pipeline.stage import DATA, stage
+from pipeline.training.cross_validation import Arena, judge
+
+
+def main() -> None:
+    name = sys.argv[1]
+    with stage("cross_validate", name) as run:
+        params = run.params
+        check_encoder(Path(params.encoder.weights), params.frames.size)
+        catalogue = load_catalogue(Path(params.data.catalogue))
+        arena = Arena(
+            videos=read_table(DATA / "videos.parquet", Video),
+            catalogue=catalogue,
+            frames=DATA / "frames",
+            recordings=Path(params.data.dir),
+            per_video=params.frames.per_video,
+            encoder=params.encoder,
+            runtime=params.runtime,
+            pretrained=Path(params.plan.cross_validation[name].pretrained) / "encoder.safetensors",
+        )
+        judged = judge(CONTESTANTS[name], arena, params.cross_validation)
+        write_table(DATA / "cross_validation" / name / "judged.parquet", Judged, judged)
+        right = [j.expected == j.predicted for j in judged]
+        run.metrics["combined.accuracy"] = sum(right) / len(right)
+
+
+if __name__ == "__main__":
+    main()
