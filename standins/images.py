@@ -6,6 +6,7 @@ Some pairs of words never meet in a training scene, so that a test shows composi
 
 from __future__ import annotations
 
+import dataclasses
 import random
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -29,18 +30,30 @@ COLOURS = {
     "brown": (0.45, 0.28, 0.14),
     "grey": (0.5, 0.5, 0.5),
     "white": (0.95, 0.95, 0.95),
-    "black": (0.08, 0.08, 0.08),
+    "black": (0.12, 0.12, 0.12),
     "cyan": (0.2, 0.8, 0.85),
 }
 SHAPES = ("circle", "square", "triangle", "ring", "cross", "star", "ellipse", "hexagon", "crescent", "surface")
 LIGHTS = {"left": (-1.0, 0.0), "right": (1.0, 0.0), "above": (0.0, -1.0), "below": (0.0, 1.0)}
-SIZES = {"small": 0.45, "large": 0.8}
+SIZES = {"small": 0.5, "large": 0.8}
 PLACES = {"left": (-0.35, 0.0), "right": (0.35, 0.0), "top": (0.0, -0.35), "bottom": (0.0, 0.35), "middle": (0.0, 0.0)}
 DEPTHS = {"flat": 0.0, "raised": 1.0}
 HELD_OUT_EVERY = 7
 OPENINGS = ("", "a photo of ", "a picture of ", "an image of ", "here is ", "this is ")
-TOPICS = ("colour", "pattern", "shape", "light", "depth", "ground", "place", "size", "grain")
-"""What a caption can be about."""
+GRAINS = ("fine", "coarse")
+WORDS: dict[str, tuple[str, ...]] = {
+    "colour": tuple(COLOURS),
+    "pattern": PATTERNS,
+    "shape": SHAPES[:-1],
+    "light": tuple(LIGHTS),
+    "depth": tuple(DEPTHS),
+    "grain": GRAINS,
+    "size": tuple(SIZES),
+    "place": tuple(PLACES),
+    "ground": tuple(COLOURS),
+}
+"""What a caption can be about, and the words for it where it can be seen."""
+TOPICS = tuple(WORDS)
 
 
 @dataclass(frozen=True)
@@ -75,7 +88,7 @@ def draw_scene(rng: random.Random, *, held_out: bool) -> Scene:
             colour=colour,
             ground=ground,
             pattern=rng.choice(PATTERNS),
-            grain=rng.choice(("fine", "coarse")),
+            grain=rng.choice(GRAINS),
             light=rng.choice(list(LIGHTS)),
             size=rng.choice(list(SIZES)),
             place=rng.choice(list(PLACES)),
@@ -86,22 +99,30 @@ def draw_scene(rng: random.Random, *, held_out: bool) -> Scene:
             return scene
 
 
-def draw_topics(rng: random.Random, everything: float) -> frozenset[str]:
-    """What the captions of one batch are about: with probability `everything` all, otherwise one to four topics."""
-    return frozenset(TOPICS if rng.random() < everything else rng.sample(TOPICS, rng.randint(1, 4)))
+def shows(scene: Scene, topic: str) -> bool:
+    """Whether one can see it: a surface has no outline and no place, no plain thing grain, no plain surface relief."""
+    if topic in ("shape", "ground", "place", "size"):
+        return scene.shape != "surface"
+    if topic == "grain":
+        return scene.pattern != "plain"
+    return topic != "depth" or scene.shape != "surface" or scene.pattern != "plain"
+
+
+def with_word(scene: Scene, topic: str, word: str) -> Scene:
+    """The scene with another word for one topic."""
+    return dataclasses.replace(scene, **{topic: word})  # type: ignore[arg-type]
 
 
 def caption(scene: Scene, topics: Collection[str] = TOPICS, opening: str = "") -> str:
     """A sentence about those topics of a scene that can be seen in it."""
-    bare = scene.shape == "surface"
-    before = ["depth", "grain"] if bare else ["depth", "size"]
-    words = [getattr(scene, topic) for topic in (*before, "colour", "pattern") if topic in topics]
+    seen = [topic for topic in topics if shows(scene, topic)]
+    words = [getattr(scene, topic) for topic in ("depth", "size", "grain", "colour", "pattern") if topic in seen]
     words.append(scene.shape if "shape" in topics else "thing")
-    if "ground" in topics and not bare:
+    if "ground" in seen:
         words.append(f"on {_article(scene.ground)} background")
-    if "place" in topics and not bare:
+    if "place" in seen:
         words.append("in the middle" if scene.place == "middle" else f"at the {scene.place}")
-    if "light" in topics:
+    if "light" in seen:
         words.append(f"lit from {'the ' if scene.light in ('left', 'right') else ''}{scene.light}")
     return opening + _article(" ".join(words))
 
@@ -119,14 +140,15 @@ def draw(scene: Scene, pixels: int) -> Array:
     periods = rng.uniform(7, 10) if scene.grain == "fine" else rng.uniform(3, 4.5)
     height = draw_pattern(scene.pattern, u, v, periods, rng)
     inside = _inside(scene, x, y, rng)
-    base = _tint(scene.colour, rng) * (0.55 + 0.55 * height[..., None])
+    base = _tint(scene.colour, rng) * (0.45 + 0.65 * height[..., None])
     if scene.depth == "raised":
         base = _tint(scene.colour, rng) * (0.8 + 0.25 * height[..., None])
         base = base * _relief(height * 0.12 + inside * 0.15, scene.light)[..., None]
     picture = inside[..., None] * base + (1 - inside[..., None]) * _tint(scene.ground, rng)
     dx, dy = LIGHTS[scene.light]
     falloff = 1 + 0.3 * (dx * x + dy * y)
-    picture = picture * falloff[..., None] * rng.uniform(0.85, 1.1) + rng.normal(0, 0.015, picture.shape)
+    noise = 0.015 * rng.standard_normal(picture.shape, dtype=np.float32)
+    picture = picture * falloff[..., None] * rng.uniform(0.85, 1.1) + noise
     return np.clip(picture, 0, 1).astype(np.float32)
 
 

@@ -9,17 +9,20 @@ from __future__ import annotations
 import math
 import random
 import statistics
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import open_clip
 import torch
 import torch.nn.functional as F
+from torch.nn.attention import SDPBackend, sdpa_kernel
+from torch.optim.lr_scheduler import LambdaLR
 
 from pipeline.artifacts import save_tensors, write_json
 from pipeline.runtime import derive_seed, seed_everything
-from standins.images import COLOURS, OPENINGS, SHAPES, caption, draw_scene, draw_topics
+from standins.beginning import initialise
+from standins.contrast import contrastive_loss, draw_captions
+from standins.images import COLOURS, OPENINGS, SHAPES, caption, draw_scene
 from standins.outputs import replacing, write_rows
 from standins.patterns import PATTERNS
 from standins.settings import FOLDER, ClipSettings, load_settings
@@ -52,6 +55,7 @@ def write_config(folder: Path, settings: ClipSettings, vocabulary: int) -> None:
         "width": settings.width,
         "layers": settings.layers,
         "head_width": 32,
+        "pool_type": "avg",
     }
     text = {
         "context_length": settings.context_length,
@@ -70,45 +74,42 @@ def write_config(folder: Path, settings: ClipSettings, vocabulary: int) -> None:
 
 
 def train(reader: Reader, settings: ClipSettings) -> Curve:
-    """Contrastive training in place: cross-entropy over a batch's similarities, both ways (Radford et al. 2021).
-
-    The captions of a batch speak of the same topics, so many are alike; pictures with like captions share the target
-    (Yang et al. 2022, UniCL). Few topics at a time are what makes the fine ones, pattern and light, learnt at all.
+    """Contrastive training in place.
 
     Returns:
-        Mean loss (nats) and share of pictures that found their caption in the batch, every `log_every` steps.
+        Mean loss (nats) and share of pictures that found their caption, over the sets of captions, every `log_every`
+        steps.
     """
     model, rng = reader.model, random.Random(derive_seed("clip scenes", settings.seed))
-    decayed = [p for p in model.parameters() if p.ndim >= 2]
-    others = [p for p in model.parameters() if p.ndim < 2]
-    groups = [{"params": decayed, "weight_decay": settings.weight_decay}, {"params": others, "weight_decay": 0.0}]
-    optimiser = torch.optim.AdamW(groups, lr=settings.learning_rate, betas=(0.9, 0.98))
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: _rate(step, settings))
+    optimisers = make_optimisers(model, settings)
+    schedules = [LambdaLR(optimiser, lambda step: _rate(step, settings)) for optimiser in optimisers]
     curve: Curve = []
     losses: list[float] = []
     hits: list[float] = []
     for step in range(1, settings.steps + 1):
-        if step > settings.steps * settings.patch_dropout_until:
-            model.visual.patch_dropout.prob = 0.0
         scenes = [draw_scene(rng, held_out=False) for _ in range(settings.batch_size)]
-        # Full captions first: their colours are learnt at once, which gives the finer topics something to build on.
-        topics = draw_topics(rng, 1.0 if step <= settings.full_steps else settings.full_captions)
-        opening = rng.choice(OPENINGS)
-        captions = [caption(scene, topics, opening) for scene in scenes]
-        ids = reader.tokens(captions)
-        with torch.autocast("cpu", dtype=torch.bfloat16):
-            image, text, scale = model(reader.pictures(scenes), ids)
-        logits, target = scale * image.float() @ text.float().T, alike(captions)
-        loss = (F.cross_entropy(logits, target) + F.cross_entropy(logits.T, target)) / 2
-        optimiser.zero_grad()
+        sets = draw_captions(rng, scenes, settings.full_captions)
+        # PyTorch's fused attention is slow backwards in bfloat16 on a processor.
+        with torch.autocast("cpu", dtype=torch.bfloat16), sdpa_kernel(SDPBackend.MATH):
+            image = F.normalize(model.encode_image(reader.pictures(scenes)).float(), dim=-1)
+            singles = reader.texts([text for captions in sets[:-1] for text in captions.texts])
+            last = reader.texts(sets[-1].texts)
+        texts = [*singles.split([len(captions.texts) for captions in sets[:-1]]), last]
+        scaled = image * model.logit_scale.exp()
+        results = [contrastive_loss(scaled, *pair) for pair in zip(texts, sets, strict=True)]
+        parts = torch.stack([part for part, _ in results])
+        loss = settings.topic_weight * parts[:-1].mean() + parts[-1]
+        for optimiser in optimisers:
+            optimiser.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
-        optimiser.step()
-        schedule.step()
+        for optimiser, schedule in zip(optimisers, schedules, strict=True):
+            optimiser.step()
+            schedule.step()
         with torch.no_grad():
             model.logit_scale.clamp_(0, math.log(settings.max_logit_scale))
         losses.append(loss.item())
-        hits.append((target.gather(1, logits.argmax(1, keepdim=True)) > 0).float().mean().item())
+        hits.append(statistics.fmean(found.item() for _, found in results))
         if step % settings.log_every == 0:
             curve.append((step, statistics.fmean(losses), statistics.fmean(hits)))
             print("step {} loss {:.3f} accuracy {:.3f}".format(*curve[-1]), flush=True)
@@ -116,17 +117,23 @@ def train(reader: Reader, settings: ClipSettings) -> Curve:
     return curve
 
 
-def alike(captions: Sequence[str]) -> torch.Tensor:
-    """Target distribution of each row, captions x captions: even over the equal ones."""
-    numbers = torch.tensor([captions.index(text) for text in captions])
-    same = (numbers[:, None] == numbers[None]).float()
-    return same / same.sum(1, keepdim=True)
+def make_optimisers(model: open_clip.CLIP, settings: ClipSettings) -> list[torch.optim.Optimizer]:
+    """Muon (Jordan 2024) for the transformers' matrices, AdamW for everything else."""
+    towers = (model.visual.transformer, model.transformer)
+    matrices = [p for tower in towers for p in tower.parameters() if p.ndim == 2]
+    chosen = {id(p) for p in matrices}
+    others = [p for p in model.parameters() if id(p) not in chosen]
+    decayed, plain = [p for p in others if p.ndim >= 2], [p for p in others if p.ndim < 2]
+    groups = [{"params": decayed, "weight_decay": settings.weight_decay}, {"params": plain, "weight_decay": 0.0}]
+    muon = torch.optim.Muon(
+        matrices, lr=settings.matrix_rate, weight_decay=settings.weight_decay, adjust_lr_fn="match_rms_adamw"
+    )
+    return [muon, torch.optim.AdamW(groups, lr=settings.learning_rate, betas=(0.9, 0.98))]
 
 
 def _rate(step: int, settings: ClipSettings) -> float:
-    """Linear warm-up, then a half cosine to zero."""
-    progress = step / settings.steps
-    return min((step + 1) / settings.warmup_steps, 0.5 + 0.5 * math.cos(math.pi * min(progress, 1)))
+    """Linear warm-up, a plateau, and a linear descent to zero."""
+    return min((step + 1) / settings.warmup_steps, 1, (settings.steps - step) / (settings.steps * settings.descent))
 
 
 def main() -> None:
@@ -138,11 +145,8 @@ def main() -> None:
         tokenizer = make_tokenizer(settings.seed)
         tokenizer.save_pretrained(folder)
         write_config(folder, settings, len(tokenizer))
-        model = open_clip.create_model(
-            f"local-dir:{folder}", load_weights=False, force_patch_dropout=settings.patch_dropout
-        )
-        with torch.no_grad():
-            model.logit_scale.fill_(math.log(1 / settings.temperature))
+        model = open_clip.create_model(f"local-dir:{folder}", load_weights=False)
+        initialise(model, settings.temperature)
         curve = train(Reader(model, tokenizer, settings), settings)
         save_tensors(
             folder / "open_clip_model.safetensors",
@@ -151,7 +155,9 @@ def main() -> None:
         )
         # Tested as stored, so that the figures are those of the rounded weights.
         stored = open_clip.create_model(f"local-dir:{folder}", precision="fp32")
-        rows = zero_shot(Reader(stored, tokenizer, settings), settings)
+        rng = random.Random(derive_seed("clip test", settings.seed))
+        scenes = [draw_scene(rng, held_out=True) for _ in range(settings.test_scenes)]
+        rows = zero_shot(Reader(stored, tokenizer, settings), scenes, rng)
     write_rows(FOLDER / "clip_curve.csv", ("step", "loss", "accuracy"), curve)
     write_rows(FOLDER / "clip_zero_shot.csv", ("question", "accuracy", "low", "high", "n", "chance"), rows)
 

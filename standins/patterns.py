@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from functools import cache
 from typing import Any
 
@@ -65,7 +66,7 @@ def draw_pattern(name: str, u: Array, v: Array, periods: float, rng: np.random.G
         case "ribbed":
             height = np.abs(np.sin(w * u / 2))
         case "cloudy":
-            height = np.clip(0.5 + 0.4 * _clouds(u.shape[0], rng), 0, 1)
+            height = np.clip(0.5 + 0.4 * _clouds(u.shape[0], rng, int(periods)), 0, 1)
         case _:
             raise ValueError(f"unknown pattern {name}")
     return height.astype(np.float32)
@@ -89,22 +90,26 @@ def _noise(pixels: int, knots: int, rng: np.random.Generator) -> Array:
     return matrix @ rng.standard_normal((matrix.shape[1], matrix.shape[1]), dtype=np.float32) @ matrix.T
 
 
-def _clouds(pixels: int, rng: np.random.Generator) -> Array:
-    """Noise of several sizes, each half as strong as the next larger one."""
-    octaves = [_noise(pixels, 3 * 2**k, rng) * 0.5**k for k in range(4)]
+def _clouds(pixels: int, rng: np.random.Generator, knots: int = 3) -> Array:
+    """Noise of several sizes from `knots` across on, each half as strong as the next larger one."""
+    octaves = [_noise(pixels, knots * 2**k, rng) * 0.5**k for k in range(4)]
     clouds: Array = np.sum(octaves, axis=0, dtype=np.float32)
     return clouds
 
 
 def _cells(u: Array, v: Array, periods: float, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Distances to the nearest and second nearest of jittered seed points (Worley 1996)."""
-    count = int(np.ceil(periods)) + 1
-    axis = (np.arange(count) + 0.5) * 2 / count
-    points = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2) + rng.uniform(-0.6, 0.6, (count * count, 2)) / count
-    du = u.ravel()[:, None] - u.min() - points[:, 0].astype(np.float32)
-    dv = v.ravel()[:, None] - v.min() - points[:, 1].astype(np.float32)
-    squared = du * du + dv * dv
-    nearest = squared.argmin(axis=1)[:, None]
-    near = np.take_along_axis(squared, nearest, axis=1)
-    np.put_along_axis(squared, nearest, np.inf, axis=1)
-    return np.sqrt(near).reshape(u.shape), np.sqrt(squared.min(axis=1)).reshape(u.shape)
+    """Distances to the nearest and second nearest of jittered seed points, one in each cell (Worley 1996)."""
+    side = np.float32(2 / (np.ceil(periods) + 1))
+    column, row = np.floor(u / side).astype(np.int64), np.floor(v / side).astype(np.int64)
+    first, top = column.min() - 1, row.min() - 1
+    jitter = rng.uniform(0.2, 0.8, (2, row.max() - top + 2, column.max() - first + 2)).astype(np.float32)
+    near, second = np.full(u.shape, np.inf, np.float32), np.full(u.shape, np.inf, np.float32)
+    # The jitter is small enough that both lie in the cell or in one beside it.
+    for down, right in itertools.product((-1, 0, 1), repeat=2):
+        i, j = row + down, column + right
+        du = u - (j + jitter[0, i - top, j - first]) * side
+        dv = v - (i + jitter[1, i - top, j - first]) * side
+        squared = du * du + dv * dv
+        second = np.minimum(second, np.maximum(near, squared))
+        near = np.minimum(near, squared)
+    return np.sqrt(near), np.sqrt(second)

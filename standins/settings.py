@@ -29,13 +29,13 @@ class ClipSettings(_Section):
     embed_dim: PositiveInt
     context_length: PositiveInt
     batch_size: int = Field(ge=2)
-    full_steps: int = Field(ge=0)
     full_captions: float = Field(ge=0, le=1)
+    topic_weight: float = Field(gt=0)
     steps: PositiveInt
-    patch_dropout: float = Field(gt=0, lt=1)
-    patch_dropout_until: float = Field(ge=0, le=1)
     learning_rate: float = Field(gt=0)
+    matrix_rate: float = Field(gt=0)
     warmup_steps: PositiveInt
+    descent: float = Field(gt=0, le=1)
     weight_decay: float = Field(ge=0)
     temperature: float = Field(gt=0)
     max_logit_scale: float = Field(gt=1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import random
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,11 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 
-from pipeline.runtime import derive_seed
-from standins.images import COLOURS, DEPTHS, LIGHTS, SHAPES, Scene, caption, draw, draw_scene
+from standins.images import WORDS, Scene, caption, draw, shows, with_word
 from standins.outputs import wilson
-from standins.patterns import PATTERNS
 
 if TYPE_CHECKING:
     from open_clip import CLIP
@@ -22,13 +20,7 @@ if TYPE_CHECKING:
 
     from standins.settings import ClipSettings
 
-ALTERNATIVES: tuple[tuple[str, Sequence[str]], ...] = (
-    ("colour", tuple(COLOURS)),
-    ("pattern", PATTERNS),
-    ("shape", SHAPES[:-1]),
-    ("light", tuple(LIGHTS)),
-    ("depth", tuple(DEPTHS)),
-)
+ASKED = ("colour", "pattern", "shape", "light", "depth", "grain", "size", "place")
 ZeroShotRow = tuple[str, float, float, float, int, float]
 
 
@@ -49,6 +41,16 @@ class Reader:
         ids: torch.Tensor = batch["input_ids"]
         return ids
 
+    def texts(self, texts: Sequence[str]) -> torch.Tensor:
+        """Unit embeddings, texts x dimensions, as `encode_text` makes them, without its work on trailing padding."""
+        ids = self.tokens(texts)
+        ends = ids.eq(self.tokenizer.eos_token_id).int().argmax(1)
+        length = int(ends.max()) + 1
+        model = self.model
+        x = model.token_embedding(ids[:, :length]) + model.positional_embedding[:length]
+        x = model.ln_final(model.transformer(x, attn_mask=model.attn_mask[:length, :length]))
+        return F.normalize((x[torch.arange(len(x)), ends] @ model.text_projection).float(), dim=-1)
+
     def pictures(self, scenes: Sequence[Scene]) -> torch.Tensor:
         """Normalised pictures, scenes x 3 x pixels x pixels."""
         stack = torch.from_numpy(np.stack([draw(scene, self.settings.image_size) for scene in scenes]))
@@ -57,38 +59,34 @@ class Reader:
 
 
 @torch.no_grad()
-def zero_shot(reader: Reader, settings: ClipSettings) -> list[ZeroShotRow]:
-    """Share of held-out scenes whose best caption is the right one: question, accuracy, low, high, n, chance.
+def zero_shot(reader: Reader, scenes: Sequence[Scene], rng: random.Random) -> list[ZeroShotRow]:
+    """Share of scenes whose best caption is the right one: question, accuracy, low, high, n, chance.
 
-    `caption` chooses among full captions of different held-out scenes; each other row replaces one word of the
-    full caption by every alternative.
+    `caption` chooses among full captions of different scenes; each other row replaces one word of the full caption,
+    where it can be seen, by every alternative.
     """
-    rng = random.Random(derive_seed("clip test", settings.seed))
-    scenes = [draw_scene(rng, held_out=True) for _ in range(settings.test_scenes)]
-    images = reader.model.encode_image(reader.pictures(scenes), normalize=True)
-    texts = reader.model.encode_text(reader.tokens([caption(s) for s in scenes]), normalize=True)
-    right = 0
+    images = torch.cat([reader.model.encode_image(reader.pictures(s), normalize=True) for s in _chunks(scenes)])
+    texts = torch.cat([reader.texts([caption(scene) for scene in s]) for s in _chunks(scenes)])
+    candidates, right = reader.settings.candidates, 0
     for index in range(len(scenes)):
-        others = rng.sample([i for i in range(len(scenes)) if i != index], settings.candidates - 1)
+        others = rng.sample([i for i in range(len(scenes)) if i != index], candidates - 1)
         right += int((texts[[index, *others]] @ images[index]).argmax() == 0)
-    rows = [_row("caption", right, len(scenes), settings.candidates)]
-    for field, words in ALTERNATIVES:
-        asked = [i for i, scene in enumerate(scenes) if _shows(scene, field)]
-        right = sum(_fills(reader, scenes[i], images[i], field, words) for i in asked)
-        rows.append(_row(field, right, len(asked), len(words)))
+    rows = [_row("caption", right, len(scenes), candidates)]
+    for topic in ASKED:
+        asked = [i for i, scene in enumerate(scenes) if shows(scene, topic)]
+        right = sum(_fills(reader, scenes[i], images[i], topic) for i in asked)
+        rows.append(_row(topic, right, len(asked), len(WORDS[topic])))
     return rows
 
 
-def _shows(scene: Scene, field: str) -> bool:
-    """Whether one can see it: a surface has no shape, and a plain one looks the same flat or raised."""
-    surface = scene.shape == "surface"
-    return not (field == "shape" and surface) and not (field == "depth" and surface and scene.pattern == "plain")
+def _chunks(scenes: Sequence[Scene], size: int = 250) -> list[Sequence[Scene]]:
+    return [scenes[i : i + size] for i in range(0, len(scenes), size)]
 
 
-def _fills(reader: Reader, scene: Scene, image: torch.Tensor, field: str, words: Sequence[str]) -> bool:
-    variants = [dataclasses.replace(scene, **{field: word}) for word in words]  # type: ignore[arg-type]
-    texts = reader.model.encode_text(reader.tokens([caption(v) for v in variants]), normalize=True)
-    return words[int((texts @ image).argmax())] == str(getattr(scene, field))
+def _fills(reader: Reader, scene: Scene, image: torch.Tensor, topic: str) -> bool:
+    words = WORDS[topic]
+    texts = reader.texts([caption(with_word(scene, topic, word)) for word in words])
+    return bool(words[int((texts @ image).argmax())] == getattr(scene, topic))
 
 
 def _row(question: str, right: int, n: int, choices: int) -> ZeroShotRow:

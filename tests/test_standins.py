@@ -17,13 +17,16 @@ from pipeline.prompts import add_tactile_tokens, encode, render
 from pipeline.records import Opd, Part, Turn
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool
+from standins.beginning import initialise
+from standins.contrast import alter, contrastive_loss, describe, draw_captions
 from standins.curriculum import FORMATS, phrases, vocabulary
-from standins.images import TOPICS, caption, draw, draw_scene
+from standins.images import TOPICS, WORDS, caption, draw, draw_scene, shows
 from standins.outputs import wilson
 from standins.settings import FOLDER, load_settings
 from standins.text import draw_draft
 from standins.vocabulary import EOS, build_tokenizer
 from standins.world import combinations, forbidden_descriptions, make_world, questions, real_catalogue
+from standins.zero_shot import ASKED, Reader
 
 MEGABYTE = 2**20
 TEXT = st.characters(exclude_categories=["Cs"])
@@ -64,7 +67,7 @@ def test_folder_is_small() -> None:
     sizes = {p: p.stat().st_size for p in FOLDER.rglob("*") if p.is_file() and "__pycache__" not in p.parts}
     assert sum(sizes.values()) <= 10 * MEGABYTE
     assert sizes[FOLDER / "llama" / "model.safetensors"] <= 4.5 * MEGABYTE
-    assert sizes[FOLDER / "clip" / "open_clip_model.safetensors"] <= 5 * MEGABYTE
+    assert sizes[FOLDER / "clip" / "open_clip_model.safetensors"] <= 3 * MEGABYTE
 
 
 def test_clip_loads_as_float32_and_reads_and_sees() -> None:
@@ -174,6 +177,83 @@ def test_pictures_are_in_range_and_held_out_pairs_stay_out() -> None:
         assert caption(scene, TOPICS) != caption(scene, ())
 
 
+def test_captions_speak_of_what_can_be_seen() -> None:
+    rng = random.Random(3)
+    scenes = [draw_scene(rng, held_out=False) for _ in range(200)]
+    for scene, topic in itertools.product(scenes, set(TOPICS) - {"shape"}):
+        assert (caption(scene, (topic,)) == caption(scene, ())) == (not shows(scene, topic))
+    plain = [s for s in scenes if s.shape == "surface" and s.pattern == "plain"]
+    assert plain
+    assert {t for t in TOPICS if shows(plain[0], t)} == {"colour", "pattern", "light"}
+    for scene in scenes:
+        other = alter(rng, scene)
+        assert caption(other) != caption(scene)
+        assert not other.held_out
+        assert sum(getattr(other, topic) != getattr(scene, topic) for topic in TOPICS) == 1
+
+
+def test_captions_of_a_batch_find_their_pictures() -> None:
+    rng = random.Random(4)
+    scenes = [draw_scene(rng, held_out=False) for _ in range(40)]
+    for everything in (0.0, 1.0):
+        sets = draw_captions(rng, scenes, everything)
+        assert len(sets) == len(TOPICS) + 1
+        for topic, captions in zip(TOPICS, sets, strict=False):
+            assert len(set(captions.texts)) == len(captions.texts) <= len(WORDS[topic])
+            for row, place in zip(captions.rows, captions.wanted, strict=True):
+                assert getattr(scenes[row], topic) in captions.texts[place]
+        assert (len(sets[-1].texts) > len(scenes)) == bool(everything)
+
+
+def test_contrastive_loss_shares_targets_and_counts_hard_negatives() -> None:
+    import torch
+    import torch.nn.functional as F
+
+    rng = random.Random(5)
+    scenes = [draw_scene(rng, held_out=False) for _ in range(12)]
+    captions = describe(scenes, ("light",), "", ("a thing lit from nowhere",))
+    image = torch.randn(12, 8, generator=torch.Generator().manual_seed(0))
+    text = F.normalize(torch.randn(len(captions.texts), 8, generator=torch.Generator().manual_seed(1)), dim=1)
+    forward = backward = 0.0
+    named = len(set(captions.wanted))
+    assert named == len(captions.texts) - 1
+    for row, place in zip(captions.rows, captions.wanted, strict=True):
+        forward -= float((image[row] @ text.T).log_softmax(0)[place]) / 12
+        backward -= float((image @ text[place]).log_softmax(0)[row]) / captions.wanted.count(place) / named
+    loss, found = contrastive_loss(image, text, captions)
+    assert float(loss) == pytest.approx((forward + backward) / 2, rel=1e-5)
+    assert 0 <= float(found) <= 1
+
+
+def test_attention_begins_near_the_identity() -> None:
+    import open_clip
+    import torch
+
+    torch.manual_seed(0)
+    model = open_clip.create_model(f"local-dir:{FOLDER / 'clip'}", load_weights=False)
+    initialise(model, temperature=0.1)
+    assert float(model.logit_scale.detach().exp()) == pytest.approx(10, rel=1e-5)
+    attention = model.visual.transformer.resblocks[0].attn
+    width = attention.embed_dim
+    query, key, value = attention.in_proj_weight.detach().chunk(3)
+    match, output = query.T @ key, attention.out_proj.weight.detach() @ value
+    assert float(match.trace()) / width > 0.5
+    assert float(output.trace()) / width == pytest.approx(-0.4, abs=0.1)
+
+
+def test_texts_are_embedded_as_open_clip_does() -> None:
+    import open_clip
+    import torch
+
+    name = f"local-dir:{FOLDER / 'clip'}"
+    model = open_clip.create_model(name, precision="fp32")
+    reader = Reader(model, open_clip.get_tokenizer(name).tokenizer, load_settings().clip)
+    texts = ["a red circle", "here is a large raised fine blue brick star lit from above"]
+    with torch.no_grad():
+        expected = model.encode_text(open_clip.get_tokenizer(name)(texts), normalize=True)
+        torch.testing.assert_close(reader.texts(texts), expected, rtol=1e-4, atol=1e-5)
+
+
 def test_training_text_holds_nothing_of_the_evaluation() -> None:
     text = "\n".join(corpus(7, 150))
     assert not [s.question for s in real_catalogue().language.scenarios if s.question in text]
@@ -198,6 +278,9 @@ def test_gate_and_zero_shot_tables_are_whole() -> None:
     assert {"PC", "PSS", "POM"} <= {row["task"] for row in gate}
     zero_shot = list(csv.DictReader((FOLDER / "clip_zero_shot.csv").open(encoding="utf-8")))
     assert list(zero_shot[0]) == ["question", "accuracy", "low", "high", "n", "chance"]
+    assert [row["question"] for row in zero_shot] == ["caption", *ASKED]
+    for row in zero_shot:
+        assert float(row["low"]) > float(row["chance"]), row["question"]
     for row in (*gate, *zero_shot):
         assert 0 <= float(row["low"]) <= float(row["accuracy"]) <= float(row["high"]) <= 1
         assert int(row["n"]) >= 200
