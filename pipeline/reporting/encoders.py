@@ -37,6 +37,7 @@ class AccuracyRow:
         """All columns."""
         return {
             "Model": self.model,
+            "What it is": CONTESTANTS[self.model].title if self.property == COMBINED else "",
             "Property": self.property,
             "Accuracy %": number(100 * self.accuracy, 1),
             "95 % over objects": _span(self.low, self.high),
@@ -157,8 +158,8 @@ def encoder_tables(
     some = next(iter(summaries.values()))
     repeats = len(some.combined.spread.values)
     setting = (
-        f"{some.videos} videos of {some.objects} objects, {folds} folds of objects, {repeats} repeats; settings are "
-        "chosen inside the training folds."
+        f"{some.videos} videos of {some.objects} objects, {folds} folds of objects, dealt {repeats} time"
+        f"{'s' * (repeats > 1)}; settings are chosen inside the training folds."
     )
     accuracies = [row for name, s in summaries.items() for row in _accuracies(name, s, catalogue, costs.get(name))]
     agreement = [row for name in verdicts for row in _agreement(name, verdicts[name], catalogue, classes)]
@@ -166,7 +167,7 @@ def encoder_tables(
         Table(
             "cross_validation",
             "Encoders over all objects",
-            f"Grouped cross-validation: {setting} What the models are stands below.",
+            f"Grouped cross-validation: {setting}",
             accuracies,
             [row for row in accuracies if row.property == COMBINED or row.model in HEADLINE],
             folder=FOLDER,
