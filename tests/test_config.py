@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import get_args
 
 import pytest
 import yaml
 
 from pipeline.config import load_params
+from pipeline.contestants import RELEASE
 from pipeline.errors import UserError
 from pipeline.plan import resolve_plan
 from pipeline.records import Opd
 from pipeline.scales import check_inputs, compose, prune, shipped_scales, write_params
+from pipeline.sections import Recipe
 from tests.closure import ROOT
 
 CONF = ROOT / "conf"
@@ -147,3 +150,18 @@ def test_prune_keeps_the_plan_and_removes_the_rest(tmp_path: Path) -> None:
     ]
     shutil.rmtree(tmp_path)
     prune(plan, tmp_path)
+
+
+def test_a_recipe_brings_its_settings_and_gives_way_to_yours() -> None:
+    smoke = compose("smoke", conf=CONF)
+    for recipe in get_args(Recipe):
+        composed = compose("smoke", [f"encoder.recipe={recipe}"], conf=CONF)
+        assert composed.encoder.recipe == recipe
+        assert composed.language == smoke.language
+        assert composed.plan.pretrain == (("scenes",) if recipe == "strong" else ())
+    release = compose("small", ["encoder.recipe=release"], conf=CONF).encoder
+    assert {name: getattr(release, name) for name in RELEASE} == RELEASE, "the contestant is the recipe"
+    own = compose("small", ["encoder.recipe=release", "encoder.epochs=3"], conf=CONF).encoder
+    assert (own.epochs, own.batch_size) == (3, RELEASE["batch_size"])
+    with pytest.raises(UserError, match=r"encoder.recipe=strong .* set encoder.reference=subtract"):
+        compose("smoke", ["encoder.recipe=strong", "encoder.reference=none"], conf=CONF)
