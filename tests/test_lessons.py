@@ -188,6 +188,14 @@ def test_classes_are_those_that_the_scene_measures_as(number: int, monkeypatch: 
     assert told[:, 5] == pytest.approx([math.log10(skin.max() + 1e-3) for skin in skins], abs=1e-5)
 
 
+def test_bumps_are_those_under_the_largest_force(monkeypatch: pytest.MonkeyPatch) -> None:
+    shares = iter([0.5, 0.0, 0.2])
+    monkeypatch.setattr(module, "bump_share", lambda *_: next(shares))
+    lesson = draw_lesson(0, CONFIG, FRAMES)
+    assert lesson.quantities[0, :, 4] == pytest.approx([0.5, 0.0, 0.2])
+    assert lesson.classes[0, 2] == 1
+
+
 @pytest.mark.parametrize("length", [0.6, 1.2, 2.4, 4.8, 7.0])
 def test_bands_tell_a_wave_as_the_filters_transfer_says(length: float) -> None:
     """A Gaussian filter of cutoff c passes 2^-(c / L)^2 of a sine of wavelength L (ISO 16610-21)."""

@@ -20,6 +20,7 @@ from torch.optim.optimizer import register_optimizer_step_pre_hook
 from transformers import EvalPrediction, TrainingArguments
 
 from pipeline.artifacts import write_table
+from pipeline.data.clips import ClipDataset, LabelledVideo
 from pipeline.errors import UserError
 from pipeline.frames.store import FRAMES_FILE, REFERENCES_FILE, TABLE_FILE, FrameStore
 from pipeline.models.frame_votes import FARTHEST, FrameVotes
@@ -51,9 +52,16 @@ Floats = np.ndarray
 CPU = RuntimeConfig(device="cpu", save_steps=2)
 
 
-def write_tower(folder: Path) -> Path:
-    """A tiny CLIP none of whose biases is 0 and none of whose scales is 1: fresh ones would hide a wrong layer."""
+def write_tower(folder: Path, *, averages: bool = False) -> Path:
+    """A tiny CLIP none of whose biases is 0 and none of whose scales is 1: fresh ones would hide a wrong layer.
+
+    Args:
+        averages: Whether its embedding is read from the mean over patches, in place of the class token.
+    """
     file = write_clip(folder) / "open_clip_model.safetensors"
+    if averages:
+        form = folder / "open_clip_config.json"
+        form.write_text(form.read_text().replace('"vision_cfg": {', '"vision_cfg": {"pool_type": "avg", '))
     draw = torch.Generator().manual_seed(1)
     save_file({k: v + 0.2 * torch.randn(v.shape, generator=draw) for k, v in load_file(file).items()}, file)
     return folder
@@ -119,7 +127,11 @@ class Tower:
         self.mean, self.std = np.array(preprocess["mean"]), np.array(preprocess["std"])
 
     def token(self, pictures: Floats, prompts: Sequence[Floats] = (), *, normed: bool = False) -> Floats:
-        """The class token after the last block of pictures (0 to 255), batch x side x side x RGB.
+        """The class token after the last block."""
+        return self.tokens(pictures, prompts, normed=normed)[:, 0]
+
+    def tokens(self, pictures: Floats, prompts: Sequence[Floats] = (), *, normed: bool = False) -> Floats:
+        """Class token and patches after the last block, of pictures (0 to 255), batch x side x side x RGB.
 
         Args:
             prompts: Count x width a layer, which take the place of those of the layer before; layers behind get none.
@@ -139,7 +151,7 @@ class Tower:
                 added = self.norm(prompts[layer], "ln_pre") if normed and layer == 0 else prompts[layer]
                 tokens = np.concatenate([tokens[:, :own], np.repeat(added[None], len(tokens), axis=0)], axis=1)
             tokens = self.block(tokens, f"transformer.resblocks.{layer}")
-        return tokens[:, 0]
+        return tokens[:, :own]
 
     def block(self, x: Floats, name: str) -> Floats:
         width = x.shape[-1]
@@ -230,6 +242,25 @@ def test_prompts_of_the_paper_pass_the_shared_map(layers: int, weights: Path, fr
     token = tower.token(frames[:, 0].numpy(), list(mapped + float64(encoder.prompts.shared.bias)))
     close(encoder(frames[:, 0], MOMENTS[:, 0]), tower.embedding(token))
     assert torch.equal(encoder(frames[:, 0], MOMENTS[:, 0]), encoder.describe(frames[:, 0], MOMENTS[:, 2]))
+
+
+def test_a_tower_that_averages_is_read_by_its_patches(frames: torch.Tensor, tmp_path: Path) -> None:
+    """It has no trained class token; prompts are no patches."""
+    folder = write_tower(tmp_path / "averaging", averages=True)
+    tower, moments = Tower(folder), MOMENTS[:, 0]
+    plain = tower.tokens(frames[:, 0].numpy())
+    close(base_encoder(config(folder, "paper"))(frames[:, 0], moments), tower.embedding(plain)[:, 1:].mean(axis=1))
+    close(
+        base_encoder(config(folder, "release"))(frames[:, 0], moments),
+        plain[:, 1:].mean(axis=1) + waves(moments.numpy(), 32),
+    )
+    tuned = property_classifier(config(folder, "release"), [2]).encoder
+    assert isinstance(tuned, PublishedEncoder)
+    assert tuned.prompts is not None
+    patches = tower.tokens(frames[:, 0].numpy(), list(float64(tuned.prompts.prompts)), normed=True)[:, 1:]
+    close(tuned(frames[:, 0], moments), patches.mean(axis=1) + waves(moments.numpy(), 32))
+    described = tower.norm(patches.mean(axis=1), "ln_post") + waves(moments.numpy(), 32)
+    close(tuned.describe(frames[:, 0], moments), described)
 
 
 @pytest.mark.parametrize("shared", [False, True])
@@ -396,6 +427,41 @@ def test_the_first_of_the_best_epochs_is_kept(
     assert [all(torch.equal(v, found[n]) for n, v in epoch.items()) for epoch in seen] == [i == kept for i in range(4)]
     assert [m.value for m in history if m.name == "validation_combined"] == list(reached)
     assert not any(tmp_path.glob("checkpoints/*/*")), "a finished training leaves no checkpoint"
+
+
+def test_a_clip_depends_on_seed_epoch_and_video_alone(tmp_path: Path) -> None:
+    store = FrameStore(write_frames(tmp_path, {"a_0": 9, "b_0": 9}))
+    videos = [LabelledVideo("a_0", (0,)), LabelledVideo("b_0", (1,))]
+
+    def clip(seed: int, epoch: int, order: int = 1) -> tuple[list[int], bytes]:
+        data = ClipDataset(store, videos[::order], per_video=3, seed=seed, flip_probability=0.5)
+        data.follow(lambda: epoch)
+        item = data[0 if order > 0 else 1]
+        return item["moments"].tolist(), item["frames"].numpy().tobytes()
+
+    assert clip(1, 4) == clip(1, 4) == clip(1, 4, -1)
+    assert len({clip(1, epoch)[1] for epoch in range(20)}) > 15
+    assert len({clip(seed, 0)[1] for seed in range(20)}) > 15
+
+
+def test_each_epoch_draws_its_own_clips(
+    weights: Path, catalogue: Catalogue, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data, setting = encoder_data(tmp_path, catalogue, PARTS), config(weights, "paper", epochs=3, batch_size=2)
+    drawn: list[tuple[int, str]] = []
+    draw = ClipDataset.__getitem__
+
+    def spy(self: ClipDataset, index: int) -> dict[str, torch.Tensor]:
+        if self.seed is not None:
+            drawn.append((self.epoch, self.videos[index].video_id))
+        return draw(self, index)
+
+    monkeypatch.setattr(ClipDataset, "__getitem__", spy)
+    seed_everything(0)
+    train_classifier(property_classifier(setting, data.classes), data, setting, CPU, seed=1, inputs=[])
+    training = [f"{o}_0" for o, part in PARTS.items() if part == Part.TRAIN]
+    assert sorted(drawn) == sorted((epoch, video) for epoch in range(3) for video in training)
+    assert [epoch for epoch, _ in drawn] == sorted(epoch for epoch, _ in drawn)
 
 
 def test_validation_counts_videos_that_are_right_in_everything(catalogue: Catalogue) -> None:

@@ -59,7 +59,6 @@ from pipeline.errors import UserError
 from pipeline.frames.extract import extract_frames
 from pipeline.frames.store import FrameStore
 from pipeline.frames.subtraction import Pictures
-from pipeline.models.scene_encoder import SceneEncoder
 from pipeline.models.tactile_encoder import FrameEncoder
 from pipeline.models.weights import check_encoder
 from pipeline.parallel import run_parallel
@@ -234,21 +233,7 @@ def formatted(encoder: FrameEncoder, form: Format) -> FrameEncoder:
             return cast(FrameEncoder, torch.ao.quantization.quantize_dynamic(changed, {nn.Linear}, torch.qint8))
     if form == "bfloat16":
         changed = changed.to(torch.bfloat16)
-        if isinstance(changed, SceneEncoder):  # It makes float32 of its pictures.
-            changed.layers = nn.Sequential(Cast(torch.bfloat16), *changed.layers)
     return changed
-
-
-class Cast(nn.Module):
-    """Turns what goes through into a number format."""
-
-    def __init__(self, dtype: torch.dtype) -> None:
-        super().__init__()
-        self.dtype = dtype
-
-    def forward(self, values: torch.Tensor) -> torch.Tensor:
-        """Values of any shape, in the format."""
-        return values.to(self.dtype)
 
 
 def judge(trial: Trial) -> tuple[Verdict, ...]:

@@ -29,7 +29,9 @@ class FrameVotes(PropertyClassifier):
 
     def standardise(self, features: torch.Tensor) -> torch.Tensor:
         """Features on the training frames' scale, within `FARTHEST`."""
-        return ((features - self.centre) / self.spread).clamp(-FARTHEST, FARTHEST)
+        scaled = (features - self.centre) / self.spread
+        # What is infinite stays so, and is found: a wild frame is held, a broken one is not.
+        return torch.where(scaled.isinf(), scaled, scaled.clamp(-FARTHEST, FARTHEST))
 
     def classify(self, features: torch.Tensor) -> list[torch.Tensor]:
         """Log of the mean probability a property, batch x classes, of features, batch x frames x dim."""
@@ -39,5 +41,5 @@ class FrameVotes(PropertyClassifier):
 
     def decide(self, logits: torch.Tensor) -> torch.Tensor:
         """The most probable combination: int64, batch x properties."""
-        evidence = [z.log_softmax(1).numpy() for z in logits.cpu().double().split(self.classes, dim=1)]
+        evidence = [z.log_softmax(1).numpy() for z in logits.detach().cpu().double().split(self.classes, dim=1)]
         return torch.from_numpy(decode_jointly(evidence, self.dependence.detach().cpu().double().numpy()))

@@ -39,9 +39,9 @@ class SceneEncoder(FrameEncoder):
         self.layers = nn.Sequential(*layers).to(memory_format=torch.channels_last)
 
     def forward(self, frames: torch.Tensor, moments: torch.Tensor) -> torch.Tensor:
-        """Embed difference pictures: uint8, batch x side x side x RGB, to float32, batch x dim."""
+        """Embed difference pictures, uint8, batch x side x side x RGB: batch x dim, in the weights' number format."""
         # The bytes lie as channels-last wants them: a view, no copy.
-        pixels = (frames.permute(0, 3, 1, 2).float() - MIDDLE) / (GAIN * STEPS)
+        pixels = (frames.permute(0, 3, 1, 2).to(next(self.parameters()).dtype) - MIDDLE) / (GAIN * STEPS)
         maps = self.layers(pixels)
         return torch.cat([maps.mean((2, 3)), maps.amax((2, 3))], dim=1)
 

@@ -14,6 +14,7 @@ from pipeline.baseline.predictor import Labels
 from pipeline.baseline.recordings import Recording, recording_features
 from pipeline.baseline.validation import Fold, Predict, cross_validate, deal, forest
 from pipeline.contestants import Contestant
+from pipeline.errors import UserError
 from pipeline.frames.store import PROBES_FILE, REFERENCES_FILE, TABLE_FILE, FrameStore
 from pipeline.models.recipes import base_encoder, property_classifier
 from pipeline.models.scene_encoder import SceneEncoder
@@ -79,6 +80,11 @@ def judge(contestant: Contestant, arena: Arena, config: CrossValidationConfig) -
     Folds depend on the objects and `config` alone, so all contestants share them.
     """
     made_of = [*arena.files, *([arena.pretrained] if arena.pretrained.is_file() else [])]
+    objects = len(set(arena.objects))
+    if objects < config.folds:
+        raise UserError(
+            f"cross_validation.folds is {config.folds} but only {objects} objects have videos; lower it, to 2 at least"
+        )
     labelled = repr([(v.video_id, arena.catalogue.labels(v.object_id)) for v in arena.videos])
     mark = fingerprint(repr(contestant), config, arena.encoder, arena.per_video, labelled, *made_of)
     work = CHECKPOINTS / "cross_validation" / mark
@@ -201,7 +207,7 @@ def _gradient(contestant: Contestant, arena: Arena) -> Predict:
         seed = derive_seed("gradient", fold.repeat, fold.number) % 2**31
         seed_everything(seed)
         known = np.unique(np.array(arena.objects)[fold.trained]).tolist()
-        chosen = deal(known, min(VALIDATION, len(known)), seed)[0]
+        chosen = deal(known, min(VALIDATION, len(known)), seed)[0] if len(known) > 1 else frozenset()
         parts = {
             video.video_id: Part.TEST if tested else Part.VALIDATION if video.object_id in chosen else Part.TRAIN
             for video, trained, tested in zip(arena.videos, fold.trained, fold.tested, strict=True)

@@ -174,8 +174,10 @@ def describe_clips(
     for batch in DataLoader(clips, batch_size=max(1, batch_size // data.per_video), collate_fn=collate_clips):
         frames, moments = batch["frames"].to(device), batch["moments"].to(device)
         described = encoder.describe(frames.flatten(0, 1), moments.flatten())
-        features.append(described.view(*frames.shape[:2], -1).float().cpu().numpy())
-    return np.concatenate(features)
+        features.append(described.view(*frames.shape[:2], -1).float().cpu())
+    found = torch.cat(features)
+    _check_finite(found.flatten(1), videos)
+    return found.numpy()
 
 
 @torch.inference_mode()
@@ -215,8 +217,9 @@ def classify(
     return records
 
 
-def _check_finite(logits: torch.Tensor, videos: Sequence[LabelledVideo]) -> None:
-    for video, finite in zip(videos, logits.isfinite().all(1).tolist(), strict=True):
+def _check_finite(values: torch.Tensor, videos: Sequence[LabelledVideo]) -> None:
+    """Values are videos x whatever."""
+    for video, finite in zip(videos, values.isfinite().all(1).tolist(), strict=True):
         if not finite:
             raise UserError(
                 f"{video.video_id}: what the encoder says of it is not finite; check the video and encoder.weights"

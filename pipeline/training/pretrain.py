@@ -10,8 +10,10 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from pipeline.data import lessons as lessons_module
 from pipeline.data.epochs import EpochDataset
 from pipeline.data.lessons import Lessons, draw_lessons
+from pipeline.frames import subtraction
 from pipeline.frames.subtraction import MIDDLE
 from pipeline.models.scene_encoder import LessonModel, SceneEncoder
 from pipeline.records import Measurement
@@ -100,7 +102,11 @@ def pretrain(
         The encoder, and the curve of its loss; `held_out_*` at the last step are over lessons that it never saw.
     """
     seed_everything(config.seed)
-    drawing = sorted(Path(invent.__file__).parent.rglob("*.py"))
+    drawing = [
+        *sorted(Path(invent.__file__).parent.rglob("*.py")),
+        Path(lessons_module.__file__),
+        Path(subtraction.__file__),
+    ]
     mark = fingerprint(config, frames.fit, frames.size, *drawing)
     work = CHECKPOINTS / "lessons" / mark
     lessons = draw_lessons(config, frames, work)

@@ -88,6 +88,9 @@ class TrainableTrainer(Trainer):
         if state_dict is not None:
             # Gathered by the distributed backend: take the gathered values.
             trained = {name: state_dict[name] for name in trained}
+        broken = next((name for name, value in trained.items() if not value.isfinite().all()), None)
+        if broken:
+            raise _diverged(f"{broken} is not finite", self.state.global_step)
         super()._save(output_dir, {name: value.contiguous() for name, value in trained.items()})
 
     def _issue_warnings_after_load(self, load_result: Any) -> None:
@@ -97,6 +100,15 @@ class TrainableTrainer(Trainer):
                 f"{self.args.output_dir}: its checkpoint has {load_result.unexpected_keys[0]}, which the model lacks; "
                 "delete the folder and run again"
             )
+
+
+def _diverged(what: str, step: int) -> UserError:
+    return UserError(
+        f"{what} at step {step}: the training diverged; lower the learning rate (earlier checkpoints are kept)"
+    )
+
+
+LOSSES = ("loss", "grad_norm", "validation_loss")
 
 
 class Watch(TrainerCallback):
@@ -116,12 +128,9 @@ class Watch(TrainerCallback):
     ) -> None:
         """Called by the Trainer after each logging step."""
         values = _measured(logs or {})
-        bad = [name for name in ("loss", "grad_norm") if not math.isfinite(values.get(name, 0.0))]
+        bad = [name for name in LOSSES if not math.isfinite(values.get(name, 0.0))]
         if bad:
-            raise UserError(
-                f"{bad[0]} is {values[bad[0]]} at step {state.global_step}: the training diverged; lower the learning "
-                "rate (earlier checkpoints are kept)"
-            )
+            raise _diverged(f"{bad[0]} is {values[bad[0]]}", state.global_step)
         if not state.is_world_process_zero:
             return
         if self.log:
@@ -189,18 +198,27 @@ def training_arguments(folder: Path, runtime: RuntimeConfig, seed: int, **own: A
 def train(trainer: Trainer) -> Trained:
     """Train to the end, from the last checkpoint where there is one, and tidy up."""
     folder = Path(str(trainer.args.output_dir))
+    _drop_unfinished(folder)
     last = get_last_checkpoint(str(folder)) if folder.is_dir() else None
     trainer.train(resume_from_checkpoint=last)
     history = [
         Measurement(step=entry["step"], name=name, value=value)
         for entry in trainer.state.log_history
-        for name, value in _measured(entry).items()
+        # A state that was read back has its names in order, one that was not has them as they were logged.
+        for name, value in sorted(_measured(entry).items())
     ]
     whole = trainer.accelerator.get_state_dict(trainer.model_wrapped)
     names = trainable_state(trainer.accelerator.unwrap_model(trainer.model))
     if trainer.is_world_process_zero():
         shutil.rmtree(folder, ignore_errors=True)
     return Trained(history, {name: whole[name] for name in names if name in whole})
+
+
+def _drop_unfinished(folder: Path) -> None:
+    """Remove checkpoints that were being written when their process died: the Trainer writes its state last."""
+    for checkpoint in folder.glob("checkpoint-*"):
+        if not (checkpoint / "trainer_state.json").is_file():
+            shutil.rmtree(checkpoint)
 
 
 def _measured(entry: Mapping[str, object]) -> dict[str, float]:
