@@ -175,14 +175,14 @@ class PretrainConfig(Section):
     """Objects that are invented; each is drawn once."""
     presses: Annotated[int, Field(ge=1, le=64)] = 3
     """Pictures of each, under different forces and lights."""
-    steps: Positive = 2400
+    steps: Positive = 900
     """Updates (AdamW, cosine)."""
     batch_size: Positive = 24
     """Objects an update."""
     learning_rate: Rate = 2e-3
-    weight_decay: Annotated[float, Field(ge=0, lt=1)] = 0.02
+    weight_decay: Annotated[float, Field(ge=0, lt=1)] = 0.01
     augment: bool = True
-    """Vary light, gain and noise of each picture, and mirror it."""
+    """Vary how strong each picture's light is, and mirror it."""
     seed: Seed = 0
 
 

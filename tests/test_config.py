@@ -115,7 +115,7 @@ def test_missing_inputs_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     with pytest.raises(UserError, match="scenes.objects"):
         check_inputs(compose("smoke", ["scenes.objects=[unicorn]"]))
     with pytest.raises(UserError, match="frames.size"):
-        check_inputs(compose("smoke", ["frames.size=96"]))
+        check_inputs(compose("smoke", ["frames.size=48"]))
 
 
 def test_plan_names() -> None:

@@ -171,7 +171,7 @@ class TestBadWeights:
 
     def test_wrong_size(self, tmp_path: Path) -> None:
         with pytest.raises(UserError, match="frames.size=32"):
-            check_encoder(write_clip(tmp_path), 80)
+            check_encoder(write_clip(tmp_path), 24)
 
     def test_checkpoint_of_another_model(self, tmp_path: Path) -> None:
         folder = write_clip(tmp_path)

@@ -185,7 +185,7 @@ def test_problems_are_one_line(root: Path, arena: Arena, tmp_path: Path, monkeyp
         encoder.measure(root)
     (root / PRETRAINED).parent.mkdir(parents=True)
     (root / PRETRAINED).symlink_to(arena.pretrained)
-    monkeypatch.setattr(encoder, "SIDE", 80)
+    monkeypatch.setattr(encoder, "SIDE", 24)
     with pytest.raises(UserError, match=r"stand-in CLIP, which `octopi scale small.* takes 32"):
         encoder.measure(root)
     monkeypatch.undo()
@@ -226,8 +226,8 @@ def test_smaller_pictures_are_means_of_blocks(arena: Arena) -> None:
     video, folder = arena.videos[0].video_id, arena.frames
     whole = FrameStore(folder, "subtract").pictures(video, [2, 0])
     np.testing.assert_array_equal(SmallerStore(folder, "subtract", encoder_cost.SIDE).pictures(video, [2, 0]), whole)
-    half = SmallerStore(folder, "subtract", 64).pictures(video, [2, 0])
-    blocks = whole.reshape(2, 64, 2, 64, 2, 3).mean(axis=(2, 4))
+    half = SmallerStore(folder, "subtract", 60).pictures(video, [2, 0])
+    blocks = whole.reshape(2, 60, 2, 60, 2, 3).mean(axis=(2, 4))
     assert np.abs(half - blocks).max() <= 0.5
     torch.manual_seed(0)
     model = SceneEncoder()

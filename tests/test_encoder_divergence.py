@@ -104,7 +104,6 @@ def test_what_diverges_between_two_reports_replaces_no_good_checkpoint(
         pictures=rng.integers(0, 256, (16, 2, 16, 16, 3), dtype=np.uint8),
         quantities=rng.normal(size=(16, 2, 5)).astype(np.float32),
         kinds=rng.integers(0, 2, (16, 4)).astype(np.uint8),
-        classes=rng.integers(0, 3, (16, 3)),
     )
     made: list[LessonModel] = []
     original: Callable[[SceneEncoder, Lessons], LessonModel] = pretraining.lesson_model
@@ -116,7 +115,7 @@ def test_what_diverges_between_two_reports_replaces_no_good_checkpoint(
     def poison(update: int) -> None:
         if update == 41:
             with torch.no_grad():
-                made[-1].object_head.weight.fill_(float("inf"))
+                made[-1].head[1].weight.fill_(float("inf"))
 
     monkeypatch.setattr(pretraining, "draw_lessons", lambda *_: lessons)
     monkeypatch.setattr(pretraining, "lesson_model", keep)

@@ -482,7 +482,6 @@ def lessons() -> Lessons:
         pictures=rng.integers(0, 256, (16, 2, 16, 16, 3), dtype=np.uint8),
         quantities=rng.normal(size=(16, 2, 5)).astype(np.float32),
         kinds=rng.integers(0, 2, (16, 4)).astype(np.uint8),
-        classes=rng.integers(0, 3, (16, 3)),
     )
 
 

@@ -13,7 +13,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.special import expit, log_softmax
+from scipy.special import expit
 
 import pipeline.parallel
 from pipeline.data import lessons as module
@@ -38,15 +38,16 @@ from pipeline.runtime import seed_everything
 from pipeline.scenes.geometry import heights
 from pipeline.scenes.invent import LAYERS, MODULUS_MPA, invent
 from pipeline.scenes.light import Sensor
-from pipeline.scenes.measure import Measured, measure
+from pipeline.scenes.measure import measure
 from pipeline.scenes.recipe import Recipe
 from pipeline.sections import FramesConfig, PretrainConfig
-from pipeline.training.pretrain import Disturbance, LessonDataset, disturb, held_out, lesson_model
+from pipeline.training import pretrain as pretraining
+from pipeline.training.pretrain import STRENGTH, LessonDataset, held_out, lesson_model, vary
 from tests.frame_rules import pillow
 
 CONFIG = PretrainConfig(objects=9, presses=3, seed=5)
 FRAMES = FramesConfig(size=32)
-ARRAYS = ("pictures", "quantities", "kinds", "classes")
+ARRAYS = ("pictures", "quantities", "kinds")
 
 
 def equal(one: Lessons, other: Lessons) -> bool:
@@ -141,12 +142,10 @@ def test_lessons_have_their_shapes_and_ranges(drawn: Lessons) -> None:
     assert (drawn.pictures.shape, drawn.pictures.dtype) == ((9, 3, 32, 32, 3), np.uint8)
     assert (drawn.quantities.shape, drawn.quantities.dtype) == ((9, 3, len(QUANTITIES)), np.float32)
     assert (drawn.kinds.shape, drawn.kinds.dtype) == ((9, len(KINDS)), np.uint8)
-    assert (drawn.classes.shape, drawn.classes.dtype) == ((9, 3), np.int64)
     assert np.isfinite(drawn.quantities).all()
     assert set(np.unique(drawn.kinds)) == {0, 1}
     assert (drawn.kinds[:, -len(BODIES) :].sum(axis=1) == 1).all(), "one body each"
     assert (drawn.kinds[:, : -len(BODIES)].sum(axis=1) <= 3).all(), "three layers at most"
-    assert ((drawn.classes >= 0) & (drawn.classes <= 2)).all()
     told = {name: drawn.quantities[..., i] for i, name in enumerate(QUANTITIES)}
     modulus, force, radius = (told[f"log10 {name}"] for name in ("modulus", "force", "contact radius"))
     assert (modulus == modulus[:, :1]).all(), "the object's, whatever the press"
@@ -158,8 +157,8 @@ def test_lessons_have_their_shapes_and_ranges(drawn: Lessons) -> None:
 
 
 @pytest.mark.parametrize("number", range(12, 20))
-def test_classes_are_those_that_the_scene_measures_as(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """From the surface and the skin under the largest force; and from the quantities, which must say the same."""
+def test_quantities_are_measured_where_they_are_shown(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Texture of the whole surface; bumps and depth of the skin in view, under each force."""
     surfaces: list[np.ndarray] = []
     skins: list[np.ndarray] = []
     texture, share = module.texture, module.bump_share
@@ -175,25 +174,15 @@ def test_classes_are_those_that_the_scene_measures_as(number: int, monkeypatch: 
 
     monkeypatch.setattr(module, "texture", note_surface)
     monkeypatch.setattr(module, "bump_share", note_skin)
-    lesson = draw_lesson(number, CONFIG, FRAMES)
-    (surface,), (*_, last) = surfaces, skins
+    told = draw_lesson(number, CONFIG, FRAMES).quantities[0].astype(np.float64)
+    (surface,) = surfaces
     assert surface.shape == (SIDE, SIDE)
-    assert last.shape == (HEIGHT, WIDTH)
-    told = lesson.quantities[0].astype(np.float64)
-    modulus = float(10 ** told[-1, 0])
-    found = measure(modulus, surface, last, PITCH)
-    assert lesson.classes[0].tolist() == [found.hardness, found.roughness, found.bumpiness]
-    again = Measured(modulus, float(10 ** told[-1, 3]) - 5e-4, float(told[-1, 4]))
-    assert lesson.classes[0].tolist() == [again.hardness, again.roughness, again.bumpiness]
-    assert told[:, 5] == pytest.approx([math.log10(skin.max() + 1e-3) for skin in skins], abs=1e-5)
-
-
-def test_bumps_are_those_under_the_largest_force(monkeypatch: pytest.MonkeyPatch) -> None:
-    shares = iter([0.5, 0.0, 0.2])
-    monkeypatch.setattr(module, "bump_share", lambda *_: next(shares))
-    lesson = draw_lesson(0, CONFIG, FRAMES)
-    assert lesson.quantities[0, :, 4] == pytest.approx([0.5, 0.0, 0.2])
-    assert lesson.classes[0, 2] == 1
+    assert {skin.shape for skin in skins} == {(HEIGHT, WIDTH)}
+    for press, skin in zip(told, skins, strict=True):
+        found = measure(float(10 ** press[0]), surface, skin, PITCH)
+        assert 10 ** press[3] - 5e-4 == pytest.approx(found.texture, rel=1e-4, abs=1e-8)
+        assert press[4] == pytest.approx(found.bump, abs=1e-6)
+        assert press[5] == pytest.approx(math.log10(skin.max() + 1e-3), abs=1e-5)
 
 
 @pytest.mark.parametrize("length", [0.6, 1.2, 2.4, 4.8, 7.0])
@@ -270,13 +259,12 @@ def test_sensors_are_made_once_and_differ() -> None:
     assert all(s.background.shape == (HEIGHT, WIDTH, 3) for s in sensors())
 
 
-# Disturbing
+# Varying
 
 
 ramp = np.arange(256, dtype=np.uint8).reshape(16, 16)
 RAMPS = np.repeat(np.stack([ramp, ramp, ramp])[..., None], 3, axis=3)
 """Three presses that show every value once in every channel."""
-NOTHING = Disturbance(strength=0, tint=0, shift=0, noise=0)
 
 
 def mirrored(pictures: np.ndarray) -> list[np.ndarray]:
@@ -289,90 +277,62 @@ def upright(pictures: np.ndarray) -> np.ndarray:
     return np.flip(pictures, tuple(axis for axis, rise in ((1, down), (2, across)) if rise < 0))
 
 
-def test_no_disturbance_only_mirrors() -> None:
+def test_presses_are_mirrored_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pretraining, "STRENGTH", (1.0, 1.0))
     pictures = np.random.default_rng(0).integers(0, 256, (3, 8, 8, 3), dtype=np.uint8)
     before = pictures.copy()
     ways = []
     for seed in range(60):
-        found = disturb(pictures, NOTHING, np.random.default_rng(seed))
+        found = vary(pictures, np.random.default_rng(seed))
         ways += [i for i, way in enumerate(mirrored(pictures)) if np.array_equal(way, found)]
     assert len(ways) == 60, "all presses alike, in one of four ways"
     assert min(ways.count(i) for i in range(4)) > 5
     assert np.array_equal(pictures, before), "what was given stays"
 
 
-@given(
-    st.integers(0, 10**6),
-    *(st.floats(0, top, allow_subnormal=False) for top in (3, 1, 60, 200)),
-    st.sampled_from([0, 1, 127, 128, 254, 255]),
-)
-def test_disturbed_pictures_stay_pictures(
-    seed: int, strength: float, tint: float, shift: float, noise: float, value: int
-) -> None:
-    amount = Disturbance(strength, tint, shift, noise)
+@given(st.integers(0, 10**6))
+def test_strengths_turn_about_the_middle(seed: int) -> None:
+    """128 + g (v - 128), rounded and cut at the ends: one factor a press."""
+    found = upright(vary(RAMPS, np.random.default_rng(seed)).astype(int))
+    assert np.array_equal(found, upright(vary(RAMPS, np.random.default_rng(seed)).astype(int))), "repeatable"
+    gains = []
+    for press in found:
+        values = press[..., 0].ravel()
+        assert (press == press[..., :1]).all(), "all channels alike"
+        inside = (values > 0) & (values < 255)
+        given_ = np.arange(256)[inside] - 128.0
+        gain = float(given_ @ (values[inside] - 128.0) / (given_ @ given_))
+        assert np.abs(values - np.clip(128 + gain * (np.arange(256) - 128), 0, 255)).max() < 1.6
+        assert values[128] == 128
+        gains.append(gain)
+    assert STRENGTH[0] - 0.01 < min(gains) <= max(gains) < STRENGTH[1] + 0.01
+    assert len(set(gains)) == 3, "each press has its own"
+
+
+@pytest.mark.parametrize("value", [0, 1, 127, 128, 254, 255])
+def test_varied_pictures_stay_pictures(value: int) -> None:
     pictures = np.full((2, 6, 5, 3), value, np.uint8)
-    found = disturb(pictures, amount, np.random.default_rng(seed))
-    assert (found.shape, found.dtype) == (pictures.shape, np.uint8)
-    assert np.array_equal(found, disturb(pictures, amount, np.random.default_rng(seed))), "the generator alone decides"
-    if value == 128 and shift == noise == 0:
-        assert (found == 128).all()
-
-
-@given(st.integers(0, 10**6), st.floats(0, 2), st.floats(0, 0.5))
-def test_gains_turn_about_the_middle(seed: int, strength: float, tint: float) -> None:
-    """128 + g (v - 128), rounded and cut at the ends: one factor a press, and one on top a channel."""
-    found = upright(disturb(RAMPS, Disturbance(strength, tint, 0, 0), np.random.default_rng(seed)).astype(int))
-    gains = np.empty((3, 3))
-    for press in range(3):
-        for channel in range(3):
-            values = found[press, ..., channel].ravel()
-            inside = (values > 0) & (values < 255)
-            given_ = np.arange(256)[inside] - 128.0
-            gain = float(given_ @ (values[inside] - 128.0) / (given_ @ given_))
-            assert np.abs(values - np.clip(128 + gain * (np.arange(256) - 128), 0, 255)).max() < 1.6
-            assert values[128] == 128
-            gains[press, channel] = gain
-    assert (np.abs(np.log(gains)) <= strength + tint + 0.02).all()
-    assert np.log(gains.max(axis=1) / gains.min(axis=1)).max() <= 2 * tint + 0.04
-
-
-def test_shifts_move_each_channel_of_each_press_as_a_whole() -> None:
-    moves = []
-    for seed in range(40):
-        found = upright(disturb(RAMPS, Disturbance(0, 0, 4, 0), np.random.default_rng(seed)).astype(int))
-        moved = (found - RAMPS)[:, 2:-2]  # Away from what is cut at 0 and 255.
-        assert (moved == moved[:, :1, :1]).all()
-        moves.append(moved[:, 0, 0])
-    assert np.std(moves) == pytest.approx(4, rel=0.15)
-    assert abs(np.mean(moves)) < 1
-    assert np.std(np.array(moves).std(axis=1)) > 0, "presses differ"
-
-
-def test_noise_is_no_more_than_said_and_differs_between_presses() -> None:
-    grey = np.full((4, 64, 64, 3), 128, np.uint8)
-    found = np.concatenate([disturb(grey, Disturbance(0, 0, 0, 6), np.random.default_rng(s)) for s in range(20)])
-    deviations = found.astype(float).std(axis=(1, 2, 3))
-    assert deviations.max() < 6.2
-    assert deviations.mean() == pytest.approx(3, abs=0.6), "even from 0 to 6"
-    assert np.abs(found.mean(axis=(1, 2, 3)) - 128).max() < 0.3
+    for seed in range(20):
+        found = vary(pictures, np.random.default_rng(seed))
+        assert (found.shape, found.dtype) == (pictures.shape, np.uint8)
+        assert (found.astype(int) - 128).min() * (value - 128) >= 0, "nothing wraps around"
 
 
 def test_a_lesson_of_a_training_depends_on_seed_epoch_and_number_alone(drawn: Lessons) -> None:
-    data = LessonDataset(drawn, augment=Disturbance(), seed=1)
+    data = LessonDataset(drawn, augment=True, seed=1)
     first = data[3]["frames"]
-    assert torch.equal(first, LessonDataset(drawn, augment=Disturbance(), seed=1)[3]["frames"])
-    assert not torch.equal(first, LessonDataset(drawn, augment=Disturbance(), seed=2)[3]["frames"])
+    assert torch.equal(first, LessonDataset(drawn, augment=True, seed=1)[3]["frames"])
+    assert not torch.equal(first, LessonDataset(drawn, augment=True, seed=2)[3]["frames"])
     data.follow(lambda: 1)
     assert not torch.equal(first, data[3]["frames"])
     data.follow(lambda: 0)
     assert torch.equal(first, data[3]["frames"])
-    plain = LessonDataset(drawn, augment=None, seed=1)
+    plain = LessonDataset(drawn, augment=False, seed=1)
     assert len(plain) == 9
     for name, kind in (("frames", torch.uint8), ("quantities", torch.float32), ("kinds", torch.float32)):
         assert plain[3][name].dtype == kind
         source = drawn.pictures if name == "frames" else getattr(drawn, name)
         np.testing.assert_array_equal(plain[3][name].numpy(), source[3])
-    np.testing.assert_array_equal(plain[3]["classes"].numpy(), drawn.classes[3])
 
 
 # Inventing
@@ -412,31 +372,28 @@ def test_bodies_and_layers_come_as_often_as_said() -> None:
 # The model
 
 
-@pytest.mark.parametrize("rare", [False, True])
-def test_the_loss_by_hand(rare: bool) -> None:
-    """In float64; `rare`: classes that the lessons lack, and a quantity that never changes."""
+@pytest.mark.parametrize("constant", [False, True])
+def test_the_loss_by_hand(constant: bool) -> None:
+    """In float64; `constant`: a quantity that never changes."""
     rng = np.random.default_rng(1)
     lessons = Lessons(
         pictures=rng.integers(0, 256, (6, 2, 32, 32, 3), dtype=np.uint8),
         quantities=rng.normal(3, 5, size=(6, 2, 4)).astype(np.float32),
         kinds=rng.integers(0, 2, (6, 3)).astype(np.uint8),
-        classes=np.array([[0, 1, 2], [0, 1, 1], [1, 1, 0], [2, 0, 0], [2, 1, 0], [2, 1, 0]]),
     )
-    if rare:
-        lessons.classes[:, 1] = 1
+    if constant:
         lessons.quantities[..., 0] = 7
     seed_everything(0)
     model = lesson_model(SceneEncoder(), lessons).eval()
     batch = slice(1, 5)
-    kinds, classes = lessons.kinds[batch].astype(np.float32), lessons.classes[batch]
-    arrays = (lessons.pictures[batch], lessons.quantities[batch], kinds, classes)
+    arrays = (lessons.pictures[batch], lessons.quantities[batch], lessons.kinds[batch].astype(np.float32))
     with torch.no_grad():
         found = {n: v.item() for n, v in model(*map(torch.from_numpy, arrays)).items()}
         pictures = torch.from_numpy(lessons.pictures[batch].reshape(-1, 32, 32, 3))
         features = model.encoder(pictures, torch.zeros(8)).double().numpy()
     weights = {n: p.detach().double().numpy() for n, p in model.named_parameters()}
-    hidden = np.maximum(features @ weights["frame_head.1.weight"].T + weights["frame_head.1.bias"], 0)
-    told = (hidden @ weights["frame_head.3.weight"].T + weights["frame_head.3.bias"]).reshape(4, 2, 7)
+    hidden = np.maximum(features @ weights["head.1.weight"].T + weights["head.1.bias"], 0)
+    told = (hidden @ weights["head.3.weight"].T + weights["head.3.bias"]).reshape(4, 2, 7)
     exact = lessons.quantities.astype(np.float64)
     wanted = (exact[batch] - exact.mean(axis=(0, 1))) / (exact.std(axis=(0, 1)) + 1e-6)
     off = np.abs(told[..., :4] - wanted)
@@ -444,29 +401,21 @@ def test_the_loss_by_hand(rare: bool) -> None:
     chances = expit(told[..., 4:])
     present = np.repeat(lessons.kinds[batch, None].astype(float), 2, axis=1)
     flags = -(present * np.log(chances) + (1 - present) * np.log(1 - chances)).mean()
-    means = features.reshape(4, 2, -1).mean(axis=1)
-    logits = np.split(means @ weights["object_head.weight"].T + weights["object_head.bias"], 3, axis=1)
-    told_classes = 0.0
-    for position, z in enumerate(logits):
-        shares = np.maximum([np.mean(lessons.classes[:, position] == c) for c in range(3)], 1e-3)
-        weight = 1 / (3 * shares)[classes[:, position]]
-        told_classes += (weight * -log_softmax(z, axis=1)[range(4), classes[:, position]]).sum() / weight.sum()
     assert found["quantities"] == pytest.approx(quantities, rel=1e-5)
     assert found["kinds"] == pytest.approx(flags, rel=1e-5)
-    assert found["classes"] == pytest.approx(told_classes, rel=1e-5)
-    assert found["loss"] == pytest.approx(2 * quantities + 0.6 * flags + 0.3 * told_classes, rel=1e-5)
+    assert found["loss"] == pytest.approx(2 * quantities + 0.6 * flags, rel=1e-5)
 
 
 def test_held_out_parts_are_means_over_lessons(drawn: Lessons) -> None:
     seed_everything(0)
     model = lesson_model(SceneEncoder(), drawn)
-    data = LessonDataset(drawn, augment=None, seed=0)
+    data = LessonDataset(drawn, augment=False, seed=0)
     found = held_out(model, data)
     assert isinstance(model, LessonModel)
     assert not model.training
     with torch.no_grad():
         single = [model(**{n: v[None] for n, v in data[i].items()}) for i in range(9)]
     assert found == pytest.approx(
-        {f"held_out_{n}": np.mean([s[n].item() for s in single]) for n in ("loss", "quantities", "kinds", "classes")}
+        {f"held_out_{n}": np.mean([s[n].item() for s in single]) for n in ("loss", "quantities", "kinds")}
     )
     assert found == held_out(model, data), "nothing is dropped at random"

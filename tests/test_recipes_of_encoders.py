@@ -510,10 +510,23 @@ def test_frames_of_a_whole_multiple_are_block_means(factor: int, kind: str, weig
     )
 
 
+@pytest.mark.parametrize("side", [33, 45, 60])
+def test_other_larger_frames_are_means_over_areas(side: int, weights: Path) -> None:
+    """Each pixel of the tower's is the mean of all that its share of the frame touches."""
+    encoder = base_encoder(config(weights, "paper"))
+    frames = np.random.default_rng(side).integers(0, 256, (2, side, side, 3), dtype=np.uint8)
+    borders = [(i * side // 32, -(-(i + 1) * side // 32)) for i in range(32)]
+    means = np.array(
+        [[frames[:, a:b, c:d].astype(float).mean(axis=(1, 2)) for c, d in borders] for a, b in borders]
+    ).transpose(2, 0, 1, 3)
+    tower = Tower(weights)
+    close(encoder(torch.from_numpy(frames), torch.zeros(2)), tower.embedding(tower.token(means, [])))
+
+
 @given(st.integers(16, 1024))
 @settings(max_examples=200)
-def test_only_whole_multiples_of_the_side_are_taken(weights: Path, size: int) -> None:
-    if any(size == 32 * factor for factor in range(1, 33)):
+def test_no_smaller_frames_are_taken(weights: Path, size: int) -> None:
+    if size >= 32:
         check_encoder(weights, size)
     else:
         with pytest.raises(UserError, match=rf"frames\.size is {size} .* frames\.size=32$"):

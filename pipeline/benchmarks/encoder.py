@@ -73,7 +73,7 @@ from pipeline.videos import list_videos
 
 Format = Literal["float32", "bfloat16", "int8"]
 
-SIDES = (96, 64, 32)
+SIDES = (90, 60, 30)
 COUNTS = (1, 2, 3, 10)
 FORMATS: tuple[Format, ...] = ("float32", "bfloat16", "int8")
 FOLDS, REPEATS = 5, 3

@@ -43,7 +43,7 @@ from pipeline.sections import FramesConfig
 from pipeline.training.cross_validation import Arena, frozen_encoder
 from pipeline.videos import VideoFile
 
-SIDE = 128
+SIDE = 120
 FRAMES = 5
 SEED = 0
 SAMPLE = 25

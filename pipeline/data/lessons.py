@@ -2,7 +2,7 @@
 
 A lesson is one invented object (`pipeline.scenes.invent`), pressed at a few forces into as many sensors of different
 light. Its pictures are differences to the no-contact frame, made as those of real videos are. Nothing of any real
-object goes in but the sensor's measured light and the classes' borders.
+object goes in but the sensor's measured light.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from pipeline.scenes.contact import Body, Method
 from pipeline.scenes.geometry import IMAGE_MM, Heights, heights
 from pipeline.scenes.invent import LAYERS, invent
 from pipeline.scenes.light import Image, Sensor, make_sensor, shade
-from pipeline.scenes.measure import CUTOFF, Measured, bump_share, texture
+from pipeline.scenes.measure import CUTOFF, bump_share, texture
 from pipeline.sections import FramesConfig, PretrainConfig
 
 WIDTH, HEIGHT = 160, 120
@@ -74,9 +74,6 @@ class Lessons:
     """Lessons x presses x `QUANTITIES`."""
     kinds: npt.NDArray[np.uint8]
     """Lessons x `KINDS`."""
-    classes: npt.NDArray[np.int64]
-    """Lessons x (hardness, roughness, bumpiness), measured as the catalogue's scenes are; bumpiness under the largest
-    force."""
 
 
 @dataclass(frozen=True)
@@ -113,23 +110,25 @@ def draw_lesson(number: int, config: PretrainConfig, frames: FramesConfig) -> Le
     forces = np.sort(np.exp(rng.uniform(math.log(FORCES[0]), math.log(FORCES[1]), config.presses)))
     pressed = Body(surface, recipe.modulus, PITCH).press(METHOD, forces)
     rough = texture(surface, PITCH)
-    pictures, quantities, bumps = [], [], 0.0
+    pictures, quantities = [], []
     for force, whole, area in zip(forces.tolist(), pressed.skins, pressed.areas.tolist(), strict=True):
         place = _place(rng)
         skin, shown = _view(whole, place), _view(surface, place)
-        bumps = bump_share(skin, PITCH)
         touched = skin > 0.15 * max(float(skin.max()), 1e-6)
         known = [np.log10(recipe.modulus), np.log10(force), np.log10(area / np.pi + 0.05) / 2, np.log10(rough + 5e-4)]
-        known += [bumps, np.log10(float(skin.max()) + 1e-3), *_bands(shown, touched), *_bands(skin, touched)]
+        known += [
+            bump_share(skin, PITCH),
+            np.log10(float(skin.max()) + 1e-3),
+            *_bands(shown, touched),
+            *_bands(skin, touched),
+        ]
         quantities.append(known)
         pictures.append(_picture(skin, sensors()[int(rng.integers(SENSORS))], rng, frames))
     present = {layer.kind for layer in recipe.relief} | {recipe.body.kind}
-    measured = Measured(recipe.modulus, rough, bumps)
     return Lessons(
         pictures=np.stack(pictures)[None],
         quantities=np.array(quantities, np.float32)[None],
         kinds=np.array([[kind in present for kind in KINDS]], np.uint8),
-        classes=np.array([[measured.hardness, measured.roughness, measured.bumpiness]], np.int64),
     )
 
 

@@ -1,8 +1,7 @@
-"""A small convolutional encoder of difference pictures, and the lessons' heads that pretrain it on scenes."""
+"""A small convolutional encoder of difference pictures, and the lessons' head that pretrain it on scenes."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import cast
 
 import torch
@@ -17,8 +16,8 @@ STEPS = 12
 CHANNELS = ((16, 2), (32, 2), (48, 1), (64, 2), (96, 1), (128, 2), (128, 1))
 """Outputs and stride of each convolution; the first is 5 x 5, the others 3 x 3."""
 HIDDEN = 192
-WEIGHTS = {"quantities": 2.0, "kinds": 0.6, "classes": 0.3}
-"""Of the three parts of the loss."""
+WEIGHTS = {"quantities": 2.0, "kinds": 0.6}
+"""Of the two parts of the loss."""
 
 
 class SceneEncoder(FrameEncoder):
@@ -47,55 +46,38 @@ class SceneEncoder(FrameEncoder):
 
 
 class LessonModel(nn.Module):
-    """The encoder with heads that tell what is known of invented objects.
+    """The encoder with a head that tells what is known of invented objects from single pictures.
 
     Args:
         encoder: To be pretrained.
         quantities: Mean and deviation of each quantity over the lessons, 2 x quantities.
         kinds: How many flags there are.
-        shares: Share of each class of each property among the lessons; rare classes weigh more.
     """
 
     _keys_to_ignore_on_save = None  # read by transformers' Trainer when it reloads a checkpoint
 
-    def __init__(
-        self, encoder: SceneEncoder, quantities: torch.Tensor, kinds: int, shares: Sequence[torch.Tensor]
-    ) -> None:
+    def __init__(self, encoder: SceneEncoder, quantities: torch.Tensor, kinds: int) -> None:
         super().__init__()
         self.encoder = encoder
         self.scale = quantities
-        self.shares = [share.clamp(min=1e-3) for share in shares]
         told = quantities.shape[1] + kinds
-        self.frame_head = nn.Sequential(
-            nn.Dropout(0.1), nn.Linear(encoder.dim, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, told)
-        )
-        self.object_head = nn.Linear(encoder.dim, sum(len(s) for s in shares))
+        self.head = nn.Sequential(nn.Dropout(0.1), nn.Linear(encoder.dim, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, told))
 
-    def forward(
-        self, frames: torch.Tensor, quantities: torch.Tensor, kinds: torch.Tensor, classes: torch.Tensor
-    ) -> dict[str, torch.Tensor]:
-        """The loss of some lessons: quantities by Huber's loss, kinds and classes by cross-entropy.
+    def forward(self, frames: torch.Tensor, quantities: torch.Tensor, kinds: torch.Tensor) -> dict[str, torch.Tensor]:
+        """The loss of some lessons: quantities, standardised, by Huber's loss, kinds by cross-entropy.
 
         Args:
             frames: uint8, lessons x presses x side x side x RGB.
             quantities: float32, lessons x presses x quantities.
             kinds: float32, lessons x kinds.
-            classes: int64, lessons x properties; told from the mean over a lesson's presses.
         """
         lessons, presses = frames.shape[:2]
         features = self.encoder(frames.flatten(0, 1), torch.zeros(lessons * presses, dtype=torch.int64))
-        numbers, flags = self.frame_head(features).split([quantities.shape[2], kinds.shape[1]], dim=1)
+        numbers, flags = self.head(features).split([quantities.shape[2], kinds.shape[1]], dim=1)
         mean, deviation = self.scale.to(quantities)
         wanted = ((quantities - mean) / deviation).flatten(0, 1)
-        logits = self.object_head(features.view(lessons, presses, -1).mean(1)).split([len(s) for s in self.shares], 1)
         parts = {
             "quantities": F.smooth_l1_loss(numbers, wanted),
             "kinds": F.binary_cross_entropy_with_logits(flags, kinds.repeat_interleave(presses, dim=0)),
-            "classes": torch.stack(
-                [
-                    F.cross_entropy(z, y, weight=(1 / (len(s) * s)).to(z))
-                    for z, y, s in zip(logits, classes.unbind(1), self.shares, strict=True)
-                ]
-            ).sum(),
         }
         return {"loss": cast(torch.Tensor, sum(WEIGHTS[name] * part for name, part in parts.items())), **parts}

@@ -49,7 +49,7 @@ class TactileEncoder(FrameEncoder):
     """CLIP's frozen visual tower, with visual prompts or (the base encoder) without, read as CLIP reads it.
 
     Args:
-        tower: The tower; it takes frames of its own side, or of a whole multiple, whose blocks are averaged.
+        tower: The tower; it takes frames of its own side or larger ones, which are averaged over areas.
         prompts: Prompts for it, not yet attached.
     """
 
@@ -79,7 +79,7 @@ class TactileEncoder(FrameEncoder):
         """Frames as the tower takes them: batch x 3 x side x side, normalised."""
         pixels = frames.permute(0, 3, 1, 2).to(self.mean.dtype) / 255
         if pixels.shape[-1] != self.image.size:
-            pixels = F.avg_pool2d(pixels, pixels.shape[-1] // self.image.size)
+            pixels = F.interpolate(pixels, self.image.size, mode="area")
         return (pixels - self.mean) / self.std
 
 

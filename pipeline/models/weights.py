@@ -28,7 +28,7 @@ def clip_file(folder: Path) -> Path:
 def check_encoder(folder: Path, size: int) -> None:
     """Raise UserError where `folder` holds no open_clip model as safetensors that takes frames of side `size`.
 
-    A whole multiple of its own side will do: the encoder averages blocks.
+    Larger frames than its own will do: the encoder averages over areas.
     """
     mend = GET_CLIP.format(folder=folder)
     if not (folder / CLIP_CONFIG).is_file():
@@ -43,10 +43,9 @@ def check_encoder(folder: Path, size: int) -> None:
         wanted = int(config["model_cfg"]["vision_cfg"]["image_size"])
     except (json.JSONDecodeError, KeyError, TypeError, ValueError):
         raise UserError(f"encoder.weights: {folder / CLIP_CONFIG} is no open_clip configuration; {mend}") from None
-    if size % wanted:
+    if size < wanted:
         raise UserError(
-            f"frames.size is {size} but the encoder in {folder} takes {wanted}, or a multiple of it; set "
-            f"frames.size={wanted}"
+            f"frames.size is {size} but the encoder in {folder} takes {wanted} or more; set frames.size={wanted}"
         )
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import math
 import shutil
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -36,26 +36,14 @@ HELD_OUT = 0.04
 """Share of the lessons that the loss is told on at the end."""
 REPORTS = 24
 """Points of the curve."""
-
-
-@dataclass(frozen=True)
-class Disturbance:
-    """How far the light of a picture may be off: what differs between sensors more than the drawn ones show."""
-
-    strength: float = 0.5
-    """Largest logarithm of the factor on all channels."""
-    tint: float = 0.16
-    """The same for each channel alone."""
-    shift: float = 1.2
-    """Deviation of a shift of each channel, in steps of the difference picture."""
-    noise: float = 3.6
-    """Largest deviation of noise, in the same steps."""
+STRENGTH = (0.7, 1.4)
+"""How much weaker or stronger the light of a picture may be."""
 
 
 class LessonDataset(EpochDataset[dict[str, torch.Tensor]]):
     """Lessons as `LessonModel` takes them; what is done to pictures depends on seed, epoch and lesson alone."""
 
-    def __init__(self, lessons: Lessons, *, augment: Disturbance | None, seed: int) -> None:
+    def __init__(self, lessons: Lessons, *, augment: bool, seed: int) -> None:
         super().__init__()
         self.lessons = lessons
         self.augment = augment
@@ -68,29 +56,22 @@ class LessonDataset(EpochDataset[dict[str, torch.Tensor]]):
         pictures = self.lessons.pictures[index]
         if self.augment:
             rng = np.random.default_rng(derive_seed(self.seed, self.epoch, index))
-            pictures = disturb(pictures, self.augment, rng)
+            pictures = vary(pictures, rng)
         return {
             "frames": torch.from_numpy(np.ascontiguousarray(pictures)),
             "quantities": torch.from_numpy(self.lessons.quantities[index]),
             "kinds": torch.from_numpy(self.lessons.kinds[index].astype(np.float32)),
-            "classes": torch.from_numpy(self.lessons.classes[index]),
         }
 
 
-def disturb(pictures: npt.NDArray[np.uint8], amount: Disturbance, rng: np.random.Generator) -> npt.NDArray[np.uint8]:
+def vary(pictures: npt.NDArray[np.uint8], rng: np.random.Generator) -> npt.NDArray[np.uint8]:
     """Mirror a lesson's pictures, all alike, and vary the light of each: uint8, presses x side x side x RGB."""
     axes = tuple(axis for axis in (1, 2) if rng.random() < 0.5)
-    pictures = np.flip(pictures, axes) if axes else pictures
-    presses = len(pictures)
-    gain = rng.uniform(-amount.strength, amount.strength, (presses, 1, 1, 1))
-    gain = np.exp(gain + rng.uniform(-amount.tint, amount.tint, (presses, 1, 1, 3))).astype(np.float32)
-    offset = MIDDLE * (1 - gain) + rng.normal(0, amount.shift, (presses, 1, 1, 3)).astype(np.float32)
-    deviation = rng.uniform(0, amount.noise, (presses, 1, 1, 1)).astype(np.float32)
-    changed = rng.standard_normal(pictures.shape, dtype=np.float32)
-    changed *= deviation
-    changed += pictures * gain
-    changed += offset
-    return np.clip(np.rint(changed, out=changed), 0, 255).astype(np.uint8)
+    low, high = map(math.log, STRENGTH)
+    strength = np.exp(rng.uniform(low, high, (len(pictures), 1, 1, 1))).astype(np.float32)
+    varied = MIDDLE + strength * (np.flip(pictures, axes).astype(np.float32) - MIDDLE)
+    shown: npt.NDArray[np.uint8] = np.clip(np.rint(varied), 0, 255).astype(np.uint8)
+    return shown
 
 
 def pretrain(
@@ -126,26 +107,25 @@ def pretrain(
         weight_decay=config.weight_decay,
         warmup_steps=round(WARMUP * config.steps),
         logging_steps=max(1, config.steps // REPORTS),
-        label_names=["classes"],
+        label_names=["kinds"],
     )
     trainer = TrainableTrainer(
         model=model,
         args=arguments,
-        train_dataset=LessonDataset(taught, augment=Disturbance() if config.augment else None, seed=config.seed),
+        train_dataset=LessonDataset(taught, augment=config.augment, seed=config.seed),
         callbacks=[Watch(log)],
     )
     history = train(trainer).history
-    told = held_out(model.cpu(), LessonDataset(held, augment=None, seed=0))
+    told = held_out(model.cpu(), LessonDataset(held, augment=False, seed=0))
     shutil.rmtree(work, ignore_errors=True)
     return model.encoder, [*history, *(Measurement(step=config.steps, name=n, value=v) for n, v in told.items())]
 
 
 def lesson_model(encoder: SceneEncoder, lessons: Lessons) -> LessonModel:
-    """The encoder with heads scaled to these lessons."""
+    """The encoder with a head scaled to these lessons."""
     flat = lessons.quantities.reshape(-1, lessons.quantities.shape[2])
     scale = torch.from_numpy(np.stack([flat.mean(axis=0), flat.std(axis=0) + 1e-6]))
-    shares = [torch.from_numpy(np.bincount(column, minlength=3) / len(column)) for column in lessons.classes.T]
-    return LessonModel(encoder, scale, lessons.kinds.shape[1], shares)
+    return LessonModel(encoder, scale, lessons.kinds.shape[1])
 
 
 @torch.inference_mode()
