@@ -68,6 +68,17 @@ class Settings(Section):
             raise ValueError(f"data.dir must be {SCENES_DIR} where data.source is scenes (set data.source=videos?)")
         return self
 
+    @model_validator(mode="after")
+    def _contestants_have_their_settings(self) -> Self:
+        models = self.cross_validation.models
+        borrowed = [n for n in models if CONTESTANTS[n].kind == "gradient" and not CONTESTANTS[n].settings]
+        if borrowed and self.encoder.recipe == "release":
+            raise ValueError(
+                f"cross_validation.models: {borrowed[0]} would be trained with the settings of encoder.recipe=release; "
+                "compare it under recipe paper or strong"
+            )
+        return self
+
     @property
     def report_name(self) -> str:
         """The folder in reports/ that this scale and source report into."""

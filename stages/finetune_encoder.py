@@ -28,11 +28,15 @@ def main() -> None:
         )
         inputs = [DATA / "frames" / name for name in (TABLE_FILE, REFERENCES_FILE)] + [DATA / "splits.parquet"]
         inputs.append(clip_file(Path(params.encoder.weights)))
-        if params.plan.pretrain:
-            inputs.insert(0, Path(params.plan.pretrained) / "encoder.safetensors")
         with live_run(params, run.name, Path()) as live:
             model, history = finetune(
-                data, params.encoder, params.runtime, seed=params.seed + seed, inputs=inputs, log=live.log
+                data,
+                params.encoder,
+                params.runtime,
+                seed=params.seed + seed,
+                inputs=inputs,
+                pretrained=Path(params.plan.pretrained) / "encoder.safetensors",
+                log=live.log,
             )
         device = resolve_device(params.runtime.device)
         judged = classify(model, data, [Part.VALIDATION, Part.TEST], params.encoder.batch_size, device)

@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import av
 import cv2
@@ -15,6 +16,9 @@ from hypothesis import settings
 
 from pipeline.physiclear.catalogue import Catalogue, load_catalogue
 from pipeline.records import Video
+
+if TYPE_CHECKING:
+    import torch
 
 ROOT = Path(__file__).parents[1]
 DATA_VARIABLE = "OCTOPI_DATA_DIR"
@@ -41,6 +45,28 @@ def real_data() -> Path:
 @pytest.fixture(scope="session")
 def catalogue() -> Catalogue:
     return load_catalogue(ROOT / "pipeline" / "physiclear")
+
+
+@pytest.fixture(scope="session")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tiny CLIP."""
+    from tests.encoders import write_tower
+
+    return write_tower(tmp_path_factory.mktemp("clip"))
+
+
+@pytest.fixture
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Checkpoints go to a folder of the working directory."""
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def frames() -> torch.Tensor:
+    """Four clips of three frames for the tiny CLIP."""
+    import torch
+
+    return torch.from_numpy(np.random.default_rng(0).integers(0, 256, (4, 3, 32, 32, 3), dtype=np.uint8))
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray]) -> Path:

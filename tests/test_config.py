@@ -163,5 +163,8 @@ def test_a_recipe_brings_its_settings_and_gives_way_to_yours() -> None:
     assert {name: getattr(release, name) for name in RELEASE} == RELEASE, "the contestant is the recipe"
     own = compose("small", ["encoder.recipe=release", "encoder.epochs=3"], conf=CONF).encoder
     assert (own.epochs, own.batch_size) == (3, RELEASE["batch_size"])
+    with pytest.raises(UserError, match=r"cross_validation.models: paper would be trained with the settings of"):
+        compose("small", ["encoder.recipe=release", "cross_validation.models=[trees,paper]"], conf=CONF)
+    compose("small", ["encoder.recipe=release", "cross_validation.models=[trees,release]"], conf=CONF)
     with pytest.raises(UserError, match=r"encoder.recipe=strong .* set encoder.reference=subtract"):
         compose("smoke", ["encoder.recipe=strong", "encoder.reference=none"], conf=CONF)

@@ -47,15 +47,10 @@ from pipeline.training.votes import Clips, Votes, fit_votes
 from tests.audit_records import probe
 from tests.closure import ROOT
 from tests.conftest import encode, fake_videos, moving_square
-from tests.test_recipes_of_encoders import write_frames, write_tower
+from tests.encoders import write_frames
 
 OBJECTS = ("baseball", "controller_base", "cotton_ball", "ice_block", "millet", "pillow", "rug")
 CONFIG = CrossValidationConfig(folds=3, repeats=2, seed=4)
-
-
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_tower(tmp_path_factory.mktemp("clip"))
 
 
 @pytest.fixture(autouse=True)

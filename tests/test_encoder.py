@@ -37,11 +37,6 @@ def config(weights: Path, prompts: int = 2, recipe: Recipe = "paper") -> Encoder
 MOMENTS = torch.tensor([[0, 5, 9]] * 4)
 
 
-@pytest.fixture
-def frames() -> torch.Tensor:
-    return torch.from_numpy(np.random.default_rng(0).integers(0, 256, (4, 3, 32, 32, 3), dtype=np.uint8))
-
-
 def test_base_encoder_is_open_clips_own_embedding(weights: Path, frames: torch.Tensor) -> None:
     import open_clip
     from PIL import Image

@@ -24,25 +24,21 @@ from pipeline.training.encoder import EncoderData, fit_heads, train_classifier
 from pipeline.training.pretrain import pretrain
 from tests.closure import ROOT
 from tests.conftest import fake_videos
+from tests.encoders import CPU, PARTS, encoder_data, write_frames, write_tower
 from tests.test_encoder_stability import (
     CLASSES,
-    CPU,
-    PARTS,
     Hook,
     Sick,
     before_updates,
     classifier,
-    elsewhere,
-    encoder_data,
     same,
     settings_of,
-    weights,
     with_a_bright_video,
 )
-from tests.test_recipes_of_encoders import write_frames, write_tower
 
-__all__ = ["before_updates", "elsewhere", "weights"]
-"""Fixtures."""
+__all__ = ["before_updates"]
+"""A fixture."""
+pytestmark = pytest.mark.usefixtures("elsewhere")
 WRITTEN = (
     "model.safetensors",
     "training_args.bin",
@@ -97,7 +93,7 @@ def test_a_last_step_that_diverges_is_told(weights: Path, catalogue: Catalogue, 
 
 
 def test_what_diverges_between_two_reports_replaces_no_good_checkpoint(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, before_updates: Hook, elsewhere: None
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, before_updates: Hook
 ) -> None:
     rng = np.random.default_rng(0)
     lessons = Lessons(
@@ -151,6 +147,6 @@ def test_more_folds_than_objects_is_one_line(tmp_path: Path) -> None:
         judge(CONTESTANTS["constant"], two_objects(tmp_path), CrossValidationConfig(folds=5))
 
 
-def test_one_training_object_leaves_none_to_validate_by(tmp_path: Path, elsewhere: None) -> None:
+def test_one_training_object_leaves_none_to_validate_by(tmp_path: Path) -> None:
     judged = judge(CONTESTANTS["paper"], two_objects(tmp_path), CrossValidationConfig(folds=2, repeats=1))
     assert len(judged) == 4

@@ -30,30 +30,14 @@ from pipeline.training.embed import embed_videos
 from pipeline.training.encoder import EncoderData, classify, fit_heads, train_classifier
 from pipeline.training.pretrain import pretrain
 from pipeline.training.votes import STRENGTHS, fit_votes
-from tests.test_recipes_of_encoders import CPU, OBJECTS, PARTS, config, encoder_data, write_frames, write_tower
+from tests.encoders import CPU, MOMENTS, OBJECTS, PARTS, config, encoder_data, write_frames
 
 CLASSES = [3, 3, 3]
 DEVICE = torch.device("cpu")
 KINDS = ("paper", "release", "strong", "scratch")
 
 
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_tower(tmp_path_factory.mktemp("clip"))
-
-
-@pytest.fixture(autouse=True)
-def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Checkpoints go to a folder of the working directory."""
-    monkeypatch.chdir(tmp_path)
-
-
-@pytest.fixture
-def frames() -> torch.Tensor:
-    return torch.from_numpy(np.random.default_rng(0).integers(0, 256, (4, 3, 32, 32, 3), dtype=np.uint8))
-
-
-MOMENTS = torch.tensor([[0, 5, 9], [1, 2, 40_000], [7, 7, 7], [3, 10**6, 4]])
+pytestmark = pytest.mark.usefixtures("elsewhere")
 
 
 def seasoned(encoder: SceneEncoder) -> SceneEncoder:

@@ -1,4 +1,4 @@
-"""A small convolutional encoder of difference pictures, and the lessons' head that pretrain it on scenes."""
+"""A small convolutional encoder of difference pictures, and the lessons' head that pretrains it on scenes."""
 
 from __future__ import annotations
 

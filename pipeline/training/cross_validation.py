@@ -182,7 +182,8 @@ def _votes(contestant: Contestant, arena: Arena) -> Predict:
 def frozen_encoder(contestant: Contestant, arena: Arena) -> FrameEncoder:
     """The encoder whose frames vote."""
     if contestant.encoder == "clip":
-        return base_encoder(arena.encoder)
+        # As CLIP reads it, whatever the recipe of the chain.
+        return base_encoder(arena.encoder.model_copy(update={"recipe": "paper"}))
     seed_everything(0)
     encoder = SceneEncoder()
     if contestant.encoder == "scenes":

@@ -68,13 +68,14 @@ def finetune(
     *,
     seed: int,
     inputs: Sequence[Path],
+    pretrained: Path,
     log: Log | None = None,
 ) -> tuple[PropertyClassifier, list[Measurement]]:
     """Train the classifier of the recipe.
 
     Args:
-        inputs: Files that the training depends on, for the checkpoints' fingerprint; for `strong` the first is the
-            pretrained encoder.
+        inputs: Files that a training by gradients depends on, for its checkpoints' fingerprint.
+        pretrained: File of the encoder that scenes have pretrained; read for `strong` alone.
 
     Returns:
         The classifier, and its training's curve.
@@ -82,7 +83,7 @@ def finetune(
     seed_everything(seed)
     model = property_classifier(config, data.classes)
     if isinstance(model, FrameVotes):
-        load_trainable(model.encoder, inputs[0])
+        load_trainable(model.encoder, pretrained)
         return model, fit_heads(model, data, config, runtime, seed)
     return model, train_classifier(model, data, config, runtime, seed=seed, inputs=inputs, log=log)
 

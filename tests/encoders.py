@@ -1,0 +1,94 @@
+"""What the tests of encoders share: tiny towers, frames as extraction leaves them, settings, comparisons."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors.torch import load_file, save_file
+
+from pipeline.artifacts import write_table
+from pipeline.frames.store import FRAMES_FILE, REFERENCES_FILE, TABLE_FILE, FrameStore
+from pipeline.physiclear.catalogue import Catalogue
+from pipeline.records import Assignment, Frame, Part
+from pipeline.sections import EncoderConfig, Recipe, RuntimeConfig
+from pipeline.training.encoder import EncoderData
+from pipeline.training.votes import Votes
+from tests.checkpoints import write_clip
+
+Floats = np.ndarray
+CPU = RuntimeConfig(device="cpu", save_steps=2)
+MOMENTS = torch.tensor([[0, 5, 9], [1, 2, 40_000], [7, 7, 7], [3, 10**6, 4]])
+OBJECTS = ("baseball", "rug", "pillow", "potato", "cotton_ball", "ice_block", "millet")
+PARTS = {o: Part.VALIDATION if i > 4 else Part.TRAIN for i, o in enumerate(OBJECTS)}
+"""Five videos to train on, two to choose by."""
+
+
+def write_tower(folder: Path, *, averages: bool = False) -> Path:
+    """A tiny CLIP none of whose biases is 0 and none of whose scales is 1: fresh ones would hide a wrong layer.
+
+    Args:
+        averages: Whether its embedding is read from the mean over patches, in place of the class token.
+    """
+    file = write_clip(folder) / "open_clip_model.safetensors"
+    if averages:
+        form = folder / "open_clip_config.json"
+        form.write_text(form.read_text().replace('"vision_cfg": {', '"vision_cfg": {"pool_type": "avg", '))
+    draw = torch.Generator().manual_seed(1)
+    save_file({k: v + 0.2 * torch.randn(v.shape, generator=draw) for k, v in load_file(file).items()}, file)
+    return folder
+
+
+def write_frames(folder: Path, lengths: Mapping[str, int], side: int = 32, seed: int = 0) -> Path:
+    """What extraction would leave of videos with so many kept frames; every third frame was kept."""
+    folder.mkdir(parents=True, exist_ok=True)
+    rng = np.random.default_rng(seed)
+    index = [(video, 3 * i) for video, count in lengths.items() for i in range(count)]
+    for name, count in ((FRAMES_FILE, len(index)), (REFERENCES_FILE, len(lengths))):
+        np.save(folder / name, rng.integers(0, 256, (count, side, side, 3), dtype=np.uint8))
+    rows = [Frame(video_id=v, frame_index=i, score=0, row=row) for row, (v, i) in enumerate(index)]
+    write_table(folder / TABLE_FILE, Frame, rows)
+    return folder
+
+
+def encoder_data(folder: Path, catalogue: Catalogue, parts: Mapping[str, Part], per_video: int = 2) -> EncoderData:
+    """Videos of 4, 1 and 3 frames by turns, one an object, in these parts."""
+    write_frames(folder, {f"{o}_0": (4, 1, 3)[i % 3] for i, o in enumerate(parts)})
+    assignments = [Assignment(video_id=f"{o}_0", object_id=o, part=part) for o, part in parts.items()]
+    return EncoderData(FrameStore(folder), catalogue, assignments, per_video)
+
+
+def config(weights: Path, recipe: Recipe, **changes: object) -> EncoderConfig:
+    return EncoderConfig.model_validate(
+        {
+            "recipe": recipe,
+            "weights": str(weights),
+            "prompts": 3,
+            "reference": "subtract" if recipe == "strong" else "none",
+            **changes,
+        }
+    )
+
+
+def float64(tensor: torch.Tensor) -> Floats:
+    return tensor.detach().double().numpy()
+
+
+def close(found: torch.Tensor, expected: Floats, rtol: float = 1e-5) -> None:
+    """Within float32's rounding, for the array as a whole."""
+    assert found.dtype == torch.float32
+    np.testing.assert_allclose(float64(found), expected, rtol=0, atol=rtol * max(1, np.abs(expected).max()))
+
+
+def drawn_votes(seed: int, dim: int, classes: Sequence[int], strength: float) -> Votes:
+    """Votes that nobody fitted."""
+    rng = np.random.default_rng(seed)
+    return Votes(
+        centre=rng.normal(size=dim).astype(np.float32),
+        spread=rng.uniform(0.1, 3, dim).astype(np.float32),
+        weights=[strength * rng.normal(size=(c, dim)) for c in classes],
+        biases=[strength * rng.normal(size=c) for c in classes],
+        dependence=rng.normal(size=tuple(classes)),
+    )
