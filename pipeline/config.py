@@ -108,6 +108,7 @@ def plan_of(settings: Settings) -> Plan:
         settings.ablation.seeds,
         pretrained=settings.encoder.recipe == "strong",
         compared={name: CONTESTANTS[name].pretrained for name in settings.cross_validation.models},
+        counterfactuals=settings.ablation.counterfactuals,
     )
 
 

@@ -14,7 +14,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from pipeline.records import Opd
+from pipeline.records import Opd, Touch
 
 NOTHING = "data/videos.parquet"
 """Stands where a stage needs nothing: DVC has no optional dependencies, and every stage comes after this table."""
@@ -74,6 +74,8 @@ class Variant(_Entry):
     embeddings: str
     model_dir: str
     """Folder of its trained part: the alignment's, or the end-to-end fine-tuning's."""
+    touch: Touch = Touch.REAL
+    """Anything else makes it a counterfactual of the variant with the same axes."""
 
 
 class Plan(_Entry):
@@ -94,6 +96,10 @@ class Plan(_Entry):
     variants: dict[str, Variant]
 
 
+FULL = (Encoder.FINETUNED, Lora.WITH, Opd.ALL)
+"""The system as the paper proposes it; the counterfactuals are put to it."""
+
+
 def variant_axes(plan: PlanName) -> list[tuple[Encoder, Lora, Opd]]:
     """The variants of a plan, without seeds.
 
@@ -102,11 +108,10 @@ def variant_axes(plan: PlanName) -> list[tuple[Encoder, Lora, Opd]]:
     """
     if plan == "factorial":
         return list(itertools.product(Encoder, Lora, Opd))
-    full = (Encoder.FINETUNED, Lora.WITH, Opd.ALL)
     if plan == "single":
-        return [full]
+        return [FULL]
     return [
-        full,
+        FULL,
         (Encoder.FINETUNED, Lora.WITH, Opd.NONE),
         (Encoder.BASE, Lora.WITH, Opd.ALL),
         (Encoder.FINETUNED, Lora.WITHOUT, Opd.ALL),
@@ -120,12 +125,14 @@ def resolve_plan(
     *,
     pretrained: bool = False,
     compared: Mapping[str, bool] | None = None,
+    counterfactuals: Sequence[Touch] = (),
 ) -> Plan:
     """Unfold a plan over seeds into the stages that it needs.
 
     Args:
         pretrained: Whether the encoder's recipe begins with a pretraining.
         compared: Models to cross-validate, each with whether it begins with a pretraining.
+        counterfactuals: What the full system also answers on in place of its videos.
     """
     compared = compared or {}
     embeddings: dict[str, EmbeddingJob] = {}
@@ -142,7 +149,7 @@ def resolve_plan(
         align[job_key] = job
         if adapter is Lora.WITH:
             lora[job_key] = job
-        variants[f"{encoder}-{adapter}-{opd}-{seed}"] = Variant(
+        variant = Variant(
             encoder=encoder,
             lora=adapter,
             opd=opd,
@@ -150,6 +157,10 @@ def resolve_plan(
             embeddings=embedding_key,
             model_dir=f"data/{'lora' if adapter is Lora.WITH else 'align'}/{job_key}",
         )
+        key = f"{encoder}-{adapter}-{opd}-{seed}"
+        variants[key] = variant
+        if (encoder, adapter, opd) == FULL:
+            variants |= {f"{key}-{touch}": variant.model_copy(update={"touch": touch}) for touch in counterfactuals}
     return Plan(
         scenes=("scenes",) if source == "scenes" else (),
         pretrain=("scenes",) if pretrained or any(compared.values()) else (),

@@ -9,7 +9,7 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 
 class Record(BaseModel):
@@ -43,6 +43,18 @@ class Opd(StrEnum):
     NONE = "none"
     NEEDED = "needed"
     ALL = "all"
+
+
+class Touch(StrEnum):
+    """What the language model gets to feel: the question's videos, or something else to see whether it minds."""
+
+    REAL = "real"
+    REMOVED = "removed"
+    """No tactile embedding at all: the two delimiters stand next to each other."""
+    SWAPPED = "swapped"
+    """A video of another object."""
+    NOISE = "noise"
+    """Normal noise with each dimension's mean and deviation."""
 
 
 class Video(Record):
@@ -213,6 +225,28 @@ class Score(Record):
     predicted: str
     """Empty where nothing could be parsed."""
     objects: tuple[str, ...]
+    tokens: int = Field(default=0, ge=0)
+    """Tokens generated for the answer, over all turns; 0 where no language model answered."""
+
+
+class GateRow(Record):
+    """What a base language model can conclude from perfect descriptions in words, before it ever felt anything."""
+
+    task: str
+    """Begins with the task's name; what follows says under which circumstances."""
+    accuracy: float = Field(ge=0, le=1)
+    low: float
+    """Of Wilson's 95 % interval."""
+    high: float
+    n: int = Field(ge=1)
+    goal: float | None = None
+    """What has to be reached; None where the row is for information."""
+    passed: bool | None = None
+
+    @field_validator("goal", "passed", mode="before")
+    @classmethod
+    def _empty_is_none(cls, value: object) -> object:
+        return None if value == "" else value
 
 
 class Classification(Record):

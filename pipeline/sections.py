@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from pipeline.contestants import CONTESTANTS
 from pipeline.plan import PlanName
-from pipeline.records import Task
+from pipeline.records import Task, Touch
 from pipeline.runtime import DeviceName, DtypeName
 
 Fraction = Annotated[float, Field(gt=0, le=1)]
@@ -258,6 +258,14 @@ class AblationConfig(Section):
     plan: PlanName = "paper"
     """`paper`: the four variants of the paper's tables. `factorial`: encoder x LoRA x OPD. `single`: no ablation."""
     seeds: tuple[Seed, ...] = Field(default=(0,), min_length=1)
+    counterfactuals: tuple[Literal[Touch.REMOVED, Touch.SWAPPED, Touch.NOISE], ...] = ()
+    """What the full system is also asked about in place of its videos, to see whether it feels them."""
+
+    @model_validator(mode="after")
+    def _counterfactuals_differ(self) -> Self:
+        if len(set(self.counterfactuals)) < len(self.counterfactuals):
+            raise ValueError(f"ablation.counterfactuals {list(map(str, self.counterfactuals))} repeats one")
+        return self
 
     @model_validator(mode="after")
     def _seeds_differ(self) -> Self:

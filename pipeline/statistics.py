@@ -1,7 +1,8 @@
 """How sure a figure is: intervals, agreement, confusion. scipy and NumPy are imported only where they are used.
 
 Sources: Wilson 1927 (the binomial interval); Owen 2007, "The pigeonhole bootstrap" (resampling crossed objects with
-product weights); Cameron, Gelbach, Miller 2008 (few clusters); Shrout and Fleiss 1979 (ICC).
+product weights); Cameron, Gelbach, Miller 2008 (few clusters); Holm 1979 (families of tests); Shrout and Fleiss 1979
+(ICC).
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from statistics import fmean, stdev
 from typing import TYPE_CHECKING
 
@@ -32,7 +34,10 @@ class Interval:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a question went: the share of its answers (one a seed) that are right, and the objects it is about."""
+    """How a question went: the share of its answers (one a seed) that are right, and the objects it is about.
+
+    For a comparison, the share under the one setting less that under the other, from -1 to 1.
+    """
 
     correct: float
     objects: tuple[str, ...]
@@ -54,6 +59,17 @@ class Proportion:
     def value(self) -> float:
         """The accuracy, from 0 to 1."""
         return self.correct / self.n
+
+
+@dataclass(frozen=True)
+class Difference:
+    """How much more often one setting is right than another, on the same questions, from -1 to 1."""
+
+    value: float
+    interval: Interval | None
+    """Object-clustered; None where fewer than two objects leave nothing to resample."""
+    p: float | None
+    """Twice the smaller share of the resamples on either side of zero: below .05 where the interval excludes zero."""
 
 
 @dataclass(frozen=True)
@@ -97,26 +113,58 @@ def clustered(outcomes: Sequence[Outcome], seed: int = 0) -> Interval | None:
     Returns:
         None for fewer than two objects.
     """
+    resampled = _resampled(outcomes, seed)
+    return _percentiles(*resampled) if resampled else None
+
+
+def paired(gains: Sequence[Outcome], seed: int = 0) -> Difference:
+    """The mean of paired differences, its object-clustered interval (`clustered`) and the p that belongs to it.
+
+    Raises:
+        ValueError: without any question.
+    """
+    if not gains:
+        raise ValueError("a comparison needs at least one question")
+    resampled = _resampled(gains, seed)
+    value = math.fsum(gain.correct for gain in gains) / len(gains)
+    if resampled is None:
+        return Difference(value, None, None)
+    values, probabilities = resampled
+    below, above = (float(probabilities[side].sum()) for side in (values <= 0, values >= 0))
+    # A p of 0 would claim more than the resamples can show: at the least it is that of the rarest of them.
+    tail = max(min(below, above), float(probabilities.min()))
+    return Difference(value, _percentiles(values, probabilities), min(1.0, 2 * tail))
+
+
+def holm(ps: Sequence[float]) -> list[float]:
+    """Holm's step-down adjustment: what each p of a family is worth when all of them were looked at (Holm 1979)."""
+    order = sorted(range(len(ps)), key=ps.__getitem__)
+    adjusted, worst = [0.0] * len(ps), 0.0
+    for rank, i in enumerate(order):
+        worst = max(worst, min(1.0, (len(ps) - rank) * ps[i]))
+        adjusted[i] = worst
+    return adjusted
+
+
+def _resampled(outcomes: Sequence[Outcome], seed: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """The mean in each resample of objects and the resample's probability; None for fewer than two objects."""
     import numpy as np
 
     objects = sorted({o for outcome in outcomes for o in outcome.objects})
     if len(objects) < 2:
         return None
     place = {o: i for i, o in enumerate(objects)}
-    sets = sorted({tuple(sorted(place[o] for o in outcome.objects)) for outcome in outcomes})
+    sets = tuple(sorted({tuple(sorted(place[o] for o in outcome.objects)) for outcome in outcomes}))
     position = {s: i for i, s in enumerate(sets)}
     correct, total = np.zeros(len(sets)), np.zeros(len(sets))
     for outcome in outcomes:
         i = position[tuple(sorted(place[o] for o in outcome.objects))]
         correct[i] += outcome.correct
         total[i] += 1
-    counts, probabilities = _resamples(len(objects), seed)
-    # resamples x object sets: how often a resample holds each set
-    weights = np.stack([counts[:, list(s)].prod(axis=1) for s in sets], axis=1)
+    weights, probabilities = _weights(len(objects), sets, seed)
     held = weights @ total
     defined = held > 0
-    accuracies = (weights @ correct)[defined] / held[defined]
-    return _percentiles(accuracies, probabilities[defined])
+    return (weights @ correct)[defined] / held[defined], probabilities[defined] / probabilities[defined].sum()
 
 
 def proportion(outcomes: Sequence[Outcome], seed: int = 0) -> Proportion:
@@ -190,6 +238,18 @@ def compositions(total: int, parts: int) -> Iterator[tuple[int, ...]]:
     for bars in itertools.combinations(range(total + parts - 1), parts - 1):
         edges = (-1, *bars, total + parts - 1)
         yield tuple(b - a - 1 for a, b in itertools.pairwise(edges))
+
+
+@lru_cache(maxsize=8)
+def _weights(objects: int, sets: tuple[tuple[int, ...], ...], seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """How often each resample holds each set of objects (resamples x sets), and each resample's probability.
+
+    Kept, since all variants answer the same questions.
+    """
+    import numpy as np
+
+    counts, probabilities = _resamples(objects, seed)
+    return np.stack([counts[:, list(s)].prod(axis=1) for s in sets], axis=1), probabilities
 
 
 def _resamples(clusters: int, seed: int) -> tuple[np.ndarray, np.ndarray]:

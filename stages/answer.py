@@ -4,10 +4,11 @@ import sys
 from pathlib import Path
 
 from pipeline.artifacts import read_jsonl, write_jsonl
+from pipeline.data.counterfactual import feel
 from pipeline.data.embeddings import EmbeddingStore
 from pipeline.evaluation.generate import Asking, answer
 from pipeline.models.octopi import build_octopi, load_octopi
-from pipeline.records import Question
+from pipeline.records import Question, Touch
 from pipeline.runtime import resolve_device
 from pipeline.stage import DATA, stage
 
@@ -21,12 +22,13 @@ def main() -> None:
         load_octopi(model, Path(variant.model_dir))
         asking = Asking(
             system_prompt=params.language.system_prompt,
-            per_video=params.frames.per_video,
+            per_video=0 if variant.touch is Touch.REMOVED else params.frames.per_video,
             max_new_tokens=params.language.max_new_tokens,
             batch_size=params.language.generation_batch_size,
         )
         questions = read_jsonl(DATA / "questions" / "evaluation.jsonl", Question)
-        predictions = answer(model.to(resolve_device(params.runtime.device)), store, questions, variant.opd, asking)
+        felt = feel(store, variant.touch, questions, variant.seed)
+        predictions = answer(model.to(resolve_device(params.runtime.device)), felt, questions, variant.opd, asking)
         write_jsonl(DATA / "answers" / key / "predictions.jsonl", predictions)
         run.metrics["answers"] = len(predictions)
         run.metrics["tokens"] = sum(p.tokens for p in predictions)

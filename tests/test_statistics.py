@@ -20,8 +20,10 @@ from pipeline.statistics import (
     clustered,
     compositions,
     confusion,
+    holm,
     icc3k,
     icc3k_interval,
+    paired,
     proportion,
     wilson,
 )
@@ -246,3 +248,53 @@ def test_confusion_counts_rows_as_expected() -> None:
 def test_spread_of_seeds() -> None:
     assert Spread((1.0, 3.0)).deviation == pytest.approx(math.sqrt(2))
     assert Spread((1.0,)).deviation is None
+
+
+def test_paired_differences_equal_brute_force() -> None:
+    """Every ordered draw of four objects, by itself."""
+    rng = random.Random(5)
+    gains = [Outcome(rng.choice((-1.0, 0.0, 0.5, 1.0)), (o,)) for o in "abcd" for _ in range(3)]
+    means = []
+    for drawn in itertools.product("abcd", repeat=4):
+        values = [g.correct for o in drawn for g in gains if g.objects == (o,)]
+        means.append(sum(values) / len(values))
+    gap = paired(gains)
+    assert gap.value == pytest.approx(sum(g.correct for g in gains) / 12)
+    assert gap.interval is not None
+    means.sort()
+    assert gap.interval.low in means
+    assert gap.interval.high in means
+    tails = [sum(m <= 1e-12 for m in means), sum(m >= -1e-12 for m in means)]
+    assert gap.p == pytest.approx(min(1, 2 * max(min(tails), 1) / len(means)))
+
+
+def test_paired_p_and_interval_say_the_same() -> None:
+    rng = random.Random(2)
+    for shift in (0.0, 0.1, 0.3, 0.6):
+        gains = [Outcome(rng.gauss(shift, 0.5), (str(o),)) for o in range(20) for _ in range(4)]
+        gap = paired(gains)
+        assert gap.interval is not None
+        assert gap.p is not None
+        assert (gap.interval.low > 0 or gap.interval.high < 0) == (gap.p < 0.05)
+
+
+def test_paired_without_difference_and_with_one_object() -> None:
+    gap = paired([Outcome(0.0, (o,)) for o in "abc"])
+    assert (gap.value, gap.p) == (0, 1)
+    alone = paired([Outcome(1.0, ("a",)), Outcome(0.0, ("a",))])
+    assert (alone.value, alone.interval, alone.p) == (0.5, None, None)
+    with pytest.raises(ValueError, match="at least one question"):
+        paired([])
+
+
+@pytest.mark.parametrize(
+    ("ps", "adjusted"),
+    [
+        # R's documentation of p.adjust describes the procedure; worked by hand here.
+        ([0.01, 0.04, 0.03, 0.005], [0.03, 0.06, 0.06, 0.02]),
+        ([0.5, 0.6], [1.0, 1.0]),
+        ([], []),
+    ],
+)
+def test_holm(ps: list[float], adjusted: list[float]) -> None:
+    assert holm(ps) == pytest.approx(adjusted)

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from pipeline.baseline.predictor import Features, Labels, PropertyPredictor, check_labels
 from pipeline.records import Judged
 from pipeline.runtime import derive_seed
-from pipeline.statistics import Interval, Outcome, Spread, clustered, confusion
+from pipeline.statistics import Difference, Interval, Outcome, Spread, clustered, confusion, paired
 
 
 @dataclass(frozen=True)
@@ -88,15 +88,6 @@ class Summary:
     properties: tuple[PropertySummary, ...]
     videos: int
     objects: int
-
-
-@dataclass(frozen=True)
-class Difference:
-    """How much more often the second of two settings has everything right, from -1 to 1."""
-
-    value: float
-    interval: Interval | None
-    """Object-clustered, 95 %, of the paired difference; None for fewer than two objects."""
 
 
 def deal(objects: Sequence[str], folds: int, seed: int) -> list[frozenset[str]]:
@@ -228,12 +219,8 @@ def compare(first: Sequence[Verdict], second: Sequence[Verdict], seed: int = 0) 
     """
     if not first or [(v.object_id, v.expected) for v in first] != [(v.object_id, v.expected) for v in second]:
         raise ValueError("only verdicts on the same videos in the same order can be compared")
-    gains = [b.correct(None) - a.correct(None) for a, b in zip(first, second, strict=True)]
-    # Moved from [-1, 1] to [0, 1] a mean difference is a proportion; its interval is moved back.
-    halves = [Outcome((gain + 1) / 2, (v.object_id,)) for gain, v in zip(gains, first, strict=True)]
-    interval = clustered(halves, seed)
-    moved = interval and Interval(2 * interval.low - 1, 2 * interval.high - 1)
-    return Difference(fmean(gains), moved)
+    gains = [Outcome(b.correct(None) - a.correct(None), (a.object_id,)) for a, b in zip(first, second, strict=True)]
+    return paired(gains, seed)
 
 
 def quadratic_kappa(expected: Sequence[int], predicted: Sequence[int], classes: int) -> float | None:

@@ -9,7 +9,7 @@ from typing import TypedDict
 import torch
 from transformers import PreTrainedTokenizerBase
 
-from pipeline.data.embeddings import FLIPS, EmbeddingStore
+from pipeline.data.embeddings import FLIPS, EmbeddingStore, TactileFeatures
 from pipeline.data.epochs import EpochDataset
 from pipeline.frames.sampling import sample_evaluation, sample_training
 from pipeline.prompts import IGNORE_INDEX, Encoded, encode, render
@@ -81,7 +81,7 @@ class ConversationDataset(EpochDataset[Sample]):
         }
 
 
-def evaluation_features(question: Question, store: EmbeddingStore, per_video: int) -> torch.Tensor:
+def evaluation_features(question: Question, store: TactileFeatures, per_video: int) -> torch.Tensor:
     """The embeddings of a question's videos at uniform intervals: (videos x per_video) x dim."""
     parts = [store.features(v, sample_evaluation(store.count(v), per_video)) for v in question.videos]
     return torch.cat(parts)

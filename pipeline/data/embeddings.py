@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Protocol
 
 import torch
 
@@ -15,6 +16,23 @@ FLIPS: tuple[Flip, ...] = ("none", "horizontal", "vertical", "both")
 TENSOR = "embeddings"
 TENSOR_FILE = "embeddings.safetensors"
 INDEX_FILE = "index.parquet"
+
+
+class TactileFeatures(Protocol):
+    """Where conversations take the embeddings of a video's frames from."""
+
+    @property
+    def dim(self) -> int:
+        """Length of an embedding."""
+        ...
+
+    def count(self, video_id: str) -> int:
+        """Frames that a video has embeddings of."""
+        ...
+
+    def features(self, video_id: str, positions: Sequence[int], flip: Flip = "none") -> torch.Tensor:
+        """Embeddings of the frames at these positions: positions x dim."""
+        ...
 
 
 class EmbeddingStore:

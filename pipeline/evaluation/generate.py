@@ -11,7 +11,7 @@ from tqdm import tqdm
 from transformers import PreTrainedTokenizerBase
 
 from pipeline.data.conversations import evaluation_features, pad_features
-from pipeline.data.embeddings import EmbeddingStore
+from pipeline.data.embeddings import TactileFeatures
 from pipeline.models.octopi import Octopi
 from pipeline.prompts import encode, render
 from pipeline.records import Opd, Prediction, Question, Turn
@@ -23,6 +23,7 @@ class Asking:
 
     system_prompt: str
     per_video: int
+    """Frames a video; 0 asks without touch."""
     max_new_tokens: int
     batch_size: int
 
@@ -36,7 +37,7 @@ class _Said:
 
 def answer(
     model: Octopi,
-    store: EmbeddingStore,
+    store: TactileFeatures,
     questions: Sequence[Question],
     opd: Opd,
     asking: Asking,

@@ -10,10 +10,37 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from pipeline.records import Score
+from pipeline.records import Score, Task
 from pipeline.reporting.published import Published
 from pipeline.reporting.table import number, span
 from pipeline.statistics import Outcome, Spread, proportion
+
+
+@dataclass(frozen=True)
+class Measure:
+    """What a row of a table measures."""
+
+    task: Task
+    name: str
+    """As in `Score.measure`."""
+
+    @property
+    def row(self) -> str:
+        """As published.csv calls it."""
+        return self.name if self.task is Task.OPD else self.task.value
+
+    @property
+    def label(self) -> str:
+        """The task, and of a description which property."""
+        return self.task.value if self.name in WHOLE else f"{self.task} {self.name}"
+
+    @property
+    def whole(self) -> bool:
+        """Whether it says that an answer is right, not only a part of it."""
+        return self.name in WHOLE
+
+
+WHOLE = ("choice", "combined")
 
 
 @dataclass(frozen=True)
@@ -62,7 +89,7 @@ class AccuracyRow:
     published_13b_low: float | None
     published_13b_high: float | None
     note: str
-    """Why the measured cells are empty."""
+    """Why the measured cells are empty, or what speaks against reading anything into them."""
 
     def display(self) -> Mapping[str, str]:
         """Intervals in one column each, seeds only where there are several."""
@@ -89,17 +116,18 @@ class AccuracyRow:
         }
 
 
-def accuracy_row(cell: Cell, by_seed: Mapping[int, Sequence[Score]], note: str = "") -> AccuracyRow:
+def accuracy_row(cell: Cell, by_seed: Mapping[int, Sequence[Score]], note: str = "", doubt: str = "") -> AccuracyRow:
     """Measure a cell from its scores, and put the published figures beside it.
 
     Args:
         by_seed: scores of one measure, at most one a question and seed; without any, the measured cells stay empty.
         note: why they do.
+        doubt: what speaks against reading anything into them where they are measured.
     """
     graded = {seed: scores for seed, scores in by_seed.items() if scores}
     every = [score for scores in graded.values() for score in scores]
     one, two = cell.published
-    measured = proportion(_outcomes(every)) if every else None
+    measured = proportion(outcomes(every)) if every else None
     spread = Spread(tuple(_share(s.correct for s in scores) for scores in graded.values())) if every else None
     clustered = measured.clustered if measured else None
     return AccuracyRow(
@@ -130,11 +158,12 @@ def accuracy_row(cell: Cell, by_seed: Mapping[int, Sequence[Score]], note: str =
         published_13b_n=two.n if two else None,
         published_13b_low=_ends(two)[0],
         published_13b_high=_ends(two)[1],
-        note="" if every else note,
+        note=doubt if every else note,
     )
 
 
-def _outcomes(scores: Sequence[Score]) -> list[Outcome]:
+def outcomes(scores: Iterable[Score]) -> list[Outcome]:
+    """By question, the share of its answers (one a seed) that are right."""
     by_question: dict[str, list[Score]] = defaultdict(list)
     for score in scores:
         by_question[score.question_id].append(score)

@@ -9,7 +9,7 @@ from pipeline.baseline.validation import Summary, Verdict, collect, compare, sum
 from pipeline.contestants import CONTESTANTS
 from pipeline.physiclear.catalogue import Catalogue
 from pipeline.records import Judged
-from pipeline.reporting.table import Table, number
+from pipeline.reporting.table import Table, number, share_span
 from pipeline.statistics import Interval
 
 FOLDER = "encoder"
@@ -40,7 +40,7 @@ class AccuracyRow:
             "What it is": CONTESTANTS[self.model].title if self.property == COMBINED else "",
             "Property": self.property,
             "Accuracy %": number(100 * self.accuracy, 1),
-            "95 % over objects": _span(self.low, self.high),
+            "95 % over objects": share_span(self.low, self.high),
             "n": str(self.n),
             "ms a video": number(self.ms_per_video, 1),
         }
@@ -91,7 +91,7 @@ class DifferenceRow:
             "What it is": self.what,
             "Against": self.against,
             "Difference": f"{100 * self.difference:+.1f}",
-            "95 % over objects": _span(self.low, self.high),
+            "95 % over objects": share_span(self.low, self.high),
         }
 
 
@@ -113,7 +113,7 @@ class AgreementRow:
             "Model": self.model,
             "Ratings": self.ratings,
             "Accuracy %": number(100 * self.accuracy, 1),
-            "95 % over objects": _span(self.low, self.high),
+            "95 % over objects": share_span(self.low, self.high),
             "Videos": str(self.videos),
             "Objects": str(self.objects),
         }
@@ -136,7 +136,7 @@ class CurveRow:
             "Model": self.model,
             "Training objects": number(self.objects, 0),
             "Accuracy %": number(100 * self.accuracy, 1),
-            "95 % over objects": _span(self.low, self.high),
+            "95 % over objects": share_span(self.low, self.high),
         }
 
 
@@ -286,7 +286,3 @@ def _curve(summaries: Mapping[str, Summary], folds: int) -> list[CurveRow]:
 
 def _ends(interval: Interval | None) -> tuple[float | None, float | None]:
     return (interval.low, interval.high) if interval else (None, None)
-
-
-def _span(low: float | None, high: float | None) -> str:
-    return "" if low is None or high is None else f"{100 * low:.1f} to {100 * high:.1f}"

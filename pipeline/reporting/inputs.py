@@ -10,11 +10,25 @@ from pipeline.artifacts import read_csv, read_jsonl, read_table
 from pipeline.config import Params
 from pipeline.physiclear.catalogue import Catalogue, load_catalogue
 from pipeline.plan import Encoder, Lora
-from pipeline.records import Assignment, Classification, Finding, Judged, Opd, Part, Question, Score, Task, Video
+from pipeline.records import (
+    Assignment,
+    Classification,
+    Finding,
+    GateRow,
+    Judged,
+    Opd,
+    Part,
+    Question,
+    Score,
+    Task,
+    Touch,
+    Video,
+)
 from pipeline.reporting.published import DATASET, Published, find
 from pipeline.splits import assign
 
 Axes = tuple[Encoder, Lora, Opd]
+GATE_FILE = "gate.csv"
 
 
 @dataclass(frozen=True)
@@ -37,6 +51,8 @@ class Inputs:
     """The data audit's."""
     judged: Mapping[str, Sequence[Judged]]
     """By model: what the cross-validation over all objects found."""
+    gate: Mapping[Task, bool]
+    """By task: whether the base language model can do it on perfect descriptions; empty where nobody asked it."""
 
     @property
     def of_paper(self) -> bool:
@@ -52,9 +68,13 @@ class Inputs:
         """The plan's variants without their seeds."""
         return list(dict.fromkeys((v.encoder, v.lora, v.opd) for v in self.params.plan.variants.values()))
 
-    def variants(self, axes: Axes) -> dict[int, str]:
+    def variants(self, axes: Axes, touch: Touch = Touch.REAL) -> dict[int, str]:
         """Seed to key of the variants with these axes; empty where the plan has none."""
-        return {v.seed: key for key, v in self.params.plan.variants.items() if (v.encoder, v.lora, v.opd) == axes}
+        return {
+            v.seed: key
+            for key, v in self.params.plan.variants.items()
+            if (v.encoder, v.lora, v.opd) == axes and v.touch is touch
+        }
 
     @property
     def test_objects(self) -> list[str]:
@@ -99,7 +119,19 @@ def read_inputs(params: Params, root: Path) -> Inputs:
         },
         findings=read_csv(audit, Finding) if audit.is_file() else (),
         judged={name: read_table(file, Judged) for name, file in compared.items() if file.is_file()},
+        gate=_read_gate(root / params.language.weights),
     )
+
+
+def _read_gate(weights: Path) -> dict[Task, bool]:
+    """What gate.csv beside the language model's folder says: a task passes where all its rows with a goal do."""
+    file = weights.parent / GATE_FILE
+    passed: dict[Task, bool] = {}
+    for row in read_csv(file, GateRow) if file.is_file() else ():
+        if row.passed is not None:
+            task = Task(row.task.split()[0])
+            passed[task] = passed.get(task, True) and row.passed
+    return passed
 
 
 def why_empty(inputs: Inputs, axes: Axes, task: Task) -> str:

@@ -13,6 +13,7 @@ from pipeline.reporting.audit import audit_table
 from pipeline.reporting.dataset import confusion_counts, dataset_tables
 from pipeline.reporting.figures import Curve, draw_confusion, draw_curves, draw_embedding_map, training_panels
 from pipeline.reporting.inputs import Inputs, no_test_videos, read_inputs
+from pipeline.reporting.language import language_tables
 from pipeline.reporting.page import Picture, render_page
 from pipeline.reporting.provenance import provenance
 from pipeline.reporting.results import headline, result_tables
@@ -38,7 +39,7 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     from pipeline.reporting.encoders import encoder_tables
 
     compared = encoder_tables(inputs.judged, inputs.catalogue, _costs(root), params.cross_validation.folds)
-    tables = [*result_tables(inputs), *compared, *dataset_tables(inputs), *audit]
+    tables = [*result_tables(inputs), *language_tables(inputs), *compared, *dataset_tables(inputs), *audit]
     for table in tables:
         write_text(folder / table.folder / f"{table.name}.csv", table.csv())
         write_text(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from pipeline.plan import Encoder, Lora
 from pipeline.records import Classification, Opd, Part, Score, Task
-from pipeline.reporting.accuracy import AccuracyRow, Cell, accuracy_row
+from pipeline.reporting.accuracy import AccuracyRow, Cell, Measure, accuracy_row
 from pipeline.reporting.inputs import Axes, Inputs, no_test_videos, why_empty
 from pipeline.reporting.published import MODELS
 from pipeline.reporting.table import Table
@@ -30,20 +30,6 @@ BASE_CLIP = System("base_clip", "Octopi (base CLIP)", (Encoder.BASE, Lora.WITH, 
 WITHOUT_LORA = System("without_lora", "Octopi (without LoRA)", (Encoder.FINETUNED, Lora.WITHOUT, Opd.ALL))
 
 UNDERSTANDING = (Task.PC, Task.PSS, Task.POM)
-
-
-@dataclass(frozen=True)
-class Measure:
-    """What a row of a table measures."""
-
-    task: Task
-    name: str
-    """As in `Score.measure`."""
-
-    @property
-    def row(self) -> str:
-        """As published.csv calls it."""
-        return self.name if self.task is Task.OPD else self.task.value
 
 
 def result_tables(inputs: Inputs) -> list[Table]:
@@ -158,7 +144,11 @@ def _answered(inputs: Inputs, table: str, measure: Measure, system: System) -> A
         for seed, key in inputs.variants(system.axes).items()
     }
     cell = _cell(inputs, table, measure, system.name, system.label)
-    return accuracy_row(cell, scores, why_empty(inputs, system.axes, measure.task))
+    return accuracy_row(cell, scores, why_empty(inputs, system.axes, measure.task), _doubt(inputs, measure.task))
+
+
+def _doubt(inputs: Inputs, task: Task) -> str:
+    return "" if inputs.gate.get(task, True) else "the base language model fails its gate in this task"
 
 
 def _baselines(inputs: Inputs, properties: Sequence[Measure]) -> list[AccuracyRow]:

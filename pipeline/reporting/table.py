@@ -67,5 +67,10 @@ def span(low: float | None, high: float | None) -> str:
     return "" if low is None or high is None else f"{low:.1f} to {high:.1f}"
 
 
+def share_span(low: float | None, high: float | None) -> str:
+    """An interval of shares in percent, as `span`."""
+    return "" if low is None or high is None else span(100 * low, 100 * high)
+
+
 def _plain(value: Cell) -> Cell:
     return round(value, 4) if isinstance(value, float) else value

@@ -120,5 +120,6 @@ def choice_score(question: Question, prediction: Prediction, predicted: str | No
             expected=question.gold.choice,
             predicted=predicted or "",
             objects=question.objects,
+            tokens=prediction.tokens,
         )
     ]

@@ -75,4 +75,5 @@ class ObjectPropertyDescription:
             expected=expected,
             predicted=predicted,
             objects=question.objects,
+            tokens=prediction.tokens,
         )

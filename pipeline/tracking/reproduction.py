@@ -75,7 +75,11 @@ def planned_stages(plan: Plan) -> list[PlannedStage]:
             for key, job in jobs.items()
         ),
         *(
-            PlannedStage(stage, key, _axes(encoder=v.encoder.value, lora=v.lora.value, opd=v.opd.value, seed=v.seed))
+            PlannedStage(
+                stage,
+                key,
+                _axes(encoder=v.encoder.value, lora=v.lora.value, opd=v.opd.value, seed=v.seed, touch=v.touch.value),
+            )
             for stage in ("answer", "grade")
             for key, v in plan.variants.items()
         ),
