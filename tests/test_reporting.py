@@ -89,7 +89,7 @@ def test_every_table_and_figure_is_there(chain: Path, params: Params) -> None:
     assert written == {
         *(f"tables/{name}.{ending}" for name in TABLES for ending in ("csv", "md")),
         *(f"language/{name}.{ending}" for name in ("ablation", "effects", "touch") for ending in ("csv", "md")),
-        *(f"figures/{name}.png" for name in ("confusion_matrices", "embedding_map", "training_curves")),
+        *(f"figures/{name}.png" for name in ("confusion_matrices", "effects", "embedding_map", "training_curves")),
         *("README.md", "metrics.json", "params.yaml", "provenance.json"),
     }
     page = (folder / "README.md").read_text()

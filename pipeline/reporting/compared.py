@@ -39,7 +39,7 @@ def effects(answered: Answered, variants: Mapping[str, Variant], measures: Seque
                 if all(axes[i] == FULL[i] for i in range(len(FULL)) if i != place):
                     proposed.append((key, rival))
         for measure in measures:
-            change = f"{one} less {other}"
+            change = f"{one} minus {other}"
             full += _effect(answered, proposed, measure, axis, change, "full system")
             if len(pairs) > len(proposed):
                 every += _effect(answered, pairs, measure, axis, change, "all")

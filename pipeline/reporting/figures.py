@@ -58,7 +58,7 @@ def draw_confusion(
     import numpy as np
 
     most = max(len(p.levels) for p in properties)
-    figure, panels = _panels(len(properties), max(3.9, 0.95 * most), max(3.7, 0.9 * most))
+    figure, panels = panels_of(len(properties), max(3.9, 0.95 * most), max(3.7, 0.9 * most))
     for axes, p, matrix in zip(panels, properties, map(np.array, counts), strict=True):
         shares = matrix / np.maximum(matrix.sum(axis=1, keepdims=True), 1)
         axes.imshow(shares, cmap="Blues", vmin=0, vmax=1)
@@ -74,7 +74,7 @@ def draw_confusion(
         right = int(matrix.trace())
         axes.set_title(f"{p.name}: {right} of {int(matrix.sum())} right")
         axes.tick_params(length=0)
-    _save(figure, path, footer)
+    save(figure, path, footer)
 
 
 def draw_embedding_map(
@@ -87,7 +87,7 @@ def draw_embedding_map(
         labels: one tuple of class indices a video.
     """
     maps = project(features)
-    figure, panels = _panels(len(maps) * len(properties), 3.9, 4.0, across=len(properties))
+    figure, panels = panels_of(len(maps) * len(properties), 3.9, 4.0, across=len(properties))
     rows = [(places, method, index, p) for method, places in maps.items() for index, p in enumerate(properties)]
     for axes, (places, method, index, p) in zip(panels, rows, strict=True):
         for level, name in enumerate(p.levels):
@@ -108,7 +108,7 @@ def draw_embedding_map(
         axes.set_xlabel(f"{method} 1")
         axes.set_ylabel(f"{method} 2")
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=2, frameon=False, fontsize=9)
-    _save(figure, path, footer)
+    save(figure, path, footer)
 
 
 def project(features: np.ndarray) -> dict[str, np.ndarray]:
@@ -133,7 +133,7 @@ def draw_curves(path: Path, panels: Sequence[Panel], footer: str) -> None:
     """The trainings' values over their optimiser steps."""
     from matplotlib.lines import Line2D
 
-    figure, places = _panels(len(panels), 3.9, 3.9)
+    figure, places = panels_of(len(panels), 3.9, 3.9)
     for axes, panel in zip(places, panels, strict=True):
         labels = list(dict.fromkeys(curve.label for curve in panel.curves))
         colours = {label: _colour(i) for i, label in enumerate(labels)}
@@ -155,7 +155,7 @@ def draw_curves(path: Path, panels: Sequence[Panel], footer: str) -> None:
         if any(curve.dashed for curve in panel.curves):
             keys.append(Line2D([], [], color="grey", linestyle="--", label="base CLIP"))
         axes.legend(handles=keys, loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2, frameon=False, fontsize=9)
-    _save(figure, path, footer)
+    save(figure, path, footer)
 
 
 def training_panels(
@@ -192,7 +192,8 @@ def _named(points: Sequence[Measurement], name: str) -> list[Measurement]:
     return sorted((m for m in points if m.name == name), key=lambda m: m.step)
 
 
-def _panels(count: int, width: float, height: float, across: int = MOST_ACROSS) -> tuple[Figure, Sequence[Axes]]:
+def panels_of(count: int, width: float, height: float, across: int = MOST_ACROSS) -> tuple[Figure, Sequence[Axes]]:
+    """A figure of so many panels, each of this width and height in inches."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -215,7 +216,8 @@ def _marker(number: int) -> str:
     return MARKERS[(number + number // len(COLOURS)) % len(MARKERS)]
 
 
-def _save(figure: Figure, path: Path, footer: str) -> None:
+def save(figure: Figure, path: Path, footer: str) -> None:
+    """Write a figure with a line of small print, equal bytes for equal figures."""
     figure.supxlabel(footer, fontsize=8, color="#555555", x=0.995, ha="right")
     with atomic(path) as temporary:
         figure.savefig(temporary, format="png", dpi=DPI, metadata={"Software": None})

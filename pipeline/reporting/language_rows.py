@@ -172,7 +172,7 @@ class TouchRow:
             "95 % over objects": share_span(self.low, self.high),
             "Chance %": number(100 * self.chance, 1),
             "Answers unchanged %": "" if self.unchanged is None else number(100 * self.unchanged, 1),
-            "Real less this": "" if self.difference is None else f"{100 * self.difference:+.1f}",
+            "Real minus this": "" if self.difference is None else f"{100 * self.difference:+.1f}",
             "its 95 %": share_span(self.difference_low, self.difference_high),
             "p": number(self.p, 3),
             "n": str(self.n),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 
 from pipeline.artifacts import read_json, read_table, write_json, write_text
@@ -11,12 +12,15 @@ from pipeline.plan import Encoder
 from pipeline.records import Embedding, Measurement, Part
 from pipeline.reporting.audit import audit_table
 from pipeline.reporting.dataset import confusion_counts, dataset_tables
+from pipeline.reporting.effects_figure import draw_effects
 from pipeline.reporting.figures import Curve, draw_confusion, draw_curves, draw_embedding_map, training_panels
 from pipeline.reporting.inputs import Inputs, no_test_videos, read_inputs
 from pipeline.reporting.language import language_tables
+from pipeline.reporting.language_rows import EffectRow
 from pipeline.reporting.page import Picture, render_page
 from pipeline.reporting.provenance import provenance
 from pipeline.reporting.results import headline, result_tables
+from pipeline.reporting.table import Table
 
 COSTS = Path("reports") / "bench" / "encoder.json"
 MODEL = "model, "
@@ -45,7 +49,7 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
         write_text(
             folder / table.folder / f"{table.name}.md", f"# {table.title}\n\n{table.caption}\n\n{table.markdown()}"
         )
-    pictures = _draw(inputs, root, folder / "figures")
+    pictures = _draw(inputs, tables, root, folder / "figures")
     origin = provenance(params, inputs.videos, root)
     metrics = headline(inputs, tables)
     write_text(folder / "README.md", render_page(inputs, origin, tables, pictures))
@@ -62,7 +66,7 @@ def _costs(root: Path) -> dict[str, float]:
     return {row["case"].removeprefix(MODEL): row["cost"] for row in rows if row["case"].startswith(MODEL)}
 
 
-def _draw(inputs: Inputs, root: Path, folder: Path) -> list[Picture]:
+def _draw(inputs: Inputs, tables: Sequence[Table], root: Path, folder: Path) -> list[Picture]:
     folder.mkdir(parents=True, exist_ok=True)
     params = inputs.params
     footer = f"scale {params.scale}, source {params.data.source}, split {params.split.name}"
@@ -70,6 +74,7 @@ def _draw(inputs: Inputs, root: Path, folder: Path) -> list[Picture]:
         _confusion(inputs, folder, footer),
         _map(inputs, root, folder, footer),
         _curves(inputs, root, folder, footer),
+        _effects(tables, folder, footer),
     ]
     for picture in pictures:
         if picture.missing:
@@ -158,6 +163,22 @@ def _curves(inputs: Inputs, root: Path, folder: Path, footer: str) -> Picture:
     if not panels:
         return picture.without("no history of any training")
     draw_curves(folder / picture.file, panels, footer)
+    return picture
+
+
+def _effects(tables: Sequence[Table], folder: Path, footer: str) -> Picture:
+    every = [row for table in tables for row in table.rows if isinstance(row, EffectRow)]
+    rows = [row for row in every if row.others == every[0].others]
+    picture = Picture(
+        "effects.png",
+        "What each part brings, drawn",
+        f"Points with intervals, one panel a task: {', '.join(dict.fromkeys(r.task for r in rows))}.",
+        "Differences of the table above with the other axes as the paper proposes. A line that crosses zero shows no "
+        "effect; a hollow point is of a task that the base language model cannot do either.",
+    )
+    if not rows:
+        return picture.without("no two variants that differ in one axis")
+    draw_effects(folder / picture.file, rows, footer)
     return picture
 
 
