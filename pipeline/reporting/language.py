@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from statistics import fmean, stdev
 
-from pipeline.plan import Variant
 from pipeline.records import Task, Touch
 from pipeline.reporting.accuracy import Measure, outcomes
 from pipeline.reporting.answered import Answered
 from pipeline.reporting.compared import counterfactuals, describing, effects
 from pipeline.reporting.inputs import Inputs
-from pipeline.reporting.language_rows import AblationRow, VariantRow
+from pipeline.reporting.language_rows import AblationRow, SeedsRow
 from pipeline.reporting.table import Row, Table
 from pipeline.statistics import clustered
 
@@ -31,8 +30,8 @@ def language_tables(inputs: Inputs) -> list[Table]:
             "Language model: every variant",
             "Mean over seeds; the CSV has every seed. *Base model* says where the language model, before any touch, "
             "cannot do the task on perfect descriptions in words either: what such a task shows is not about touch.",
-            [row for key, v in real.items() for row in _ablation(answered, key, v, measures)],
-            [row for axes in inputs.axes for row in _over_seeds(answered, inputs.variants(axes), measures)],
+            [row for key in real for measure in measures if (row := _row(answered, [key], measure))],
+            [row for axes in inputs.axes for row in _over_seeds(answered, [*inputs.variants(axes).values()], measures)],
             folder=FOLDER,
         ),
         Table(
@@ -63,59 +62,38 @@ def language_tables(inputs: Inputs) -> list[Table]:
     return [table for table in tables if table.rows]
 
 
-def _ablation(answered: Answered, key: str, v: Variant, measures: Sequence[Measure]) -> list[AblationRow]:
-    rows = []
-    for measure in measures:
-        scores = answered.every([key], measure)
-        if scores:
-            interval = clustered(outcomes(scores))
-            rows.append(
-                AblationRow(
-                    source=answered.inputs.params.data.source,
-                    encoder=v.encoder,
-                    lora=v.lora,
-                    opd=v.opd,
-                    seed=v.seed,
-                    task=measure.label,
-                    accuracy=fmean(s.correct for s in scores),
-                    low=interval.low if interval else None,
-                    high=interval.high if interval else None,
-                    n=len(scores),
-                    chance=answered.chance(measure),
-                    unparsed=fmean(not s.parsed for s in scores),
-                    truncated=fmean(s.truncated for s in scores),
-                    tokens=fmean(s.tokens for s in scores),
-                    gate=answered.gate(measure),
-                )
-            )
-    return rows
+def _row(answered: Answered, keys: Sequence[str], measure: Measure) -> AblationRow | None:
+    """One measure of variants that differ in nothing but the seed; None where none of them was asked."""
+    scores = answered.every(keys, measure)
+    if not scores:
+        return None
+    params = answered.inputs.params
+    variant, answers = params.plan.variants[keys[0]], outcomes(scores)
+    interval = clustered(answers)
+    return AblationRow(
+        source=params.data.source,
+        encoder=variant.encoder,
+        lora=variant.lora,
+        opd=variant.opd,
+        seed=variant.seed,
+        task=measure.label,
+        accuracy=fmean(a.correct for a in answers),
+        low=interval.low if interval else None,
+        high=interval.high if interval else None,
+        n=len(answers),
+        chance=answered.chance(measure),
+        unparsed=fmean(not s.parsed for s in scores),
+        truncated=fmean(s.truncated for s in scores),
+        tokens=fmean(s.tokens for s in scores),
+        gate=answered.gate(measure),
+    )
 
 
-def _over_seeds(answered: Answered, seeds: Mapping[int, str], measures: Sequence[Measure]) -> list[Row]:
+def _over_seeds(answered: Answered, keys: Sequence[str], measures: Sequence[Measure]) -> list[Row]:
     rows: list[Row] = []
     for measure in measures:
-        by_seed = [s for key in seeds.values() if (s := answered.every([key], measure))]
-        if by_seed:
-            variant = answered.inputs.params.plan.variants[next(iter(seeds.values()))]
-            scores = [s for some in by_seed for s in some]
-            answers, accuracies = outcomes(scores), [fmean(s.correct for s in some) for some in by_seed]
-            interval = clustered(answers)
-            rows.append(
-                VariantRow(
-                    encoder=variant.encoder,
-                    lora=variant.lora,
-                    opd=variant.opd,
-                    task=measure.label,
-                    accuracy=fmean(accuracies),
-                    deviation=stdev(accuracies) if len(accuracies) > 1 else None,
-                    low=interval.low if interval else None,
-                    high=interval.high if interval else None,
-                    n=len(answers),
-                    chance=answered.chance(measure),
-                    unparsed=fmean(not s.parsed for s in scores),
-                    truncated=fmean(s.truncated for s in scores),
-                    tokens=fmean(s.tokens for s in scores),
-                    gate=answered.gate(measure),
-                )
-            )
+        pooled = _row(answered, keys, measure)
+        if pooled:
+            alone = [row.accuracy for key in keys if (row := _row(answered, [key], measure))]
+            rows.append(SeedsRow(pooled, stdev(alone) if len(alone) > 1 else None))
     return rows

@@ -33,39 +33,13 @@ class AblationRow:
     """Whether the base language model can do the task on perfect descriptions; empty where nobody asked it."""
 
     def display(self) -> Mapping[str, str]:
-        """Unused: a person reads the mean over seeds."""
-        raise NotImplementedError
-
-
-@dataclass(frozen=True)
-class VariantRow:
-    """One variant over its seeds. Shares, from 0 to 1."""
-
-    encoder: str
-    lora: str
-    opd: str
-    task: str
-    accuracy: float
-    deviation: float | None
-    """Over seeds."""
-    low: float | None
-    high: float | None
-    n: int
-    chance: float
-    unparsed: float
-    truncated: float
-    tokens: float
-    gate: str
-
-    def display(self) -> Mapping[str, str]:
-        """All columns."""
+        """All columns but source and seed."""
         return {
             "Encoder": self.encoder,
             "LoRA": self.lora,
             "OPD": self.opd,
             "Task": self.task,
             "Accuracy %": number(100 * self.accuracy, 1),
-            "± over seeds": "" if self.deviation is None else number(100 * self.deviation, 1),
             "95 % over objects": share_span(self.low, self.high),
             "n": str(self.n),
             "Chance %": number(100 * self.chance, 1),
@@ -74,6 +48,21 @@ class VariantRow:
             "Tokens": number(self.tokens, 0),
             "Base model": self.gate,
         }
+
+
+@dataclass(frozen=True)
+class SeedsRow:
+    """One variant over its seeds, for reading."""
+
+    pooled: AblationRow
+    """Every question counts once, with the share of its answers that are right; the seed is the first."""
+    deviation: float | None
+    """Of the accuracies under each seed; None for one seed."""
+
+    def display(self) -> Mapping[str, str]:
+        """All columns."""
+        deviation = "" if self.deviation is None else number(100 * self.deviation, 1)
+        return {**self.pooled.display(), "± over seeds": deviation}
 
 
 @dataclass(frozen=True)
