@@ -19,6 +19,7 @@ CHECKPOINTS = Path("checkpoints")
 
 DeviceName = Literal["auto", "cpu", "cuda", "mps"]
 DtypeName = Literal["float32", "bfloat16", "float16"]
+Quantization = Literal["none", "nf4"]
 
 
 def derive_seed(*parts: object) -> int:

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from pipeline.contestants import CONTESTANTS
 from pipeline.plan import PlanName
 from pipeline.records import Task, Touch
-from pipeline.runtime import DeviceName, DtypeName
+from pipeline.runtime import DeviceName, DtypeName, Quantization
 
 Fraction = Annotated[float, Field(gt=0, le=1)]
 Positive = Annotated[int, Field(ge=1)]
@@ -213,6 +213,8 @@ class LanguageConfig(Section):
     """Folder in transformers' format with a Llama-like model (safetensors) and a fast tokenizer."""
     dtype: DtypeName = "float32"
     """Number format of the frozen weights; whatever is trained stays in float32."""
+    quantization: Quantization = "none"
+    """`nf4`: hold the frozen linear layers in four bits (needs bitsandbytes and a CUDA device)."""
     system_prompt: str = ""
     """Put before each conversation (Vicuna has one; the stand-in was made without)."""
     max_new_tokens: Annotated[int, Field(ge=1, le=4096)] = 256

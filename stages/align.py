@@ -5,7 +5,6 @@ from pathlib import Path
 
 from pipeline.artifacts import read_jsonl, write_table
 from pipeline.data.embeddings import TENSOR_FILE, EmbeddingStore
-from pipeline.models.octopi import save_octopi
 from pipeline.records import Measurement, Question
 from pipeline.stage import DATA, stage
 from pipeline.tracking import live_run
@@ -33,7 +32,7 @@ def main() -> None:
             trained = align(model, data, params.align, params.runtime, Job(run.name, mark, material.seed, live.log))
         run.finish_training(trained.history)
         out = DATA / "align" / key
-        save_octopi(model, trained.state, out)
+        model.save_pretrained(out, trained.state)
         write_table(out / "history.parquet", Measurement, trained.history)
 
 

@@ -1,13 +1,12 @@
 """Let one variant answer the evaluation questions."""
 
 import sys
-from pathlib import Path
 
 from pipeline.artifacts import read_jsonl, write_jsonl
 from pipeline.data.counterfactual import feel
 from pipeline.data.embeddings import EmbeddingStore
 from pipeline.evaluation.generate import Asking, answer
-from pipeline.models.octopi import build_octopi, load_octopi
+from pipeline.models.octopi import OctopiForCausalLM
 from pipeline.records import Question, Touch
 from pipeline.runtime import resolve_device
 from pipeline.stage import DATA, stage
@@ -17,14 +16,16 @@ def main() -> None:
     key = sys.argv[1]
     with stage("answer", key) as run:
         params, variant = run.params, run.params.plan.variants[key]
+        language = params.language
         store = EmbeddingStore(DATA / "embeddings" / variant.embeddings)
-        model = build_octopi(params.language, store.dim)
-        load_octopi(model, Path(variant.model_dir))
+        model = OctopiForCausalLM.from_pretrained(
+            variant.model_dir, base=language.weights, dtype=language.dtype, quantization=language.quantization
+        )
         asking = Asking(
-            system_prompt=params.language.system_prompt,
+            system_prompt=language.system_prompt,
             per_video=0 if variant.touch is Touch.REMOVED else params.frames.per_video,
-            max_new_tokens=params.language.max_new_tokens,
-            batch_size=params.language.generation_batch_size,
+            max_new_tokens=language.max_new_tokens,
+            batch_size=language.generation_batch_size,
         )
         questions = read_jsonl(DATA / "questions" / "evaluation.jsonl", Question)
         felt = feel(store, variant.touch, questions, variant.seed)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from pipeline.artifacts import read_jsonl, write_table
 from pipeline.data.embeddings import TENSOR_FILE, EmbeddingStore
-from pipeline.models.octopi import CONNECTOR_FILE, load_octopi, save_octopi
+from pipeline.models.octopi import CONNECTOR_FILE
 from pipeline.records import Measurement, Question
 from pipeline.stage import DATA, stage
 from pipeline.tracking import live_run
@@ -31,8 +31,7 @@ def main() -> None:
             flip_probability=params.encoder.flip_probability,
             seed=params.seed + plan.seed,
         )
-        model, data = assemble(material, params.lora.samples, "lora")
-        load_octopi(model, inputs[2].parent)
+        model, data = assemble(material, params.lora.samples, "lora", aligned=inputs[2].parent)
         add_lora(model, params.lora)
         mark = fingerprint(params.lora, params.language, params.frames, params.encoder, plan, params.seed, *inputs)
         with live_run(params, run.name, Path()) as live:
@@ -41,7 +40,7 @@ def main() -> None:
             )
         run.finish_training(trained.history)
         out = DATA / "lora" / key
-        save_octopi(model, trained.state, out)
+        model.save_pretrained(out, trained.state)
         write_table(out / "history.parquet", Measurement, trained.history)
 
 

@@ -11,6 +11,7 @@ from transformers import PreTrainedTokenizerBase
 
 from pipeline.data.embeddings import FLIPS, EmbeddingStore, TactileFeatures
 from pipeline.data.epochs import EpochDataset
+from pipeline.errors import UserError
 from pipeline.frames.sampling import sample_evaluation, sample_training
 from pipeline.prompts import IGNORE_INDEX, Encoded, encode, render
 from pipeline.records import Opd, Question
@@ -30,6 +31,12 @@ class ConversationDataset(EpochDataset[Sample]):
 
     Which frames and which mirroring a video gets depends on seed, epoch, question and place alone, so that a resumed
     training sees what an uninterrupted one does.
+
+    Args:
+        positions: Tokens that the language model can read at once; None where that is unknown.
+
+    Raises:
+        UserError: naming the question that is too long, or has nothing to learn from.
     """
 
     def __init__(
@@ -43,6 +50,7 @@ class ConversationDataset(EpochDataset[Sample]):
         per_video: int,
         flip_probability: float,
         seed: int,
+        positions: int | None = None,
     ) -> None:
         super().__init__()
         self.questions = [q for q in questions if q.dialogue(opd)]
@@ -61,7 +69,16 @@ class ConversationDataset(EpochDataset[Sample]):
                 eos=str(tokenizer.eos_token),
                 complete=True,
             )
-            self.encoded.append(encode(text, tokenizer))
+            encoded = encode(text, tokenizer)
+            check_length(question.question_id, len(encoded.input_ids), positions)
+            if all(label == IGNORE_INDEX for label in encoded.labels):
+                raise UserError(f"{question.question_id}: has no answer to learn from; run `dvc repro questions -f`")
+            self.encoded.append(encoded)
+
+    @property
+    def lengths(self) -> list[int]:
+        """Tokens of each conversation."""
+        return [len(e.input_ids) for e in self.encoded]
 
     def __len__(self) -> int:
         return len(self.questions)
@@ -81,6 +98,15 @@ class ConversationDataset(EpochDataset[Sample]):
         }
 
 
+def check_length(question_id: str, tokens: int, positions: int | None) -> None:
+    """Raise UserError where a question has more tokens than the language model has positions."""
+    if positions is not None and tokens > positions:
+        raise UserError(
+            f"{question_id}: takes {tokens} tokens, but the language model reads {positions} at once; lower "
+            "frames.per_video, shorten language.system_prompt, or name a model with more positions in language.weights"
+        )
+
+
 def evaluation_features(question: Question, store: TactileFeatures, per_video: int) -> torch.Tensor:
     """The embeddings of a question's videos at uniform intervals: (videos x per_video) x dim."""
     parts = [store.features(v, sample_evaluation(store.count(v), per_video)) for v in question.videos]
@@ -93,21 +119,20 @@ def pad_features(features: Sequence[torch.Tensor]) -> torch.Tensor:
 
 
 class ConversationCollator:
-    """Pads on the right with the padding token, masked out of attention and loss."""
+    """Pads on the right with the padding token to the longest of the batch, left out of the loss.
+
+    There is no attention mask: no token of a causal model sees what comes behind it.
+    """
 
     def __init__(self, pad_id: int) -> None:
         self.pad_id = pad_id
 
     def __call__(self, samples: Iterable[Sample]) -> dict[str, torch.Tensor]:
-        """Input ids, attention mask, labels (batch x length) and features (batch x frames x dim)."""
+        """Input ids, labels (batch x length) and features (batch x frames x dim)."""
         samples = list(samples)
         pad = torch.nn.utils.rnn.pad_sequence
-        lengths = torch.tensor([len(s["input_ids"]) for s in samples])
-        ids = pad([s["input_ids"] for s in samples], batch_first=True, padding_value=self.pad_id)
         return {
-            "input_ids": ids,
-            # By length, not by comparing with the padding token: that may occur in a text.
-            "attention_mask": (torch.arange(ids.shape[1]) < lengths[:, None]).long(),
+            "input_ids": pad([s["input_ids"] for s in samples], batch_first=True, padding_value=self.pad_id),
             "labels": pad([s["labels"] for s in samples], batch_first=True, padding_value=IGNORE_INDEX),
             "features": pad_features([s["features"] for s in samples]),
         }

@@ -7,11 +7,13 @@ import os
 import random
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
+from pipeline.data.buckets import LengthBuckets
 from pipeline.data.conversations import ConversationCollator, ConversationDataset
 from pipeline.data.embeddings import EmbeddingStore
 from pipeline.errors import UserError
-from pipeline.models.octopi import Octopi, build_octopi
+from pipeline.models.octopi import OctopiForCausalLM
 from pipeline.records import Opd, Question
 from pipeline.runtime import derive_seed, seed_everything
 from pipeline.sections import LanguageConfig, LoraTrainConfig, RuntimeConfig, TrainConfig
@@ -28,7 +30,7 @@ from pipeline.training.trainer import (
 logger = logging.getLogger(__name__)
 
 
-def add_lora(model: Octopi, config: LoraTrainConfig) -> None:
+def add_lora(model: OctopiForCausalLM, config: LoraTrainConfig) -> None:
     """Put fresh low-rank adapters (float32) on the language model's linear layers."""
     from peft import LoraConfig, get_peft_model
 
@@ -59,13 +61,26 @@ class Material:
     seed: int
 
 
-def assemble(material: Material, samples: int, purpose: str) -> tuple[Octopi, ConversationDataset]:
-    """A fresh model and its training conversations: `samples` questions, drawn by seed and purpose.
+def assemble(
+    material: Material, samples: int, purpose: str, aligned: Path | None = None
+) -> tuple[OctopiForCausalLM, ConversationDataset]:
+    """A model and its training conversations: `samples` questions, drawn by seed and purpose.
 
     Each OPD mode draws as many, from the questions that have a dialogue in it.
+
+    Args:
+        aligned: Folder of a model to go on with; by default a fresh one.
     """
     seed_everything(material.seed)
-    model = build_octopi(material.language, material.store.dim)
+    language = material.language
+    if aligned is None:
+        model = OctopiForCausalLM.from_base(
+            language.weights, material.store.dim, dtype=language.dtype, quantization=language.quantization
+        )
+    else:
+        model = OctopiForCausalLM.from_pretrained(
+            aligned, base=language.weights, dtype=language.dtype, quantization=language.quantization
+        )
     usable = [q for q in material.questions if q.dialogue(material.opd)]
     random.Random(derive_seed(material.seed, purpose)).shuffle(usable)
     if not usable:
@@ -77,10 +92,11 @@ def assemble(material: Material, samples: int, purpose: str) -> tuple[Octopi, Co
         material.opd,
         material.store,
         model.tokenizer,
-        system_prompt=material.language.system_prompt,
+        system_prompt=language.system_prompt,
         per_video=material.per_video,
         flip_probability=material.flip_probability,
         seed=material.seed,
+        positions=model.positions,
     )
     return model, data
 
@@ -95,13 +111,15 @@ class Job:
     log: Log | None = None
 
 
-def align(model: Octopi, data: ConversationDataset, config: TrainConfig, runtime: RuntimeConfig, job: Job) -> Trained:
+def align(
+    model: OctopiForCausalLM, data: ConversationDataset, config: TrainConfig, runtime: RuntimeConfig, job: Job
+) -> Trained:
     """Train the projection and the two new tokens; the language model stays frozen."""
     return _fit(model, data, config, runtime, job, {"connector": config.projection_learning_rate})
 
 
 def finetune_lora(
-    model: Octopi, data: ConversationDataset, config: LoraTrainConfig, runtime: RuntimeConfig, job: Job
+    model: OctopiForCausalLM, data: ConversationDataset, config: LoraTrainConfig, runtime: RuntimeConfig, job: Job
 ) -> Trained:
     """Train adapters, projection and new tokens, each at its own rate."""
     rates = {"connector": config.projection_learning_rate, "llm": config.learning_rate}
@@ -109,7 +127,7 @@ def finetune_lora(
 
 
 def _fit(
-    model: Octopi,
+    model: OctopiForCausalLM,
     data: ConversationDataset,
     config: TrainConfig,
     runtime: RuntimeConfig,
@@ -139,6 +157,7 @@ def _fit(
         data_collator=ConversationCollator(int(model.tokenizer.pad_token_id)),
         callbacks=[Watch(job.log)],
         rates=rates,
+        sampler=LengthBuckets(data.lengths, config.micro_batch_size, job.seed, lambda: data.epoch),
     )
     return train(trainer)
 

@@ -14,6 +14,7 @@ from typing import Any, cast
 
 import torch
 from pydantic import BaseModel
+from torch.utils.data import Sampler
 from transformers import PrinterCallback, Trainer, TrainerCallback, TrainerControl, TrainerState, TrainingArguments
 from transformers.trainer_utils import get_last_checkpoint
 
@@ -41,19 +42,29 @@ class TrainableTrainer(Trainer):
         rates: Learning rate of the parameters under each name.
         wave: Updates after which the rate has fallen to a hundredth, to rise again in as many, for ever: the published
             code gives its cosine the length of one epoch. By default one cosine spans the training.
+        sampler: The order of the training set, where it is not simply random.
     """
 
     def __init__(
-        self, *args: Any, rates: Mapping[str, float] | None = None, wave: int | None = None, **kwargs: Any
+        self,
+        *args: Any,
+        rates: Mapping[str, float] | None = None,
+        wave: int | None = None,
+        sampler: Sampler[int] | None = None,
+        **kwargs: Any,
     ) -> None:
         super().__init__(*args, **kwargs)
         self.remove_callback(PrinterCallback)
         self._rates = rates
         self._wave = wave
+        self._sampler = sampler
         if isinstance(self.train_dataset, EpochDataset):
             # The state's epoch has a fraction for the steps within one.
             self.train_dataset.follow(lambda: int(self.state.epoch or 0))
         self.optimizer: torch.optim.Optimizer | None
+
+    def _get_train_sampler(self, train_dataset: Any = None) -> Sampler[int] | None:
+        return self._sampler or cast("Sampler[int] | None", super()._get_train_sampler(train_dataset))
 
     def create_optimizer(self, model: torch.nn.Module | None = None) -> torch.optim.Optimizer:
         """AdamW with one group a prefix of `rates`, or the Trainer's own without."""
@@ -88,9 +99,7 @@ class TrainableTrainer(Trainer):
         if state_dict is not None:
             # Gathered by the distributed backend: take the gathered values.
             trained = {name: state_dict[name] for name in trained}
-        broken = next((name for name, value in trained.items() if not value.isfinite().all()), None)
-        if broken:
-            raise _diverged(f"{broken} is not finite", self.state.global_step)
+        check_finite(trained, self.state.global_step)
         super()._save(output_dir, {name: value.contiguous() for name, value in trained.items()})
 
     def _issue_warnings_after_load(self, load_result: Any) -> None:
@@ -106,6 +115,13 @@ def _diverged(what: str, step: int) -> UserError:
     return UserError(
         f"{what} at step {step}: the training diverged; lower the learning rate (earlier checkpoints are kept)"
     )
+
+
+def check_finite(state: Mapping[str, torch.Tensor], step: int) -> None:
+    """Raise UserError where a trained parameter is not finite."""
+    broken = next((name for name, value in state.items() if not value.isfinite().all()), None)
+    if broken:
+        raise _diverged(f"{broken} is not finite", step)
 
 
 LOSSES = ("loss", "grad_norm", "validation_loss")
@@ -209,9 +225,11 @@ def train(trainer: Trainer) -> Trained:
     ]
     whole = trainer.accelerator.get_state_dict(trainer.model_wrapped)
     names = trainable_state(trainer.accelerator.unwrap_model(trainer.model))
+    state = {name: whole[name] for name in names if name in whole}
+    check_finite(state, trainer.state.global_step)
     if trainer.is_world_process_zero():
         shutil.rmtree(folder, ignore_errors=True)
-    return Trained(history, {name: whole[name] for name in names if name in whole})
+    return Trained(history, state)
 
 
 def _drop_unfinished(folder: Path) -> None:

@@ -1,0 +1,51 @@
+"""Keys and values of the tokens read so far, kept in room that is reserved ahead."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from transformers import Cache, DynamicCache, PretrainedConfig
+from transformers.cache_utils import DynamicLayer
+
+AHEAD = 64
+"""Tokens that room is made for at a time."""
+
+
+class RoomyLayer(DynamicLayer):
+    """Writes new tokens behind the old ones, where transformers' own layer copies all of them for each new token.
+
+    What attention is given has the same values. Shapes: batch x heads x tokens x head size.
+    """
+
+    keys: torch.Tensor
+    values: torch.Tensor
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self._room: tuple[torch.Tensor, torch.Tensor] | None = None
+
+    def update(
+        self, key_states: torch.Tensor, value_states: torch.Tensor, *_: Any, **__: Any
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Add the newest tokens' keys and values; give back all of them."""
+        if not self.is_initialized:
+            self.lazy_initialization(key_states, value_states)
+            self._room = None
+        old, needed = self.get_seq_length(), self.get_seq_length() + key_states.shape[-2]
+        if self._room is None or self._room[0].shape[-2] < needed:
+            keys, values = (s.new_empty(*s.shape[:-2], needed + AHEAD, s.shape[-1]) for s in (key_states, value_states))
+            if old:
+                keys[..., :old, :], values[..., :old, :] = self.keys, self.values
+            self._room = keys, values
+        for room, new in zip(self._room, (key_states, value_states), strict=True):
+            room[..., old:needed, :] = new
+        self.keys, self.values = (room[..., :needed, :] for room in self._room)
+        return self.keys, self.values
+
+
+def roomy_cache(config: PretrainedConfig) -> Cache:
+    """An empty cache for a model; layers with a sliding window keep the one that transformers has for them."""
+    cache = DynamicCache(config=config)
+    cache.layers = [RoomyLayer() if type(layer) is DynamicLayer else layer for layer in cache.layers]
+    return cache
