@@ -31,8 +31,17 @@ def write_clip(folder: Path, seed: int = 0) -> Path:
     return folder
 
 
-def write_llama(folder: Path, seed: int = 0) -> Path:
-    """A Llama with a byte-level tokenizer as `save_pretrained` lays it out."""
+def write_llama(
+    folder: Path, seed: int = 0, *, bos: bool = True, pad: str | None = "<pad>", shard: str = "5GB", **shapes: object
+) -> Path:
+    """A Llama with a byte-level tokenizer as `save_pretrained` lays it out.
+
+    Args:
+        bos: Whether the tokenizer begins a text with its token for that.
+        pad: Its padding token.
+        shard: Largest file of weights.
+        shapes: What is to be otherwise in LlamaConfig.
+    """
     from tokenizers import Tokenizer, decoders, models, pre_tokenizers, processors
     from transformers import LlamaConfig, LlamaForCausalLM, PreTrainedTokenizerFast
 
@@ -42,22 +51,22 @@ def write_llama(folder: Path, seed: int = 0) -> Path:
     tokenizer = Tokenizer(models.BPE(vocab=vocabulary, merges=[], unk_token="<unk>"))
     tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
     tokenizer.decoder = decoders.ByteLevel()
-    tokenizer.post_processor = processors.TemplateProcessing(single="<s> $A", special_tokens=[("<s>", 1)])
-    PreTrainedTokenizerFast(
-        tokenizer_object=tokenizer, pad_token="<pad>", bos_token="<s>", eos_token="</s>", unk_token="<unk>"
-    ).save_pretrained(folder)
+    if bos:
+        tokenizer.post_processor = processors.TemplateProcessing(single="<s> $A", special_tokens=[("<s>", 1)])
+    named = {"bos_token": "<s>", "eos_token": "</s>", "unk_token": "<unk>"} | ({"pad_token": pad} if pad else {})
+    PreTrainedTokenizerFast(tokenizer_object=tokenizer, **named).save_pretrained(folder)
     torch.manual_seed(seed)
-    config = LlamaConfig(
-        vocab_size=len(vocabulary),
-        hidden_size=32,
-        intermediate_size=64,
-        num_hidden_layers=2,
-        num_attention_heads=4,
-        num_key_value_heads=2,
-        max_position_embeddings=2048,
-        bos_token_id=1,
-        eos_token_id=2,
-        pad_token_id=0,
-    )
-    LlamaForCausalLM(config).save_pretrained(folder)
+    usual = {
+        "vocab_size": len(vocabulary),
+        "hidden_size": 32,
+        "intermediate_size": 64,
+        "num_hidden_layers": 2,
+        "num_attention_heads": 4,
+        "num_key_value_heads": 2,
+        "max_position_embeddings": 2048,
+        "bos_token_id": 1,
+        "eos_token_id": 2,
+        "pad_token_id": 0,
+    }
+    LlamaForCausalLM(LlamaConfig(**(usual | shapes))).save_pretrained(folder, max_shard_size=shard)  # type: ignore[arg-type]
     return folder

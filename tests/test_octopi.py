@@ -10,62 +10,23 @@ from safetensors.torch import save_file
 from torch.optim.optimizer import register_optimizer_step_pre_hook
 from torch.utils.data import SequentialSampler
 
-from pipeline.artifacts import save_tensors, write_table
 from pipeline.data.conversations import ConversationCollator
-from pipeline.data.embeddings import FLIPS, INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
+from pipeline.data.embeddings import EmbeddingStore
 from pipeline.errors import UserError
-from pipeline.evaluation.generate import Asking, answer
+from pipeline.evaluation.generate import answer
 from pipeline.models.llm import load_llm
 from pipeline.models.octopi import OctopiForCausalLM
 from pipeline.models.tactile_encoder import trainable_state
-from pipeline.physiclear.catalogue import load_catalogue
 from pipeline.prompts import IGNORE_INDEX, TACT_FRAME
-from pipeline.questions import build_questions, pool_of
-from pipeline.records import Assignment, Embedding, Opd, Part, Question, Task
-from pipeline.runtime import seed_everything
-from pipeline.sections import LanguageConfig, LoraTrainConfig, RuntimeConfig, TrainConfig
+from pipeline.records import Opd, Question, Task
+from pipeline.sections import LanguageConfig, LoraTrainConfig, RuntimeConfig
 from pipeline.training import trainer as shared
-from pipeline.training.language import Job, Material, add_lora, align, assemble, finetune_lora
+from pipeline.training.language import Job, add_lora, align, assemble, finetune_lora
 from tests.checkpoints import write_llama
-from tests.closure import ROOT
+from tests.language import DIM, FRAMES, SMALL, asking, language, material, model, questions, store
 
-FRAMES, DIM = 2, 6
-
-
-@pytest.fixture(scope="module")
-def language(tmp_path_factory: pytest.TempPathFactory) -> LanguageConfig:
-    folder = write_llama(tmp_path_factory.mktemp("llama"))
-    return LanguageConfig(weights=str(folder), max_new_tokens=12, generation_batch_size=4)
-
-
-@pytest.fixture(scope="module")
-def questions() -> list[Question]:
-    catalogue = load_catalogue(ROOT / "pipeline" / "physiclear")
-    videos = [Assignment(video_id=f"{o}_0", object_id=o, part=Part.TRAIN) for o in list(catalogue.objects)[::4]]
-    counts = {Task.OPD: 4, Task.PC: 4, Task.PSS: 3, Task.PSR: 3}
-    return build_questions(pool_of(Part.TRAIN, videos, catalogue), counts, seed=0, distinct=False)
-
-
-@pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory, questions: list[Question]) -> EmbeddingStore:
-    folder = tmp_path_factory.mktemp("embeddings")
-    videos = sorted({v for q in questions for v in q.videos})
-    index = [Embedding(video_id=v, frame_index=f, flip=flip, row=0) for v in videos for flip in FLIPS for f in range(3)]
-    index = [entry.model_copy(update={"row": row}) for row, entry in enumerate(index)]
-    write_table(folder / INDEX_FILE, Embedding, index)
-    save_tensors(folder / TENSOR_FILE, {TENSOR: torch.randn(len(index), DIM, generator=torch.manual_seed(0))})
-    return EmbeddingStore(folder)
-
-
-def material(language: LanguageConfig, questions: list[Question], store: EmbeddingStore) -> Material:
-    trained = [q for q in questions if q.task is not Task.PSR]
-    return Material(trained, store, Opd.ALL, language, per_video=FRAMES, flip_probability=0.5, seed=3)
-
-
-@pytest.fixture
-def model(language: LanguageConfig) -> OctopiForCausalLM:
-    seed_everything(1)
-    return OctopiForCausalLM.from_base(language.weights, DIM).eval()
+__all__ = ["language", "model", "questions", "store"]
+"""Fixtures."""
 
 
 def test_tactile_embeddings_stand_where_the_frames_are(model: OctopiForCausalLM) -> None:
@@ -165,10 +126,6 @@ def test_unknown_target_module_is_named(model: OctopiForCausalLM) -> None:
         add_lora(model, LoraTrainConfig(samples=1, target_modules=("q_projection",)))
 
 
-def asking(batch_size: int, tokens: int = 12) -> Asking:
-    return Asking(system_prompt="", per_video=FRAMES, max_new_tokens=tokens, batch_size=batch_size)
-
-
 @pytest.mark.parametrize("opd", list(Opd))
 def test_batch_size_changes_no_answer(
     model: OctopiForCausalLM, questions: list[Question], store: EmbeddingStore, opd: Opd
@@ -176,6 +133,8 @@ def test_batch_size_changes_no_answer(
     one = answer(model, store, questions, opd, asking(1))
     many = answer(model, store, questions, opd, asking(5))
     assert one == many
+    mixed = answer(model, store, questions[::-1], opd, asking(len(questions)))
+    assert sorted(mixed, key=lambda p: p.question_id) == sorted(one, key=lambda p: p.question_id)
     turns = {q.question_id: len(d.turns) for q in questions if (d := q.dialogue(opd))}
     assert {p.question_id: len(p.outputs) for p in one} == turns
     if opd is Opd.NONE:
@@ -213,9 +172,6 @@ def test_answers_equal_generation_by_hand(
             break
     expected = model.tokenizer.decode(said, skip_special_tokens=True).strip()
     assert answer(model, store, [question], Opd.ALL, asking(1))[0].outputs == (expected,)
-
-
-SMALL = TrainConfig(samples=8, epochs=2, batch_size=4, micro_batch_size=2, projection_learning_rate=1e-3)
 
 
 class Killed(Exception):

@@ -18,6 +18,12 @@ def _encoder(root: Path) -> Sequence[BenchRow]:
     return encoder.measure(root)
 
 
+def _language(root: Path) -> Sequence[BenchRow]:
+    from pipeline.benchmarks import language
+
+    return language.measure(root)
+
+
 SECTIONS: dict[str, Callable[[Path], Sequence[BenchRow]]] = {
     "frames": frames.measure,
     "realism": realism.measure,
@@ -25,6 +31,7 @@ SECTIONS: dict[str, Callable[[Path], Sequence[BenchRow]]] = {
     "selection": selection.measure,
     "startup": startup.measure,
     "encoder": _encoder,
+    "language": _language,
 }
 """To add a section: write its module with a `measure(root)` beside this one and list it here."""
 

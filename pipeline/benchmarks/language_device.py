@@ -1,0 +1,225 @@
+"""True shapes with random weights on a CUDA device: training by stages' own functions, answers, memory, share of peak.
+
+Nothing is asked of what such a model says: it runs to the limit of new tokens. A share is of the matrix rate that the
+card itself shows in one large product, and its operations are those that torch counts in a few updates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import perf_counter
+
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+from transformers import AutoModelForCausalLM, LlamaConfig
+
+from pipeline.benchmarks.language_bed import SEED, Bed, Encode, LanguageRow, make_bed
+from pipeline.benchmarks.language_ways import PUBLISHED, UPDATE, answer_batched, answer_published, train
+from pipeline.models.llm import load_tokenizer
+from pipeline.models.octopi import OctopiForCausalLM
+from pipeline.records import Question
+from pipeline.runtime import DeviceName, DtypeName, resolve_device, resolve_dtype, seed_everything
+from pipeline.sections import LoraTrainConfig, RuntimeConfig, TrainConfig
+from pipeline.training.language import Job, add_lora, align, finetune_lora
+
+COUNTED = 1
+"""Updates in which operations are counted, and which warm the device up."""
+
+
+@dataclass(frozen=True)
+class Size:
+    """What is run, and how much of it."""
+
+    name: str
+    llama: LlamaConfig
+    tower: str
+    """open_clip's name."""
+    side: int = 224
+    device: DeviceName = "cuda"
+    dtype: DtypeName = "bfloat16"
+    updates: int = 50
+    published_updates: int = 3
+    micro: int = 4
+    rank: int = 128
+    asked: int = 64
+    published_asked: int = 6
+    batch: int = 16
+    limit: int = 128
+    product: int = 8192
+    """Side of the matrices whose product shows the card's rate."""
+    runtime: RuntimeConfig = field(default_factory=lambda: RuntimeConfig(gradient_checkpointing=True))
+
+
+PAPER = Size(
+    name="paper-7b",
+    llama=LlamaConfig(
+        hidden_size=4096,
+        intermediate_size=11008,
+        num_hidden_layers=32,
+        num_attention_heads=32,
+        num_key_value_heads=32,
+        max_position_embeddings=4096,
+        vocab_size=32000,
+    ),
+    tower="ViT-L-14-quickgelu",
+)
+
+
+@dataclass(frozen=True)
+class Spent:
+    """What a case took."""
+
+    seconds: float
+    megabytes: float | None
+    samples: int
+    tokens: int
+    flops: float
+
+
+def device_rows(root: Path, size: Size = PAPER) -> list[LanguageRow]:
+    """Alignment, LoRA and answering, each the pipeline's way and the published one."""
+    device = resolve_device(size.device)
+    rate = matrix_rate(device, resolve_dtype(size.dtype), size.product)
+    rows: list[LanguageRow] = []
+    with TemporaryDirectory() as folder:
+        bed = random_bed(root, size, Path(folder), device)
+        for name, rank in (("alignment", 0), ("LoRA", size.rank)):
+            if rank:
+                add_lora(bed.model, _lora(size, 1))
+            spent = {
+                "published way": _spend(bed, size, size.published_updates, _published(bed)),
+                "pipeline's way": _spend(bed, size, size.updates, _pipeline(bed, size, rank)),
+            }
+            rows += _rows(f"{size.name} measured, {name}", spent, "useful tokens a second", rate)
+        spent = {
+            "published way": _asked(bed, size.published_asked, lambda b: answer_published(b, size.limit, forward=True)),
+            "pipeline's way": _asked(bed, size.asked, lambda b: answer_batched(b, size.limit, size.batch)),
+        }
+    return rows + _rows(f"{size.name} measured, answering", spent, "samples a second", rate)
+
+
+def random_bed(root: Path, size: Size, folder: Path, device: torch.device) -> Bed:
+    """A model and a tower with random weights, made where they stay; the stand-in's tokenizer."""
+    tokenizer = load_tokenizer(root / "standins" / "llama")
+
+    def make(dim: int) -> OctopiForCausalLM:
+        seed_everything(SEED)
+        with device:
+            llm = AutoModelForCausalLM.from_config(size.llama, dtype=resolve_dtype(size.dtype))
+        return OctopiForCausalLM(llm.requires_grad_(False).eval(), tokenizer, dim)
+
+    counts = (size.updates * UPDATE, size.asked)
+    catalogue = root / "pipeline" / "physiclear"
+    return make_bed(make, random_tower(size, device), size.side, counts, folder, catalogue, device)
+
+
+def random_tower(size: Size, device: torch.device) -> Encode:
+    """CLIP's visual tower up to the class token's last state, as the published code reads it."""
+    import open_clip
+
+    dtype = resolve_dtype(size.dtype)
+    with device:
+        visual = open_clip.CLIP(**open_clip.get_model_config(size.tower)).visual.to(dtype).eval()
+    visual.proj = None
+
+    def encode(frames: torch.Tensor) -> torch.Tensor:
+        embedded: torch.Tensor = visual(frames.permute(0, 3, 1, 2).to(dtype) / 127.5 - 1)
+        return embedded
+
+    return encode
+
+
+def matrix_rate(device: torch.device, dtype: torch.dtype, side: int) -> float:
+    """Operations a second in products of square matrices: the best of ten after a warm-up."""
+    a, b = (torch.randn(side, side, device=device).to(dtype) for _ in range(2))
+    seconds = []
+    for _ in range(13):
+        seconds.append(_timed(lambda: torch.mm(a, b), device))
+    return 2 * side**3 / min(seconds[3:])
+
+
+def _timed(run: Callable[[], object], device: torch.device) -> float:
+    if device.type == "cuda":
+        torch.cuda.synchronize()
+    started = perf_counter()
+    run()
+    if device.type == "cuda":
+        torch.cuda.synchronize()
+    return perf_counter() - started
+
+
+def _lora(size: Size, samples: int) -> LoraTrainConfig:
+    return LoraTrainConfig(
+        samples=samples, batch_size=UPDATE, micro_batch_size=size.micro, rank=size.rank, alpha=2 * size.rank
+    )
+
+
+def _pipeline(bed: Bed, size: Size, rank: int) -> Callable[[list[Question]], object]:
+    def run(questions: list[Question]) -> object:
+        data, job = bed.conversations(questions), Job("bench", f"{size.name}{rank}", SEED)
+        if rank:
+            return finetune_lora(bed.model, data, _lora(size, len(questions)), size.runtime, job)
+        config = TrainConfig(samples=len(questions), batch_size=UPDATE, micro_batch_size=size.micro)
+        return align(bed.model, data, config, size.runtime, job)
+
+    return run
+
+
+def _published(bed: Bed) -> Callable[[list[Question]], object]:
+    def run(questions: list[Question]) -> None:
+        # The published code keeps all activations.
+        bed.model.llm.gradient_checkpointing_disable()
+        trained = [p for p in bed.model.train().parameters() if p.requires_grad]
+        train(bed, PUBLISHED, questions, torch.optim.AdamW(trained, lr=1e-6))
+
+    return run
+
+
+def _spend(bed: Bed, size: Size, updates: int, run: Callable[[list[Question]], object]) -> Spent:
+    few, questions = list(bed.training[: COUNTED * UPDATE]), list(bed.training[: updates * UPDATE])
+    with FlopCounterMode(display=False) as counter:
+        run(few)
+    seconds, megabytes = _with_memory(bed, lambda: run(questions))
+    tokens, counted = (sum(bed.conversations(some).lengths) for some in (questions, few))
+    return Spent(seconds, megabytes, len(questions), tokens, counter.get_total_flops() * tokens / counted)
+
+
+def _asked(bed: Bed, count: int, run: Callable[[Bed], object]) -> Spent:
+    some = replace(bed, asked=bed.asked[:count])
+    with FlopCounterMode(display=False) as counter:
+        run(some)
+    seconds, megabytes = _with_memory(bed, lambda: run(some))
+    return Spent(seconds, megabytes, count, 0, float(counter.get_total_flops()))
+
+
+def _with_memory(bed: Bed, run: Callable[[], object]) -> tuple[float, float | None]:
+    if bed.device.type != "cuda":
+        return _timed(run, bed.device), None
+    torch.cuda.reset_peak_memory_stats()
+    seconds = _timed(run, bed.device)
+    return seconds, round(torch.cuda.max_memory_allocated() / 1e6, 1)
+
+
+def _rows(what: str, spent: dict[str, Spent], unit: str, rate: float) -> list[LanguageRow]:
+    rates = {case: (s.tokens or s.samples) / s.seconds for case, s in spent.items()}
+    baseline = next(iter(spent))
+    return [
+        LanguageRow(
+            case=f"{what}, {case}",
+            cost=round(rates[case], 3),
+            low=round(rates[case], 3),
+            high=round(rates[case], 3),
+            unit=unit,
+            baseline=f"{what}, {baseline}",
+            ratio=round(rates[case] / rates[baseline], 3),
+            samples=s.samples,
+            tokens=s.tokens or None,
+            flops=s.flops,
+            megabytes=s.megabytes,
+            share=round(s.flops / s.seconds / rate, 4),
+        )
+        for case, s in spent.items()
+    ]
