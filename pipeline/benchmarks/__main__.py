@@ -18,12 +18,20 @@ def _encoder(root: Path) -> Sequence[BenchRow]:
     return encoder.measure(root)
 
 
+def _coverage(root: Path) -> Sequence[BenchRow]:
+    # NumPy's whole statistics are loaded for this section alone, for the same reason.
+    from pipeline.benchmarks import coverage
+
+    return coverage.measure(root)
+
+
 SECTIONS: dict[str, Callable[[Path], Sequence[BenchRow]]] = {
     "frames": frames.measure,
     "realism": realism.measure,
     "scenes": scenes.measure,
     "selection": selection.measure,
     "startup": startup.measure,
+    "coverage": _coverage,
     "encoder": _encoder,
 }
 """To add a section: write its module with a `measure(root)` beside this one and list it here."""

@@ -6,7 +6,7 @@ they share one object, so that clusters overlap. Two estimates of the variance:
 - `variance`, which the reports use, fits variance components by moments (Henderson 1953, method 1; Searle, Casella,
   McCulloch 1992, chapter 5): one for objects, one for sets of objects that questions come back to, one for questions.
   It supposes that a question's objects add up. For questions about one object, as many about each, it is the ordinary
-  cluster-robust variance with the factor G / (G - 1), but never below that of independent questions.
+  cluster-robust variance with the factor G / (G - 1), unless that is below the variance of independent questions.
 - `overlapping_variance` supposes nothing of the kind: every two questions that share an object count with the product
   of their residuals (Cameron, Gelbach, Miller 2011, by inclusion and exclusion over the objects shared; Aronow, Samii,
   Assenova 2015 for pairs). It is unbiased for designs in which each object is equally frequent, but falls below zero
@@ -95,19 +95,11 @@ def components(values: Values, clusters: Clusters) -> Values:
     centred = values - values.mean(axis=-1, keepdims=True)
     groups = [centred if f is None else centred @ f for f in clusters.factors]
     sums = np.stack([(g**2).sum(axis=-1) for g in groups], axis=-1)
-    flat = sums.reshape(-1, len(groups))
-    found, kept = np.zeros_like(flat), np.ones(flat.shape, dtype=bool)
-    for _ in groups:
-        for pattern in np.unique(kept, axis=0):
-            rows = (kept == pattern).all(axis=1)
-            fitted = np.linalg.solve(clusters.moments[np.ix_(pattern, pattern)], flat[np.ix_(rows, pattern)].T).T
-            found[np.ix_(rows, pattern)] = fitted
-            found[np.ix_(rows, ~pattern)] = 0
-        # What would be below 0 is left out, and the others are fitted again without it.
-        if (found >= 0).all():
-            break
-        kept &= found >= 0
-    parts: Values = np.maximum(found, 0.0).reshape(sums.shape)
+    # Through the first axes: solve takes right-hand sides in columns.
+    found = np.linalg.solve(clusters.moments, np.moveaxis(sums, -1, 0).reshape(len(groups), -1))
+    # The others are not fitted again without what is below 0: that would take what is too much from them as well, and
+    # covers less in simulated designs.
+    parts: Values = np.maximum(np.moveaxis(found.reshape(-1, *sums.shape[:-1]), 0, -1), 0.0)
     return parts
 
 

@@ -22,21 +22,24 @@ class Difference:
     interval: Interval | None
     """Object-clustered; None where the questions cannot show that objects differ."""
     p: float | None
-    """Of the sign-flip test over objects; None likewise. Its interval is not this one: the test is exact but has few
-    values, so that it may doubt what the interval excludes."""
+    """Of the sign-flip test over objects; None likewise. It is not the interval's: it takes few values, and may doubt
+    what the interval excludes, or the other way round."""
     least: float | None = None
     """The smallest p that so few objects can give."""
     mcnemar: float | None = None
     """Exact, as if questions were independent: only to be read beside `p`. None where differences are not whole."""
     detectable: float | None = None
-    """The smallest true difference that the interval would exclude 0 for in four of five repetitions."""
+    """The smallest true difference that a t test over objects with the interval's standard error would find in four of
+    five repetitions."""
 
 
 def paired(gains: Sequence[Outcome], seed: int = 0) -> Difference:
     """The mean of paired differences with all that belongs to it; `seed` is that of signs drawn for many objects.
 
-    The interval (`bounds.difference_bounds`) covers 93 % and more in simulated designs but for
-    seven objects with questions about two or three that correlate strongly within objects: 84 to 93 % there.
+    Simulated (reports/bench/coverage.md), the interval (`bounds.difference_bounds`) covers 93 % and more; with seven
+    objects 97 to 100 % for most questions about one. It falls short, 88 to 91 %, with seven objects for questions about
+    two or three that correlate within objects, where a setting is nearly always right. It holds nothing of seeds:
+    `over_seeds` and `factorial_effects` do.
 
     Raises:
         ValueError: without any question.
@@ -73,8 +76,8 @@ def paired(gains: Sequence[Outcome], seed: int = 0) -> Difference:
 def mcnemar(gains: Sequence[float]) -> float | None:
     """Two-sided exact McNemar test: of the questions that one setting alone gets right, is it half each?
 
-    It takes questions to be independent. Where they share objects it finds differences where there are none: at 5 %,
-    simulated, in up to half of the comparisons.
+    It takes questions to be independent. Where they share objects it finds differences where there are none:
+    simulated, in up to half of the comparisons where 5 % are meant.
 
     Args:
         gains: 1 where the first setting alone is right, -1 where the second alone is, 0 otherwise.

@@ -37,9 +37,9 @@ class Proportion:
 def wilson(correct: float, n: int) -> Interval:
     """Wilson's 95 % interval of a proportion; `correct` is rounded to a whole number of successes.
 
-    It takes questions to be independent. Where they share objects it is too narrow: simulated with 7 objects and a
-    latent correlation of .7 within objects, it covers 70 to 90 % for questions about one object and 35 to 85 % for
-    questions about two or three.
+    It takes questions to be independent. Where they share objects that differ it is too narrow: simulated with seven
+    objects and a correlation of .7 within objects, it covers 72 to 92 % for questions about one object and 36 to 86 %
+    for questions about two or three; more objects make it no better.
 
     Raises:
         ValueError: if `n` is not positive or `correct` is not from 0 to `n`.
@@ -55,6 +55,12 @@ def clustered(outcomes: Sequence[Outcome]) -> Interval | None:
 
     The variance is `clusters.variance`, the interval `bounds.accuracy_bounds`. It holds all of Wilson's interval of as
     many independent questions.
+
+    Simulated (reports/bench/coverage.md), it covers 93 to 97 % of accuracies from .3 to .8 for questions about one
+    object, with twenty objects and more also for questions about two or three (91.7 % at the least). It is wider than
+    it need be, 97 to 99.7 %, where few objects do not differ. It falls short, 90 to 92 %, with seven objects for
+    questions about two or three that correlate by .3 and more within objects, and with twenty and sixty at .05 or .97
+    where the correlation is .7.
 
     Returns:
         None where the questions cannot show that objects differ: fewer than two objects, or each about all of them.

@@ -30,10 +30,11 @@ def resampled(outcomes: Sequence[Outcome], seed: int = 0) -> Interval | None:
     which no question has any weight (all draws on too few objects) have no mean and are left out. With up to
     `MOST_ENUMERATED` objects the distribution is exact, beyond it is drawn with `seed`.
 
-    Simulated with seven objects and questions about one, it covers 84 to 89 % where it is called 95 %, and 44 to 80 %
-    of accuracies near 0 or 1; for questions about two or three it covers too much where objects do not differ (the
-    product of the weights counts each question's own chance several times) and too little where they differ much. At
-    60 objects it is fair. `clustered` is better throughout; this one is for whoever wants no model.
+    It is optimistic where objects are few: simulated (reports/bench/coverage.md) with seven and questions about one, it
+    covers 85 to 88 % of accuracies from .3 to .8 and 46 to 82 % of .05 or .97. For questions about two or three it
+    covers up to 100 % where objects do not differ, as the product of the weights counts each question's own chance
+    several times, and 49 to 89 % where they differ much. With sixty objects and questions about one it is fair.
+    `clustered` is closer to 95 % nearly throughout; this one is for whoever wants no model.
 
     Returns:
         None for fewer than two objects, or where every question is about every object.

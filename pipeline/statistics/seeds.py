@@ -4,7 +4,13 @@ Every question is answered under every seed. The variance of the mean over both 
 (Cameron, Gelbach, Miller 2011): that of the questions' means by objects, plus that of the seeds' means, less what both
 contain. Degrees of freedom are those of a sum of two variances (Satterthwaite 1946): objects less one, seeds less one.
 A bootstrap over objects and seeds would ask for more seeds than anybody trains: two or three drawn anew from three
-have hardly any spread. NumPy is imported only where it is used.
+have hardly any spread.
+
+Simulated (reports/bench/coverage.md) with five seeds, the interval covers 93 to 100 % of accuracies over all runs, but
+88 to 93 % with seven objects and questions about two or three that depend on them. A single run says nothing of others:
+where they deviate by five points, its interval covers nine tenths and, with many objects, half.
+
+NumPy is imported only where it is used.
 """
 
 from __future__ import annotations
