@@ -20,11 +20,11 @@ from pipeline.statistics import (
     clustered,
     compositions,
     confusion,
-    holm,
     icc3k,
     icc3k_interval,
-    paired,
     proportion,
+    quadratic_kappa,
+    resampled,
     wilson,
 )
 from tests.closure import ROOT
@@ -73,11 +73,11 @@ def brute_force(outcomes: Sequence[Outcome]) -> Interval:
 
 @pytest.mark.parametrize("about", [1, 2, 3])
 @pytest.mark.parametrize("seed", range(5))
-def test_clustered_equals_brute_force(about: int, seed: int) -> None:
+def test_resampled_equals_brute_force(about: int, seed: int) -> None:
     rng = random.Random(seed)
     objects = [f"object {i}" for i in range(5)]
     outcomes = [Outcome(rng.choice([0, 1, 0.5]), tuple(rng.sample(objects, about))) for _ in range(17)]
-    ours, reference = clustered(outcomes), brute_force(outcomes)
+    ours, reference = resampled(outcomes), brute_force(outcomes)
     assert ours is not None
     assert ours.low == pytest.approx(reference.low, abs=1e-9)
     assert ours.high == pytest.approx(reference.high, abs=1e-9)
@@ -97,23 +97,29 @@ def test_seven_objects_have_1716_resamples() -> None:
 def test_many_objects_are_drawn_and_close_to_normal_theory() -> None:
     """Forty objects of one question each: the bootstrap of a mean, standard error sqrt(p (1 - p) / n)."""
     outcomes = [Outcome(float(i < 20), (f"object {i}",)) for i in range(40)]
-    interval = clustered(outcomes, seed=3)
+    interval = resampled(outcomes, seed=3)
     assert interval is not None
-    assert interval == clustered(outcomes, seed=3)
+    assert interval == resampled(outcomes, seed=3)
     half = 1.96 * math.sqrt(0.25 / 40)
     assert interval.low == pytest.approx(0.5 - half, abs=0.03)
     assert interval.high == pytest.approx(0.5 + half, abs=0.03)
 
 
 def test_one_object_has_nothing_to_resample() -> None:
-    assert clustered([Outcome(1, ("a",)), Outcome(0, ("a",))]) is None
+    for interval in (resampled, clustered):
+        assert interval([Outcome(1, ("a",)), Outcome(0, ("a",))]) is None
+        assert interval([]) is None
+        # Two objects that every question is about cannot be seen to differ either.
+        assert interval([Outcome(1, ("a", "b")), Outcome(0, ("b", "a"))]) is None
     assert proportion([Outcome(1, ("a",))]).clustered is None
 
 
 def test_all_right_is_one() -> None:
     result = proportion([Outcome(1, (o,)) for o in "abcabc"])
     assert result.value == 1
-    assert result.clustered == Interval(1, 1)
+    assert result.resampled == Interval(1, 1), "why it is not the interval that reports give"
+    assert result.clustered is not None
+    assert (result.clustered.high, result.clustered.low < result.wilson.low) == (1, True)
     assert result.wilson.high == pytest.approx(1)
     assert result.wilson.low < 0.7
 
@@ -245,56 +251,31 @@ def test_confusion_counts_rows_as_expected() -> None:
         confusion([0], [], 3)
 
 
+@given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 3)), min_size=1, max_size=40))
+@settings(deadline=None, max_examples=60)
+def test_kappa_is_one_less_the_ratio_of_distances(pairs: list[tuple[int, int]]) -> None:
+    expected, predicted = [a for a, _ in pairs], [b for _, b in pairs]
+    apart = sum((a - b) ** 2 for a, b in pairs) / len(pairs)
+    by_chance = sum((a - b) ** 2 for a in expected for b in predicted) / len(pairs) ** 2
+    kappa = quadratic_kappa(expected, predicted, 4)
+    if by_chance == 0:
+        assert kappa is None
+    else:
+        assert kappa == pytest.approx(1 - apart / by_chance, abs=1e-12)
+
+
+def test_kappa_of_cohens_example() -> None:
+    """The counts of Cohen 1968, table 1, with quadratic weights, by hand."""
+    table = [[88, 14, 18], [10, 40, 10], [2, 6, 12]]
+    pairs = [(r, c) for r, row in enumerate(table) for c, count in enumerate(row) for _ in range(count)]
+    rows, columns = [120, 60, 20], [100, 60, 40]
+    apart = 14 + 10 + 10 + 6 + 4 * (18 + 2)
+    by_chance = sum((r - c) ** 2 * rows[r] * columns[c] for r in range(3) for c in range(3)) / 200
+    kappa = quadratic_kappa([r for r, _ in pairs], [c for _, c in pairs], 3)
+    assert kappa == pytest.approx(1 - apart / by_chance, abs=1e-12)
+    assert quadratic_kappa([0, 0], [1, 1], 3) == 0, "constant answers that are wrong agree by chance alone"
+
+
 def test_spread_of_seeds() -> None:
     assert Spread((1.0, 3.0)).deviation == pytest.approx(math.sqrt(2))
     assert Spread((1.0,)).deviation is None
-
-
-def test_paired_differences_equal_brute_force() -> None:
-    """Every ordered draw of four objects, by itself."""
-    rng = random.Random(5)
-    gains = [Outcome(rng.choice((-1.0, 0.0, 0.5, 1.0)), (o,)) for o in "abcd" for _ in range(3)]
-    means = []
-    for drawn in itertools.product("abcd", repeat=4):
-        values = [g.correct for o in drawn for g in gains if g.objects == (o,)]
-        means.append(sum(values) / len(values))
-    gap = paired(gains)
-    assert gap.value == pytest.approx(sum(g.correct for g in gains) / 12)
-    assert gap.interval is not None
-    means.sort()
-    assert gap.interval.low in means
-    assert gap.interval.high in means
-    tails = [sum(m <= 1e-12 for m in means), sum(m >= -1e-12 for m in means)]
-    assert gap.p == pytest.approx(min(1, 2 * max(min(tails), 1) / len(means)))
-
-
-def test_paired_p_and_interval_say_the_same() -> None:
-    rng = random.Random(2)
-    for shift in (0.0, 0.1, 0.3, 0.6):
-        gains = [Outcome(rng.gauss(shift, 0.5), (str(o),)) for o in range(20) for _ in range(4)]
-        gap = paired(gains)
-        assert gap.interval is not None
-        assert gap.p is not None
-        assert (gap.interval.low > 0 or gap.interval.high < 0) == (gap.p < 0.05)
-
-
-def test_paired_without_difference_and_with_one_object() -> None:
-    gap = paired([Outcome(0.0, (o,)) for o in "abc"])
-    assert (gap.value, gap.p) == (0, 1)
-    alone = paired([Outcome(1.0, ("a",)), Outcome(0.0, ("a",))])
-    assert (alone.value, alone.interval, alone.p) == (0.5, None, None)
-    with pytest.raises(ValueError, match="at least one question"):
-        paired([])
-
-
-@pytest.mark.parametrize(
-    ("ps", "adjusted"),
-    [
-        # R's documentation of p.adjust describes the procedure; worked by hand here.
-        ([0.01, 0.04, 0.03, 0.005], [0.03, 0.06, 0.06, 0.02]),
-        ([0.5, 0.6], [1.0, 1.0]),
-        ([], []),
-    ],
-)
-def test_holm(ps: list[float], adjusted: list[float]) -> None:
-    assert holm(ps) == pytest.approx(adjusted)

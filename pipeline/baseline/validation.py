@@ -1,10 +1,8 @@
 """How good the baseline is on objects that it has never touched: grouped cross-validation and what it shows.
 
-All videos of an object are in one fold, as videos of one object look alike. Intervals draw objects anew: they hold
-the chance of which objects were measured, not that of how folds and trees fell. The spread over repeats shows the
+All videos of an object are in one fold, as videos of one object look alike. Intervals are clustered by object: they
+hold the chance of which objects were measured, not that of how folds and trees fell. The spread over repeats shows the
 latter; more repeats average it out.
-
-Source: Cohen 1968 (weighted kappa).
 """
 
 from __future__ import annotations
@@ -21,7 +19,7 @@ import numpy.typing as npt
 from pipeline.baseline.predictor import Features, Labels, PropertyPredictor, check_labels
 from pipeline.records import Judged
 from pipeline.runtime import derive_seed
-from pipeline.statistics import Difference, Interval, Outcome, Spread, clustered, confusion, paired
+from pipeline.statistics import Difference, Interval, Outcome, Spread, clustered, paired, quadratic_kappa
 
 
 @dataclass(frozen=True)
@@ -193,8 +191,8 @@ def cross_validate(
     )
 
 
-def summarise(verdicts: Sequence[Verdict], classes: Sequence[int], seed: int = 0) -> Summary:
-    """All figures of a cross-validation; `seed` is that of the intervals.
+def summarise(verdicts: Sequence[Verdict], classes: Sequence[int]) -> Summary:
+    """All figures of a cross-validation.
 
     Raises:
         ValueError: without any verdict.
@@ -202,8 +200,8 @@ def summarise(verdicts: Sequence[Verdict], classes: Sequence[int], seed: int = 0
     if not verdicts:
         raise ValueError("a summary needs at least one verdict")
     return Summary(
-        combined=_accuracy(verdicts, None, math.prod(classes), seed),
-        properties=tuple(_property(verdicts, position, count, seed) for position, count in enumerate(classes)),
+        combined=_accuracy(verdicts, None, math.prod(classes)),
+        properties=tuple(_property(verdicts, position, count) for position, count in enumerate(classes)),
         videos=len(verdicts),
         objects=len({v.object_id for v in verdicts}),
     )
@@ -223,26 +221,17 @@ def compare(first: Sequence[Verdict], second: Sequence[Verdict], seed: int = 0) 
     return paired(gains, seed)
 
 
-def quadratic_kappa(expected: Sequence[int], predicted: Sequence[int], classes: int) -> float | None:
-    """1 - (mean squared distance) / (the same if both were paired at random); None where the latter is 0."""
-    counts = np.array(confusion(expected, predicted, classes), dtype=np.float64)
-    distance = np.subtract.outer(np.arange(classes), np.arange(classes)) ** 2
-    random = np.outer(counts.sum(axis=1), counts.sum(axis=0)) / counts.sum()
-    unexpected = float((distance * random).sum())
-    return 1 - float((distance * counts).sum()) / unexpected if unexpected > 0 else None
-
-
-def _property(verdicts: Sequence[Verdict], position: int, count: int, seed: int) -> PropertySummary:
+def _property(verdicts: Sequence[Verdict], position: int, count: int) -> PropertySummary:
     expected = [v.expected[position] for v in verdicts for _ in v.predicted]
     predicted = [p[position] for v in verdicts for p in v.predicted]
     return PropertySummary(
-        accuracy=_accuracy(verdicts, position, count, seed),
+        accuracy=_accuracy(verdicts, position, count),
         absolute_error=fmean(abs(e - p) for e, p in zip(expected, predicted, strict=True)),
         kappa=quadratic_kappa(expected, predicted, count),
     )
 
 
-def _accuracy(verdicts: Sequence[Verdict], position: int | None, answers: int, seed: int) -> Accuracy:
+def _accuracy(verdicts: Sequence[Verdict], position: int | None, answers: int) -> Accuracy:
     def part(labels: tuple[int, ...]) -> tuple[int, ...]:
         return labels if position is None else labels[position : position + 1]
 
@@ -250,7 +239,7 @@ def _accuracy(verdicts: Sequence[Verdict], position: int | None, answers: int, s
     common = Counter(part(v.expected) for v in verdicts).most_common(1)[0][1]
     return Accuracy(
         spread=Spread(tuple(fmean(part(v.predicted[r]) == part(v.expected) for v in verdicts) for r in repeats)),
-        interval=clustered([Outcome(v.correct(position), (v.object_id,)) for v in verdicts], seed),
+        interval=clustered([Outcome(v.correct(position), (v.object_id,)) for v in verdicts]),
         majority=common / len(verdicts),
         chance=1 / answers,
     )

@@ -24,12 +24,20 @@ def _language(root: Path) -> Sequence[BenchRow]:
     return language.measure(root)
 
 
+def _coverage(root: Path) -> Sequence[BenchRow]:
+    # NumPy's whole statistics are loaded for this section alone, for the same reason.
+    from pipeline.benchmarks import coverage
+
+    return coverage.measure(root)
+
+
 SECTIONS: dict[str, Callable[[Path], Sequence[BenchRow]]] = {
     "frames": frames.measure,
     "realism": realism.measure,
     "scenes": scenes.measure,
     "selection": selection.measure,
     "startup": startup.measure,
+    "coverage": _coverage,
     "encoder": _encoder,
     "language": _language,
 }

@@ -37,8 +37,9 @@ def language_tables(inputs: Inputs) -> list[Table]:
         Table(
             "effects",
             "What each part brings",
-            "Differences on the same questions, in percentage points, over seeds. Intervals and p draw objects anew; "
-            "p (Holm) is adjusted for all comparisons with the same *Others*.",
+            "Differences on the same questions, in percentage points, over seeds. Intervals are clustered by object; p "
+            "flips the signs of whole objects: with few it takes few values, with seven none below .016. p (Holm) is "
+            "adjusted for all comparisons with the same *Others*.",
             effects(answered, real, whole),
             folder=FOLDER,
         ),

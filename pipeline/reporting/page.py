@@ -16,9 +16,10 @@ READING = """\
   values.
 - **95 % Wilson** treats questions as independent, which they are not: they reuse videos and objects. A k that is not
   whole is rounded for it.
-- **95 % over objects** draws the objects anew instead (all resamples of up to eight objects, 10 000 drawn beyond; a
-  question weighs the product over its objects of how often each was drawn). With so few objects it is
-  optimistic, and it has no width where no answer or every answer is right.
+- **95 % over objects** is Wilson's with the number of independent questions that would be as sure of their mean as
+  these are, which share objects; Student's t over the objects makes up for how few these are. Simulated, it covers
+  what it says but for some designs with few objects, or with questions about two or three that depend strongly on
+  them: reports/bench/coverage.md names them.
 - **Chance** is a uniform guess; **Majority** the best constant answer in hindsight, on the same questions.
 - **Unparsed %** are answers that no choice could be read from; they count as wrong. **Truncated %** ran into the
   limit of `language.max_new_tokens`.
