@@ -22,6 +22,7 @@ $(DONE): requirements.lock pyproject.toml
 
 repro: install
 	dvc repro
+	@octopi page
 	@python -c 'from pipeline.config import load_params; print(f"\nTables and figures: reports/{load_params().report_name}/README.md")'
 	@echo "Dashboard:          make dashboard, then open http://127.0.0.1:$(PORT)"
 

@@ -94,6 +94,14 @@ def publish() -> None:
     typer.echo(str(publish_runs(load_params(), Path())))
 
 
+@app.command()
+def page() -> None:
+    """Write reports/index.html: all reports on one page, to open from disk."""
+    from pipeline.review import write_page
+
+    typer.echo(f"{write_page(Path())}: all reports on one page; open it in a browser")
+
+
 def main() -> None:
     """Run the command; bad input ends it with one line and status 1."""
     try:

@@ -12,6 +12,7 @@ from safetensors.numpy import save_file
 
 from pipeline.artifacts import write_csv, write_json, write_jsonl, write_table
 from pipeline.config import Params
+from pipeline.evaluation.grading import grade
 from pipeline.physiclear.catalogue import Catalogue, load_catalogue
 from pipeline.plan import Variant
 from pipeline.questions import build_questions, pool_of
@@ -20,6 +21,7 @@ from pipeline.records import (
     Classification,
     Embedding,
     Finding,
+    Frame,
     Measurement,
     Part,
     Prediction,
@@ -29,7 +31,6 @@ from pipeline.records import (
     Video,
 )
 from pipeline.scales import compose
-from pipeline.tasks import TASKS
 from pipeline.tracking.reproduction import planned_stages
 from tests.closure import ROOT
 
@@ -77,8 +78,10 @@ def write_chain(root: Path, params: Params, *, objects: Sequence[str] = (), skil
             write_table(data / stage / key / "history.parquet", Measurement, _loss(rng, 60))
             (data / stage / key / "connector.safetensors").write_bytes(b"weights")
     for key, variant in params.plan.variants.items():
-        scores = [s for q in questions for s in _answer(q, variant, catalogue, skill, rng)]
-        write_table(data / "scores" / key / "scores.parquet", Score, scores)
+        said = [p for q in questions if (p := _say(q, variant, skill, rng))]
+        write_jsonl(data / "answers" / key / "predictions.jsonl", said)
+        write_table(data / "scores" / key / "scores.parquet", Score, grade(questions, said, catalogue))
+    _film(data / "frames", videos)
 
 
 def write_lock(root: Path, params: Params, changed: str = "", only: Sequence[str] = ()) -> None:
@@ -148,15 +151,29 @@ def _classify(a: Assignment, catalogue: Catalogue, skill: float, rng: random.Ran
     return records if a.part in (Part.VALIDATION, Part.TEST) else []
 
 
-def _answer(q: Question, variant: Variant, catalogue: Catalogue, skill: float, rng: random.Random) -> list[Score]:
-    """The gold answer, or one that cannot be read, through the task's own grader."""
+def _say(q: Question, variant: Variant, skill: float, rng: random.Random) -> Prediction | None:
+    """The gold answer, or one that cannot be read."""
     dialogue = q.dialogue(variant.opd)
     if dialogue is None:
-        return []
+        return None
     right = rng.random() < skill
     outputs = tuple(turn.assistant if right else "I cannot tell." for turn in dialogue.turns)
-    said = Prediction(question_id=q.question_id, task=q.task, outputs=outputs, truncated=not right, tokens=9)
-    return TASKS[q.task].grade(q, said, catalogue)
+    return Prediction(question_id=q.question_id, task=q.task, outputs=outputs, truncated=not right, tokens=9)
+
+
+def _film(folder: Path, videos: Sequence[Video], kept: int = 4, side: int = 24) -> None:
+    """Frames of one colour each."""
+    rng = np.random.default_rng(0)
+    index = [
+        Frame(video_id=v.video_id, frame_index=i, score=0, row=kept * place + i)
+        for place, v in enumerate(videos)
+        for i in range(kept)
+    ]
+    colours = rng.integers(0, 256, (len(index), 1, 1, 3), dtype=np.uint8)
+    folder.mkdir(parents=True)
+    np.save(folder / "frames.npy", np.broadcast_to(colours, (len(index), side, side, 3)))
+    np.save(folder / "references.npy", np.full((len(videos), side, side, 3), 90, np.uint8))
+    write_table(folder / "frames.parquet", Frame, index)
 
 
 def _embed(folder: Path, assignments: Sequence[Assignment]) -> None:

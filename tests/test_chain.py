@@ -22,10 +22,12 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
 
 def test_tables_and_figures_are_there(project: Project) -> None:
     report = project.folder / "reports" / "smoke-scenes"
-    for name in ("README.md", "params.yaml", "provenance.json", "metrics.json", "tables", "figures"):
+    for name in ("README.md", "params.yaml", "provenance.json", "metrics.json", "tables", "figures", "samples"):
         assert (report / name).exists(), name
     assert "prove" in (report / "README.md").read_text(), "the smoke report says what its figures are worth"
     assert (project.folder / "mlruns" / "mlflow.db").is_file()
+    project.run("octopi", "page")
+    assert "At a glance" in (project.folder / "reports" / "index.html").read_text()
 
 
 def test_second_time_does_nothing(project: Project) -> None:

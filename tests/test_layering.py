@@ -37,6 +37,7 @@ LEVELS = {
     "evaluation": 6,
     "tracking": 7,
     "reporting": 7,
+    "review": 8,
     "stage": 7,
     "scales": 7,
     "cli": 9,

@@ -20,6 +20,8 @@ from pipeline.reporting.language_rows import EffectRow
 from pipeline.reporting.page import Picture, render_page
 from pipeline.reporting.provenance import provenance
 from pipeline.reporting.results import headline, result_tables
+from pipeline.reporting.samples import FOLDER as SAMPLES
+from pipeline.reporting.samples import write_samples
 from pipeline.reporting.table import Table
 
 COSTS = Path("reports") / "bench" / "encoder.json"
@@ -50,6 +52,7 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
             folder / table.folder / f"{table.name}.md", f"# {table.title}\n\n{table.caption}\n\n{table.markdown()}"
         )
     pictures = _draw(inputs, tables, root, folder / "figures")
+    write_samples(inputs, root, folder / SAMPLES)
     origin = provenance(params, inputs.videos, root)
     metrics = headline(inputs, tables)
     write_text(folder / "README.md", render_page(inputs, origin, tables, pictures))

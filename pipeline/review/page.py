@@ -1,0 +1,224 @@
+"""What stands on the page, put together from the files; the templates only say how it looks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.records import Severity
+from pipeline.reporting.results import OCTOPI
+from pipeline.reporting.samples import FOLDER
+from pipeline.review.folders import Bench, Report, find_grids, read_benches, read_reports
+from pipeline.review.graph import Drawing, draw_chain
+from pipeline.review.known import ACCURACY, BENCH, view_of
+from pipeline.review.matrices import Matrix, matrices
+from pipeline.review.missing import Gap, gaps
+from pipeline.review.readme import Section
+from pipeline.review.tables import Drawn, Shown, draw, show
+from pipeline.review.themes import BENCHES, EVERYWHERE, ORIGIN, OTHERS, SAMPLES, THEMES, BenchText, Theme
+from pipeline.review.traced import Grid, Piece, fill
+from pipeline.review.views import View
+
+HEADLINE = (
+    ("PC", "understanding", "Property comparison"),
+    ("PSS", "understanding", "Superlative selection"),
+    ("POM", "understanding", "Object matching"),
+    ("PSR", "scenario_reasoning", "Scenario reasoning"),
+    ("combined", "property_description", "Description, all properties right"),
+)
+"""Row, table and name of the figures at a glance."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A PNG on the page."""
+
+    file: str
+    """Relative to reports/."""
+    alt: str
+
+
+@dataclass(frozen=True)
+class Block:
+    """A table, matrices or a figure under its heading."""
+
+    title: str
+    caption: str
+    source: str
+    """File that the caption stands in."""
+    table: Shown | None = None
+    matrices: tuple[Matrix, ...] = ()
+    pictures: tuple[Picture, ...] = ()
+    counts: tuple[tuple[str, Piece], ...] = ()
+
+
+@dataclass(frozen=True)
+class Group:
+    """The blocks of one theme."""
+
+    theme: Theme
+    blocks: tuple[Block, ...]
+
+
+@dataclass(frozen=True)
+class Chapter:
+    """One report."""
+
+    report: Report
+    groups: tuple[Group, ...]
+
+    @property
+    def themes(self) -> tuple[Theme, ...]:
+        """All that stands in the chapter, for the contents."""
+        return (*(group.theme for group in self.groups), SAMPLES, ORIGIN)
+
+
+@dataclass(frozen=True)
+class Glance:
+    """What one report has measured in one task."""
+
+    value: tuple[Piece, ...]
+    interval: tuple[Piece, ...]
+    counted: tuple[Piece, ...]
+    note: Piece
+    drawn: Drawn | None
+
+
+@dataclass(frozen=True)
+class GlanceRow:
+    """One task: what a guess reaches, what the paper printed, what each report measured."""
+
+    task: str
+    name: str
+    chance: tuple[Piece, ...]
+    published: tuple[tuple[Piece, ...], ...]
+    measured: tuple[Glance | None, ...]
+
+
+@dataclass(frozen=True)
+class Page:
+    """Everything."""
+
+    chapters: tuple[Chapter, ...]
+    glance: tuple[GlanceRow, ...]
+    chain: Drawing
+    speed: tuple[Block, ...]
+    stability: tuple[Block, ...]
+    missing: tuple[Gap, ...]
+
+
+def compose(root: Path) -> Page:
+    """Read reports/ and dvc.yaml below `root`."""
+    reports_dir = root / "reports"
+    reports, benches = read_reports(reports_dir), read_benches(reports_dir)
+    shared = {e.name: [_shared(grid, e.title) for grid in find_grids(reports_dir, f"{e.name}.csv")] for e in EVERYWHERE}
+    return Page(
+        chapters=tuple(_chapter(report) for report in reports),
+        glance=_glance(reports),
+        chain=draw_chain(root / "dvc.yaml"),
+        speed=(*shared["speed_error"], *(_bench(bench) for bench in benches if bench.grid)),
+        stability=tuple(shared["stability"]),
+        missing=tuple(gaps(reports, benches, [name for name, blocks in shared.items() if blocks])),
+    )
+
+
+def _chapter(report: Report) -> Chapter:
+    shared = {e.name for e in EVERYWHERE}
+    sections: dict[str, list[Section]] = {}
+    for section in report.readme.sections:
+        if section.file:
+            sections.setdefault(section.name, []).append(section)
+    for name, grid in report.tables.items():
+        if name not in sections and name not in shared:
+            title = name.replace("_", " ").capitalize()
+            sections[name] = [Section(title, "", grid.file.removeprefix(f"{report.name}/"))]
+    themed = {name for theme in THEMES for name in theme.names}
+    others = Theme(OTHERS.key, OTHERS.title, tuple(name for name in sections if name not in themed | shared))
+    groups = []
+    for theme in (*THEMES, others):
+        blocks = [block for name in theme.names for block in _blocks(report, sections.get(name, ()))]
+        if blocks:
+            groups.append(Group(theme, tuple(blocks)))
+    return Chapter(report, tuple(groups))
+
+
+def _blocks(report: Report, sections: Sequence[Section]) -> list[Block]:
+    """What is written under one name: the table first, and the figure where the table does not show the same."""
+    blocks: list[Block] = []
+    readme = report.file("README.md")
+    for section in sections:
+        grid = report.tables.get(section.name)
+        if section.file.endswith(".png"):
+            if not any(block.matrices for block in blocks):
+                picture = Picture(report.file(section.file), section.alt)
+                blocks.append(Block(section.title, section.caption, readme, pictures=(picture,)))
+        elif grid is None:
+            continue
+        elif section.name == "confusion_matrices" and (found := matrices(grid)):
+            blocks.append(Block(section.title, section.caption, readme, matrices=tuple(found)))
+        elif section.name == "audit":
+            blocks.append(_audit(grid, section, readme))
+        else:
+            shown = show(grid, view_of(section.name), section.title)
+            blocks.append(Block(section.title, section.caption, readme, table=shown))
+    return blocks
+
+
+def _audit(grid: Grid, section: Section, readme: str) -> Block:
+    """What needs attention; the rest is counted, and in the file."""
+    urgent = [row for row in range(len(grid.rows)) if grid.value(row, "severity") != Severity.INFO]
+    urgent.sort(key=lambda row: grid.value(row, "severity"))
+    counts = tuple((severity.value, grid.where("severity", severity.value)) for severity in Severity)
+    shown = show(grid, view_of("audit"), section.title, only=urgent)
+    return Block(section.title, section.caption, readme, table=shown if urgent else None, counts=counts)
+
+
+def _shared(grid: Grid, title: str) -> Block:
+    return Block(title, "", "", table=show(grid, View(()), title, name=grid.file.replace("/", "-")[:-4]))
+
+
+def _bench(bench: Bench) -> Block:
+    assert bench.grid is not None, "sections without figures are among what is missing"
+    text = BENCHES.get(bench.name, BenchText(bench.name.replace("_", " ").capitalize(), ""))
+    alt = f"Plot of the table {text.title}: cost against error, with intervals."
+    pictures = tuple(Picture(file, alt) for file in bench.pictures)
+    table = show(bench.grid, BENCH, text.title, name=f"bench-{bench.name}")
+    return Block(text.title, text.caption, "", table=table, pictures=pictures)
+
+
+def _glance(reports: Sequence[Report]) -> tuple[GlanceRow, ...]:
+    rows = []
+    for row, table, name in HEADLINE:
+        found = [_find(report.tables.get(table), row) for report in reports]
+        some = next((f for f in found if f), None)
+        if some:
+            grid, place = some
+            printed = tuple(fill(f"{{published_{model}:.2f}}", grid, place) for model in ("7b", "13b"))
+            measured = tuple(_measured(*f) if f else None for f in found)
+            rows.append(GlanceRow(row, name, fill("{chance:.2f}", grid, place), printed, measured))
+    return tuple(rows)
+
+
+def _find(grid: Grid | None, row: str) -> tuple[Grid, int] | None:
+    """Where the full system's figure stands."""
+    places = range(len(grid.rows)) if grid else ()
+    at = (i for i in places if grid and (grid.value(i, "row"), grid.value(i, "system")) == (row, OCTOPI.label))
+    place = next(at, None)
+    return (grid, place) if grid and place is not None else None
+
+
+def _measured(grid: Grid, row: int) -> Glance:
+    assert ACCURACY.bar is not None, "accuracies are drawn"
+    return Glance(
+        fill("{value:.2f}", grid, row),
+        fill("{clustered_low:.1f} to {clustered_high:.1f}", grid, row),
+        fill("{k:g}/{n}", grid, row),
+        grid.piece(row, "note"),
+        draw(grid, row, ACCURACY.bar),
+    )
+
+
+def strip_file(report: Report, strip: str) -> str:
+    """A sample's strip of frames, relative to reports/."""
+    return report.file(f"{FOLDER}/{strip}")

@@ -1,0 +1,114 @@
+"""How a report's tables and figures are grouped on the page, and what a reviewer would look for in vain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Theme:
+    """A group of tables and figures, by file name without ending, in reading order."""
+
+    key: str
+    title: str
+    names: tuple[str, ...]
+
+
+THEMES = (
+    Theme("results", "The paper's tables", ("understanding", "scenario_reasoning", "property_description")),
+    Theme(
+        "parts",
+        "What each part brings",
+        (
+            *("effects", "interactions", "encoder_understanding", "encoder_property"),
+            *("lora_understanding", "lora_property", "describing", "ablation", "all_variants"),
+        ),
+    ),
+    Theme("touch", "Is touch used?", ("touch",)),
+    Theme(
+        "encoders",
+        "Encoders",
+        (
+            *("cross_validation", "differences", "learning_curve", "errors", "agreement"),
+            *("confusion_matrices", "embedding_map"),
+        ),
+    ),
+    Theme("training", "Training curves", ("training_curves",)),
+    Theme(
+        "data",
+        "The data",
+        ("property_counts", "property_combinations", "video_lengths", "annotator_agreement", "audit"),
+    ),
+)
+OTHERS = Theme("others", "Further tables", ())
+SAMPLES = Theme("samples", "Sample answers", ())
+ORIGIN = Theme("origin", "Where it comes from", ())
+
+
+@dataclass(frozen=True)
+class Expected:
+    """A table that a report may lack, and why that would be."""
+
+    name: str
+    title: str
+    reason: str
+    wanted: str = ""
+    """The list in params.yaml that asks for it; where it names something, the report is older than the table."""
+
+
+EXPECTED = (
+    Expected("effects", "What each part brings", "no two of its variants differ in one part alone", "plan.lora"),
+    Expected("describing", "Describing what is needed, or everything", "its plan has no variant with OPD `needed`"),
+    Expected(
+        "touch",
+        "Is touch used?",
+        "`ablation.counterfactuals` names nothing to put in the place of touch",
+        "ablation.counterfactuals",
+    ),
+    Expected(
+        "cross_validation",
+        "Encoders over all objects",
+        "`cross_validation.models` names no model",
+        "cross_validation.models",
+    ),
+)
+OLDER = "the report is older than this table; `dvc repro` at its scale writes it"
+NO_SAMPLES = "the report is older than sample answers are; `dvc repro` at its scale writes them"
+NO_GATE = "no gate.csv lay beside its language model, or the report is older than the gate"
+EVERYWHERE = (
+    Expected("speed_error", "Speed against error, all parts in one table", "nothing has gathered it yet"),
+    Expected("stability", "Numerical stability", "nothing has written a stability.csv yet"),
+)
+
+
+@dataclass(frozen=True)
+class BenchText:
+    """What a section of the benchmarks is about."""
+
+    title: str
+    caption: str
+
+
+BENCHES = {
+    "coverage": BenchText(
+        "Do intervals hold what they promise?", "Simulated designs with a known truth: how often an interval holds it."
+    ),
+    "encoder": BenchText(
+        "Encoders", "Resolution, frames, number formats, prompts and training speed, cost against combined error."
+    ),
+    "frames": BenchText(
+        "Finding frames", "Time of each rule for choosing frames, against bare decoding and the published way."
+    ),
+    "language": BenchText("Language model", "Training and generation against the published way, in one run."),
+    "realism": BenchText(
+        "How like real videos scenes are",
+        "Distances between synthetic and real videos, against two halves of the real.",
+    ),
+    "scenes": BenchText(
+        "Models of contact", "Time of a contact against the error in what the camera sees, and whether labels hold."
+    ),
+    "selection": BenchText(
+        "Which frames, and how many", "Time of a video against the combined error on objects never touched."
+    ),
+    "startup": BenchText("Starting", "What stages pay before their first line of work."),
+}
