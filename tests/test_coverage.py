@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -83,6 +84,21 @@ def test_tests_keep_their_size() -> None:
         (gains,) = design.differences(((0.5, 0.5),), 2000)
         assert (flipped(gains, design) <= 0.05).mean() <= 0.05
         assert (mcnemar(gains, design) <= 0.05).mean() > 0.05
+
+
+def test_simpler_flips_of_questions_about_several_objects_find_what_is_not_there() -> None:
+    """Why differences are split by least squares first: with sums over an object's questions, or products of signs, a
+    test that means 5 % rejects three times as often and more."""
+    for design in (Design(7, 2, 0.3), Design(7, 3, 0.7)):
+        (gains,) = design.differences(((0.5, 0.5),), 1000)
+        signs = np.array(list(itertools.product((1.0, -1.0), repeat=7)))
+        membership = design.clusters().membership
+        products = np.stack([signs[:, list(s)].prod(axis=1) for s in design.questions()], axis=1)
+        measured = np.abs(gains.sum(axis=1, keepdims=True)) - 1e-9
+        for flipped_sums in (gains @ membership @ signs.T / design.about, gains @ products.T):
+            p = (np.abs(flipped_sums) >= measured).mean(axis=1)
+            assert (p <= 0.05).mean() > 0.15
+        assert (flipped(gains, design) <= 0.05).mean() <= 0.05
 
 
 def test_verdicts_allow_for_the_monte_carlo_error() -> None:

@@ -39,6 +39,7 @@ from pipeline.runtime import derive_seed, seed_everything
 from pipeline.scales import compose
 from pipeline.scenes.film import write_film
 from pipeline.sections import CrossValidationConfig, EncoderConfig, RuntimeConfig
+from pipeline.statistics import Interval, Outcome, clustered, paired
 from pipeline.training import cross_validation as module
 from pipeline.training import votes as voting
 from pipeline.training.cross_validation import Arena, frozen_encoder, judge
@@ -617,14 +618,13 @@ def right(judged: Sequence[Judged], position: int | None = None) -> dict[str, li
     return objects
 
 
-def interval(values: Mapping[str, Sequence[float]]) -> tuple[float, float]:
-    """Of the mean over videos, by every way to draw as many objects with replacement."""
-    sums = [(sum(v), len(v)) for v in values.values()]
-    means = sorted(
-        sum(s for s, _ in drawn) / sum(n for _, n in drawn) for drawn in itertools.product(sums, repeat=len(sums))
-    )
-    low, high = (means[math.ceil(share * len(means) - 1e-9) - 1] for share in (0.025, 0.975))
-    return low, high
+def outcomes(values: Mapping[str, Sequence[float]]) -> list[Outcome]:
+    return [Outcome(float(v), (o,)) for o, every in values.items() for v in every]
+
+
+def ends(interval: Interval | None) -> tuple[float, float]:
+    assert interval is not None
+    return interval.low, interval.high
 
 
 def mean(values: Mapping[str, Sequence[float]]) -> float:
@@ -677,7 +677,7 @@ def test_accuracies_by_hand(tables: dict[str, Table], judged: dict[str, list[Jud
         (row,) = (
             r for r in found if r["model"] == model and r["property"] == names[0 if position is None else position + 1]
         )
-        low, high = interval(right(judged[model], position))
+        low, high = ends(clustered(outcomes(right(judged[model], position))))
         assert (float(row["low"]), float(row["high"])) == pytest.approx((low, high), abs=6e-5)
 
 
@@ -710,7 +710,7 @@ def test_agreement_splits_objects_by_their_ratings(tables: dict[str, Table], jud
         objects = UNANIMOUS if row["ratings"] == "unanimous" else DISPUTED
         values = {o: v for o, v in right(judged[row["model"]]).items() if o in objects}
         assert float(row["accuracy"]) == pytest.approx(mean(values), abs=6e-5)
-        assert (float(row["low"]), float(row["high"])) == pytest.approx(interval(values), abs=6e-5)
+        assert (float(row["low"]), float(row["high"])) == pytest.approx(ends(clustered(outcomes(values))), abs=6e-5)
         assert int(row["objects"]) == len(objects)
         assert int(row["videos"]) == sum(map(len, values.values()))
 
@@ -740,7 +740,9 @@ def test_differences_are_against_the_parent_or_the_baseline(
         assert float(row["difference"]) == pytest.approx(mean(own) - mean(other), abs=6e-5)
         assert row["what"] == CONTESTANTS[row["model"]].title
         if row["model"] == "paper":
-            assert (float(row["low"]), float(row["high"])) == pytest.approx(interval(gains), abs=6e-5)
+            assert (float(row["low"]), float(row["high"])) == pytest.approx(
+                ends(paired(outcomes(gains)).interval), abs=6e-5
+            )
     alone = {n: records for n, records in judged.items() if n in ("paper", "strong-raw")}
     without = {t.name: t for t in encoder_tables(alone, catalogue, {}, 5)}
     assert "differences" not in without, "nothing to compare with"

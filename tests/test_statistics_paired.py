@@ -20,6 +20,7 @@ from pipeline.statistics import (
     Factor,
     Outcome,
     clustered,
+    deviations,
     factorial_effects,
     holm,
     mcnemar,
@@ -171,6 +172,24 @@ def test_the_smallest_effect_has_its_power_by_quadrature(objects: int, power: fl
         return float(beyond * stats.chi.pdf(s * math.sqrt(freedom), freedom) * math.sqrt(freedom))
 
     assert quad(found, 0, 10, limit=200, points=[1])[0] == pytest.approx(power, abs=1e-8)
+
+
+def test_deviations_of_one_comparison_plan_the_next() -> None:
+    rng, found = np.random.default_rng(6), []
+    for _ in range(300):
+        values = np.repeat(rng.normal(0, 0.3, 12), 5) + rng.normal(0, 0.5, 60)
+        seen = deviations([Outcome(float(v), (f"{i // 5}",)) for i, v in enumerate(values)])
+        assert seen is not None
+        found.append((seen.between**2, seen.within**2))
+    assert np.mean(found, axis=0) == pytest.approx([0.09, 0.25], rel=0.06)
+    alike = deviations([Outcome(float(i % 2), (f"{i // 2}",)) for i in range(8)])
+    assert alike is not None
+    assert (alike.between, alike.within) == (0, pytest.approx(math.sqrt(0.5), rel=0.3))
+    each = deviations([Outcome(x, (o,)) for x, o in ((0.0, "a"), (1.0, "b"))])
+    assert each is not None
+    assert (each.between, each.within) == (pytest.approx(math.sqrt(0.5)), 0)
+    assert deviations([]) is None
+    assert deviations([Outcome(1.0, ("a",)), Outcome(0.0, ("a",))]) is None
 
 
 def test_smaller_sizes_and_more_power_need_larger_effects() -> None:

@@ -7,7 +7,7 @@ sets at once is in `clusters`, `bounds`, `flips` and `seeds.crossed`; everything
 from __future__ import annotations
 
 from pipeline.statistics.agreement import confusion, icc3k, icc3k_interval, quadratic_kappa
-from pipeline.statistics.design import planned_error, smallest_effect
+from pipeline.statistics.design import Deviations, deviations, planned_error, smallest_effect
 from pipeline.statistics.factorial import Factor, FactorialEffect, factorial_effects
 from pipeline.statistics.figures import Answer, Interval, Outcome, Spread
 from pipeline.statistics.paired import Difference, holm, mcnemar, paired
@@ -17,6 +17,7 @@ from pipeline.statistics.seeds import OverSeeds, SeedParts, over_seeds
 
 __all__ = [
     "Answer",
+    "Deviations",
     "Difference",
     "Factor",
     "FactorialEffect",
@@ -29,6 +30,7 @@ __all__ = [
     "clustered",
     "compositions",
     "confusion",
+    "deviations",
     "factorial_effects",
     "holm",
     "icc3k",

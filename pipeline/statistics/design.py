@@ -1,4 +1,4 @@
-"""What a comparison can find before it is made. scipy is imported only where it is used.
+"""What a comparison can find before it is made. scipy and NumPy are imported only where they are used.
 
 Sources: Bloom 1995 (minimum detectable effects); Murray 1998 (trials of groups: degrees of freedom by groups); Miller
 2024, section 5 (the same for evaluations of language models).
@@ -7,7 +7,11 @@ Sources: Bloom 1995 (minimum detectable effects); Murray 1998 (trials of groups:
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
+
+from pipeline.statistics.figures import Outcome
 
 POWER = 0.8
 ALPHA = 0.05
@@ -55,6 +59,35 @@ def planned_error(objects: int, questions: float, between: float, within: float)
     if objects < 1 or questions <= 0:
         raise ValueError("a design needs objects and questions")
     return math.sqrt((between**2 + within**2 / questions) / objects)
+
+
+@dataclass(frozen=True)
+class Deviations:
+    """How much paired differences vary."""
+
+    between: float
+    """Between objects: of an object's own share in the differences of its questions."""
+    within: float
+    """Between questions about the same objects; 0 where no object has two, as they cannot be told apart then."""
+
+
+def deviations(gains: Sequence[Outcome]) -> Deviations | None:
+    """What was observed of both, to plan the next comparison with; below 0 estimated variances count as 0.
+
+    Returns:
+        None where the questions cannot show that objects differ.
+    """
+    if not gains:
+        return None
+    import numpy as np
+
+    from pipeline.statistics.clusters import clusters_of, components
+
+    clusters = clusters_of(tuple(gain.objects for gain in gains))
+    if not clusters.estimable:
+        return None
+    own, *rest = components(np.array([gain.correct for gain in gains]), clusters)
+    return Deviations(math.sqrt(float(own)), math.sqrt(float(sum(rest))))
 
 
 @lru_cache(maxsize=64)

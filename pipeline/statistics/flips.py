@@ -6,7 +6,8 @@ objects signs are looked at, or, with many objects, some that are drawn (Phipson
 
 For questions about one object, what is flipped is the object's sum of differences. Questions about several have no
 such sum: an object's sum takes in what the others do, and flipping these sums as if they were independent finds
-differences where there are none, as flipping each question by the product of its objects' signs does. So the
+differences where there are none, as flipping each question by the product of its objects' signs does (simulated at
+5 %, in 18 to 52 % of the comparisons; a test holds that). So the
 differences are first split: each is taken as the mean of its objects' effects, which least squares find, and these are
 flipped. In the second moment that is right where objects have effects that add up and questions no chance of their
 own; a question's own chance counts at least as often as it has objects, since the inverse of a matrix of counts has
