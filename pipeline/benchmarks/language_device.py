@@ -1,7 +1,7 @@
 """True shapes with random weights on a CUDA device: training by stages' own functions, answers, memory, share of peak.
 
 Nothing is asked of what such a model says: it runs to the limit of new tokens. A share is of the matrix rate that the
-card itself shows in one large product, and its operations are those that torch counts in a few updates.
+card itself shows in one large product; operations of training are those that torch counts in an update.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from torch.utils.flop_counter import FlopCounterMode
 from transformers import AutoModelForCausalLM, LlamaConfig
 
 from pipeline.benchmarks.language_bed import SEED, Bed, Encode, LanguageRow, make_bed
+from pipeline.benchmarks.language_counts import H100, Cost, Llama, Tower
+from pipeline.benchmarks.language_paper import Length, pipeline_answers, published_answers
 from pipeline.benchmarks.language_ways import PUBLISHED, UPDATE, answer_batched, answer_published, train
 from pipeline.models.llm import load_tokenizer
 from pipeline.models.octopi import OctopiForCausalLM
@@ -37,6 +39,8 @@ class Size:
     llama: LlamaConfig
     tower: str
     """open_clip's name."""
+    frames: Tower = field(default_factory=Tower)
+    """The tower's shapes, to count with."""
     side: int = 224
     device: DeviceName = "cuda"
     dtype: DtypeName = "bfloat16"
@@ -94,9 +98,19 @@ def device_rows(root: Path, size: Size = PAPER) -> list[LanguageRow]:
                 "pipeline's way": _spend(bed, size, size.updates, _pipeline(bed, size, rank)),
             }
             rows += _rows(f"{size.name} measured, {name}", spent, "useful tokens a second", rate)
+        llama = shapes_of(size.llama, bed.store.dim)
+        few, all_ = (replace(bed, asked=bed.asked[:n]) for n in (size.published_asked, size.asked))
         spent = {
-            "published way": _asked(bed, size.published_asked, lambda b: answer_published(b, size.limit, forward=True)),
-            "pipeline's way": _asked(bed, size.asked, lambda b: answer_batched(b, size.limit, size.batch)),
+            "published way": _asked(
+                few,
+                lambda: answer_published(few, size.limit, forward=True),
+                published_answers(_lengths(few, size), llama, size.frames, H100, forward=True),
+            ),
+            "pipeline's way": _asked(
+                all_,
+                lambda: answer_batched(all_, size.limit, size.batch),
+                pipeline_answers(_lengths(all_, size), size.batch, llama, H100),
+            ),
         }
     return rows + _rows(f"{size.name} measured, answering", spent, "samples a second", rate)
 
@@ -187,12 +201,30 @@ def _spend(bed: Bed, size: Size, updates: int, run: Callable[[list[Question]], o
     return Spent(seconds, megabytes, len(questions), tokens, counter.get_total_flops() * tokens / counted)
 
 
-def _asked(bed: Bed, count: int, run: Callable[[Bed], object]) -> Spent:
-    some = replace(bed, asked=bed.asked[:count])
-    with FlopCounterMode(display=False) as counter:
-        run(some)
-    seconds, megabytes = _with_memory(bed, lambda: run(some))
-    return Spent(seconds, megabytes, count, 0, float(counter.get_total_flops()))
+def _asked(bed: Bed, run: Callable[[], object], cost: Cost) -> Spent:
+    """Operations are counted from shapes, without the adapters' hundredth part."""
+    seconds, megabytes = _with_memory(bed, run)
+    return Spent(seconds, megabytes, len(bed.asked), 0, cost.flops)
+
+
+def _lengths(bed: Bed, size: Size) -> list[Length]:
+    data = bed.conversations(bed.asked)
+    prompts = [next(i for i, label in enumerate(e.labels) if label >= 0) for e in data.encoded]
+    return [(n + size.limit, size.limit, len(q.videos)) for q, n in zip(data.questions, prompts, strict=True)]
+
+
+def shapes_of(config: LlamaConfig, tactile: int) -> Llama:
+    """What is counted with, of transformers' configuration."""
+    return Llama(
+        hidden=config.hidden_size,
+        layers=config.num_hidden_layers,
+        heads=config.num_attention_heads,
+        kv_heads=config.num_key_value_heads,
+        head_size=config.head_dim,
+        ffn=config.intermediate_size,
+        vocabulary=config.vocab_size,
+        tactile=tactile,
+    )
 
 
 def _with_memory(bed: Bed, run: Callable[[], object]) -> tuple[float, float | None]:
