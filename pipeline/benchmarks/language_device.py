@@ -10,15 +10,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from time import perf_counter
 
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 from transformers import AutoModelForCausalLM, LlamaConfig
 
-from pipeline.benchmarks.language_bed import SEED, Bed, Encode, LanguageRow, make_bed
-from pipeline.benchmarks.language_counts import H100, Cost, Llama, Tower
+from pipeline.benchmarks.language_bed import SEED, Bed, LanguageRow, make_bed
+from pipeline.benchmarks.language_counts import H100, Cost, Tower
 from pipeline.benchmarks.language_paper import Length, pipeline_answers, published_answers
+from pipeline.benchmarks.language_random import matrix_rate, random_tower, shapes_of, timed
 from pipeline.benchmarks.language_ways import PUBLISHED, UPDATE, answer_batched, answer_published, train
 from pipeline.models.llm import load_tokenizer
 from pipeline.models.octopi import OctopiForCausalLM
@@ -127,42 +127,9 @@ def random_bed(root: Path, size: Size, folder: Path, device: torch.device) -> Be
 
     counts = (size.updates * UPDATE, size.asked)
     catalogue = root / "pipeline" / "physiclear"
-    return make_bed(make, random_tower(size, device), size.side, counts, folder, catalogue, device)
-
-
-def random_tower(size: Size, device: torch.device) -> Encode:
-    """CLIP's visual tower up to the class token's last state, as the published code reads it."""
-    import open_clip
-
-    dtype = resolve_dtype(size.dtype)
-    with device:
-        visual = open_clip.CLIP(**open_clip.get_model_config(size.tower)).visual.to(dtype).eval()
-    visual.proj = None
-
-    def encode(frames: torch.Tensor) -> torch.Tensor:
-        embedded: torch.Tensor = visual(frames.permute(0, 3, 1, 2).to(dtype) / 127.5 - 1)
-        return embedded
-
-    return encode
-
-
-def matrix_rate(device: torch.device, dtype: torch.dtype, side: int) -> float:
-    """Operations a second in products of square matrices: the best of ten after a warm-up."""
-    a, b = (torch.randn(side, side, device=device).to(dtype) for _ in range(2))
-    seconds = []
-    for _ in range(13):
-        seconds.append(_timed(lambda: torch.mm(a, b), device))
-    return 2 * side**3 / min(seconds[3:])
-
-
-def _timed(run: Callable[[], object], device: torch.device) -> float:
-    if device.type == "cuda":
-        torch.cuda.synchronize()
-    started = perf_counter()
-    run()
-    if device.type == "cuda":
-        torch.cuda.synchronize()
-    return perf_counter() - started
+    return make_bed(
+        make, random_tower(size.tower, resolve_dtype(size.dtype), device), size.side, counts, folder, catalogue, device
+    )
 
 
 def _lora(size: Size, samples: int) -> LoraTrainConfig:
@@ -213,25 +180,11 @@ def _lengths(bed: Bed, size: Size) -> list[Length]:
     return [(n + size.limit, size.limit, len(q.videos)) for q, n in zip(data.questions, prompts, strict=True)]
 
 
-def shapes_of(config: LlamaConfig, tactile: int) -> Llama:
-    """What is counted with, of transformers' configuration."""
-    return Llama(
-        hidden=config.hidden_size,
-        layers=config.num_hidden_layers,
-        heads=config.num_attention_heads,
-        kv_heads=config.num_key_value_heads,
-        head_size=config.head_dim,
-        ffn=config.intermediate_size,
-        vocabulary=config.vocab_size,
-        tactile=tactile,
-    )
-
-
 def _with_memory(bed: Bed, run: Callable[[], object]) -> tuple[float, float | None]:
     if bed.device.type != "cuda":
-        return _timed(run, bed.device), None
+        return timed(run, bed.device), None
     torch.cuda.reset_peak_memory_stats()
-    seconds = _timed(run, bed.device)
+    seconds = timed(run, bed.device)
     return seconds, round(torch.cuda.max_memory_allocated() / 1e6, 1)
 
 
