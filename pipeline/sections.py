@@ -218,6 +218,7 @@ class LanguageConfig(Section):
     system_prompt: str = ""
     """Put before each conversation (Vicuna has one; the stand-in was made without)."""
     max_new_tokens: Annotated[int, Field(ge=1, le=4096)] = 256
+    """Of an answer; fewer where the language model has no more positions. Longer answers are cut and marked."""
     generation_batch_size: Positive = 32
 
 
@@ -230,7 +231,7 @@ class TrainConfig(Section):
     batch_size: Positive = 16
     """Questions an update, over all devices."""
     micro_batch_size: Positive = 16
-    """Questions at a time on one device; the rest is accumulated."""
+    """Questions at a time on one device, of like length; the rest is accumulated, each token weighing the same."""
     projection_learning_rate: Rate = 2e-5
     warmup_ratio: Annotated[float, Field(ge=0, lt=1)] = 0.0
     weight_decay: Annotated[float, Field(ge=0, lt=1)] = 0.0

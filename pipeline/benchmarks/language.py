@@ -45,6 +45,8 @@ WARM = 192
 LIMIT = 160
 """New tokens."""
 RATE = 3e-3
+MICRO = 4
+"""Conversations at a time in the Trainer, as every scale has it."""
 BATCHES = (1, 8, 32)
 """Questions answered at a time."""
 CPU = torch.device("cpu")
@@ -101,7 +103,7 @@ def _embed(encoder: TactileEncoder) -> Encode:
 def _align(bed: Bed, count: int, rate: float = RATE) -> None:
     """By the stage's own function, Trainer and all."""
     samples = len(bed.training[:count])
-    config = TrainConfig(samples=samples, batch_size=UPDATE, micro_batch_size=UPDATE, projection_learning_rate=rate)
+    config = TrainConfig(samples=samples, batch_size=UPDATE, micro_batch_size=MICRO, projection_learning_rate=rate)
     align(
         bed.model, bed.conversations(bed.training[:count]), config, RuntimeConfig(device="cpu"), Job("bench", "x", SEED)
     )

@@ -1,7 +1,7 @@
 """True shapes with random weights on a CUDA device: training by stages' own functions, answers, memory, share of peak.
 
 Nothing is asked of what such a model says: it runs to the limit of new tokens. A share is of the matrix rate that the
-card itself shows in one large product, and its operations are those that torch counts in a few updates.
+card itself shows in one large product; operations of training are those that torch counts in an update.
 """
 
 from __future__ import annotations
@@ -10,13 +10,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from time import perf_counter
 
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 from transformers import AutoModelForCausalLM, LlamaConfig
 
-from pipeline.benchmarks.language_bed import SEED, Bed, Encode, LanguageRow, make_bed
+from pipeline.benchmarks.language_bed import SEED, Bed, LanguageRow, make_bed
+from pipeline.benchmarks.language_counts import H100, Cost, Tower
+from pipeline.benchmarks.language_paper import Length, pipeline_answers, published_answers
+from pipeline.benchmarks.language_random import matrix_rate, random_tower, shapes_of, timed
 from pipeline.benchmarks.language_ways import PUBLISHED, UPDATE, answer_batched, answer_published, train
 from pipeline.models.llm import load_tokenizer
 from pipeline.models.octopi import OctopiForCausalLM
@@ -37,6 +39,8 @@ class Size:
     llama: LlamaConfig
     tower: str
     """open_clip's name."""
+    frames: Tower = field(default_factory=Tower)
+    """The tower's shapes, to count with."""
     side: int = 224
     device: DeviceName = "cuda"
     dtype: DtypeName = "bfloat16"
@@ -94,9 +98,19 @@ def device_rows(root: Path, size: Size = PAPER) -> list[LanguageRow]:
                 "pipeline's way": _spend(bed, size, size.updates, _pipeline(bed, size, rank)),
             }
             rows += _rows(f"{size.name} measured, {name}", spent, "useful tokens a second", rate)
+        llama = shapes_of(size.llama, bed.store.dim)
+        few, all_ = (replace(bed, asked=bed.asked[:n]) for n in (size.published_asked, size.asked))
         spent = {
-            "published way": _asked(bed, size.published_asked, lambda b: answer_published(b, size.limit, forward=True)),
-            "pipeline's way": _asked(bed, size.asked, lambda b: answer_batched(b, size.limit, size.batch)),
+            "published way": _asked(
+                few,
+                lambda: answer_published(few, size.limit, forward=True),
+                published_answers(_lengths(few, size), llama, size.frames, H100, forward=True),
+            ),
+            "pipeline's way": _asked(
+                all_,
+                lambda: answer_batched(all_, size.limit, size.batch),
+                pipeline_answers(_lengths(all_, size), size.batch, llama, H100),
+            ),
         }
     return rows + _rows(f"{size.name} measured, answering", spent, "samples a second", rate)
 
@@ -113,42 +127,9 @@ def random_bed(root: Path, size: Size, folder: Path, device: torch.device) -> Be
 
     counts = (size.updates * UPDATE, size.asked)
     catalogue = root / "pipeline" / "physiclear"
-    return make_bed(make, random_tower(size, device), size.side, counts, folder, catalogue, device)
-
-
-def random_tower(size: Size, device: torch.device) -> Encode:
-    """CLIP's visual tower up to the class token's last state, as the published code reads it."""
-    import open_clip
-
-    dtype = resolve_dtype(size.dtype)
-    with device:
-        visual = open_clip.CLIP(**open_clip.get_model_config(size.tower)).visual.to(dtype).eval()
-    visual.proj = None
-
-    def encode(frames: torch.Tensor) -> torch.Tensor:
-        embedded: torch.Tensor = visual(frames.permute(0, 3, 1, 2).to(dtype) / 127.5 - 1)
-        return embedded
-
-    return encode
-
-
-def matrix_rate(device: torch.device, dtype: torch.dtype, side: int) -> float:
-    """Operations a second in products of square matrices: the best of ten after a warm-up."""
-    a, b = (torch.randn(side, side, device=device).to(dtype) for _ in range(2))
-    seconds = []
-    for _ in range(13):
-        seconds.append(_timed(lambda: torch.mm(a, b), device))
-    return 2 * side**3 / min(seconds[3:])
-
-
-def _timed(run: Callable[[], object], device: torch.device) -> float:
-    if device.type == "cuda":
-        torch.cuda.synchronize()
-    started = perf_counter()
-    run()
-    if device.type == "cuda":
-        torch.cuda.synchronize()
-    return perf_counter() - started
+    return make_bed(
+        make, random_tower(size.tower, resolve_dtype(size.dtype), device), size.side, counts, folder, catalogue, device
+    )
 
 
 def _lora(size: Size, samples: int) -> LoraTrainConfig:
@@ -187,19 +168,23 @@ def _spend(bed: Bed, size: Size, updates: int, run: Callable[[list[Question]], o
     return Spent(seconds, megabytes, len(questions), tokens, counter.get_total_flops() * tokens / counted)
 
 
-def _asked(bed: Bed, count: int, run: Callable[[Bed], object]) -> Spent:
-    some = replace(bed, asked=bed.asked[:count])
-    with FlopCounterMode(display=False) as counter:
-        run(some)
-    seconds, megabytes = _with_memory(bed, lambda: run(some))
-    return Spent(seconds, megabytes, count, 0, float(counter.get_total_flops()))
+def _asked(bed: Bed, run: Callable[[], object], cost: Cost) -> Spent:
+    """Operations are counted from shapes, without the adapters' hundredth part."""
+    seconds, megabytes = _with_memory(bed, run)
+    return Spent(seconds, megabytes, len(bed.asked), 0, cost.flops)
+
+
+def _lengths(bed: Bed, size: Size) -> list[Length]:
+    data = bed.conversations(bed.asked)
+    prompts = [next(i for i, label in enumerate(e.labels) if label >= 0) for e in data.encoded]
+    return [(n + size.limit, size.limit, len(q.videos)) for q, n in zip(data.questions, prompts, strict=True)]
 
 
 def _with_memory(bed: Bed, run: Callable[[], object]) -> tuple[float, float | None]:
     if bed.device.type != "cuda":
-        return _timed(run, bed.device), None
+        return timed(run, bed.device), None
     torch.cuda.reset_peak_memory_stats()
-    seconds = _timed(run, bed.device)
+    seconds = timed(run, bed.device)
     return seconds, round(torch.cuda.max_memory_allocated() / 1e6, 1)
 
 

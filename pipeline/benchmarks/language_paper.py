@@ -44,9 +44,9 @@ def _rows(what: str, costs: dict[str, Cost], amount: float, unit: str, samples: 
     return [
         LanguageRow(
             case=f"{what}, {case}",
-            cost=round(amount / cost.seconds, 2),
-            low=round(amount / cost.seconds, 2),
-            high=round(amount / cost.seconds, 2),
+            cost=round(amount / cost.seconds, 4),
+            low=round(amount / cost.seconds, 4),
+            high=round(amount / cost.seconds, 4),
             unit=unit,
             baseline=f"{what}, {baseline}",
             ratio=round(costs[baseline].seconds / cost.seconds, 3),

@@ -17,8 +17,8 @@ class LengthBuckets(Sampler[int]):
     """Every index once: random pools of `POOL` batches, cut by length into batches, which come in random order.
 
     transformers' own grouping goes from long to short within each pool, so that updates run through the tasks in the
-    order of their lengths, and draws from the process's random numbers, which a training that is resumed in a later
-    epoch finds in another state. Here the order follows from seed and epoch alone, on every device alike.
+    order of their lengths, and draws from the process's random numbers, whose state depends on what came before. Here
+    the order follows from seed and epoch alone, on every device and in a resumed training alike.
 
     Args:
         lengths: Tokens of each item.
