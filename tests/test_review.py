@@ -281,6 +281,15 @@ def test_real_videos_have_no_picture_and_the_page_says_why(fresh: Element, made:
     assert scenes.find("img")
 
 
+def test_an_empty_cell_says_why(fresh: Element) -> None:
+    empty = [e for e in fresh.find("td") if "empty" in e.attributes.get("class", "").split()]
+    assert "variant not in the plan `single`" in {e.words for e in empty}
+    assert all("measured" in e.attributes["class"] for e in empty)
+    for cell in empty:
+        assert cell.parent is not None
+        assert cell.parent.find("circle") == [], "what was not measured is not drawn"
+
+
 def test_samples_show_right_and_wrong_answers(fresh: Element, made: Path) -> None:
     sheet = json.loads((made / "reports" / "smoke-scenes" / "samples" / "samples.json").read_text())
     (chapter,) = [e for e in fresh.walk() if e.attributes.get("id") == "smoke-scenes-samples"]

@@ -10,7 +10,13 @@ ACCURACY = View(
     (
         Column("Task", "{row}", HEAD),
         Column("System", "{system}", HEAD),
-        Column("Measured %|95 % over objects", "{value:.2f}", MEASURED, "{clustered_low:.1f} to {clustered_high:.1f}"),
+        Column(
+            "Measured %|95 % over objects",
+            "{value:.2f}",
+            MEASURED,
+            "{clustered_low:.1f} to {clustered_high:.1f}",
+            otherwise="{note}",
+        ),
         Column("k/n|95 % Wilson", "{k:g}/{n}", small="{low:.1f} to {high:.1f}"),
         *(
             Column(
@@ -26,7 +32,7 @@ ACCURACY = View(
         Column("Seeds", "{seeds}"),
         Column("Mean ± deviation over seeds", "{seed_mean:.2f} ± {seed_sd:.2f}"),
         Column("By seed", "{seed_values}", WORDS, needs="seed_sd"),
-        Column("Note", "{note}", WORDS),
+        Column("Note", "{note}", WORDS, needs="value"),
     ),
     Bar(
         "value",
