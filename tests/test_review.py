@@ -22,6 +22,7 @@ from pipeline.reporting import write_report
 from pipeline.reporting.samples import NO_PICTURES
 from pipeline.review import PAGE, write_page
 from pipeline.review.graph import HEIGHT, WIDTH, draw_chain
+from pipeline.review.traced import Grid, fill
 from tests.closure import ROOT
 from tests.fake_chain import fake_params, write_chain
 from tests.web import Element, Sources, parse_html, says
@@ -279,6 +280,36 @@ def test_real_videos_have_no_picture_and_the_page_says_why(fresh: Element, made:
     assert chapter.find("img") == []
     (scenes,) = [e for e in fresh.walk() if e.attributes.get("id") == "smoke-scenes-samples"]
     assert scenes.find("img")
+
+
+@pytest.mark.parametrize(
+    ("figure", "template", "shown"),
+    [
+        ("30.625", "{x:.2f}", "30.63"),
+        ("2.675", "{x:.2f}", "2.68"),
+        ("0.5965", "{x:p.2f}", "59.65"),
+        ("-0.0004", "{x:p+.2f}", "-0.04"),
+        ("1.0", "{x:p.2f}", "100.00"),
+        ("6.5", "{x:g}", "6.5"),
+        ("4.0", "{x:g}", "4"),
+        ("0: 33.33", "{x}", "0: 33.33"),
+        ("none", "{x:.2f}", "none"),
+        ("", "{x:.2f}", ""),
+        ("3.1e-05", "{x:.5f}", "0.00003"),
+    ],
+)
+def test_figures_are_rounded_as_one_learns_at_school(figure: str, template: str, shown: str) -> None:
+    grid = Grid("some.csv", ("x",), ((figure,),))
+    assert "".join(piece.text for piece in fill(template, grid, 0)) == shown
+
+
+def test_an_empty_cell_says_why(fresh: Element) -> None:
+    empty = [e for e in fresh.find("td") if "empty" in e.attributes.get("class", "").split()]
+    assert "variant not in the plan `single`" in {e.words for e in empty}
+    assert all("measured" in e.attributes["class"] for e in empty)
+    for cell in empty:
+        assert cell.parent is not None
+        assert cell.parent.find("circle") == [], "what was not measured is not drawn"
 
 
 def test_samples_show_right_and_wrong_answers(fresh: Element, made: Path) -> None:

@@ -25,7 +25,7 @@ class Report:
     name: str
     readme: Readme
     tables: Mapping[str, Grid]
-    """By file name without ending."""
+    """By file relative to the folder."""
     provenance: Mapping[str, Any]
     params: Mapping[str, Any]
     params_text: str
@@ -35,6 +35,10 @@ class Report:
     def file(self, name: str) -> str:
         """A file of this folder as sources name it."""
         return f"{self.name}/{name}"
+
+    def table(self, name: str) -> Grid | None:
+        """The first table with this file name, given without its ending."""
+        return next((grid for file, grid in self.tables.items() if Path(file).stem == name), None)
 
     def origin(self, place: str) -> Piece:
         """A value of provenance.json."""
@@ -101,7 +105,7 @@ def _read(reports: Path, name: str) -> Report:
     return Report(
         name=name,
         readme=parse((folder / README).read_text(encoding="utf-8")),
-        tables={grid.file.rsplit("/", 1)[-1][:-4]: grid for file in files if (grid := read_grid(reports, file))},
+        tables={file.removeprefix(f"{name}/"): grid for file in files if (grid := read_grid(reports, file))},
         provenance=_json(folder / "provenance.json"),
         params=yaml.safe_load(text) or {},
         params_text=text,

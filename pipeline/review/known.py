@@ -1,4 +1,8 @@
-"""How the tables of a report are shown. What a view does not name is shown as it is, so that no column gets lost."""
+"""How the tables of a report are shown. What a view does not name is shown as it is, so that no column gets lost.
+
+Shares have four digits in their files, so percent have two here: with one, a figure that was rounded before could end
+up another one than the report's own.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,13 @@ ACCURACY = View(
     (
         Column("Task", "{row}", HEAD),
         Column("System", "{system}", HEAD),
-        Column("Measured %|95 % over objects", "{value:.2f}", MEASURED, "{clustered_low:.1f} to {clustered_high:.1f}"),
+        Column(
+            "Measured %|95 % over objects",
+            "{value:.2f}",
+            MEASURED,
+            "{clustered_low:.1f} to {clustered_high:.1f}",
+            otherwise="{note}",
+        ),
         Column("k/n|95 % Wilson", "{k:g}/{n}", small="{low:.1f} to {high:.1f}"),
         *(
             Column(
@@ -26,7 +36,7 @@ ACCURACY = View(
         Column("Seeds", "{seeds}"),
         Column("Mean ± deviation over seeds", "{seed_mean:.2f} ± {seed_sd:.2f}"),
         Column("By seed", "{seed_values}", WORDS, needs="seed_sd"),
-        Column("Note", "{note}", WORDS),
+        Column("Note", "{note}", WORDS, needs="value"),
     ),
     Bar(
         "value",
@@ -44,10 +54,10 @@ ABLATION = View(
         Column("OPD", "{opd}", HEAD),
         Column("Seed", "{seed}", HEAD),
         Column("Task", "{task}", HEAD),
-        Column("Accuracy %|95 % over objects", "{accuracy:p.1f}", MEASURED, "{low:p.1f} to {high:p.1f}"),
+        Column("Accuracy %|95 % over objects", "{accuracy:p.2f}", MEASURED, "{low:p.2f} to {high:p.2f}"),
         Column("n", "{n}"),
-        Column("Chance %", "{chance:p.1f}"),
-        Column("Unparsed %|truncated %", "{unparsed:p.1f}", small="{truncated:p.1f}"),
+        Column("Chance %", "{chance:p.2f}"),
+        Column("Unparsed %|truncated %", "{unparsed:p.2f}", small="{truncated:p.2f}"),
         Column("Tokens", "{tokens:.0f}"),
         Column("Base model", "{gate}", WORDS),
     ),
@@ -60,7 +70,7 @@ EFFECTS = View(
         Column("Change", "{change}", HEAD),
         Column("Others", "{others}", WORDS),
         Column("Task", "{task}", HEAD),
-        Column("Difference, points|95 % over objects", "{difference:p+.1f}", MEASURED, "{low:p.1f} to {high:p.1f}"),
+        Column("Difference, points|95 % over objects", "{difference:p+.2f}", MEASURED, "{low:p.2f} to {high:p.2f}"),
         Column("p", "{p:.3f}"),
         Column("p (Holm)", "{p_holm:.3f}"),
         Column("n", "{n}"),
@@ -72,9 +82,9 @@ EFFECTS = View(
 DESCRIBING = View(
     (
         Column("Task", "{task}", HEAD),
-        Column("Error %, needed", "{error_needed:p.1f}", MEASURED),
-        Column("Error %, all", "{error_all:p.1f}", MEASURED),
-        Column("Difference, points|95 % over objects", "{difference:p+.1f}", MEASURED, "{low:p.1f} to {high:p.1f}"),
+        Column("Error %, needed", "{error_needed:p.2f}", MEASURED),
+        Column("Error %, all", "{error_all:p.2f}", MEASURED),
+        Column("Difference, points|95 % over objects", "{difference:p+.2f}", MEASURED, "{low:p.2f} to {high:p.2f}"),
         Column("Tokens, needed", "{tokens_needed:.0f}"),
         Column("Tokens, all", "{tokens_all:.0f}"),
         Column("n", "{n}"),
@@ -86,14 +96,14 @@ TOUCH = View(
     (
         Column("Touch", "{touch}", HEAD),
         Column("Task", "{task}", HEAD),
-        Column("Accuracy %|95 % over objects", "{accuracy:p.1f}", MEASURED, "{low:p.1f} to {high:p.1f}"),
-        Column("Chance %", "{chance:p.1f}"),
-        Column("Answers unchanged %", "{unchanged:p.1f}"),
+        Column("Accuracy %|95 % over objects", "{accuracy:p.2f}", MEASURED, "{low:p.2f} to {high:p.2f}"),
+        Column("Chance %", "{chance:p.2f}"),
+        Column("Answers unchanged %", "{unchanged:p.2f}"),
         Column(
             "Real minus this, points|95 % over objects",
-            "{difference:p+.1f}",
+            "{difference:p+.2f}",
             MEASURED,
-            "{difference_low:p.1f} to {difference_high:p.1f}",
+            "{difference_low:p.2f} to {difference_high:p.2f}",
         ),
         Column("p", "{p:.3f}"),
         Column("n", "{n}"),
@@ -101,7 +111,7 @@ TOUCH = View(
     ),
     Bar("accuracy", "low", "high", 1, chance="chance"),
 )
-SHARES = (Column("Accuracy %|95 % over objects", "{accuracy:p.1f}", MEASURED, "{low:p.1f} to {high:p.1f}"),)
+SHARES = (Column("Accuracy %|95 % over objects", "{accuracy:p.2f}", MEASURED, "{low:p.2f} to {high:p.2f}"),)
 SHARE_BAR = Bar("accuracy", "low", "high", 1)
 ENCODERS = View(
     (
@@ -131,7 +141,7 @@ DIFFERENCES = View(
     (
         Column("Model", "{model}", HEAD),
         Column("Against", "{against}", HEAD),
-        Column("Difference, points|95 % over objects", "{difference:p+.1f}", MEASURED, "{low:p.1f} to {high:p.1f}"),
+        Column("Difference, points|95 % over objects", "{difference:p+.2f}", MEASURED, "{low:p.2f} to {high:p.2f}"),
         Column("What it is", "{what}", WORDS),
     ),
     Bar("difference", "low", "high", 1, signed=True),
@@ -142,10 +152,10 @@ ERRORS = View(
         Column("Property", "{property}", HEAD),
         Column("Mean absolute error", "{absolute_error:.3f}", MEASURED),
         Column("Kappa", "{kappa:.3f}", MEASURED),
-        Column("Best constant %", "{majority:p.1f}"),
-        Column("Chance %", "{chance:p.1f}"),
+        Column("Best constant %", "{majority:p.2f}"),
+        Column("Chance %", "{chance:p.2f}"),
         Column("Repeats", "{repeats}"),
-        Column("Deviation over repeats, points", "{spread:p.1f}"),
+        Column("Deviation over repeats, points", "{spread:p.2f}"),
     )
 )
 COUNTS = View(

@@ -36,8 +36,8 @@ def gaps(reports: Sequence[Report], benches: Iterable[Bench], found: Iterable[st
 
 def _of_report(report: Report) -> list[Gap]:
     found = []
-    for name, grid in report.tables.items():
-        if name in ACCURACIES:
+    for name in ACCURACIES:
+        if grid := report.table(name):
             found += [Gap(report.name, what, why) for what, why in _empty_cells(report, name, grid)]
     found += [
         Gap(report.name, (Piece(s.title),), Piece(s.missing, f"{report.file(README)}#"))
@@ -45,11 +45,11 @@ def _of_report(report: Report) -> list[Gap]:
         if s.missing
     ]
     found += [
-        Gap(report.name, (Piece(e.title),), Piece(_reason(report, e))) for e in EXPECTED if e.name not in report.tables
+        Gap(report.name, (Piece(e.title),), Piece(_reason(report, e))) for e in EXPECTED if not report.table(e.name)
     ]
     if not report.samples:
         found.append(Gap(report.name, (Piece("Sample answers"),), Piece(NO_SAMPLES)))
-    ablation = report.tables.get("ablation")
+    ablation = report.table("ablation")
     if ablation is None or not any(ablation.value(row, "gate") for row in range(len(ablation.rows))):
         found.append(Gap(report.name, (Piece("Gate marks"),), Piece(NO_GATE)))
     return found

@@ -129,10 +129,11 @@ def _chapter(report: Report) -> Chapter:
     for section in report.readme.sections:
         if section.file:
             sections.setdefault(section.name, []).append(section)
-    for name, grid in report.tables.items():
-        if name not in sections and name not in shared:
-            title = name.replace("_", " ").capitalize()
-            sections[name] = [Section(title, "", grid.file.removeprefix(f"{report.name}/"))]
+    told = {section.file for section in report.readme.sections}
+    for file in report.tables:
+        name = Path(file).stem
+        if file not in told and name not in shared:
+            sections.setdefault(name, []).append(Section(name.replace("_", " ").capitalize(), "", file))
     themed = {name for theme in THEMES for name in theme.names}
     others = Theme(OTHERS.key, OTHERS.title, tuple(name for name in sections if name not in themed | shared))
     groups = []
@@ -148,7 +149,7 @@ def _blocks(report: Report, sections: Sequence[Section]) -> list[Block]:
     blocks: list[Block] = []
     readme = report.file("README.md")
     for section in sections:
-        grid = report.tables.get(section.name)
+        grid = report.tables.get(section.file)
         if section.file.endswith(".png"):
             if not any(block.matrices for block in blocks):
                 picture = Picture(report.file(section.file), section.alt)
@@ -190,7 +191,7 @@ def _bench(bench: Bench) -> Block:
 def _glance(reports: Sequence[Report]) -> tuple[GlanceRow, ...]:
     rows = []
     for row, table, name in HEADLINE:
-        found = [_find(report.tables.get(table), row) for report in reports]
+        found = [_find(report.table(table), row) for report in reports]
         some = next((f for f in found if f), None)
         if some:
             grid, place = some

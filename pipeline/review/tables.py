@@ -18,7 +18,7 @@ BAR_HEADING = "Drawn"
 class Drawn:
     """Places in the little picture, in its units; None where there is nothing to draw."""
 
-    value: float
+    value: float | None
     low: float | None
     high: float | None
     chance: float | None
@@ -74,18 +74,14 @@ def show(
         name: For the table's anchor; the file's name by default.
     """
     chosen = range(len(grid.rows)) if only is None else only
-    named = {name for column in view.columns for name in (*fields(column.template + column.small), column.needs)}
+    named = {
+        name
+        for column in view.columns
+        for name in (*fields(column.template + column.small + column.otherwise), column.needs)
+    }
     known = named | set(view.hidden) | set(view.bar.marks if view.bar else ())
     columns = [*view.columns, *_others(grid, known)]
-    cells = [
-        [
-            Cell(fill(c.template, grid, row), c.kind, fill(c.small, grid, row))
-            if not c.needs or grid.value(row, c.needs)
-            else Cell((), c.kind)
-            for row in chosen
-        ]
-        for c in columns
-    ]
+    cells = [[_cell(grid, row, column) for row in chosen] for column in columns]
     kept = [(_heading(c), column) for c, column in zip(columns, cells, strict=True) if _any(column)]
     if view.bar and any(grid.number(row, view.bar.value) is not None for row in chosen):
         # Behind the figure that it draws, so that a phone shows that one first.
@@ -106,23 +102,16 @@ def show(
 
 
 def draw(grid: Grid, row: int, bar: Bar) -> Drawn | None:
-    """Where the row's figures lie between the ends of its picture; None where it has no figure."""
-    value = grid.number(row, bar.value)
-    if value is None:
-        return None
+    """Where the row's figures lie between the ends of its picture; None where it has no figure at all."""
 
     def place(column: str) -> float | None:
         figure = grid.number(row, column) if column else None
         return None if figure is None else _place(figure / bar.unit, bar.signed)
 
-    return Drawn(
-        _place(value / bar.unit, bar.signed),
-        place(bar.low),
-        place(bar.high),
-        place(bar.chance),
-        tuple(map(place, bar.marks)),
-        bar.signed,
-    )
+    value, marks = place(bar.value), tuple(map(place, bar.marks))
+    if value is None and not any(mark is not None for mark in marks):
+        return None
+    return Drawn(value, place(bar.low), place(bar.high), place(bar.chance), marks, bar.signed)
 
 
 def _place(share: float, signed: bool) -> float:
@@ -136,6 +125,13 @@ def _others(grid: Grid, known: Iterable[str]) -> list[Column]:
         Column(name.replace("_", " "), f"{{{name}}}", Kind.HEAD if first and i == 0 else Kind.PLAIN)
         for i, name in enumerate(c for c in grid.columns if c not in known)
     ]
+
+
+def _cell(grid: Grid, row: int, column: Column) -> Cell:
+    if column.needs and not grid.value(row, column.needs):
+        return Cell((), column.kind)
+    pieces = fill(column.template, grid, row)
+    return Cell(pieces, column.kind, fill(column.small if pieces else column.otherwise, grid, row))
 
 
 def _heading(column: Column) -> Heading:

@@ -11,6 +11,7 @@ import csv
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from decimal import ROUND_HALF_UP, Decimal, localcontext
 from functools import cache
 from pathlib import Path
 from string import Formatter
@@ -99,9 +100,17 @@ def fill(template: str, grid: Grid, row: int) -> tuple[Piece, ...]:
                 pieces.append(grid.piece(row, name))
             else:
                 factor = 100 if form.startswith("p") else 1
-                text = format(figure * factor, form.removeprefix("p"))
+                text = _rounded(grid.value(row, name), factor, form.removeprefix("p"))
                 pieces.append(Piece(text, f"{grid.file}#{row + 1}:{name}", factor))
     return tuple(pieces)
+
+
+def _rounded(figure: str, factor: int, form: str) -> str:
+    """A figure as its file writes it, in decimal digits: halves go up, whatever its nearest binary fraction is."""
+    if form == "g":
+        return format(float(figure) * factor, form)
+    with localcontext(rounding=ROUND_HALF_UP):
+        return format(Decimal(figure) * factor, form)
 
 
 def fields(template: str) -> tuple[str, ...]:

@@ -30,6 +30,8 @@ class Column:
     """A second line, smaller."""
     needs: str = ""
     """A column without which there is nothing to show."""
+    otherwise: str = ""
+    """What stands in the place of a figure that is not there."""
 
 
 @dataclass(frozen=True)
