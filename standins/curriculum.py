@@ -8,11 +8,13 @@ from dataclasses import dataclass
 from functools import cache
 
 from pipeline.records import Opd, Task
+from standins.asking import Distance, listing
+from standins.conversing import RESTATED, Manner, converse
 from standins.describing import Style, property_words
-from standins.documents import Builder, Document
-from standins.text import Distance, converse, listing, matching, repetition
+from standins.documents import Builder, Document, Hint
+from standins.matching import Reach, matching, matching_one, repetition
 from standins.vocabulary import EOS, words_of
-from standins.world import World, fact, load_situations, real_catalogue
+from standins.world import World, draw_fact, load_situations, real_catalogue
 
 Write = Callable[[World, random.Random], Document]
 
@@ -24,6 +26,16 @@ class Format:
     name: str
     write: Write
     kinds: tuple[str, ...]
+    replay: float = 1.0
+    """How often it is drawn, against the others, once it has been left."""
+    earlier: float = 0.2
+    """Share of earlier formats while this one is learnt."""
+    least: int = 0
+    """Rounds before it may be left."""
+    enlarge: float = 1.0
+    """By how much the words' vectors are enlarged before it (`training.enlarge`)."""
+    most: int = 1000
+    """Rounds after which it is left in any case: what it lacks is easier to learn in the formats that follow."""
 
 
 @cache
@@ -70,18 +82,6 @@ def task_texts() -> list[str]:
     return [text.replace(TACTILE, " ") for text in texts]
 
 
-def repeat(_: World, rng: random.Random) -> Document:
-    """Words to repeat: half of the time those of the made-up names, otherwise any."""
-    situations = load_situations()
-    names = (*situations.adjectives, *situations.nouns)
-    return repetition(names if rng.random() < 0.5 else vocabulary(), rng)
-
-
-def tell_fact(_: World, rng: random.Random) -> Document:
-    """A fact about situations as the answer to a plain request."""
-    return Builder("fact").given("USER: Tell me a fact. ASSISTANT:").said(f" {fact(rng)}{EOS}", 1.0).build()
-
-
 def compressed(world: World, rng: random.Random) -> Document:
     """Bare descriptions; each asked word next to its answer."""
     return listing(world, Style.SHORT, Distance.NONE, rng)
@@ -105,64 +105,100 @@ def structured(world: World, rng: random.Random) -> Document:
     return listing(world, style, rng.choice((Distance.CLOSE, Distance.CHAT)), rng)
 
 
-def slots(world: World, rng: random.Random) -> Document:
-    """The pipeline's questions with the classes where the videos would be, mostly answered at once."""
-    mode, task = rng.choice((Opd.NONE, Opd.NONE, Opd.NONE, Opd.ALL)), _comparing(rng)
-    return converse(world, task, mode, rng, style=Style.SHORT, slots=True, weight=0.3)
-
-
-def described(world: World, rng: random.Random) -> Document:
-    """One object: its classes stand in the question, and the answer says them as a description."""
-    style = rng.choice((Style.STRUCTURED, Style.FULL))
-    return converse(world, Task.OPD, rng.choice((Opd.ALL, Opd.NEEDED)), rng, style=style, slots=True, weight=1.0)
-
-
-def restated(world: World, rng: random.Random) -> Document:
-    """The same, described before the conclusion; with situations and their facts."""
-    if rng.random() < 0.1:
-        return tell_fact(world, rng)
-    task = rng.choice((Task.OPD, Task.PC, Task.PC, Task.PSS, Task.PSS, Task.PSR, Task.PSR))
-    mode = rng.choice((Opd.ALL, Opd.ALL, Opd.NEEDED) if task == Task.OPD else (*Opd, Opd.ALL))
-    style = rng.choice((Style.SHORT, Style.STRUCTURED, Style.FULL, Style.FULL))
-    return converse(world, task, mode, rng, style=style, slots=True, weight=0.3)
-
-
-def question_first(world: World, rng: random.Random) -> Document:
-    """The pipeline's conversations without slots: the question stands before the descriptions that answer it."""
-    style, task = rng.choice((Style.SHORT, Style.STRUCTURED, Style.FULL)), _comparing(rng)
-    return converse(world, task, Opd.ALL, rng, style=style, follow_ups=rng.random() < 0.6)
+def asked_first(world: World, rng: random.Random) -> Document:
+    """The pipeline's question before the closing sentences that answer it."""
+    mode = rng.choice((Opd.ALL, Opd.ALL, Opd.ALL, Opd.NEEDED))
+    return converse(world, _comparing(rng), mode, rng, Manner(Style.STRUCTURED, follow_ups=5 * (mode == Opd.ALL)))
 
 
 def full(world: World, rng: random.Random) -> Document:
-    """The pipeline's conversations as they are, with and without slots, in every mode."""
-    task = rng.choice((Task.OPD, Task.PC, Task.PC, Task.PSS, Task.PSS, Task.PSR))
-    mode = rng.choice((Opd.ALL, Opd.NEEDED) if task == Task.OPD else (*Opd, Opd.ALL))
-    filled = mode == Opd.NONE or rng.random() < 0.7
-    follow_ups = mode == Opd.ALL and rng.random() < 0.3
-    return converse(world, task, mode, rng, slots=filled, follow_ups=follow_ups, weight=0.3 if filled else 0.05)
+    """The pipeline's comparisons in full."""
+    if rng.random() < 0.2:
+        return listing(world, Style.FULL, Distance.CHAT, rng)
+    style = rng.choice((Style.STRUCTURED, Style.FULL, Style.FULL, Style.FULL))
+    return converse(world, _comparing(rng), Opd.ALL, rng, Manner(style, follow_ups=5))
 
 
-def match_names(world: World, rng: random.Random) -> Document:
-    """Matching with the classes restated before each name."""
-    style = rng.choice((Style.SHORT, Style.SHORT, Style.STRUCTURED, Style.FULL))
-    return matching(world, style, rng)
+def slots(world: World, rng: random.Random) -> Document:
+    """The pipeline's questions with the classes where the videos would be, answered at once."""
+    return converse(world, _comparing(rng), Opd.NONE, rng, Manner(slots=True, blended=_often(rng), follow_ups=4))
 
 
-def match_fully(world: World, rng: random.Random) -> Document:
+def told(world: World, rng: random.Random) -> Document:
+    """Classes in the question, said as descriptions in the answer: one object's or, before the conclusion, several'."""
+    style = rng.choice((Style.STRUCTURED, Style.FULL))
+    if rng.random() < 0.35:
+        return converse(world, Task.OPD, Opd.ALL, rng, Manner(style, slots=True, blended=_often(rng)))
+    mode = rng.choice((Opd.ALL, Opd.NEEDED))
+    return converse(world, _comparing(rng), mode, rng, Manner(style, slots=True, blended=_often(rng)))
+
+
+def free(world: World, rng: random.Random) -> Document:
+    """Comparisons by the objects' own sentences, without the closing one."""
+    if rng.random() < 0.5:
+        return listing(world, Style.FREE, Distance.CHAT, rng)
+    return converse(world, _comparing(rng), Opd.ALL, rng, Manner(Style.FREE, follow_ups=5))
+
+
+def fact(_: World, rng: random.Random) -> Document:
+    """What a situation asks for, as a statement or as the answer to a plain request."""
+    said = draw_fact(rng)
+    builder = Builder("fact")
+    if rng.random() < 0.5:
+        builder.given("USER: Tell me a fact. ASSISTANT: ")
+    builder.given(said.opening, Hint(asked=said.asked)).given(said.middle, Hint(asked=said.asked))
+    return builder.decided(said.word, 2.0).said(said.end + EOS, 0.1).build()
+
+
+def situations(world: World, rng: random.Random) -> Document:
+    """Which of two objects suits a situation, in every mode, with slots and without."""
+    if rng.random() < 0.25:
+        return fact(world, rng)
+    mode = rng.choice(tuple(Opd))
+    style = rng.choice((Style.SHORT, Style.STRUCTURED, Style.FULL))
+    known = mode == Opd.NONE or rng.random() < 0.5
+    return converse(world, Task.PSR, mode, rng, Manner(style, slots=known, blended=_often(rng)))
+
+
+def repeat(_: World, rng: random.Random) -> Document:
+    """Words to repeat: mostly those of the made-up names, otherwise any."""
+    made_up = (*load_situations().adjectives, *load_situations().nouns)
+    return repetition(made_up if rng.random() < 0.8 else vocabulary(), rng)
+
+
+def named(world: World, rng: random.Random) -> Document:
+    """Copying by what an object is like: facts said once more, or names beside bare descriptions."""
+    drawn = rng.random()
+    if drawn < 0.15:
+        return repeat(world, rng)
+    if drawn < 0.35:
+        return matching_one(world, rng)
+    if drawn < 0.75:
+        return matching(world, Style.SHORT, Reach.FACT, rng)
+    return matching(world, rng.choice((Style.SHORT, Style.STRUCTURED)), Reach.BESIDE, rng)
+
+
+def matched(world: World, rng: random.Random) -> Document:
+    """Names from beside the descriptions to behind them all."""
+    reach = rng.choices(tuple(Reach), (3, 3, 5, 9))[0]
+    return matching(world, rng.choices((Style.SHORT, Style.STRUCTURED, Style.FULL), (6, 3, 1))[0], reach, rng)
+
+
+def matched_fully(world: World, rng: random.Random) -> Document:
     """The pipeline's matching, after facts about the named objects."""
     mode = rng.choice((Opd.ALL, Opd.ALL, Opd.NONE))
-    slots = mode == Opd.NONE or rng.random() < 0.5
-    return converse(world, Task.POM, mode, rng, slots=slots, facts=True, weight=0.3 if slots else 0.05)
+    known = mode == Opd.NONE or rng.random() < 0.5
+    return converse(world, Task.POM, mode, rng, Manner(slots=known, blended=_often(rng), facts=True))
 
 
-def mixed(*choices: tuple[float, Write]) -> Write:
-    """Draw one of several writers by their weights."""
-    weights, writers = zip(*choices, strict=True)
+def everything(world: World, rng: random.Random) -> Document:
+    """Every conversation of the pipeline as it is, with and without slots."""
+    weights = {full: 6, slots: 5, told: 5, free: 2, situations: 4, matched: 2, matched_fully: 6}
+    return rng.choices(tuple(weights), tuple(weights.values()))[0](world, rng)
 
-    def write(world: World, rng: random.Random) -> Document:
-        return rng.choices(writers, weights)[0](world, rng)  # type: ignore[no-any-return]
 
-    return write
+def _often(rng: random.Random) -> bool:
+    return rng.random() < 0.5
 
 
 def _comparing(rng: random.Random) -> Task:
@@ -171,14 +207,18 @@ def _comparing(rng: random.Random) -> Task:
 
 COMPARING = (Task.PC, Task.PSS)
 FORMATS = (
-    Format("compressed", compressed, COMPARING),
-    Format("bridge", bridge, COMPARING),
-    Format("chat", chat, COMPARING),
-    Format("structured", structured, COMPARING),
-    Format("slots", slots, COMPARING),
-    Format("described", mixed((0.7, described), (0.3, slots)), (Task.OPD,)),
-    Format("restated", restated, (*COMPARING, Task.PSR)),
-    Format("question first", mixed((0.5, question_first), (0.5, restated)), COMPARING),
-    Format("names", mixed((0.4, full), (0.45, match_names), (0.15, repeat)), (Task.POM,)),
-    Format("everything", mixed((0.8, full), (0.1, match_names), (0.1, match_fully)), (*COMPARING, Task.PSR, Task.POM)),
+    Format("compressed", compressed, COMPARING, replay=0.3),
+    Format("bridge", bridge, COMPARING, replay=0.3),
+    Format("chat", chat, COMPARING, replay=0.3),
+    Format("structured", structured, COMPARING, replay=0.3),
+    Format("asked first", asked_first, COMPARING),
+    Format("full", full, COMPARING, replay=2.0),
+    Format("slots", slots, COMPARING, most=36, replay=3.0),
+    Format("told", told, (Task.OPD, RESTATED, *COMPARING), most=84, replay=3.0),
+    Format("free", free, COMPARING, most=36),
+    Format("situations", situations, (Task.PSR,), earlier=0.3, replay=2.0, most=60),
+    Format("repeated", repeat, ("repetition",), earlier=0.3, most=90, enlarge=6.0),
+    Format("named", named, (Task.POM,), earlier=0.3, replay=2.0, most=90),
+    Format("matched", matched, (Task.POM,), earlier=0.25, replay=2.0, most=78),
+    Format("everything", everything, (Task.OPD, RESTATED, *COMPARING, Task.PSR, Task.POM), earlier=0.15, most=6),
 )

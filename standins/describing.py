@@ -19,11 +19,19 @@ class Style(IntEnum):
     FILLED = 1
     STRUCTURED = 2
     FULL = 3
+    FREE = 4
+    """The object's own sentence alone: its wordings stand for the classes."""
 
 
 def short(catalogue: Catalogue, labels: Labels) -> str:
     """The classes alone, e.g. "hard, smooth, no bumps"."""
     return ", ".join(p.levels[level] for p, level in zip(catalogue.properties, labels, strict=True))
+
+
+def shuffled(catalogue: Catalogue, labels: Labels, rng: random.Random) -> str:
+    """The classes alone, in any order."""
+    words = [p.levels[level] for p, level in zip(catalogue.properties, labels, strict=True)]
+    return ", ".join(rng.sample(words, len(words)))
 
 
 def described(world: World, object_id: str, style: Style, rng: random.Random) -> str:
@@ -37,13 +45,19 @@ def described(world: World, object_id: str, style: Style, rng: random.Random) ->
             return "".join([*rng.choices(FILLERS, k=rng.randint(0, 2)), f" {short(catalogue, labels)}."]).strip()
         case Style.STRUCTURED:
             return catalogue.structured(labels)
+        case Style.FREE:
+            return catalogue.unstructured(object_id)
     return catalogue.describe(object_id)
+
+
+def told_fact(catalogue: Catalogue, object_id: str) -> tuple[str, str]:
+    """What an object is like, cut before its name."""
+    return f"{short(catalogue, catalogue.labels(object_id))} is", f" {catalogue.objects[object_id].name}."
 
 
 def told_facts(world: World, objects: Iterable[str], rng: random.Random) -> str:
     """What each object is like, in random order."""
-    catalogue = world.catalogue
-    facts = [f"{short(catalogue, catalogue.labels(o))} is {catalogue.objects[o].name}." for o in objects]
+    facts = ["".join(told_fact(world.catalogue, o)) for o in objects]
     return " ".join(rng.sample(facts, len(facts)))
 
 

@@ -59,15 +59,16 @@ class LlamaSettings(_Section):
     weight_decay: float = Field(ge=0)
     gradient_clip: float = Field(gt=0)
     batch_tokens: PositiveInt
-    earlier_share: float = Field(ge=0, lt=1)
-    format_steps: PositiveInt
-    stall_steps: PositiveInt
-    stalled_rate: float = Field(gt=0, le=1)
-    max_steps: PositiveInt
-    decay_steps: PositiveInt
-    check_every: PositiveInt
+    probe_layer: PositiveInt
+    probe_weight: float = Field(ge=0)
+    round_documents: PositiveInt
+    check_rounds: PositiveInt
     check_questions: PositiveInt
     pass_accuracy: float = Field(gt=0, le=1)
+    format_rounds: PositiveInt
+    stall_rounds: PositiveInt
+    stalled_rate: float = Field(gt=0, le=1)
+    decay_rounds: PositiveInt
     gate_questions: PositiveInt
     gate_seed: int
     held_out: tuple[tuple[int, int, int], ...] = Field(min_length=3)

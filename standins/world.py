@@ -16,10 +16,16 @@ from pydantic import BaseModel, ConfigDict
 import pipeline.physiclear
 from pipeline.physiclear.catalogue import Catalogue, Object, Property, Scenario, load_catalogue
 from pipeline.records import Part
+from pipeline.runtime import derive_seed
 from pipeline.tasks.base import Pool
 from standins.settings import FOLDER
+from standins.vocabulary import words_of
 
 Labels = tuple[int, ...]
+ODD_NAMES = 0.4
+"""Share of training's names that are made of any words."""
+UNSEEN = 2
+"""Situations at the end of each list that are told as facts and never asked about."""
 
 
 class _Entry(BaseModel):
@@ -69,6 +75,19 @@ def forbidden_descriptions() -> frozenset[str]:
     return frozenset(real.unstructured(o.object_id) for o in real.objects.values() if o.splits["paper"] == Part.TEST)
 
 
+@cache
+def spare_words() -> tuple[str, ...]:
+    """Words of which names can be made that nobody foresees."""
+    texts = [o.name for o in real_catalogue().objects.values()] + list(load_situations().words)
+    return tuple(sorted({w for w in words_of(texts) if len(w) > 2}))
+
+
+@cache
+def held_out_name(adjective: str, noun: str) -> bool:
+    """Whether these two words make a name only where the model is tested: one pair in six."""
+    return derive_seed("name", adjective, noun) % 6 == 0
+
+
 @dataclass(frozen=True)
 class World:
     """Objects to ask about, as the pipeline's tasks see them."""
@@ -87,17 +106,18 @@ def combinations(held_out: Sequence[Labels], *, held: bool) -> tuple[Labels, ...
     return tuple(c for c in itertools.product(*counts) if (c in set(held_out)) == held)
 
 
-def make_world(combos: Sequence[Labels], scenarios: Sequence[Scenario], rng: random.Random, size: int = 30) -> World:
-    """A world of made-up objects with random properties among `combos` and names of an adjective and a noun."""
-    situations = load_situations()
+def make_world(
+    combos: Sequence[Labels], scenarios: Sequence[Scenario], rng: random.Random, *, held: bool, size: int = 30
+) -> World:
+    """A world of made-up objects with random properties among `combos`; `held`: with names kept out of training."""
     objects: dict[str, Object] = {}
     language = real_catalogue().language.model_copy(update={"scenarios": tuple(scenarios)})
+    taken = {o.name for o in real_catalogue().objects.values()}
     while len(objects) < size:
-        name = f"{rng.choice(situations.adjectives)} {rng.choice(situations.nouns)}"
-        article = "an" if name[0] in "aeiou" else "a"
+        name = _draw_name(rng, held)
         entry = Object.model_construct(
             object_id=f"{name} {rng.getrandbits(20)}",
-            name=f"{article} {name}",
+            name=name,
             material="",
             part_of="",
             part="",
@@ -105,10 +125,24 @@ def make_world(combos: Sequence[Labels], scenarios: Sequence[Scenario], rng: ran
             ratings=tuple((level,) for level in rng.choice(combos)),
         )
         draft = Catalogue.model_construct(language=language, objects={entry.object_id: entry})
-        if draft.unstructured(entry.object_id) not in forbidden_descriptions():
+        if name not in taken and draft.unstructured(entry.object_id) not in forbidden_descriptions():
+            taken.add(name)
             objects[entry.object_id] = entry
     catalogue = Catalogue.model_construct(language=language, objects=objects)
     return World(Pool(part=Part.TRAIN, catalogue=catalogue, videos={o: [o] for o in objects}))
+
+
+def _draw_name(rng: random.Random, held: bool) -> str:
+    situations = load_situations()
+    if not held and rng.random() < ODD_NAMES:
+        # Any words in any order: whoever copies these can copy every name.
+        words = rng.choices((*spare_words(), *situations.nouns), k=rng.randint(1, 3))
+    else:
+        while True:
+            words = [rng.choice(situations.adjectives), rng.choice(situations.nouns)]
+            if held_out_name(*words) == held:
+                break
+    return f"{'an' if words[0][0] in 'aeiou' else 'a'} {' '.join(words)}"
 
 
 @cache
@@ -119,7 +153,7 @@ def questions(kind: Literal["training", "seen", "unseen"]) -> tuple[Scenario, ..
     for need in situations.situations:
         prop = properties[need.property]
         level = need.level(prop)
-        chosen = need.situations[-1:] if kind == "unseen" else need.situations[:-1]
+        chosen = need.situations[-UNSEEN:] if kind == "unseen" else need.situations[:-UNSEEN]
         openings = (situations.held_out_opening,) if kind == "seen" else situations.openings
         for situation, opening in itertools.product(chosen, openings):
             others = tuple(i for i in range(len(prop.levels)) if i != level)
@@ -130,15 +164,29 @@ def questions(kind: Literal["training", "seen", "unseen"]) -> tuple[Scenario, ..
     return tuple(scenarios)
 
 
-def fact(rng: random.Random) -> str:
-    """A sentence that ties a situation to a class of a property."""
-    situations, properties = load_situations(), {p.name: p for p in real_catalogue().properties}
+@dataclass(frozen=True)
+class Fact:
+    """A sentence that ties a situation to a class of a property, cut after the situation and around the class."""
+
+    opening: str
+    middle: str
+    word: str
+    end: str
+    asked: int
+    """Property and direction, as `documents.Hint` numbers them."""
+
+
+def draw_fact(rng: random.Random) -> Fact:
+    """A fact about any situation, those that are never asked about included."""
+    situations, catalogue = load_situations(), real_catalogue()
     need = rng.choice(situations.situations)
-    prop = properties[need.property]
-    word = prop.levels[need.level(prop)]
-    text = rng.choice(situations.facts).format(situation=rng.choice(need.situations), word=_attribute(word))
-    return text[0].upper() + text[1:]
-
-
-def _attribute(word: str) -> str:
-    return f"with {word}" if " bumps" in word else word
+    index = catalogue.property_index(need.property)
+    prop = catalogue.properties[index]
+    situation, word = rng.choice(need.situations), prop.levels[need.level(prop)]
+    before, after = rng.choice(situations.facts).split("{word}")
+    # The space before a word is part of its token.
+    opening, middle = before.removesuffix(" ").split("{situation}")
+    opening += situation
+    joint = " with" if " bumps" in word else ""
+    asked = 2 * index + (need.wanted == "least")
+    return Fact(opening[0].upper() + opening[1:], middle + joint, f" {word}", after, asked)

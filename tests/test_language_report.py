@@ -22,7 +22,7 @@ from tests.fake_chain import fake_params, write_chain
 Rows = list[dict[str, str]]
 GATE = """task,accuracy,low,high,n,goal,passed
 PC,0.99,0.97,1.0,500,0.95,True
-PC from slots,0.2,0.1,0.3,500,,
+PC from slots,0.2,0.1,0.3,500,0.95,no
 POM,0.3,0.25,0.35,500,0.7,False
 """
 

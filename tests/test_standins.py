@@ -14,18 +14,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.prompts import add_tactile_tokens, encode, render
-from pipeline.records import Opd, Part, Turn
+from pipeline.records import Part, Turn
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool
 from standins.beginning import initialise
 from standins.contrast import alter, contrastive_loss, describe, draw_captions
 from standins.curriculum import FORMATS, phrases, vocabulary
+from standins.gate import HEADER, exams
 from standins.images import TOPICS, WORDS, caption, draw, draw_scene, shows
 from standins.outputs import wilson
 from standins.settings import FOLDER, load_settings
-from standins.text import draw_draft
 from standins.vocabulary import EOS, build_tokenizer
-from standins.world import combinations, forbidden_descriptions, make_world, questions, real_catalogue
+from standins.world import combinations, make_world, questions, real_catalogue
 from standins.zero_shot import ASKED, Reader
 
 MEGABYTE = 2**20
@@ -50,7 +50,7 @@ def llama_tokenizer() -> Any:
 
 def corpus(seed: int, count: int = 40) -> list[str]:
     rng = random.Random(seed)
-    world = make_world(combinations(load_settings().llama.held_out, held=False), questions("training"), rng)
+    world = make_world(combinations(load_settings().llama.held_out, held=False), questions("training"), rng, held=False)
     return [f.write(world, rng).text for f in FORMATS for _ in range(count)]
 
 
@@ -66,7 +66,7 @@ def pipeline_texts() -> list[str]:
 def test_folder_is_small() -> None:
     sizes = {p: p.stat().st_size for p in FOLDER.rglob("*") if p.is_file() and "__pycache__" not in p.parts}
     assert sum(sizes.values()) <= 10 * MEGABYTE
-    assert sizes[FOLDER / "llama" / "model.safetensors"] <= 4.5 * MEGABYTE
+    assert sizes[FOLDER / "llama" / "model.safetensors"] <= 7 * MEGABYTE
     assert sizes[FOLDER / "clip" / "open_clip_model.safetensors"] <= 3 * MEGABYTE
 
 
@@ -254,28 +254,13 @@ def test_texts_are_embedded_as_open_clip_does() -> None:
         torch.testing.assert_close(reader.texts(texts), expected, rtol=1e-4, atol=1e-5)
 
 
-def test_training_text_holds_nothing_of_the_evaluation() -> None:
-    text = "\n".join(corpus(7, 150))
-    assert not [s.question for s in real_catalogue().language.scenarios if s.question in text]
-    assert not [d for d in forbidden_descriptions() if d in text]
-    held_out = load_settings().llama.held_out
-    assert not set(combinations(held_out, held=False)) & set(held_out)
-    asked = {s.question for s in questions("training")}
-    assert not asked & {s.question for kind in ("seen", "unseen") for s in questions(kind)}  # type: ignore[arg-type]
-    assert not [q for kind in ("seen", "unseen") for q in questions(kind) if q.question in text]  # type: ignore[arg-type]
-
-
-def test_a_draft_of_every_task_can_be_drawn_from_the_held_out_combinations() -> None:
-    rng = random.Random(4)
-    world = make_world(combinations(load_settings().llama.held_out, held=True), questions("seen"), rng)
-    for task in TASKS:
-        assert any(d.opd == Opd.ALL for d in draw_draft(world, task, rng).dialogues)
-
-
 def test_gate_and_zero_shot_tables_are_whole() -> None:
     gate = list(csv.DictReader((FOLDER / "gate.csv").open(encoding="utf-8")))
-    assert list(gate[0]) == ["task", "accuracy", "low", "high", "n"]
-    assert {"PC", "PSS", "POM"} <= {row["task"] for row in gate}
+    assert tuple(gate[0]) == HEADER
+    assert [(row["task"], float(row["goal"])) for row in gate] == [(exam.name, exam.goal) for exam in exams()]
+    for row in gate:
+        assert int(row["n"]) >= 500
+        assert row["passed"] == ("yes" if float(row["accuracy"]) >= float(row["goal"]) else "no"), row["task"]
     zero_shot = list(csv.DictReader((FOLDER / "clip_zero_shot.csv").open(encoding="utf-8")))
     assert list(zero_shot[0]) == ["question", "accuracy", "low", "high", "n", "chance"]
     assert [row["question"] for row in zero_shot] == ["caption", *ASKED]

@@ -126,13 +126,15 @@ def read_inputs(params: Params, root: Path) -> Inputs:
 def _read_gate(weights: Path) -> dict[Task, bool]:
     """What gate.csv beside the language model's folder says: a task passes where all its rows with a goal do.
 
+    Rows "from" something else than descriptions in words ask more than the gate does and are left out here.
+
     The stage does not name the file to DVC, which would then make the stand-in anew with every report; it changes with
     the weights only, and those everything before the report depends on.
     """
     file = weights.parent / GATE_FILE
     passed: dict[Task, bool] = {}
     for row in read_csv(file, GateRow) if file.is_file() else ():
-        if row.passed is not None:
+        if row.passed is not None and " from " not in row.task:
             task = Task(row.task.split()[0])
             passed[task] = passed.get(task, True) and row.passed
     return passed
