@@ -65,11 +65,17 @@ run(kind, LanguageConfig(weights=weights), questions, EmbeddingStore(Path(embedd
 def run(kind: str, language: LanguageConfig, questions: list[Question], store: EmbeddingStore, folder: Path) -> Trained:
     """One training with its checkpoints below the folder."""
     shared.CHECKPOINTS = folder
-    model, data = assemble(material(language, questions, store), 10, "test")
-    if kind == "align":
-        return align(model, data, CONFIG, RUNTIME, Job(kind, "x", 0))
-    add_lora(model, CONFIG)
-    return finetune_lora(model, data, CONFIG, RUNTIME, Job(kind, "x", 0))
+    # Sums depend on the number of threads in their last bits, and each process would take its own.
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        model, data = assemble(material(language, questions, store), 10, "test")
+        if kind == "align":
+            return align(model, data, CONFIG, RUNTIME, Job(kind, "x", 0))
+        add_lora(model, CONFIG)
+        return finetune_lora(model, data, CONFIG, RUNTIME, Job(kind, "x", 0))
+    finally:
+        torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")
