@@ -14,7 +14,6 @@ from pipeline.reporting.inputs import Inputs
 from pipeline.reporting.language_rows import DescribingRow, EffectRow, TouchRow
 from pipeline.statistics import Outcome, clustered, holm, paired
 
-Axes = tuple[Encoder, Lora, Opd]
 CONTRASTS: tuple[tuple[str, int, Encoder | Lora | Opd, Encoder | Lora | Opd], ...] = (
     ("encoder", 0, Encoder.FINETUNED, Encoder.BASE),
     ("LoRA", 1, Lora.WITH, Lora.WITHOUT),
