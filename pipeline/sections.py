@@ -127,6 +127,9 @@ class QuestionsConfig(Section):
     seed: Seed = 0
     train: QuestionCounts
     evaluation: QuestionCounts
+    facts: bool = False
+    """Begin matching questions with what the named objects are like, for a language model that has never heard of
+    them: then touch and reasoning are asked for and no knowledge of the world. Tables say so."""
 
     @model_validator(mode="after")
     def _psr_is_not_trained(self) -> Self:

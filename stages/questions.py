@@ -19,7 +19,7 @@ def main() -> None:
             ("evaluation", Part.TEST, config.evaluation, True),
         ):
             pool = pool_of(part, assignments, catalogue)
-            questions = build_questions(pool, counts.by_task(), seed=config.seed, distinct=distinct)
+            questions = build_questions(pool, counts.by_task(), seed=config.seed, distinct=distinct, facts=config.facts)
             write_jsonl(DATA / "questions" / f"{name}.jsonl", questions)
             for task in counts.by_task():
                 run.metrics[f"{name}.{task}"] = sum(q.task == task for q in questions)

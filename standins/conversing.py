@@ -10,8 +10,9 @@ from pipeline.prompts import TACTILE, render
 from pipeline.records import Opd, Task, Turn
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Draft
+from pipeline.tasks.pom import fact
 from standins.asking import Distance, ask_all, conclude
-from standins.describing import Style, short, shuffled, told_fact
+from standins.describing import Style, short, shuffled
 from standins.documents import UNKNOWN, Builder, Document, Hint
 from standins.vocabulary import EOS
 from standins.world import World
@@ -155,7 +156,7 @@ class _Writer:
 def tell(builder: Builder, world: World, object_id: str, space: str = " ") -> None:
     """Append the fact about an object."""
     labels = world.catalogue.labels(object_id)
-    classes, name = told_fact(world.catalogue, object_id)
+    classes, name = fact(world.catalogue, object_id)
     builder.given(space + classes, Hint(labels=labels)).given(name, Hint(named=labels, copied=True))
 
 

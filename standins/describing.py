@@ -50,17 +50,6 @@ def described(world: World, object_id: str, style: Style, rng: random.Random) ->
     return catalogue.describe(object_id)
 
 
-def told_fact(catalogue: Catalogue, object_id: str) -> tuple[str, str]:
-    """What an object is like, cut before its name."""
-    return f"{short(catalogue, catalogue.labels(object_id))} is", f" {catalogue.objects[object_id].name}."
-
-
-def told_facts(world: World, objects: Iterable[str], rng: random.Random) -> str:
-    """What each object is like, in random order."""
-    facts = ["".join(told_fact(world.catalogue, o)) for o in objects]
-    return " ".join(rng.sample(facts, len(facts)))
-
-
 def property_words(properties: Iterable[Property]) -> list[str]:
     """The words of several words that become one token: classes, comparatives, superlatives."""
     said = [w for p in properties for w in (*p.levels, p.more, p.less, p.most, p.least)]

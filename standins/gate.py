@@ -23,8 +23,9 @@ from pipeline.records import Opd, Part, Prediction, Question, Task, Turn
 from pipeline.runtime import derive_seed
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool
+from pipeline.tasks.pom import facts
 from standins.conversing import draw_draft
-from standins.describing import short, told_facts
+from standins.describing import short
 from standins.documents import BLEND, blend_ids
 from standins.outputs import wilson, write_rows
 from standins.settings import FOLDER, LlamaSettings, load_settings
@@ -148,7 +149,7 @@ def _item(exam: Exam, world: World, number: int, rng: random.Random) -> Item:
         if exam.objects == "test, own sentence alone":
             said = [text.replace(f" {catalogue.structured(labels)}", "") for text in said]
     if exam.task == Task.POM:
-        first = f"{told_facts(world, draft.objects, rng)} {first}"
+        first = f"{facts(catalogue, draft.objects, rng)} {first}"
     asked = [first, *(t.user for t in turns[1:])]
     given = "" if exam.slots != "none" or exam.task == Task.PSR else f" {said[-1].rpartition(MARKER)[0]}{MARKER}"
     filled = tuple(Turn(user=user, assistant=text) for user, text in zip(asked, said, strict=True))

@@ -49,7 +49,10 @@ def test_same_seed_gives_identical_results(project: Project) -> None:
     assert yaml.safe_load((project.folder / "dvc.lock").read_text()) == before
 
 
-WHO = "from accelerate import Accelerator; a = Accelerator(cpu=True); print(a.distributed_type.value, a.num_processes)"
+WHO = """from accelerate import Accelerator
+a = Accelerator(cpu=True)
+a.print(a.distributed_type.value, a.num_processes)
+"""
 
 
 def test_two_processes_train_like_one(project: Project) -> None:

@@ -87,6 +87,28 @@ def test_strata_are_balanced() -> None:
     assert set(described.values()) == {2}, "every object of the part is described equally often"
 
 
+def test_facts_stand_before_the_same_matching_questions() -> None:
+    plain = build_questions(POOLS[Part.TEST], COUNTS, seed=1, distinct=True)
+    told = build_questions(POOLS[Part.TEST], COUNTS, seed=1, distinct=True, facts=True)
+    orders = set()
+    for without, question in zip(plain, told, strict=True):
+        if question.task != Task.POM:
+            assert question == without
+            continue
+        assert question.model_copy(update={"dialogues": without.dialogues}) == without
+        for bare, dialogue in zip(without.dialogues, question.dialogues, strict=True):
+            facts = dialogue.turns[0].user.removesuffix(bare.turns[0].user)
+            assert facts != dialogue.turns[0].user
+            assert dialogue.turns[0].assistant == bare.turns[0].assistant
+            for object_id in question.objects:
+                levels = zip(CATALOGUE.properties, CATALOGUE.labels(object_id), strict=True)
+                classes = ", ".join(p.levels[level] for p, level in levels)
+                assert f"{classes} is {CATALOGUE.objects[object_id].name}." in facts
+        first = [facts.index(f" {CATALOGUE.objects[o].name}.") for o in question.objects]
+        orders.add(tuple(sorted(range(3), key=first.__getitem__)))
+    assert len(orders) == 6, "the order of the facts gives nothing away"
+
+
 def test_an_empty_part_has_no_questions() -> None:
     assert build_questions(Pool(Part.TEST, CATALOGUE, {}), COUNTS, seed=0, distinct=True) == []
 

@@ -36,6 +36,8 @@ class Answered:
         return TASKS[measure.task].chance(self.inputs.catalogue)[measure.name]
 
     def gate(self, measure: Measure) -> str:
-        """Whether the base language model passes the task's gate."""
+        """Whether the base language model passes the task's gate, and whether questions tell what it need not know."""
         passed = self.inputs.gate.get(measure.task)
-        return "" if passed is None else "passed" if passed else FAILED
+        words = [] if passed is None else ["passed" if passed else FAILED]
+        words += ["facts told"] * self.inputs.told(measure.task)
+        return ", ".join(words)

@@ -24,7 +24,7 @@ def draw_effects(path: Path, rows: Sequence[EffectRow], footer: str) -> None:
     for number, (axes, task) in enumerate(zip(panels, tasks, strict=True)):
         for row in (r for r in rows if r.task == task):
             height = -changes.index(f"{row.axis}: {row.change}")
-            face = "white" if row.gate == FAILED else COLOURS[0]
+            face = "white" if row.gate.startswith(FAILED) else COLOURS[0]
             if row.low is not None and row.high is not None:
                 axes.plot([100 * row.low, 100 * row.high], [height, height], color=COLOURS[0], linewidth=1.8)
             axes.plot(100 * row.difference, height, "o", color=COLOURS[0], markerfacecolor=face, markersize=6)

@@ -54,6 +54,10 @@ class Inputs:
     gate: Mapping[Task, bool]
     """By task: whether the base language model can do it on perfect descriptions; empty where nobody asked it."""
 
+    def told(self, task: Task) -> bool:
+        """Whether the task's questions say what the objects are like, so that no knowledge of them is asked for."""
+        return task is Task.POM and self.params.questions.facts
+
     @property
     def of_paper(self) -> bool:
         """Whether the catalogue is of the data set that the paper's figures are about."""

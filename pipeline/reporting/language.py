@@ -29,7 +29,8 @@ def language_tables(inputs: Inputs) -> list[Table]:
             "ablation",
             "Language model: every variant",
             "Mean over seeds; the CSV has every seed. *Base model* says where the language model, before any touch, "
-            "cannot do the task on perfect descriptions in words either: what such a task shows is not about touch.",
+            "cannot do the task on perfect descriptions in words either: what such a task shows is not about touch. "
+            "*Facts told*: matching questions say what the named objects are like (`questions.facts`).",
             [row for key in real for measure in measures if (row := _row(answered, [key], measure))],
             [row for axes in inputs.axes for row in _over_seeds(answered, [*inputs.variants(axes).values()], measures)],
             folder=FOLDER,

@@ -148,7 +148,10 @@ def _answered(inputs: Inputs, table: str, measure: Measure, system: System) -> A
 
 
 def _doubt(inputs: Inputs, task: Task) -> str:
-    return "" if inputs.gate.get(task, True) else "the base language model fails its gate in this task"
+    failed = not inputs.gate.get(task, True)
+    doubts = ["the base language model fails its gate in this task"] * failed
+    doubts += ["the question says what the named objects are like (questions.facts)"] * inputs.told(task)
+    return "; ".join(doubts)
 
 
 def _baselines(inputs: Inputs, properties: Sequence[Measure]) -> list[AccuracyRow]:

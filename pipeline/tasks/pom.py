@@ -5,9 +5,11 @@ from __future__ import annotations
 import itertools
 import random
 import re
+from collections.abc import Iterable
+from dataclasses import replace
 
 from pipeline.physiclear.catalogue import Catalogue
-from pipeline.records import Opd, Prediction, Question, Score, Task
+from pipeline.records import Dialogue, Opd, Prediction, Question, Score, Task
 from pipeline.tasks.base import (
     LETTERS,
     Draft,
@@ -24,6 +26,30 @@ from pipeline.tasks.base import (
 OPENINGS = ("Given three tactile videos: {videos}.", "You have tactile videos of one object each: {videos}.")
 REQUEST = "atch each video to one of the following objects in alphabetical order: {options}."
 ORDERS = tuple("".join(order) for order in itertools.permutations("123"))
+
+
+def fact(catalogue: Catalogue, object_id: str) -> tuple[str, str]:
+    """What an object is like, cut before its name: "hard, smooth, no bumps is" and " a ruler."."""
+    labels = catalogue.labels(object_id)
+    classes = ", ".join(p.levels[level] for p, level in zip(catalogue.properties, labels, strict=True))
+    return f"{classes} is", f" {catalogue.objects[object_id].name}."
+
+
+def facts(catalogue: Catalogue, objects: Iterable[str], rng: random.Random) -> str:
+    """What each object is like, in random order."""
+    told = ["".join(fact(catalogue, o)) for o in objects]
+    return " ".join(rng.sample(told, len(told)))
+
+
+def with_facts(draft: Draft, catalogue: Catalogue, rng: random.Random) -> Draft:
+    """The same question after the facts about its objects; what is left to find out is which video is of which."""
+    told = facts(catalogue, draft.objects, rng)
+
+    def begin(dialogue: Dialogue) -> Dialogue:
+        first, *rest = dialogue.turns
+        return dialogue.model_copy(update={"turns": (first.model_copy(update={"user": f"{told} {first.user}"}), *rest)})
+
+    return replace(draft, dialogues=tuple(map(begin, draft.dialogues)))
 
 
 class PropertyObjectMatching:
