@@ -221,6 +221,7 @@ def test_garbage_describes_nothing(output: str) -> None:
     [
         *("", "Maybe.", "Not sure.", "None", "Nobody knows", "The first object is harder.", "Yesterday", "Bothersome"),
         *("Conclusion:", "Conclusion: maybe", "Yes. Conclusion: I cannot say.", "First object: Overall, yes."),
+        *("Yes and no.", "yes or no", "Yes/No", "Conclusion: No / yes", "Both or no"),
     ],
 )
 def test_no_comparison_is_read_from(output: str) -> None:

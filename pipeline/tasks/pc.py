@@ -72,8 +72,12 @@ class PropertyComparison:
         )
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
-        """Read from how the conclusion begins: "Yes", "No" or "Both"."""
-        match = re.match(r"(yes|no|both)\b", conclusion(prediction.outputs[0]), flags=re.IGNORECASE)
+        """Read from how the conclusion begins: "Yes", "No" or "Both"; "yes and no" is none of them."""
+        match = re.match(
+            r"(yes|no|both)\b(?!\s*(?:and|or|/)\s*(?:yes|no|both)\b)",
+            conclusion(prediction.outputs[0]),
+            flags=re.IGNORECASE,
+        )
         read = {"yes": "yes", "no": "no", "both": "same"}
         return choice_score(question, prediction, read[match[1].lower()] if match else None)
 
