@@ -19,7 +19,7 @@ import numpy as np
 
 from pipeline.baseline.features import video_features
 from pipeline.benchmarks import BenchRow
-from pipeline.benchmarks.pareto import draw_pareto
+from pipeline.benchmarks.pareto import draw_rows
 from pipeline.benchmarks.transfer import Kind, transfer
 from pipeline.config import load_params
 from pipeline.frames.reference import reference_indices
@@ -82,9 +82,9 @@ def measure(root: Path) -> Sequence[BenchRow]:
     recipes = load_recipes(root / data.catalogue, catalogue, 0)
     pictures, labels = look_at(recipes, catalogue)
     slopes = "relative error in slopes, quartiles over objects"
-    draw_pareto(pictures, root / PICTURES[0], f"Ways to compute a contact: {len(recipes)} objects", slopes)
+    draw_rows(pictures, root / PICTURES[0], f"Ways to compute a contact: {len(recipes)} objects", slopes)
     wrong = "not all properties right, object-clustered 95 % interval"
-    draw_pareto(labels, root / PICTURES[1], "What a classifier learns from each way, tested on the finest", wrong)
+    draw_rows(labels, root / PICTURES[1], "What a classifier learns from each way, tested on the finest", wrong)
     return [*ball_rows(), *pictures, *labels, *write_rows(recipes)]
 
 
