@@ -187,6 +187,12 @@ def test_the_whole_tiny(small: None, monkeypatch: pytest.MonkeyPatch) -> None:
     assert half.logit_error is not None
     assert 0 < half.logit_error < 0.1
     assert half.error is not None
+    for row in (*answers, half):
+        assert row.error is not None
+        assert row.error_low is not None
+        assert row.error_high is not None
+        assert 0 <= row.error_low <= row.error <= row.error_high <= 1
+    assert all(row.error_low is None for row in trained)
     assert rows[language_formats.case_of("float32")].logit_error == 0
 
 

@@ -51,6 +51,7 @@ from pipeline.benchmarks.encoder_cost import (
     with_error,
 )
 from pipeline.benchmarks.encoder_training import Describe, prompts, training_speed
+from pipeline.benchmarks.operations import counted
 from pipeline.benchmarks.pareto import draw_rows
 from pipeline.config import load_params
 from pipeline.contestants import CONTESTANTS
@@ -211,6 +212,8 @@ def trade(arena: Arena) -> list[EncoderRow]:
             "megabytes": megabytes(changed),
             "parameters": parameters(encoder),
         }
+        if setting.form != "int8":
+            columns[setting.case]["flops"] = counted(partial(_describe, Describe(changed), shown[setting.case], 0))
     costs = take_turns(cases, range(len(shown[BASELINE])))
     verdicts = dict(zip(cases, run_parallel(judge, trials, "encoder", "setting"), strict=True))
     rows = []
