@@ -6,7 +6,7 @@ import itertools
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.benchmarks import BenchRow
@@ -33,7 +33,6 @@ def test_the_front_holds_what_nothing_beats(pairs: list[tuple[int, int]]) -> Non
     assert [p.cost for p in found] == sorted(p.cost for p in found)
 
 
-@settings(deadline=None, max_examples=60)
 @given(st.lists(st.tuples(st.floats(200, 800), st.floats(150, 450)), min_size=1, max_size=10))
 def test_names_cover_nothing_where_there_is_room(points: list[tuple[float, float]]) -> None:
     boxes = place_labels(points, [(WIDTH, HEIGHT)] * len(points), FRAME)
