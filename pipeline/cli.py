@@ -96,9 +96,11 @@ def publish() -> None:
 
 @app.command()
 def page() -> None:
-    """Write reports/index.html: all reports on one page, to open from disk."""
+    """Gather speed against error and write reports/index.html: all reports on one page, to open from disk."""
     from pipeline.review import write_page
+    from pipeline.speed.gather import write_speed_error
 
+    write_speed_error(Path())
     typer.echo(f"{write_page(Path())}: all reports on one page; open it in a browser")
 
 

@@ -7,13 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from pipeline.baseline.features import video_features
 from pipeline.benchmarks import BenchRow, frames, selection
 from pipeline.benchmarks.__main__ import SECTIONS, main
-from pipeline.benchmarks.pareto import front
 from pipeline.benchmarks.startup import BASELINE, measure, top_imports
 from pipeline.decoding import decode
 from pipeline.errors import UserError
@@ -61,19 +58,6 @@ def test_command_writes_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 def test_unknown_section_names_the_allowed(arguments: list[str]) -> None:
     with pytest.raises(SystemExit, match="allowed sections: frames, realism, scenes, selection, startup"):
         main(arguments)
-
-
-def row(case: str, cost: float, error: float | None) -> BenchRow:
-    return BenchRow(case=case, cost=cost, unit="ms", baseline=case, ratio=1, error=error, low=0, high=1)
-
-
-@given(st.lists(st.tuples(st.integers(1, 9), st.integers(0, 9)), max_size=12))
-def test_the_front_holds_what_nothing_beats(points: list[tuple[int, int]]) -> None:
-    rows = [row(f"{i}", cost, error / 10) for i, (cost, error) in enumerate(points)]
-    beaten = {(a, b) for a, b in points for c, d in points if (c <= a and d < b) or (c < a and d <= b)}
-    found = front([*rows, row("no error", 1, None)])
-    assert {(int(r.cost), round(10 * (r.error or 0))) for r in found} == set(points) - beaten
-    assert [r.cost for r in found] == sorted(r.cost for r in found)
 
 
 def test_frames_are_timed_on_any_videos(tiny_videos: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

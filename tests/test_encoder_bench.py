@@ -169,8 +169,15 @@ def test_the_whole_on_balls(root: Path, arena: Arena) -> None:
         10,
     ]
 
+    one, five, ten = (
+        cases[f"model, {name}"].flops or 0 for name in ("strong-one-frame", "strong", "strong-ten-frames")
+    )
+    assert 0 < one < five < ten, "frames cost operations"
+    assert cases["model, trees"].flops is None
+
     for setting in settings():
         row = cases[setting.case]
+        assert (row.flops is None) == (setting.form == "int8"), "what torch cannot count is empty"
         assert (row.frames, row.unit, row.baseline) == (setting.frames, "ms a video, encoder alone", BASELINE)
         assert row.difference_low is not None
     for case in encoder_training.PROMPTS:

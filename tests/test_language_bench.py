@@ -12,6 +12,7 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 from transformers import LlamaConfig
 
+from pipeline.artifacts import write_json
 from pipeline.benchmarks import language as bench
 from pipeline.benchmarks import language_formats, language_ways
 from pipeline.benchmarks.language_bed import FRAMES, Bed, take_turns
@@ -24,6 +25,7 @@ from pipeline.models.clip import load_visual_tower
 from pipeline.models.octopi import OctopiForCausalLM
 from pipeline.prompts import IGNORE_INDEX
 from pipeline.sections import LoraTrainConfig
+from pipeline.speed.questions import gather
 from pipeline.training.language import add_lora
 from tests.checkpoints import CLIP_CONFIG, write_clip, write_llama
 from tests.closure import ROOT
@@ -187,7 +189,21 @@ def test_the_whole_tiny(small: None, monkeypatch: pytest.MonkeyPatch) -> None:
     assert half.logit_error is not None
     assert 0 < half.logit_error < 0.1
     assert half.error is not None
+    for row in (*answers, half):
+        assert row.error is not None
+        assert row.error_low is not None
+        assert row.error_high is not None
+        assert 0 <= row.error_low <= row.error <= row.error_high <= 1
+    assert all(row.error_low is None for row in trained)
     assert rows[language_formats.case_of("float32")].logit_error == 0
+    write_json(Path("reports/bench/language.json"), [row.model_dump() for row in rows.values()])
+    found, _ = gather(Path("reports"))
+    settings = {answer.question.key: [r.setting for r in answer.rows] for answer in found}
+    assert settings["number format, language model"] == list(language_formats.FORMATS)
+    assert len(settings["language model, answering"]) == len(answers)
+    assert len(settings["language model, training"]) == len(WAYS) + 1
+    for answer in found:
+        assert all(r.flops for r in answer.rows) == (answer.question.key != "number format, language model")
 
 
 def test_memory_is_that_of_the_case(small: None) -> None:

@@ -37,11 +37,12 @@ LEVELS = {
     "evaluation": 6,
     "tracking": 7,
     "reporting": 7,
-    "review": 8,
+    "speed": 8,
+    "review": 9,
     "stage": 7,
     "scales": 7,
-    "cli": 9,
-    "benchmarks": 9,
+    "cli": 10,
+    "benchmarks": 10,
 }
 
 

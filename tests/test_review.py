@@ -23,6 +23,8 @@ from pipeline.reporting.samples import NO_PICTURES
 from pipeline.review import PAGE, write_page
 from pipeline.review.graph import HEIGHT, WIDTH, draw_chain
 from pipeline.review.traced import Grid, fill
+from pipeline.speed.gather import write_speed_error
+from pipeline.speed.questions import QUESTIONS
 from tests.closure import ROOT
 from tests.fake_chain import fake_params, write_chain
 from tests.web import Element, Sources, parse_html, says
@@ -59,7 +61,16 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copytree(ROOT / "reports" / "bench", root / "reports" / "bench")
     stability = "part,case,dtype,finite,error,bound,verdict\nprojection,all zero,bfloat16,True,0.0031,0.01,passed\n"
     (root / "reports" / "stability.csv").write_text(stability)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pipeline.speed.gather.draw_pareto", copy_plot)
+        write_speed_error(root)
     return root
+
+
+def copy_plot(_: object, path: Path, *__: object) -> None:
+    """In the place of drawing, which takes seconds."""
+    path.parent.mkdir(exist_ok=True)
+    shutil.copy(ROOT / "reports" / "bench" / "selection.png", path)
 
 
 @pytest.fixture(scope="module")
@@ -361,7 +372,42 @@ def test_tables_that_no_view_knows_are_shown(changed: Path) -> None:
     text = page_of(changed).words
     assert "encoder x OPD" in text
     assert "Interactions" in text
-    assert "which frames uniform 1.5" in text
+    assert "which frames" in text
+    assert "uniform 1.500" in text, "without a recommendation, captions and plots as well"
+
+
+def test_speed_against_error_has_a_recommendation_a_plot_and_a_table_each(page: Element, reports: Path) -> None:
+    with (reports / "speed_error.csv").open(newline="") as stream:
+        lines = list(csv.DictReader(stream))
+    (chapter,) = [e for e in page.walk() if e.attributes.get("id") == "speed"]
+    titles = {question.key: question.title for question in QUESTIONS}
+    first, *blocks = [e for e in chapter.find("section") if "block" in e.attributes.get("class", "")]
+    chosen = [line for line in lines if line["recommended"] == "True"]
+    rows = [row.words for row in first.find("tr")[1:]]
+    assert len(rows) == len(chosen)
+    assert all(words.startswith(f"{c['question']} {c['setting']} ") for words, c in zip(rows, chosen, strict=True))
+    for block, line in zip(blocks, chosen, strict=False):
+        assert block.find("h3")[0].words == titles[line["question"]]
+        assert len(block.find("img")) == 1
+        own = [other["setting"] for other in lines if other["question"] == line["question"]]
+        settings = [row.find("th")[0].words for row in block.find("tr")[1:]]
+        assert settings == own, "all of them, none folded away"
+        assert block.find("details") == []
+        flagged = [row for row in block.find("tr")[1:] if any(c.words == "True" for c in row.find("td"))]
+        assert [row.find("th")[0].words for row in flagged] == [line["setting"]]
+        (caption,) = [p for p in block.find("p") if p.attributes.get("class") == "caption"]
+        assert caption.text.startswith(f"Recommended: {line['setting']} ")
+
+
+def test_what_speed_is_not_measured_is_among_what_is_missing(page: Element, reports: Path) -> None:
+    with (reports / "speed_error.csv").open(newline="") as stream:
+        there = {line["question"] for line in csv.DictReader(stream)}
+    (missing,) = [e for e in page.walk() if e.attributes.get("id") == "missing"]
+    rows = [row.words for row in missing.find("tr")]
+    for question in QUESTIONS:
+        named = [row for row in rows if row.startswith(f"speed {question.title} ")]
+        assert len(named) == (question.key not in there)
+        assert all("make bench SECTION=" in row or "dvc repro" in row for row in named)
 
 
 def test_what_is_missing_is_named_with_the_reason(changed: Path) -> None:
@@ -411,9 +457,12 @@ def test_without_a_report_one_line_says_what_to_do(tmp_path: Path, monkeypatch: 
 
 def test_the_command_names_the_page(changed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(changed)
+    monkeypatch.setattr("pipeline.speed.gather.draw_pareto", copy_plot)
+    (changed / "reports" / "speed_error.csv").unlink()
     result = CliRunner().invoke(app, ["page"])
     assert result.exit_code == 0, result.output
     assert result.output.startswith("reports/index.html: ")
+    assert (changed / "reports" / "speed_error.csv").is_file()
     assert "octopi page" in (ROOT / "Makefile").read_text()
 
 

@@ -49,11 +49,25 @@ def test_ways_are_held_against_the_first(two_ways: None, catalogue: Catalogue) -
     assert (first.error, first.image) == (0.0, 0.0)
     assert springs.error is not None
     assert springs.error > 0.1
+    assert (first.image_low, first.image_high) == (0.0, 0.0)
+    assert springs.image is not None
+    assert springs.image_low is not None
+    assert springs.image_high is not None
+    assert springs.image_low < springs.image < springs.image_high
     assert springs.ratio == 1
     assert [row.case for row in labels] == ["labels, layer, 64 cells", "labels, winkler"]
     for row in labels:
         assert row.error is not None
         assert 0 <= row.low <= row.error <= row.high <= 1
+
+
+def test_an_interval_over_objects_is_students() -> None:
+    """Three objects with means 1, 2 and 6: 3 plus and minus t (4.3027 with two degrees) times the root of 7 / 3."""
+    errors = [("a", 0.5), ("a", 1.5), ("b", 2.0), ("b", 2.0), ("c", 5.0), ("c", 7.0)]
+    assert scenes.over_objects(errors) == (0.0, pytest.approx(3 + 4.3027 * (7 / 3) ** 0.5, abs=1e-3))
+    close = [(owner, 10 + error / 100) for owner, error in errors]
+    assert scenes.over_objects(close) == (pytest.approx(9.964, abs=2e-3), pytest.approx(10.096, abs=2e-3))
+    assert scenes.over_objects(errors[:2]) == (None, None)
 
 
 def test_a_data_set_is_timed_and_weighed(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:

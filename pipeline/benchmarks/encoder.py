@@ -51,7 +51,8 @@ from pipeline.benchmarks.encoder_cost import (
     with_error,
 )
 from pipeline.benchmarks.encoder_training import Describe, prompts, training_speed
-from pipeline.benchmarks.pareto import draw_pareto
+from pipeline.benchmarks.operations import counted
+from pipeline.benchmarks.pareto import draw_rows
 from pipeline.config import load_params
 from pipeline.contestants import CONTESTANTS
 from pipeline.data.clips import ClipDataset
@@ -190,7 +191,7 @@ def draw(whole: Sequence[EncoderRow], settled: Sequence[EncoderRow], path: Path,
     judged = [row for row in whole if row.error is not None]
     moved = [row.model_copy(update={"cost": row.cost + decoding}) for row in settled]
     rows = [row.model_copy(update={"unit": f"{VIDEO}, decoding included"}) for row in (*judged, *moved)]
-    draw_pareto(rows, path, title, "error (not all properties right), object-clustered 95 % interval")
+    draw_rows(rows, path, title, "error (not all properties right), object-clustered 95 % interval")
 
 
 def trade(arena: Arena) -> list[EncoderRow]:
@@ -211,6 +212,8 @@ def trade(arena: Arena) -> list[EncoderRow]:
             "megabytes": megabytes(changed),
             "parameters": parameters(encoder),
         }
+        if setting.form != "int8":
+            columns[setting.case]["flops"] = counted(partial(_describe, Describe(changed), shown[setting.case], 0))
     costs = take_turns(cases, range(len(shown[BASELINE])))
     verdicts = dict(zip(cases, run_parallel(judge, trials, "encoder", "setting"), strict=True))
     rows = []

@@ -28,6 +28,7 @@ from pipeline.baseline.recordings import FRAMES as TREE_FRAMES
 from pipeline.baseline.recordings import Recording, describe
 from pipeline.baseline.validation import Verdict, collect, compare, summarise
 from pipeline.benchmarks import BenchRow
+from pipeline.benchmarks.operations import counted
 from pipeline.contestants import CONTESTANTS, Contestant
 from pipeline.frames.sampling import sample_evaluation
 from pipeline.frames.scan import Scan, scan
@@ -70,6 +71,9 @@ class EncoderRow(BenchRow):
     megabytes: float | None = None
     """Parameters and buffers of encoder and heads as they lie in memory, in 10^6 bytes."""
     parameters: int | None = None
+    flops: int | None = None
+    """Operations of encoder and heads for one video, or of the unit's frame; without decoding, and where torch can
+    count them."""
     difference: float | None = None
     """Combined accuracy less the baseline's, on the same videos."""
     difference_low: float | None = None
@@ -89,7 +93,13 @@ def models(arena: Arena, root: Path) -> list[EncoderRow]:
             model = classifier(contestant, arena).eval()
             frames = contestant.frames or arena.per_video
             cases[case] = _network(model, contestant, frames)
-            columns[case] = {"frames": frames, "megabytes": megabytes(model), "parameters": parameters(model)}
+            clip = torch.zeros(1, frames, SIDE, SIDE, 3, dtype=torch.uint8), torch.zeros(1, frames)
+            columns[case] = {
+                "frames": frames,
+                "megabytes": megabytes(model),
+                "parameters": parameters(model),
+                "flops": counted(lambda model=model, clip=clip: model(*clip)),  # type: ignore[misc]
+            }
     sample = [
         VideoFile(arena.recordings / v.path, v.path, v.object_id, v.video_id) for v in spread(arena.videos, SAMPLE)
     ]
@@ -132,11 +142,15 @@ def _true_shape(name: str) -> list[EncoderRow]:
     half = copy.deepcopy(visual).to(torch.bfloat16)
     towers = {f"{name}, float32": visual, f"{name}, bfloat16": half}
     cases = {f"{name}, float32": visual, f"{name}, bfloat16": lambda frame: half(frame.to(torch.bfloat16))}
+    frame = torch.rand(1, 3, *visual.image_size)
     with torch.inference_mode():
-        costs = take_turns(cases, [torch.rand(1, 3, *visual.image_size)])
+        costs = take_turns(cases, [frame])
+        flops = counted(lambda: visual(frame))
     unit, first = "ms a frame, encoder alone", next(iter(towers))
     return [
-        make_row(case, unit, costs, first, frames=1, megabytes=megabytes(tower), parameters=parameters(tower))
+        make_row(
+            case, unit, costs, first, frames=1, megabytes=megabytes(tower), parameters=parameters(tower), flops=flops
+        )
         for case, tower in towers.items()
     ]
 

@@ -12,6 +12,7 @@ are in the system's cache.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -34,6 +35,7 @@ from pipeline.benchmarks.encoder_cost import (
     take_turns,
     with_error,
 )
+from pipeline.benchmarks.operations import counted
 from pipeline.data.clips import ClipDataset, LabelledVideo, collate_clips
 from pipeline.decoding import decode
 from pipeline.frames.extract import extract_frames
@@ -81,7 +83,13 @@ def prompts(arena: Arena, assignments: Sequence[Assignment]) -> list[EncoderRow]
     costs = take_turns({case: Describe(model.encoder) for case, model in models.items()}, shown)
     rows = []
     for case, model in models.items():
-        columns = {"frames": data.per_video, "megabytes": megabytes(model), "parameters": parameters(model)}
+        columns = {
+            "frames": data.per_video,
+            "megabytes": megabytes(model),
+            "parameters": parameters(model),
+            # Not in inference mode, in which the counter fails at parameters that are put into a layer, as prompts are.
+            "flops": counted(partial(model.encoder.describe, shown[0]["frames"], shown[0]["moments"])),
+        }
         row = make_row(case, ALONE, costs, USUAL, **columns)
         rows.append(with_error(row, verdicts[case], verdicts[USUAL], data.classes))
     return rows

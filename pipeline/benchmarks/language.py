@@ -20,17 +20,16 @@ import resource
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from statistics import fmean
 from tempfile import TemporaryDirectory
 
 import torch
-from torch.utils.flop_counter import FlopCounterMode
 
-from pipeline.benchmarks.language_bed import SEED, Bed, Encode, LanguageRow, make_bed, make_row, take_turns
+from pipeline.benchmarks.language_bed import SEED, Bed, Encode, LanguageRow, differing, make_bed, make_row, take_turns
 from pipeline.benchmarks.language_device import device_rows
 from pipeline.benchmarks.language_formats import format_rows
 from pipeline.benchmarks.language_paper import counted_rows
 from pipeline.benchmarks.language_ways import PUBLISHED, UPDATE, WAYS, Way, answer_batched, answer_published, train
+from pipeline.benchmarks.operations import counted
 from pipeline.models.octopi import OctopiForCausalLM
 from pipeline.models.recipes import base_encoder
 from pipeline.models.tactile_encoder import TactileEncoder
@@ -175,17 +174,10 @@ def answering(bed: Bed) -> list[LanguageRow]:
             samples=count,
             tokens=tokens,
             flops=float(flops[case]),
-            error=fmean(a != b for a, b in zip(said[case], said[ASKED_PUBLISHED], strict=True)),
+            **differing(said[case], said[ASKED_PUBLISHED], bed.asked),
         )
         for case in cases
     ]
-
-
-def counted(run: Callable[[], object]) -> int:
-    """Operations that torch counts in a call."""
-    with FlopCounterMode(display=False) as counter:
-        run()
-    return int(counter.get_total_flops())
 
 
 def lengths_of(bed: Bed) -> list[tuple[int, int, int]]:

@@ -10,7 +10,7 @@ import gc
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import median
+from statistics import fmean, median
 from time import perf_counter
 from typing import Literal
 
@@ -27,6 +27,7 @@ from pipeline.physiclear.catalogue import load_catalogue
 from pipeline.questions import build_questions, pool_of
 from pipeline.records import Assignment, Embedding, Opd, Part, Question, Task
 from pipeline.runtime import seed_everything
+from pipeline.statistics import Outcome, clustered
 
 SEED = 0
 FRAMES = 5
@@ -48,6 +49,9 @@ class LanguageRow(BenchRow):
     the baseline's.
     """
 
+    error_low: float | None = None
+    """Ends of the error's object-clustered 95 % interval."""
+    error_high: float | None = None
     ratio_low: float | None = None
     """Range of the ratios within a repeat."""
     ratio_high: float | None = None
@@ -162,6 +166,19 @@ def take_turns(
             run()
             found[case].append(amounts[case] / (perf_counter() - started))
     return found
+
+
+def differing(said: Sequence[str], reference: Sequence[str], questions: Sequence[Question]) -> dict[str, float | None]:
+    """The columns of the share of answers that differ from others, one a question."""
+    apart = [
+        Outcome(float(a != b), question.objects) for a, b, question in zip(said, reference, questions, strict=True)
+    ]
+    interval = clustered(apart)
+    return {
+        "error": fmean(outcome.correct for outcome in apart),
+        "error_low": round(interval.low, 4) if interval else None,
+        "error_high": round(interval.high, 4) if interval else None,
+    }
 
 
 def make_row(case: str, unit: str, rates: Rates, baseline: str, **columns: object) -> LanguageRow:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from statistics import fmean
-
 import torch
 
-from pipeline.benchmarks.language_bed import FRAMES, OPD, Bed, LanguageRow, make_row, take_turns
+from pipeline.benchmarks.language_bed import FRAMES, OPD, Bed, LanguageRow, differing, make_row, take_turns
 from pipeline.data.conversations import ConversationCollator
 from pipeline.evaluation.generate import Asking, answer
 from pipeline.models.octopi import OctopiForCausalLM
@@ -41,7 +39,7 @@ def format_rows(bed: Bed, limit: int) -> list[LanguageRow]:
             rates,
             case_of("float32"),
             samples=count,
-            error=fmean(a != b for a, b in zip(said[name], said["float32"], strict=True)),
+            **differing(said[name], said["float32"], bed.asked),
             logit_error=float((logits[name] - exact).abs().max() / exact.abs().max()),
         )
         for name in FORMATS

@@ -12,14 +12,14 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import fmean, median
+from statistics import fmean, median, stdev
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from pipeline.baseline.features import video_features
 from pipeline.benchmarks import BenchRow
-from pipeline.benchmarks.pareto import draw_pareto
+from pipeline.benchmarks.pareto import draw_rows
 from pipeline.benchmarks.transfer import Kind, transfer
 from pipeline.config import load_params
 from pipeline.frames.reference import reference_indices
@@ -54,7 +54,10 @@ class SceneRow(BenchRow):
     pressure: float | None = None
     """Relative error of the peak pressure."""
     image: float | None = None
-    """Root mean square error of a frame in contact, in 8-bit steps."""
+    """Root mean square error of a frame in contact, in 8-bit steps: the mean over scenes."""
+    image_low: float | None = None
+    """Ends of its 95 % interval, Student's t over the objects' means."""
+    image_high: float | None = None
     bytes: int | None = None
 
 
@@ -82,9 +85,9 @@ def measure(root: Path) -> Sequence[BenchRow]:
     recipes = load_recipes(root / data.catalogue, catalogue, 0)
     pictures, labels = look_at(recipes, catalogue)
     slopes = "relative error in slopes, quartiles over objects"
-    draw_pareto(pictures, root / PICTURES[0], f"Ways to compute a contact: {len(recipes)} objects", slopes)
+    draw_rows(pictures, root / PICTURES[0], f"Ways to compute a contact: {len(recipes)} objects", slopes)
     wrong = "not all properties right, object-clustered 95 % interval"
-    draw_pareto(labels, root / PICTURES[1], "What a classifier learns from each way, tested on the finest", wrong)
+    draw_rows(labels, root / PICTURES[1], "What a classifier learns from each way, tested on the finest", wrong)
     return [*ball_rows(), *pictures, *labels, *write_rows(recipes)]
 
 
@@ -203,6 +206,7 @@ def look_at(recipes: dict[str, Recipe], catalogue: Catalogue) -> tuple[list[Scen
     pictures = []
     for place, name in enumerate(names):
         low, middle, high = np.quantile([s.slopes[place] for s in seen], (0.25, 0.5, 0.75))
+        image_low, image_high = over_objects([(s.object_id, s.images[place]) for s in seen])
         pictures.append(
             SceneRow(
                 case=name,
@@ -214,9 +218,23 @@ def look_at(recipes: dict[str, Recipe], catalogue: Catalogue) -> tuple[list[Scen
                 low=round(float(low), 4),
                 high=round(float(high), 4),
                 image=round(fmean(s.images[place] for s in seen), 3),
+                image_low=image_low,
+                image_high=image_high,
             )
         )
     return pictures, _label_rows(seen, names, costs, catalogue)
+
+
+def over_objects(errors: Sequence[tuple[str, float]]) -> tuple[float | None, float | None]:
+    """Ends of the 95 % interval of a mean error, not below 0, as many scenes an object; None for a single object."""
+    from scipy.stats import t
+
+    owners = sorted({owner for owner, _ in errors})
+    means = [fmean(error for owner, error in errors if owner == own) for own in owners]
+    if len(means) < 2:
+        return None, None
+    half = float(t.ppf(0.975, len(means) - 1)) * stdev(means) / len(means) ** 0.5
+    return round(max(fmean(means) - half, 0.0), 3), round(fmean(means) + half, 3)
 
 
 def _label_rows(

@@ -19,7 +19,7 @@ from pipeline.baseline.features import frame_features, pool_features
 from pipeline.baseline.recordings import mean_reference
 from pipeline.baseline.validation import Verdict, compare, cross_validate, forest, summarise
 from pipeline.benchmarks import BenchRow, bench_videos
-from pipeline.benchmarks.pareto import draw_pareto
+from pipeline.benchmarks.pareto import draw_rows
 from pipeline.decoding import decode
 from pipeline.errors import UserError
 from pipeline.frames.sampling import sample_evaluation
@@ -136,7 +136,7 @@ def measure(root: Path) -> Sequence[TradeRow]:
             )
         )
     title = f"Which frames, and how many: {len(samples)} videos of {len(set(objects))} objects"
-    draw_pareto(rows, root / PICTURE, title, "error (not all properties right), object-clustered 95 % interval")
+    draw_rows(rows, root / PICTURE, title, "error (not all properties right), object-clustered 95 % interval")
     return rows
 
 

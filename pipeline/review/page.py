@@ -9,13 +9,15 @@ from pathlib import Path
 from pipeline.records import Severity
 from pipeline.reporting.results import OCTOPI
 from pipeline.reporting.samples import FOLDER
+from pipeline.review.blocks import Block, Picture
 from pipeline.review.folders import Bench, Report, find_grids, read_benches, read_reports
 from pipeline.review.graph import Drawing, draw_chain
 from pipeline.review.known import ACCURACY, BENCH, view_of
-from pipeline.review.matrices import Matrix, matrices
+from pipeline.review.matrices import matrices
 from pipeline.review.missing import Gap, gaps
 from pipeline.review.readme import Section
-from pipeline.review.tables import Drawn, Shown, draw, show
+from pipeline.review.speed import speed_blocks, speed_gaps
+from pipeline.review.tables import Drawn, draw, show
 from pipeline.review.themes import BENCHES, EVERYWHERE, ORIGIN, OTHERS, SAMPLES, THEMES, BenchText, Theme
 from pipeline.review.traced import Grid, Piece, fill
 from pipeline.review.views import View
@@ -28,29 +30,6 @@ HEADLINE = (
     ("combined", "property_description", "Description, all properties right"),
 )
 """Row, table and name of the figures at a glance."""
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A PNG on the page."""
-
-    file: str
-    """Relative to reports/."""
-    alt: str
-
-
-@dataclass(frozen=True)
-class Block:
-    """A table, matrices or a figure under its heading."""
-
-    title: str
-    caption: str
-    source: str
-    """File that the caption stands in."""
-    table: Shown | None = None
-    matrices: tuple[Matrix, ...] = ()
-    pictures: tuple[Picture, ...] = ()
-    counts: tuple[tuple[str, Piece], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -112,14 +91,17 @@ def compose(root: Path) -> Page:
     """Read reports/ and dvc.yaml below `root`."""
     reports_dir = root / "reports"
     reports, benches = read_reports(reports_dir), read_benches(reports_dir)
-    shared = {e.name: [_shared(grid, e.title) for grid in find_grids(reports_dir, f"{e.name}.csv")] for e in EVERYWHERE}
+    grids = {e.name: find_grids(reports_dir, f"{e.name}.csv") for e in EVERYWHERE}
+    stability = next(e for e in EVERYWHERE if e.name == "stability")
+    speed = [block for grid in grids["speed_error"] for block in speed_blocks(reports_dir, grid)]
+    missing = gaps(reports, benches, [name for name, found in grids.items() if found])
     return Page(
         chapters=tuple(_chapter(report) for report in reports),
         glance=_glance(reports),
         chain=draw_chain(root / "dvc.yaml"),
-        speed=(*shared["speed_error"], *(_bench(bench) for bench in benches if bench.grid)),
-        stability=tuple(shared["stability"]),
-        missing=tuple(gaps(reports, benches, [name for name, blocks in shared.items() if blocks])),
+        speed=(*speed, *(_bench(bench) for bench in benches if bench.grid)),
+        stability=tuple(_shared(grid, stability.title) for grid in grids[stability.name]),
+        missing=(*missing, *speed_gaps(reports_dir)),
     )
 
 

@@ -131,6 +131,8 @@ def _cell(grid: Grid, row: int, column: Column) -> Cell:
     if column.needs and not grid.value(row, column.needs):
         return Cell((), column.kind)
     pieces = fill(column.template, grid, row)
+    if column.kind is Kind.FLAG and "".join(piece.text for piece in pieces) != "True":
+        return Cell((), column.kind)
     return Cell(pieces, column.kind, fill(column.small if pieces else column.otherwise, grid, row))
 
 

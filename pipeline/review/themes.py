@@ -76,7 +76,7 @@ OLDER = "the report is older than this table; `dvc repro` at its scale writes it
 NO_SAMPLES = "the report is older than sample answers are; `dvc repro` at its scale writes them"
 NO_GATE = "no gate.csv lay beside its language model, or the report is older than the gate"
 EVERYWHERE = (
-    Expected("speed_error", "Speed against error, all parts in one table", "nothing has gathered it yet"),
+    Expected("speed_error", "Speed against error, all parts in one table", "`octopi page` gathers it"),
     Expected("stability", "Numerical stability", "nothing has written a stability.csv yet"),
 )
 
