@@ -54,7 +54,8 @@ FACTORIAL = View(
         Column("Variants", "{cells}"),
         Column("Base model", "{gate}", WORDS),
     ),
-    Bar("difference", "low", "high", 1, signed=True),
+    # Interactions reach from -2 to 2.
+    Bar("difference", "low", "high", 2, signed=True),
 )
 SEEDS = View(
     (
@@ -62,21 +63,21 @@ SEEDS = View(
         Column("LoRA", "{lora}", HEAD),
         Column("OPD", "{opd}", HEAD),
         Column("Task", "{task}", HEAD),
-        Column("Accuracy %|95 %, new objects and runs", "{accuracy:p.2f}", MEASURED, "{low:p.2f} to {high:p.2f}"),
-        Column("± over seeds, points", "{deviation:p.2f}", MEASURED),
-        Column("± by answers alone", "{expected:p.2f}"),
-        Column("at the most", "{most:p.2f}"),
+        Column("Accuracy %|95 %", "{accuracy:p.2f}", MEASURED, "{low:p.2f} to {high:p.2f}"),
+        Column("± over seeds, points|± by answers alone", "{deviation:p.2f}", MEASURED, "{expected:p.2f}"),
+        Column("± by answers at the most", "{most:p.2f}"),
         Column("Seeds ±", "{sd_seeds:p.2f}"),
         Column("Objects ±", "{sd_objects:p.2f}"),
         Column("Questions ±", "{sd_questions:p.2f}"),
         Column("Answers ±", "{sd_answers:p.2f}"),
         Column("Seeds", "{seeds}"),
-        Column("Shares by seed", "{by_seed}", WORDS),
         Column("n", "{n}"),
         Column("Base model", "{gate}", WORDS),
         Column("Note", "{note}", WORDS),
     ),
     Bar("accuracy", "low", "high", 1),
+    # Beside every accuracy.
+    hidden=("by_seed",),
 )
 DESCRIBING = View(
     (
