@@ -1,7 +1,7 @@
 """Two settings on the same questions: difference, interval, tests. scipy and NumPy are imported where they are used.
 
-Sources: Bonett and Price 2012 (the interval, here with an effective n); McNemar 1947; Agresti 2013, section 11.1
-(the exact test); Holm 1979.
+Sources: Bonett and Price 2012 (the interval, here with an effective n); McNemar 1947, as an exact test Agresti 2013;
+Holm 1979.
 """
 
 from __future__ import annotations
@@ -55,6 +55,10 @@ def paired(gains: Sequence[Outcome], seed: int = 0) -> Difference:
 
 def paired_over_seeds(gains: Sequence[Answer], seed: int = 0) -> Difference:
     """As `paired`, where both settings were run under several seeds: the interval is for new objects and new seeds.
+
+    Simulated (`make bench SECTION=coverage`) with five seeds, it covers 93 to 100 %, but about 92 % with seven objects
+    for questions about two or three that depend much on them, where a setting is nearly always right. What leaves the
+    seeds out covers as little as 63 % with sixty objects.
 
     Args:
         gains: One a question and seed; `correct` is the difference, from -1 to 1.
