@@ -56,6 +56,24 @@ def test_paired_by_hand() -> None:
     assert gap.mcnemar == 2 * (1 + 7) / 2**7
 
 
+@given(better=st.integers(0, 12), worse=st.integers(0, 12), same=st.integers(0, 12))
+@settings(deadline=None, max_examples=60)
+def test_independent_questions_have_bonett_and_prices_interval(better: int, worse: int, same: int) -> None:
+    """One question an object: both kinds of discordant questions get one more, and t stands in place of z."""
+    n = better + worse + same
+    if n < 2 or max(better, worse, same) == n:
+        return
+    values = [1.0] * better + [-1.0] * worse + [0.0] * same
+    gap = paired([Outcome(v, (f"{i:02}",)) for i, v in enumerate(values)])
+    one, other = (better + 1) / (n + 2), (worse + 1) / (n + 2)
+    half = stats.t.ppf(0.975, n - 1) * math.sqrt((one + other - (one - other) ** 2) / (n + 2))
+    assert gap.interval is not None
+    # It must hold the difference itself, which the two more questions pull towards nothing.
+    low, high = min(one - other - half, gap.value), max(one - other + half, gap.value)
+    assert gap.interval.low == pytest.approx(max(-1.0, low), abs=1e-12)
+    assert gap.interval.high == pytest.approx(min(1.0, high), abs=1e-12)
+
+
 def test_paired_without_difference_and_with_one_object() -> None:
     gap = paired([Outcome(0.0, (o,)) for o in "abc"])
     assert (gap.value, gap.p, gap.mcnemar) == (0, 1, 1)
@@ -95,7 +113,7 @@ def test_paired_properties(gains: list[tuple[int, list[str]]], seed: int) -> Non
 
 
 def test_mcnemar_of_agrestis_ratings() -> None:
-    """Agresti 2013, table 11.1: approval of a prime minister twice; 150 and 86 changed their minds, z = -4.17."""
+    """Agresti 2013: approval of a prime minister twice; 150 and 86 changed their minds, z = -4.17."""
     p = mcnemar([1] * 150 + [-1] * 86 + [0] * (794 + 570))
     exact = 2 * sum(Fraction(math.comb(236, k), 2**236) for k in range(87))
     assert p == pytest.approx(float(exact), rel=1e-12)
@@ -110,6 +128,7 @@ def test_mcnemar_is_the_binomial_tail(better: int, worse: int, same: int) -> Non
     p = mcnemar([1.0] * better + [0.0] * same + [-1.0] * worse)
     tail = sum(Fraction(math.comb(n, k), 2**n) for k in range(min(better, worse) + 1))
     assert p == pytest.approx(min(1.0, float(2 * tail)), abs=1e-12)
+    assert p == (stats.binomtest(better, n).pvalue if n else 1)
     assert mcnemar([0.5] + [1.0] * better) is None, "a mean over seeds is no count"
 
 
@@ -123,7 +142,7 @@ def test_mcnemar_is_the_binomial_tail(better: int, worse: int, same: int) -> Non
     ],
 )
 def test_holm(ps: list[float], adjusted: list[float]) -> None:
-    assert holm(ps) == pytest.approx(adjusted)
+    assert holm(ps) == pytest.approx(adjusted, abs=1e-12)
 
 
 @given(st.lists(st.floats(0.001, 1), min_size=1, max_size=6))

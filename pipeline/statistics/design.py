@@ -1,7 +1,7 @@
 """What a comparison can find before it is made. scipy and NumPy are imported only where they are used.
 
-Sources: Bloom 1995 (minimum detectable effects); Murray 1998 (trials of groups: degrees of freedom by groups); Miller
-2024, section 5 (the same for evaluations of language models).
+Sources: Bloom 1995 (minimum detectable effects, without clusters); Murray 1998 (trials of groups: degrees of freedom by
+groups); Miller 2024, arXiv 2411.00640 (power of evaluations of language models).
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 A main effect is the mean, over all settings of the other factors, of the difference between two levels; an interaction
 of two factors is by how much the effect of the one differs between two levels of the other (Fisher 1935; Box, Hunter,
-Hunter 2005, chapter 5). Both are contrasts of cell means on the same questions, so they are paired differences, and
-everything holds for them that holds for those.
+Hunter 2005). Both are contrasts of cell means on the same questions, so they are paired differences, and everything
+holds for them that holds for those.
 """
 
 from __future__ import annotations
