@@ -199,11 +199,10 @@ def test_runs_that_differ_widen_the_comparison() -> None:
     assert apart.detectable > same.detectable
 
 
-@pytest.mark.parametrize("about", [1, 2])
-def test_the_comparison_over_seeds_covers_new_seeds(about: int) -> None:
+def test_the_comparison_over_seeds_covers_new_seeds() -> None:
     """Two equally good settings whose runs deviate by ten points: what leaves the seeds out covers less."""
-    rng, objects, seeds, covered, without = np.random.default_rng(about), 20, 5, 0, 0
-    sets = [rng.choice(objects, about, replace=False) for _ in range(100)]
+    rng, objects, seeds, covered, without = np.random.default_rng(2), 20, 5, 0, 0
+    sets = [rng.choice(objects, 2, replace=False) for _ in range(100)]
     names = [tuple(f"{o:02}" for o in sorted(s)) for s in sets]
     for _ in range(200):
         rates = 0.5 + rng.normal(0, 0.1, (2, seeds, 1)) + rng.normal(0, 0.05, (2, 1, objects))[:, :, sets].mean(axis=-1)

@@ -39,10 +39,11 @@ class Answered:
             keys: Seed to key.
         """
         found = {seed: scores for seed, key in keys.items() if (scores := self.scores(key, measure))}
+        asked = shared(found.values())
         return [
             Answer(q, seed, float(scores[q].correct), scores[q].objects)
             for seed, scores in found.items()
-            for q in shared(found.values())
+            for q in asked
         ]
 
     def gains(self, pairs: Mapping[int, tuple[str, str]], measure: Measure) -> list[Answer]:
