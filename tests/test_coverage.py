@@ -8,11 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.benchmarks.coverage import CoverageRow, measure, table, verdict
+from pipeline.benchmarks.coverage import measure
 from pipeline.benchmarks.coverage_methods import adjusted, effective, flipped, independent, mcnemar, resampled
+from pipeline.benchmarks.coverage_table import CoverageRow, table, verdict
 from pipeline.benchmarks.simulation import Design
-from pipeline.statistics import Outcome, clustered, paired, wilson
+from pipeline.statistics import Answer, Outcome, clustered, paired, paired_over_seeds, wilson
 from pipeline.statistics import mcnemar as exact_mcnemar
+from pipeline.statistics.bounds import difference_bounds
+from pipeline.statistics.seeds import crossed
 
 DESIGNS = [Design(7, 1, 0.3), Design(7, 2, 0.7), Design(20, 3, 0.3)]
 
@@ -33,6 +36,35 @@ def test_the_truth_is_true(design: Design) -> None:
     (runs,) = design.runs((0.8,), 2, 3000)
     assert runs.shape == (3000, 2, len(design.questions()))
     assert runs.mean() == pytest.approx(0.8, abs=0.015)
+    for gap, values in zip((0.0, 0.3), design.run_differences(((0.8, 0.8), (0.8, 0.5)), 3, 3000), strict=True):
+        assert values.shape == (3000, 3, len(design.questions()))
+        assert values.mean() == pytest.approx(gap, abs=0.015)
+        assert set(np.unique(values)) <= {-1, 0, 1}
+
+
+def test_settings_have_runs_of_their_own_and_questions_in_common() -> None:
+    """Equally good settings: their differences vary less than if nothing were common, and over seeds."""
+    design = DESIGNS[0]
+    (gains,) = design.run_differences(((0.5, 0.5),), 4, 3000)
+    assert 0.3 < gains.var() < 0.5
+    means = gains.mean(axis=2)
+    alone = gains.var(axis=2, ddof=1).mean() / gains.shape[2]
+    assert means.var(axis=1, ddof=1).mean() > 1.2 * alone
+
+
+@pytest.mark.parametrize("design", DESIGNS, ids=str)
+def test_what_is_simulated_over_seeds_is_what_reports_use(design: Design) -> None:
+    (gains,) = design.run_differences(((0.7, 0.6),), 3, 2)
+    low, high = difference_bounds(crossed(gains, design.clusters()), design.clusters())
+    for i in range(2):
+        answers = [
+            Answer(f"{q:03}", seed, outcome.correct, outcome.objects)
+            for seed in range(3)
+            for q, outcome in enumerate(outcomes(gains[i, seed], design))
+        ]
+        found = paired_over_seeds(answers).interval
+        assert found is not None
+        assert (low[i], high[i]) == pytest.approx((found.low, found.high), abs=1e-9)
 
 
 def test_answers_about_one_object_are_correlated_as_said() -> None:
@@ -115,7 +147,8 @@ def test_verdicts_allow_for_the_monte_carlo_error() -> None:
 def test_all_designs_are_measured_and_written(tmp_path: Path) -> None:
     rows = measure(tmp_path, repetitions=20, objects=(7,))
     assert len({row.case for row in rows}) == len(rows)
-    assert {row.kind for row in rows} == {"accuracy", "difference", "seeds", "size", "power", "smallest effect"}
+    kinds = {"accuracy", "difference", "seeds", "difference over seeds", "size", "power", "smallest effect"}
+    assert {row.kind for row in rows} == kinds
     assert {(row.about, row.correlation) for row in rows} == {(a, r) for a in (1, 2, 3) for r in (0, 0.3, 0.7)}
     for row in rows:
         assert row.baseline in {other.case for other in rows}
@@ -126,7 +159,7 @@ def test_all_designs_are_measured_and_written(tmp_path: Path) -> None:
     assert text == table(rows)
     # A table row each, and what does not hold once more above.
     named = [(r.case, v) for r in rows if r.reported for v in ("liberal", "conservative") if v in r.verdict]
-    assert sum(line.startswith("| ") for line in text.splitlines()) == len(rows) + 6
+    assert sum(line.startswith("| ") for line in text.splitlines()) == len(rows) + len(kinds)
     assert sum(line.startswith("- ") for line in text.splitlines()) == len(named)
 
 

@@ -27,6 +27,7 @@ from pipeline.reporting.figures import project
 from pipeline.reporting.inputs import read_inputs, why_empty
 from pipeline.reporting.provenance import provenance
 from pipeline.reporting.published import find, published
+from pipeline.statistics import Outcome, resampled
 from tests.closure import ROOT
 from tests.fake_chain import fake_params, write_chain
 
@@ -90,7 +91,11 @@ def test_every_table_and_figure_is_there(chain: Path, params: Params) -> None:
     assert strips
     assert written - strips == {
         *(f"tables/{name}.{ending}" for name in TABLES for ending in ("csv", "md")),
-        *(f"language/{name}.{ending}" for name in ("ablation", "effects", "touch") for ending in ("csv", "md")),
+        *(
+            f"language/{name}.{ending}"
+            for name in ("ablation", "effects", "seeds", "touch")
+            for ending in ("csv", "md")
+        ),
         *(f"figures/{name}.png" for name in ("confusion_matrices", "effects", "embedding_map", "training_curves")),
         *("README.md", "metrics.json", "params.yaml", "provenance.json", "samples/samples.json"),
     }
@@ -123,6 +128,10 @@ def test_measured_cells_are_what_the_scores_say(chain: Path, params: Params) -> 
         assert metrics[f"finetuned-with-all.{task}"] == pytest.approx(right / len(graded), abs=1e-6)
         assert float(row["unparsed"]) == pytest.approx(100 - float(row["value"]), abs=1e-3)
         assert float(row["low"]) <= float(row["value"]) <= float(row["high"])
+        again = resampled([Outcome(s.correct, s.objects) for s in graded])
+        assert again is not None
+        assert float(row["resampled_low"]) == pytest.approx(100 * again.low, abs=1e-4)
+        assert float(row["resampled_high"]) == pytest.approx(100 * again.high, abs=1e-4)
         assert row["note"] == (
             "the question says what the named objects are like (questions.facts)" if task is Task.POM else ""
         )
@@ -147,7 +156,7 @@ def test_no_scores_leave_cells_empty_with_a_note(copy: Path, params: Params) -> 
     for row in rows(folder, "understanding"):
         empty = row["system"] == "Octopi (no OPD)"
         assert (row["note"] == "not graded yet: finetuned-with-none-0") == empty
-        assert all((row[c] == "") == empty for c in ("value", "k", "n", "low", "high", "unparsed", "seeds"))
+        assert all((row[c] == "") == empty for c in ("value", "k", "n", "low", "resampled_low", "unparsed", "seeds"))
         assert row["published_7b"] != ""
     heads = [r for r in rows(folder, "property_description") if r["system"] == "FT CLIP"]
     assert all(r["value"] == "" and r["note"].startswith("no classifications") for r in heads)

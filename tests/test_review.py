@@ -268,6 +268,8 @@ def test_all_parts_are_there(fresh: Element) -> None:
         "The chain",
         "Is touch used?",
         "What each part brings",
+        "Main effects and interactions",
+        "Why results differ from run to run",
         "Describing what is needed, or everything",
         "Sample answers",
         "Map of the embeddings",
@@ -312,6 +314,20 @@ def test_real_videos_have_no_picture_and_the_page_says_why(fresh: Element, made:
 def test_figures_are_rounded_as_one_learns_at_school(figure: str, template: str, shown: str) -> None:
     grid = Grid("some.csv", ("x",), ((figure,),))
     assert "".join(piece.text for piece in fill(template, grid, 0)) == shown
+
+
+def test_a_single_run_shows_no_deviation_and_two_do(fresh: Element) -> None:
+    one, two = (
+        next(t for t in fresh.find("table") if t.attributes.get("id") == f"{name}-why-results-differ-from-run-to-run")
+        for name in ("smoke-scenes", "smoke-videos")
+    )
+    heads = [table.find("thead")[0].words for table in (one, two)]
+    assert "over seeds" not in heads[0]
+    assert "at the most" in heads[0]
+    assert "one run says nothing of others" in one.words
+    assert "± over seeds" in heads[1]
+    assert "± by answers alone" in heads[1]
+    assert "at the most" not in heads[1]
 
 
 def test_an_empty_cell_says_why(fresh: Element) -> None:
@@ -414,6 +430,7 @@ def test_what_is_missing_is_named_with_the_reason(changed: Path) -> None:
     folder = changed / "reports" / "smoke-scenes"
     (folder / "language" / "describing.csv").unlink()
     (folder / "language" / "touch.csv").unlink()
+    (folder / "language" / "seeds.csv").unlink()
     shutil.rmtree(folder / "samples")
     (changed / "reports" / "stability.csv").unlink()
     readme = (folder / "README.md").read_text()
@@ -429,6 +446,8 @@ def test_what_is_missing_is_named_with_the_reason(changed: Path) -> None:
         "smoke-scenes Is touch used? the report is older than this table",
         "smoke-scenes Sample answers the report is older",
         "smoke-videos Describing what is needed, or everything its plan has no variant with OPD needed",
+        "smoke-videos Main effects and interactions its plan crosses no two parts",
+        "smoke-scenes Why results differ from run to run the report is older than this table",
         "speed Section frames its run measured nothing",
         "all reports Numerical stability nothing has written a stability.csv yet",
     ):

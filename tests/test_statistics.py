@@ -7,6 +7,7 @@ import math
 import random
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import NormalDist
 
 import pytest
 from hypothesis import given, settings
@@ -30,23 +31,26 @@ from pipeline.statistics import (
 from tests.closure import ROOT
 
 SHROUT_FLEISS = [[9, 2, 5, 8], [6, 1, 3, 2], [8, 4, 6, 8], [7, 1, 2, 6], [10, 5, 6, 9], [6, 2, 4, 7]]
-"""Shrout and Fleiss 1979, table 2: six targets, four judges."""
+"""The example of Shrout and Fleiss 1979: six targets, four judges."""
 
 
 @given(n=st.integers(1, 500), data=st.data())
 @settings(deadline=None, max_examples=60)
 def test_wilson_is_the_closed_form(n: int, data: st.DataObject) -> None:
     k = data.draw(st.integers(0, n))
-    z, p = 1.959963984540054, k / n
+    z, p = NormalDist().inv_cdf(0.975), k / n
     centre = (p + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
     interval = wilson(k, n)
-    assert interval.low == pytest.approx(max(0.0, centre - half), abs=1e-9)
-    assert interval.high == pytest.approx(min(1.0, centre + half), abs=1e-9)
+    assert interval.low == pytest.approx(max(0.0, centre - half), abs=1e-12)
+    assert interval.high == pytest.approx(min(1.0, centre + half), abs=1e-12)
+    # Seen the other way: at its ends the score test of the share just doubts what was counted.
+    for end in (interval.low, interval.high):
+        assert (p - end) ** 2 * n == pytest.approx(z * z * end * (1 - end), abs=1e-9)
 
 
 def test_wilson_worked_example() -> None:
-    """Newcombe 1998, table I: 81 of 263, method 3."""
+    """Newcombe 1998: 81 of 263, the score method without correction."""
     interval = wilson(81, 263)
     assert (round(interval.low, 4), round(interval.high, 4)) == (0.2553, 0.3662)
 
@@ -79,8 +83,28 @@ def test_resampled_equals_brute_force(about: int, seed: int) -> None:
     outcomes = [Outcome(rng.choice([0, 1, 0.5]), tuple(rng.sample(objects, about))) for _ in range(17)]
     ours, reference = resampled(outcomes), brute_force(outcomes)
     assert ours is not None
-    assert ours.low == pytest.approx(reference.low, abs=1e-9)
-    assert ours.high == pytest.approx(reference.high, abs=1e-9)
+    assert ours.low == pytest.approx(reference.low, abs=1e-12)
+    assert ours.high == pytest.approx(reference.high, abs=1e-12)
+
+
+@pytest.mark.parametrize("about", [1, 2])
+def test_seven_objects_equal_all_823543_ordered_resamples(about: int) -> None:
+    """The paper's number of test objects; ten questions each that are right by halves as well."""
+    import numpy as np
+
+    rng = np.random.default_rng(about)
+    sets = [rng.choice(7, about, replace=False) for _ in range(35)]
+    correct = rng.choice([0, 0.5, 1], 35)
+    drawn = np.stack(np.unravel_index(np.arange(7**7), (7,) * 7), axis=1).astype(np.int8)
+    counts = np.stack([(drawn == o).sum(axis=1, dtype=np.int8) for o in range(7)], axis=1).astype(np.float64)
+    weights = [counts[:, s].prod(axis=1) for s in sets]
+    total = sum(weights)
+    means = sum(w * c for w, c in zip(weights, correct, strict=True))[total > 0] / total[total > 0]
+    means.sort()
+    low, high = (means[math.ceil(share * len(means) - 1e-6) - 1] for share in (0.025, 0.975))
+    found = resampled([Outcome(float(c), tuple(f"{o}" for o in s)) for c, s in zip(correct, sets, strict=True)])
+    assert found is not None
+    assert (found.low, found.high) == pytest.approx((low, high), abs=1e-12)
 
 
 @pytest.mark.parametrize("clusters", range(1, 9))
@@ -168,6 +192,18 @@ def anova(ratings: Sequence[Sequence[float]]) -> tuple[float, int, int]:
     fitted = table.mean(1, keepdims=True) + table.mean(0, keepdims=True) - table.mean()
     error = ((table - fitted) ** 2).sum() / ((targets - 1) * (raters - 1))
     return float(raters * table.mean(1).var(ddof=1) / error), targets - 1, (targets - 1) * (raters - 1)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_icc3k_is_that_of_the_analysis_of_variance(seed: int) -> None:
+    rng = random.Random(seed)
+    ratings = [[rng.gauss(t, 1) for _ in range(2 + seed % 3)] for t in range(3 + 4 * seed)]
+    ratio, targets, errors = anova(ratings)
+    value, interval = icc3k(ratings), icc3k_interval(ratings)
+    assert value == pytest.approx(1 - 1 / ratio, abs=1e-12)
+    assert interval is not None
+    assert interval.low == pytest.approx(1 - f_quantile(0.975, targets, errors) / ratio, abs=1e-12)
+    assert interval.high == pytest.approx(1 - f_quantile(0.025, targets, errors) / ratio, abs=1e-12)
 
 
 def test_icc3k_interval_of_shrout_and_fleiss() -> None:
@@ -265,7 +301,7 @@ def test_kappa_is_one_less_the_ratio_of_distances(pairs: list[tuple[int, int]]) 
 
 
 def test_kappa_of_cohens_example() -> None:
-    """The counts of Cohen 1968, table 1, with quadratic weights, by hand."""
+    """Counts after Cohen 1968 with quadratic weights, by hand."""
     table = [[88, 14, 18], [10, 40, 10], [2, 6, 12]]
     pairs = [(r, c) for r, row in enumerate(table) for c, count in enumerate(row) for _ in range(count)]
     rows, columns = [120, 60, 20], [100, 60, 40]

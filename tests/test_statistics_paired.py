@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import random
+from collections.abc import Sequence
 from fractions import Fraction
 from statistics import fmean
 
@@ -26,6 +27,7 @@ from pipeline.statistics import (
     mcnemar,
     over_seeds,
     paired,
+    paired_over_seeds,
     planned_error,
     smallest_effect,
 )
@@ -52,6 +54,24 @@ def test_paired_by_hand() -> None:
     assert gap.p == fmean(far)
     assert gap.least == 2 / 16
     assert gap.mcnemar == 2 * (1 + 7) / 2**7
+
+
+@given(better=st.integers(0, 12), worse=st.integers(0, 12), same=st.integers(0, 12))
+@settings(deadline=None, max_examples=60)
+def test_independent_questions_have_bonett_and_prices_interval(better: int, worse: int, same: int) -> None:
+    """One question an object: both kinds of discordant questions get one more, and t stands in place of z."""
+    n = better + worse + same
+    if n < 2 or max(better, worse, same) == n:
+        return
+    values = [1.0] * better + [-1.0] * worse + [0.0] * same
+    gap = paired([Outcome(v, (f"{i:02}",)) for i, v in enumerate(values)])
+    one, other = (better + 1) / (n + 2), (worse + 1) / (n + 2)
+    half = stats.t.ppf(0.975, n - 1) * math.sqrt((one + other - (one - other) ** 2) / (n + 2))
+    assert gap.interval is not None
+    # It must hold the difference itself, which the two more questions pull towards nothing.
+    low, high = min(one - other - half, gap.value), max(one - other + half, gap.value)
+    assert gap.interval.low == pytest.approx(max(-1.0, low), abs=1e-12)
+    assert gap.interval.high == pytest.approx(min(1.0, high), abs=1e-12)
 
 
 def test_paired_without_difference_and_with_one_object() -> None:
@@ -93,7 +113,7 @@ def test_paired_properties(gains: list[tuple[int, list[str]]], seed: int) -> Non
 
 
 def test_mcnemar_of_agrestis_ratings() -> None:
-    """Agresti 2013, table 11.1: approval of a prime minister twice; 150 and 86 changed their minds, z = -4.17."""
+    """Agresti 2013: approval of a prime minister twice; 150 and 86 changed their minds, z = -4.17."""
     p = mcnemar([1] * 150 + [-1] * 86 + [0] * (794 + 570))
     exact = 2 * sum(Fraction(math.comb(236, k), 2**236) for k in range(87))
     assert p == pytest.approx(float(exact), rel=1e-12)
@@ -108,6 +128,7 @@ def test_mcnemar_is_the_binomial_tail(better: int, worse: int, same: int) -> Non
     p = mcnemar([1.0] * better + [0.0] * same + [-1.0] * worse)
     tail = sum(Fraction(math.comb(n, k), 2**n) for k in range(min(better, worse) + 1))
     assert p == pytest.approx(min(1.0, float(2 * tail)), abs=1e-12)
+    assert p == (stats.binomtest(better, n).pvalue if n else 1)
     assert mcnemar([0.5] + [1.0] * better) is None, "a mean over seeds is no count"
 
 
@@ -121,7 +142,7 @@ def test_mcnemar_is_the_binomial_tail(better: int, worse: int, same: int) -> Non
     ],
 )
 def test_holm(ps: list[float], adjusted: list[float]) -> None:
-    assert holm(ps) == pytest.approx(adjusted)
+    assert holm(ps) == pytest.approx(adjusted, abs=1e-12)
 
 
 @given(st.lists(st.floats(0.001, 1), min_size=1, max_size=6))
@@ -132,6 +153,71 @@ def test_holm_is_the_closure_of_bonferroni(ps: list[float]) -> None:
     families = [f for size in range(1, len(ps) + 1) for f in itertools.combinations(places, size)]
     worth = {f: min(1.0, len(f) * min(ps[i] for i in f)) for f in families}
     assert holm(ps) == pytest.approx([max(w for f, w in worth.items() if i in f) for i in places], abs=1e-12)
+
+
+def over_runs(rows: Sequence[Sequence[float]], each: int = 5) -> list[Answer]:
+    """Differences of seeds x questions, `each` about one object."""
+    return answers(np.array(rows, dtype=float), each)
+
+
+def test_several_seeds_are_one_comparison_of_their_means() -> None:
+    rng = np.random.default_rng(5)
+    table = rng.integers(-1, 2, (4, 35)).astype(float)
+    several, means = paired_over_seeds(over_runs(table)), paired(outcomes_of(table.mean(axis=0)))
+    assert several.value == pytest.approx(table.mean(), abs=1e-12)
+    assert (several.p, several.least) == (means.p, means.least), "signs are those of objects, whatever the seeds"
+    alone = [mcnemar(row.tolist()) for row in table]
+    assert several.mcnemar == min(1, 4 * min(p for p in alone if p is not None))
+    assert means.mcnemar is None, "means over seeds are no counts"
+    one = paired_over_seeds(over_runs(table[:1]))
+    assert one == paired(outcomes_of(table[0]))
+    halves = paired_over_seeds(over_runs(table / 2))
+    assert halves.mcnemar is None
+
+
+def test_mcnemar_over_seeds_by_hand() -> None:
+    """Five to none under one seed, two to one under the other: 2 / 2^5 and 1."""
+    rows = [[1, 1, 1, 1, 1, 0, 0, 0, 0, 0], [1, 1, -1, 0, 0, 0, 0, 0, 0, 0]]
+    assert paired_over_seeds(over_runs(rows)).mcnemar == 2 * (2 / 2**5)
+    assert paired_over_seeds(over_runs(rows[1:])).mcnemar == 1
+
+
+def test_runs_that_differ_widen_the_comparison() -> None:
+    """The same question means; under seeds that agree, and under seeds of which one is far better."""
+    agree = np.tile([1.0, 0, 0, 1, 0], (4, 14)).reshape(4, 70)
+    differ = agree.copy()
+    differ[0], differ[1:] = 1.0, np.where(agree[1:] > 0, 1.0, -1 / 3)
+    assert differ.mean(axis=0) == pytest.approx(agree.mean(axis=0))
+    same, apart = paired_over_seeds(over_runs(agree)), paired_over_seeds(over_runs(differ))
+    assert same.interval is not None
+    assert apart.interval is not None
+    assert same.interval == paired(outcomes_of(agree.mean(axis=0))).interval, "the same answers again add nothing"
+    assert apart.interval.low < same.interval.low < same.interval.high < apart.interval.high
+    assert same.p == apart.p
+    assert same.detectable is not None
+    assert apart.detectable is not None
+    assert apart.detectable > same.detectable
+
+
+def test_the_comparison_over_seeds_covers_new_seeds() -> None:
+    """Two equally good settings whose runs deviate by ten points: what leaves the seeds out covers less."""
+    rng, objects, seeds, covered, without = np.random.default_rng(2), 20, 5, 0, 0
+    sets = [rng.choice(objects, 2, replace=False) for _ in range(100)]
+    names = [tuple(f"{o:02}" for o in sorted(s)) for s in sets]
+    for _ in range(200):
+        rates = 0.5 + rng.normal(0, 0.1, (2, seeds, 1)) + rng.normal(0, 0.05, (2, 1, objects))[:, :, sets].mean(axis=-1)
+        one, other = rng.random((2, seeds, 100)) < rates
+        table = one.astype(float) - other
+        gap = paired_over_seeds(
+            [Answer(f"{q:03}", s, float(table[s, q]), names[q]) for s in range(seeds) for q in range(100)]
+        )
+        alone = paired([Outcome(float(v), names[q]) for q, v in enumerate(table.mean(axis=0))])
+        for found in (gap, alone):
+            assert found.interval is not None
+        covered += gap.interval.low <= 0 <= gap.interval.high  # type: ignore[union-attr]
+        without += alone.interval.low <= 0 <= alone.interval.high  # type: ignore[union-attr]
+    assert covered / 200 >= 0.93
+    assert without / 200 <= 0.85
 
 
 # What a design can find
@@ -202,7 +288,19 @@ def test_smaller_sizes_and_more_power_need_larger_effects() -> None:
             planned_error(objects, questions, 0.1, 0.1)
 
 
+def test_the_smallest_effect_of_an_error_that_knows_its_freedom() -> None:
+    assert smallest_effect(0.1, 7, freedom=6) == smallest_effect(0.1, 7)
+    assert smallest_effect(0.1, 7, freedom=2.5) > smallest_effect(0.1, 7)
+    # Any number of objects may stand beside it.
+    assert smallest_effect(0.1, 60, freedom=2.5) == smallest_effect(0.1, 7, freedom=2.5)
+
+
 # Seeds
+
+
+def outcomes_of(row: np.ndarray, each: int = 5) -> list[Outcome]:
+    """One run, as `answers`."""
+    return [Outcome(float(value), (f"{q // each:02}",)) for q, value in enumerate(row)]
 
 
 def answers(table: np.ndarray, each: int = 5, levels: tuple[str, ...] = ()) -> list[Answer]:
@@ -219,6 +317,21 @@ def test_one_seed_is_the_clustered_interval() -> None:
     found = over_seeds(answers(table))
     assert found.interval == clustered([Outcome(a.correct, a.objects) for a in answers(table)])
     assert (found.parts, found.expected, found.questions, found.seeds) == (None, None, 35, (0,))
+    share = table.mean()
+    assert found.most == pytest.approx(math.sqrt(share * (1 - share) / 35), abs=1e-12)
+
+
+def test_answers_alone_make_no_more_than_if_questions_were_alike() -> None:
+    """The deviation over 4000 runs of questions that are not equally hard, against its bound."""
+    rng = np.random.default_rng(8)
+    rates = rng.random(40)
+    table = (rng.random((4000, 40)) < rates).astype(float)
+    found = over_seeds(answers(table))
+    assert found.expected == pytest.approx(math.sqrt((rates * (1 - rates)).sum()) / 40, rel=0.02)
+    assert found.expected is not None
+    assert found.spread.deviation == pytest.approx(found.expected, rel=0.05)
+    assert found.most == pytest.approx(math.sqrt(rates.mean() * (1 - rates.mean()) / 40), rel=0.02)
+    assert found.expected < found.most
 
 
 def test_runs_that_agree_add_nothing() -> None:
@@ -302,14 +415,12 @@ def test_effects_are_those_of_least_squares() -> None:
         assert effect.interval is not None
         assert effect.interval.low <= effect.value <= effect.interval.high
         assert effect.p is not None
-        assert effect.p_holm is not None
-        assert 2 / 128 <= effect.p <= effect.p_holm <= 1
+        assert 2 / 128 <= effect.p <= 1
+        assert effect.detectable is not None
+        assert effect.detectable > 0
         assert (effect.questions, effect.seeds, effect.cells) == (35, 2, 8)
-    assert effects[0].change == "encoder: finetuned minus base"
-    assert effects[3].change == "encoder: finetuned minus base x LoRA: with minus without"
-    for size in (1, 2):
-        family = [e for e in effects if len(e.factors) == size]
-        assert [e.p_holm for e in family] == holm([e.p for e in family if e.p is not None])
+    assert effects[0].changes == ("finetuned minus base",)
+    assert effects[3].changes == ("finetuned minus base", "with minus without")
 
 
 def test_one_pair_of_cells_is_the_paired_difference() -> None:
@@ -323,18 +434,19 @@ def test_one_pair_of_cells_is_the_paired_difference() -> None:
     assert gap.interval is not None
     assert effects[0].interval.low == pytest.approx(gap.interval.low, abs=1e-12)
     assert effects[0].p == gap.p
+    assert effects[0].detectable == pytest.approx(gap.detectable, abs=1e-12)
 
 
 def test_three_levels_and_missing_cells() -> None:
     factors = (Factor("LoRA", ("without", "with")), Factor("OPD", ("none", "needed", "all")))
     cells = [c for c in itertools.product(*(f.levels for f in factors)) if c != ("without", "needed")]
     effects = factorial_effects([a for c in cells for a in answers(np.ones((2, 10)), levels=c)], factors)
-    assert {e.change: e.cells for e in effects} == {
-        "LoRA: with minus without": 4,
-        "OPD: needed minus none": 2,
-        "OPD: all minus none": 4,
-        "OPD: all minus needed": 2,
-        "LoRA: with minus without x OPD: all minus none": 4,
+    assert {(e.factors, e.changes): e.cells for e in effects} == {
+        (("LoRA",), ("with minus without",)): 4,
+        (("OPD",), ("needed minus none",)): 2,
+        (("OPD",), ("all minus none",)): 4,
+        (("OPD",), ("all minus needed",)): 2,
+        (("LoRA", "OPD"), ("with minus without", "all minus none")): 4,
     }
     assert {e.value for e in effects} == {0}
 

@@ -15,7 +15,6 @@ from typing import Literal
 import numpy as np
 
 from pipeline.artifacts import write_text
-from pipeline.benchmarks import BenchRow
 from pipeline.benchmarks.coverage_methods import (
     ACCURACY,
     DIFFERENCE,
@@ -23,12 +22,14 @@ from pipeline.benchmarks.coverage_methods import (
     Bounds,
     Method,
     Test,
+    adjusted,
     effective,
     overlapping,
 )
+from pipeline.benchmarks.coverage_table import OVER_SEEDS, CoverageRow, Verdict, table, verdict
 from pipeline.benchmarks.simulation import Design
 from pipeline.statistics import planned_error, smallest_effect, wilson
-from pipeline.statistics.bounds import accuracy_bounds, estimate
+from pipeline.statistics.bounds import accuracy_bounds, difference_bounds, estimate
 from pipeline.statistics.clusters import Values
 from pipeline.statistics.seeds import crossed
 
@@ -43,34 +44,14 @@ SEEDS = (1, 5)
 HOLDS = (0.93, 0.97)
 SIZE = 0.05
 
-Verdict = Literal["holds", "conservative", "liberal", ""]
-
-
-class CoverageRow(BenchRow):
-    """A method in a design."""
-
-    kind: Literal["accuracy", "difference", "seeds", "size", "power", "smallest effect"]
-    method: str
-    reported: bool
-    """Whether the reports use it."""
-    objects: int
-    about: int
-    correlation: float
-    seeds: int
-    truths: tuple[str, ...]
-    shares: tuple[float, ...]
-    """Covered or, by a test, rejected: one a truth."""
-    verdict: tuple[Verdict, ...]
-    """Whether that is 93 to 97 %, or of equal settings 5 %, as far as the repetitions can tell; empty for power."""
-    repetitions: int
-
 
 def measure(root: Path, repetitions: int = REPETITIONS, objects: Sequence[int] = OBJECTS) -> list[CoverageRow]:
     """Simulate all designs and write reports/bench/coverage.md beside the rows that are returned."""
     rows: list[CoverageRow] = []
     for count, about, correlation in itertools.product(objects, ABOUT, CORRELATIONS):
         design = Design(count, about, correlation)
-        rows += _accuracies(design, repetitions) + _differences(design, repetitions) + _runs(design, repetitions)
+        rows += _accuracies(design, repetitions) + _differences(design, repetitions)
+        rows += _runs(design, repetitions) + _run_differences(design, repetitions)
     rows += [row for count in objects for row in _smallest_effects(count, repetitions)]
     write_text(root / "reports" / "bench" / "coverage.md", table(rows))
     return rows
@@ -111,6 +92,20 @@ def _runs(design: Design, repetitions: int) -> list[CoverageRow]:
     return rows
 
 
+def _run_differences(design: Design, repetitions: int) -> list[CoverageRow]:
+    """Intervals for the difference over other objects and other runs, from five runs of both settings."""
+    clusters, pairs, seeds = design.clusters(), (*EQUAL, *UNEQUAL), SEEDS[-1]
+    values = design.run_differences(pairs, seeds, max(1, repetitions // 2))
+    alone = [difference_bounds(estimate(v.mean(axis=1), clusters), clusters) for v in values]
+    both = [difference_bounds(crossed(v, clusters), clusters) for v in values]
+    found = [
+        (Method("objects alone", adjusted), alone),
+        (Method("objects and seeds", adjusted, reported=True), both),
+    ]
+    named = [f"{a:g} - {b:g}" for a, b in pairs]
+    return _intervals("difference over seeds", design, found, [a - b for a, b in pairs], named, seeds)
+
+
 def _smallest_effects(objects: int, repetitions: int) -> list[CoverageRow]:
     """How often the smallest effect of a plan is found, with normal differences: 80 % is what it says."""
     between, within, design = 0.15, 0.6, Design(objects, 1, 0)
@@ -131,7 +126,7 @@ def _smallest_effects(objects: int, repetitions: int) -> list[CoverageRow]:
 
 
 def _intervals(
-    kind: Literal["accuracy", "difference", "seeds"],
+    kind: Literal["accuracy", "difference", "seeds", "difference over seeds"],
     design: Design,
     found: Sequence[tuple[Method, Sequence[Bounds]]],
     truths: Sequence[float],
@@ -212,73 +207,6 @@ def _test(
     )
 
 
-def verdict(share: float, repetitions: int, low: float, high: float) -> Verdict:
-    """Whether a share lies in a range, or above or below it, as far as its Monte Carlo error can tell."""
-    spread = wilson(share * repetitions, repetitions)
-    if spread.high < low:
-        return "liberal"
-    return "conservative" if spread.low > high else "holds"
-
-
 def _case(kind: str, method: str, design: Design, seeds: int) -> str:
-    runs = f", {seeds} seeds" if kind == "seeds" else ""
+    runs = f", {seeds} seeds" if kind in OVER_SEEDS else ""
     return f"{kind}, {method}, {design.objects} objects, {design.about} a question, r {design.correlation:g}{runs}"
-
-
-def table(rows: Sequence[CoverageRow]) -> str:
-    """The rows as a page: first where the reported intervals and tests do not hold, then everything."""
-    short, wide = (
-        [f"- {r.case}: {named}" for r in rows if r.reported and (named := _shares(r, judged))]
-        for judged in ("liberal", "conservative")
-    )
-    lines = [
-        "# Coverage of intervals, size and power of tests",
-        "",
-        f"Simulated, {max(r.repetitions for r in rows)} repetitions a design (seeds: half), so that 95 % is known to "
-        "about a point. In percent. *r* is the correlation within objects before answers are cut into right and "
-        "wrong. **Bold**: below 93 % covered, or of equal settings more than 7 % rejected, beyond Monte Carlo error; "
-        "*italic*: above 97 %, or fewer than 3 %. Truths are accuracies; of differences, the two accuracies. With "
-        "*seeds* the truth is over all runs, so that one run cannot cover it. The smallest effect is what a plan of 5 "
-        "questions an object should find in 80 of 100 repetitions.",
-        "",
-        "## Where what the reports use falls short",
-        "",
-        *(short or ["Nowhere."]),
-        "",
-        "## Where it covers more, or rejects less, than it says",
-        "",
-        *(wide or ["Nowhere."]),
-    ]
-    for kind in dict.fromkeys(r.kind for r in rows):
-        chosen = [r for r in rows if r.kind == kind]
-        widest = max((r.truths for r in chosen), key=len)
-        heads = ("",) if kind == "smallest effect" else widest
-        columns = ["Method", "Objects", "A question", "r", *(["Seeds"] if kind == "seeds" else []), *heads]
-        lines += [
-            "",
-            f"## {kind.capitalize()}",
-            "",
-            f"| {' | '.join([*columns, 'Width'])} |",
-            "|---" * len(columns) + "|---|",
-        ]
-        for row in chosen:
-            seeds = [str(row.seeds)] if kind == "seeds" else []
-            name = f"{row.method} (reported)" if row.reported else row.method
-            shares = _marked(row) if kind != "smallest effect" else [f"{row.truths[0]}: {_marked(row)[0]}"]
-            width = f"{row.cost:.2f}" if row.cost else ""
-            cells = [name, str(row.objects), str(row.about), f"{row.correlation:g}", *seeds, *shares, width]
-            lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
-
-
-def _shares(row: CoverageRow, judged: str) -> str:
-    pairs = zip(row.truths, row.shares, row.verdict, strict=True)
-    return ", ".join(f"{100 * share:.1f} % at {truth}" for truth, share, found in pairs if found == judged)
-
-
-def _marked(row: CoverageRow) -> list[str]:
-    marks = {"liberal": "**", "conservative": "*"}
-    return [
-        f"{(mark := marks.get(judged, ''))}{100 * share:.1f}{mark}"
-        for share, judged in zip(row.shares, row.verdict, strict=True)
-    ]

@@ -75,15 +75,33 @@ class Design:
         Runs are better or worse as a whole (`RUNS` of the variance); half of what neither objects nor runs explain is
         the question's, the other half its answer's in one run.
         """
-        rng = self.generator("runs", seeds)
+        lasting, passing = self._of_runs(self.generator("runs", seeds), seeds, repetitions)
+        return [(lasting + passing < _threshold(truth)).astype(np.float64) for truth in truths]
+
+    def run_differences(self, pairs: Iterable[tuple[float, float]], seeds: int, repetitions: int) -> list[Values]:
+        """Of two settings, each run under several seeds: 1, 0 or -1, repetitions x seeds x questions.
+
+        As `runs`; of what objects and questions make under all seeds, `SHARED` is common to both settings.
+        """
+        rng = self.generator("run differences", seeds)
+        both, _ = self._of_runs(rng, 1, repetitions)
+        found = []
+        for _ in range(2):
+            lasting, passing = self._of_runs(rng, seeds, repetitions)
+            found.append(np.sqrt(SHARED) * both + np.sqrt(1 - SHARED) * lasting + passing)
+        one, other = found
+        return [(one < _threshold(a)).astype(np.float64) - (other < _threshold(b)) for a, b in pairs]
+
+    def _of_runs(self, rng: np.random.Generator, seeds: int, repetitions: int) -> tuple[Values, Values]:
+        """What objects and questions make under all seeds (repetitions x 1 x questions), and what runs and single
+        answers bring (repetitions x seeds x questions); their sum is standard normal."""
         membership = self.clusters().membership
         own = rng.standard_normal((repetitions, 1, self.objects)) @ membership.T / np.sqrt(self.about)
         run = rng.standard_normal((repetitions, seeds, 1))
         question = rng.standard_normal((repetitions, 1, len(membership)))
         answer = rng.standard_normal((repetitions, seeds, len(membership)))
-        rest = 1 - self.correlation - RUNS
-        latent = np.sqrt(self.correlation) * own + np.sqrt(RUNS) * run + np.sqrt(rest / 2) * (question + answer)
-        return [(latent < _threshold(truth)).astype(np.float64) for truth in truths]
+        rest = np.sqrt((1 - self.correlation - RUNS) / 2)
+        return np.sqrt(self.correlation) * own + rest * question, np.sqrt(RUNS) * run + rest * answer
 
 
 @lru_cache(maxsize=4)

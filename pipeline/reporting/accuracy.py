@@ -70,6 +70,9 @@ class AccuracyRow:
     high: float | None
     clustered_low: float | None
     clustered_high: float | None
+    resampled_low: float | None
+    """By resampling objects: optimistic where they are few, and only to be read beside the interval before it."""
+    resampled_high: float | None
     chance: float
     majority: float | None
     """The best constant answer in hindsight, on the same questions."""
@@ -92,7 +95,7 @@ class AccuracyRow:
     """Why the measured cells are empty, or what speaks against reading anything into them."""
 
     def display(self) -> Mapping[str, str]:
-        """Intervals in one column each, seeds only where there are several."""
+        """Intervals in one column each, that by resampling in the CSV alone; seeds only where there are several."""
         several = f"{number(self.seed_mean)} ± {number(self.seed_sd)} ({self.seed_values})"
         return {
             "": self.row,
@@ -130,6 +133,7 @@ def accuracy_row(cell: Cell, by_seed: Mapping[int, Sequence[Score]], note: str =
     measured = proportion(outcomes(every)) if every else None
     spread = Spread(tuple(_share(s.correct for s in scores) for scores in graded.values())) if every else None
     clustered = measured.clustered if measured else None
+    resampled = measured.resampled if measured else None
     return AccuracyRow(
         row=cell.row,
         system=cell.system,
@@ -140,6 +144,8 @@ def accuracy_row(cell: Cell, by_seed: Mapping[int, Sequence[Score]], note: str =
         high=100 * measured.wilson.high if measured else None,
         clustered_low=100 * clustered.low if clustered else None,
         clustered_high=100 * clustered.high if clustered else None,
+        resampled_low=100 * resampled.low if resampled else None,
+        resampled_high=100 * resampled.high if resampled else None,
         chance=100 * cell.chance,
         majority=_majority(next(iter(graded.values()))) if every else None,
         unparsed=_share(not s.parsed for s in every) if every else None,

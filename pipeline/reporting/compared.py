@@ -2,92 +2,63 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from statistics import fmean
 
-from pipeline.plan import FULL, Encoder, Lora, Variant
+from pipeline.plan import FULL, Encoder, Lora
 from pipeline.records import Opd, Touch
 from pipeline.reporting.accuracy import Measure, outcomes
 from pipeline.reporting.answered import Answered
-from pipeline.reporting.inputs import Inputs
-from pipeline.reporting.language_rows import DescribingRow, EffectRow, TouchRow
-from pipeline.statistics import Outcome, clustered, holm, paired
-
-CONTRASTS: tuple[tuple[str, int, Encoder | Lora | Opd, Encoder | Lora | Opd], ...] = (
-    ("encoder", 0, Encoder.FINETUNED, Encoder.BASE),
-    ("LoRA", 1, Lora.WITH, Lora.WITHOUT),
-    ("OPD", 2, Opd.ALL, Opd.NONE),
-    ("OPD", 2, Opd.NEEDED, Opd.NONE),
-    ("OPD", 2, Opd.NEEDED, Opd.ALL),
-)
-"""Axis, its place in a variant's axes, and which of its values is compared with which."""
+from pipeline.reporting.compared_rows import DescribingRow, EffectRow, TouchRow
+from pipeline.reporting.factors import FACTORS, adjusted
+from pipeline.reporting.inputs import Axes, Inputs
+from pipeline.statistics import Answer, Outcome, clustered, deviations, paired_over_seeds
 
 
-def effects(answered: Answered, variants: Mapping[str, Variant], measures: Sequence[Measure]) -> list[EffectRow]:
-    """What changing one axis does, the other axes as the paper proposes and, where there are more, over all of them."""
-    keys = {(v.encoder, v.lora, v.opd, v.seed): key for key, v in variants.items()}
-    full, every = [], []
-    for axis, place, one, other in CONTRASTS:
-        pairs: list[tuple[str, str]] = []
-        proposed: list[tuple[str, str]] = []
-        for axes, key in keys.items():
-            rival = keys.get((*axes[:place], other, *axes[place + 1 :]))  # type: ignore[arg-type]
-            if axes[place] == one and rival is not None:
-                pairs.append((key, rival))
-                if all(axes[i] == FULL[i] for i in range(len(FULL)) if i != place):
-                    proposed.append((key, rival))
-        for measure in measures:
-            change = f"{one} minus {other}"
-            full += _effect(answered, proposed, measure, axis, change, "full system")
-            if len(pairs) > len(proposed):
-                every += _effect(answered, pairs, measure, axis, change, "all")
-    return [*_adjusted(full), *_adjusted(every)]
+def effects(answered: Answered, measures: Sequence[Measure]) -> list[EffectRow]:
+    """What changing one axis does, the other axes as the paper proposes; over seeds that have both variants."""
+    rows: list[EffectRow] = []
+    for place, factor in enumerate(FACTORS):
+        for other, one in itertools.combinations(factor.levels, 2):
+            first, second = (answered.inputs.variants(_with(place, level)) for level in (one, other))
+            pairs = {seed: (key, second[seed]) for seed, key in first.items() if seed in second}
+            for measure in measures:
+                if gains := answered.gains(pairs, measure):
+                    rows.append(_effect(factor.name, f"{one} minus {other}", measure, gains, answered.gate(measure)))
+    return adjusted(rows)
 
 
-def _effect(
-    answered: Answered, pairs: Sequence[tuple[str, str]], measure: Measure, axis: str, change: str, others: str
-) -> list[EffectRow]:
-    gains, compared = _gains(answered, pairs, measure)
-    if not gains:
-        return []
-    gap = paired(gains)
-    return [
-        EffectRow(
-            axis=axis,
-            change=change,
-            others=others,
-            task=measure.label,
-            difference=gap.value,
-            low=gap.interval.low if gap.interval else None,
-            high=gap.interval.high if gap.interval else None,
-            p=gap.p,
-            p_holm=None,
-            n=len(gains),
-            pairs=compared,
-            gate=answered.gate(measure),
-        )
-    ]
+def _with(place: int, level: str) -> Axes:
+    """The axes that the paper proposes but for one."""
+    names = [level if i == place else str(value) for i, value in enumerate(FULL)]
+    return Encoder(names[0]), Lora(names[1]), Opd(names[2])
 
 
-def _adjusted(rows: Sequence[EffectRow]) -> list[EffectRow]:
-    tested = [row for row in rows if row.p is not None]
-    adjusted = dict(zip(map(id, tested), holm([row.p for row in tested if row.p is not None]), strict=True))
-    return [EffectRow(**{**vars(row), "p_holm": adjusted.get(id(row))}) for row in rows]
-
-
-def _gains(answered: Answered, pairs: Iterable[tuple[str, str]], measure: Measure) -> tuple[list[Outcome], int]:
-    """By question, the mean over pairs of variants of how much more often the first is right; and how many pairs."""
-    gains: defaultdict[str, list[int]] = defaultdict(list)
-    objects: dict[str, tuple[str, ...]] = {}
-    compared = 0
-    for first, second in pairs:
-        one, other = answered.scores(first, measure), answered.scores(second, measure)
-        compared += bool(one and other)
-        for question in one.keys() & other.keys():
-            gains[question].append(one[question].correct - other[question].correct)
-            objects[question] = one[question].objects
-    return [Outcome(fmean(gains[q]), objects[q]) for q in sorted(gains)], compared
+def _effect(axis: str, change: str, measure: Measure, gains: Sequence[Answer], gate: str) -> EffectRow:
+    gap = paired_over_seeds(gains)
+    by_question: defaultdict[str, list[Answer]] = defaultdict(list)
+    for gain in gains:
+        by_question[gain.question].append(gain)
+    seen = deviations([Outcome(fmean(g.correct for g in same), same[0].objects) for same in by_question.values()])
+    return EffectRow(
+        axis=axis,
+        change=change,
+        task=measure.label,
+        difference=gap.value,
+        low=gap.interval.low if gap.interval else None,
+        high=gap.interval.high if gap.interval else None,
+        p=gap.p,
+        p_holm=None,
+        p_mcnemar=gap.mcnemar,
+        smallest_effect=gap.detectable,
+        sd_objects=seen.between if seen else None,
+        sd_questions=seen.within if seen else None,
+        n=len(by_question),
+        pairs=len({gain.seed for gain in gains}),
+        gate=gate,
+    )
 
 
 def describing(answered: Answered, inputs: Inputs, measures: Sequence[Measure]) -> list[DescribingRow]:
@@ -96,9 +67,9 @@ def describing(answered: Answered, inputs: Inputs, measures: Sequence[Measure]) 
     rows = []
     for measure in measures:
         one, other = (answered.every(keys.values(), measure) for keys in (needed, everything))
-        gains, _ = _gains(answered, [(everything[s], needed[s]) for s in needed if s in everything], measure)
+        gains = answered.gains({s: (everything[s], needed[s]) for s in needed if s in everything}, measure)
         if gains:
-            gap = paired(gains)
+            gap = paired_over_seeds(gains)
             rows.append(
                 DescribingRow(
                     task=measure.label,
@@ -109,7 +80,7 @@ def describing(answered: Answered, inputs: Inputs, measures: Sequence[Measure]) 
                     high=gap.interval.high if gap.interval else None,
                     tokens_needed=fmean(s.tokens for s in one),
                     tokens_all=fmean(s.tokens for s in other),
-                    n=len(gains),
+                    n=len({gain.question for gain in gains}),
                     gate=answered.gate(measure),
                 )
             )
@@ -129,8 +100,8 @@ def counterfactuals(answered: Answered, inputs: Inputs, measures: Sequence[Measu
                 continue
             answers = outcomes(scores)
             interval = clustered(answers)
-            gains, _ = _gains(answered, [(real[s], key) for s, key in keys.items()], measure)
-            gap = paired(gains) if gains and touch is not Touch.REAL else None
+            gains = answered.gains({s: (real[s], key) for s, key in keys.items()}, measure)
+            gap = paired_over_seeds(gains) if gains and touch is not Touch.REAL else None
             ends = gap.interval if gap else None
             rows.append(
                 TouchRow(

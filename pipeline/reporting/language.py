@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from statistics import fmean, stdev
+from statistics import fmean
 
 from pipeline.records import Task, Touch
 from pipeline.reporting.accuracy import Measure, outcomes
 from pipeline.reporting.answered import Answered
 from pipeline.reporting.compared import counterfactuals, describing, effects
+from pipeline.reporting.factorial import factorial
 from pipeline.reporting.inputs import Inputs
-from pipeline.reporting.language_rows import AblationRow, SeedsRow
-from pipeline.reporting.table import Row, Table
+from pipeline.reporting.language_rows import AblationRow
+from pipeline.reporting.seeds import seeds
+from pipeline.reporting.table import Table
 from pipeline.statistics import clustered
 
 FOLDER = "language"
@@ -32,16 +34,48 @@ def language_tables(inputs: Inputs) -> list[Table]:
             "cannot do the task on perfect descriptions in words either: what such a task shows is not about touch. "
             "*Facts told*: matching questions say what the named objects are like (`questions.facts`).",
             [row for key in real for measure in measures if (row := _row(answered, [key], measure))],
-            [row for axes in inputs.axes for row in _over_seeds(answered, [*inputs.variants(axes).values()], measures)],
+            [
+                row
+                for axes in inputs.axes
+                for measure in measures
+                if (row := _row(answered, [*inputs.variants(axes).values()], measure))
+            ],
+            folder=FOLDER,
+        ),
+        Table(
+            "seeds",
+            "Why results differ from run to run",
+            "Each variant under all its seeds. Compare *± over seeds*, by how much the runs' accuracies deviate, with "
+            "*± by answers alone*, by how much they would if all runs were equally good and only single answers fell "
+            "this way or that. Where both are alike, more questions make runs agree; where the first is clearly "
+            "larger, whole runs differ, and more seeds are needed. Both are rough with few seeds. The last four split "
+            "the variance of a single answer; *95 %* is for other objects and other runs. A single run shows none of "
+            "this: its interval is for other objects alone, and *at the most* is what single answers alone could make "
+            "of it.",
+            seeds(answered, whole),
             folder=FOLDER,
         ),
         Table(
             "effects",
             "What each part brings",
-            "Differences on the same questions, in percentage points, over seeds. Intervals are clustered by object; p "
-            "flips the signs of whole objects: with few it takes few values, with seven none below .016. p (Holm) is "
-            "adjusted for all comparisons with the same *Others*.",
-            effects(answered, real, whole),
+            "One change at a time, the other parts as the paper proposes: differences on the same questions, in "
+            "percentage points, over seeds. Intervals are for new objects and, with several seeds, new seeds. p flips "
+            "the signs of whole objects: with few it takes few values, with seven none below .016; p (Holm) is "
+            "adjusted for all rows. p (McNemar) takes questions to be independent, which they are not, and is only to "
+            "be read beside p; with several seeds each is tested alone, and the smallest p counts times their number. "
+            "*Smallest effect* is what a t test on this design would find in four of five repetitions; above 100 there "
+            "is none.",
+            effects(answered, whole),
+            folder=FOLDER,
+        ),
+        Table(
+            "factorial",
+            "Main effects and interactions",
+            "Over all variants, not the full system alone. A main effect is the mean, over all settings of the other "
+            "parts, of what a change brings; an interaction is by how much that differs between two settings of "
+            "another part. Percentage points on the same questions; intervals are for new objects and, with several "
+            "seeds, new seeds; p (Holm) is adjusted for all main effects, or for all interactions.",
+            factorial(answered, whole),
             folder=FOLDER,
         ),
         Table(
@@ -89,13 +123,3 @@ def _row(answered: Answered, keys: Sequence[str], measure: Measure) -> AblationR
         tokens=fmean(s.tokens for s in scores),
         gate=answered.gate(measure),
     )
-
-
-def _over_seeds(answered: Answered, keys: Sequence[str], measures: Sequence[Measure]) -> list[Row]:
-    rows: list[Row] = []
-    for measure in measures:
-        pooled = _row(answered, keys, measure)
-        if pooled:
-            alone = [row.accuracy for key in keys if (row := _row(answered, [key], measure))]
-            rows.append(SeedsRow(pooled, stdev(alone) if len(alone) > 1 else None))
-    return rows

@@ -20,6 +20,9 @@ READING = """\
   these are, which share objects; Student's t over the objects makes up for how few these are. Simulated, it covers
   what it says but for some designs with few objects, or with questions about two or three that depend strongly on
   them: reports/bench/coverage.md names them.
+- `resampled_low` and `resampled_high`, in the CSV alone, are the same by drawing objects anew instead: with up to eight
+  objects from all ways to draw them (1716 with seven), beyond from 10 000. With few objects that is **optimistic**:
+  simulated with seven and questions about one, it covers 85 to 88 % of middling accuracies and less near 0 and 100.
 - **Chance** is a uniform guess; **Majority** the best constant answer in hindsight, on the same questions.
 - **Unparsed %** are answers that no choice could be read from; they count as wrong. **Truncated %** ran into the
   limit of `language.max_new_tokens`.

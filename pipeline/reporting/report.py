@@ -11,12 +11,12 @@ from pipeline.config import PARAMS_FILE, Params
 from pipeline.plan import Encoder
 from pipeline.records import Embedding, Measurement, Part
 from pipeline.reporting.audit import audit_table
+from pipeline.reporting.compared_rows import EffectRow, FactorialRow
 from pipeline.reporting.dataset import confusion_counts, dataset_tables
 from pipeline.reporting.effects_figure import draw_effects
 from pipeline.reporting.figures import Curve, draw_confusion, draw_curves, draw_embedding_map, training_panels
 from pipeline.reporting.inputs import Inputs, no_test_videos, read_inputs
 from pipeline.reporting.language import language_tables
-from pipeline.reporting.language_rows import EffectRow
 from pipeline.reporting.page import Picture, render_page
 from pipeline.reporting.provenance import provenance
 from pipeline.reporting.results import headline, result_tables
@@ -78,6 +78,7 @@ def _draw(inputs: Inputs, tables: Sequence[Table], root: Path, folder: Path) -> 
         _map(inputs, root, folder, footer),
         _curves(inputs, root, folder, footer),
         _effects(tables, folder, footer),
+        _factorial(tables, folder, footer),
     ]
     for picture in pictures:
         if picture.missing:
@@ -170,8 +171,7 @@ def _curves(inputs: Inputs, root: Path, folder: Path, footer: str) -> Picture:
 
 
 def _effects(tables: Sequence[Table], folder: Path, footer: str) -> Picture:
-    every = [row for table in tables for row in table.rows if isinstance(row, EffectRow)]
-    rows = [row for row in every if row.others == every[0].others]
+    rows = [row for table in tables for row in table.rows if isinstance(row, EffectRow)]
     picture = Picture(
         "effects.png",
         "What each part brings, drawn",
@@ -181,6 +181,22 @@ def _effects(tables: Sequence[Table], folder: Path, footer: str) -> Picture:
     )
     if not rows:
         return picture.without("no two variants that differ in one axis")
+    draw_effects(folder / picture.file, rows, footer)
+    return picture
+
+
+def _factorial(tables: Sequence[Table], folder: Path, footer: str) -> Picture:
+    rows = [row for table in tables for row in table.rows if isinstance(row, FactorialRow)]
+    picture = Picture(
+        "factorial.png",
+        "Main effects and interactions, drawn",
+        f"Points with intervals, one panel a task: {', '.join(dict.fromkeys(r.task for r in rows))}.",
+        "Main effects (dots, above the dotted line) and interactions (diamonds, below it) over all variants. An "
+        "interaction that crosses zero gives no reason to doubt that the parts' effects add up; a hollow point is of a "
+        "task that the base language model cannot do either.",
+    )
+    if not rows:
+        return picture.without("the plan's variants cross no two parts")
     draw_effects(folder / picture.file, rows, footer)
     return picture
 

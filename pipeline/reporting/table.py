@@ -62,6 +62,11 @@ def number(value: float | None, digits: int = 2) -> str:
     return "" if value is None else f"{value:.{digits}f}"
 
 
+def percent(share: float | None) -> str:
+    """A share in percent for reading, to one decimal; empty for None."""
+    return "" if share is None else number(100 * share, 1)
+
+
 def span(low: float | None, high: float | None) -> str:
     """An interval for reading, to one decimal; empty for None."""
     return "" if low is None or high is None else f"{low:.1f} to {high:.1f}"

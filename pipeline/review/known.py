@@ -1,11 +1,14 @@
 """How the tables of a report are shown. What a view does not name is shown as it is, so that no column gets lost.
 
+Those about the language model have a module of their own.
+
 Shares have four digits in their files, so percent have two here: with one, a figure that was rounded before could end
 up another one than the report's own.
 """
 
 from __future__ import annotations
 
+from pipeline.review.known_language import LANGUAGE
 from pipeline.review.views import Bar, Column, Kind, View
 
 HEAD, MEASURED, PRINTED, WORDS = Kind.HEAD, Kind.MEASURED, Kind.PUBLISHED, Kind.WORDS
@@ -22,6 +25,7 @@ ACCURACY = View(
             otherwise="{note}",
         ),
         Column("k/n|95 % Wilson", "{k:g}/{n}", small="{low:.1f} to {high:.1f}"),
+        Column("95 % by resampling objects (optimistic)", "{resampled_low:.1f} to {resampled_high:.1f}"),
         *(
             Column(
                 f"Published\N{NO-BREAK SPACE}{model}|n; 95 % Wilson",
@@ -46,70 +50,6 @@ ACCURACY = View(
         chance="chance",
         marks=("published_7b", "published_13b"),
     ),
-)
-ABLATION = View(
-    (
-        Column("Encoder", "{encoder}", HEAD),
-        Column("LoRA", "{lora}", HEAD),
-        Column("OPD", "{opd}", HEAD),
-        Column("Seed", "{seed}", HEAD),
-        Column("Task", "{task}", HEAD),
-        Column("Accuracy %|95 % over objects", "{accuracy:p.2f}", MEASURED, "{low:p.2f} to {high:p.2f}"),
-        Column("n", "{n}"),
-        Column("Chance %", "{chance:p.2f}"),
-        Column("Unparsed %|truncated %", "{unparsed:p.2f}", small="{truncated:p.2f}"),
-        Column("Tokens", "{tokens:.0f}"),
-        Column("Base model", "{gate}", WORDS),
-    ),
-    Bar("accuracy", "low", "high", 1, chance="chance"),
-    hidden=("source",),
-)
-EFFECTS = View(
-    (
-        Column("Part", "{axis}", HEAD),
-        Column("Change", "{change}", HEAD),
-        Column("Others", "{others}", WORDS),
-        Column("Task", "{task}", HEAD),
-        Column("Difference, points|95 % over objects", "{difference:p+.2f}", MEASURED, "{low:p.2f} to {high:p.2f}"),
-        Column("p", "{p:.3f}"),
-        Column("p (Holm)", "{p_holm:.3f}"),
-        Column("n", "{n}"),
-        Column("Pairs", "{pairs}"),
-        Column("Base model", "{gate}", WORDS),
-    ),
-    Bar("difference", "low", "high", 1, signed=True),
-)
-DESCRIBING = View(
-    (
-        Column("Task", "{task}", HEAD),
-        Column("Error %, needed", "{error_needed:p.2f}", MEASURED),
-        Column("Error %, all", "{error_all:p.2f}", MEASURED),
-        Column("Difference, points|95 % over objects", "{difference:p+.2f}", MEASURED, "{low:p.2f} to {high:p.2f}"),
-        Column("Tokens, needed", "{tokens_needed:.0f}"),
-        Column("Tokens, all", "{tokens_all:.0f}"),
-        Column("n", "{n}"),
-        Column("Base model", "{gate}", WORDS),
-    ),
-    Bar("difference", "low", "high", 1, signed=True),
-)
-TOUCH = View(
-    (
-        Column("Touch", "{touch}", HEAD),
-        Column("Task", "{task}", HEAD),
-        Column("Accuracy %|95 % over objects", "{accuracy:p.2f}", MEASURED, "{low:p.2f} to {high:p.2f}"),
-        Column("Chance %", "{chance:p.2f}"),
-        Column("Answers unchanged %", "{unchanged:p.2f}"),
-        Column(
-            "Real minus this, points|95 % over objects",
-            "{difference:p+.2f}",
-            MEASURED,
-            "{difference_low:p.2f} to {difference_high:p.2f}",
-        ),
-        Column("p", "{p:.3f}"),
-        Column("n", "{n}"),
-        Column("Base model", "{gate}", WORDS),
-    ),
-    Bar("accuracy", "low", "high", 1, chance="chance"),
 )
 SHARES = (Column("Accuracy %|95 % over objects", "{accuracy:p.2f}", MEASURED, "{low:p.2f} to {high:p.2f}"),)
 SHARE_BAR = Bar("accuracy", "low", "high", 1)
@@ -214,20 +154,16 @@ BENCH = View(
         Column("Interval", "{low} to {high}"),
     )
 )
-VIEWS = {
-    "ablation": ABLATION,
+VIEWS = LANGUAGE | {
     "agreement": AGREEMENT,
     "annotator_agreement": _figures(3),
     "audit": AUDIT,
     "cross_validation": ENCODERS,
-    "describing": DESCRIBING,
     "differences": DIFFERENCES,
-    "effects": EFFECTS,
     "errors": ERRORS,
     "learning_curve": CURVE,
     "property_combinations": COMBINATIONS,
     "property_counts": COUNTS,
-    "touch": TOUCH,
     "video_lengths": _figures(1),
 }
 ACCURACIES = (

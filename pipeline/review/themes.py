@@ -20,10 +20,11 @@ THEMES = (
         "parts",
         "What each part brings",
         (
-            *("effects", "interactions", "encoder_understanding", "encoder_property"),
+            *("effects", "factorial", "encoder_understanding", "encoder_property"),
             *("lora_understanding", "lora_property", "describing", "ablation", "all_variants"),
         ),
     ),
+    Theme("seeds", "Why do runs differ?", ("seeds",)),
     Theme("touch", "Is touch used?", ("touch",)),
     Theme(
         "encoders",
@@ -58,6 +59,10 @@ class Expected:
 
 EXPECTED = (
     Expected("effects", "What each part brings", "no two of its variants differ in one part alone", "plan.lora"),
+    Expected(
+        "factorial", "Main effects and interactions", "its plan crosses no two parts, or it is older than this table"
+    ),
+    Expected("seeds", "Why results differ from run to run", "nothing was answered", "plan.variants"),
     Expected("describing", "Describing what is needed, or everything", "its plan has no variant with OPD `needed`"),
     Expected(
         "touch",

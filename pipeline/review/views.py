@@ -44,7 +44,7 @@ class Bar:
     low: str
     high: str
     unit: float
-    """What 100 % are in the file: 100 or 1."""
+    """What the ends of the picture are in the file: 100 or 1, or 2 for what reaches from -200 to 200 %."""
     signed: bool = False
     """Whether it shows a difference, from -100 to 100 with a line at nothing."""
     chance: str = ""

@@ -10,7 +10,7 @@ from pipeline.statistics.agreement import confusion, icc3k, icc3k_interval, quad
 from pipeline.statistics.design import Deviations, deviations, planned_error, smallest_effect
 from pipeline.statistics.factorial import Factor, FactorialEffect, factorial_effects
 from pipeline.statistics.figures import Answer, Interval, Outcome, Spread
-from pipeline.statistics.paired import Difference, holm, mcnemar, paired
+from pipeline.statistics.paired import Difference, holm, mcnemar, paired, paired_over_seeds
 from pipeline.statistics.proportions import Proportion, clustered, proportion, wilson
 from pipeline.statistics.resampling import compositions, resampled
 from pipeline.statistics.seeds import OverSeeds, SeedParts, over_seeds
@@ -38,6 +38,7 @@ __all__ = [
     "mcnemar",
     "over_seeds",
     "paired",
+    "paired_over_seeds",
     "planned_error",
     "proportion",
     "quadratic_kappa",

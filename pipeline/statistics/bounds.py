@@ -1,8 +1,8 @@
 """Intervals from a variance over questions that share objects. All functions take many data sets at once.
 
 A variance over few objects is itself uncertain: Student's t with one degree of freedom less than there are objects
-makes up for it (Cameron and Miller 2015). Near 0 and 1 a symmetric interval fails whatever its variance, so they take
-the shape of those for independent questions, with an effective number of these.
+makes up for most of it, though not in all designs (Cameron and Miller 2015). Near 0 and 1 a symmetric interval fails
+whatever its variance, so they take the shape of those for independent questions, with an effective number of these.
 """
 
 from __future__ import annotations
@@ -41,9 +41,10 @@ def estimate(values: Values, clusters: Clusters) -> Estimate:
 def accuracy_bounds(found: Estimate, clusters: Clusters) -> tuple[Values, Values]:
     """Wilson's interval with the effective number of questions in place of n and Student's t in place of z.
 
-    The effective number is that of independent questions with the variance found (Kish 1965; for Wilson's interval
-    Kott and Carr 1997, with t Korn and Graubard 1998): at most n. Where all answers are alike there is nothing to
-    estimate a variance from, and objects count, not questions.
+    The effective number is that of independent questions with the variance found (Kish 1965), at most n: so Korn and
+    Graubard 1998, with t, for the exact interval; Franco, Little, Louis, Slud 2019 compare intervals of this kind and
+    recommend Wilson's. Where all answers are alike there is nothing to estimate a variance from, and objects count, not
+    questions.
     """
     binomial = found.mean * (1 - found.mean)
     n = _effective(binomial, found.variance, clusters)

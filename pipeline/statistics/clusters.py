@@ -3,10 +3,11 @@
 Questions about one object are ordinary clusters. Two questions about pairs or triples depend on each other as soon as
 they share one object, so that clusters overlap. Two estimates of the variance:
 
-- `variance`, which the reports use, fits variance components by moments (Henderson 1953, method 1; Searle, Casella,
-  McCulloch 1992, chapter 5): one for objects, one for sets of objects that questions come back to, one for questions.
-  It supposes that a question's objects add up. For questions about one object, as many about each, it is the ordinary
-  cluster-robust variance with the factor G / (G - 1), unless that is below the variance of independent questions.
+- `variance`, which the reports use, fits variance components by moments: sums of squares are set equal to what they are
+  expected to be (Henderson 1953; Searle, Casella, McCulloch 1992). There is one for objects, one for sets of objects
+  that questions come back to, and one for questions. It supposes that a question's objects add up. For questions about
+  one object, as many about each, it is the ordinary cluster-robust variance with the factor G / (G - 1), unless that is
+  below the variance of independent questions.
 - `overlapping_variance` supposes nothing of the kind: every two questions that share an object count with the product
   of their residuals (Cameron, Gelbach, Miller 2011, by inclusion and exclusion over the objects shared; Aronow, Samii,
   Assenova 2015 for pairs). It is unbiased for designs in which each object is equally frequent, but falls below zero

@@ -1,7 +1,7 @@
 """What a comparison can find before it is made. scipy and NumPy are imported only where they are used.
 
-Sources: Bloom 1995 (minimum detectable effects); Murray 1998 (trials of groups: degrees of freedom by groups); Miller
-2024, section 5 (the same for evaluations of language models).
+Sources: Bloom 1995 (minimum detectable effects, without clusters); Murray 1998 (trials of groups: degrees of freedom by
+groups); Miller 2024, arXiv 2411.00640 (power of evaluations of language models).
 """
 
 from __future__ import annotations
@@ -17,7 +17,9 @@ POWER = 0.8
 ALPHA = 0.05
 
 
-def smallest_effect(error: float, objects: int, power: float = POWER, alpha: float = ALPHA) -> float:
+def smallest_effect(
+    error: float, objects: int, power: float = POWER, alpha: float = ALPHA, freedom: float | None = None
+) -> float:
     """The smallest true difference that a two-sided t test over objects finds with the given power.
 
     That is the standard error times the noncentrality at which Student's t, with as many degrees of freedom as there
@@ -30,6 +32,7 @@ def smallest_effect(error: float, objects: int, power: float = POWER, alpha: flo
         objects: How many of them.
         power: How often it is to be found.
         alpha: The test's size.
+        freedom: Degrees of freedom of the error where they are not objects less one.
 
     Returns:
         In the unit of `error`; above 1 no difference of accuracies is large enough.
@@ -41,7 +44,7 @@ def smallest_effect(error: float, objects: int, power: float = POWER, alpha: flo
         raise ValueError("a test over objects needs at least two")
     if not 0 < alpha < power < 1:
         raise ValueError(f"power {power} at size {alpha}: 0 < size < power < 1 is needed")
-    return error * _noncentrality(objects - 1, power, alpha)
+    return error * _noncentrality(objects - 1 if freedom is None else freedom, power, alpha)
 
 
 def planned_error(objects: int, questions: float, between: float, within: float) -> float:
@@ -91,7 +94,7 @@ def deviations(gains: Sequence[Outcome]) -> Deviations | None:
 
 
 @lru_cache(maxsize=64)
-def _noncentrality(freedom: int, power: float, alpha: float) -> float:
+def _noncentrality(freedom: float, power: float, alpha: float) -> float:
     from scipy.optimize import brentq
     from scipy.stats import f, ncf
 

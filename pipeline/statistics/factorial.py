@@ -2,8 +2,8 @@
 
 A main effect is the mean, over all settings of the other factors, of the difference between two levels; an interaction
 of two factors is by how much the effect of the one differs between two levels of the other (Fisher 1935; Box, Hunter,
-Hunter 2005, chapter 5). Both are contrasts of cell means on the same questions, so they are paired differences, and
-everything holds for them that holds for those. NumPy is imported only where it is used.
+Hunter 2005). Both are contrasts of cell means on the same questions, so they are paired differences, and everything
+holds for them that holds for those.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from __future__ import annotations
 import itertools
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from pipeline.statistics.figures import Answer, Interval
-from pipeline.statistics.paired import holm
+from pipeline.statistics.paired import Difference, difference
 
 Levels = tuple[str, ...]
 Signs = Mapping[Levels, int]
@@ -25,7 +25,7 @@ Cell = Mapping[tuple[int, str], Answer]
 
 @dataclass(frozen=True)
 class Factor:
-    """What is varied, and its levels from the simplest on."""
+    """What is varied, and its levels; of every two the later is compared with the earlier."""
 
     name: str
     levels: Levels
@@ -37,19 +37,28 @@ class FactorialEffect:
 
     factors: tuple[str, ...]
     """One for a main effect, two for an interaction."""
-    change: str
+    changes: tuple[str, ...]
+    """As "with minus without", one a factor."""
     value: float
     """Difference of accuracies, -1 to 1; of an interaction a difference of differences, -2 to 2."""
     interval: Interval | None
     """95 %, for new objects and new seeds; None where the questions cannot show that objects differ."""
     p: float | None
-    """Of the sign-flip test over objects, on means over seeds; None likewise."""
-    p_holm: float | None
-    """Adjusted for all effects of the same kind that were asked for together."""
+    """Of the sign-flip test over objects, on means over seeds; None likewise. Several are looked at: see `holm`."""
+    detectable: float | None
+    """The smallest true effect that the design would find, as of every paired difference; None likewise."""
     questions: int
     seeds: int
     cells: int
     """Settings whose answers are compared."""
+
+
+@dataclass(frozen=True)
+class _Contrast:
+    found: Difference
+    questions: int
+    seeds: int
+    cells: int
 
 
 def factorial_effects(answers: Sequence[Answer], factors: Sequence[Factor], seed: int = 0) -> list[FactorialEffect]:
@@ -71,12 +80,11 @@ def factorial_effects(answers: Sequence[Answer], factors: Sequence[Factor], seed
     for places in [(i,) for i in range(len(factors))] + list(itertools.combinations(range(len(factors)), 2)):
         changes = [itertools.combinations(factors[i].levels, 2) for i in places]
         for pairs in itertools.product(*changes):
-            change = " x ".join(f"{factors[i].name}: {b} minus {a}" for i, (a, b) in zip(places, pairs, strict=True))
-            names = tuple(factors[i].name for i in places)
-            effect = _effect(cells, _signs(cells, places, pairs), len(places), seed)
-            if effect:
-                effects.append(replace(effect, factors=names, change=change))
-    return [e for size in (1, 2) for e in _adjusted([e for e in effects if len(e.factors) == size])]
+            contrast = _contrast(cells, _signs(cells, places, pairs), seed)
+            if contrast:
+                names = tuple(factors[i].name for i in places)
+                effects.append(_effect(contrast, names, tuple(f"{b} minus {a}" for a, b in pairs)))
+    return effects
 
 
 def _cells(answers: Sequence[Answer], factors: Sequence[Factor]) -> dict[Levels, dict[tuple[int, str], Answer]]:
@@ -106,37 +114,33 @@ def _signs(cells: Mapping[Levels, Cell], places: Sequence[int], pairs: Sequence[
     return signs
 
 
-def _effect(cells: Mapping[Levels, Cell], signs: Signs, scale: int, seed: int) -> FactorialEffect | None:
-    """The contrast, times `scale`, without its name; None where its cells have no seed or question in common."""
+def _contrast(cells: Mapping[Levels, Cell], signs: Signs, seed: int) -> _Contrast | None:
+    """The contrast scaled to -1 to 1; None where its cells have no seed or question in common."""
     seeds = sorted(set.intersection(*({s for s, _ in cells[c]} for c in signs))) if signs else []
     asked = [{q for s, q in cells[c] if s == one} for c in signs for one in seeds]
     about = {q: a.objects for c in signs for (_, q), a in cells[c].items()}
     questions = sorted(set.intersection(*asked), key=lambda q: (about[q], q)) if asked else []
     if not questions:
         return None
-    import numpy as np
-
-    from pipeline.statistics.bounds import difference_bounds
-    from pipeline.statistics.clusters import clusters_of
-    from pipeline.statistics.flips import sign_flip
-    from pipeline.statistics.seeds import crossed
-
     # Half of the cells count 1, half -1: divided by half their number even an interaction lies from -1 to 1, as every
     # paired difference does.
-    sums = [[sum(n * cells[c][s, q].correct for c, n in signs.items()) for q in questions] for s in seeds]
-    table = np.array(sums) / (len(signs) / 2)
-    clusters = clusters_of(tuple(about[q] for q in questions))
-    interval = p = None
-    if clusters.estimable:
-        low, high = difference_bounds(crossed(table, clusters), clusters)
-        interval = Interval(scale * float(low), scale * float(high))
-        p = float(sign_flip(table.mean(axis=0), clusters, seed))
+    half = len(signs) / 2
+    rows = [[sum(n * cells[c][s, q].correct for c, n in signs.items()) / half for q in questions] for s in seeds]
+    found = difference(rows, tuple(about[q] for q in questions), seed)
+    return _Contrast(found, len(questions), len(seeds), len(signs))
+
+
+def _effect(contrast: _Contrast, factors: tuple[str, ...], changes: tuple[str, ...]) -> FactorialEffect:
+    found, scale = contrast.found, len(factors)
+    ends = found.interval
     return FactorialEffect(
-        (), "", scale * float(table.mean()), interval, p, None, len(questions), len(seeds), len(signs)
+        factors=factors,
+        changes=changes,
+        value=scale * found.value,
+        interval=Interval(scale * ends.low, scale * ends.high) if ends else None,
+        p=found.p,
+        detectable=None if found.detectable is None else scale * found.detectable,
+        questions=contrast.questions,
+        seeds=contrast.seeds,
+        cells=contrast.cells,
     )
-
-
-def _adjusted(effects: Sequence[FactorialEffect]) -> list[FactorialEffect]:
-    tested = [e.p for e in effects if e.p is not None]
-    worth = iter(holm(tested))
-    return [e if e.p is None else replace(e, p_holm=next(worth)) for e in effects]

@@ -1,7 +1,8 @@
 """Accuracies and their intervals. scipy and NumPy are imported only where they are used.
 
-Sources: Wilson 1927 (the binomial interval); Kott and Carr 1997, Korn and Graubard 1998 (the same for clustered
-answers); Miller 2024 (error bars of evaluations, clustered questions).
+Sources: Wilson 1927 (the binomial interval); Korn and Graubard 1998, Franco, Little, Louis, Slud 2019 (intervals with
+an effective number of clustered answers); Miller 2024, arXiv 2411.00640 (error bars of evaluations, clustered
+questions); Bowyer, Aitchison, Ivanova 2025, arXiv 2503.01747 (why not the normal approximation below a few hundred).
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Objects drawn anew: the bootstrap over clusters, enumerated where they are few. NumPy is imported where it is used.
 
-Sources: Owen 2007, "The pigeonhole bootstrap" (resampling crossed objects with product weights); Cameron, Gelbach,
-Miller 2008 (few clusters).
+Sources: Owen 2007, "The pigeonhole bootstrap", and Owen and Eckles 2012 (crossed factors drawn apart, their weights
+multiplied); Davezies, D'Haultfoeuille, Guyonvarch 2021 (pairs of objects of one kind, drawn once for both places);
+Cameron, Gelbach, Miller 2008 (few clusters).
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ def resampled(outcomes: Sequence[Outcome], seed: int = 0) -> Interval | None:
     """Percentile interval of a mean over questions when objects, not questions, are drawn anew with replacement.
 
     A question's weight in a resample is the product over its objects of how often each was drawn: for questions about
-    one object this is the ordinary cluster bootstrap, for pairs and triples Owen's pigeonhole bootstrap. Resamples in
+    one object this is the ordinary cluster bootstrap, for pairs and triples the pigeonhole bootstrap with one draw of
+    objects for all places. Resamples in
     which no question has any weight (all draws on too few objects) have no mean and are left out. With up to
     `MOST_ENUMERATED` objects the distribution is exact, beyond it is drawn with `seed`.
 

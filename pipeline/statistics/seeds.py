@@ -54,6 +54,9 @@ class OverSeeds:
     """None for a single seed."""
     expected: float | None
     """The deviation over seeds that single answers alone would make, were all runs equally good; None likewise."""
+    most: float
+    """What that would be if every question were equally hard, sqrt(p (1 - p) / n): for one seed all that is known of
+    it. Where questions differ it is less, though with few seeds `expected` may be estimated higher."""
     interval: Interval | None
     """95 %, for the accuracy over new objects and new runs; for a single seed, new objects alone. None where the
     questions cannot show that objects differ."""
@@ -78,12 +81,14 @@ def over_seeds(answers: Sequence[Answer]) -> OverSeeds:
         interval = Interval(float(low), float(high))
     parts = _parts(table, clusters) if len(seeds) > 1 and clusters.estimable else None
     alone = _residual(table) if len(seeds) > 1 else None
+    mean = float(table.mean())
     return OverSeeds(
         spread=Spread(tuple(map(float, table.mean(axis=1)))),
         seeds=seeds,
         questions=len(objects),
         parts=parts,
         expected=None if alone is None else math.sqrt(alone / len(objects)),
+        most=math.sqrt(max(0.0, mean * (1 - mean)) / len(objects)),
         interval=interval,
     )
 
