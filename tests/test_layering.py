@@ -11,6 +11,7 @@ from tests.closure import ROOT, imported
 LEVELS = {
     "__init__": 0,
     "errors": 0,
+    "revisions": 0,
     "records": 0,
     "decoding": 0,
     "runtime": 0,
@@ -38,6 +39,7 @@ LEVELS = {
     "tracking": 7,
     "reporting": 7,
     "review": 8,
+    "comparison": 8,
     "stage": 7,
     "scales": 7,
     "cli": 9,
