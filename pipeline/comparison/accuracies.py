@@ -16,9 +16,7 @@ from pipeline.comparison.cached import (
 )
 from pipeline.comparison.locked import Locked
 from pipeline.statistics import Outcome, holm, paired
-
-WHOLE = ("choice", "combined")
-"""Measures that say that an answer is right, not only a part of it."""
+from pipeline.tracking.standings import WHOLE
 
 
 @dataclass(frozen=True)

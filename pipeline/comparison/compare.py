@@ -10,7 +10,6 @@ from pipeline.comparison.accuracies import Tested, tested_accuracies
 from pipeline.comparison.cached import Cache
 from pipeline.comparison.figures import Figures, moved_figures
 from pipeline.comparison.locked import (
-    LOCK_FILE,
     Change,
     Locked,
     StageChange,
@@ -21,6 +20,7 @@ from pipeline.comparison.locked import (
 )
 from pipeline.config import PARAMS_FILE
 from pipeline.revisions import Disk, Tree, find_commit
+from pipeline.tracking.committed import LOCK_FILE
 from pipeline.tracking.reproduction import flatten
 
 PLAN = "plan."

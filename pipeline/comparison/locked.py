@@ -9,9 +9,8 @@ from typing import Any
 import yaml
 
 from pipeline.errors import UserError
+from pipeline.tracking.committed import LOCK_FILE
 from pipeline.tracking.reproduction import flatten
-
-LOCK_FILE = "dvc.lock"
 
 
 @dataclass(frozen=True)
