@@ -274,7 +274,7 @@ def serve(root: Path, folder: Path) -> Iterator[str]:
             start_new_session=True,
         )
     try:
-        deadline = time.monotonic() + 120
+        deadline = time.monotonic() + 300
         while True:
             try:
                 with urlopen(f"http://127.0.0.1:{port}/health", timeout=2):
@@ -301,7 +301,7 @@ def words(folder: Path, address: str) -> str:
         [*command, *quiet, "--dump-dom", address],
         capture_output=True,
         text=True,
-        timeout=180,
+        timeout=300,
         check=True,
         env={**os.environ, "HOME": str(folder)},
     )
