@@ -104,6 +104,25 @@ def page() -> None:
     typer.echo(f"{write_page(Path())}: all reports on one page; open it in a browser")
 
 
+@app.command()
+def compare(
+    old: Annotated[str, typer.Argument(help="A Git revision: a hash, a tag, a branch, HEAD~1.")],
+    new: Annotated[str, typer.Argument(help="Another one; without it, what lies on disk now.")] = "",
+    json: Annotated[Path | None, typer.Option(help="Also write everything to this file, for machines.")] = None,
+) -> None:
+    """Say what differs between two revisions: parameters, stages, figures, and whether accuracies really changed."""
+    from dataclasses import asdict
+
+    from pipeline.artifacts import write_json
+    from pipeline.comparison import compare as compare_states
+    from pipeline.comparison import describe
+
+    found = compare_states(Path(), old, new)
+    if json is not None:
+        write_json(json, {"differs": found.differs, **asdict(found)})
+    typer.echo(describe(found))
+
+
 def main() -> None:
     """Run the command; bad input ends it with one line and status 1."""
     try:

@@ -11,6 +11,7 @@ from tests.closure import ROOT, imported
 LEVELS = {
     "__init__": 0,
     "errors": 0,
+    "revisions": 0,
     "records": 0,
     "decoding": 0,
     "runtime": 0,
@@ -39,6 +40,7 @@ LEVELS = {
     "reporting": 7,
     "speed": 8,
     "review": 9,
+    "comparison": 8,
     "stage": 7,
     "scales": 7,
     "cli": 10,
