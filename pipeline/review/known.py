@@ -214,6 +214,17 @@ BENCH = View(
         Column("Interval", "{low} to {high}"),
     )
 )
+STABILITY = View(
+    (
+        Column("Part", "{part}", HEAD),
+        Column("Case", "{case}", HEAD),
+        Column("Format", "{dtype}", WORDS),
+        Column("Finite", "{finite}", WORDS),
+        Column("Error", "{error}", MEASURED),
+        Column("Bound", "{bound}"),
+        Column("Verdict", "{verdict}", WORDS),
+    )
+)
 VIEWS = {
     "ablation": ABLATION,
     "agreement": AGREEMENT,
@@ -227,6 +238,7 @@ VIEWS = {
     "learning_curve": CURVE,
     "property_combinations": COMBINATIONS,
     "property_counts": COUNTS,
+    "stability": STABILITY,
     "touch": TOUCH,
     "video_lengths": _figures(1),
 }

@@ -18,7 +18,7 @@ from pipeline.review.readme import Section
 from pipeline.review.tables import Drawn, Shown, draw, show
 from pipeline.review.themes import BENCHES, EVERYWHERE, ORIGIN, OTHERS, SAMPLES, THEMES, BenchText, Theme
 from pipeline.review.traced import Grid, Piece, fill
-from pipeline.review.views import View
+from pipeline.stability.record import Judgement
 
 HEADLINE = (
     ("PC", "understanding", "Property comparison"),
@@ -112,7 +112,11 @@ def compose(root: Path) -> Page:
     """Read reports/ and dvc.yaml below `root`."""
     reports_dir = root / "reports"
     reports, benches = read_reports(reports_dir), read_benches(reports_dir)
-    shared = {e.name: [_shared(grid, e.title) for grid in find_grids(reports_dir, f"{e.name}.csv")] for e in EVERYWHERE}
+    told = {report.file(s.file): (report, s) for report in reports for s in report.readme.sections if s.file}
+    shared = {
+        e.name: [_shared(grid, e.title, *told.get(grid.file, ())) for grid in find_grids(reports_dir, f"{e.name}.csv")]
+        for e in EVERYWHERE
+    }
     return Page(
         chapters=tuple(_chapter(report) for report in reports),
         glance=_glance(reports),
@@ -175,8 +179,12 @@ def _audit(grid: Grid, section: Section, readme: str) -> Block:
     return Block(section.title, section.caption, readme, table=shown if urgent else None, counts=counts)
 
 
-def _shared(grid: Grid, title: str) -> Block:
-    return Block(title, "", "", table=show(grid, View(()), title, name=grid.file.replace("/", "-")[:-4]))
+def _shared(grid: Grid, title: str, report: Report | None = None, section: Section | None = None) -> Block:
+    """A table over all parts; what its report says about it, where that does."""
+    name, view = grid.file.replace("/", "-")[:-4], view_of(Path(grid.file).stem)
+    counts = tuple((v.value, grid.where("verdict", v.value)) for v in Judgement) if "verdict" in grid.columns else ()
+    caption, source = (section.caption, report.file("README.md")) if report and section else ("", "")
+    return Block(title, caption, source, table=show(grid, view, title, name=name), counts=counts)
 
 
 def _bench(bench: Bench) -> Block:
