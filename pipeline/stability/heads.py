@@ -26,7 +26,7 @@ from pipeline.stability.encoder import CLASSES, PART
 
 SIZES = (1e4, 1e30)
 """Of features."""
-WEIGHTS = (1.0, 1e4)
+HEAVIER = (1.0, 1e4)
 """By which heads' weights are multiplied."""
 
 
@@ -125,7 +125,7 @@ def huge_classifier(kind: type[PropertyClassifier], weight: float) -> PropertyCl
 
 
 def _huge() -> Iterator[Case]:
-    for kind, size, weight in itertools.product((PropertyClassifier, FrameVotes), SIZES, WEIGHTS):
+    for kind, size, weight in itertools.product((PropertyClassifier, FrameVotes), SIZES, HEAVIER):
         name = "votes" if kind is FrameVotes else "heads"
         yield Case(
             PART,

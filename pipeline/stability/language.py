@@ -24,7 +24,7 @@ from pipeline.stability.condition import magnification, rounded
 
 PART = "language model"
 DIM, FRAMES, LENGTH = 64, 4, 40
-SIZES = (0.0, 1e-30, 1e4)
+SIZES = (0.0, 1e-30, 1.0, 1e4)
 """Of tactile embeddings; at 1e4 a random connector's output is near the largest number of float16."""
 LONGEST = 480
 """Terms of the longest sum in the stand-in Llama."""

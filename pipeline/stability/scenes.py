@@ -153,10 +153,12 @@ def _energy(gap: Floats, dtype: Dtype) -> Floats:
 
 
 def bodies(side: int = 61) -> dict[str, Floats]:
-    """Heights in mm of a ball, a flat, and a needle of one pixel, side x side."""
+    """Heights in mm of a ball, smooth and rough, a flat, and a needle of one pixel, side x side."""
     spike = np.full((side, side), -50.0)
     spike[side // 2, side // 2] = 0
-    return {"ball": -ball(30 / side, side, 25.0), "flat": np.zeros((side, side)), "needle": spike}
+    smooth = -ball(30 / side, side, 25.0)
+    rough = smooth + 0.02 * np.random.default_rng(0).standard_normal((side, side))
+    return {"ball": smooth, "rough ball": rough, "flat": np.zeros((side, side)), "needle": spike}
 
 
 def _imprints() -> Iterator[Case]:
