@@ -31,11 +31,21 @@ from pipeline.records import (
     Video,
 )
 from pipeline.scales import compose
+from pipeline.stability.record import Judgement, StabilityRow
 from pipeline.tracking.reproduction import planned_stages
 from tests.closure import ROOT
 
 DIM = 8
 VIDEOS_AN_OBJECT = 3
+HARD_CASES = [
+    StabilityRow(part=p, case=c, dtype=d, finite=True, error=e, bound=b, verdict=Judgement.PASSED)
+    for p, c, d, e, b in (
+        ("projection", "all zero", "float64", None, None),
+        ("projection", "all zero", "bfloat16", 0.0031, 0.01),
+        ("projection", "huge", "bfloat16", 1.2e-7, 1e-5),
+        ("frames", "black", "uint8", 0.0, 0.0),
+    )
+]
 
 
 def fake_params(*overrides: str) -> Params:
@@ -63,6 +73,7 @@ def write_chain(root: Path, params: Params, *, objects: Sequence[str] = (), skil
     write_table(data / "videos.parquet", Video, videos)
     write_table(data / "splits.parquet", Assignment, assignments)
     write_csv(data / "audit" / "audit.csv", Finding, _audit(videos))
+    write_csv(data / "stability.csv", StabilityRow, HARD_CASES)
     pool = pool_of(Part.TEST, assignments, catalogue)
     questions = build_questions(pool, params.questions.evaluation.by_task(), seed=0, distinct=True)
     write_jsonl(data / "questions" / "evaluation.jsonl", questions)

@@ -148,25 +148,10 @@ def test_the_same_twice() -> None:
 
 
 @pytest.mark.parametrize("method", [*WAYS, None], ids=str)
-@pytest.mark.parametrize("force", [0.0, 1e-9, 1e6])
-def test_any_force_is_finite(method: Method | None, force: float) -> None:
-    for heights in BODIES.values():
-        imprint = press(heights, force, 1.0, PITCH, method)
-        assert np.isfinite(imprint.skins).all()
-        assert np.isfinite(imprint.radii).all()
-        if force == 0:
-            assert not imprint.skins.any()
-
-
-@pytest.mark.filterwarnings("ignore::pipeline.scenes.elastic.solver.NotConverged")
-@pytest.mark.parametrize("method", [*WAYS, None], ids=str)
-@pytest.mark.parametrize("ratio", [1e-4, 1e4])
-def test_any_modulus_is_finite(method: Method | None, ratio: float) -> None:
-    needle = np.full((SIDE, SIDE), -50.0, np.float32)
-    needle[SIDE // 2, SIDE // 2] = 0
-    for heights in (*BODIES.values(), needle):
-        imprint = press(heights, 8.0, 0.25 * ratio, PITCH, method)
-        assert np.isfinite(imprint.skins).all()
+@pytest.mark.parametrize("body", BODIES)
+def test_no_force_makes_no_imprint(method: Method | None, body: str) -> None:
+    """That any other force and modulus makes a finite one, pipeline.stability.scenes has."""
+    assert not press(BODIES[body], 0.0, 1.0, PITCH, method).skins.any()
 
 
 def test_a_contact_over_the_whole_patch() -> None:

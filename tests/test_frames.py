@@ -82,14 +82,10 @@ def test_what_is_held_in_memory_changes_nothing(tmp_path: Path, name: str, monke
         np.testing.assert_array_equal(one.image, other.image)
 
 
-def test_white_to_black_is_the_greatest_difference() -> None:
-    black, white = (frame[..., 0] for frame in flashing(2))
-    assert difference(black, white) == difference(white, black) == 255 * 30 * 40
-    large = np.full((4320, 7680), 255, np.uint8)
-    assert difference(large, np.zeros_like(large)) == 255 * large.size, "exact beyond 32 bits"
-    padded = np.zeros((30, 64), np.uint8)
+def test_what_stands_behind_a_lines_end_does_not_count() -> None:
+    white, padded = np.full((30, 40), 255, np.uint8), np.zeros((30, 64), np.uint8)
     padded[:, 40:] = 99
-    assert difference(padded[:, :40], white) == 255 * 30 * 40, "what stands behind a line's end does not count"
+    assert difference(padded[:, :40], white) == 255 * 30 * 40
 
 
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**32))

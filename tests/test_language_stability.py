@@ -20,6 +20,7 @@ from pipeline.models.octopi import OctopiForCausalLM
 from pipeline.prompts import IGNORE_INDEX, Encoded, encode
 from pipeline.records import Embedding, Opd, Question
 from pipeline.sections import LanguageConfig, LoraTrainConfig
+from pipeline.stability.language_ways import ALPHA, RANK
 from pipeline.training.language import add_lora, assemble
 from tests.language import DIM, asking, language, material, model, questions, store
 
@@ -105,8 +106,6 @@ def test_a_row_that_is_all_padding_spoils_nothing(side: str, model: OctopiForCau
     output.loss.backward()
     assert output.loss.isfinite()
     assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())
-    alone = model(ids[:1], positions[:1]).logits
-    torch.testing.assert_close(model(ids, positions, mask).logits[:1], alone, atol=2e-6, rtol=0)
 
 
 def test_labels_that_are_all_ignored_weigh_nothing(model: OctopiForCausalLM) -> None:
@@ -152,7 +151,7 @@ def test_answers_of_one_token_are_learnt(model: OctopiForCausalLM) -> None:
 
 # Adapters
 
-PAPER = LoraTrainConfig(samples=1, rank=128, alpha=256)
+PAPER = LoraTrainConfig(samples=1, rank=RANK, alpha=ALPHA)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
@@ -165,9 +164,9 @@ def test_a_fresh_adapter_of_the_papers_size_is_the_identity(dtype: torch.dtype, 
     assert torch.equal(model.eval()(ids, torch.zeros(3, 0, DIM)).logits, before)
 
 
-@pytest.mark.parametrize(("dtype", "bound"), [(torch.float64, 1e-6), (torch.float32, 1e-4)])
-def test_a_merged_adapter_is_the_sum_of_both(dtype: torch.dtype, bound: float, model: OctopiForCausalLM) -> None:
-    """W + alpha / rank B A, by hand; logits of float64 only to transformers' normalisation, which stays float32."""
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_a_merged_adapter_is_the_sum_of_both(dtype: torch.dtype, model: OctopiForCausalLM) -> None:
+    """W + alpha / rank B A, by hand; how near that comes in logits is among the hard cases."""
     add_lora(model, PAPER)
     for name, parameter in model.named_parameters():
         if "lora_B" in name:
@@ -175,34 +174,16 @@ def test_a_merged_adapter_is_the_sum_of_both(dtype: torch.dtype, bound: float, m
     model.eval().to(dtype)
     layer = model.llm.get_base_model().model.layers[1].self_attn.q_proj
     low, high = layer.lora_A["default"].weight.double(), layer.lora_B["default"].weight.double()
-    expected = layer.base_layer.weight.double() + 256 / 128 * high @ low
+    expected = layer.base_layer.weight.double() + ALPHA / RANK * high @ low
     ids = torch.randint(4, 200, (3, 40), generator=torch.manual_seed(0))
     embeddings = model.embed(ids, torch.zeros(3, 0, DIM))
     apart = model.llm(inputs_embeds=embeddings).logits
     merged = copy.deepcopy(model.llm).merge_and_unload()
-    torch.testing.assert_close(
-        merged.model.layers[1].self_attn.q_proj.weight.double(), expected, atol=1e-3 * bound, rtol=0
-    )
-    together = merged(inputs_embeds=embeddings).logits
-    torch.testing.assert_close(together, apart, atol=bound * float(apart.abs().max()), rtol=0)
+    sizes = layer.base_layer.weight.double().abs() + ALPHA / RANK * high.abs() @ low.abs()
+    off = (merged.model.layers[1].self_attn.q_proj.weight.double() - expected).abs()
+    assert (off <= (RANK + 2) * torch.finfo(dtype).eps * sizes).all()
     with model.llm.disable_adapter():
         assert not torch.allclose(model.llm(inputs_embeds=embeddings).logits, apart, atol=1e-3), "it does something"
-
-
-# Fewer bits
-
-
-def test_bfloat16_changes_logits_by_little(language: LanguageConfig, model: OctopiForCausalLM) -> None:
-    ids = torch.randint(4, 200, (8, 60), generator=torch.manual_seed(0))
-    ids[:, 3], ids[:, 4:8], ids[:, 8] = model.start_id, model.frame_id, model.end_id
-    features = torch.randn(8, 4, DIM, generator=torch.manual_seed(1))
-    half = OctopiForCausalLM.from_base(language.weights, DIM, dtype="bfloat16").eval()
-    half.connector.load_state_dict(model.connector.state_dict())
-    with torch.no_grad():
-        exact, found = model(ids, features).logits, half(ids, features).logits.float()
-    error = float((found - exact).abs().max() / exact.abs().max())
-    assert 0 < error < 0.05, "some three digits"
-    assert (found.argmax(-1) == exact.argmax(-1)).float().mean() > 0.9
 
 
 # NaN

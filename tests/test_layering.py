@@ -36,6 +36,7 @@ LEVELS = {
     "models": 5,
     "training": 6,
     "evaluation": 6,
+    "stability": 6,
     "tracking": 7,
     "reporting": 7,
     "speed": 8,

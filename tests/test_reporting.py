@@ -27,9 +27,11 @@ from pipeline.reporting.figures import project
 from pipeline.reporting.inputs import read_inputs, why_empty
 from pipeline.reporting.provenance import provenance
 from pipeline.reporting.published import find, published
+from pipeline.reporting.stability import stability_table
+from pipeline.stability.record import Judgement, StabilityRow
 from pipeline.statistics import Outcome, resampled
 from tests.closure import ROOT
-from tests.fake_chain import fake_params, write_chain
+from tests.fake_chain import HARD_CASES, fake_params, write_chain
 
 TABLES = {
     "all_variants",
@@ -44,6 +46,7 @@ TABLES = {
     "property_counts",
     "property_description",
     "scenario_reasoning",
+    "stability",
     "understanding",
     "video_lengths",
 }
@@ -234,6 +237,30 @@ def test_an_audit_without_warnings_says_so() -> None:
     table = audit_table([finding("contact", "all", Severity.INFO)])
     assert table.markdown() == "Nothing.\n"
     assert table.csv().splitlines() == ["check,item,measured,expected,severity", "contact,all,measured all,,info"]
+
+
+def test_hard_cases_stand_on_the_page_by_part_and_format_and_whole_in_the_csv(chain: Path, params: Params) -> None:
+    folder = report(chain, params)
+    written = rows(folder, "stability")
+    assert [StabilityRow.model_validate(row) for row in written] == HARD_CASES
+    section = (folder / "README.md").read_text().split("\n## Numerical stability\n")[1].split("\n## ")[0]
+    assert "4 rows, 0 of them failed" in section
+    assert "no rows in float16" in section
+    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in section.splitlines() if line.startswith("|")]
+    assert lines[0] == ["Part", "Format", "Cases", "Failed", "Nearest to its bound", "Error", "Bound"]
+    assert lines[2:] == [
+        ["projection", "float64", "1", "0", "", "", ""],
+        ["projection", "bfloat16", "2", "0", "all zero", "3.1e-03", "1.0e-02"],
+        ["frames", "uint8", "1", "0", "black", "0", "0"],
+    ]
+
+
+def test_a_failed_hard_case_is_counted_and_outweighs_all_that_have_bounds() -> None:
+    red = HARD_CASES[3].model_copy(update={"error": 1e-9, "verdict": Judgement.FAILED, "dtype": "float16"})
+    table = stability_table([red, red.model_copy(update={"case": "near", "bound": 2e-9, "error": 1.9e-9})])
+    assert "2 rows, 2 of them failed" in table.caption
+    assert "float16 ran on a CUDA device" in table.caption
+    assert "| frames | float16 | 2 | 2 | black | 1.0e-09 | 0 |" in table.markdown()
 
 
 def test_a_chain_that_was_not_audited_has_no_audit_section(copy: Path, params: Params) -> None:

@@ -26,6 +26,7 @@ from pipeline.records import (
 )
 from pipeline.reporting.published import DATASET, Published, find
 from pipeline.splits import assign
+from pipeline.stability.record import STABILITY_FILE, StabilityRow
 
 Axes = tuple[Encoder, Lora, Opd]
 GATE_FILE = "gate.csv"
@@ -49,6 +50,8 @@ class Inputs:
     """By encoder seed: what the heads say about test videos."""
     findings: Sequence[Finding]
     """The data audit's."""
+    hard_cases: Sequence[StabilityRow]
+    """Of every part, judged."""
     judged: Mapping[str, Sequence[Judged]]
     """By model: what the cross-validation over all objects found."""
     gate: Mapping[Task, bool]
@@ -101,7 +104,7 @@ def read_inputs(params: Params, root: Path) -> Inputs:
         if q.part == Part.TEST
     }
     files = {key: data / "scores" / key / "scores.parquet" for key in params.plan.variants}
-    audit = data / "audit" / "audit.csv"
+    audit, hard = data / "audit" / "audit.csv", data / STABILITY_FILE
     compared = {name: data / "cross_validation" / name / "judged.parquet" for name in params.plan.cross_validation}
     judged = {seed: data / "encoder" / str(seed) / "classifications.parquet" for seed in params.plan.encoder_seeds}
     return Inputs(
@@ -122,6 +125,7 @@ def read_inputs(params: Params, root: Path) -> Inputs:
             if file.is_file()
         },
         findings=read_csv(audit, Finding) if audit.is_file() else (),
+        hard_cases=read_csv(hard, StabilityRow) if hard.is_file() else (),
         judged={name: read_table(file, Judged) for name, file in compared.items() if file.is_file()},
         gate=_read_gate(root / params.language.weights),
     )

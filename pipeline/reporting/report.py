@@ -22,6 +22,7 @@ from pipeline.reporting.provenance import provenance
 from pipeline.reporting.results import headline, result_tables
 from pipeline.reporting.samples import FOLDER as SAMPLES
 from pipeline.reporting.samples import write_samples
+from pipeline.reporting.stability import stability_table
 from pipeline.reporting.table import Table
 
 COSTS = Path("reports") / "bench" / "encoder.json"
@@ -40,12 +41,13 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     """
     inputs = read_inputs(params, root)
     folder = root / "reports" / params.report_name
-    audit = [audit_table(inputs.findings)] if inputs.findings else []
+    checked = [audit_table(inputs.findings)] if inputs.findings else []
+    checked += [stability_table(inputs.hard_cases)] if inputs.hard_cases else []
     # NumPy comes with it, which stages that only ask for a report's name should not wait for.
     from pipeline.reporting.encoders import encoder_tables
 
     compared = encoder_tables(inputs.judged, inputs.catalogue, _costs(root), params.cross_validation.folds)
-    tables = [*result_tables(inputs), *language_tables(inputs), *compared, *dataset_tables(inputs), *audit]
+    tables = [*result_tables(inputs), *language_tables(inputs), *compared, *dataset_tables(inputs), *checked]
     for table in tables:
         write_text(folder / table.folder / f"{table.name}.csv", table.csv())
         write_text(

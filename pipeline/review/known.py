@@ -154,6 +154,17 @@ BENCH = View(
         Column("Interval", "{low} to {high}"),
     )
 )
+STABILITY = View(
+    (
+        Column("Part", "{part}", HEAD),
+        Column("Case", "{case}", HEAD),
+        Column("Format", "{dtype}", WORDS),
+        Column("Finite", "{finite}", WORDS),
+        Column("Error", "{error}", MEASURED),
+        Column("Bound", "{bound}"),
+        Column("Verdict", "{verdict}", WORDS),
+    )
+)
 VIEWS = LANGUAGE | {
     "agreement": AGREEMENT,
     "annotator_agreement": _figures(3),
@@ -164,6 +175,7 @@ VIEWS = LANGUAGE | {
     "learning_curve": CURVE,
     "property_combinations": COMBINATIONS,
     "property_counts": COUNTS,
+    "stability": STABILITY,
     "video_lengths": _figures(1),
 }
 ACCURACIES = (

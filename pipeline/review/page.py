@@ -20,7 +20,7 @@ from pipeline.review.speed import speed_blocks, speed_gaps
 from pipeline.review.tables import Drawn, draw, show
 from pipeline.review.themes import BENCHES, EVERYWHERE, ORIGIN, OTHERS, SAMPLES, THEMES, BenchText, Theme
 from pipeline.review.traced import Grid, Piece, fill
-from pipeline.review.views import View
+from pipeline.stability.record import Judgement
 
 HEADLINE = (
     ("PC", "understanding", "Property comparison"),
@@ -91,8 +91,9 @@ def compose(root: Path) -> Page:
     """Read reports/ and dvc.yaml below `root`."""
     reports_dir = root / "reports"
     reports, benches = read_reports(reports_dir), read_benches(reports_dir)
+    told = {report.file(s.file): (report, s) for report in reports for s in report.readme.sections if s.file}
     grids = {e.name: find_grids(reports_dir, f"{e.name}.csv") for e in EVERYWHERE}
-    stability = next(e for e in EVERYWHERE if e.name == "stability")
+    title = next(e.title for e in EVERYWHERE if e.name == "stability")
     speed = [block for grid in grids["speed_error"] for block in speed_blocks(reports_dir, grid)]
     missing = gaps(reports, benches, [name for name, found in grids.items() if found])
     return Page(
@@ -100,7 +101,7 @@ def compose(root: Path) -> Page:
         glance=_glance(reports),
         chain=draw_chain(root / "dvc.yaml"),
         speed=(*speed, *(_bench(bench) for bench in benches if bench.grid)),
-        stability=tuple(_shared(grid, stability.title) for grid in grids[stability.name]),
+        stability=tuple(_shared(grid, title, *told.get(grid.file, ())) for grid in grids["stability"]),
         missing=(*missing, *speed_gaps(reports_dir)),
     )
 
@@ -157,8 +158,12 @@ def _audit(grid: Grid, section: Section, readme: str) -> Block:
     return Block(section.title, section.caption, readme, table=shown if urgent else None, counts=counts)
 
 
-def _shared(grid: Grid, title: str) -> Block:
-    return Block(title, "", "", table=show(grid, View(()), title, name=grid.file.replace("/", "-")[:-4]))
+def _shared(grid: Grid, title: str, report: Report | None = None, section: Section | None = None) -> Block:
+    """A table over all parts; what its report says about it, where that does."""
+    name, view = grid.file.replace("/", "-")[:-4], view_of(Path(grid.file).stem)
+    counts = tuple((v.value, grid.where("verdict", v.value)) for v in Judgement) if "verdict" in grid.columns else ()
+    caption, source = (section.caption, report.file("README.md")) if report and section else ("", "")
+    return Block(title, caption, source, table=show(grid, view, title, name=name), counts=counts)
 
 
 def _bench(bench: Bench) -> Block:

@@ -83,7 +83,7 @@ def planned_stages(plan: Plan) -> list[PlannedStage]:
             for stage in ("answer", "grade")
             for key, v in plan.variants.items()
         ),
-        PlannedStage("report"),
+        *(PlannedStage(name) for name in ("stability", "report")),
     ]
 
 
