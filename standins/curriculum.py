@@ -14,7 +14,7 @@ from standins.describing import Style, property_words
 from standins.documents import Builder, Document, Hint
 from standins.matching import Reach, matching, matching_one, repetition
 from standins.vocabulary import EOS, words_of
-from standins.world import World, draw_fact, load_situations, real_catalogue
+from standins.world import World, draw_fact, load_situations, real_catalogue, reworded
 
 Write = Callable[[World, random.Random], Document]
 
@@ -150,6 +150,14 @@ def fact(_: World, rng: random.Random) -> Document:
     return builder.decided(said.word, 2.0).said(said.end + EOS, 0.1).build()
 
 
+def wanted(_: World, rng: random.Random) -> Document:
+    """What a situation asks for, where its question is put with no object to choose: the same fact, found by asking."""
+    said = draw_fact(rng)
+    question = rng.choice(load_situations().openings).format(situation=said.situation)
+    builder = Builder("fact").given(f"USER: {question} What is it like? ASSISTANT:", Hint(asked=said.asked))
+    return builder.given(f" Something{said.joint}").decided(said.word, 2.0).said(f".{EOS}", 0.1).build()
+
+
 def situations(world: World, rng: random.Random) -> Document:
     """Which of two objects suits a situation, in every mode, with slots and without."""
     if rng.random() < 0.25:
@@ -158,6 +166,11 @@ def situations(world: World, rng: random.Random) -> Document:
     style = rng.choice((Style.SHORT, Style.STRUCTURED, Style.FULL))
     known = mode == Opd.NONE or rng.random() < 0.5
     return converse(world, Task.PSR, mode, rng, Manner(style, slots=known, blended=_often(rng)))
+
+
+def rephrased(world: World, rng: random.Random) -> Document:
+    """The same in wordings of which only the situation makes sense."""
+    return situations(reworded(world, rng), rng)
 
 
 def repeat(_: World, rng: random.Random) -> Document:
@@ -192,8 +205,19 @@ def matched_fully(world: World, rng: random.Random) -> Document:
 
 
 def everything(world: World, rng: random.Random) -> Document:
-    """Every conversation of the pipeline as it is, with and without slots."""
-    weights = {full: 6, slots: 5, told: 5, free: 2, situations: 4, matched: 2, matched_fully: 6}
+    """Every conversation of the pipeline as it is, with and without slots; and the facts that scenarios rest on."""
+    weights = {
+        full: 6,
+        slots: 5,
+        told: 8,
+        free: 2,
+        situations: 5,
+        rephrased: 6,
+        fact: 3,
+        wanted: 6,
+        matched: 2,
+        matched_fully: 6,
+    }
     return rng.choices(tuple(weights), tuple(weights.values()))[0](world, rng)
 
 
@@ -214,11 +238,11 @@ FORMATS = (
     Format("asked first", asked_first, COMPARING),
     Format("full", full, COMPARING, replay=2.0),
     Format("slots", slots, COMPARING, most=36, replay=3.0),
-    Format("told", told, (Task.OPD, RESTATED, *COMPARING), most=84, replay=3.0),
+    Format("told", told, (Task.OPD, RESTATED, *COMPARING), most=108, replay=3.0),
     Format("free", free, COMPARING, most=36),
     Format("situations", situations, (Task.PSR,), earlier=0.3, replay=2.0, most=60),
-    Format("repeated", repeat, ("repetition",), earlier=0.3, most=90, enlarge=6.0),
-    Format("named", named, (Task.POM,), earlier=0.3, replay=2.0, most=90),
-    Format("matched", matched, (Task.POM,), earlier=0.25, replay=2.0, most=78),
-    Format("everything", everything, (Task.OPD, RESTATED, *COMPARING, Task.PSR, Task.POM), earlier=0.15, most=6),
+    Format("repeated", repeat, ("repetition",), earlier=0.3, enlarge=6.0),
+    Format("named", named, (Task.POM,), earlier=0.3, replay=2.0, most=102),
+    Format("matched", matched, (Task.POM,), earlier=0.25, replay=2.0, most=102),
+    Format("everything", everything, (Task.OPD, RESTATED, *COMPARING, Task.PSR, Task.POM), earlier=0.15, most=42),
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import random
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Literal
@@ -24,6 +24,8 @@ from standins.vocabulary import words_of
 Labels = tuple[int, ...]
 ODD_NAMES = 0.4
 """Share of training's names that are made of any words."""
+PLAIN_NAMES = 0.6
+"""Share of the other names that are an adjective and a noun; the rest name a part or an amount of something."""
 UNSEEN = 2
 """Situations at the end of each list that are told as facts and never asked about."""
 
@@ -135,26 +137,63 @@ def make_world(
 def _draw_name(rng: random.Random, held: bool) -> str:
     situations = load_situations()
     if not held and rng.random() < ODD_NAMES:
-        # Any words in any order: whoever copies these can copy every name.
-        words = rng.choices((*spare_words(), *situations.nouns), k=rng.randint(1, 3))
-    else:
-        while True:
-            words = [rng.choice(situations.adjectives), rng.choice(situations.nouns)]
-            if held_out_name(*words) == held:
-                break
-    return f"{'an' if words[0][0] in 'aeiou' else 'a'} {' '.join(words)}"
+        return _odd_name(rng)
+    while True:
+        words = [rng.choice(situations.adjectives), rng.choice(situations.nouns)]
+        if held_out_name(*words) == held:
+            break
+    whole, part = " ".join(words), rng.choice(situations.nouns)
+    if rng.random() < PLAIN_NAMES:
+        return _with_article(whole)
+    forms = (
+        f"{_with_article(whole)}'s {part}",
+        f"{_with_article(part)} of {whole}",
+        f"the {rng.choice(situations.adjectives)} {part} of {_with_article(whole)}",
+        f"the {part} of {_with_article(whole)}'s {rng.choice(situations.nouns)}",
+    )
+    return rng.choice(forms)
+
+
+def _odd_name(rng: random.Random) -> str:
+    """Any words in any order, now and then joined as in names of parts: whoever copies these can copy every name."""
+    words = rng.choices((*spare_words(), *load_situations().nouns), k=rng.randint(1, 4))
+    name = words[0]
+    for word in words[1:]:
+        name += rng.choice((" ", " ", " ", "'s ", "' ", " of ", " of a ", " on a ")) + word
+    return name if rng.random() < 0.1 else _with_article(name)
+
+
+def _with_article(name: str) -> str:
+    return f"{'an' if name[0] in 'aeiou' else 'a'} {name}"
 
 
 @cache
 def questions(kind: Literal["training", "seen", "unseen"]) -> tuple[Scenario, ...]:
     """Scenarios for training, of seen kinds in a wording kept for the gate, and of unseen kinds."""
+    openings = load_situations().openings if kind != "seen" else (load_situations().held_out_opening,)
+    return _scenarios(openings, unseen=kind == "unseen")
+
+
+def reworded(world: World, rng: random.Random) -> World:
+    """The same world, its scenarios asked for in random words: whoever answers these reads the situation alone."""
+    opening = f"{rng.choice(('Which', 'What', 'Here', 'Someone'))} {' '.join(_filler(rng))} {{situation}}"
+    opening = " ".join([opening, *_filler(rng)]).replace("  ", " ") + rng.choice("?.")
+    language = world.catalogue.language.model_copy(update={"scenarios": _scenarios((opening,), unseen=False)})
+    catalogue = Catalogue.model_construct(language=language, objects=world.catalogue.objects)
+    return World(replace(world.pool, catalogue=catalogue))
+
+
+def _filler(rng: random.Random) -> list[str]:
+    return rng.choices(spare_words(), k=rng.randint(0, 4))
+
+
+def _scenarios(openings: Sequence[str], *, unseen: bool) -> tuple[Scenario, ...]:
     situations, properties = load_situations(), {p.name: p for p in real_catalogue().properties}
     scenarios = []
     for need in situations.situations:
         prop = properties[need.property]
         level = need.level(prop)
-        chosen = need.situations[-UNSEEN:] if kind == "unseen" else need.situations[:-UNSEEN]
-        openings = (situations.held_out_opening,) if kind == "seen" else situations.openings
+        chosen = need.situations[-UNSEEN:] if unseen else need.situations[:-UNSEEN]
         for situation, opening in itertools.product(chosen, openings):
             others = tuple(i for i in range(len(prop.levels)) if i != level)
             question = opening.format(situation=situation)
@@ -174,6 +213,9 @@ class Fact:
     end: str
     asked: int
     """Property and direction, as `documents.Hint` numbers them."""
+    situation: str
+    joint: str
+    """What stands between "something" and the class."""
 
 
 def draw_fact(rng: random.Random) -> Fact:
@@ -189,4 +231,4 @@ def draw_fact(rng: random.Random) -> Fact:
     opening += situation
     joint = " with" if " bumps" in word else ""
     asked = 2 * index + (need.wanted == "least")
-    return Fact(opening[0].upper() + opening[1:], middle + joint, f" {word}", after, asked)
+    return Fact(opening[0].upper() + opening[1:], middle + joint, f" {word}", after, asked, situation, joint)
