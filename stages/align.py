@@ -9,7 +9,6 @@ from pipeline.records import Measurement, Question
 from pipeline.stage import DATA, stage
 from pipeline.tracking import live_run
 from pipeline.training.language import Job, Material, align, assemble
-from pipeline.training.trainer import fingerprint
 
 
 def main() -> None:
@@ -27,7 +26,7 @@ def main() -> None:
             seed=params.seed + plan.seed,
         )
         model, data = assemble(material, params.align.samples, "align")
-        mark = fingerprint(params.align, params.language, params.frames, params.encoder, plan, params.seed, *inputs)
+        mark = material.mark(params.align, *inputs)
         with live_run(params, run.name, Path()) as live:
             trained = align(model, data, params.align, params.runtime, Job(run.name, mark, material.seed, live.log))
         run.finish_training(trained.history)

@@ -10,7 +10,6 @@ from pipeline.records import Measurement, Question
 from pipeline.stage import DATA, stage
 from pipeline.tracking import live_run
 from pipeline.training.language import Job, Material, add_lora, assemble, finetune_lora
-from pipeline.training.trainer import fingerprint
 
 
 def main() -> None:
@@ -33,7 +32,7 @@ def main() -> None:
         )
         model, data = assemble(material, params.lora.samples, "lora", aligned=inputs[2].parent)
         add_lora(model, params.lora)
-        mark = fingerprint(params.lora, params.language, params.frames, params.encoder, plan, params.seed, *inputs)
+        mark = material.mark(params.lora, *inputs)
         with live_run(params, run.name, Path()) as live:
             trained = finetune_lora(
                 model, data, params.lora, params.runtime, Job(run.name, mark, material.seed, live.log)

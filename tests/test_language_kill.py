@@ -126,6 +126,21 @@ def test_killed_by_the_system_and_resumed_ends_the_same(
         assert torch.equal(again.state[name], value), name
 
 
+def test_another_language_model_under_the_same_name_begins_anew(
+    language: LanguageConfig, questions: list[Question], store: EmbeddingStore, tmp_path: Path
+) -> None:
+    """A checkpoint holds only what is trained: gone on with on other weights, it would be neither's."""
+    weights, inputs = tmp_path / "llm", tmp_path / "train.jsonl"
+    weights.mkdir()
+    write_jsonl(inputs, [])
+    (weights / "model.safetensors").write_bytes(b"one")
+    held = material(language.model_copy(update={"weights": str(weights)}), questions, store)
+    before = held.mark(SMALL, inputs)
+    assert held.mark(SMALL, inputs) == before
+    (weights / "model.safetensors").write_bytes(b"two")
+    assert held.mark(SMALL, inputs) != before
+
+
 @pytest.mark.parametrize("factor", [100, 1e30])
 def test_a_rate_too_high_ends_finite_or_in_one_line(
     factor: float,

@@ -23,6 +23,7 @@ from pipeline.training.trainer import (
     Trained,
     Watch,
     checkpoint_dir,
+    fingerprint,
     train,
     training_arguments,
 )
@@ -59,6 +60,14 @@ class Material:
     per_video: int
     flip_probability: float
     seed: int
+
+    def mark(self, config: TrainConfig, *inputs: Path) -> str:
+        """A fingerprint of all that a training depends on; `inputs` are the files of questions and embeddings, and
+        what was trained before."""
+        weights = Path(self.language.weights)
+        return fingerprint(
+            config, self.language, self.opd, self.per_video, str(self.flip_probability), self.seed, weights, *inputs
+        )
 
 
 def assemble(

@@ -158,14 +158,18 @@ class Watch(TrainerCallback):
 
 
 def fingerprint(*parts: BaseModel | str | int | Path) -> str:
-    """A short hash of settings and input files: checkpoints of one training are never taken for another's."""
+    """A short hash of settings and of input files, or all files of folders: checkpoints of one training are never
+    taken for another's."""
     digest = hashlib.sha256()
     for part in parts:
         if isinstance(part, BaseModel):
             digest.update(json.dumps(part.model_dump(mode="json"), sort_keys=True).encode())
         elif isinstance(part, Path):
-            with part.open("rb") as stream:
-                digest.update(hashlib.file_digest(stream, "sha256").digest())
+            for file in sorted(part.iterdir()) if part.is_dir() else [part]:
+                if file.is_file():
+                    digest.update(file.name.encode())
+                    with file.open("rb") as stream:
+                        digest.update(hashlib.file_digest(stream, "sha256").digest())
         else:
             digest.update(str(part).encode())
         digest.update(b"\0")
