@@ -15,7 +15,7 @@ from standins.asking import Distance, ask_all, conclude
 from standins.describing import Style, short, shuffled
 from standins.documents import UNKNOWN, Builder, Document, Hint
 from standins.vocabulary import EOS
-from standins.world import World
+from standins.world import World, misread
 
 MAIN = 2.0
 """Loss weight of what decides in a conversation's conclusion; a follow-up's is 1."""
@@ -40,6 +40,8 @@ class Manner:
     """Loss weight of the classes said in descriptions whose slots hold them."""
     facts: bool = False
     """Begin with what each object is like (for matching)."""
+    misread: bool = False
+    """Feel some objects a class off what they are like."""
     follow_ups: int = 0
     """At most so many short questions about the same objects after the conversation."""
 
@@ -56,12 +58,15 @@ def draw_draft(world: World, task: Task, rng: random.Random) -> Draft:
 def converse(world: World, task: Task, mode: Opd, rng: random.Random, manner: Manner = Manner()) -> Document:
     """One conversation of a task under an OPD mode."""
     draft = draw_draft(world, task, rng)
+    felt = misread(world, draft.objects, rng) if manner.misread else world
     turns = [t for d in draft.dialogues if d.opd == mode for t in d.turns]
     told = f"{' '.join(rng.sample(FACTS, len(FACTS)))} " if manner.facts else ""
-    filled = [Turn(user=_mark(t.user), assistant=_restyle(t.assistant, world, draft, manner.style)) for t in turns]
+    filled = [
+        Turn(user=_mark(t.user), assistant=_restyle(t.assistant, world, felt, draft, manner.style)) for t in turns
+    ]
     filled[0] = filled[0].model_copy(update={"user": told + filled[0].user})
     rendered = render(filled, system_prompt="", frames=0, eos=EOS, complete=True)
-    writer, position = _Writer(Builder(task), world, draft, manner, rng), 0
+    writer, position = _Writer(Builder(task), felt, world, draft, manner, rng), 0
     for start, stop in rendered.answers:
         writer.question(rendered.text[position:start])
         writer.answer(rendered.text[start : stop - len(EOS)])
@@ -77,6 +82,9 @@ def converse(world: World, task: Task, mode: Opd, rng: random.Random, manner: Ma
 class _Writer:
     builder: Builder
     world: World
+    """As it is felt."""
+    told: World
+    """As it is."""
     draft: Draft
     manner: Manner
     rng: random.Random
@@ -90,7 +98,7 @@ class _Writer:
             if part and part[-1] in VIDEOS:
                 self._slot(part[:-1], VIDEOS.index(part[-1]))
             elif part and part[-1] in FACTS:
-                tell(self.builder, self.world, self.draft.objects[FACTS.index(part[-1])], part[:-1])
+                tell(self.builder, self.told, self.draft.objects[FACTS.index(part[-1])], part[:-1])
             else:
                 self.builder.given(part, Hint(asked=self.asked) if text.endswith(part) else Hint())
 
@@ -183,16 +191,20 @@ def _mark(user: str) -> str:
     return user
 
 
-def _restyle(answer: str, world: World, draft: Draft, style: Style) -> str:
-    """The answer with other descriptions in place of the full ones."""
+def _restyle(answer: str, world: World, felt: World, draft: Draft, style: Style) -> str:
+    """The answer with other descriptions, of what is felt, in place of the full ones."""
+    replaced = {world.catalogue.describe(o): _styled(felt, o, style) for o in draft.objects}
+    # All at once: what one object feels like may be how another is described.
+    return re.sub("|".join(map(re.escape, replaced)), lambda found: replaced[found[0]], answer)
+
+
+def _styled(world: World, object_id: str, style: Style) -> str:
     catalogue = world.catalogue
-    for object_id in draft.objects:
-        labels, whole = catalogue.labels(object_id), catalogue.describe(object_id)
-        match style:
-            case Style.STRUCTURED:
-                answer = answer.replace(whole, catalogue.structured(labels))
-            case Style.SHORT:
-                answer = answer.replace(whole, f"{short(catalogue, labels)}.")
-            case Style.FREE:
-                answer = answer.replace(whole, catalogue.unstructured(object_id))
-    return answer
+    match style:
+        case Style.STRUCTURED:
+            return catalogue.structured(catalogue.labels(object_id))
+        case Style.SHORT:
+            return f"{short(catalogue, catalogue.labels(object_id))}."
+        case Style.FREE:
+            return catalogue.unstructured(object_id)
+    return catalogue.describe(object_id)

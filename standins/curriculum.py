@@ -14,7 +14,7 @@ from standins.describing import Style, property_words
 from standins.documents import Builder, Document, Hint
 from standins.matching import Reach, matching, matching_one, repetition
 from standins.vocabulary import EOS, words_of
-from standins.world import World, draw_fact, load_situations, real_catalogue, reworded
+from standins.world import World, draw_fact, load_situations, real_catalogue, reworded, wording
 
 Write = Callable[[World, random.Random], Document]
 
@@ -151,10 +151,10 @@ def fact(_: World, rng: random.Random) -> Document:
 
 
 def wanted(_: World, rng: random.Random) -> Document:
-    """What a situation asks for, where its question is put with no object to choose: the same fact, found by asking."""
+    """What a situation asks for, in answer to random words around it, with no object to choose."""
     said = draw_fact(rng)
-    question = rng.choice(load_situations().openings).format(situation=said.situation)
-    builder = Builder("fact").given(f"USER: {question} What is it like? ASSISTANT:", Hint(asked=said.asked))
+    question = f"USER: {wording(rng).format(situation=said.situation)} What is it like? ASSISTANT:"
+    builder = Builder("fact").given(question, Hint(asked=said.asked))
     return builder.given(f" Something{said.joint}").decided(said.word, 2.0).said(f".{EOS}", 0.1).build()
 
 
@@ -204,20 +204,20 @@ def matched_fully(world: World, rng: random.Random) -> Document:
     return converse(world, Task.POM, mode, rng, Manner(slots=known, blended=_often(rng), facts=True))
 
 
+def matched_by_likeness(world: World, rng: random.Random) -> Document:
+    """The same where touch errs by a class here and there: each object is what it is most like, and no two are one."""
+    mode = rng.choice((Opd.ALL, Opd.ALL, Opd.NONE))
+    known = mode == Opd.NONE or rng.random() < 0.5
+    manner = Manner(slots=known, blended=_often(rng), facts=True, misread=True)
+    return converse(world, Task.POM, mode, rng, manner)
+
+
 def everything(world: World, rng: random.Random) -> Document:
     """Every conversation of the pipeline as it is, with and without slots; and the facts that scenarios rest on."""
-    weights = {
-        full: 6,
-        slots: 5,
-        told: 8,
-        free: 2,
-        situations: 5,
-        rephrased: 6,
-        fact: 3,
-        wanted: 6,
-        matched: 2,
-        matched_fully: 6,
-    }
+    compared = {full: 6, slots: 5, told: 8, free: 2}
+    suited = {situations: 5, rephrased: 6, fact: 3, wanted: 6}
+    named_right = {matched: 2, matched_fully: 5, matched_by_likeness: 8}
+    weights = compared | suited | named_right
     return rng.choices(tuple(weights), tuple(weights.values()))[0](world, rng)
 
 
@@ -244,5 +244,5 @@ FORMATS = (
     Format("repeated", repeat, ("repetition",), earlier=0.3, enlarge=6.0),
     Format("named", named, (Task.POM,), earlier=0.3, replay=2.0, most=102),
     Format("matched", matched, (Task.POM,), earlier=0.25, replay=2.0, most=102),
-    Format("everything", everything, (Task.OPD, RESTATED, *COMPARING, Task.PSR, Task.POM), earlier=0.15, most=42),
+    Format("everything", everything, (Task.OPD, RESTATED, *COMPARING, Task.PSR, Task.POM), earlier=0.15, most=60),
 )

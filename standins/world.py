@@ -26,6 +26,10 @@ ODD_NAMES = 0.4
 """Share of training's names that are made of any words."""
 PLAIN_NAMES = 0.6
 """Share of the other names that are an adjective and a noun; the rest name a part or an amount of something."""
+MISREAD = 0.7
+"""Share of objects that `misread` tries to feel wrongly."""
+MISREADINGS = 40
+"""Tries before it feels everything as it is."""
 UNSEEN = 2
 """Situations at the end of each list that are told as facts and never asked about."""
 
@@ -167,6 +171,46 @@ def _with_article(name: str) -> str:
     return f"{'an' if name[0] in 'aeiou' else 'a'} {name}"
 
 
+def misread(world: World, objects: Sequence[str], rng: random.Random) -> World:
+    """The world as touch may feel it: a property or two of some of these objects are a class off.
+
+    Of all ways to tell them apart the right one fits best still, and alone; no combination is felt that none of the
+    world's objects has.
+    """
+    catalogue = world.catalogue
+    known = {catalogue.labels(o) for o in catalogue.objects}
+    truth = [catalogue.labels(o) for o in objects]
+    for _ in range(MISREADINGS):
+        felt = [_nudged(labels, rng) if rng.random() < MISREAD else labels for labels in truth]
+        possible = len(set(felt)) == len(felt) and known.issuperset(felt)
+        if possible and felt != truth and _fits_alone(felt, truth):
+            entries = dict(catalogue.objects)
+            for object_id, labels in zip(objects, felt, strict=True):
+                ratings = tuple((level,) for level in labels)
+                entries[object_id] = entries[object_id].model_copy(update={"ratings": ratings})
+            changed = Catalogue.model_construct(language=catalogue.language, objects=entries)
+            return World(replace(world.pool, catalogue=changed))
+    return world
+
+
+def _fits_alone(felt: Sequence[Labels], truth: Sequence[Labels]) -> bool:
+    costs = [sum(map(_distance, felt, order)) for order in itertools.permutations(truth)]
+    # The first permutation is the order as it is.
+    return all(cost > costs[0] for cost in costs[1:])
+
+
+def _nudged(labels: Labels, rng: random.Random) -> Labels:
+    felt = list(labels)
+    for index in rng.sample(range(len(labels)), rng.choice((1, 1, 2))):
+        highest = len(real_catalogue().properties[index].levels) - 1
+        felt[index] = min(highest, max(0, felt[index] + rng.choice((-1, 1))))
+    return tuple(felt)
+
+
+def _distance(one: Labels, other: Labels) -> int:
+    return sum(abs(a - b) for a, b in zip(one, other, strict=True))
+
+
 @cache
 def questions(kind: Literal["training", "seen", "unseen"]) -> tuple[Scenario, ...]:
     """Scenarios for training, of seen kinds in a wording kept for the gate, and of unseen kinds."""
@@ -174,11 +218,15 @@ def questions(kind: Literal["training", "seen", "unseen"]) -> tuple[Scenario, ..
     return _scenarios(openings, unseen=kind == "unseen")
 
 
+def wording(rng: random.Random) -> str:
+    """An opening of random words, with a place for the situation."""
+    opening = [rng.choice(("Which", "What", "Here", "Someone")), *_filler(rng), "{situation}", *_filler(rng)]
+    return " ".join(opening) + rng.choice("?.")
+
+
 def reworded(world: World, rng: random.Random) -> World:
     """The same world, its scenarios asked for in random words: whoever answers these reads the situation alone."""
-    opening = f"{rng.choice(('Which', 'What', 'Here', 'Someone'))} {' '.join(_filler(rng))} {{situation}}"
-    opening = " ".join([opening, *_filler(rng)]).replace("  ", " ") + rng.choice("?.")
-    language = world.catalogue.language.model_copy(update={"scenarios": _scenarios((opening,), unseen=False)})
+    language = world.catalogue.language.model_copy(update={"scenarios": _scenarios((wording(rng),), unseen=False)})
     catalogue = Catalogue.model_construct(language=language, objects=world.catalogue.objects)
     return World(replace(world.pool, catalogue=catalogue))
 

@@ -7,15 +7,19 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 import yaml
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import cdist
 
 from pipeline.records import Opd, Prediction, Task
 from pipeline.tasks import TASKS
+from pipeline.tasks.pom import fact
 from standins.asking import comparisons, superlatives
 from standins.conversing import FACTS, VIDEOS, Manner, asked_number, converse, draw_draft
-from standins.curriculum import FORMATS, Format, compressed, phrases, repeat, vocabulary
+from standins.curriculum import FORMATS, Format, compressed, phrases, repeat, vocabulary, wanted
 from standins.describing import Style
 from standins.documents import BLEND, UNKNOWN, Builder, Hint, blend_ids, tokenise
 from standins.gate import Exam, answer, examine, exams, make_items, prompts
@@ -32,8 +36,10 @@ from standins.world import (
     held_out_name,
     load_situations,
     make_world,
+    misread,
     questions,
     real_catalogue,
+    reworded,
 )
 from tests.closure import closure
 
@@ -223,6 +229,58 @@ def test_matching_names_each_object_by_its_fact() -> None:
         for before, piece in zip(document.pieces, document.pieces[1:], strict=False):
             if piece.decision:
                 assert (before.hint.labels or before.hint.recalled) == by_name[piece.text.strip()]
+
+
+def test_what_is_felt_wrongly_still_fits_best_and_alone() -> None:
+    """Against scipy's assignment: any other way to tell the three apart costs more."""
+    rng = random.Random(12)
+    for _ in range(20):
+        world = a_world(rng)
+        known = {world.catalogue.labels(o) for o in world.pool.objects}
+        objects = draw_draft(world, Task.POM, rng).objects
+        felt = misread(world, objects, rng).catalogue
+        truth, read = ([c.labels(o) for o in objects] for c in (world.catalogue, felt))
+        costs = cdist(np.array(read), np.array(truth), "cityblock")
+        _, best = linear_sum_assignment(costs)
+        assert list(best) == [0, 1, 2]
+        for cell in range(3):
+            dearer = costs.copy()
+            dearer[cell, cell] += 0.5
+            assert list(linear_sum_assignment(dearer)[1]) == [0, 1, 2]
+        assert known.issuperset(read)
+        assert read != truth
+        others = set(world.pool.objects) - set(objects)
+        assert all(felt.labels(o) == world.catalogue.labels(o) for o in others)
+
+
+def test_matching_by_likeness_tells_what_is_and_describes_what_is_felt() -> None:
+    rng = random.Random(13)
+    wrong = 0
+    for _ in range(30):
+        world = a_world(rng)
+        catalogue = world.catalogue
+        text = converse(world, Task.POM, Opd.ALL, rng, Manner(facts=True, misread=True)).text
+        conclusion = text.rpartition("Conclusion:")[2]
+        ends = (", b) is", " and c) is", ".</s>")
+        objects = [
+            o for o in catalogue.objects if any(f" is {catalogue.objects[o].name}{e}" in conclusion for e in ends)
+        ]
+        assert len(objects) == 3
+        assert all("".join(fact(catalogue, o)) in text for o in objects)
+        wrong += sum(catalogue.structured(catalogue.labels(o)) not in text for o in objects)
+    assert wrong > 20
+
+
+def test_random_wordings_hold_the_situation_and_no_wording_of_the_gate() -> None:
+    rng = random.Random(14)
+    world = a_world(rng)
+    asked = {s.name for s in questions("training")}
+    for _ in range(20):
+        scenarios = reworded(world, rng).catalogue.language.scenarios
+        assert {s.name for s in scenarios} == asked
+        assert all(s.name in s.question for s in scenarios)
+    opening = load_situations().held_out_opening.partition("{")[0]
+    assert not [text for text in (wanted(world, rng).text for _ in range(500)) if opening in text]
 
 
 def test_blends_are_sums_of_the_words_embeddings() -> None:
