@@ -5,8 +5,9 @@
 memory of fresh processes. The model is aligned a little first, so that answers are as long as answers are. Frames are
 five a video. Alignment is what is trained: projection and new tokens.
 
-**Counted** at the true shapes of paper-7b (`pipeline.benchmarks.language_counts`), from the lengths that the same
-questions have in the stand-in's tokens: Vicuna's are some more, for both ways alike.
+**Counted** at the true shapes of paper-7b (`pipeline.benchmarks.language_counts`, and the memory in
+`pipeline.benchmarks.language_memory`), from the lengths that the same questions have in the stand-in's tokens: Vicuna's
+are some more, for both ways alike.
 
 **On a CUDA device**, where one is there, the same is measured with random weights of those shapes
 (`pipeline.benchmarks.language_device`).

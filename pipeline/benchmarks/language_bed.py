@@ -64,9 +64,9 @@ class LanguageRow(BenchRow):
     gigabytes: float | None = None
     """10^9 bytes of weights, keys and values that are read, where the row is counted."""
     megabytes: float | None = None
-    """Peak memory in 10^6 bytes: of a fresh process, or of torch on a CUDA device."""
+    """Peak memory in 10^6 bytes: of a fresh process, of torch on a CUDA device, or counted (a bound from below)."""
     share: float | None = None
-    """Of the card's measured matrix rate."""
+    """Of the card's matrix rate: the measured one, and in a counted row that of its data sheet."""
     logit_error: float | None = None
     """Largest difference between logits, over the largest logit."""
     source: Literal["measured", "counted"] = "measured"

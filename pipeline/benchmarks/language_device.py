@@ -54,7 +54,7 @@ class Size:
     limit: int = 128
     product: int = 8192
     """Side of the matrices whose product shows the card's rate."""
-    runtime: RuntimeConfig = field(default_factory=lambda: RuntimeConfig(gradient_checkpointing=True))
+    runtime: RuntimeConfig = field(default_factory=RuntimeConfig)
 
 
 PAPER = Size(

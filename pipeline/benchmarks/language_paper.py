@@ -1,11 +1,12 @@
-"""Rows of paper-7b at its true shapes, counted: what an update and an answer cost either way on a card."""
+"""Rows of paper-7b at its true shapes, counted: what an update and an answer cost either way on a card, and hold."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from pipeline.benchmarks.language_bed import FRAMES, LanguageRow
 from pipeline.benchmarks.language_counts import H100, Batch, Card, Cost, Llama, Tower, answering, encoding, step, total
+from pipeline.benchmarks.language_memory import answering_bytes, training_bytes
 from pipeline.benchmarks.language_ways import CUTOFF
 
 RANK = 128
@@ -23,37 +24,54 @@ def counted_rows(lengths: Sequence[Length], card: Card = H100) -> list[LanguageR
     llama, tower = Llama(), Tower()
     rows: list[LanguageRow] = []
     tokens = sum(length for length, _, _ in lengths)
+    one = Batch(1, CUTOFF, CUTOFF, 0)
     for name, rank in (("alignment", 0), ("LoRA", RANK)):
         costs = {"published way": published_training(lengths, llama, tower, card, rank)}
+        peaks = {"published way": training_bytes(llama, one, rank, tower=tower.weights)}
         for size, again in ((4, True), (4, False), (16, False)):
             case = f"{size} at a time{', gradient checkpointing' if again else ''}"
             costs[case] = pipeline_training(lengths, size, llama, card, rank, again)
-        rows += _rows(f"paper-7b on {card.name}, {name}", costs, tokens, "useful tokens a second", len(lengths), tokens)
-    new = sum(answer for _, answer, _ in lengths)
+            peaks[case] = max(training_bytes(llama, batch, rank, again) for batch in largest(lengths, size))
+        rows += _rows(f"paper-7b on {card.name}, {name}", costs, peaks, card, tokens, len(lengths), tokens)
+    new, longest = sum(answer for _, answer, _ in lengths), max(length for length, _, _ in lengths)
     costs = {
         "published way": published_answers(lengths, llama, tower, card, forward=True),
         "without the published loop's forward pass": published_answers(lengths, llama, tower, card, forward=False),
         "16 at a time": pipeline_answers(lengths, 16, llama, card),
     }
-    count = len(lengths)
-    return rows + _rows(f"paper-7b on {card.name}, answering", costs, count, "samples a second", count, new)
+    peaks = dict.fromkeys(costs, answering_bytes(llama, 1, longest, tower.weights))
+    peaks["16 at a time"] = answering_bytes(llama, 16, longest)
+    return rows + _rows(f"paper-7b on {card.name}, answering", costs, peaks, card, None, len(lengths), new)
 
 
-def _rows(what: str, costs: dict[str, Cost], amount: float, unit: str, samples: int, tokens: int) -> list[LanguageRow]:
-    baseline = next(iter(costs))
+def _rows(
+    what: str,
+    costs: Mapping[str, Cost],
+    peaks: Mapping[str, int],
+    card: Card,
+    useful: int | None,
+    samples: int,
+    tokens: int,
+) -> list[LanguageRow]:
+    """Args:
+    useful: Tokens trained on, of which the row gives the rate; without, it gives the rate of samples.
+    """
+    baseline, amount = next(iter(costs)), useful or samples
     return [
         LanguageRow(
             case=f"{what}, {case}",
             cost=round(amount / cost.seconds, 4),
             low=round(amount / cost.seconds, 4),
             high=round(amount / cost.seconds, 4),
-            unit=unit,
+            unit="useful tokens a second" if useful else "samples a second",
             baseline=f"{what}, {baseline}",
             ratio=round(costs[baseline].seconds / cost.seconds, 3),
             samples=samples,
             tokens=tokens,
             flops=cost.flops,
             gigabytes=round(cost.bytes / 1e9, 1),
+            megabytes=round(peaks[case] / 1e6, 1),
+            share=round(cost.flops / cost.seconds / card.rate, 4),
             source="counted",
         )
         for case, cost in costs.items()
@@ -86,6 +104,12 @@ def batches(lengths: Sequence[Length], size: int) -> list[Batch]:
         )
         for group in groups
     ]
+
+
+def largest(lengths: Sequence[Length], size: int) -> set[Batch]:
+    """The batches of most tokens and of most logits: one of them holds most."""
+    cut = batches(lengths, size)
+    return {max(cut, key=lambda b: b.rows * b.length), max(cut, key=lambda b: b.logits)}
 
 
 def published_answers(lengths: Sequence[Length], llama: Llama, tower: Tower, card: Card, forward: bool) -> Cost:
