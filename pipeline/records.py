@@ -211,6 +211,10 @@ class Prediction(Record):
     """Tokens generated, over all turns."""
 
 
+WHOLE = ("choice", "combined")
+"""Measures that say that an answer is right, not only a part of it."""
+
+
 class Score(Record):
     """One graded measure of one answer; OPD has one a property and `combined`, other tasks `choice`."""
 

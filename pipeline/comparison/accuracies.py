@@ -15,8 +15,8 @@ from pipeline.comparison.cached import (
     score_hashes,
 )
 from pipeline.comparison.locked import Locked
+from pipeline.records import WHOLE
 from pipeline.statistics import Outcome, holm, paired
-from pipeline.tracking.standings import WHOLE
 
 
 @dataclass(frozen=True)

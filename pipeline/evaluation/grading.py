@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from pipeline.errors import UserError
 from pipeline.physiclear.catalogue import Catalogue
-from pipeline.records import Prediction, Question, Score
+from pipeline.records import WHOLE, Prediction, Question, Score
 from pipeline.tasks import TASKS
 
 
@@ -30,7 +30,7 @@ def summarise(scores: Sequence[Score]) -> dict[str, float]:
         for measure in dict.fromkeys(s.measure for s in of_task):
             chosen = [s.correct for s in of_task if s.measure == measure]
             metrics[f"{task}.{measure}.accuracy"] = sum(chosen) / len(chosen)
-        questions = {s.question_id: s for s in of_task if s.measure in ("choice", "combined")}.values()
+        questions = {s.question_id: s for s in of_task if s.measure in WHOLE}.values()
         metrics[f"{task}.n"] = len(questions)
         metrics[f"{task}.unparsed"] = sum(not s.parsed for s in questions) / len(questions)
         metrics[f"{task}.truncated"] = sum(s.truncated for s in questions) / len(questions)

@@ -10,7 +10,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from pipeline.records import Score, Task
+from pipeline.records import WHOLE, Score, Task
 from pipeline.reporting.published import Published
 from pipeline.reporting.table import number, span
 from pipeline.statistics import Outcome, Spread, proportion
@@ -38,9 +38,6 @@ class Measure:
     def whole(self) -> bool:
         """Whether it says that an answer is right, not only a part of it."""
         return self.name in WHOLE
-
-
-WHOLE = ("choice", "combined")
 
 
 @dataclass(frozen=True)

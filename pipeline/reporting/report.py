@@ -177,14 +177,11 @@ def _effects(tables: Sequence[Table], folder: Path, footer: str) -> Picture:
     picture = Picture(
         "effects.png",
         "What each part brings, drawn",
-        f"Points with intervals, one panel a task: {', '.join(dict.fromkeys(r.task for r in rows))}.",
+        _panels(rows),
         "Differences of the table above with the other axes as the paper proposes. A line that crosses zero shows no "
         "effect; a hollow point is of a task that the base language model cannot do either.",
     )
-    if not rows:
-        return picture.without("no two variants that differ in one axis")
-    draw_effects(folder / picture.file, rows, footer)
-    return picture
+    return _drawn(picture, rows, "no two variants that differ in one axis", folder, footer)
 
 
 def _factorial(tables: Sequence[Table], folder: Path, footer: str) -> Picture:
@@ -192,13 +189,23 @@ def _factorial(tables: Sequence[Table], folder: Path, footer: str) -> Picture:
     picture = Picture(
         "factorial.png",
         "Main effects and interactions, drawn",
-        f"Points with intervals, one panel a task: {', '.join(dict.fromkeys(r.task for r in rows))}.",
+        _panels(rows),
         "Main effects (dots, above the dotted line) and interactions (diamonds, below it) over all variants. An "
         "interaction that crosses zero gives no reason to doubt that the parts' effects add up; a hollow point is of a "
         "task that the base language model cannot do either.",
     )
+    return _drawn(picture, rows, "the plan's variants cross no two parts", folder, footer)
+
+
+def _panels(rows: Sequence[EffectRow | FactorialRow]) -> str:
+    return f"Points with intervals, one panel a task: {', '.join(dict.fromkeys(row.task for row in rows))}."
+
+
+def _drawn(
+    picture: Picture, rows: Sequence[EffectRow] | Sequence[FactorialRow], missing: str, folder: Path, footer: str
+) -> Picture:
     if not rows:
-        return picture.without("the plan's variants cross no two parts")
+        return picture.without(missing)
     draw_effects(folder / picture.file, rows, footer)
     return picture
 

@@ -12,8 +12,7 @@ from pipeline.artifacts import atomic, read_jsonl, write_json
 from pipeline.frames.sampling import sample_evaluation
 from pipeline.plan import FULL
 from pipeline.prompts import TACTILE
-from pipeline.records import Opd, Prediction, Question, Record, Score, Task
-from pipeline.reporting.accuracy import WHOLE
+from pipeline.records import WHOLE, Opd, Prediction, Question, Record, Score, Task
 from pipeline.reporting.inputs import Inputs
 
 FOLDER = "samples"

@@ -6,11 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.artifacts import read_table
-from pipeline.records import Score
+from pipeline.records import WHOLE, Score
 from pipeline.statistics import Outcome, clustered
 
-WHOLE = ("choice", "combined")
-"""Measures that say that an answer is right, not only a part of it."""
 ENDS = ("low", "high")
 """Of an interval, in the names of metrics."""
 DIGITS = 4
