@@ -4,7 +4,8 @@ Run from the repository's root: `python -m standins.gate`. Writes `standins/gate
 descriptions are given as the assistant's own words (OPD mode `all`) and the model says the conclusion; in the rows
 "from slots" the classes stand in words where the videos would be and the model says everything; "from blends" puts one
 vector there, the sum of those words' embeddings, as a projection of touch might. Made-up objects have property
-combinations and names that no training text shows; the "test objects" are the catalogue's. For POM the facts about the
+combinations and names that no training text shows; the "test objects" are the catalogue's, and so are their scenarios,
+of which no training text speaks at all. For POM the facts about the
 named objects stand in the question.
 """
 
@@ -84,6 +85,7 @@ def exams() -> tuple[Exam, ...]:
     suited = [
         Exam("PSR seen kinds", Task.PSR, GOALS[Task.PSR], scenarios="seen"),
         Exam("PSR unseen kinds", Task.PSR, 0.65, scenarios="unseen"),
+        Exam("PSR test objects", Task.PSR, 0.65, objects="test"),
     ]
     modes = {Task.OPD: (Opd.ALL,), Task.POM: (Opd.ALL, Opd.NONE)}
     return (
