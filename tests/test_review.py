@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import csv
 import hashlib
+import io
 import itertools
 import json
 import re
@@ -12,7 +13,9 @@ import shutil
 from collections import Counter
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 from typer.testing import CliRunner
 
 from pipeline.artifacts import write_json
@@ -163,8 +166,10 @@ def test_pictures_are_those_of_the_reports_and_have_texts(page: Element, reports
     assert pictures
     for picture in pictures:
         kind, _, data = picture.attributes["src"].partition(",")
-        assert kind == "data:image/png;base64"
-        assert base64.b64decode(data) == (reports / picture.attributes["data-source"]).read_bytes()
+        assert kind == "data:image/webp;base64"
+        files = io.BytesIO(base64.b64decode(data)), reports / picture.attributes["data-source"]
+        shown, stored = (np.asarray(Image.open(file).convert("RGBA")) for file in files)
+        np.testing.assert_array_equal(shown, stored)
         assert len(picture.attributes["alt"]) > 10
         assert int(picture.attributes["width"]) > 0
 

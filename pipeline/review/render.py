@@ -14,6 +14,8 @@ import re
 from functools import partial
 from pathlib import Path
 
+import cv2
+import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
@@ -25,6 +27,8 @@ from pipeline.review.tables import BAR_WIDTH
 
 PAGE = Path("reports") / "index.html"
 TEMPLATE, STYLE = "page.html", "style.css"
+LOSSLESS = 101
+"""OpenCV's WebP quality above 100."""
 
 
 def write_page(root: Path) -> Path:
@@ -80,8 +84,12 @@ def anchor(text: str) -> str:
 
 
 def picture(reports: Path, file: str) -> str:
-    """A PNG as a data URI."""
-    return f"data:image/png;base64,{base64.b64encode(_bytes(reports, file)).decode()}"
+    """A PNG as a data URI: as lossless WebP, which takes half the room."""
+    pixels = cv2.imdecode(np.frombuffer(_bytes(reports, file), np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        raise UserError(f"{reports / file}: no picture; run `dvc repro` at its scale")
+    encoded = cv2.imencode(".webp", pixels, [cv2.IMWRITE_WEBP_QUALITY, LOSSLESS])[1]
+    return f"data:image/webp;base64,{base64.b64encode(encoded.tobytes()).decode()}"
 
 
 def pixels(reports: Path, file: str) -> tuple[int, int]:
