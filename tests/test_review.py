@@ -33,6 +33,7 @@ from tests.fake_chain import fake_params, write_chain
 from tests.web import Element, Sources, parse_html, says
 
 LARGEST = 6 * 2**20
+REPORTS = ("smoke-scenes", "smoke-videos")
 NUMBER = re.compile(r"\d")
 MEASURED = re.compile(r"\d\.\d")
 
@@ -396,6 +397,41 @@ def test_tables_that_no_view_knows_are_shown(changed: Path) -> None:
     assert "Interactions" in text
     assert "which frames" in text
     assert "uniform 1.500" in text, "without a recommendation, captions and plots as well"
+
+
+def test_of_simulated_coverage_what_the_reports_use_is_shown_the_worst_first(fresh: Element) -> None:
+    used = [row for row in json.loads((ROOT / "reports" / "bench" / "coverage.json").read_text()) if row["reported"]]
+    short = sum("liberal" in row["verdict"] for row in used)
+    assert 0 < short < len(used)
+    (block,) = [e for e in fresh.find("section") if e.words.startswith("Do intervals hold what they promise?")]
+    rows = [row.words for row in block.find("tr")[1:]]
+    assert len(rows) == len(used)
+    assert ["liberal" in words for words in rows] == [True] * short + [False] * (len(used) - short)
+
+
+def test_variants_of_several_seeds_are_summed_up_and_left_to_their_file(fresh: Element, made: Path) -> None:
+    one, two = (next(e for e in fresh.walk() if e.attributes.get("id") == f"{name}-parts") for name in REPORTS)
+    title = "Language model: every variant"
+    assert title in {caption.words for caption in one.find("caption")}
+    assert title not in {caption.words for caption in two.find("caption")}
+    (block,) = [e for e in two.find("section") if e.words.startswith(title)]
+    file = "smoke-videos/language/ablation.csv"
+    with (made / "reports" / file).open(newline="") as stream:
+        rows = len(list(csv.DictReader(stream)))
+    assert [a.attributes["href"] for a in block.find("a")] == [file]
+    assert [e.text for e in block.walk() if e.attributes.get("data-source") == f"{file}#count"] == [str(rows)]
+
+
+def test_a_table_that_several_reports_share_is_shown_once(changed: Path) -> None:
+    text = "part,case,dtype,finite,error,bound,verdict\nloss,logits of 0,float64,True,0.0,1e-15,{}\n"
+    files = [changed / "reports" / name / "tables" / "stability.csv" for name in REPORTS]
+    for verdict, shown in (("ok", 1), ("failed", 2)):
+        files[0].write_text(text.format("ok"))
+        files[1].write_text(text.format(verdict))
+        (chapter,) = [e for e in page_of(changed).walk() if e.attributes.get("id") == "stability"]
+        assert len(chapter.find("table")) == shown
+        links = [a.attributes["href"] for a in chapter.find("a")]
+        assert links == [f"{name}/tables/stability.csv" for name in REPORTS]
 
 
 def test_speed_against_error_has_a_recommendation_a_plot_and_a_table_each(page: Element, reports: Path) -> None:

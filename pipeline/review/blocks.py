@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from pipeline.review.matrices import Matrix
 from pipeline.review.tables import Shown
-from pipeline.review.traced import Piece
+from pipeline.review.traced import Grid, Piece
 
 
 @dataclass(frozen=True)
@@ -30,3 +30,7 @@ class Block:
     matrices: tuple[Matrix, ...] = ()
     pictures: tuple[Picture, ...] = ()
     counts: tuple[tuple[str, Piece], ...] = ()
+    left: Grid | None = None
+    """A table that is left to its file, being too long to read."""
+    same: tuple[str, ...] = ()
+    """Files that say the same as the table's."""

@@ -154,6 +154,21 @@ BENCH = View(
         Column("Interval", "{low} to {high}"),
     )
 )
+COVERAGE = View(
+    (
+        Column("Figure", "{kind}", HEAD),
+        Column("Method", "{method}", HEAD),
+        Column("Objects", "{objects}"),
+        Column("Objects a question", "{about}"),
+        Column("Correlation", "{correlation:g}"),
+        Column("Seeds", "{seeds}"),
+        Column("Truth", "{truths}", WORDS),
+        Column("Share covered or rejected", "{shares}", Kind.WORDS),
+        Column("Mean width", "{cost:.3f}"),
+        Column("Verdict", "{verdict}", WORDS),
+    ),
+    hidden=("case", "unit", "baseline", "ratio", "error", "low", "high", "reported", "repetitions"),
+)
 STABILITY = View(
     (
         Column("Part", "{part}", HEAD),
@@ -169,6 +184,7 @@ VIEWS = LANGUAGE | {
     "agreement": AGREEMENT,
     "annotator_agreement": _figures(3),
     "audit": AUDIT,
+    "coverage": COVERAGE,
     "cross_validation": ENCODERS,
     "differences": DIFFERENCES,
     "errors": ERRORS,

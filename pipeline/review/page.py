@@ -12,7 +12,7 @@ from pipeline.reporting.samples import FOLDER
 from pipeline.review.blocks import Block, Picture
 from pipeline.review.folders import Bench, Report, find_grids, read_benches, read_reports
 from pipeline.review.graph import Drawing, draw_chain
-from pipeline.review.known import ACCURACY, BENCH, view_of
+from pipeline.review.known import ACCURACY, BENCH, VIEWS, view_of
 from pipeline.review.matrices import matrices
 from pipeline.review.missing import Gap, gaps
 from pipeline.review.readme import Section
@@ -101,7 +101,7 @@ def compose(root: Path) -> Page:
         glance=_glance(reports),
         chain=draw_chain(root / "dvc.yaml"),
         speed=(*speed, *(_bench(bench) for bench in benches if bench.grid)),
-        stability=tuple(_shared(grid, title, *told.get(grid.file, ())) for grid in grids["stability"]),
+        stability=tuple(_shared(same, title, *told.get(same[0].file, ())) for same in _equal(grids["stability"])),
         missing=(*missing, *speed_gaps(reports_dir)),
     )
 
@@ -143,6 +143,9 @@ def _blocks(report: Report, sections: Sequence[Section]) -> list[Block]:
             blocks.append(Block(section.title, section.caption, readme, matrices=tuple(found)))
         elif section.name == "audit":
             blocks.append(_audit(grid, section, readme))
+        elif section.name == "ablation" and len({grid.value(row, "seed") for row in range(len(grid.rows))}) > 1:
+            # Every variant is in the table over seeds, and hundreds of rows that say it seed by seed hide the others.
+            blocks.append(Block(section.title, section.caption, readme, left=grid))
         else:
             shown = show(grid, view_of(section.name), section.title)
             blocks.append(Block(section.title, section.caption, readme, table=shown))
@@ -154,16 +157,30 @@ def _audit(grid: Grid, section: Section, readme: str) -> Block:
     urgent = [row for row in range(len(grid.rows)) if grid.value(row, "severity") != Severity.INFO]
     urgent.sort(key=lambda row: grid.value(row, "severity"))
     counts = tuple((severity.value, grid.where("severity", severity.value)) for severity in Severity)
-    shown = show(grid, view_of("audit"), section.title, only=urgent)
+    shown = show(grid, view_of("audit"), section.title, only=urgent, part="what needs attention")
     return Block(section.title, section.caption, readme, table=shown if urgent else None, counts=counts)
 
 
-def _shared(grid: Grid, title: str, report: Report | None = None, section: Section | None = None) -> Block:
-    """A table over all parts; what its report says about it, where that does."""
+def _equal(grids: Sequence[Grid]) -> list[list[Grid]]:
+    """Tables in groups of those that say the same, in order."""
+    groups: list[list[Grid]] = []
+    for grid in grids:
+        group = next((g for g in groups if (g[0].columns, g[0].rows) == (grid.columns, grid.rows)), None)
+        if group is None:
+            groups.append([grid])
+        else:
+            group.append(grid)
+    return groups
+
+
+def _shared(same: Sequence[Grid], title: str, report: Report | None = None, section: Section | None = None) -> Block:
+    """A table over all parts, and where else it lies; what its report says about it, where that does."""
+    grid = same[0]
     name, view = grid.file.replace("/", "-")[:-4], view_of(Path(grid.file).stem)
     counts = tuple((v.value, grid.where("verdict", v.value)) for v in Judgement) if "verdict" in grid.columns else ()
     caption, source = (section.caption, report.file("README.md")) if report and section else ("", "")
-    return Block(title, caption, source, table=show(grid, view, title, name=name), counts=counts)
+    table = show(grid, view, title, name=name)
+    return Block(title, caption, source, table=table, counts=counts, same=tuple(g.file for g in same[1:]))
 
 
 def _bench(bench: Bench) -> Block:
@@ -171,8 +188,17 @@ def _bench(bench: Bench) -> Block:
     text = BENCHES.get(bench.name, BenchText(bench.name.replace("_", " ").capitalize(), ""))
     alt = f"Plot of the table {text.title}: cost against error, with intervals."
     pictures = tuple(Picture(file, alt) for file in bench.pictures)
-    table = show(bench.grid, BENCH, text.title, name=f"bench-{bench.name}")
+    view, name = VIEWS.get(bench.name, BENCH), f"bench-{bench.name}"
+    table = show(bench.grid, view, text.title, only=_used(bench.grid), part="what the reports use", name=name)
     return Block(text.title, text.caption, "", table=table, pictures=pictures)
+
+
+def _used(grid: Grid) -> Sequence[int] | None:
+    """Of methods that are compared those that the reports use, where they fall short first; None for other tables."""
+    if "reported" not in grid.columns:
+        return None
+    used = [row for row in range(len(grid.rows)) if grid.value(row, "reported") == "true"]
+    return sorted(used, key=lambda row: "liberal" not in grid.value(row, "verdict"))
 
 
 def _glance(reports: Sequence[Report]) -> tuple[GlanceRow, ...]:

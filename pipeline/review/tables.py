@@ -52,25 +52,30 @@ class Shown:
 
     name: str
     title: str
-    caption: str
     file: str
     """Relative to reports/."""
     headings: tuple[Heading, ...]
     rows: tuple[tuple[Cell, ...], ...]
     size: Piece
     """Rows in the file."""
-    whole: bool
-    """Whether all of them are shown."""
+    part: str
+    """Which of them are shown, in words; empty for all."""
     folded: bool
 
 
 def show(
-    grid: Grid, view: View, title: str, caption: str = "", only: Sequence[int] | None = None, name: str = ""
+    grid: Grid,
+    view: View,
+    title: str,
+    only: Sequence[int] | None = None,
+    part: str = "some",
+    name: str = "",
 ) -> Shown:
     """Fill a view; columns without any content are left out, columns that the view does not know come last.
 
     Args:
         only: The rows to show, counted from 0; all by default.
+        part: Which those are, in words.
         name: For the table's anchor; the file's name by default.
     """
     chosen = range(len(grid.rows)) if only is None else only
@@ -91,12 +96,11 @@ def show(
     return Shown(
         name=name or grid.file.rsplit("/", 1)[-1].rsplit(".", 1)[0],
         title=title,
-        caption=caption,
         file=grid.file,
         headings=tuple(heading for heading, _ in kept),
         rows=tuple(zip(*(column for _, column in kept), strict=True)),
         size=grid.size,
-        whole=len(chosen) == len(grid.rows),
+        part=part if len(chosen) < len(grid.rows) else "",
         folded=len(chosen) > LONG,
     )
 

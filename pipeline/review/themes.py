@@ -96,7 +96,11 @@ class BenchText:
 
 BENCHES = {
     "coverage": BenchText(
-        "Do intervals hold what they promise?", "Simulated designs with a known truth: how often an interval holds it."
+        "Do intervals hold what they promise?",
+        "Simulated designs with a known truth: how often an interval holds it, or a test rejects it. An interval that "
+        "is called 95 % *holds* where it covers 93 to 97 % as far as the repetitions can tell; *liberal* covers less, "
+        "*conservative* more. Where the reports' own intervals fall short comes first; `bench/coverage.md` has every "
+        "method.",
     ),
     "encoder": BenchText(
         "Encoders", "Resolution, frames, number formats, prompts and training speed, cost against combined error."

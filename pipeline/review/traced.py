@@ -67,7 +67,7 @@ class Grid:
 
 
 def read_grid(reports: Path, file: str) -> Grid | None:
-    """A CSV, or a JSON list of rows without their lists; None where the file is absent, empty or neither."""
+    """A CSV, or a JSON list of rows; None where the file is absent, empty or neither."""
     path = reports / file
     if not path.is_file():
         return None
@@ -78,9 +78,7 @@ def read_grid(reports: Path, file: str) -> Grid | None:
     found = read_json(path)
     if not isinstance(found, list) or not found or not all(isinstance(row, dict) for row in found):
         return None
-    # What is a list in itself is no cell; the file is there for whoever wants it.
-    flat = (name for row in found for name, value in row.items() if not isinstance(value, list))
-    columns = tuple(dict.fromkeys(flat))
+    columns = tuple(dict.fromkeys(name for row in found for name in row))
     return Grid(file, columns, tuple(tuple(_plain(row.get(name)) for name in columns) for row in found))
 
 
@@ -141,6 +139,8 @@ def lookup(content: Any, place: str) -> Any:
 def _plain(value: object) -> str:
     if value is None:
         return ""
+    if isinstance(value, list):
+        return ", ".join(filter(None, map(_plain, value)))
     return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
 
 
