@@ -162,10 +162,10 @@ COVERAGE = View(
         Column("Objects a question", "{about}"),
         Column("Correlation", "{correlation:g}"),
         Column("Seeds", "{seeds}"),
-        Column("Truth", "{truths}", WORDS),
-        Column("Share covered or rejected", "{shares}", Kind.WORDS),
+        Column("Truth", "{truths}", Kind.LIST),
+        Column("Share covered or rejected", "{shares}", Kind.LIST),
+        Column("Verdict", "{verdict}", Kind.LIST),
         Column("Mean width", "{cost:.3f}"),
-        Column("Verdict", "{verdict}", WORDS),
     ),
     hidden=("case", "unit", "baseline", "ratio", "error", "low", "high", "reported", "repetitions"),
 )

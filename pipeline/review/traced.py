@@ -140,7 +140,7 @@ def _plain(value: object) -> str:
     if value is None:
         return ""
     if isinstance(value, list):
-        return ", ".join(filter(None, map(_plain, value)))
+        return "\n".join(filter(None, map(_plain, value)))
     return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
 
 

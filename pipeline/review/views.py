@@ -16,6 +16,8 @@ class Kind(StrEnum):
     PLAIN = "plain"
     """A figure that goes with the measured one."""
     WORDS = "words"
+    LIST = "list"
+    """Several values, a line each."""
     FLAG = "flag"
     """Says `True` in the rows that are singled out, and nothing in others."""
 
