@@ -145,7 +145,8 @@ class Sources:
 def says(shown: str, value: Any, factor: float = 1) -> bool:
     """Whether a text shows a value: the same words, or the figure rounded to the digits that are shown."""
     if isinstance(value, list):
-        return shown.split("\n") == [str(v) for v in value if v != ""]
+        said = [str(v) for v in value if v != ""]
+        return shown in {", ".join(said), "\n".join(said)}
     if isinstance(value, bool):
         return shown == str(value).lower()
     try:
