@@ -19,6 +19,7 @@ from pipeline.errors import UserError
 from pipeline.records import Score, Task
 from pipeline.reporting import write_report
 from pipeline.reporting.answered import FAILED
+from pipeline.reporting.directions import verdict
 from pipeline.reporting.seeds import ONE_RUN
 from pipeline.statistics import Outcome, clustered, holm
 from tests.fake_chain import fake_params, write_chain
@@ -130,6 +131,46 @@ def test_effects_are_paired_by_question_over_seeds(root: Path, params: Params) -
         assert clear or float(row["p"]) > 0.049
         assert float(row["smallest_effect"]) > 0
         assert min(float(row["sd_objects"]), float(row["sd_questions"])) >= 0
+
+
+def test_directions_are_the_papers_beside_the_same_effects(root: Path, params: Params) -> None:
+    table, found = rows(root, params, "directions"), rows(root, params, "effects")
+    assert [(r["part"], r["task"]) for r in table] == [
+        *(("OPD", task) for task in ("PC", "PSS", "POM", "PSR")),
+        *(("encoder", task) for task in ("PC", "PSS", "POM", "OPD")),
+        *(("LoRA", task) for task in ("PC", "PSS", "POM", "OPD")),
+    ]
+    for row in table:
+        key = (row["part"], row["change"], row["task"])
+        (effect,) = [e for e in found if (e["axis"], e["change"], e["task"]) == key]
+        assert [row[c] for c in ("difference", "low", "high", "gate")] == [
+            effect[c] for c in ("difference", "low", "high", "gate")
+        ]
+        low, high = float(row["low"]), float(row["high"])
+        assert row["verdict"] == ("holds" if low > 0 else "reversed" if high < 0 else "not shown")
+    # By hand from the paper's tables, in percent: 48.10 - 46.51, 55.06 - 40.70, 47.37 - 39.47, 55.26 - 50.00.
+    printed = {(r["part"], r["task"]): (float(r["published_7b"]), float(r["published_13b"])) for r in table}
+    assert printed["OPD", "PC"] == pytest.approx((0.0159, 0.1436), abs=1e-9)
+    assert printed["OPD", "PSR"] == pytest.approx((0.0653, 0.2826), abs=1e-9)
+    assert printed["encoder", "OPD"] == pytest.approx((0.0790, 0.0526), abs=1e-9)
+    assert printed["LoRA", "PC"] == pytest.approx((0.0759, 0.0253), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "said"),
+    [
+        (0.001, 0.4, "holds"),
+        (0.0, 0.4, "not shown"),
+        (-0.2, 0.3, "not shown"),
+        (-0.3, 0.0, "not shown"),
+        (-0.3, -0.001, "reversed"),
+        (None, None, "not shown"),
+    ],
+)
+def test_a_direction_holds_where_its_interval_is_clear_of_zero(
+    low: float | None, high: float | None, said: str
+) -> None:
+    assert verdict(low, high) == said
 
 
 def test_mcnemar_is_exact_one_seed_at_a_time(root: Path, params: Params, single: Path) -> None:
@@ -263,7 +304,7 @@ def test_counterfactuals_are_in_no_other_table(root: Path, params: Params) -> No
 
 
 def test_a_task_that_the_base_model_cannot_do_is_marked_everywhere(root: Path, params: Params) -> None:
-    for name in ("ablation", "effects", "factorial", "seeds", "describing", "touch"):
+    for name in ("ablation", "directions", "effects", "factorial", "seeds", "describing", "touch"):
         marks = {(r["task"].split()[0], r["gate"]) for r in rows(root, params, name)}
         assert marks == {("PC", "passed"), ("PSS", ""), ("POM", f"{FAILED}, facts told"), ("PSR", ""), ("OPD", "")}, (
             name

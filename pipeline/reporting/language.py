@@ -9,6 +9,7 @@ from pipeline.records import Task, Touch
 from pipeline.reporting.accuracy import Measure, outcomes
 from pipeline.reporting.answered import Answered
 from pipeline.reporting.compared import counterfactuals, describing, effects
+from pipeline.reporting.directions import directions
 from pipeline.reporting.factorial import factorial
 from pipeline.reporting.inputs import Inputs
 from pipeline.reporting.language_rows import AblationRow
@@ -26,6 +27,7 @@ def language_tables(inputs: Inputs) -> list[Table]:
     answered = Answered(inputs)
     real = {key: v for key, v in inputs.params.plan.variants.items() if v.touch is Touch.REAL}
     whole = [m for m in measures if m.whole]
+    changes = effects(answered, whole)
     tables = [
         Table(
             "ablation",
@@ -56,6 +58,16 @@ def language_tables(inputs: Inputs) -> list[Table]:
             folder=FOLDER,
         ),
         Table(
+            "directions",
+            "Do the paper's directions hold?",
+            "What the paper says each part brings, against what it brings here, in percentage points. A direction "
+            "*holds* where the interval for new objects and seeds lies above zero, is *reversed* where it lies below, "
+            "and otherwise is *not shown*, which is not the same as absent: the table after this one says how large an "
+            "effect would have been found.",
+            directions(inputs, whole, changes),
+            folder=FOLDER,
+        ),
+        Table(
             "effects",
             "What each part brings",
             "One change at a time, the other parts as the paper proposes: differences on the same questions, in "
@@ -65,7 +77,7 @@ def language_tables(inputs: Inputs) -> list[Table]:
             "be read beside p; with several seeds each is tested alone, and the smallest p counts times their number. "
             "*Smallest effect* is what a t test on this design would find in four of five repetitions; above 100 there "
             "is none.",
-            effects(answered, whole),
+            changes,
             folder=FOLDER,
         ),
         Table(

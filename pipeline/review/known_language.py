@@ -24,6 +24,18 @@ ABLATION = View(
     Bar("accuracy", "low", "high", 1, chance="chance"),
     hidden=("source",),
 )
+DIRECTIONS = View(
+    (
+        Column("Part", "{part}", HEAD),
+        Column("Change", "{change}", HEAD),
+        Column("Task", "{task}", HEAD),
+        Column("Verdict", "{verdict}", WORDS),
+        DIFFERENCE,
+        *(Column(f"Published\N{NO-BREAK SPACE}{m}", f"{{published_{m}:p+.2f}}", Kind.PUBLISHED) for m in ("7b", "13b")),
+        Column("Base model", "{gate}", WORDS),
+    ),
+    Bar("difference", "low", "high", 1, signed=True, marks=("published_7b", "published_13b")),
+)
 EFFECTS = View(
     (
         Column("Part", "{axis}", HEAD),
@@ -114,6 +126,7 @@ TOUCH = View(
 LANGUAGE = {
     "ablation": ABLATION,
     "describing": DESCRIBING,
+    "directions": DIRECTIONS,
     "effects": EFFECTS,
     "factorial": FACTORIAL,
     "seeds": SEEDS,

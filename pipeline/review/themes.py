@@ -20,7 +20,7 @@ THEMES = (
         "parts",
         "What each part brings",
         (
-            *("effects", "factorial", "encoder_understanding", "encoder_property"),
+            *("directions", "effects", "factorial", "encoder_understanding", "encoder_property"),
             *("lora_understanding", "lora_property", "describing", "ablation", "all_variants"),
         ),
     ),
@@ -58,6 +58,11 @@ class Expected:
 
 
 EXPECTED = (
+    Expected(
+        "directions",
+        "Do the paper's directions hold?",
+        "no two of its variants differ in a part that the paper leaves out, or it is older than this table",
+    ),
     Expected("effects", "What each part brings", "no two of its variants differ in one part alone", "plan.lora"),
     Expected(
         "factorial", "Main effects and interactions", "its plan crosses no two parts, or it is older than this table"
