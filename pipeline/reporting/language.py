@@ -59,7 +59,7 @@ def language_tables(inputs: Inputs) -> list[Table]:
         ),
         Table(
             "directions",
-            "Do the paper's directions hold?",
+            "Do the paper's directions hold?" if inputs.of_paper else "Does each part help?",
             "What the paper says each part brings, against what it brings here, in percentage points. A direction "
             "*holds* where the interval for new objects and seeds lies above zero, is *reversed* where it lies below, "
             "and otherwise is *not shown*, which is not the same as absent: the table after this one says how large an "
