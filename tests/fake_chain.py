@@ -22,6 +22,7 @@ from pipeline.records import (
     Embedding,
     Finding,
     Frame,
+    Judged,
     Measurement,
     Part,
     Prediction,
@@ -93,6 +94,9 @@ def write_chain(root: Path, params: Params, *, objects: Sequence[str] = (), skil
         write_jsonl(data / "answers" / key / "predictions.jsonl", said)
         write_table(data / "scores" / key / "scores.parquet", Score, grade(questions, said, catalogue))
     _film(data / "frames", videos)
+    for name in params.plan.cross_validation:
+        records = [_judge(a, catalogue, skill, rng) for a in assignments]
+        write_table(data / "cross_validation" / name / "judged.parquet", Judged, records)
 
 
 def write_lock(root: Path, params: Params, changed: str = "", only: Sequence[str] = ()) -> None:
@@ -160,6 +164,12 @@ def _classify(a: Assignment, catalogue: Catalogue, skill: float, rng: random.Ran
             )
         )
     return records if a.part in (Part.VALIDATION, Part.TEST) else []
+
+
+def _judge(a: Assignment, catalogue: Catalogue, skill: float, rng: random.Random) -> Judged:
+    labels = catalogue.labels(a.object_id)
+    guess = labels if rng.random() < skill else tuple(rng.randrange(len(p.levels)) for p in catalogue.properties)
+    return Judged(video_id=a.video_id, object_id=a.object_id, repeat=0, expected=labels, predicted=guess)
 
 
 def _say(q: Question, variant: Variant, skill: float, rng: random.Random) -> Prediction | None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import itertools
 import math
+import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
@@ -17,7 +19,7 @@ import torch
 from pydantic import ValidationError
 from torch.optim.optimizer import register_optimizer_step_pre_hook
 
-from pipeline.artifacts import write_table
+from pipeline.artifacts import read_json, write_table
 from pipeline.baseline.features import video_features
 from pipeline.baseline.predictor import PropertyPredictor
 from pipeline.baseline.recordings import Recording, describe, recording_features
@@ -33,8 +35,11 @@ from pipeline.models.scene_encoder import SceneEncoder
 from pipeline.models.tactile_encoder import FrameEncoder, PropertyClassifier, save_trainable, trainable_state
 from pipeline.physiclear.catalogue import Catalogue
 from pipeline.records import Judged, Measurement, Part, Probe
+from pipeline.reporting import write_report
+from pipeline.reporting.encoder_report import write_encoder_report
 from pipeline.reporting.encoders import encoder_tables
 from pipeline.reporting.table import Table
+from pipeline.review.readme import parse
 from pipeline.runtime import derive_seed, seed_everything
 from pipeline.scales import compose
 from pipeline.scenes.film import write_film
@@ -49,6 +54,7 @@ from tests.audit_records import probe
 from tests.closure import ROOT
 from tests.conftest import encode, fake_videos, moving_square
 from tests.encoders import write_frames
+from tests.fake_chain import fake_params, write_chain
 
 OBJECTS = ("baseball", "controller_base", "cotton_ball", "ice_block", "millet", "pillow", "rug")
 CONFIG = CrossValidationConfig(folds=3, repeats=2, seed=4)
@@ -640,7 +646,6 @@ def judged(catalogue: Catalogue) -> dict[str, list[Judged]]:
 @pytest.fixture(scope="module")
 def tables(judged: dict[str, list[Judged]], catalogue: Catalogue) -> dict[str, Table]:
     found = encoder_tables(judged, catalogue, {"trees": 12.5, "strong": 3.25}, 5)
-    assert all(table.folder == "encoder" for table in found)
     return {table.name: table for table in found}
 
 
@@ -775,6 +780,42 @@ def test_the_learning_curve_is_sorted(catalogue: Catalogue) -> None:
 
 def test_nothing_judged_leaves_no_table(catalogue: Catalogue) -> None:
     assert encoder_tables({}, catalogue, {}, 5) == []
+
+
+def test_the_comparison_is_a_folder_that_says_where_it_comes_from(
+    judged: dict[str, list[Judged]], tmp_path: Path
+) -> None:
+    params = fake_params("cross_validation.models=[trees,paper]")
+    write_chain(tmp_path, params)
+    shutil.rmtree(tmp_path / "data" / "cross_validation")
+    assert write_encoder_report(params, tmp_path) == {}
+    folder = tmp_path / "reports" / params.report_name / "encoder"
+    assert "no model of `cross_validation.models`" in (folder / "README.md").read_text()
+    for name in ("paper", "trees", "strong"):
+        write_table(tmp_path / "data" / "cross_validation" / name / "judged.parquet", Judged, judged[name])
+    found = write_encoder_report(params, tmp_path)
+    assert set(found) == {"trees.combined", "paper.combined"}, "strong was not asked for"
+    assert found["trees.combined"] == pytest.approx(mean(right(judged["trees"])), abs=1e-6)
+    readme = parse((folder / "README.md").read_text())
+    names = [section.file for section in readme.sections]
+    assert names == ["cross_validation.csv", "differences.csv", "errors.csv", "agreement.csv"]
+    assert all((folder / name).is_file() for name in names)
+    assert (folder / "params.yaml").read_text() == (tmp_path / "params.yaml").read_text()
+    origin = read_json(folder / "provenance.json")
+    assert origin["params_sha256"] == hashlib.sha256((tmp_path / "params.yaml").read_bytes()).hexdigest()
+
+
+def test_the_rest_of_a_report_neither_needs_nor_touches_the_comparison(tmp_path: Path) -> None:
+    params = fake_params("cross_validation.models=[trees,probe]", "ablation.plan=single")
+    write_chain(tmp_path, params)
+    write_report(params, tmp_path)
+    folder = tmp_path / "reports" / params.report_name
+    assert not (folder / "encoder").exists()
+    assert "(encoder/README.md)" in (folder / "README.md").read_text()
+    (folder / "encoder").mkdir()
+    (folder / "encoder" / "README.md").write_text("# Encoders\n")
+    write_report(params, tmp_path)
+    assert [file.name for file in (folder / "encoder").iterdir()] == ["README.md"]
 
 
 def test_one_object_has_no_interval(catalogue: Catalogue) -> None:

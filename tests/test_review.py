@@ -22,6 +22,7 @@ from pipeline.artifacts import write_json
 from pipeline.cli import app
 from pipeline.errors import UserError
 from pipeline.reporting import write_report
+from pipeline.reporting.encoder_report import write_encoder_report
 from pipeline.reporting.samples import NO_PICTURES
 from pipeline.review import PAGE, write_page
 from pipeline.review.graph import HEIGHT, WIDTH, draw_chain
@@ -61,6 +62,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 # Drawing figures takes seconds, and the other report has all of them.
                 patch.setattr("pipeline.reporting.report._draw", lambda *_: [])
             write_report(params, chain)
+        write_encoder_report(params, chain)
         shutil.move(chain / "reports" / params.report_name, root / "reports" / params.report_name)
     shutil.copytree(ROOT / "reports" / "bench", root / "reports" / "bench")
     with pytest.MonkeyPatch.context() as patch:

@@ -13,6 +13,7 @@ from pipeline.reporting.table import Table, number, share_span
 from pipeline.statistics import Interval
 
 FOLDER = "encoder"
+"""Of these tables, below the report's."""
 RIVAL = "trees"
 """What every model that is no variation of another is compared with."""
 
@@ -170,7 +171,7 @@ def encoder_tables(
             f"Grouped cross-validation: {setting}",
             accuracies,
             [row for row in accuracies if row.property == COMBINED or row.model in HEADLINE],
-            folder=FOLDER,
+            folder="",
         ),
         Table(
             "differences",
@@ -178,7 +179,7 @@ def encoder_tables(
             "Combined accuracy on the same videos by the same folds, in percentage points. Parts of a model are "
             "compared with it, models of their own with the baseline.",
             _differences(verdicts),
-            folder=FOLDER,
+            folder="",
         ),
         Table(
             "errors",
@@ -187,7 +188,7 @@ def encoder_tables(
             "answer and even guessing reach.",
             [row for name, s in summaries.items() for row in _errors(name, s, catalogue)],
             [row for name, s in summaries.items() if name in HEADLINE for row in _errors(name, s, catalogue)],
-            folder=FOLDER,
+            folder="",
         ),
         Table(
             "agreement",
@@ -196,7 +197,7 @@ def encoder_tables(
             "and among the others.",
             agreement,
             [row for row in agreement if row.model in HEADLINE],
-            folder=FOLDER,
+            folder="",
         ),
     ]
     curve = _curve(summaries, folds)
@@ -207,7 +208,7 @@ def encoder_tables(
                 "What more objects would bring",
                 "The strong recipe after learning from only some of the training objects of each fold.",
                 curve,
-                folder=FOLDER,
+                folder="",
             )
         )
     return [table for table in tables if table.rows]

@@ -15,7 +15,6 @@ from pipeline.records import (
     Classification,
     Finding,
     GateRow,
-    Judged,
     Opd,
     Part,
     Question,
@@ -52,8 +51,6 @@ class Inputs:
     """The data audit's."""
     hard_cases: Sequence[StabilityRow]
     """Of every part, judged."""
-    judged: Mapping[str, Sequence[Judged]]
-    """By model: what the cross-validation over all objects found."""
     gate: Mapping[Task, bool]
     """By task: whether the base language model can do it on perfect descriptions; empty where nobody asked it."""
 
@@ -105,7 +102,6 @@ def read_inputs(params: Params, root: Path) -> Inputs:
     }
     files = {key: data / "scores" / key / "scores.parquet" for key in params.plan.variants}
     audit, hard = data / "audit" / "audit.csv", data / STABILITY_FILE
-    compared = {name: data / "cross_validation" / name / "judged.parquet" for name in params.plan.cross_validation}
     judged = {seed: data / "encoder" / str(seed) / "classifications.parquet" for seed in params.plan.encoder_seeds}
     return Inputs(
         params=params,
@@ -126,7 +122,6 @@ def read_inputs(params: Params, root: Path) -> Inputs:
         },
         findings=read_csv(audit, Finding) if audit.is_file() else (),
         hard_cases=read_csv(hard, StabilityRow) if hard.is_file() else (),
-        judged={name: read_table(file, Judged) for name, file in compared.items() if file.is_file()},
         gate=_read_gate(root / params.language.weights),
     )
 

@@ -32,6 +32,12 @@ PUBLISHED = """\
 - **Published** are the paper's figures with the n that they fit and its Wilson interval. They were measured with other
   models on other questions: they stand beside the measured figures and are no part of them.
 """
+ENCODERS = "Encoders over all objects"
+ELSEWHERE = """\
+Encoders and their rivals, cross-validated over all objects: [encoder/README.md](encoder/README.md), which a stage of
+its own writes, with its own provenance.
+"""
+NOTHING = "Nothing: no model of `cross_validation.models` has been cross-validated.\n"
 SMOKE = "\n> **Scale `smoke`: its figures prove nothing but that the chain runs.**\n"
 
 
@@ -55,10 +61,11 @@ class Picture:
 def render_page(inputs: Inputs, origin: Provenance, tables: Sequence[Table], pictures: Sequence[Picture]) -> str:
     """README.md of the report's folder."""
     sections = [
-        *(f"## {t.title}\n\n{t.caption} ([CSV]({t.folder}/{t.name}.csv))\n\n{t.markdown()}" for t in tables),
+        *(t.section for t in tables),
         *(f"## {p.title}\n\n{_picture(p)}" for p in pictures),
+        *([f"## {ENCODERS}\n\n{ELSEWHERE}"] if inputs.params.plan.cross_validation else []),
     ]
-    titles = [*(t.title for t in tables), *(p.title for p in pictures)]
+    titles = [section.splitlines()[0].removeprefix("## ") for section in sections]
     contents = "".join(f"- [{title}](#{_anchor(title)})\n" for title in titles)
     smoke = SMOKE if inputs.params.scale == "smoke" else ""
     return "\n".join(
@@ -68,9 +75,16 @@ def render_page(inputs: Inputs, origin: Provenance, tables: Sequence[Table], pic
             f"## Contents\n\n{contents}",
             f"## How to read it\n\n{READING.format(published=PUBLISHED if inputs.of_paper else '')}",
             *sections,
-            f"## Provenance\n\n{_origin(origin)}",
+            f"## Provenance\n\n{_origin(origin)}- headline accuracies: [metrics.json](metrics.json)\n",
         ]
     )
+
+
+def render_encoder_page(origin: Provenance, tables: Sequence[Table]) -> str:
+    """README.md of the folder of encoders."""
+    sections = [table.section for table in tables] or [NOTHING]
+    title = f"# {ENCODERS}: scale {origin.scale}, source {origin.source}\n"
+    return "\n".join([title, *sections, f"## Provenance\n\n{_origin(origin)}"])
 
 
 def _test_set(inputs: Inputs) -> str:
@@ -99,7 +113,7 @@ def _origin(origin: Provenance) -> str:
         f"- parameters: [params.yaml](params.yaml), sha256 `{origin.params_sha256}`\n"
         f"- videos: sha256 `{origin.data_sha256}` over their hashes\n"
         f"- Python {origin.python}, {packages}\n"
-        "- all of it as JSON: [provenance.json](provenance.json); headline accuracies: [metrics.json](metrics.json)\n"
+        "- all of it as JSON: [provenance.json](provenance.json)\n"
     )
 
 

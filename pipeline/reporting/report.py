@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline.artifacts import read_json, read_table, write_json, write_text
+from pipeline.artifacts import read_table, write_json, write_text
 from pipeline.config import PARAMS_FILE, Params
 from pipeline.plan import Encoder
 from pipeline.records import Embedding, Measurement, Part
@@ -23,11 +23,7 @@ from pipeline.reporting.results import headline, result_tables
 from pipeline.reporting.samples import FOLDER as SAMPLES
 from pipeline.reporting.samples import write_samples
 from pipeline.reporting.stability import stability_table
-from pipeline.reporting.table import Table
-
-COSTS = Path("reports") / "bench" / "encoder.json"
-MODEL = "model, "
-"""Begins the cases of that file that are contestants of the cross-validation."""
+from pipeline.reporting.table import Table, write_tables
 
 
 def write_report(params: Params, root: Path) -> dict[str, float]:
@@ -43,16 +39,8 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     folder = root / "reports" / params.report_name
     checked = [audit_table(inputs.findings)] if inputs.findings else []
     checked += [stability_table(inputs.hard_cases)] if inputs.hard_cases else []
-    # NumPy comes with it, which stages that only ask for a report's name should not wait for.
-    from pipeline.reporting.encoders import encoder_tables
-
-    compared = encoder_tables(inputs.judged, inputs.catalogue, _costs(root), params.cross_validation.folds)
-    tables = [*result_tables(inputs), *language_tables(inputs), *compared, *dataset_tables(inputs), *checked]
-    for table in tables:
-        write_text(folder / table.folder / f"{table.name}.csv", table.csv())
-        write_text(
-            folder / table.folder / f"{table.name}.md", f"# {table.title}\n\n{table.caption}\n\n{table.markdown()}"
-        )
+    tables = [*result_tables(inputs), *language_tables(inputs), *dataset_tables(inputs), *checked]
+    write_tables(tables, folder)
     pictures = _draw(inputs, tables, root, folder / "figures")
     write_samples(inputs, root, folder / SAMPLES)
     origin = provenance(params, inputs.videos, root)
@@ -62,13 +50,6 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     write_json(folder / "provenance.json", origin.model_dump())
     write_json(folder / "metrics.json", metrics)
     return metrics
-
-
-def _costs(root: Path) -> dict[str, float]:
-    """Milliseconds a video that the benchmark has measured, by model."""
-    file = root / COSTS
-    rows = read_json(file) if file.is_file() else []
-    return {row["case"].removeprefix(MODEL): row["cost"] for row in rows if row["case"].startswith(MODEL)}
 
 
 def _draw(inputs: Inputs, tables: Sequence[Table], root: Path, folder: Path) -> list[Picture]:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Protocol
+
+from pipeline.artifacts import write_text
 
 Cell = str | int | float | None
 
@@ -33,6 +36,12 @@ class Table:
     folder: str = "tables"
     """Below the report's folder."""
 
+    @property
+    def section(self) -> str:
+        """Title, caption and table as a page has them."""
+        file = (Path(self.folder) / f"{self.name}.csv").as_posix()
+        return f"## {self.title}\n\n{self.caption} ([CSV]({file}))\n\n{self.markdown()}"
+
     def csv(self) -> str:
         """All fields of all rows; None is an empty cell."""
         stream = io.StringIO()
@@ -55,6 +64,15 @@ class Table:
             *([row[name].replace("|", "\\|") for name in columns] for row in shown),
         ]
         return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def write_tables(tables: Iterable[Table], folder: Path) -> None:
+    """Write each as CSV and Markdown below a report's folder."""
+    for table in tables:
+        write_text(folder / table.folder / f"{table.name}.csv", table.csv())
+        write_text(
+            folder / table.folder / f"{table.name}.md", f"# {table.title}\n\n{table.caption}\n\n{table.markdown()}"
+        )
 
 
 def number(value: float | None, digits: int = 2) -> str:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from pipeline.artifacts import read_json
+from pipeline.reporting.encoders import FOLDER as ENCODERS
 from pipeline.reporting.samples import FILE, FOLDER
-from pipeline.review.readme import Readme, parse
+from pipeline.review.readme import Readme, parse, within
 from pipeline.review.traced import Grid, Piece, entry, lookup, read_grid
 
 README = "README.md"
@@ -27,6 +28,8 @@ class Report:
     tables: Mapping[str, Grid]
     """By file relative to the folder."""
     provenance: Mapping[str, Any]
+    encoders: Mapping[str, Any]
+    """The provenance of the comparison of encoders; empty where there is none of its own."""
     params: Mapping[str, Any]
     params_text: str
     samples: Mapping[str, Any]
@@ -43,6 +46,10 @@ class Report:
     def origin(self, place: str) -> Piece:
         """A value of provenance.json."""
         return entry(self.file("provenance.json"), self.provenance, place)
+
+    def encoder_origin(self, place: str) -> Piece:
+        """A value of the provenance of the comparison of encoders."""
+        return entry(self.file(f"{ENCODERS}/provenance.json"), self.encoders, place)
 
     def param(self, place: str) -> Piece:
         """A value of params.yaml; a list as one text."""
@@ -102,11 +109,16 @@ def _read(reports: Path, name: str) -> Report:
     files = sorted(path.relative_to(reports).as_posix() for path in folder.rglob("*.csv"))
     params = folder / "params.yaml"
     text = params.read_text(encoding="utf-8") if params.is_file() else ""
+    readme, encoders = parse((folder / README).read_text(encoding="utf-8")), folder / ENCODERS / README
+    if encoders.is_file():
+        inner = within(parse(encoders.read_text(encoding="utf-8")), ENCODERS)
+        readme = replace(readme, sections=(*readme.sections, *inner))
     return Report(
         name=name,
-        readme=parse((folder / README).read_text(encoding="utf-8")),
+        readme=readme,
         tables={file.removeprefix(f"{name}/"): grid for file in files if (grid := read_grid(reports, file))},
         provenance=_json(folder / "provenance.json"),
+        encoders=_json(folder / ENCODERS / "provenance.json"),
         params=yaml.safe_load(text) or {},
         params_text=text,
         samples=_json(folder / FOLDER / FILE),

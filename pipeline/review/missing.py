@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from pipeline.review.folders import README, Bench, Report
+from pipeline.review.folders import Bench, Report
 from pipeline.review.known import ACCURACIES
 from pipeline.review.themes import EVERYWHERE, EXPECTED, NO_GATE, NO_SAMPLES, OLDER, Expected
 from pipeline.review.traced import Grid, Piece, lookup
@@ -40,7 +40,7 @@ def _of_report(report: Report) -> list[Gap]:
         if grid := report.table(name):
             found += [Gap(report.name, what, why) for what, why in _empty_cells(report, name, grid)]
     found += [
-        Gap(report.name, (Piece(s.title),), Piece(s.missing, f"{report.file(README)}#"))
+        Gap(report.name, (Piece(s.title),), Piece(s.missing, f"{report.file(s.told)}#"))
         for s in report.readme.sections
         if s.missing
     ]

@@ -130,9 +130,8 @@ def _chapter(report: Report) -> Chapter:
 def _blocks(report: Report, sections: Sequence[Section]) -> list[Block]:
     """What is written under one name: the table first, and the figure where the table does not show the same."""
     blocks: list[Block] = []
-    readme = report.file("README.md")
     for section in sections:
-        grid = report.tables.get(section.file)
+        grid, readme = report.tables.get(section.file), report.file(section.told)
         if section.file.endswith(".png"):
             if not any(block.matrices for block in blocks):
                 picture = Picture(report.file(section.file), section.alt)
@@ -178,7 +177,7 @@ def _shared(same: Sequence[Grid], title: str, report: Report | None = None, sect
     grid = same[0]
     name, view = grid.file.replace("/", "-")[:-4], view_of(Path(grid.file).stem)
     counts = tuple((v.value, grid.where("verdict", v.value)) for v in Judgement) if "verdict" in grid.columns else ()
-    caption, source = (section.caption, report.file("README.md")) if report and section else ("", "")
+    caption, source = (section.caption, report.file(section.told)) if report and section else ("", "")
     table = show(grid, view, title, name=name)
     return Block(title, caption, source, table=table, counts=counts, same=tuple(g.file for g in same[1:]))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 TABLE = re.compile(r"^(?P<caption>.*?) ?\(\[CSV\]\((?P<file>[^)]+)\)\)$", re.DOTALL)
 IMAGE = re.compile(r"^!\[(?P<alt>[^\]]*)\]\((?P<file>[^)]+)\)$")
@@ -23,6 +23,8 @@ class Section:
     alt: str = ""
     missing: str = ""
     """Why a figure was not drawn."""
+    told: str = "README.md"
+    """The file that says so, relative to the report's folder."""
 
     @property
     def name(self) -> str:
@@ -51,6 +53,11 @@ def parse(text: str) -> Readme:
     tested = [p for p in paragraphs[1:] if not p.startswith(">")]
     sections = [_section(*part.split("\n", 1)) for part in parts if "\n" in part]
     return Readme(title, " ".join(warnings), " ".join(tested), tuple(s for s in sections if s and s.title not in FRAME))
+
+
+def within(readme: Readme, folder: str) -> tuple[Section, ...]:
+    """The sections of a README.md in a folder of the report's, as the report's own."""
+    return tuple(replace(s, file=s.file and f"{folder}/{s.file}", told=f"{folder}/{s.told}") for s in readme.sections)
 
 
 def _section(title: str, body: str) -> Section | None:

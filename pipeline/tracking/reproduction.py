@@ -57,6 +57,7 @@ def planned_stages(plan: Plan) -> list[PlannedStage]:
         *(PlannedStage(name) for name in ("extract_frames", "split", "audit", "questions")),
         *(PlannedStage("pretrain", key, trained=f"data/pretrained/{key}") for key in plan.pretrain),
         *(PlannedStage("cross_validate", name) for name in plan.cross_validation),
+        PlannedStage("compare_encoders"),
         *(
             PlannedStage(
                 "finetune_encoder", str(s), _axes(encoder=Encoder.FINETUNED.value, seed=s), f"data/encoder/{s}"
