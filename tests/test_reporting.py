@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import json
 import os
 import re
@@ -365,9 +366,26 @@ def test_published_accuracies_are_whole_numbers_of_answers() -> None:
         assert interval.low < cell.value < interval.high
 
 
+def test_provenance_tells_weights_of_one_name_apart(tmp_path: Path, params: Params) -> None:
+    (tmp_path / "params.yaml").write_text("scale: smoke\n")
+    (tmp_path / "llm" / "part").mkdir(parents=True)
+    (tmp_path / "llm" / "part" / "a.bin").write_bytes(b"one")
+
+    def digests() -> dict[str, str]:
+        return {w.folder: w.sha256 for w in provenance(params, [], ["llm", "absent"], tmp_path).weights}
+
+    line = f"part/a.bin {hashlib.sha256(b'one').hexdigest()}\n"
+    assert digests() == {"llm": hashlib.sha256(line.encode()).hexdigest(), "absent": "unknown"}
+    (tmp_path / "llm" / "part" / "a.bin").write_bytes(b"two")
+    second = digests()["llm"]
+    assert second != hashlib.sha256(line.encode()).hexdigest()
+    (tmp_path / "llm" / "part" / "a.bin").rename(tmp_path / "llm" / "b.bin")
+    assert digests()["llm"] != second, "another name is another folder"
+
+
 def test_provenance_names_the_code_not_the_report(tmp_path: Path, params: Params) -> None:
     (tmp_path / "params.yaml").write_text("a: 1\n")
-    assert provenance(params, [], tmp_path).revision == "unknown"
+    assert provenance(params, [], [], tmp_path).revision == "unknown"
 
     def git(*arguments: str) -> None:
         who = ["-c", "user.name=n", "-c", "user.email=e@e", "-c", "commit.gpgsign=false"]
@@ -379,14 +397,14 @@ def test_provenance_names_the_code_not_the_report(tmp_path: Path, params: Params
     git("init")
     git("add", "pipeline")
     git("commit", "-m", "code")
-    committed = provenance(params, [], tmp_path)
+    committed = provenance(params, [], [], tmp_path)
     assert re.fullmatch("[0-9a-f]{40}", committed.revision)
     git("add", "reports")
     git("commit", "-m", "report")
-    assert provenance(params, [], tmp_path) == committed
+    assert provenance(params, [], [], tmp_path) == committed
     assert committed.dirty is False
     (tmp_path / "pipeline" / "file").write_text("2")
-    assert provenance(params, [], tmp_path).dirty is True
+    assert provenance(params, [], [], tmp_path).dirty is True
 
 
 def test_the_params_beside_the_report_are_the_runs(chain: Path, params: Params) -> None:

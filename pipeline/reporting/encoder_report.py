@@ -33,7 +33,8 @@ def write_encoder_report(params: Params, root: Path) -> dict[str, float]:
     files = {name: found / name / "judged.parquet" for name in params.plan.cross_validation}
     judged = {name: read_table(file, Judged) for name, file in files.items() if file.is_file()}
     catalogue = load_catalogue(root / params.data.catalogue)
-    origin = provenance(params, read_table(root / "data" / "videos.parquet", Video), root)
+    videos = read_table(root / "data" / "videos.parquet", Video)
+    origin = provenance(params, videos, [params.encoder.weights], root)
     tables = encoder_tables(judged, catalogue, _costs(root), params.cross_validation.folds)
     folder = root / "reports" / params.report_name / FOLDER
     write_tables(tables, folder)

@@ -107,11 +107,13 @@ def _picture(picture: Picture) -> str:
 
 def _origin(origin: Provenance) -> str:
     changed = " (with uncommitted changes)" if origin.dirty else ""
+    weights = ", ".join(f"`{w.folder}` sha256 `{w.sha256}`" for w in origin.weights)
     packages = ", ".join(f"{name} {version}" for name, version in origin.packages.items())
     return (
         f"- code: revision `{origin.revision}`{changed}\n"
         f"- parameters: [params.yaml](params.yaml), sha256 `{origin.params_sha256}`\n"
         f"- videos: sha256 `{origin.data_sha256}` over their hashes\n"
+        f"- weights: {weights}\n"
         f"- Python {origin.python}, {packages}\n"
         "- all of it as JSON: [provenance.json](provenance.json)\n"
     )

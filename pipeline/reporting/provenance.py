@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import platform
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from importlib import metadata
 from pathlib import Path
 
@@ -18,6 +18,17 @@ CODE = ("pipeline", "stages", "conf", "dvc.yaml")
 """What a result can depend on. A commit of the report alone does not change the report's revision."""
 PACKAGES = ("torch", "transformers", "peft", "open_clip_torch", "dvc")
 UNKNOWN = "unknown"
+
+
+class Weights(BaseModel):
+    """A folder of pretrained weights."""
+
+    model_config = ConfigDict(frozen=True)
+
+    folder: str
+    """As params.yaml has it."""
+    sha256: str
+    """Over its files' names and hashes; "unknown" where it is not there."""
 
 
 class Provenance(BaseModel):
@@ -35,12 +46,13 @@ class Provenance(BaseModel):
     params_sha256: str
     data_sha256: str
     """Over the rows of videos.parquet, so over every video's hash."""
+    weights: tuple[Weights, ...]
     python: str
     packages: dict[str, str]
 
 
-def provenance(params: Params, videos: Sequence[Video], root: Path) -> Provenance:
-    """Describe the report of `root`."""
+def provenance(params: Params, videos: Sequence[Video], weights: Iterable[str], root: Path) -> Provenance:
+    """Describe the report of `root` that was made with these folders of pretrained weights."""
     rows = "\n".join(video.model_dump_json() for video in videos)
     revision = _git(root, "log", "-1", "--format=%H", "--", *CODE)
     return Provenance(
@@ -51,9 +63,20 @@ def provenance(params: Params, videos: Sequence[Video], root: Path) -> Provenanc
         dirty=bool(_git(root, "status", "--porcelain", "--", *CODE)),
         params_sha256=hashlib.sha256((root / PARAMS_FILE).read_bytes()).hexdigest(),
         data_sha256=hashlib.sha256(rows.encode()).hexdigest(),
+        weights=tuple(Weights(folder=folder, sha256=_digest(root / folder)) for folder in weights),
         python=platform.python_version(),
         packages={name: _version(name) for name in PACKAGES},
     )
+
+
+def _digest(folder: Path) -> str:
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    total = hashlib.sha256()
+    for file in files:
+        with file.open("rb") as stream:
+            digest = hashlib.file_digest(stream, "sha256").hexdigest()
+        total.update(f"{file.relative_to(folder).as_posix()} {digest}\n".encode())
+    return total.hexdigest() if files else UNKNOWN
 
 
 def _git(root: Path, *arguments: str) -> str:

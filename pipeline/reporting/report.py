@@ -43,7 +43,7 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     write_tables(tables, folder)
     pictures = _draw(inputs, tables, root, folder / "figures")
     write_samples(inputs, root, folder / SAMPLES)
-    origin = provenance(params, inputs.videos, root)
+    origin = provenance(params, inputs.videos, [params.encoder.weights, params.language.weights], root)
     metrics = headline(inputs, tables)
     write_text(folder / "README.md", render_page(inputs, origin, tables, pictures))
     write_text(folder / "params.yaml", (root / PARAMS_FILE).read_text(encoding="utf-8"))
