@@ -305,6 +305,14 @@ def test_all_parts_are_there(fresh: Element) -> None:
     assert "nothing has written a stability.csv" not in text
 
 
+def test_the_comparison_of_encoders_says_where_it_comes_from_itself(fresh: Element) -> None:
+    sources = [e.attributes.get("data-source", "") for e in fresh.walk()]
+    assert sources.count("smoke-scenes/encoder/provenance.json#revision") == 1
+    captions = [e for e in fresh.walk() if e.attributes.get("data-source") == "smoke-scenes/encoder/README.md#"]
+    assert any(e.text.startswith("Grouped cross-validation: ") for e in captions)
+    assert not [s for s in sources if "smoke-scenes/README.md" in s and "cross-validation" in s]
+
+
 def test_real_videos_have_no_picture_and_the_page_says_why(fresh: Element, made: Path) -> None:
     assert not list((made / "reports" / "smoke-videos" / "samples").glob("*.png"))
     (chapter,) = [e for e in fresh.walk() if e.attributes.get("id") == "smoke-videos-samples"]
@@ -488,6 +496,7 @@ def test_what_is_missing_is_named_with_the_reason(changed: Path) -> None:
     (folder / "language" / "touch.csv").unlink()
     (folder / "language" / "seeds.csv").unlink()
     shutil.rmtree(folder / "samples")
+    shutil.rmtree(folder / "encoder")
     for file in (changed / "reports").rglob("stability.csv"):
         file.unlink()
     readme = (folder / "README.md").read_text()
@@ -504,6 +513,7 @@ def test_what_is_missing_is_named_with_the_reason(changed: Path) -> None:
         "smoke-scenes Sample answers the report is older",
         "smoke-videos Describing what is needed, or everything its plan has no variant with OPD needed",
         "smoke-videos Main effects and interactions its plan crosses no two parts",
+        "smoke-scenes Encoders over all objects its models have not been cross-validated; ",
         "smoke-scenes Why results differ from run to run the report is older than this table",
         "speed Section frames its run measured nothing",
         "all reports Numerical stability nothing has written a stability.csv yet",

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from pipeline.review.folders import Bench, Report
 from pipeline.review.known import ACCURACIES
-from pipeline.review.themes import EVERYWHERE, EXPECTED, NO_GATE, NO_SAMPLES, OLDER, Expected
+from pipeline.review.themes import EVERYWHERE, EXPECTED, NO_GATE, NO_SAMPLES, Expected
 from pipeline.review.traced import Grid, Piece, lookup
 
 
@@ -59,7 +59,7 @@ def _reason(report: Report, table: Expected) -> str:
     # One training is no comparison, one contestant or counterfactual is.
     least = 2 if table.name == "effects" else 1
     asked = bool(table.wanted) and len(lookup(report.params, table.wanted) or ()) >= least
-    return OLDER if asked else table.reason
+    return table.due if asked else table.reason
 
 
 def _empty_cells(report: Report, name: str, grid: Grid) -> list[tuple[tuple[Piece, ...], Piece]]:
