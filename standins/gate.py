@@ -5,14 +5,14 @@ descriptions are given as the assistant's own words (OPD mode `all`) and the mod
 "from slots" the classes stand in words where the videos would be and the model says everything; "from blends" puts one
 vector there, the sum of those words' embeddings, as a projection of touch might. Made-up objects have property
 combinations and names that no training text shows; the "test objects" are the catalogue's, and so are their scenarios,
-of which no training text speaks at all. For POM the facts about the
-named objects stand in the question.
+of which no training text speaks at all; the "whole catalogue" has every name that an evaluation may ask for. For POM
+the facts about the named objects stand in the question.
 """
 
 from __future__ import annotations
 
 import random
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -56,7 +56,7 @@ class Exam:
     goal: float
     mode: Opd = Opd.ALL
     slots: Literal["none", "words", "blends"] = "none"
-    objects: Literal["made up", "test", "test, own sentence alone"] = "made up"
+    objects: Literal["made up", "test", "test, own sentence alone", "all"] = "made up"
     scenarios: Literal["training", "seen", "unseen"] = "training"
     measure: str = "choice"
 
@@ -81,6 +81,7 @@ def exams() -> tuple[Exam, ...]:
     matching = [
         Exam("POM", Task.POM, GOALS[Task.POM]),
         Exam("POM test objects", Task.POM, GOALS[Task.POM], objects="test"),
+        Exam("POM whole catalogue", Task.POM, GOALS[Task.POM], objects="all"),
     ]
     suited = [
         Exam("PSR seen kinds", Task.PSR, GOALS[Task.PSR], scenarios="seen"),
@@ -116,14 +117,14 @@ def make_items(exam: Exam, settings: LlamaSettings) -> list[Item]:
         if exam.objects == "made up":
             world = make_world(combos, questions(exam.scenarios), rng, held=True)
         else:
-            world = World(_test_pool())
+            world = World(_real_pool(Part) if exam.objects == "all" else _real_pool((Part.TEST,)))
         items += [_item(exam, world, len(items) + i, rng) for i in range(QUESTIONS_A_WORLD)]
     return items[: settings.gate_questions]
 
 
-def _test_pool() -> Pool:
-    real = real_catalogue()
-    chosen = {name: [name] for name, o in real.objects.items() if o.splits["paper"] == Part.TEST}
+def _real_pool(parts: Iterable[Part]) -> Pool:
+    real, wanted = real_catalogue(), set(parts)
+    chosen = {name: [name] for name, o in real.objects.items() if o.splits["paper"] in wanted}
     return Pool(part=Part.TEST, catalogue=real, videos=chosen)
 
 

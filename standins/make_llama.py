@@ -81,8 +81,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--from", type=Path, dest="file", help="go on from this checkpoint, also of another recipe")
     file = parser.parse_args().file
-    torch.set_num_threads(1)
     settings = load_settings().llama
+    torch.set_num_threads(settings.threads)
     seed_everything(settings.seed)
     tokenizer = build_tokenizer(vocabulary(), phrases())
     model = make_model(settings, tokenizer)

@@ -48,6 +48,7 @@ class LlamaSettings(_Section):
     """The tiny Llama: architecture, curriculum, gate."""
 
     seed: int
+    threads: PositiveInt
     hidden_size: PositiveInt
     intermediate_size: PositiveInt
     layers: PositiveInt

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 import torch
 import torch.nn.functional as F
-from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from pipeline.runtime import derive_seed
 from standins.curriculum import Format
@@ -150,14 +149,12 @@ class Trainer:
             group["lr"] = self.settings.learning_rate * rate * warm
         ids, weights = pad(batch)
         noise = torch.Generator().manual_seed(derive_seed("llama noise", self.settings.seed, self.steps) % 2**32)
-        # PyTorch's fused attention is slow backwards in bfloat16 on a processor.
-        with torch.autocast("cpu", dtype=torch.bfloat16), sdpa_kernel(SDPBackend.MATH):
-            output = self.model.model(inputs_embeds=embed(self.model, ids, batch, noise), output_hidden_states=True)
-            counted = weights[:, 1:] > 0
-            logits = self.model.lm_head(output.last_hidden_state[:, :-1][counted])
+        output = self.model.model(inputs_embeds=embed(self.model, ids, batch, noise), output_hidden_states=True)
+        counted = weights[:, 1:] > 0
+        logits = self.model.lm_head(output.last_hidden_state[:, :-1][counted])
         # The weighted mean over the tokens that count; the others need no logits at all.
         weight = weights[:, 1:][counted]
-        loss = (F.cross_entropy(logits.float(), ids[:, 1:][counted], reduction="none") * weight).sum() / weight.sum()
+        loss = (F.cross_entropy(logits, ids[:, 1:][counted], reduction="none") * weight).sum() / weight.sum()
         self.losses.append(loss.item())
         read = self.probes(output.hidden_states, batch, self.model.get_input_embeddings().weight)
         loss = loss + self.settings.probe_weight * read
@@ -244,9 +241,8 @@ def accuracies(model: LlamaForCausalLM, documents: Sequence[Tokens], limit: int)
         length = ids.shape[1]
         decisions = torch.tensor([[*t.decisions, *[-1] * (length - len(t.decisions))] for t in batch])
         counted = decisions[:, 1:] >= 0
-        with torch.autocast("cpu", dtype=torch.bfloat16), sdpa_kernel(SDPBackend.MATH):
-            hidden = model.model(inputs_embeds=embed(model, ids, batch)).last_hidden_state[:, :-1][counted]
-            right = (model.lm_head(hidden).argmax(-1) == ids[:, 1:][counted]).tolist()
+        hidden = model.model(inputs_embeds=embed(model, ids, batch)).last_hidden_state[:, :-1][counted]
+        right = (model.lm_head(hidden).argmax(-1) == ids[:, 1:][counted]).tolist()
         made: dict[tuple[int, int], bool] = {}
         rows = counted.nonzero()[:, 0].tolist()
         for row, decision, hit in zip(rows, decisions[:, 1:][counted].tolist(), right, strict=True):

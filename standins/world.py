@@ -32,6 +32,9 @@ MISREADINGS = 40
 """Tries before it feels everything as it is."""
 UNSEEN = 2
 """Situations at the end of each list that are told as facts and never asked about."""
+JOINTS = (" ", " ", " ", "'s ", "' ", " of ", " of a ", " on a ")
+"""What stands between the words of a name that nobody foresees."""
+ARTICLES = ("a", "an")
 
 
 class _Entry(BaseModel):
@@ -83,9 +86,9 @@ def forbidden_descriptions() -> frozenset[str]:
 
 @cache
 def spare_words() -> tuple[str, ...]:
-    """Words of which names can be made that nobody foresees."""
+    """Words for names that nobody foresees: all of the catalogue's names but those that join or begin one, and more."""
     texts = [o.name for o in real_catalogue().objects.values()] + list(load_situations().words)
-    return tuple(sorted({w for w in words_of(texts) if len(w) > 2}))
+    return tuple(sorted(words_of(texts) - words_of((*JOINTS, *ARTICLES))))
 
 
 @cache
@@ -163,12 +166,12 @@ def _odd_name(rng: random.Random) -> str:
     words = rng.choices((*spare_words(), *load_situations().nouns), k=rng.randint(1, 4))
     name = words[0]
     for word in words[1:]:
-        name += rng.choice((" ", " ", " ", "'s ", "' ", " of ", " of a ", " on a ")) + word
+        name += rng.choice(JOINTS) + word
     return name if rng.random() < 0.1 else _with_article(name)
 
 
 def _with_article(name: str) -> str:
-    return f"{'an' if name[0] in 'aeiou' else 'a'} {name}"
+    return f"{ARTICLES[name[0] in 'aeiou']} {name}"
 
 
 def misread(world: World, objects: Sequence[str], rng: random.Random) -> World:
