@@ -19,7 +19,7 @@ from pipeline.plan import resolve_plan
 from pipeline.records import Touch
 from pipeline.sections import SCENES_DIR
 
-WIDTH, HEIGHT = 132, 42
+WIDTH, HEIGHT = 144, 42
 ACROSS, DOWN = 18, 30
 """Free space between two boxes."""
 TOP = 8
