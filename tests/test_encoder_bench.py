@@ -26,7 +26,7 @@ from pipeline.models.scene_encoder import SceneEncoder
 from pipeline.models.tactile_encoder import FrameEncoder, save_trainable
 from pipeline.physiclear.catalogue import Catalogue
 from pipeline.records import Judged, Part
-from pipeline.reporting.report import COSTS, _costs
+from pipeline.reporting.encoder_report import COSTS, _costs
 from pipeline.scenes.film import write_film
 from pipeline.scenes.light import make_sensor, shade
 from pipeline.sections import CrossValidationConfig, EncoderConfig, FramesConfig, RuntimeConfig
