@@ -203,6 +203,8 @@ class CrossValidationConfig(Section):
     @field_validator("models")
     @classmethod
     def _models_are_known(cls, models: tuple[str, ...]) -> tuple[str, ...]:
+        if not models:
+            raise ValueError("names no model, but every report has a comparison; [constant] is the cheapest")
         unknown = [name for name in models if name not in CONTESTANTS]
         if unknown:
             raise ValueError(f"{unknown[0]} is no model; known: {', '.join(CONTESTANTS)}")

@@ -24,6 +24,7 @@ from pipeline.plan import Encoder, Lora
 from pipeline.records import Assignment, Finding, Opd, Part, Score, Severity, Task
 from pipeline.reporting import write_report
 from pipeline.reporting.audit import MOST_ALIKE, audit_table
+from pipeline.reporting.encoder_report import write_encoder_report
 from pipeline.reporting.figures import project
 from pipeline.reporting.inputs import read_inputs, why_empty
 from pipeline.reporting.provenance import provenance
@@ -56,6 +57,7 @@ TRAINING_OBJECTS = ("baseball", "cotton_ball", "pillow", "potato", "rug")
 
 def report(root: Path, params: Params) -> Path:
     write_report(params, root)
+    write_encoder_report(params, root)
     return root / "reports" / params.report_name
 
 
@@ -102,11 +104,17 @@ def test_every_table_and_figure_is_there(chain: Path, params: Params) -> None:
         ),
         *(f"figures/{name}.png" for name in ("confusion_matrices", "effects", "embedding_map", "training_curves")),
         *("README.md", "metrics.json", "params.yaml", "provenance.json", "samples/samples.json"),
+        *(f"encoder/{file}" for file in ("README.md", "params.yaml", "provenance.json")),
+        *(
+            f"encoder/{name}.{ending}"
+            for name in ("agreement", "cross_validation", "differences", "errors")
+            for ending in ("csv", "md")
+        ),
     }
     page = (folder / "README.md").read_text()
     linked = re.findall(r"\]\(([^)#]+)\)", page)
     assert linked
-    assert set(linked) - {"encoder/README.md"} <= written, "that one is of another stage"
+    assert set(linked) <= written
     assert "prove nothing but that the chain runs" in page
     assert "Test objects without videos: clothes_peg, hairbrush_handle, microfiber_cloth." in page
     headings = {re.sub(r"[:'?,]", "", h.lower().replace(" ", "-")) for h in re.findall(r"^## (.+)$", page, re.M)}
@@ -379,6 +387,9 @@ def test_provenance_tells_weights_of_one_name_apart(tmp_path: Path, params: Para
     (tmp_path / "llm" / "part" / "a.bin").write_bytes(b"two")
     second = digests()["llm"]
     assert second != hashlib.sha256(line.encode()).hexdigest()
+    (tmp_path / "llm" / ".cache").mkdir()
+    (tmp_path / "llm" / ".cache" / "when").write_text("today")
+    assert digests()["llm"] == second, "what a download leaves about itself are no weights"
     (tmp_path / "llm" / "part" / "a.bin").rename(tmp_path / "llm" / "b.bin")
     assert digests()["llm"] != second, "another name is another folder"
 

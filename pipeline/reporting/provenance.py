@@ -28,7 +28,7 @@ class Weights(BaseModel):
     folder: str
     """As params.yaml has it."""
     sha256: str
-    """Over its files' names and hashes; "unknown" where it is not there."""
+    """Over its files' names and hashes, hidden ones left out; "unknown" where it is not there."""
 
 
 class Provenance(BaseModel):
@@ -70,12 +70,13 @@ def provenance(params: Params, videos: Sequence[Video], weights: Iterable[str], 
 
 
 def _digest(folder: Path) -> str:
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    found = {path.relative_to(folder): path for path in folder.rglob("*") if path.is_file()}
+    # Downloads leave hidden files that tell when they were made.
+    files = sorted(name for name in found if not any(part.startswith(".") for part in name.parts))
     total = hashlib.sha256()
-    for file in files:
-        with file.open("rb") as stream:
-            digest = hashlib.file_digest(stream, "sha256").hexdigest()
-        total.update(f"{file.relative_to(folder).as_posix()} {digest}\n".encode())
+    for name in files:
+        with found[name].open("rb") as stream:
+            total.update(f"{name.as_posix()} {hashlib.file_digest(stream, 'sha256').hexdigest()}\n".encode())
     return total.hexdigest() if files else UNKNOWN
 
 
