@@ -307,7 +307,9 @@ def test_equal_input_gives_equal_bytes(copy: Path, chain: Path, params: Params) 
     code = (
         "import sys; from pathlib import Path; from pipeline.config import load_params;"
         "from pipeline.reporting import write_report;"
-        "root = Path(sys.argv[1]); write_report(load_params(root / 'params.yaml'), root)"
+        "from pipeline.reporting.encoder_report import write_encoder_report;"
+        "root = Path(sys.argv[1]); params = load_params(root / 'params.yaml');"
+        "write_report(params, root); write_encoder_report(params, root)"
     )
     environment = {**os.environ, "PYTHONHASHSEED": "7", "OMP_NUM_THREADS": "1"}
     subprocess.run([sys.executable, "-c", code, str(copy)], check=True, cwd=ROOT, env=environment)
