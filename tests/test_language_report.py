@@ -330,7 +330,7 @@ def test_one_seed_and_one_variant_leave_out_what_cannot_be_compared(tmp_path: Pa
     write_chain(tmp_path, params)
     write_report(params, tmp_path)
     folder = tmp_path / "reports" / params.report_name / "language"
-    assert sorted(p.name for p in folder.glob("*.csv")) == ["ablation.csv", "seeds.csv"]
+    assert sorted(p.name for p in folder.glob("*.csv")) == ["ablation.csv", "reasoning.csv", "seeds.csv"]
 
 
 def test_missing_answers_leave_rows_out(tmp_path: Path, params: Params) -> None:

@@ -99,7 +99,7 @@ def test_every_table_and_figure_is_there(chain: Path, params: Params) -> None:
         *(f"tables/{name}.{ending}" for name in TABLES for ending in ("csv", "md")),
         *(
             f"language/{name}.{ending}"
-            for name in ("ablation", "directions", "effects", "seeds", "touch")
+            for name in ("ablation", "directions", "effects", "reasoning", "seeds", "touch")
             for ending in ("csv", "md")
         ),
         *(f"figures/{name}.png" for name in ("confusion_matrices", "effects", "embedding_map", "training_curves")),

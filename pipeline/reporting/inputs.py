@@ -17,6 +17,7 @@ from pipeline.records import (
     GateRow,
     Opd,
     Part,
+    Prediction,
     Question,
     Score,
     Task,
@@ -26,6 +27,7 @@ from pipeline.records import (
 from pipeline.reporting.published import DATASET, Published, find
 from pipeline.splits import assign
 from pipeline.stability.record import STABILITY_FILE, StabilityRow
+from pipeline.tasks.described import described_right
 
 Axes = tuple[Encoder, Lora, Opd]
 GATE_FILE = "gate.csv"
@@ -45,6 +47,9 @@ class Inputs:
     """Evaluation questions about test videos: id to task."""
     scores: Mapping[str, Sequence[Score]]
     """By variant; only of `questions`."""
+    described: Mapping[str, Mapping[str, bool | None]]
+    """By variant that describes before it concludes, and question: whether all that is asked about is described
+    right; None where that cannot be read."""
     classifications: Mapping[int, Sequence[Classification]]
     """By encoder seed: what the heads say about test videos."""
     findings: Sequence[Finding]
@@ -96,9 +101,7 @@ def read_inputs(params: Params, root: Path) -> Inputs:
     catalogue = load_catalogue(root / params.data.catalogue)
     videos = read_table(data / "videos.parquet", Video)
     asked = {
-        q.question_id: q.task
-        for q in read_jsonl(data / "questions" / "evaluation.jsonl", Question)
-        if q.part == Part.TEST
+        q.question_id: q for q in read_jsonl(data / "questions" / "evaluation.jsonl", Question) if q.part == Part.TEST
     }
     files = {key: data / "scores" / key / "scores.parquet" for key in params.plan.variants}
     audit, hard = data / "audit" / "audit.csv", data / STABILITY_FILE
@@ -109,12 +112,13 @@ def read_inputs(params: Params, root: Path) -> Inputs:
         videos=videos,
         assignments=read_table(data / "splits.parquet", Assignment),
         missing=assign(catalogue, videos, params.split).missing[Part.TEST],
-        questions=asked,
+        questions={name: q.task for name, q in asked.items()},
         scores={
             key: [s for s in read_table(file, Score) if s.question_id in asked]
             for key, file in files.items()
             if file.is_file()
         },
+        described=_read_described(params, data / "answers", asked, catalogue),
         classifications={
             seed: [c for c in read_table(file, Classification) if c.part == Part.TEST]
             for seed, file in judged.items()
@@ -124,6 +128,22 @@ def read_inputs(params: Params, root: Path) -> Inputs:
         hard_cases=read_csv(hard, StabilityRow) if hard.is_file() else (),
         gate=_read_gate(root / params.language.weights),
     )
+
+
+def _read_described(
+    params: Params, folder: Path, asked: Mapping[str, Question], catalogue: Catalogue
+) -> dict[str, dict[str, bool | None]]:
+    """Of the variants that were given the real touch; OPD questions have nothing but the description."""
+    found = {}
+    for key, variant in params.plan.variants.items():
+        file = folder / key / "predictions.jsonl"
+        if variant.touch is Touch.REAL and variant.opd is not Opd.NONE and file.is_file():
+            found[key] = {
+                said.question_id: described_right(asked[said.question_id], said, variant.opd, catalogue)
+                for said in read_jsonl(file, Prediction)
+                if said.question_id in asked and said.task is not Task.OPD
+            }
+    return found
 
 
 def _read_gate(weights: Path) -> dict[Task, bool]:

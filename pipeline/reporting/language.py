@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from statistics import fmean
 
+from pipeline.plan import FULL
 from pipeline.records import Task, Touch
 from pipeline.reporting.accuracy import Measure, outcomes
 from pipeline.reporting.answered import Answered
@@ -13,6 +14,7 @@ from pipeline.reporting.directions import directions
 from pipeline.reporting.factorial import factorial
 from pipeline.reporting.inputs import Inputs
 from pipeline.reporting.language_rows import AblationRow
+from pipeline.reporting.reasoning import reasoning
 from pipeline.reporting.seeds import seeds
 from pipeline.reporting.table import Table
 from pipeline.statistics import clustered
@@ -96,6 +98,19 @@ def language_tables(inputs: Inputs) -> list[Table]:
             "The full system where it first describes only the properties that a question asks about, and where it "
             "describes all: errors and generated tokens. Before matching and describing all are needed.",
             describing(answered, inputs, whole),
+            folder=FOLDER,
+        ),
+        Table(
+            "reasoning",
+            "Touch or reasoning: where answers go wrong",
+            "A system that describes before it concludes can err in either. *Described right*: all that the question "
+            "asks about, of all its objects, is described as labelled; *left out*: part of it is not said, or cannot "
+            "be read. *Right after that*: how many of the answers that described right then conclude right; what "
+            "lacks to 100 is the language model's reasoning. *Right otherwise*: an answer whose descriptions are wrong "
+            "may still be right by luck, or because the error does not matter to the question. The full system and its "
+            "`needed` twin are shown; the CSV has every variant that describes.",
+            (parted := reasoning(answered, inputs, whole)),
+            [row for row in parted if (row.encoder, row.lora) == FULL[:2]],
             folder=FOLDER,
         ),
         Table(

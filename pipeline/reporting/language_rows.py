@@ -106,3 +106,56 @@ class SeedsRow:
             "Base model": self.gate,
             "Note": self.note,
         }
+
+
+@dataclass(frozen=True)
+class ReasoningRow:
+    """Where answers of one variant go wrong, over its seeds: in describing or in concluding. Shares, from 0 to 1."""
+
+    encoder: str
+    lora: str
+    opd: str
+    task: str
+    accuracy: float
+    described: float
+    """Answers that describe all that is asked about, of all objects, as labelled."""
+    described_low: float | None
+    described_high: float | None
+    missing: float
+    """Answers that leave out, or say unreadably, something that is asked about; they are not right."""
+    n: int
+    concluded: float | None
+    """Right conclusions among the answers that described right; None where none did."""
+    concluded_low: float | None
+    concluded_high: float | None
+    concluded_n: int
+    """Questions that at least one seed's answer described right."""
+    otherwise: float | None
+    """Right conclusions among the other answers."""
+    otherwise_low: float | None
+    otherwise_high: float | None
+    otherwise_n: int
+    chance: float
+    gate: str
+
+    def display(self) -> Mapping[str, str]:
+        """All columns."""
+        return {
+            "Encoder": self.encoder,
+            "LoRA": self.lora,
+            "OPD": self.opd,
+            "Task": self.task,
+            "Accuracy %": percent(self.accuracy),
+            "Described right %": percent(self.described),
+            "its 95 %": share_span(self.described_low, self.described_high),
+            "Left out %": percent(self.missing),
+            "n": str(self.n),
+            "Right after that %": percent(self.concluded),
+            "95 % of that": share_span(self.concluded_low, self.concluded_high),
+            "n of that": str(self.concluded_n),
+            "Right otherwise %": percent(self.otherwise),
+            "95 % otherwise": share_span(self.otherwise_low, self.otherwise_high),
+            "n otherwise": str(self.otherwise_n),
+            "Chance %": percent(self.chance),
+            "Base model": self.gate,
+        }

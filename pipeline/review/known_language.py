@@ -104,6 +104,27 @@ DESCRIBING = View(
     ),
     Bar("difference", "low", "high", 1, signed=True),
 )
+REASONING = View(
+    (
+        Column("Encoder", "{encoder}", HEAD),
+        Column("LoRA", "{lora}", HEAD),
+        Column("OPD", "{opd}", HEAD),
+        Column("Task", "{task}", HEAD),
+        Column("Accuracy %", "{accuracy:p.2f}", MEASURED),
+        Column("Described right %|95 %", "{described:p.2f}", MEASURED, "{described_low:p.2f} to {described_high:p.2f}"),
+        Column("Left out %", "{missing:p.2f}"),
+        Column("n", "{n}"),
+        Column(
+            "Right after that %|95 %", "{concluded:p.2f}", MEASURED, "{concluded_low:p.2f} to {concluded_high:p.2f}"
+        ),
+        Column("n of that", "{concluded_n}"),
+        Column("Right otherwise %|95 %", "{otherwise:p.2f}", MEASURED, "{otherwise_low:p.2f} to {otherwise_high:p.2f}"),
+        Column("n otherwise", "{otherwise_n}"),
+        Column("Chance %", "{chance:p.2f}"),
+        Column("Base model", "{gate}", WORDS),
+    ),
+    Bar("described", "described_low", "described_high", 1),
+)
 TOUCH = View(
     (
         Column("Touch", "{touch}", HEAD),
@@ -129,6 +150,7 @@ LANGUAGE = {
     "directions": DIRECTIONS,
     "effects": EFFECTS,
     "factorial": FACTORIAL,
+    "reasoning": REASONING,
     "seeds": SEEDS,
     "touch": TOUCH,
 }

@@ -21,7 +21,7 @@ THEMES = (
         "What each part brings",
         (
             *("directions", "effects", "factorial", "encoder_understanding", "encoder_property"),
-            *("lora_understanding", "lora_property", "describing", "ablation", "all_variants"),
+            *("lora_understanding", "lora_property", "describing", "reasoning", "ablation", "all_variants"),
         ),
     ),
     Theme("seeds", "Why do runs differ?", ("seeds",)),
@@ -70,6 +70,11 @@ EXPECTED = (
     ),
     Expected("seeds", "Why results differ from run to run", "nothing was answered", "plan.variants"),
     Expected("describing", "Describing what is needed, or everything", "its plan has no variant with OPD `needed`"),
+    Expected(
+        "reasoning",
+        "Touch or reasoning: where answers go wrong",
+        "its plan has no variant that describes before it concludes, or it is older than this table",
+    ),
     Expected(
         "touch",
         "Is touch used?",

@@ -1,0 +1,55 @@
+"""What an answer says of each object before it concludes, and whether that is right."""
+
+from __future__ import annotations
+
+import re
+
+from pipeline.physiclear.catalogue import Catalogue
+from pipeline.physiclear.language import OPENING
+from pipeline.records import Opd, Prediction, Question
+from pipeline.tasks.base import LETTERS, ORDINALS, find_level
+
+Classes = tuple[tuple[int | None, ...], ...]
+"""Object by object, the class of each property that the question asks about; None where none was named, or several."""
+
+_MARK = re.compile(rf"\b({'|'.join(ORDINALS)}) object\s*:|\b([{LETTERS}])\)", flags=re.IGNORECASE)
+
+
+def read_descriptions(question: Question, prediction: Prediction, opd: Opd, catalogue: Catalogue) -> Classes | None:
+    """The classes that an answer names, of what the question asks about.
+
+    They are read as descriptions are graded: from "Overall" on, since before it an answer describes freely.
+
+    Args:
+        question: With two objects or more; a description alone has nothing to conclude.
+        opd: How the model was to describe: any mode but `none`.
+
+    Returns:
+        None where the objects are not described one after the other, each once.
+    """
+    described = re.split(r"conclusion\s*:", prediction.outputs[0], flags=re.IGNORECASE)[0]
+    marks = list(_MARK.finditer(described))
+    said = [(m[1] or m[2]).lower() for m in marks]
+    if said not in (list(LETTERS[: len(question.objects)]), [o.lower() for o in ORDINALS[: len(question.objects)]]):
+        return None
+    ends = [m.start() for m in marks[1:]] + [len(described)]
+    texts = [_closing(described[m.end() : end], opd) for m, end in zip(marks, ends, strict=True)]
+    asked = [p for p in catalogue.properties if p.name in question.gold.properties]
+    return tuple(tuple(find_level(text, p) for p in asked) for text in texts)
+
+
+def described_right(question: Question, prediction: Prediction, opd: Opd, catalogue: Catalogue) -> bool | None:
+    """Whether all that a question asks about is described as labelled; None where that cannot be read."""
+    read = read_descriptions(question, prediction, opd, catalogue)
+    if read is None or any(level is None for levels in read for level in levels):
+        return None
+    places = [i for i, p in enumerate(catalogue.properties) if p.name in question.gold.properties]
+    return read == tuple(tuple(labels[i] for i in places) for labels in question.gold.labels)
+
+
+def _closing(text: str, opd: Opd) -> str:
+    """The structured part; a catalogue may word single properties (`needed`) without that opening."""
+    found = re.search(rf"\b{OPENING}\b", text, flags=re.IGNORECASE)
+    if found:
+        return text[found.end() :]
+    return text if opd is Opd.NEEDED else ""
