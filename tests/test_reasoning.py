@@ -48,8 +48,8 @@ def _reference(question: Question, opd: Opd) -> list[str]:
     return [turn.assistant for turn in dialogue.turns]
 
 
-def _right(question: Question, opd: Opd, *outputs: str) -> bool | None:
-    return described_right(question, _said(question, *outputs), opd, CATALOGUE)
+def _right(question: Question, *outputs: str) -> bool | None:
+    return described_right(question, _said(question, *outputs), CATALOGUE)
 
 
 @pytest.mark.parametrize("opd", DESCRIBING)
@@ -58,10 +58,10 @@ def test_every_reference_answer_describes_right(task: Task, opd: Opd) -> None:
     asked = [q for q in QUESTIONS if q.task is task]
     assert len(asked) == 40
     for question in asked:
-        assert _right(question, opd, *_reference(question, opd)) is True
+        assert _right(question, *_reference(question, opd)) is True
         places = [i for i, name in enumerate(CATALOGUE.property_names) if name in question.gold.properties]
         expected = tuple(tuple(labels[i] for i in places) for labels in question.gold.labels)
-        assert read_descriptions(question, _said(question, *_reference(question, opd)), opd, CATALOGUE) == expected
+        assert read_descriptions(question, _said(question, *_reference(question, opd)), CATALOGUE) == expected
 
 
 @given(data=st.data())
@@ -75,7 +75,7 @@ def test_one_class_changed_is_wrong_exactly_where_it_is_asked_about(data: st.Dat
     marks = ("First object:", "Second object:") if question.task is Task.PC else ("a)", "b)", "c)")
     text = " ".join(f"{mark} {_sentence(levels)}" for mark, levels in zip(marks, classes, strict=False))
     asked = prop.name in question.gold.properties
-    assert _right(question, Opd.ALL, f"{text} Conclusion: whatever.") is not asked
+    assert _right(question, f"{text} Conclusion: whatever.") is not asked
 
 
 def _sentence(levels: list[int]) -> str:
@@ -104,9 +104,8 @@ CHOSEN = next(q for q in QUESTIONS if q.task is Task.PSS and q.gold.properties =
         "First object: Overall, it presents a surface. Second object: Overall, it presents a hard surface.",
     ],
 )
-@pytest.mark.parametrize("opd", DESCRIBING)
-def test_what_cannot_be_read_is_neither_right_nor_wrong(text: str, opd: Opd) -> None:
-    assert _right(COMPARED, opd, text) is None
+def test_what_cannot_be_read_is_neither_right_nor_wrong(text: str) -> None:
+    assert _right(COMPARED, text) is None
 
 
 def test_what_stands_before_overall_or_after_the_conclusion_is_not_read() -> None:
@@ -116,30 +115,39 @@ def test_what_stands_before_overall_or_after_the_conclusion_is_not_read() -> Non
     text = (
         f"a) It may have big bumps. {a} b) No bumps? {b} c) Small bumps? {c} Conclusion: a) is the least bumpy, b) not."
     )
-    assert _right(CHOSEN, Opd.ALL, text) is True
+    assert _right(CHOSEN, text) is True
     # What was described in full stays described where the answer was cut before it concluded.
-    assert _right(CHOSEN, Opd.ALL, f"a) {a} b) {b} c) {c}") is True
-    # Free words alone are no description.
-    assert _right(CHOSEN, Opd.ALL, f"a) {levels[0]} b) {levels[1]} c) {levels[2]}") is None
-    # But a catalogue may word a single property as it likes.
-    assert _right(CHOSEN, Opd.NEEDED, f"a) {levels[0]} b) {levels[1]} c) {levels[2]}") is True
+    assert _right(CHOSEN, f"a) {a} b) {b} c) {c}") is True
+    # An answer without that sentence is read as it stands.
+    assert _right(CHOSEN, f"a) {levels[0]} b) {levels[1]} c) {levels[2]}") is True
+
+
+@given(data=st.data())
+def test_free_words_are_read_by_what_they_stand_for(data: st.DataObject) -> None:
+    question = data.draw(st.sampled_from(QUESTIONS))
+    marks = ("First object:", "Second object:") if question.task is Task.PC else ("a)", "b)", "c)")
+    texts = []
+    for mark, labels in zip(marks, question.gold.labels, strict=False):
+        words = [data.draw(st.sampled_from(p.phrases[i])) for p, i in zip(CATALOGUE.properties, labels, strict=True)]
+        texts.append(f"{mark} {', '.join(words)}.")
+    assert _right(question, " ".join(texts)) is True
+    assert _right(question, " ".join(texts[:-1])) is None
 
 
 def test_of_two_turns_the_first_describes() -> None:
     question = next(q for q in QUESTIONS if q.task is Task.PSR)
     first, second = _reference(question, Opd.ALL)
-    assert _right(question, Opd.ALL, first, "The most suitable object is b).") is True
-    assert _right(question, Opd.ALL, second, first) is None
+    assert _right(question, first, "The most suitable object is b).") is True
+    assert _right(question, second, first) is None
 
 
 @given(
     st.text(max_size=40),
     st.lists(st.sampled_from(["a)", "b)", "c)", "First object:", "Overall", "hard", "no bumps", "Conclusion:"])),
     st.sampled_from(QUESTIONS),
-    st.sampled_from(DESCRIBING),
 )
-def test_any_text_is_read_or_refused(noise: str, words: list[str], question: Question, opd: Opd) -> None:
-    read = read_descriptions(question, _said(question, f"{noise} {' '.join(words)}"), opd, CATALOGUE)
+def test_any_text_is_read_or_refused(noise: str, words: list[str], question: Question) -> None:
+    read = read_descriptions(question, _said(question, f"{noise} {' '.join(words)}"), CATALOGUE)
     if read is not None:
         assert len(read) == len(question.objects)
         assert {len(levels) for levels in read} == {len(question.gold.properties)}

@@ -139,7 +139,7 @@ def _read_described(
         file = folder / key / "predictions.jsonl"
         if variant.touch is Touch.REAL and variant.opd is not Opd.NONE and file.is_file():
             found[key] = {
-                said.question_id: described_right(asked[said.question_id], said, variant.opd, catalogue)
+                said.question_id: described_right(asked[said.question_id], said, catalogue)
                 for said in read_jsonl(file, Prediction)
                 if said.question_id in asked and said.task is not Task.OPD
             }

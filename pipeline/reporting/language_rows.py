@@ -117,7 +117,7 @@ class ReasoningRow:
     opd: str
     task: str
     accuracy: float
-    described: float
+    described: float | None
     """Answers that describe all that is asked about, of all objects, as labelled."""
     described_low: float | None
     described_high: float | None

@@ -7,6 +7,7 @@ right, or among the others, a question has the share of these answers that are r
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from statistics import fmean
 
 from pipeline.records import Score, Task
@@ -14,7 +15,7 @@ from pipeline.reporting.accuracy import Measure, outcomes
 from pipeline.reporting.answered import Answered
 from pipeline.reporting.inputs import Axes, Inputs
 from pipeline.reporting.language_rows import ReasoningRow
-from pipeline.statistics import Outcome, clustered
+from pipeline.statistics import clustered
 
 
 def reasoning(answered: Answered, inputs: Inputs, measures: Sequence[Measure]) -> list[ReasoningRow]:
@@ -22,6 +23,16 @@ def reasoning(answered: Answered, inputs: Inputs, measures: Sequence[Measure]) -
     tasks = [m for m in measures if m.task is not Task.OPD]
     found = (_row(answered, inputs, axes, measure) for axes in inputs.axes for measure in tasks)
     return [row for row in found if row]
+
+
+@dataclass(frozen=True)
+class _Share:
+    """Of right answers among some; without any, n is 0 and the rest None."""
+
+    value: float | None
+    low: float | None
+    high: float | None
+    n: int
 
 
 def _row(answered: Answered, inputs: Inputs, axes: Axes, measure: Measure) -> ReasoningRow | None:
@@ -33,43 +44,37 @@ def _row(answered: Answered, inputs: Inputs, axes: Axes, measure: Measure) -> Re
     ]
     if not every:
         return None
-    right = outcomes(score.model_copy(update={"correct": bool(said)}) for score, said in every)
-    after, otherwise = ([score for score, said in every if bool(said) is wanted] for wanted in (True, False))
-    described_low, described_high = _ends(right)
+    described = _share([score.model_copy(update={"correct": said is True}) for score, said in every])
+    concluded = _share([score for score, said in every if said is True])
+    otherwise = _share([score for score, said in every if said is not True])
     encoder, lora, opd = axes
-    concluded, luck = _given(after), _given(otherwise)
     return ReasoningRow(
         encoder=encoder,
         lora=lora,
         opd=opd,
         task=measure.label,
         accuracy=fmean(score.correct for score, _ in every),
-        described=fmean(bool(said) for _, said in every),
-        described_low=described_low,
-        described_high=described_high,
+        described=described.value,
+        described_low=described.low,
+        described_high=described.high,
         missing=fmean(said is None for _, said in every),
-        n=len(right),
-        concluded=concluded[0],
-        concluded_low=concluded[1],
-        concluded_high=concluded[2],
-        concluded_n=concluded[3],
-        otherwise=luck[0],
-        otherwise_low=luck[1],
-        otherwise_high=luck[2],
-        otherwise_n=luck[3],
+        n=described.n,
+        concluded=concluded.value,
+        concluded_low=concluded.low,
+        concluded_high=concluded.high,
+        concluded_n=concluded.n,
+        otherwise=otherwise.value,
+        otherwise_low=otherwise.low,
+        otherwise_high=otherwise.high,
+        otherwise_n=otherwise.n,
         chance=answered.chance(measure),
         gate=answered.gate(measure),
     )
 
 
-def _given(scores: Sequence[Score]) -> tuple[float | None, float | None, float | None, int]:
-    """The share of right answers, each question counted once; its interval; the number of questions."""
-    if not scores:
-        return None, None, None, 0
+def _share(scores: Sequence[Score]) -> _Share:
     asked = outcomes(scores)
-    return (fmean(outcome.correct for outcome in asked), *_ends(asked), len(asked))
-
-
-def _ends(asked: Sequence[Outcome]) -> tuple[float | None, float | None]:
-    interval = clustered(asked)
-    return (interval.low, interval.high) if interval else (None, None)
+    if not asked:
+        return _Share(None, None, None, 0)
+    value, interval = fmean(outcome.correct for outcome in asked), clustered(asked)
+    return _Share(value, interval.low if interval else None, interval.high if interval else None, len(asked))

@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 
 from pipeline.physiclear.catalogue import Catalogue
-from pipeline.physiclear.language import OPENING
-from pipeline.records import Opd, Prediction, Question
+from pipeline.physiclear.describing import levels_named
+from pipeline.physiclear.language import OPENING, Property
+from pipeline.records import Prediction, Question
 from pipeline.tasks.base import LETTERS, ORDINALS, find_level
 
 Classes = tuple[tuple[int | None, ...], ...]
@@ -15,14 +16,11 @@ Classes = tuple[tuple[int | None, ...], ...]
 _MARK = re.compile(rf"\b({'|'.join(ORDINALS)}) object\s*:|\b([{LETTERS}])\)", flags=re.IGNORECASE)
 
 
-def read_descriptions(question: Question, prediction: Prediction, opd: Opd, catalogue: Catalogue) -> Classes | None:
+def read_descriptions(question: Question, prediction: Prediction, catalogue: Catalogue) -> Classes | None:
     """The classes that an answer names, of what the question asks about.
-
-    They are read as descriptions are graded: from "Overall" on, since before it an answer describes freely.
 
     Args:
         question: With two objects or more; a description alone has nothing to conclude.
-        opd: How the model was to describe: any mode but `none`.
 
     Returns:
         None where the objects are not described one after the other, each once.
@@ -33,23 +31,23 @@ def read_descriptions(question: Question, prediction: Prediction, opd: Opd, cata
     if said not in (list(LETTERS[: len(question.objects)]), [o.lower() for o in ORDINALS[: len(question.objects)]]):
         return None
     ends = [m.start() for m in marks[1:]] + [len(described)]
-    texts = [_closing(described[m.end() : end], opd) for m, end in zip(marks, ends, strict=True)]
     asked = [p for p in catalogue.properties if p.name in question.gold.properties]
-    return tuple(tuple(find_level(text, p) for p in asked) for text in texts)
+    return tuple(tuple(_level(described[m.end() : end], p) for p in asked) for m, end in zip(marks, ends, strict=True))
 
 
-def described_right(question: Question, prediction: Prediction, opd: Opd, catalogue: Catalogue) -> bool | None:
-    """Whether all that a question asks about is described as labelled; None where that cannot be read."""
-    read = read_descriptions(question, prediction, opd, catalogue)
+def described_right(question: Question, prediction: Prediction, catalogue: Catalogue) -> bool | None:
+    """Whether all that a question asks about is described as labelled; None where that is not said, or unreadable."""
+    read = read_descriptions(question, prediction, catalogue)
     if read is None or any(level is None for levels in read for level in levels):
         return None
     places = [i for i, p in enumerate(catalogue.properties) if p.name in question.gold.properties]
     return read == tuple(tuple(labels[i] for i in places) for labels in question.gold.labels)
 
 
-def _closing(text: str, opd: Opd) -> str:
-    """The structured part; a catalogue may word single properties (`needed`) without that opening."""
-    found = re.search(rf"\b{OPENING}\b", text, flags=re.IGNORECASE)
-    if found:
-        return text[found.end() :]
-    return text if opd is Opd.NEEDED else ""
+def _level(text: str, prop: Property) -> int | None:
+    """Read as a description is graded, from "Overall" on; where an answer has no such sentence, by all wordings."""
+    closing = re.search(rf"\b{OPENING}\b", text, flags=re.IGNORECASE)
+    if closing:
+        return find_level(text[closing.end() :], prop)
+    named = levels_named(text, prop)
+    return next(iter(named)) if len(named) == 1 else None
