@@ -299,6 +299,21 @@ def test_predictability_follows_from_its_seed(monkeypatch: pytest.MonkeyPatch) -
     assert first != predictability(data.features, data.labels, data.objects, 4)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_classes_that_are_equally_likely_are_not_told_apart_by_rounding(
+    monkeypatch: pytest.MonkeyPatch, seed: int
+) -> None:
+    """Sessions with as many objects of each class: every score is a tie, and each processor rounds in its own way."""
+    monkeypatch.setattr(leakage, "PERMUTATIONS", 200)
+    rng = np.random.default_rng(seed)
+    objects = [f"object_{i:02d}" for i in range(36)]
+    labels = [i % 3 for i in range(36)]
+    session = np.eye(4)[[i // 9 for i in range(36)]]
+    exact = predictability(session, labels, objects, seed)
+    for _ in range(5):
+        assert predictability(session + rng.normal(scale=1e-14, size=session.shape), labels, objects, seed) == exact
+
+
 def test_fewer_objects_than_folds_and_constant_features(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(leakage, "PERMUTATIONS", 10)
     few = planted(0, leak=1.0, objects=3)
