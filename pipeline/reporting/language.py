@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from statistics import fmean
 
-from pipeline.plan import FULL
 from pipeline.records import Task, Touch
 from pipeline.reporting.accuracy import Measure, outcomes
 from pipeline.reporting.answered import Answered
@@ -107,10 +106,8 @@ def language_tables(inputs: Inputs) -> list[Table]:
             "asks about, of all its objects, is described as labelled; *left out*: part of it is not said, or cannot "
             "be read. *Right after that*: how many of the answers that described right then conclude right; what "
             "lacks to 100 is the language model's reasoning. *Right otherwise*: an answer whose descriptions are wrong "
-            "may still be right by luck, or because the error does not matter to the question. The full system and its "
-            "`needed` twin are shown; the CSV has every variant that describes.",
-            (parted := reasoning(answered, inputs, whole)),
-            [row for row in parted if (row.encoder, row.lora) == FULL[:2]],
+            "may still be right by luck, or because the error does not matter to the question.",
+            reasoning(answered, inputs, whole),
             folder=FOLDER,
         ),
         Table(

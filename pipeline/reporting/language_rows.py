@@ -145,7 +145,6 @@ class ReasoningRow:
             "LoRA": self.lora,
             "OPD": self.opd,
             "Task": self.task,
-            "Accuracy %": percent(self.accuracy),
             "Described right %": percent(self.described),
             "its 95 %": share_span(self.described_low, self.described_high),
             "Left out %": percent(self.missing),
@@ -156,6 +155,7 @@ class ReasoningRow:
             "Right otherwise %": percent(self.otherwise),
             "95 % otherwise": share_span(self.otherwise_low, self.otherwise_high),
             "n otherwise": str(self.otherwise_n),
+            "All right %": percent(self.accuracy),
             "Chance %": percent(self.chance),
             "Base model": self.gate,
         }
