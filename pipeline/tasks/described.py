@@ -45,7 +45,7 @@ def described_right(question: Question, prediction: Prediction, catalogue: Catal
 
 
 def _level(text: str, prop: Property) -> int | None:
-    """Read as a description is graded, from "Overall" on; where an answer has no such sentence, by all wordings."""
+    """Read from the first "Overall" on, since `needed` has such a sentence a property; without one, by all wordings."""
     closing = re.search(rf"\b{OPENING}\b", text, flags=re.IGNORECASE)
     if closing:
         return find_level(text[closing.end() :], prop)
