@@ -160,11 +160,15 @@ def test_rows_of_a_bench_are_its_cases(
         )
 
 
-def test_encoders_have_the_errors_of_the_largest_cross_validation(table: list[Cells]) -> None:
+def test_encoders_have_the_errors_of_the_fullest_cross_validation(table: list[Cells]) -> None:
     cases = {c["case"]: c for c in json.loads((ROOT / "reports" / "bench" / "encoder.json").read_text())}
     files = [*(ROOT / "reports").glob("*/encoder/cross_validation.csv")]
     tables = [[x for x in csv.DictReader(f.open()) if x["property"] == "combined"] for f in files]
-    largest = {x["model"]: x for x in max(tables, key=lambda lines: max(int(x["n"]) for x in lines))}
+
+    def fullness(lines: list[dict[str, str]]) -> tuple[int, int]:
+        return sum(f"model, {x['model']}" in cases for x in lines), max(int(x["n"]) for x in lines)
+
+    largest = {x["model"]: x for x in max(tables, key=fullness)}
     rows = of(table, "encoder")
     assert {cells["setting"] for cells in rows} == {c.removeprefix("model, ") for c in cases if c.startswith("model, ")}
     for cells in rows:
@@ -173,6 +177,28 @@ def test_encoders_have_the_errors_of_the_largest_cross_validation(table: list[Ce
         errors = {name: 1 - float(judged[share]) if judged else None for name, share in shares.items()}
         found = cases[f"model, {cells['setting']}"]
         same(cells, {"cost": found["cost"], "ratio": found["ratio"], "frames": found["frames"], **errors})
+
+
+def test_more_models_count_for_more_than_more_videos_and_those_for_more_than_names(reports: Path) -> None:
+    write_json(reports / "bench" / "encoder.json", [case(f"model, {m}", 9) for m in ("strong", "trees", "probe")])
+
+    def compared(report: str, videos: int, **accuracies: float) -> None:
+        (reports / report / "encoder").mkdir(parents=True)
+        rows = [f"{model},combined,{value},,,{videos}" for model, value in accuracies.items()]
+        text = "\n".join(["model,property,accuracy,low,high,n", *rows])
+        (reports / report / "encoder" / "cross_validation.csv").write_text(text)
+
+    def errors() -> dict[str, float | None]:
+        return {found.setting: found.error for found in answers(reports)["encoder"].rows}
+
+    compared("a", 900, constant=0.1, other=0.2, trees=0.5)
+    assert errors() == {"strong": None, "trees": 0.5, "probe": None}
+    compared("b", 300, strong=0.6, trees=0.4)
+    assert errors() == {"strong": 0.4, "trees": 0.6, "probe": None}, "two of the benchmark's models, not one of three"
+    compared("c", 400, strong=0.7, probe=0.3)
+    assert errors() == {"strong": 0.3, "trees": None, "probe": 0.7}, "as many models and more videos"
+    compared("d", 400, strong=0.9, probe=0.9)
+    assert errors()["strong"] == 0.3, "of equals the first by name"
 
 
 def test_every_question_has_one_recommendation_and_its_baseline(table: list[Cells]) -> None:

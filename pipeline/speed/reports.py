@@ -52,7 +52,7 @@ class Variant(Line):
 
 @dataclass(frozen=True)
 class Encoders:
-    """Which encoder: costs from the benchmark, errors from the cross-validation over the most videos.
+    """Which encoder: costs from the benchmark, errors from the cross-validation of most of its models, then videos.
 
     The benchmark's own errors are those that the cross-validation had when it ran; the report may know more by now.
     """
@@ -71,13 +71,14 @@ class Encoders:
         judged = [(name, lines) for name, lines in tables if lines]
         if not judged:
             return Missing(f"no report has a `{ENCODERS}`; {COMPARE}")
-        name, lines = max(judged, key=lambda table: max(line.n for line in table[1]))
+        settings = {row.setting for row in costs.rows}
+        # A comparison of two models over many videos must not hide one of them all over fewer.
+        name, lines = max(judged, key=lambda table: (len(settings & _models(table[1])), _videos(table[1])))
         by_model = {line.model: line for line in lines}
         rows = [_with_error(row, by_model.get(row.setting)) for row in costs.rows]
-        videos = max(line.n for line in lines)
         origin = (
-            f"Costs from `reports/{bench_file('encoder')}`, errors from `reports/{name}`, {videos} videos; models that "
-            "only one of them has are left out or have no error."
+            f"Costs from `reports/{bench_file('encoder')}`, errors from `reports/{name}`, {_videos(lines)} videos; "
+            "models that only one of them has are left out or have no error."
         )
         return checked(rows, self.baseline, origin, bench_file("encoder"), bench_command("encoder"))
 
@@ -122,6 +123,14 @@ class Describing:
 def _files(reports: Path, name: str) -> list[str]:
     """A table in all reports, by the reports' names."""
     return sorted(path.relative_to(reports).as_posix() for path in reports.glob(f"*/{name}"))
+
+
+def _models(lines: Iterable[Judged]) -> set[str]:
+    return {line.model for line in lines}
+
+
+def _videos(lines: Iterable[Judged]) -> int:
+    return max(line.n for line in lines)
 
 
 def _with_error(row: SpeedRow, judged: Judged | None) -> SpeedRow:
