@@ -42,6 +42,15 @@ def test_generating_does_not_depend_on_grading() -> None:
     assert not [d for d in deps if "tasks/" in d or "grading" in d]
 
 
+def test_a_changed_report_is_published() -> None:
+    """The dashboard keeps a copy of the report, which may change where no score does, by a new table or figure."""
+    outs = [out for name in ("report", "compare_encoders") for out in stages()[name]["outs"]]
+    written = [path for out in outs for path in ([out] if isinstance(out, str) else out) if path.startswith("reports/")]
+    assert len(written) == 8
+    read = tuple(f"{dep}/" for dep in stages()["publish"]["deps"])
+    assert not [path for path in written if not path.startswith(read)]
+
+
 @pytest.mark.parametrize("scale", shipped_scales(ROOT / "conf"))
 def test_foreach_keys_are_in_the_plan(scale: str) -> None:
     plan = compose(scale, conf=ROOT / "conf").plan
