@@ -49,8 +49,8 @@ def check(
     catalogue: Annotated[Path, CATALOGUE] = Path("pipeline/physiclear"),
 ) -> None:
     """List every file of a folder that is wrong or odd; status 1 where something must be mended."""
-    from pipeline.audit.run import check_folder
-    from pipeline.physiclear.catalogue import load_catalogue
+    from pipeline.videos.audit.run import check_folder
+    from pipeline.videos.catalogue import load_catalogue
 
     _show(check_folder(folder, load_catalogue(catalogue)))
 
@@ -63,11 +63,11 @@ def audit(
     out: Annotated[Path, typer.Option(help="Where all findings go.")] = Path("audit.csv"),
 ) -> None:
     """Measure what can be trusted: files, contact, labels, copies, sessions, leaks; status 1 where errors are found."""
-    from pipeline.artifacts import write_csv
-    from pipeline.audit.run import audit_folder
-    from pipeline.physiclear.catalogue import load_catalogue
+    from pipeline.io import write_csv
+    from pipeline.videos.audit.run import audit_folder
+    from pipeline.videos.catalogue import load_catalogue
     from pipeline.records import Finding
-    from pipeline.sections import SplitConfig
+    from pipeline.config import SplitConfig
 
     # Not validated: a name that no split can have is a finding, like one that this catalogue's splits do not.
     config = SplitConfig.model_construct(name=split) if split else None
@@ -88,7 +88,7 @@ def _show(findings: Sequence[Finding]) -> None:
 @app.command()
 def publish() -> None:
     """Show the reproduction in params.yaml and dvc.lock in MLflow; a second time adds nothing."""
-    from pipeline.config import load_params
+    from pipeline.params import load_params
     from pipeline.tracking.publishing import publish as publish_runs
 
     typer.echo(str(publish_runs(load_params(), Path())))
@@ -113,7 +113,7 @@ def compare(
     """Say what differs between two revisions: parameters, stages, figures, and whether accuracies really changed."""
     from dataclasses import asdict
 
-    from pipeline.artifacts import write_json
+    from pipeline.io import write_json
     from pipeline.comparison import compare as compare_states
     from pipeline.comparison import describe
 

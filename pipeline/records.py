@@ -1,6 +1,6 @@
 """The typed records that stages hand to each other.
 
-Each table or JSON-lines file holds one kind of record; `pipeline.artifacts` writes and reads them and
+Each table or JSON-lines file holds one kind of record; `pipeline.io` writes and reads them and
 checks every row against the model.
 """
 
@@ -102,7 +102,7 @@ class Probe(Record):
     saturated: float
     """Share of values at 0 or 255 where contact is strongest."""
     contact: float
-    """Largest strength of contact in a probed frame (`pipeline.frames.reference.strength`)."""
+    """Largest strength of contact in a probed frame (`pipeline.videos.frames.reference.strength`)."""
     quiet: float
     """Smallest strength in a probed frame after the reference: what noise alone gives in a quiet part of a video."""
     contact_end: float

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import yaml
 
-from pipeline.artifacts import write_text
-from pipeline.config import PARAMS_FILE, Params, resolve
+from pipeline.io import write_text
+from pipeline.params import PARAMS_FILE, Params, resolve
 from pipeline.errors import UserError
-from pipeline.models import weights
-from pipeline.physiclear.catalogue import load_catalogue
+from pipeline import weights
+from pipeline.videos.catalogue import load_catalogue
 from pipeline.plan import Plan
-from pipeline.splits import check_split
+from pipeline.videos.split import check_split
 
 CONF = Path("conf")
 RECIPE = "encoder.recipe"

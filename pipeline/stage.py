@@ -15,8 +15,8 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from pipeline.artifacts import write_json
-from pipeline.config import Params, load_params
+from pipeline.io import write_json
+from pipeline.params import Params, load_params
 from pipeline.errors import UserError
 from pipeline.records import Measurement
 from pipeline.runtime import limit_threads

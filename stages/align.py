@@ -3,12 +3,12 @@
 import sys
 from pathlib import Path
 
-from pipeline.artifacts import read_jsonl, write_table
-from pipeline.data.embeddings import TENSOR_FILE, EmbeddingStore
+from pipeline.io import read_jsonl, write_table
+from pipeline.embeddings import TENSOR_FILE, EmbeddingStore
 from pipeline.records import Measurement, Question
 from pipeline.stage import DATA, stage
 from pipeline.tracking import live_run
-from pipeline.training.language import Job, Material, align, assemble
+from pipeline.language.training import Job, Material, align, assemble
 
 
 def main() -> None:

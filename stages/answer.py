@@ -2,11 +2,11 @@
 
 import sys
 
-from pipeline.artifacts import read_jsonl, write_jsonl
-from pipeline.data.counterfactual import feel
-from pipeline.data.embeddings import EmbeddingStore
-from pipeline.evaluation.generate import Asking, answer
-from pipeline.models.octopi import OctopiForCausalLM
+from pipeline.io import read_jsonl, write_jsonl
+from pipeline.language.input_ablation import feel
+from pipeline.embeddings import EmbeddingStore
+from pipeline.language.generate import Asking, answer
+from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.records import Question, Touch
 from pipeline.runtime import resolve_device
 from pipeline.stage import DATA, stage

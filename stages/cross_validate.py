@@ -3,13 +3,13 @@
 import sys
 from pathlib import Path
 
-from pipeline.artifacts import read_table, write_table
-from pipeline.contestants import CONTESTANTS
-from pipeline.models.weights import check_encoder
-from pipeline.physiclear.catalogue import load_catalogue
+from pipeline.io import read_table, write_table
+from pipeline.encoder.candidates import CONTESTANTS
+from pipeline.weights import check_encoder
+from pipeline.videos.catalogue import load_catalogue
 from pipeline.records import Judged, Video
 from pipeline.stage import DATA, stage
-from pipeline.training.cross_validation import Arena, judge
+from pipeline.encoder.cross_validation import Arena, judge
 
 
 def main() -> None:

@@ -3,18 +3,19 @@
 import sys
 from pathlib import Path
 
-from pipeline.artifacts import read_table, save_tensors, write_table
-from pipeline.data.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE
-from pipeline.frames.store import FrameStore
-from pipeline.models.recipes import base_encoder, property_classifier
-from pipeline.models.tactile_encoder import FrameEncoder, load_trainable
-from pipeline.models.weights import check_encoder
-from pipeline.physiclear.catalogue import load_catalogue
+from pipeline.io import read_table, save_tensors, write_table
+from pipeline.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE
+from pipeline.videos.frames.store import FrameStore
+from pipeline.encoder.recipes import base_encoder, property_classifier
+from pipeline.encoder.model import FrameEncoder
+from pipeline.trainable import load_trainable
+from pipeline.weights import check_encoder
+from pipeline.videos.catalogue import load_catalogue
 from pipeline.plan import Encoder
 from pipeline.records import Assignment, Embedding, Part
 from pipeline.runtime import resolve_device
 from pipeline.stage import DATA, stage
-from pipeline.training.embed import embed_videos, standardize
+from pipeline.encoder.embed import embed_videos, standardize
 
 
 def main() -> None:

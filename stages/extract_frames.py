@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from pipeline.artifacts import write_table
-from pipeline.frames.extract import extract_frames
-from pipeline.physiclear.catalogue import load_catalogue
+from pipeline.io import write_table
+from pipeline.videos.frames.extract import extract_frames
+from pipeline.videos.catalogue import load_catalogue
 from pipeline.records import Video
 from pipeline.runtime import CHECKPOINTS
 from pipeline.stage import DATA, stage

@@ -3,16 +3,16 @@
 import sys
 from pathlib import Path
 
-from pipeline.artifacts import read_table, write_table
-from pipeline.frames.store import REFERENCES_FILE, TABLE_FILE, FrameStore
-from pipeline.models.tactile_encoder import save_trainable
-from pipeline.models.weights import check_encoder, clip_file
-from pipeline.physiclear.catalogue import load_catalogue
+from pipeline.io import read_table, write_table
+from pipeline.videos.frames.store import REFERENCES_FILE, TABLE_FILE, FrameStore
+from pipeline.trainable import save_trainable
+from pipeline.weights import check_encoder, clip_file
+from pipeline.videos.catalogue import load_catalogue
 from pipeline.records import Assignment, Classification, Measurement, Part
 from pipeline.runtime import resolve_device
 from pipeline.stage import DATA, stage
 from pipeline.tracking import live_run
-from pipeline.training.encoder import EncoderData, classify, finetune
+from pipeline.encoder.finetune import EncoderData, classify, finetune
 
 
 def main() -> None:

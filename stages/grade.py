@@ -3,9 +3,9 @@
 import sys
 from pathlib import Path
 
-from pipeline.artifacts import read_jsonl, write_table
+from pipeline.io import read_jsonl, write_table
 from pipeline.evaluation.grading import grade, summarise
-from pipeline.physiclear.catalogue import load_catalogue
+from pipeline.videos.catalogue import load_catalogue
 from pipeline.records import Prediction, Question, Score
 from pipeline.stage import DATA, stage
 

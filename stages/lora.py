@@ -3,13 +3,13 @@
 import sys
 from pathlib import Path
 
-from pipeline.artifacts import read_jsonl, write_table
-from pipeline.data.embeddings import TENSOR_FILE, EmbeddingStore
-from pipeline.models.octopi import CONNECTOR_FILE
+from pipeline.io import read_jsonl, write_table
+from pipeline.embeddings import TENSOR_FILE, EmbeddingStore
+from pipeline.language.octopi import CONNECTOR_FILE
 from pipeline.records import Measurement, Question
 from pipeline.stage import DATA, stage
 from pipeline.tracking import live_run
-from pipeline.training.language import Job, Material, add_lora, assemble, finetune_lora
+from pipeline.language.training import Job, Material, add_lora, assemble, finetune_lora
 
 
 def main() -> None:

@@ -3,12 +3,12 @@
 import sys
 from pathlib import Path
 
-from pipeline.artifacts import write_table
-from pipeline.models.tactile_encoder import save_trainable
+from pipeline.io import write_table
+from pipeline.trainable import save_trainable
 from pipeline.records import Measurement
 from pipeline.stage import DATA, stage
 from pipeline.tracking import live_run
-from pipeline.training.pretrain import pretrain
+from pipeline.encoder.pretrain import pretrain
 
 
 def main() -> None:

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from pipeline.artifacts import read_table, write_jsonl
-from pipeline.physiclear.catalogue import load_catalogue
-from pipeline.questions import build_questions, pool_of
+from pipeline.io import read_table, write_jsonl
+from pipeline.videos.catalogue import load_catalogue
+from pipeline.tasks.questions import build_questions, pool_of
 from pipeline.records import Assignment, Part
 from pipeline.stage import DATA, stage
 

@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from pipeline.artifacts import read_table, write_table
-from pipeline.physiclear.catalogue import load_catalogue
+from pipeline.io import read_table, write_table
+from pipeline.videos.catalogue import load_catalogue
 from pipeline.records import Assignment, Part, Video
-from pipeline.splits import assign
+from pipeline.videos.split import assign
 from pipeline.stage import DATA, stage
 
 

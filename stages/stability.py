@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from pipeline.artifacts import write_csv
+from pipeline.io import write_csv
 from pipeline.stability.record import STABILITY_FILE, StabilityRow
 from pipeline.stability.run import all_cases, judge_all, stop_on_red, summary
 from pipeline.stage import DATA, stage

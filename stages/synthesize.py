@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-from pipeline.artifacts import write_csv
-from pipeline.physiclear.catalogue import load_catalogue
+from pipeline.io import write_csv
+from pipeline.videos.catalogue import load_catalogue
 from pipeline.scenes.recipe import load_recipes
 from pipeline.scenes.video import SceneRow, share_as_labelled, synthesize
-from pipeline.sections import SCENES_DIR
+from pipeline.config import SCENES_DIR
 from pipeline.stage import stage
 
 

@@ -6,7 +6,7 @@ import random
 import re
 from dataclasses import dataclass, replace
 
-from pipeline.prompts import TACTILE, render
+from pipeline.language.chat import TACTILE, render
 from pipeline.records import Opd, Task, Turn
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Draft

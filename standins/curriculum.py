@@ -62,7 +62,7 @@ def phrases() -> tuple[str, ...]:
 
 def task_texts() -> list[str]:
     """The constant wording of every task's module, so that a new template is in the vocabulary as well."""
-    from pipeline.prompts import TACTILE
+    from pipeline.language.chat import TACTILE
     from pipeline.tasks import base, opd, pc, pom, psr, pss
 
     texts = [

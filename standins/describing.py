@@ -6,7 +6,7 @@ import random
 from collections.abc import Iterable
 from enum import IntEnum
 
-from pipeline.physiclear.catalogue import Catalogue, Property
+from pipeline.videos.catalogue import Catalogue, Property
 from standins.world import Labels, World
 
 FILLERS = (" It presents", " The surface feels", " Overall,", " There are", " It is")

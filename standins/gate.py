@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Literal
 
 import torch
 
-from pipeline.physiclear.catalogue import Catalogue
-from pipeline.prompts import TACTILE, render
+from pipeline.videos.catalogue import Catalogue
+from pipeline.language.chat import TACTILE, render
 from pipeline.records import Opd, Part, Prediction, Question, Task, Turn
 from pipeline.runtime import derive_seed
 from pipeline.tasks import TASKS

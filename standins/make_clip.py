@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.optim.lr_scheduler import LambdaLR
 
-from pipeline.artifacts import save_tensors, write_json
+from pipeline.io import save_tensors, write_json
 from pipeline.runtime import derive_seed, seed_everything
 from standins.beginning import initialise
 from standins.contrast import contrastive_loss, draw_captions

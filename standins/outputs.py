@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from pipeline.artifacts import write_text
+from pipeline.io import write_text
 
 Z95 = 1.959963984540054
 """The normal quantile of a two-sided 95 % interval."""

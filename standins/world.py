@@ -13,8 +13,8 @@ from typing import Literal
 import yaml
 from pydantic import BaseModel, ConfigDict
 
-import pipeline.physiclear
-from pipeline.physiclear.catalogue import Catalogue, Object, Property, Scenario, load_catalogue
+import pipeline
+from pipeline.videos.catalogue import Catalogue, Object, Property, Scenario, load_catalogue
 from pipeline.records import Part
 from pipeline.runtime import derive_seed
 from pipeline.tasks.base import Pool
@@ -74,7 +74,7 @@ def load_situations() -> Situations:
 @cache
 def real_catalogue() -> Catalogue:
     """The catalogue whose words the pipeline speaks."""
-    return load_catalogue(Path(pipeline.physiclear.__file__).parent)
+    return load_catalogue(Path(pipeline.__file__).parent / "physiclear")
 
 
 @cache

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from pipeline.physiclear.catalogue import Catalogue, load_catalogue
+from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.records import Video
 
 if TYPE_CHECKING:
@@ -140,7 +140,7 @@ def tiny_videos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def few_permutations(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few permutations in the audit of leakage, where they are not what is tested."""
-    monkeypatch.setattr("pipeline.audit.leakage.PERMUTATIONS", 50)
+    monkeypatch.setattr("pipeline.videos.audit.leakage.PERMUTATIONS", 50)
 
 
 def fake_videos(objects: Iterable[str], per_object: int = 3) -> list[Video]:

@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from safetensors.torch import load_file, save_file
 
-from pipeline.artifacts import write_table
-from pipeline.frames.store import FRAMES_FILE, REFERENCES_FILE, TABLE_FILE, FrameStore
-from pipeline.physiclear.catalogue import Catalogue
+from pipeline.io import write_table
+from pipeline.videos.frames.store import FRAMES_FILE, REFERENCES_FILE, TABLE_FILE, FrameStore
+from pipeline.videos.catalogue import Catalogue
 from pipeline.records import Assignment, Frame, Part
-from pipeline.sections import EncoderConfig, Recipe, RuntimeConfig
-from pipeline.training.encoder import EncoderData
-from pipeline.training.votes import Votes
+from pipeline.config import EncoderConfig, Recipe, RuntimeConfig
+from pipeline.encoder.finetune import EncoderData
+from pipeline.encoder.frame_heads import Votes
 from tests.checkpoints import write_clip
 
 Floats = np.ndarray

@@ -10,12 +10,12 @@ import numpy as np
 import yaml
 from safetensors.numpy import save_file
 
-from pipeline.artifacts import write_csv, write_json, write_jsonl, write_table
-from pipeline.config import Params
+from pipeline.io import write_csv, write_json, write_jsonl, write_table
+from pipeline.params import Params
 from pipeline.evaluation.grading import grade
-from pipeline.physiclear.catalogue import Catalogue, load_catalogue
+from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.plan import Variant
-from pipeline.questions import build_questions, pool_of
+from pipeline.tasks.questions import build_questions, pool_of
 from pipeline.records import (
     Assignment,
     Classification,

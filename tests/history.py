@@ -11,7 +11,7 @@ from pathlib import Path
 
 import yaml
 
-from pipeline.artifacts import write_table
+from pipeline.io import write_table
 from pipeline.records import Score, Task
 
 REPORT = "reports/smoke-scenes"

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pipeline.cli import app
-from pipeline.config import load_params
+from pipeline.params import load_params
 from pipeline.errors import UserError
 from tests.closure import ROOT
 from tests.conftest import moving_square, write_video

@@ -9,13 +9,13 @@ from typing import get_args
 import pytest
 import yaml
 
-from pipeline.config import load_params
-from pipeline.contestants import RELEASE
+from pipeline.params import load_params
+from pipeline.encoder.candidates import RELEASE
 from pipeline.errors import UserError
 from pipeline.plan import resolve_plan
 from pipeline.records import Opd
 from pipeline.scales import check_inputs, compose, prune, shipped_scales, write_params
-from pipeline.sections import Recipe
+from pipeline.config import Recipe
 from tests.closure import ROOT
 
 CONF = ROOT / "conf"

@@ -12,7 +12,7 @@ from filelock import FileLock
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.artifacts import (
+from pipeline.io import (
     atomic,
     load_tensors,
     read_json,

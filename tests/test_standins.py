@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.prompts import add_tactile_tokens, encode, render
+from pipeline.language.chat import add_tactile_tokens, encode, render
 from pipeline.records import Part, Turn
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool

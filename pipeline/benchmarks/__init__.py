@@ -7,8 +7,8 @@ from pathlib import Path
 
 from pydantic import Field
 
-from pipeline.config import load_params
-from pipeline.physiclear.catalogue import Catalogue, load_catalogue
+from pipeline.params import load_params
+from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.records import Record
 
 

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from pipeline.artifacts import write_json
+from pipeline.io import write_json
 from pipeline.benchmarks import BenchRow, frames, realism, scenes, selection, startup
 from pipeline.errors import UserError
 

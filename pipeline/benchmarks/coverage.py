@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.artifacts import write_text
+from pipeline.io import write_text
 from pipeline.benchmarks.coverage_methods import (
     ACCURACY,
     DIFFERENCE,

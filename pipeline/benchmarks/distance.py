@@ -17,8 +17,8 @@ from statistics import fmean
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.baseline.predictor import Features
-from pipeline.baseline.validation import deal
+from pipeline.encoder.baseline.predictor import Features
+from pipeline.encoder.baseline.validation import deal
 from pipeline.runtime import cores, derive_seed
 
 Values = npt.NDArray[np.float64]

@@ -28,8 +28,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from pipeline.baseline.predictor import Labels
-from pipeline.baseline.validation import Fold, Verdict, cross_validate
+from pipeline.encoder.baseline.predictor import Labels
+from pipeline.encoder.baseline.validation import Fold, Verdict, cross_validate
 from pipeline.benchmarks import bench_videos
 from pipeline.benchmarks.encoder_cost import (
     ALONE,
@@ -53,24 +53,24 @@ from pipeline.benchmarks.encoder_cost import (
 from pipeline.benchmarks.encoder_training import Describe, prompts, training_speed
 from pipeline.benchmarks.operations import counted
 from pipeline.benchmarks.pareto import draw_rows
-from pipeline.config import load_params
-from pipeline.contestants import CONTESTANTS
-from pipeline.data.clips import ClipDataset
+from pipeline.params import load_params
+from pipeline.encoder.candidates import CONTESTANTS
+from pipeline.encoder.clips import ClipDataset
 from pipeline.errors import UserError
-from pipeline.frames.extract import extract_frames
-from pipeline.frames.store import FrameStore
-from pipeline.frames.subtraction import Pictures
-from pipeline.models.tactile_encoder import FrameEncoder
-from pipeline.models.weights import check_encoder
+from pipeline.videos.frames.extract import extract_frames
+from pipeline.videos.frames.store import FrameStore
+from pipeline.videos.frames.subtraction import Pictures
+from pipeline.encoder.model import FrameEncoder
+from pipeline.weights import check_encoder
 from pipeline.parallel import run_parallel
 from pipeline.records import Assignment, Part
 from pipeline.runtime import derive_seed
-from pipeline.sections import FramesConfig, RuntimeConfig, SplitConfig
-from pipeline.splits import assign
-from pipeline.training.cross_validation import Arena, frozen_encoder
-from pipeline.training.encoder import EncoderData, describe_clips
-from pipeline.training.votes import Clips, choose_strength, fit_votes
-from pipeline.videos import list_videos
+from pipeline.config import FramesConfig, RuntimeConfig, SplitConfig
+from pipeline.videos.split import assign
+from pipeline.encoder.cross_validation import Arena, frozen_encoder
+from pipeline.encoder.finetune import EncoderData, describe_clips
+from pipeline.encoder.frame_heads import Clips, choose_strength, fit_votes
+from pipeline.videos.files import list_videos
 
 Format = Literal["float32", "bfloat16", "int8"]
 

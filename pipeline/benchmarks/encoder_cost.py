@@ -1,6 +1,6 @@
 """What encoders cost on one core: contestants from the file to the decided classes, and CLIPs of several sizes.
 
-A contestant's video is decoded, its frames are chosen and fitted (`pipeline.frames.scan`), its reference is subtracted
+A contestant's video is decoded, its frames are chosen and fitted (`pipeline.videos.frames.scan`), its reference is subtracted
 where the contestant wants that, the frames are embedded and the heads decide. All of them get frames of `SIDE` pixels,
 as in the cross-validation whose errors stand beside the costs. Trees decode a second time, whole frames; the first pass
 tells them where the reference is. Where cost depends on no training, weights are random, and trees have grown on random
@@ -21,28 +21,28 @@ import numpy as np
 import torch
 from torch import nn
 
-from pipeline.artifacts import read_table
-from pipeline.baseline.features import VIDEO_FEATURE_NAMES
-from pipeline.baseline.predictor import Labels, PropertyPredictor
-from pipeline.baseline.recordings import FRAMES as TREE_FRAMES
-from pipeline.baseline.recordings import Recording, describe
-from pipeline.baseline.validation import Verdict, collect, compare, summarise
+from pipeline.io import read_table
+from pipeline.encoder.baseline.features import VIDEO_FEATURE_NAMES
+from pipeline.encoder.baseline.predictor import Labels, PropertyPredictor
+from pipeline.encoder.baseline.recordings import FRAMES as TREE_FRAMES
+from pipeline.encoder.baseline.recordings import Recording, describe
+from pipeline.encoder.baseline.validation import Verdict, collect, compare, summarise
 from pipeline.benchmarks import BenchRow
 from pipeline.benchmarks.operations import counted
-from pipeline.contestants import CONTESTANTS, Contestant
-from pipeline.frames.sampling import sample_evaluation
-from pipeline.frames.scan import Scan, scan
-from pipeline.frames.subtraction import subtract
-from pipeline.models.clip import load_visual_tower
-from pipeline.models.frame_votes import FrameVotes
-from pipeline.models.recipes import property_classifier
-from pipeline.models.scene_encoder import SceneEncoder
-from pipeline.models.tactile_encoder import Heads, PropertyClassifier
+from pipeline.encoder.candidates import CONTESTANTS, Contestant
+from pipeline.sampling import sample_evaluation
+from pipeline.videos.frames.scan import Scan, scan
+from pipeline.videos.frames.subtraction import subtract
+from pipeline.encoder.clip import load_visual_tower
+from pipeline.encoder.frame_classifier import FrameVotes
+from pipeline.encoder.recipes import property_classifier
+from pipeline.encoder.scene_encoder import SceneEncoder
+from pipeline.encoder.model import Heads, PropertyClassifier
 from pipeline.records import Judged
 from pipeline.runtime import seed_everything
-from pipeline.sections import FramesConfig
-from pipeline.training.cross_validation import Arena, frozen_encoder
-from pipeline.videos import VideoFile
+from pipeline.config import FramesConfig
+from pipeline.encoder.cross_validation import Arena, frozen_encoder
+from pipeline.videos.files import VideoFile
 
 SIDE = 120
 FRAMES = 5

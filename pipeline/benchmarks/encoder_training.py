@@ -22,7 +22,7 @@ import torch
 from PIL import Image
 from torch.utils.data import DataLoader
 
-from pipeline.baseline.validation import Verdict
+from pipeline.encoder.baseline.validation import Verdict
 from pipeline.benchmarks.encoder_cost import (
     ALONE,
     SAMPLE,
@@ -36,19 +36,19 @@ from pipeline.benchmarks.encoder_cost import (
     with_error,
 )
 from pipeline.benchmarks.operations import counted
-from pipeline.data.clips import ClipDataset, LabelledVideo, collate_clips
-from pipeline.decoding import decode
-from pipeline.frames.extract import extract_frames
-from pipeline.frames.store import TABLE_FILE, FrameStore
-from pipeline.frames.subtraction import Pictures
-from pipeline.models.clip import load_visual_tower
-from pipeline.models.recipes import property_classifier
-from pipeline.models.tactile_encoder import FrameEncoder, PropertyClassifier
+from pipeline.encoder.clips import ClipDataset, LabelledVideo, collate_clips
+from pipeline.videos.decoding import decode
+from pipeline.videos.frames.extract import extract_frames
+from pipeline.videos.frames.store import TABLE_FILE, FrameStore
+from pipeline.videos.frames.subtraction import Pictures
+from pipeline.encoder.clip import load_visual_tower
+from pipeline.encoder.recipes import property_classifier
+from pipeline.encoder.model import FrameEncoder, PropertyClassifier
 from pipeline.records import Assignment, Part, Video
 from pipeline.runtime import seed_everything
-from pipeline.sections import EncoderConfig, FramesConfig
-from pipeline.training.cross_validation import Arena
-from pipeline.training.encoder import EncoderData, classify, train_classifier
+from pipeline.config import EncoderConfig, FramesConfig
+from pipeline.encoder.cross_validation import Arena
+from pipeline.encoder.finetune import EncoderData, classify, train_classifier
 
 EPOCHS = 8
 PROMPTS = {
@@ -125,7 +125,7 @@ class JpegStore(FrameStore):
     """A store whose frames are read from JPEG files, as the published code reads them.
 
     Args:
-        folder: What `pipeline.frames.extract` wrote; it says which frames there are and at which size they are wanted.
+        folder: What `pipeline.videos.frames.extract` wrote; it says which frames there are and at which size they are wanted.
         pictures: What `write_jpegs` wrote.
     """
 

@@ -22,13 +22,13 @@ from typing import get_args
 import cv2
 
 from pipeline.benchmarks import BenchRow, bench_videos
-from pipeline.decoding import Image, decode
-from pipeline.frames.extract import extract_frames
-from pipeline.frames.selection import changed_pixels
+from pipeline.videos.decoding import Image, decode
+from pipeline.videos.frames.extract import extract_frames
+from pipeline.videos.frames.selection import changed_pixels
 from pipeline.parallel import run_parallel
-from pipeline.physiclear.catalogue import Catalogue
-from pipeline.sections import FramesConfig, Selection
-from pipeline.videos import list_videos
+from pipeline.videos.catalogue import Catalogue
+from pipeline.config import FramesConfig, Selection
+from pipeline.videos.files import list_videos
 
 REPEATS = 3
 SIZE = 64

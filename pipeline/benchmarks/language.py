@@ -31,11 +31,11 @@ from pipeline.benchmarks.language_formats import format_rows
 from pipeline.benchmarks.language_paper import counted_rows
 from pipeline.benchmarks.language_ways import PUBLISHED, UPDATE, WAYS, Way, answer_batched, answer_published, train
 from pipeline.benchmarks.operations import counted
-from pipeline.models.octopi import OctopiForCausalLM
-from pipeline.models.recipes import base_encoder
-from pipeline.models.tactile_encoder import TactileEncoder
-from pipeline.sections import EncoderConfig, RuntimeConfig, TrainConfig
-from pipeline.training.language import Job, align
+from pipeline.language.octopi import OctopiForCausalLM
+from pipeline.encoder.recipes import base_encoder
+from pipeline.encoder.model import TactileEncoder
+from pipeline.config import EncoderConfig, RuntimeConfig, TrainConfig
+from pipeline.language.training import Job, align
 
 REPEATS = 5
 TRAINED, ASKED = 64, 64

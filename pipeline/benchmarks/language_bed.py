@@ -17,14 +17,14 @@ from typing import Literal
 import numpy as np
 import torch
 
-from pipeline.artifacts import save_tensors, write_table
+from pipeline.io import save_tensors, write_table
 from pipeline.benchmarks import BenchRow
-from pipeline.data.conversations import ConversationDataset
-from pipeline.data.embeddings import FLIPS, INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
-from pipeline.frames.sampling import sample_evaluation
-from pipeline.models.octopi import OctopiForCausalLM
-from pipeline.physiclear.catalogue import load_catalogue
-from pipeline.questions import build_questions, pool_of
+from pipeline.language.conversations import ConversationDataset
+from pipeline.embeddings import FLIPS, INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
+from pipeline.sampling import sample_evaluation
+from pipeline.language.octopi import OctopiForCausalLM
+from pipeline.videos.catalogue import load_catalogue
+from pipeline.tasks.questions import build_questions, pool_of
 from pipeline.records import Assignment, Embedding, Opd, Part, Question, Task
 from pipeline.runtime import seed_everything
 from pipeline.statistics import Outcome, clustered

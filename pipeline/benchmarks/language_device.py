@@ -20,12 +20,12 @@ from pipeline.benchmarks.language_counts import H100, Cost, Tower
 from pipeline.benchmarks.language_paper import Length, pipeline_answers, published_answers
 from pipeline.benchmarks.language_random import matrix_rate, random_tower, shapes_of, timed
 from pipeline.benchmarks.language_ways import PUBLISHED, UPDATE, answer_batched, answer_published, train
-from pipeline.models.llm import load_tokenizer
-from pipeline.models.octopi import OctopiForCausalLM
+from pipeline.language.base import load_tokenizer
+from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.records import Question
 from pipeline.runtime import DeviceName, DtypeName, resolve_device, resolve_dtype, seed_everything
-from pipeline.sections import LoraTrainConfig, RuntimeConfig, TrainConfig
-from pipeline.training.language import Job, add_lora, align, finetune_lora
+from pipeline.config import LoraTrainConfig, RuntimeConfig, TrainConfig
+from pipeline.language.training import Job, add_lora, align, finetune_lora
 
 COUNTED = 1
 """Updates in which operations are counted, and which warm the device up."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 
 from pipeline.benchmarks.language_bed import FRAMES, OPD, Bed, LanguageRow, differing, make_row, take_turns
-from pipeline.data.conversations import ConversationCollator
-from pipeline.evaluation.generate import Asking, answer
-from pipeline.models.octopi import OctopiForCausalLM
+from pipeline.language.conversations import ConversationCollator
+from pipeline.language.generate import Asking, answer
+from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.runtime import DtypeName
 
 FORMATS: tuple[DtypeName, ...] = ("float32", "bfloat16")

@@ -15,10 +15,10 @@ import torch
 from torch.nn import functional as F
 
 from pipeline.benchmarks.language_bed import FRAMES, OPD, SEED, Bed
-from pipeline.data.buckets import LengthBuckets
-from pipeline.data.conversations import ConversationCollator, Sample
-from pipeline.evaluation.generate import Asking, answer
-from pipeline.prompts import IGNORE_INDEX
+from pipeline.language.buckets import LengthBuckets
+from pipeline.language.conversations import ConversationCollator, Sample
+from pipeline.language.generate import Asking, answer
+from pipeline.language.chat import IGNORE_INDEX
 from pipeline.records import Prediction, Question
 
 UPDATE = 16

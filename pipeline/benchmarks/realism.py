@@ -18,25 +18,25 @@ from tempfile import TemporaryDirectory
 import cv2
 import numpy as np
 
-from pipeline.artifacts import atomic
-from pipeline.baseline.features import HEIGHT, VIDEO_FEATURE_NAMES, WIDTH, Vector, video_features
-from pipeline.baseline.recordings import mean_reference
-from pipeline.baseline.validation import deal
+from pipeline.io import atomic
+from pipeline.encoder.baseline.features import HEIGHT, VIDEO_FEATURE_NAMES, WIDTH, Vector, video_features
+from pipeline.encoder.baseline.recordings import mean_reference
+from pipeline.encoder.baseline.validation import deal
 from pipeline.benchmarks import DATA_VARIABLE, BenchRow, bench_videos
 from pipeline.benchmarks.distance import frechet, mean_differences, principal_axes, told_apart, wasserstein
 from pipeline.benchmarks.transfer import Kind, transfer
-from pipeline.config import load_params
-from pipeline.decoding import Image, decode
+from pipeline.params import load_params
+from pipeline.videos.decoding import Image, decode
 from pipeline.errors import UserError
-from pipeline.frames.sampling import sample_evaluation
-from pipeline.frames.scan import Scan, scan
+from pipeline.sampling import sample_evaluation
+from pipeline.videos.frames.scan import Scan, scan
 from pipeline.parallel import run_parallel
-from pipeline.physiclear.catalogue import Catalogue
+from pipeline.videos.catalogue import Catalogue
 from pipeline.runtime import derive_seed
 from pipeline.scenes.recipe import Recipe, load_recipes
 from pipeline.scenes.video import synthesize
-from pipeline.sections import FramesConfig, ScenesConfig
-from pipeline.videos import VideoFile, list_videos
+from pipeline.config import FramesConfig, ScenesConfig
+from pipeline.videos.files import VideoFile, list_videos
 
 FRAMES = 5
 FEWEST = 10

@@ -17,14 +17,14 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from pipeline.baseline.features import video_features
+from pipeline.encoder.baseline.features import video_features
 from pipeline.benchmarks import BenchRow
 from pipeline.benchmarks.pareto import draw_rows
 from pipeline.benchmarks.transfer import Kind, transfer
-from pipeline.config import load_params
-from pipeline.frames.reference import reference_indices
+from pipeline.params import load_params
+from pipeline.videos.frames.reference import reference_indices
 from pipeline.parallel import run_parallel
-from pipeline.physiclear.catalogue import Catalogue, load_catalogue
+from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.runtime import derive_seed
 from pipeline.scenes.contact import GEL, slope_error
 from pipeline.scenes.elastic.kernels import half_space_table, make_kernel
@@ -34,7 +34,7 @@ from pipeline.scenes.light import Image, make_sensor
 from pipeline.scenes.recipe import Recipe, load_recipes
 from pipeline.scenes.render import Scene, make_scene, render
 from pipeline.scenes.video import synthesize
-from pipeline.sections import ScenesConfig
+from pipeline.config import ScenesConfig
 
 RADIUS, FORCES = 10.0, (0.8, 0.9, 1.0, 1.1, 1.2)
 """The ball, in mm, and forces in N on a body of 1 MPa: several, as one is as lucky as its circle fits the grid."""

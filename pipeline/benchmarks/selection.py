@@ -15,18 +15,18 @@ from statistics import fmean, median
 
 import numpy as np
 
-from pipeline.baseline.features import frame_features, pool_features
-from pipeline.baseline.recordings import mean_reference
-from pipeline.baseline.validation import Verdict, compare, cross_validate, forest, summarise
+from pipeline.encoder.baseline.features import frame_features, pool_features
+from pipeline.encoder.baseline.recordings import mean_reference
+from pipeline.encoder.baseline.validation import Verdict, compare, cross_validate, forest, summarise
 from pipeline.benchmarks import BenchRow, bench_videos
 from pipeline.benchmarks.pareto import draw_rows
-from pipeline.decoding import decode
+from pipeline.videos.decoding import decode
 from pipeline.errors import UserError
-from pipeline.frames.sampling import sample_evaluation
-from pipeline.frames.scan import Scan, scan
+from pipeline.sampling import sample_evaluation
+from pipeline.videos.frames.scan import Scan, scan
 from pipeline.parallel import run_parallel
-from pipeline.sections import FramesConfig, Selection
-from pipeline.videos import VideoFile, list_videos
+from pipeline.config import FramesConfig, Selection
+from pipeline.videos.files import VideoFile, list_videos
 
 COUNTS = (1, 3, 5, 10)
 RULES: tuple[Selection, ...] = ("salient", "release", "uniform", "contact")

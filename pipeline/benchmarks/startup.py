@@ -24,7 +24,7 @@ BASELINE = "importing torch, Trainer, peft, open_clip and mlflow"
 PUBLISH = """\
 import sys
 from pathlib import Path
-from pipeline.config import load_params
+from pipeline.params import load_params
 from pipeline.tracking.publishing import publish
 params = load_params()
 tracking = params.tracking.model_copy(update={"uri": f"sqlite:///{sys.argv[1]}/mlflow.db"})

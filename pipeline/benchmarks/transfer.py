@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.baseline.predictor import Features, Labels, PropertyPredictor
-from pipeline.baseline.validation import Accuracy, Summary, Verdict, deal, summarise
+from pipeline.encoder.baseline.predictor import Features, Labels, PropertyPredictor
+from pipeline.encoder.baseline.validation import Accuracy, Summary, Verdict, deal, summarise
 from pipeline.benchmarks import BenchRow
 from pipeline.runtime import derive_seed
 

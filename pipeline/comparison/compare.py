@@ -18,7 +18,7 @@ from pipeline.comparison.locked import (
     load_yaml,
     read_locked,
 )
-from pipeline.config import PARAMS_FILE
+from pipeline.params import PARAMS_FILE
 from pipeline.revisions import Disk, Tree, find_commit
 from pipeline.tracking.committed import LOCK_FILE
 from pipeline.tracking.reproduction import flatten

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from pipeline.errors import UserError
-from pipeline.physiclear.catalogue import Catalogue
+from pipeline.videos.catalogue import Catalogue
 from pipeline.records import WHOLE, Prediction, Question, Score
 from pipeline.tasks import TASKS
 

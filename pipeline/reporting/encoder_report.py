@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pipeline.artifacts import read_json, read_table, write_json, write_text
-from pipeline.config import PARAMS_FILE, Params
-from pipeline.physiclear.catalogue import load_catalogue
+from pipeline.io import read_json, read_table, write_json, write_text
+from pipeline.params import PARAMS_FILE, Params
+from pipeline.videos.catalogue import load_catalogue
 from pipeline.records import Judged, Video
 from pipeline.reporting.encoders import COMBINED, FOLDER, AccuracyRow, encoder_tables
 from pipeline.reporting.page import render_encoder_page

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from pipeline.baseline.validation import Summary, Verdict, collect, compare, summarise
-from pipeline.contestants import CONTESTANTS
-from pipeline.physiclear.catalogue import Catalogue
+from pipeline.encoder.baseline.validation import Summary, Verdict, collect, compare, summarise
+from pipeline.encoder.candidates import CONTESTANTS
+from pipeline.videos.catalogue import Catalogue
 from pipeline.records import Judged
 from pipeline.reporting.table import Table, number, share_span
 from pipeline.statistics import Interval

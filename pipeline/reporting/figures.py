@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.artifacts import atomic
-from pipeline.physiclear.catalogue import Property
+from pipeline.io import atomic
+from pipeline.videos.catalogue import Property
 from pipeline.records import Measurement
 
 if TYPE_CHECKING:

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.artifacts import read_csv, read_jsonl, read_table
-from pipeline.config import Params
-from pipeline.physiclear.catalogue import Catalogue, load_catalogue
+from pipeline.io import read_csv, read_jsonl, read_table
+from pipeline.params import Params
+from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.plan import Encoder, Lora
 from pipeline.records import (
     Assignment,
@@ -25,7 +25,7 @@ from pipeline.records import (
     Video,
 )
 from pipeline.reporting.published import DATASET, Published, find
-from pipeline.splits import assign
+from pipeline.videos.split import assign
 from pipeline.stability.record import STABILITY_FILE, StabilityRow
 from pipeline.tasks.described import described_right
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from pipeline.config import PARAMS_FILE, Params
+from pipeline.params import PARAMS_FILE, Params
 from pipeline.records import Video
 
 CODE = ("pipeline", "stages", "conf", "dvc.yaml")

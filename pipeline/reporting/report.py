@@ -6,8 +6,8 @@ from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline.artifacts import read_table, write_json, write_text
-from pipeline.config import PARAMS_FILE, Params
+from pipeline.io import read_table, write_json, write_text
+from pipeline.params import PARAMS_FILE, Params
 from pipeline.plan import Encoder
 from pipeline.records import Embedding, Measurement, Part
 from pipeline.reporting.audit import audit_table

@@ -8,10 +8,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from pipeline.artifacts import atomic, read_jsonl, write_json
-from pipeline.frames.sampling import sample_evaluation
+from pipeline.io import atomic, read_jsonl, write_json
+from pipeline.sampling import sample_evaluation
 from pipeline.plan import FULL
-from pipeline.prompts import TACTILE
+from pipeline.language.chat import TACTILE
 from pipeline.records import WHOLE, Opd, Prediction, Question, Record, Score, Task
 from pipeline.reporting.inputs import Inputs
 
@@ -116,7 +116,7 @@ def draw_strips(inputs: Inputs, source: Path, folder: Path, videos: Iterable[str
     import cv2
     import numpy as np
 
-    from pipeline.frames.store import FrameStore
+    from pipeline.videos.frames.store import FrameStore
 
     store = FrameStore(source, inputs.params.encoder.reference)
     side = min(LARGEST, store.size)

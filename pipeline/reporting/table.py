@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Protocol
 
-from pipeline.artifacts import write_text
+from pipeline.io import write_text
 
 Cell = str | int | float | None
 

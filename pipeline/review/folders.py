@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from pipeline.artifacts import read_json
+from pipeline.io import read_json
 from pipeline.reporting.encoders import FOLDER as ENCODERS
 from pipeline.reporting.samples import FILE, FOLDER
 from pipeline.review.readme import Readme, parse, within

@@ -17,7 +17,7 @@ import yaml
 
 from pipeline.plan import resolve_plan
 from pipeline.records import Touch
-from pipeline.sections import SCENES_DIR
+from pipeline.config import SCENES_DIR
 
 WIDTH, HEIGHT = 144, 42
 ACROSS, DOWN = 18, 30

@@ -19,7 +19,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from pipeline.artifacts import write_text
+from pipeline.io import write_text
 from pipeline.errors import UserError
 from pipeline.review.graph import HEIGHT, WIDTH
 from pipeline.review.page import Page, compose, strip_file

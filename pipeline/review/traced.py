@@ -17,7 +17,7 @@ from pathlib import Path
 from string import Formatter
 from typing import Any
 
-from pipeline.artifacts import read_json
+from pipeline.io import read_json
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.errors import UserError
-from pipeline.physiclear.catalogue import Catalogue
+from pipeline.videos.catalogue import Catalogue
 from pipeline.scenes.grid import Heights
 
 SOFT_BELOW_MPA = 0.12

@@ -1,7 +1,7 @@
 """What the hand does: rest, press, twist under force, let go, as in the public videos.
 
 The figures below were measured on the videos of the development split's 53 training objects, from the course of each
-video's contact (`pipeline.frames.reference.strength` against the first frames, over what is left once the object is
+video's contact (`pipeline.videos.frames.reference.strength` against the first frames, over what is left once the object is
 gone). A video's contact grows about as the force does: for a ball the sum of |slope| over the contact goes as a^3 / R,
 which is F / E* by Hertz. So the course of the contact stands for the course of the force; its height in N is unknown.
 """

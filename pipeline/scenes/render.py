@@ -17,7 +17,7 @@ from pipeline.scenes.light import Image, Sensor, shade
 from pipeline.scenes.measure import Measured, measure
 from pipeline.scenes.motion import REACH_MM, Motion, make_motion
 from pipeline.scenes.recipe import Recipe
-from pipeline.sections import ScenesConfig
+from pipeline.config import ScenesConfig
 
 MARGIN_MM = REACH_MM
 """How far a patch reaches beyond the view at every angle."""

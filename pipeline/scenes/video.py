@@ -14,7 +14,7 @@ import numpy as np
 
 from pipeline.errors import UserError
 from pipeline.parallel import run_parallel
-from pipeline.physiclear.catalogue import Catalogue
+from pipeline.videos.catalogue import Catalogue
 from pipeline.records import Record
 from pipeline.runtime import derive_seed
 from pipeline.scenes.film import write_film
@@ -22,7 +22,7 @@ from pipeline.scenes.light import make_sensor
 from pipeline.scenes.motion import draw_length
 from pipeline.scenes.recipe import Recipe
 from pipeline.scenes.render import make_scene, measure_scene, render
-from pipeline.sections import ScenesConfig
+from pipeline.config import ScenesConfig
 
 cv2.setNumThreads(1)  # Videos are what runs in parallel.
 

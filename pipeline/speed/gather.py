@@ -10,7 +10,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline.artifacts import write_text
+from pipeline.io import write_text
 from pipeline.errors import UserError
 from pipeline.reporting.table import Table
 from pipeline.speed.pareto import Point, draw_pareto

@@ -8,7 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.artifacts import atomic
+from pipeline.io import atomic
 from pipeline.speed.labels import MARKER, Box, Place, place_labels
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from pipeline.artifacts import read_json
+from pipeline.io import read_json
 from pipeline.errors import UserError
 from pipeline.speed.rows import SpeedRow
 

@@ -14,9 +14,9 @@ from functools import partial
 import numpy as np
 import torch
 
-from pipeline.baseline.predictor import decode_jointly, log_dependence
-from pipeline.models.frame_votes import FrameVotes
-from pipeline.models.tactile_encoder import FrameEncoder
+from pipeline.encoder.baseline.predictor import decode_jointly, log_dependence
+from pipeline.encoder.frame_classifier import FrameVotes
+from pipeline.encoder.model import FrameEncoder
 from pipeline.stability.case import DOUBLE, SOLVED, Case, Dtype, Floats, exactly
 
 PART = "joint decisions"

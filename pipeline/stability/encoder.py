@@ -15,11 +15,11 @@ from typing import cast, get_args
 import numpy as np
 import torch
 
-from pipeline.models.recipes import base_encoder, property_classifier
-from pipeline.models.scene_encoder import SceneEncoder
-from pipeline.models.tactile_encoder import FrameEncoder
+from pipeline.encoder.recipes import base_encoder, property_classifier
+from pipeline.encoder.scene_encoder import SceneEncoder
+from pipeline.encoder.model import FrameEncoder
 from pipeline.runtime import seed_everything
-from pipeline.sections import EncoderConfig, Recipe
+from pipeline.config import EncoderConfig, Recipe
 from pipeline.stability.case import NETWORKS, Bound, Case, Dtype, Floats
 from pipeline.stability.condition import magnification, rounded
 

@@ -13,13 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.decoding import Decoder, Image, brightness
-from pipeline.frames.course import run_pass
-from pipeline.frames.reference import strength
-from pipeline.frames.selection import difference
-from pipeline.frames.subtraction import GAIN, MIDDLE, RING, subtract
+from pipeline.videos.decoding import Decoder, Image, brightness
+from pipeline.videos.frames.probing import run_pass
+from pipeline.videos.frames.reference import strength
+from pipeline.videos.frames.selection import difference
+from pipeline.videos.frames.subtraction import GAIN, MIDDLE, RING, subtract
 from pipeline.scenes.film import write_film
-from pipeline.sections import FramesConfig
+from pipeline.config import FramesConfig
 from pipeline.stability.case import BYTES, Bound, Case, Dtype, Floats, exactly, summing
 
 PART = "frames"

@@ -16,10 +16,10 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from pipeline.models.frame_votes import FrameVotes
-from pipeline.models.published import SHORTEST_FEATURE, PublishedHeads
-from pipeline.models.scene_encoder import SceneEncoder
-from pipeline.models.tactile_encoder import FrameEncoder, Heads, PropertyClassifier
+from pipeline.encoder.frame_classifier import FrameVotes
+from pipeline.encoder.release import SHORTEST_FEATURE, PublishedHeads
+from pipeline.encoder.scene_encoder import SceneEncoder
+from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
 from pipeline.runtime import seed_everything
 from pipeline.stability.case import NETWORKS, SOLVED, Bound, Case, Dtype, Floats, summing
 from pipeline.stability.encoder import CLASSES, PART

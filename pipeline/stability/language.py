@@ -16,8 +16,8 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from pipeline.models.octopi import OctopiForCausalLM
-from pipeline.prompts import IGNORE_INDEX
+from pipeline.language.octopi import OctopiForCausalLM
+from pipeline.language.chat import IGNORE_INDEX
 from pipeline.runtime import seed_everything
 from pipeline.stability.case import NETWORKS, Bound, Case, Dtype, Floats, exactly, summing
 from pipeline.stability.condition import magnification, rounded

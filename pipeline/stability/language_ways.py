@@ -14,8 +14,8 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from pipeline.models.cache import AHEAD, roomy_cache
-from pipeline.models.octopi import OctopiForCausalLM
+from pipeline.language.cache import AHEAD, roomy_cache
+from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.runtime import seed_everything
 from pipeline.stability.case import NETWORKS, Bound, Case, Dtype, Floats, exactly
 from pipeline.stability.condition import magnification, rounded

@@ -18,10 +18,10 @@ from torch import nn
 from transformers import PreTrainedModel
 from transformers.modeling_outputs import CausalLMOutput
 
-from pipeline.models.octopi import OctopiForCausalLM
-from pipeline.models.scene_encoder import LessonModel, SceneEncoder
-from pipeline.models.tactile_encoder import FrameEncoder, PropertyClassifier
-from pipeline.prompts import IGNORE_INDEX
+from pipeline.language.octopi import OctopiForCausalLM
+from pipeline.encoder.scene_encoder import LessonModel, SceneEncoder
+from pipeline.encoder.model import FrameEncoder, PropertyClassifier
+from pipeline.language.chat import IGNORE_INDEX
 from pipeline.runtime import seed_everything
 from pipeline.stability.case import NETWORKS, SOLVED, Bound, Case, Dtype, Floats, summing
 from pipeline.stability.language import made, plain

@@ -16,7 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipeline.decoding import decode
+from pipeline.videos.decoding import decode
 from pipeline.scenes.film import write_film
 from pipeline.scenes.grid import Grid, thread
 from pipeline.scenes.light import Sensor, make_sensor, shade

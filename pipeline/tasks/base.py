@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from pipeline.physiclear.catalogue import Catalogue, Property
-from pipeline.physiclear.words import mentioned, plain
+from pipeline.videos.catalogue import Catalogue, Property
+from pipeline.videos.phrases import mentioned, plain
 from pipeline.records import Dialogue, Gold, Opd, Part, Prediction, Question, Score, Task, Turn
 
 LETTERS = "abc"

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 
-from pipeline.physiclear.catalogue import Catalogue
-from pipeline.physiclear.describing import levels_named
-from pipeline.physiclear.language import OPENING, Property
+from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.descriptions import levels_named
+from pipeline.videos.wording import OPENING, Property
 from pipeline.records import Prediction, Question
 from pipeline.tasks.base import LETTERS, ORDINALS, find_level
 

@@ -6,8 +6,8 @@ import math
 import random
 import re
 
-from pipeline.physiclear.catalogue import Catalogue
-from pipeline.physiclear.language import OPENING
+from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.wording import OPENING
 from pipeline.records import Opd, Prediction, Question, Score, Task
 from pipeline.tasks.base import Draft, Pool, draw_videos, find_level, gold, single_turn
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 import re
 
-from pipeline.physiclear.catalogue import Catalogue
+from pipeline.videos.catalogue import Catalogue
 from pipeline.records import Opd, Prediction, Question, Score, Task
 from pipeline.tasks.base import (
     ORDINALS,

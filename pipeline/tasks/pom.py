@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterable
 from dataclasses import replace
 
-from pipeline.physiclear.catalogue import Catalogue
+from pipeline.videos.catalogue import Catalogue
 from pipeline.records import Dialogue, Opd, Prediction, Question, Score, Task
 from pipeline.tasks.base import (
     LETTERS,

@@ -6,7 +6,7 @@ import random
 import re
 from collections.abc import Mapping
 
-from pipeline.physiclear.catalogue import Catalogue, Scenario
+from pipeline.videos.catalogue import Catalogue, Scenario
 from pipeline.records import Dialogue, Opd, Prediction, Question, Score, Task, Turn
 from pipeline.tasks.base import LETTERS, Draft, Pool, choice_score, descriptions, draw_videos, gold, lettered
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import yaml
 
-from pipeline.config import PARAMS_FILE, Params
+from pipeline.params import PARAMS_FILE, Params
 from pipeline.errors import UserError
 from pipeline.revisions import Commit, Disk, find_commit
 from pipeline.tracking.reproduction import planned_stages

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.records import Task
-from pipeline.sections import TrackingConfig
+from pipeline.config import TrackingConfig
 from pipeline.tracking.standings import ENDS, figure
 from pipeline.tracking.store import KEY, Store
 

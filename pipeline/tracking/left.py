@@ -8,8 +8,8 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from pipeline.artifacts import read_json, read_table
-from pipeline.config import Params
+from pipeline.io import read_json, read_table
+from pipeline.params import Params
 from pipeline.records import Measurement
 from pipeline.tracking.reproduction import LockEntry, PlannedStage, digest
 from pipeline.tracking.standings import standings

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from pipeline.config import Params
+from pipeline.params import Params
 from pipeline.errors import UserError
 from pipeline.tracking.reproduction import PlannedStage, planned_stages, reproduction_key
 from pipeline.tracking.runs import common_tags, parent_name, stage_tags

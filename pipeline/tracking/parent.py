@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from pipeline.artifacts import read_json
-from pipeline.config import PARAMS_FILE, Params
+from pipeline.io import read_json
+from pipeline.params import PARAMS_FILE, Params
 from pipeline.records import Touch
 from pipeline.tracking.committed import VIDEOS, committed
 from pipeline.tracking.dashboard import (

@@ -12,7 +12,7 @@ import logging
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.config import Params
+from pipeline.params import Params
 from pipeline.tracking.dashboard import KIND, Dashboard, kind
 from pipeline.tracking.left import content, folders, points, timing
 from pipeline.tracking.parent import Parent

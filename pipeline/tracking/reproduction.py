@@ -11,7 +11,7 @@ from typing import Any
 
 import yaml
 
-from pipeline.config import PARAMS_FILE, Params
+from pipeline.params import PARAMS_FILE, Params
 from pipeline.errors import UserError
 from pipeline.plan import Encoder, Lora, Plan
 

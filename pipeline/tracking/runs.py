@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 from pathlib import Path
 
-from pipeline.config import Params
+from pipeline.params import Params
 from pipeline.tracking.reproduction import PlannedStage
 from pipeline.tracking.store import KEY, STAGE
 

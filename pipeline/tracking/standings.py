@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.artifacts import read_table
+from pipeline.io import read_table
 from pipeline.records import WHOLE, Score
 from pipeline.statistics import Outcome, clustered
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, ParamSpec, TypeVar
 
-from pipeline.sections import TrackingConfig
+from pipeline.config import TrackingConfig
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient

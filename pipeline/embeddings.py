@@ -1,0 +1,74 @@
+"""Tactile embeddings, computed once by the frozen encoder and looked up ever after."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol
+
+import torch
+
+from pipeline.io import load_tensors, read_table
+from pipeline.errors import UserError
+from pipeline.records import Embedding, Flip
+
+FLIPS: tuple[Flip, ...] = ("none", "horizontal", "vertical", "both")
+TENSOR = "embeddings"
+TENSOR_FILE = "embeddings.safetensors"
+INDEX_FILE = "index.parquet"
+
+
+class TactileFeatures(Protocol):
+    """Where conversations take the embeddings of a video's frames from."""
+
+    @property
+    def dim(self) -> int:
+        """Length of an embedding."""
+        ...
+
+    def count(self, video_id: str) -> int:
+        """Frames that a video has embeddings of."""
+        ...
+
+    def features(self, video_id: str, positions: Sequence[int], flip: Flip = "none") -> torch.Tensor:
+        """Embeddings of the frames at these positions: positions x dim."""
+        ...
+
+
+class EmbeddingStore:
+    """Embeddings of every salient frame; training videos also in their three mirrored versions.
+
+    Raises:
+        UserError: naming the video, where an embedding is not finite: it would spoil all that is trained on it.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.tensor = load_tensors(folder / TENSOR_FILE)[TENSOR]
+        """float32, rows x dim."""
+        self._rows: dict[tuple[str, str], list[int]] = defaultdict(list)
+        finite = self.tensor.isfinite().all(1).tolist()
+        for entry in read_table(folder / INDEX_FILE, Embedding):
+            if not finite[entry.row]:
+                raise UserError(
+                    f"{folder / TENSOR_FILE}: {entry.video_id} has an embedding that is not finite (frame "
+                    f"{entry.frame_index}); check the video and the encoder, then run `dvc repro embed -f`"
+                )
+            self._rows[entry.video_id, entry.flip].append(entry.row)
+
+    @property
+    def dim(self) -> int:
+        """Length of an embedding."""
+        return self.tensor.shape[1]
+
+    def count(self, video_id: str) -> int:
+        """Salient frames of a video; a video without any is a UserError."""
+        if (video_id, "none") not in self._rows:
+            raise UserError(f"{self.folder / INDEX_FILE}: {video_id} has no embedding; run `dvc repro`")
+        return len(self._rows[video_id, "none"])
+
+    def features(self, video_id: str, positions: Sequence[int], flip: Flip = "none") -> torch.Tensor:
+        """Embeddings of the frames at these positions in the list of salient frames: positions x dim."""
+        rows = self._rows[video_id, flip]
+        return self.tensor[[rows[p] for p in positions]]

@@ -1,0 +1,78 @@
+"""The encoder as the published code reads it (github.com/clear-nus/octopi), where that differs from the paper.
+
+The language model is given the class token as the last transformer layer leaves it, the classifier the same token after
+the tower's last normalisation; to both a sinusoid of the frame's number is added. The classifier scales a video's mean
+to length 1 and puts a hidden layer, shared by the properties, before the heads. A tower that averages its patches has
+no trained class token: there the average takes its place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from pipeline.encoder.clip import VisualTower
+from pipeline.encoder.model import Heads, TactileEncoder
+from pipeline.encoder.vpt import VisualPrompts
+
+HIDDEN = 512
+DROPOUT = 0.5
+LONGEST_WAVE = 10_000
+"""In frames, times 2 pi (Vaswani et al. 2017, section 3.5)."""
+SHORTEST_FEATURE = 1e-6
+"""Below this length a video's mean stays as it is instead of being blown up to length 1; float16 still holds it."""
+
+
+class PublishedEncoder(TactileEncoder):
+    """The class token before the last normalisation and CLIP's projection; `dim` is the transformer's width."""
+
+    def __init__(self, tower: VisualTower, prompts: VisualPrompts | None = None) -> None:
+        super().__init__(tower, prompts)
+        self.dim = tower.width
+        self.averages = tower.averages
+        self._token: torch.Tensor
+        self.visual.get_submodule("transformer").register_forward_hook(self._keep)
+
+    def _keep(self, _: nn.Module, __: tuple[torch.Tensor, ...], tokens: torch.Tensor) -> None:
+        self._token = tokens[:, 1:].mean(1) if self.averages else tokens[:, 0]
+
+    def forward(self, frames: torch.Tensor, moments: torch.Tensor) -> torch.Tensor:
+        """The class token, and the frame's number: float32, batch x width."""
+        self.visual(self.pixels(frames))
+        return self._token + sinusoid(moments, self.dim).to(self._token.dtype)
+
+    def describe(self, frames: torch.Tensor, moments: torch.Tensor) -> torch.Tensor:
+        """The same with the class token normalised."""
+        self.visual(self.pixels(frames))
+        normalised: torch.Tensor = self.visual.get_submodule("ln_post")(self._token)
+        return normalised + sinusoid(moments, self.dim).to(normalised.dtype)
+
+
+class PublishedHeads(nn.Module):
+    """A shared hidden layer, then one linear layer a property."""
+
+    def __init__(self, dim: int, classes: Sequence[int]) -> None:
+        super().__init__()
+        self.shared = nn.Linear(dim, HIDDEN)
+        self.dropout = nn.Dropout(DROPOUT)
+        self.properties = Heads(HIDDEN, classes)
+
+    def forward(self, features: torch.Tensor) -> list[torch.Tensor]:
+        """Logits a property, batch x classes, of features, batch x dim."""
+        features = F.normalize(features, dim=-1, eps=SHORTEST_FEATURE)
+        logits: list[torch.Tensor] = self.properties(F.relu(self.dropout(self.shared(features))))
+        return logits
+
+
+def sinusoid(moments: torch.Tensor, dim: int) -> torch.Tensor:
+    """sin and cos of t / 10000^(2 i / dim) by turns: float32, moments x dim.
+
+    Computed in float64, on the CPU since not every device has it: in float32 late frames lose digits, in half precision
+    the first rates already fall together.
+    """
+    rates = LONGEST_WAVE ** (-torch.arange(0, dim, 2, dtype=torch.float64) / dim)
+    angles = moments.cpu().double()[:, None] * rates
+    return torch.stack([angles.sin(), angles.cos()], dim=-1).flatten(1)[:, :dim].float().to(moments.device)

@@ -1,0 +1,194 @@
+"""Pictures of invented objects with all that is known of each: what an encoder is pretrained on.
+
+A lesson is one invented object (`pipeline.scenes.invent`), pressed at a few forces into as many sensors of different
+light. Its pictures are differences to the no-contact frame, made as those of real videos are. Nothing of any real
+object goes in but the sensor's measured light.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.io import atomic
+from pipeline.videos.frames.subtraction import subtract
+from pipeline.parallel import run_parallel
+from pipeline.runtime import derive_seed
+from pipeline.scenes.contact import Body, Method
+from pipeline.scenes.geometry import IMAGE_MM, Heights, heights
+from pipeline.scenes.invent import LAYERS, invent
+from pipeline.scenes.light import Image, Sensor, make_sensor, shade
+from pipeline.scenes.measure import CUTOFF, bump_share, texture
+from pipeline.config import FramesConfig, PretrainConfig
+
+WIDTH, HEIGHT = 160, 120
+"""Pixels that lessons are drawn at before they are fitted to the encoder's size."""
+PITCH = IMAGE_MM[0] / WIDTH
+SIDE = int(np.hypot(WIDTH, HEIGHT) + 8 / PITCH) | 1
+"""Of the pressed patch: the view at every angle and 4 mm around it; odd, so that a pixel is in the middle."""
+METHOD = Method("layer", 64)
+"""A third of the time of 128 cells, for slopes that are off by .34 in place of .19 (reports/bench/scenes.json)."""
+FORCES = (0.1, 8.0)
+"""In N, drawn evenly on a logarithmic axis: wider than the real videos' range."""
+OFF_CENTRE_MM = ((-1.2, 1.6), (0.2, 1.1))
+"""Mean and deviation of the contact's place, across and down, as in the development split's training objects."""
+SENSORS = 24
+QUALITY = (60, 96)
+"""JPEG quality between which a picture is coded: real frames went through a lossy codec too."""
+BANDS_MM = (0.3, 0.6, 1.2, 2.4, 4.8)
+"""Borders between the wavelengths whose heights are to be told."""
+BODIES = ("flat", "round", "bar", "wedge")
+
+QUANTITIES: tuple[str, ...] = (
+    "log10 modulus",
+    "log10 force",
+    "log10 contact radius",
+    "log10 texture",
+    "bump share",
+    "log10 depth",
+    *(f"log10 surface below {band} mm" for band in BANDS_MM),
+    *(f"log10 skin below {band} mm" for band in BANDS_MM),
+)
+"""What is to be told of each press as a number."""
+KINDS: tuple[str, ...] = (*LAYERS, *BODIES)
+"""What is to be told of each object as present or absent."""
+
+CHUNK = 50
+"""Lessons that one process draws at a time, and that a killed drawing loses at most for each process."""
+
+
+@dataclass(frozen=True)
+class Lessons:
+    """Lessons drawn; arrays have one row a lesson."""
+
+    pictures: npt.NDArray[np.uint8]
+    """Lessons x presses x size x size x RGB."""
+    quantities: npt.NDArray[np.float32]
+    """Lessons x presses x `QUANTITIES`."""
+    kinds: npt.NDArray[np.uint8]
+    """Lessons x `KINDS`."""
+
+
+@dataclass(frozen=True)
+class _Job:
+    first: int
+    last: int
+    config: PretrainConfig
+    frames: FramesConfig
+    file: Path
+
+    def __str__(self) -> str:
+        return f"lessons {self.first} to {self.last}"
+
+
+def draw_lessons(config: PretrainConfig, frames: FramesConfig, folder: Path) -> Lessons:
+    """Draw all lessons, in as many processes as there are cores; what is finished waits in `folder`.
+
+    Lesson i depends on the seed and i alone.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    borders = range(0, config.objects, CHUNK)
+    jobs = [_Job(i, min(i + CHUNK, config.objects), config, frames, folder / f"{i:06d}.npz") for i in borders]
+    for _ in run_parallel(_draw, [job for job in jobs if not job.file.is_file()], "lessons", "chunk"):
+        pass
+    parts = [np.load(job.file) for job in jobs]
+    return Lessons(*(np.concatenate([part[name] for part in parts]) for name in Lessons.__dataclass_fields__))
+
+
+def draw_lesson(number: int, config: PretrainConfig, frames: FramesConfig) -> Lessons:
+    """One lesson, in arrays of one row."""
+    rng = np.random.default_rng(derive_seed(config.seed, "lesson", number))
+    recipe = invent(rng)
+    surface = heights(recipe.surface, SIDE, PITCH, rng)
+    forces = np.sort(np.exp(rng.uniform(math.log(FORCES[0]), math.log(FORCES[1]), config.presses)))
+    pressed = Body(surface, recipe.modulus, PITCH).press(METHOD, forces)
+    rough = texture(surface, PITCH)
+    pictures, quantities = [], []
+    for force, whole, area in zip(forces.tolist(), pressed.skins, pressed.areas.tolist(), strict=True):
+        place = _place(rng)
+        skin, shown = _view(whole, place), _view(surface, place)
+        touched = skin > 0.15 * max(float(skin.max()), 1e-6)
+        known = [np.log10(recipe.modulus), np.log10(force), np.log10(area / np.pi + 0.05) / 2, np.log10(rough + 5e-4)]
+        known += [
+            bump_share(skin, PITCH),
+            np.log10(float(skin.max()) + 1e-3),
+            *_bands(shown, touched),
+            *_bands(skin, touched),
+        ]
+        quantities.append(known)
+        pictures.append(_picture(skin, sensors()[int(rng.integers(SENSORS))], rng, frames))
+    present = {layer.kind for layer in recipe.relief} | {recipe.body.kind}
+    return Lessons(
+        pictures=np.stack(pictures)[None],
+        quantities=np.array(quantities, np.float32)[None],
+        kinds=np.array([[kind in present for kind in KINDS]], np.uint8),
+    )
+
+
+@lru_cache(maxsize=1)
+def sensors() -> list[Sensor]:
+    """The sensors that lessons are seen through; each has its own background, tints and dust."""
+    return [make_sensor.__wrapped__(WIDTH, HEIGHT, seed) for seed in range(SENSORS)]
+
+
+def _draw(job: _Job) -> None:
+    cv2.setNumThreads(1)
+    drawn = [draw_lesson(number, job.config, job.frames) for number in range(job.first, job.last)]
+    names = Lessons.__dataclass_fields__
+    with atomic(job.file) as temporary, temporary.open("wb") as stream:
+        rows: dict[str, Any] = {name: np.concatenate([getattr(d, name) for d in drawn]) for name in names}
+        np.savez(stream, **rows)
+
+
+def _place(rng: np.random.Generator) -> npt.NDArray[np.float64]:
+    """Where the patch's middle comes to lie in the picture, and how it is turned: an affine map."""
+    middle = (SIDE - 1) / 2
+    turn: npt.NDArray[np.float64] = cv2.getRotationMatrix2D((middle, middle), rng.uniform(0, 360), 1.0)
+    for axis, (size, (mean, deviation)) in enumerate(zip((WIDTH, HEIGHT), OFF_CENTRE_MM, strict=True)):
+        turn[axis, 2] += (size - 1) / 2 - middle + rng.normal(mean, deviation) / PITCH
+    return turn
+
+
+def _view(patch: Heights, place: npt.NDArray[np.float64]) -> Heights:
+    size = (WIDTH, HEIGHT)
+    shown: Heights = cv2.warpAffine(patch, place, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return shown
+
+
+def _bands(field: Heights, where: npt.NDArray[np.bool_]) -> list[float]:
+    """Logarithm of the root mean square height in mm of each band of wavelengths, where the body touches."""
+    found = []
+    for band in BANDS_MM:
+        smooth = cv2.GaussianBlur(field, (0, 0), CUTOFF * band / PITCH)
+        rest = (field - smooth)[where]
+        found.append(float(np.log10(rest.std() + 1e-3)) if rest.size else -3.0)
+        field = smooth
+    return found
+
+
+def _picture(skin: Heights, sensor: Sensor, rng: np.random.Generator, frames: FramesConfig) -> Image:
+    """The difference picture of one press: size x size x RGB."""
+    frame = shade(skin, sensor, PITCH, int(rng.integers(2**40)))
+    coded = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(*QUALITY))])[1]
+    frame = np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR), dtype=np.uint8)
+    reference = np.asarray(cv2.convertScaleAbs(sensor.background), dtype=np.uint8)
+    fitted, untouched = (_fit(picture, frames)[:, :, ::-1] for picture in (frame, reference))
+    picture: Image = subtract(fitted[None], untouched)[0]
+    return picture
+
+
+def _fit(picture: Image, frames: FramesConfig) -> Image:
+    """As `pipeline.videos.frames.fit` does it with frames of a video."""
+    if frames.fit == "crop":
+        left = (WIDTH - HEIGHT) // 2
+        picture = picture[:, left : left + HEIGHT]
+    way = cv2.INTER_AREA if frames.size < HEIGHT else cv2.INTER_LINEAR
+    fitted: Image = cv2.resize(picture, (frames.size, frames.size), interpolation=way)
+    return fitted

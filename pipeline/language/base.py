@@ -1,0 +1,94 @@
+"""Loading of the language model and its tokenizer from a folder, never from a hub."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from transformers import (
+    AutoModelForCausalLM,
+    AutoTokenizer,
+    BitsAndBytesConfig,
+    PreTrainedModel,
+    PreTrainedTokenizerBase,
+)
+
+from pipeline.errors import UserError
+from pipeline.weights import GET_LLM, check_language
+from pipeline.language.chat import add_tactile_tokens
+from pipeline.runtime import Quantization
+
+
+def load_tokenizer(folder: Path) -> PreTrainedTokenizerBase:
+    """The tokenizer with the tactile tokens added, and with a padding token.
+
+    Where there is none, the unknown token pads, or else the end token: what is padding is known by its place, never by
+    its id, so that an end token stays one that is learnt and stops an answer.
+
+    Raises:
+        UserError: where there is no end token, which answers are stopped by.
+    """
+    check_language(folder)
+    tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True, use_fast=True)
+    if tokenizer.eos_token is None:
+        raise UserError(
+            f"language.weights: {folder / 'tokenizer_config.json'} names no eos_token; answers end with it, so add it"
+        )
+    add_tactile_tokens(tokenizer)
+    if tokenizer.pad_token is None:
+        tokenizer.pad_token = tokenizer.unk_token or tokenizer.eos_token
+    return tokenizer
+
+
+def load_llm(folder: Path, dtype: torch.dtype, quantization: Quantization = "none") -> PreTrainedModel:
+    """The language model, frozen and in evaluation mode.
+
+    Args:
+        dtype: Of the weights; with `nf4`, of what is computed and of the layers that are left whole.
+        quantization: `nf4` holds linear layers in four bits (Dettmers et al. 2023), on the CUDA device.
+
+    Raises:
+        UserError: for a missing folder or file, a pickle, a checkpoint that does not fit its configuration, or
+            four bits where they cannot be had.
+    """
+    check_language(folder)
+    own = _four_bits(dtype) if quantization == "nf4" else {}
+    try:
+        model, info = AutoModelForCausalLM.from_pretrained(
+            folder, dtype=dtype, local_files_only=True, use_safetensors=True, output_loading_info=True, **own
+        )
+    except (OSError, ValueError, RuntimeError, KeyError, SafetensorError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise UserError(
+            f"language.weights: {folder} cannot be loaded ({reason}); {GET_LLM.format(folder=folder)}"
+        ) from None
+    wrong = sorted(map(str, [*info["missing_keys"], *info["mismatched_keys"]]))
+    if wrong:
+        raise UserError(
+            f"language.weights: {folder} does not fit its config.json ({wrong[0]} is missing or of another shape); "
+            f"{GET_LLM.format(folder=folder)}"
+        )
+    return model.requires_grad_(False).eval()
+
+
+def _four_bits(dtype: torch.dtype) -> dict[str, Any]:
+    lacking = [
+        name
+        for name, there in (
+            ("bitsandbytes (`pip install bitsandbytes`)", find_spec("bitsandbytes") is not None),
+            ("a CUDA device", torch.cuda.is_available()),
+        )
+        if not there
+    ]
+    if lacking:
+        raise UserError(f"language.quantization: nf4 needs {' and '.join(lacking)}; or set language.quantization=none")
+    config = BitsAndBytesConfig(
+        load_in_4bit=True,
+        bnb_4bit_quant_type="nf4",
+        bnb_4bit_use_double_quant=True,
+        bnb_4bit_compute_dtype=dtype,
+    )
+    return {"quantization_config": config, "device_map": {"": torch.cuda.current_device()}}

@@ -1,0 +1,55 @@
+"""What Octopi adds to a language model, and what a saved model says of itself."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from torch import nn
+
+from pipeline.io import read_json
+from pipeline.errors import UserError
+from pipeline.language.chat import TACTILE_TOKENS
+
+CONFIG_FILE = "config.json"
+
+
+class OctopiConfig(BaseModel):
+    """config.json of a saved model: what it stands on, and its shapes."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    model_type: str = "octopi"
+    architectures: tuple[str, ...] = ("OctopiForCausalLM",)
+    base_model: str
+    """Folder of the language model, as `language.weights` named it."""
+    tactile_dim: int = Field(ge=1)
+    """Length of a tactile embedding."""
+    hidden_size: int = Field(ge=1)
+    """Length of a word embedding."""
+    tactile_tokens: tuple[str, ...] = TACTILE_TOKENS
+
+
+class Connector(nn.Module):
+    """The paper's projection (two linear layers, GELU between) and the embeddings of the two new tokens.
+
+    The new tokens' embeddings live here, not in the language model's matrix: they are the only word embeddings that
+    are trained, the matrix keeps its shape, and a plain PEFT adapter stays loadable on the untouched base.
+    """
+
+    def __init__(self, tactile_dim: int, hidden: int) -> None:
+        super().__init__()
+        self.projection = nn.Sequential(nn.Linear(tactile_dim, hidden), nn.GELU(), nn.Linear(hidden, hidden))
+        self.delimiters = nn.Parameter(torch.zeros(2, hidden))
+
+
+def read_config(folder: Path) -> OctopiConfig:
+    """config.json of a folder that `OctopiForCausalLM.save_pretrained` wrote; anything else is a UserError."""
+    try:
+        return OctopiConfig.model_validate(read_json(folder / CONFIG_FILE))
+    except ValidationError as error:
+        found = error.errors(include_url=False)[0]
+        raise UserError(
+            f"{folder / CONFIG_FILE}: {'.'.join(map(str, found['loc']))}: {found['msg']}; run `dvc repro`"
+        ) from None

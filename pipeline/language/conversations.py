@@ -1,0 +1,138 @@
+"""Questions as the language model is trained on them: token ids, labels and tactile embeddings."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterable, Sequence
+from typing import TypedDict
+
+import torch
+from transformers import PreTrainedTokenizerBase
+
+from pipeline.embeddings import FLIPS, EmbeddingStore, TactileFeatures
+from pipeline.sampling import EpochDataset
+from pipeline.errors import UserError
+from pipeline.sampling import sample_evaluation, sample_training
+from pipeline.language.chat import IGNORE_INDEX, Encoded, encode, render
+from pipeline.records import Opd, Question
+from pipeline.runtime import derive_seed
+
+
+class Sample(TypedDict):
+    """One conversation: ids and labels of one length, and the embeddings of its frames in reading order."""
+
+    input_ids: torch.Tensor
+    labels: torch.Tensor
+    features: torch.Tensor
+
+
+class ConversationDataset(EpochDataset[Sample]):
+    """Training conversations under one OPD mode.
+
+    Which frames and which mirroring a video gets depends on seed, epoch, question and place alone, so that a resumed
+    training sees what an uninterrupted one does.
+
+    Args:
+        positions: Tokens that the language model can read at once; None where that is unknown.
+
+    Raises:
+        UserError: naming the question that is too long, or has nothing to learn from.
+    """
+
+    def __init__(
+        self,
+        questions: Sequence[Question],
+        opd: Opd,
+        store: EmbeddingStore,
+        tokenizer: PreTrainedTokenizerBase,
+        *,
+        system_prompt: str,
+        per_video: int,
+        flip_probability: float,
+        seed: int,
+        positions: int | None = None,
+    ) -> None:
+        super().__init__()
+        self.questions = [q for q in questions if q.dialogue(opd)]
+        self.store = store
+        self.per_video = per_video
+        self.flip_probability = flip_probability
+        self.seed = seed
+        self.encoded: list[Encoded] = []
+        for question in self.questions:
+            dialogue = question.dialogue(opd)
+            assert dialogue is not None
+            text = render(
+                dialogue.turns,
+                system_prompt=system_prompt,
+                frames=per_video,
+                eos=str(tokenizer.eos_token),
+                complete=True,
+            )
+            encoded = encode(text, tokenizer)
+            check_length(question.question_id, len(encoded.input_ids), positions)
+            if all(label == IGNORE_INDEX for label in encoded.labels):
+                raise UserError(f"{question.question_id}: has no answer to learn from; run `dvc repro questions -f`")
+            self.encoded.append(encoded)
+
+    @property
+    def lengths(self) -> list[int]:
+        """Tokens of each conversation."""
+        return [len(e.input_ids) for e in self.encoded]
+
+    def __len__(self) -> int:
+        return len(self.questions)
+
+    def __getitem__(self, index: int) -> Sample:
+        question, encoded = self.questions[index], self.encoded[index]
+        rng = random.Random(derive_seed(self.seed, self.epoch, question.question_id))
+        parts = []
+        for video_id in question.videos:
+            positions = sample_training(self.store.count(video_id), self.per_video, rng)
+            horizontal, vertical = (rng.random() < self.flip_probability for _ in range(2))
+            parts.append(self.store.features(video_id, positions, FLIPS[horizontal + 2 * vertical]))
+        return {
+            "input_ids": torch.tensor(encoded.input_ids),
+            "labels": torch.tensor(encoded.labels),
+            "features": torch.cat(parts),
+        }
+
+
+def check_length(question_id: str, tokens: int, positions: int | None) -> None:
+    """Raise UserError where a question has more tokens than the language model has positions."""
+    if positions is not None and tokens > positions:
+        raise UserError(
+            f"{question_id}: takes {tokens} tokens, but the language model reads {positions} at once; lower "
+            "frames.per_video, shorten language.system_prompt, or name a model with more positions in language.weights"
+        )
+
+
+def evaluation_features(question: Question, store: TactileFeatures, per_video: int) -> torch.Tensor:
+    """The embeddings of a question's videos at uniform intervals: (videos x per_video) x dim."""
+    parts = [store.features(v, sample_evaluation(store.count(v), per_video)) for v in question.videos]
+    return torch.cat(parts)
+
+
+def pad_features(features: Sequence[torch.Tensor]) -> torch.Tensor:
+    """Stack rows of unequal numbers of frames: batch x (most frames) x dim, zeros behind."""
+    return torch.nn.utils.rnn.pad_sequence(list(features), batch_first=True)
+
+
+class ConversationCollator:
+    """Pads on the right with the padding token to the longest of the batch, left out of the loss.
+
+    There is no attention mask: no token of a causal model sees what comes behind it.
+    """
+
+    def __init__(self, pad_id: int) -> None:
+        self.pad_id = pad_id
+
+    def __call__(self, samples: Iterable[Sample]) -> dict[str, torch.Tensor]:
+        """Input ids, labels (batch x length) and features (batch x frames x dim)."""
+        samples = list(samples)
+        pad = torch.nn.utils.rnn.pad_sequence
+        return {
+            "input_ids": pad([s["input_ids"] for s in samples], batch_first=True, padding_value=self.pad_id),
+            "labels": pad([s["labels"] for s in samples], batch_first=True, padding_value=IGNORE_INDEX),
+            "features": pad_features([s["features"] for s in samples]),
+        }

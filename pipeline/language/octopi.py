@@ -1,0 +1,224 @@
+"""Octopi: tactile embeddings, projected into a language model's word embedding space."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Self, cast
+
+import torch
+from torch import nn
+from torch.nn import functional as F
+from transformers import PreTrainedModel, PreTrainedTokenizerBase
+from transformers.modeling_outputs import CausalLMOutput
+
+from pipeline.io import save_tensors, write_json
+from pipeline.errors import UserError
+from pipeline.language.adapter import load_adapter, save_adapter
+from pipeline.language.cache import roomy_cache
+from pipeline.language.connector import CONFIG_FILE, Connector, OctopiConfig, read_config
+from pipeline.language.base import load_llm, load_tokenizer
+from pipeline.trainable import load_trainable
+from pipeline.language.chat import IGNORE_INDEX, TACTILE_TOKENS
+from pipeline.runtime import DtypeName, Quantization, resolve_dtype
+
+CONNECTOR_FILE = "connector.safetensors"
+ADAPTER_DIR = "adapter"
+
+
+class OctopiForCausalLM(nn.Module):
+    """A causal language model that reads tactile embeddings at the places of `<tact_frame>`.
+
+    It is saved and loaded by `save_pretrained` and `from_pretrained`, but is no `PreTrainedModel`: those write all of
+    their weights, and here the base (13 GB for Vicuna-7b) stays where it is, beside a connector and an adapter of some
+    megabytes. All that Trainer and accelerate ask of a model is that its `forward` gives a loss.
+
+    Args:
+        llm: A Llama-like model, or a PEFT model around one; frozen but for adapters.
+        tokenizer: Knows the three tactile tokens.
+        tactile_dim: Length of a tactile embedding.
+        base: Folder that the language model came from.
+
+    Raises:
+        UserError: where the tokenizer has tokens that the model has no embedding of.
+    """
+
+    _keys_to_ignore_on_save = None  # read by transformers' Trainer when it reloads a checkpoint
+    accepts_loss_kwargs = True  # has Trainer count an update's tokens and give them to `forward`
+
+    def __init__(
+        self, llm: PreTrainedModel, tokenizer: PreTrainedTokenizerBase, tactile_dim: int, base: str = ""
+    ) -> None:
+        super().__init__()
+        self.llm = llm
+        matrix = llm.get_input_embeddings().weight
+        self.connector = Connector(tactile_dim, matrix.shape[1])
+        # Not named `config`: what has that name is transformers' own to Trainer, which writes into it.
+        self.octopi_config = OctopiConfig(base_model=base, tactile_dim=tactile_dim, hidden_size=matrix.shape[1])
+        with torch.no_grad():
+            # The mean of all words is a neutral start for a new one.
+            self.connector.delimiters.copy_(matrix.float().mean(0).expand(2, -1))
+        ids = tokenizer.convert_tokens_to_ids(list(TACTILE_TOKENS))
+        self.start_id, self.frame_id, self.end_id = ids
+        self.tokenizer = tokenizer
+        beyond = sorted(t for t, i in tokenizer.get_vocab().items() if i >= len(matrix) and t not in TACTILE_TOKENS)
+        if beyond:
+            raise UserError(
+                f"language.weights: the tokenizer in {base} has {beyond[0]}, of which the model has no embedding "
+                f"({len(matrix)} rows); resize the model's embeddings or take the token out"
+            )
+
+    @classmethod
+    def from_base(
+        cls, base: Path | str, tactile_dim: int, *, dtype: DtypeName = "float32", quantization: Quantization = "none"
+    ) -> Self:
+        """A fresh model on the frozen language model in the folder `base`; its connector is drawn from torch's seed."""
+        folder = Path(base)
+        llm = load_llm(folder, resolve_dtype(dtype), quantization)
+        return cls(llm, load_tokenizer(folder), tactile_dim, str(base))
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        folder: Path | str,
+        *,
+        base: Path | str | None = None,
+        dtype: DtypeName = "float32",
+        quantization: Quantization = "none",
+    ) -> Self:
+        """Load what `save_pretrained` wrote, ready to answer.
+
+        Args:
+            folder: With config.json, connector.safetensors and, where there is one, adapter/.
+            base: Folder of the language model; by default the one that config.json names.
+            dtype: Number format of the frozen weights; connector and adapter are float32 whatever it is.
+            quantization: `nf4` for linear layers of four bits (bitsandbytes and CUDA).
+
+        Raises:
+            UserError: naming the file that is missing, broken, a pickle, or does not fit the language model.
+        """
+        folder = Path(folder)
+        config = read_config(folder)
+        model = cls.from_base(base or config.base_model, config.tactile_dim, dtype=dtype, quantization=quantization)
+        if model.octopi_config.hidden_size != config.hidden_size:
+            raise UserError(
+                f"{folder / CONFIG_FILE}: made for word embeddings of {config.hidden_size}, but "
+                f"{model.octopi_config.base_model} has {model.octopi_config.hidden_size}; name its own language model, "
+                f"{config.base_model}, in language.weights"
+            )
+        load_trainable(model.connector, folder / CONNECTOR_FILE)
+        if (folder / ADAPTER_DIR).is_dir():
+            model.llm = load_adapter(model.llm, folder / ADAPTER_DIR)
+        for name, value in model.named_parameters():
+            if (name.startswith("connector.") or "lora_" in name) and not value.isfinite().all():
+                raise UserError(f"{folder}: {name} is not finite; lower the learning rate it was trained at")
+        return model.eval()
+
+    def save_pretrained(self, folder: Path | str, state_dict: Mapping[str, torch.Tensor] | None = None) -> None:
+        """Write config.json, the connector and, where there is one, the adapter in PEFT's own format.
+
+        Args:
+            folder: Made where it is not there.
+            state_dict: The parameters by name where the model's own are sharded over processes.
+        """
+        folder, state = Path(folder), self.state_dict() if state_dict is None else state_dict
+        write_json(folder / CONFIG_FILE, self.octopi_config.model_dump(mode="json"))
+        save_tensors(folder / CONNECTOR_FILE, _below("connector", state))
+        save_adapter(self.llm, folder / ADAPTER_DIR, _below("llm", state))
+
+    @property
+    def positions(self) -> int | None:
+        """Tokens that the language model can read at once, prompt and answer together; None where it does not say."""
+        return cast("int | None", getattr(self.llm.config.get_text_config(), "max_position_embeddings", None))
+
+    def embed(self, input_ids: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
+        """Word embeddings with the tactile ones in their places.
+
+        Args:
+            input_ids: batch x length.
+            features: batch x (most frames of a row) x tactile_dim; a row's frames come first, in reading order, and
+                what lies behind them is padding that is never read.
+
+        Returns:
+            batch x length x hidden, in the language model's number format.
+        """
+        words = self.llm.get_input_embeddings()
+        tactile = torch.isin(input_ids, input_ids.new_tensor([self.start_id, self.frame_id, self.end_id]))
+        # The tactile tokens have no row in the word matrix.
+        embeddings = words(input_ids.masked_fill(tactile, 0))
+        frames = input_ids == self.frame_id
+        used = torch.arange(features.shape[1], device=features.device) < frames.sum(1, keepdim=True)
+        projected = self.connector.projection(features[used].to(self.connector.delimiters.dtype))
+        embeddings = embeddings.masked_scatter(frames[..., None], projected.to(embeddings.dtype))
+        for token, row in ((self.start_id, 0), (self.end_id, 1)):
+            delimiter = self.connector.delimiters[row].to(embeddings.dtype)
+            embeddings = torch.where((input_ids == token)[..., None], delimiter, embeddings)
+        return cast(torch.Tensor, embeddings)
+
+    def forward(
+        self,
+        input_ids: torch.Tensor,
+        features: torch.Tensor,
+        attention_mask: torch.Tensor | None = None,
+        labels: torch.Tensor | None = None,
+        num_items_in_batch: torch.Tensor | int | None = None,
+    ) -> CausalLMOutput:
+        """Logits, or with labels the cross-entropy over the answers' tokens alone.
+
+        Args:
+            input_ids: batch x length.
+            features: batch x frames x tactile_dim, as `embed` wants them.
+            attention_mask: batch x length. Rows that are padded on the right need none: no token sees a later one.
+            labels: batch x length, each token its own label; `IGNORE_INDEX` is left out.
+            num_items_in_batch: Labelled tokens of the whole update, so that accumulated batches weigh each token
+                alike; by default those of this batch.
+
+        Returns:
+            Without labels `logits`, batch x length x vocabulary. With labels `loss`, the sum over labelled tokens
+            divided by their number; 0 where there is none. Logits are then computed only for columns that some row
+            needs: in long prompts that saves the larger part of them.
+        """
+        call: dict[str, Any] = {
+            "inputs_embeds": self.embed(input_ids, features),
+            "attention_mask": attention_mask,
+            "use_cache": False,
+        }
+        if labels is None:
+            return CausalLMOutput(logits=self.llm(**call).logits)
+        targets = labels[:, 1:]
+        learned = targets != IGNORE_INDEX
+        columns = learned.any(0).nonzero().flatten()
+        logits = self.llm(**call, logits_to_keep=columns).logits[learned[:, columns]]
+        exact = logits.to(torch.promote_types(logits.dtype, torch.float32))
+        loss = F.cross_entropy(exact, targets[learned], reduction="sum")
+        count = len(logits) if num_items_in_batch is None else num_items_in_batch
+        return CausalLMOutput(loss=loss / torch.as_tensor(count, device=loss.device).clamp(min=1))
+
+    @torch.inference_mode()
+    def generate(
+        self, input_ids: torch.Tensor, features: torch.Tensor, attention_mask: torch.Tensor, **options: Any
+    ) -> torch.Tensor:
+        """transformers' `generate` after tactile questions, padded on the left.
+
+        Args:
+            input_ids: batch x length.
+            features: batch x frames x tactile_dim, as `embed` wants them.
+            attention_mask: batch x length; 0 for padding.
+            options: What `generate` knows besides.
+
+        Returns:
+            The new tokens alone: batch x (at most max_new_tokens).
+        """
+        return cast(
+            torch.Tensor,
+            self.llm.generate(
+                inputs_embeds=self.embed(input_ids, features),
+                attention_mask=attention_mask,
+                past_key_values=roomy_cache(self.llm.config),
+                **options,
+            ),
+        )
+
+
+def _below(prefix: str, state: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    return {name.removeprefix(f"{prefix}."): v for name, v in state.items() if name.startswith(f"{prefix}.")}

@@ -1,0 +1,41 @@
+"""The trained part of a module, apart from the frozen base around it: what is saved, and read back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import nn
+
+from pipeline.errors import UserError
+from pipeline.io import load_tensors, save_tensors
+
+
+def trainable_state(module: nn.Module) -> dict[str, torch.Tensor]:
+    """What is trained, by name: parameters, and the running statistics of the layers that they are in."""
+    state: dict[str, torch.Tensor] = {}
+    kept = module.state_dict()
+    for prefix, part in module.named_modules():
+        own = {n: p for n, p in part.named_parameters(prefix, recurse=False) if p.requires_grad}
+        running = {n: b for n, b in part.named_buffers(prefix, recurse=False) if own and n in kept}
+        state |= {name: value.detach() for name, value in (own | running).items()}
+    return state
+
+
+def save_trainable(module: nn.Module, path: Path) -> None:
+    """Write what is trained, and only that, as safetensors."""
+    save_tensors(path, trainable_state(module))
+
+
+def load_trainable(module: nn.Module, path: Path) -> None:
+    """Read what `save_trainable` wrote; names and shapes must be exactly those of the module's `trainable_state`."""
+    loaded, own = load_tensors(path), trainable_state(module)
+    wrong = sorted(loaded.keys() ^ own.keys()) or [n for n in own if loaded[n].shape != own[n].shape]
+    if wrong:
+        raise UserError(
+            f"{path}: does not fit the model ({wrong[0]} is missing, unknown or of another shape); it was made with "
+            "other parameters or weights: run `dvc repro`"
+        )
+    with torch.no_grad():
+        for name, value in own.items():
+            value.copy_(loaded[name])

@@ -1,0 +1,158 @@
+"""Checks of single videos and of what they have in common: length, rate, light, and whether anything is touched."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from statistics import fmean, median
+
+from pipeline.videos.catalogue import Catalogue
+from pipeline.records import Finding, Probe, Severity
+from pipeline.reporting.published import DATASET, find
+
+SHORT = 0.5
+"""A video with less than this share of the median length at its frame rate is named."""
+FOUND = 2.0
+"""Contact is found where its strength is this many times the quiet level of the data set. Measured on real videos:
+those of a cotton ball reach 1.5 to 2.0 times the level, the median of all 4.2."""
+STILL = 0.5
+"""Contact is still present at the end with this share of the video's strongest."""
+DARK_OR_BRIGHT = 6.0
+"""A video is named whose brightness is this many times the usual deviation away from its frame rate's median."""
+STEP = 4.0
+"""Change of the mean brightness between probed frames, in 8-bit steps: about ten times what contact does."""
+SATURATED = 0.05
+IRREGULAR = 1.5
+"""Longest over shortest distance between frames, from which a frame rate counts as variable."""
+DEVIATION = 1.4826
+"""Median absolute deviation to standard deviation, for a normal distribution."""
+
+
+def check_files(probes: Sequence[Probe], catalogue: Catalogue, *, synthetic: bool = False) -> Iterator[Finding]:
+    """All checks of this module, over videos that decode; the paper's counts do not stand beside `synthetic` ones."""
+    if not probes:
+        return
+    yield from _overview(probes, catalogue, of_paper=catalogue.language.dataset == DATASET and not synthetic)
+    for group in _by_rate(probes).values():
+        yield from _lengths(group)
+        yield from _brightness(group)
+    yield from _headers(probes)
+    yield from _contact(probes)
+
+
+def quiet_level(probes: Sequence[Probe]) -> float:
+    """Strength that noise alone gives: the median over videos of each one's quiet frames."""
+    return median(p.quiet for p in probes)
+
+
+def touches(probe: Probe, level: float) -> bool:
+    """Whether a video shows contact, by the quiet level of its data set."""
+    return probe.contact > FOUND * level
+
+
+def _overview(probes: Sequence[Probe], catalogue: Catalogue, *, of_paper: bool) -> Iterator[Finding]:
+    published = find("video_lengths", "average", "frames") if of_paper else None
+    videos = Counter(p.object_id for p in probes)
+    frames = [p.frames for p in probes]
+    expected = f"{published.n} videos of {len(catalogue.objects)} objects" if published else ""
+    measured = f"{len(probes)} videos of {len(videos)} objects"
+    yield _finding("videos", "all", measured, expected, warn=bool(expected) and measured != expected)
+    counts = Counter(videos.values())
+    spread = ", ".join(f"{n} objects with {count}" for count, n in sorted(counts.items()))
+    yield _finding("videos per object", "all", spread)
+    absent = sorted(catalogue.objects.keys() - videos)
+    if absent:
+        yield _finding("videos", ", ".join(absent), "no video", "one or more an object", warn=True)
+    mean = fmean(frames)
+    yield _finding(
+        "length",
+        "all",
+        f"{min(frames)} to {max(frames)} frames, mean {mean:.1f}",
+        _published_lengths() if published else "",
+        warn=published is not None
+        and _published_lengths() != f"{min(frames)} to {max(frames)} frames, mean {mean:.1f}",
+    )
+    for check, groups in (
+        ("frame rate", Counter(f"{p.fps:g} frames/s" for p in probes)),
+        ("resolution", Counter(f"{p.width}x{p.height}" for p in probes)),
+    ):
+        usual = max(groups.items(), key=lambda item: (item[1], item[0]))[0]
+        for name, count in sorted(groups.items()):
+            yield _finding(check, name, f"{count} videos", "" if name == usual else usual, warn=name != usual)
+
+
+def _published_lengths() -> str:
+    low, high, mean = (find("video_lengths", row, "frames") for row in ("minimum", "maximum", "average"))
+    return f"{low.value:g} to {high.value:g} frames, mean {mean.value:.1f}" if low and high and mean else ""
+
+
+def _by_rate(probes: Sequence[Probe]) -> dict[float, list[Probe]]:
+    groups: dict[float, list[Probe]] = defaultdict(list)
+    for probe in probes:
+        groups[probe.fps].append(probe)
+    return groups
+
+
+def _lengths(group: Sequence[Probe]) -> Iterator[Finding]:
+    usual = median(p.frames for p in group)
+    for p in group:
+        if p.frames < SHORT * usual:
+            expected = f"about {usual:g}, as others at {p.fps:g} frames/s"
+            yield _finding("length", p.path, f"{p.frames} frames", expected, warn=True)
+
+
+def _brightness(group: Sequence[Probe]) -> Iterator[Finding]:
+    middle = median(p.brightness for p in group)
+    # At least one step: where all videos are equally bright, rounding is no outlier.
+    spread = max(1.0, DEVIATION * median(abs(p.brightness - middle) for p in group))
+    for p in group:
+        if abs(p.brightness - middle) > DARK_OR_BRIGHT * spread:
+            expected = f"{middle:.1f} +- {spread:.1f}, as others at {p.fps:g} frames/s"
+            yield _finding("brightness", p.path, f"{p.brightness:.1f} of 255", expected, warn=True)
+
+
+def _headers(probes: Sequence[Probe]) -> Iterator[Finding]:
+    for p in probes:
+        if _header_lies(p):
+            expected = f"{p.header_frames}, by the header"
+            yield _finding("frames that decode", p.path, str(p.frames), expected, warn=True)
+        if p.rotation:
+            yield _finding("rotation", p.path, f"{p.rotation} degrees in the metadata, applied", "0", warn=True)
+        if p.irregular > IRREGULAR:
+            yield _finding("frame rate", p.path, f"varies by a factor of {p.irregular:.1f}", "even", warn=True)
+        if p.brightness_step > STEP:
+            yield _finding(
+                "brightness", p.path, f"a step of {p.brightness_step:.1f} of 255", f"at most {STEP:g}", warn=True
+            )
+        if p.saturated > SATURATED:
+            share = f"{100 * p.saturated:.0f} % of values at 0 or 255"
+            yield _finding("saturation", p.path, share, f"at most {100 * SATURATED:g} %", warn=True)
+        if p.kept == 0:
+            yield _finding("frames kept", p.path, "0", "5 or more, by frames.selection", warn=True)
+    differing = sum(_header_lies(p) for p in probes)
+    yield _finding("frames that decode", "all", f"{differing} of {len(probes)} videos differ from their header", "0")
+
+
+def _header_lies(probe: Probe) -> bool:
+    # Some containers promise no number (0): nothing to hold them to.
+    return probe.header_frames not in (0, probe.frames)
+
+
+def _contact(probes: Sequence[Probe]) -> Iterator[Finding]:
+    level = quiet_level(probes)
+    yield _finding("contact", "all", f"quiet level {level:.2f}, median contact {median(p.contact for p in probes):.2f}")
+    for p in probes:
+        if p.starts_touching:
+            measured = "touched from the first frame: the reference comes from the end"
+            yield _finding("contact at the start", p.path, measured, "untouched", warn=True)
+        if not touches(p, level):
+            measured = f"not found: strength {p.contact:.2f}"
+            yield _finding("contact", p.path, measured, f"over {FOUND * level:.2f}", warn=True)
+        elif p.contact_end > max(FOUND * level, STILL * p.contact):
+            measured = f"still {p.contact_end:.2f} of {p.contact:.2f}"
+            yield _finding("contact at the end", p.path, measured, f"under {STILL * p.contact:.2f}", warn=True)
+
+
+def _finding(check: str, item: str, measured: str, expected: str = "", *, warn: bool = False) -> Finding:
+    severity = Severity.WARNING if warn else Severity.INFO
+    return Finding(check=check, item=item, measured=measured, expected=expected, severity=severity)

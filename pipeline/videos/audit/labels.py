@@ -1,0 +1,113 @@
+"""Checks of the labels: recomputed from the ratings, beside what the publishers state, print and write of them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from difflib import get_close_matches
+from statistics import fmean
+
+from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.descriptions import contradiction
+from pipeline.records import Finding, Part, Severity
+from pipeline.reporting.published import DATASET, find
+from pipeline.statistics import icc3k, icc3k_interval
+
+
+def check_labels(catalogue: Catalogue) -> Iterator[Finding]:
+    """All checks of this module; none needs a video."""
+    yield from _agreement(catalogue)
+    yield from _counts(catalogue)
+    yield from _stated(catalogue)
+    yield from _descriptions(catalogue)
+    yield from _splits(catalogue)
+
+
+def similar_names(unknown: Sequence[str], catalogue: Catalogue) -> Iterator[Finding]:
+    """Objects of the folder that the catalogue lacks, but nearly has."""
+    for name in unknown:
+        close = get_close_matches(name, catalogue.objects, n=1, cutoff=0.9)
+        if close:
+            yield _warning("spelling", name, "not in the catalogue", f"{close[0]}?")
+
+
+def _agreement(catalogue: Catalogue) -> Iterator[Finding]:
+    for place, prop in enumerate(catalogue.properties):
+        ratings = [o.ratings[place] for o in catalogue.objects.values()]
+        expected = _published(catalogue, "annotator_agreement", prop.name, "icc3k", "{:.3f}")
+        if len({len(r) for r in ratings}) > 1:
+            yield _info(
+                "agreement, ICC(3,k)", prop.name, "undefined: objects have different numbers of ratings", expected
+            )
+            continue
+        value, interval = icc3k(ratings), icc3k_interval(ratings)
+        if value is None or interval is None:
+            yield _info("agreement, ICC(3,k)", prop.name, "undefined: one rating, or no variance", expected)
+            continue
+        measured = f"{value:.3f} ({interval.low:.3f} to {interval.high:.3f})"
+        warn = bool(expected) and f"{value:.3f}" != expected
+        yield (_warning if warn else _info)("agreement, ICC(3,k)", prop.name, measured, expected)
+        disputed = sum(len(set(r)) > 1 for r in ratings)
+        yield _info("disputed ratings", prop.name, f"{disputed} of {len(ratings)} objects", "")
+
+
+def _counts(catalogue: Catalogue) -> Iterator[Finding]:
+    for place, prop in enumerate(catalogue.properties):
+        counts = Counter(o.labels[place] for o in catalogue.objects.values())
+        for level, name in enumerate(prop.levels):
+            expected = _published(catalogue, "property_counts", name, "count", "{:g}")
+            warn = counts[level] == 0 or (bool(expected) and str(counts[level]) != expected)
+            item = f"{prop.name}: {name}"
+            yield (_warning if warn else _info)("objects of a class", item, str(counts[level]), expected)
+
+
+def _stated(catalogue: Catalogue) -> Iterator[Finding]:
+    for o in catalogue.objects.values():
+        for place, stated in enumerate(o.stated):
+            if stated is not None and stated != o.labels[place]:
+                prop, ratings = catalogue.properties[place], o.ratings[place]
+                measured = f"{prop.levels[o.labels[place]]} (mean rating {fmean(ratings):.2f})"
+                yield _warning("stated label", f"{o.object_id}: {prop.name}", measured, prop.levels[stated])
+
+
+def _descriptions(catalogue: Catalogue) -> Iterator[Finding]:
+    for o in catalogue.objects.values():
+        for prop, label, ratings in zip(catalogue.properties, o.labels, o.ratings, strict=True):
+            named = contradiction(o.description, prop, label)
+            if named:
+                words = " or ".join(prop.levels[level] for level in sorted(named))
+                measured = f"rated {prop.levels[label]} ({' '.join(map(str, ratings))})"
+                yield _warning("description", f"{o.object_id}: {prop.name}", measured, f"described as {words}")
+
+
+def _splits(catalogue: Catalogue) -> Iterator[Finding]:
+    """Where the catalogue's splits disagree, and parts that lack a class."""
+    names = list(dict.fromkeys(name for o in catalogue.objects.values() for name in o.splits))
+    for name in names[1:]:
+        for o in catalogue.objects.values():
+            one, other = o.splits[names[0]], o.splits[name]
+            if one != other:
+                yield _info("splits differ", o.object_id, f"{one} in {names[0]}", f"{other} in {name}")
+    for name in names:
+        for part in (Part.TRAIN, Part.VALIDATION, Part.TEST):
+            members = [o for o in catalogue.objects.values() if o.splits[name] == part]
+            for place, prop in enumerate(catalogue.properties):
+                there = {o.labels[place] for o in members}
+                lacking = [word for level, word in enumerate(prop.levels) if level not in there]
+                if members and lacking:
+                    yield _warning(
+                        "classes of a part", f"{name}, {part}: {prop.name}", f"no {' or '.join(lacking)}", "all"
+                    )
+
+
+def _published(catalogue: Catalogue, table: str, row: str, system: str, form: str) -> str:
+    cell = find(table, row, system) if catalogue.language.dataset == DATASET else None
+    return form.format(cell.value) if cell else ""
+
+
+def _info(check: str, item: str, measured: str, expected: str) -> Finding:
+    return Finding(check=check, item=item, measured=measured, expected=expected, severity=Severity.INFO)
+
+
+def _warning(check: str, item: str, measured: str, expected: str) -> Finding:
+    return Finding(check=check, item=item, measured=measured, expected=expected, severity=Severity.WARNING)

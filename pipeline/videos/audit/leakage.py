@@ -1,0 +1,248 @@
+"""What a model could know without feeling anything: the same video, object or recording session in two parts."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from statistics import fmean, pstdev
+
+import numpy as np
+
+from pipeline.videos.audit.files import quiet_level, touches
+from pipeline.videos.catalogue import Catalogue
+from pipeline.records import Assignment, Finding, Part, Probe, Severity, Video
+from pipeline.runtime import derive_seed
+
+DUPLICATE = 0.965
+"""Correlation of two videos' strongest contacts, from which they count as near-duplicates. Measured on 354 real videos:
+those of different objects reach .963 at most; of 24 copies encoded anew at a low rate, half of them brightened and
+shortened as well, four in five are found."""
+SPREAD = 2.0
+"""Sessions are told apart where references lie farther from each other than this many times the usual distance between
+nearest neighbours (average linkage)."""
+PERMUTATIONS = 2000
+FOLDS = 5
+RIDGE = 1.0
+ALPHA = 0.1
+"""Below this p value a prediction from nothing but the untouched sensor is a warning. Generous: a leak that is missed
+costs more than one that is looked into, and a few dozen objects give such a test little power."""
+LEARNT_FROM = (Part.TRAIN, Part.VALIDATION)
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What is known of the videos; `parts` is empty where no split was asked for."""
+
+    probes: Sequence[Probe]
+    videos: Sequence[Video]
+    parts: Mapping[str, Part]
+    """By video id."""
+
+
+def evidence(probes: Sequence[Probe], videos: Sequence[Video], assignments: Sequence[Assignment]) -> Evidence:
+    """Put together what the checks need."""
+    return Evidence(probes, videos, {a.video_id: a.part for a in assignments})
+
+
+def check_leakage(found: Evidence, catalogue: Catalogue, seed: int = 0) -> Iterator[Finding]:
+    """All checks of this module; `seed` is of the permutations."""
+    if not found.probes:
+        return
+    yield from _objects(found)
+    yield from _copies(found)
+    yield from _near_copies(found)
+    names = sessions(found.probes)
+    yield from _sessions(found, names, catalogue)
+    yield from _tell_tales(found, names, catalogue, seed)
+
+
+def sessions(probes: Sequence[Probe]) -> list[str]:
+    """The recording session of each video: as videos.csv names it, else told apart by format and untouched picture.
+
+    The untouched picture carries the sensor's gel, dust and light. Its brightness is taken off, since that drifts.
+    """
+    from scipy.cluster.hierarchy import fcluster, linkage
+    from scipy.spatial.distance import pdist, squareform
+
+    names = [p.session for p in probes]
+    groups: dict[tuple[float, int, int], list[int]] = defaultdict(list)
+    for place, p in enumerate(probes):
+        if not p.session:
+            groups[p.fps, p.width, p.height].append(place)
+    for (fps, width, height), places in sorted(groups.items()):
+        label = f"{fps:g} frames/s, {width}x{height}"
+        pictures = np.array([probes[i].thumbnail for i in places]).reshape(len(places), -1, 3)
+        pictures = (pictures - pictures.mean(1, keepdims=True)).reshape(len(places), -1)
+        clusters = np.ones(len(places), dtype=int)
+        if len(places) > 2:
+            distances = pdist(pictures) / np.sqrt(pictures.shape[1])
+            square = squareform(distances) + np.diag(np.full(len(places), np.inf))
+            usual = float(np.median(square.min(1)))
+            clusters = fcluster(linkage(distances, "average"), max(SPREAD * usual, 1e-9), "distance")
+        # The largest cluster is A, so that names do not depend on the order of the videos.
+        sizes = Counter(clusters.tolist())
+        first = {c: min(probes[i].video_id for i, own in zip(places, clusters, strict=True) if own == c) for c in sizes}
+        order = sorted(sizes, key=lambda c: (-sizes[c], first[c]))
+        for i, cluster in zip(places, clusters, strict=True):
+            names[i] = f"{label}, look {order.index(cluster) + 1}"
+    return names
+
+
+def predictability(
+    features: np.ndarray, labels: Sequence[int], objects: Sequence[str], seed: int
+) -> tuple[float, list[float]]:
+    """How well features predict labels of objects never seen, and how well they predict permuted labels.
+
+    Ridge regression on one-hot classes, in closed form so that permutations cost one matrix product; objects are dealt
+    into folds. Labels are permuted among objects, so videos of an object keep a common label.
+
+    Args:
+        features: videos x dimensions.
+        labels: class of each video, equal within an object.
+        objects: object of each video.
+
+    Returns:
+        The share of videos predicted right, and the same for each permutation.
+    """
+    names = sorted(set(objects))
+    member = np.array([names.index(o) for o in objects])
+    rng = np.random.default_rng(seed)
+    fold = rng.permutation(len(names)) % min(FOLDS, len(names))
+    own = np.zeros(len(names), dtype=int)
+    own[member] = labels
+    orders = np.stack([own, *(rng.permutation(own) for _ in range(PERMUTATIONS))])
+    classes = np.eye(max(labels) + 1)[orders]  # orders x objects x classes
+    right = np.zeros(len(orders))
+    spread = features.std(0)
+    scaled = (features - features.mean(0)) / np.where(spread > 0, spread, 1) / np.sqrt(features.shape[1])
+    for number in sorted(set(fold.tolist())):
+        test = fold[member] == number
+        centre = scaled[~test].mean(0)
+        inside, across = scaled[~test] - centre, scaled[test] - centre
+        weights = across @ inside.T @ np.linalg.inv(inside @ inside.T + RIDGE * np.eye(len(inside)))
+        # A video's prediction is the mean of the training labels and what its likeness to training videos adds. Videos
+        # of an object share their label, so their weights can be added up before any label is looked at.
+        owner = np.eye(len(names))[member[~test]]
+        share = owner.mean(0)
+        votes = weights @ owner + (1 - weights.sum(1, keepdims=True)) * share
+        scores = np.einsum("vn,onc->ovc", votes, classes, optimize=True)
+        # Rounded, since sessions make classes exactly equally likely: the first then wins on every processor.
+        right += (scores.round(9).argmax(2) == orders[:, member[test]]).sum(1)
+    shares = right / len(member)
+    return float(shares[0]), shares[1:].tolist()
+
+
+def _objects(found: Evidence) -> Iterator[Finding]:
+    parts: dict[str, set[Part]] = defaultdict(set)
+    for p in found.probes:
+        if found.parts.get(p.video_id, Part.UNUSED) != Part.UNUSED:
+            parts[p.object_id].add(found.parts[p.video_id])
+    for name, where in sorted(parts.items()):
+        if len(where) > 1:
+            yield _finding("object in two parts", name, ", ".join(sorted(where)), "one part", Severity.ERROR)
+    if found.parts:
+        crossing = sum(len(where) > 1 for where in parts.values())
+        yield _finding("object in two parts", "all", f"{crossing} of {len(parts)} objects", "0", Severity.INFO)
+
+
+def _copies(found: Evidence) -> Iterator[Finding]:
+    earlier: dict[str, list[Video]] = defaultdict(list)
+    copies = 0
+    for video in found.videos:
+        twins = earlier[video.sha256]
+        if twins:
+            copies += 1
+            crossing = [t for t in twins if _crosses(found, video.video_id, t.video_id)]
+            twin = (crossing or twins)[0]
+            yield _pair("same content", video.path, twin.path, "equal bytes", bool(crossing))
+        twins.append(video)
+    yield _finding("same content", "all", f"{copies} of {len(found.videos)} files", "0", Severity.INFO)
+
+
+def _near_copies(found: Evidence) -> Iterator[Finding]:
+    level = quiet_level(found.probes)
+    shown = [p for p in found.probes if touches(p, level)]
+    if len(shown) < 2:
+        nothing = f"{len(shown)} videos in contact: nothing to compare"
+        yield _finding("near-duplicate", "all", nothing, f"at most {DUPLICATE}", Severity.INFO)
+        return
+    signatures = np.array([p.signature for p in shown])
+    alike = np.triu(signatures @ signatures.T, 1)
+    same = {v.video_id: v.sha256 for v in found.videos}
+    for i, j in np.argwhere(alike > DUPLICATE).tolist():
+        one, other = shown[i], shown[j]
+        if same.get(one.video_id) != same.get(other.video_id):
+            crosses = _crosses(found, one.video_id, other.video_id)
+            measured = f"contact correlates at {alike[i, j]:.3f}"
+            if one.object_id == other.object_id and not crosses:
+                # One object pressed twice in the same way looks alike, and leaks nothing.
+                twice = f"{measured} with {one.path}, the same object"
+                yield _finding("near-duplicate", other.path, twice, "different videos", Severity.INFO)
+            else:
+                yield _pair("near-duplicate", other.path, one.path, measured, crosses)
+    measured = f"closest pair of {len(shown)} videos in contact correlates at {alike.max():.3f}"
+    yield _finding("near-duplicate", "all", measured, f"at most {DUPLICATE}", Severity.INFO)
+
+
+def _crosses(found: Evidence, one: str, other: str) -> bool:
+    """Whether two videos stand in different parts of the split that are both used."""
+    parts = {found.parts.get(one, Part.UNUSED), found.parts.get(other, Part.UNUSED)}
+    return len(parts) == 2 and Part.UNUSED not in parts
+
+
+def _pair(check: str, item: str, twin: str, measured: str, crosses: bool) -> Finding:
+    severity = Severity.ERROR if crosses else Severity.WARNING
+    where = "in another part of the split: remove one of them" if crosses else "remove one of them"
+    return _finding(check, item, f"{measured} with {twin}, {where}", "different videos", severity)
+
+
+def _sessions(found: Evidence, names: Sequence[str], catalogue: Catalogue) -> Iterator[Finding]:
+    """What each session holds beside the whole, and whether training and test share it."""
+    members: dict[str, list[Probe]] = defaultdict(list)
+    for name, probe in zip(names, found.probes, strict=True):
+        members[name].append(probe)
+    whole = {p.object_id for p in found.probes}
+    for name, probes in sorted(members.items()):
+        objects = {p.object_id for p in probes}
+        light = fmean(p.brightness for p in probes)
+        shares = "; ".join(_shares(prop.name, i, objects, catalogue) for i, prop in enumerate(catalogue.properties))
+        expected = "; ".join(_shares(prop.name, i, whole, catalogue) for i, prop in enumerate(catalogue.properties))
+        measured = f"{len(probes)} videos of {len(objects)} objects, brightness {light:.1f}; {shares}"
+        yield _finding("session", name, measured, expected, Severity.INFO)
+        parts = Counter(found.parts.get(p.video_id, Part.UNUSED) for p in probes)
+        if parts[Part.TEST] and any(parts[part] for part in LEARNT_FROM):
+            counts = ", ".join(f"{parts[part]} {part}" for part in (*LEARNT_FROM, Part.TEST) if parts[part])
+            yield _finding("session in two parts", name, counts, "one part", Severity.WARNING)
+
+
+def _shares(name: str, place: int, objects: set[str], catalogue: Catalogue) -> str:
+    counts = Counter(catalogue.labels(o)[place] for o in objects)
+    percent = "/".join(f"{100 * counts[i] / len(objects):.0f}" for i in range(len(catalogue.properties[place].levels)))
+    return f"{name} {percent} %"
+
+
+def _tell_tales(found: Evidence, names: Sequence[str], catalogue: Catalogue, seed: int) -> Iterator[Finding]:
+    """Whether the untouched sensor, or the session alone, tells the property of an object never seen."""
+    objects = [p.object_id for p in found.probes]
+    known = sorted(set(names))
+    inputs = {
+        "no-contact reference": np.array([p.thumbnail for p in found.probes]),
+        "session": np.eye(len(known))[[known.index(n) for n in names]],
+    }
+    for place, prop in enumerate(catalogue.properties):
+        labels = [catalogue.labels(o)[place] for o in objects]
+        for what, features in inputs.items():
+            check = f"predicted from the {what} alone"
+            if len(set(objects)) < FOLDS or len(set(labels)) < 2 or features.shape[1] < 2:
+                yield _finding(check, prop.name, "undefined: too few objects, classes or sessions", "", Severity.INFO)
+                continue
+            share, null = predictability(features, labels, objects, derive_seed(seed, what, prop.name))
+            p = (1 + sum(n >= share - 1e-12 for n in null)) / (1 + len(null))
+            expected = f"{100 * fmean(null):.1f} +- {100 * pstdev(null):.1f} % if it told nothing"
+            severity = Severity.WARNING if p < ALPHA else Severity.INFO
+            yield _finding(check, prop.name, f"{100 * share:.1f} %, p = {p:.4f}", expected, severity)
+
+
+def _finding(check: str, item: str, measured: str, expected: str, severity: Severity) -> Finding:
+    return Finding(check=check, item=item, measured=measured, expected=expected, severity=severity)

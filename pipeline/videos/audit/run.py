@@ -1,0 +1,119 @@
+"""The whole audit: of a folder as it lies there, or of what the chain has read already."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from pipeline.videos.audit.files import check_files
+from pipeline.videos.audit.labels import check_labels, similar_names
+from pipeline.videos.audit.leakage import check_leakage, evidence
+from pipeline.errors import UserError
+from pipeline.videos.frames.scan import Scan, scan
+from pipeline.parallel import run_parallel
+from pipeline.videos.catalogue import Catalogue
+from pipeline.records import Assignment, Finding, Probe, Severity, Video
+from pipeline.config import FramesConfig, SplitConfig
+from pipeline.videos.split import assign
+from pipeline.videos.files import VideoFile, list_videos
+
+AUDIT_FILE = "audit.csv"
+ORDER = (Severity.ERROR, Severity.WARNING, Severity.INFO)
+
+
+def audit_folder(folder: Path, catalogue: Catalogue, split: SplitConfig | None = None) -> list[Finding]:
+    """Everything about a folder of videos, errors first; decodes every file once and raises nothing about them.
+
+    Args:
+        split: also look for what leaks between its parts.
+    """
+    listing = list_videos(folder, catalogue)
+    findings: list[Finding] = [*listing.findings, *similar_names(listing.strangers, catalogue)]
+    scans, broken = _scan_all(listing.files)
+    findings += broken
+    probes = [s.probe for s in scans]
+    videos = [s.video for s in scans]
+    findings += check_labels(catalogue)
+    if videos:
+        assignments: Sequence[Assignment] = ()
+        if split is not None:
+            try:
+                assignments = assign(catalogue, videos, split).assignments
+            except UserError as error:
+                message = str(error)
+                findings.append(Finding(check="split", item=split.name, measured=message, severity=Severity.ERROR))
+        findings += _measured(probes, videos, assignments, catalogue)
+    return by_severity(findings)
+
+
+def check_folder(folder: Path, catalogue: Catalogue) -> list[Finding]:
+    """What is wrong or odd about the files of a folder, errors first; labels and leaks are left to the audit."""
+    listing = list_videos(folder, catalogue)
+    scans, broken = _scan_all(listing.files)
+    found = [*listing.findings, *broken, *check_files([s.probe for s in scans], catalogue)]
+    return by_severity(found)
+
+
+def audit_chain(
+    folder: Path,
+    probes: Sequence[Probe],
+    videos: Sequence[Video],
+    assignments: Sequence[Assignment],
+    catalogue: Catalogue,
+    *,
+    synthetic: bool = False,
+) -> list[Finding]:
+    """The audit of what the chain has decoded and split, errors first; opens no video."""
+    listing = list_videos(folder, catalogue)
+    return by_severity(
+        [
+            *listing.findings,
+            *similar_names(listing.strangers, catalogue),
+            *check_labels(catalogue),
+            *_measured(probes, videos, assignments, catalogue, synthetic=synthetic),
+        ]
+    )
+
+
+def by_severity(findings: Iterable[Finding]) -> list[Finding]:
+    """Errors first, then warnings, otherwise in the order found."""
+    return sorted(findings, key=lambda f: ORDER.index(f.severity))
+
+
+def stop_on_errors(findings: Sequence[Finding], path: Path) -> None:
+    """Raise UserError with the first error, and how many there are."""
+    errors = [f for f in findings if f.severity is Severity.ERROR]
+    if errors:
+        first = errors[0]
+        more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
+        raise UserError(f"{first.check}: {first.item}: {first.measured}{more}; all findings stand in {path}")
+
+
+def summary(findings: Sequence[Finding]) -> dict[str, float]:
+    """How many findings there are of each severity, as flat metrics."""
+    counts = Counter(f.severity for f in findings)
+    return {f"{severity}s": counts[severity] for severity in (Severity.ERROR, Severity.WARNING)}
+
+
+def _measured(
+    probes: Sequence[Probe],
+    videos: Sequence[Video],
+    assignments: Sequence[Assignment],
+    catalogue: Catalogue,
+    *,
+    synthetic: bool = False,
+) -> list[Finding]:
+    found = evidence(probes, videos, assignments)
+    return [*check_files(probes, catalogue, synthetic=synthetic), *check_leakage(found, catalogue)]
+
+
+def _scan_all(files: Sequence[VideoFile]) -> tuple[list[Scan], list[Finding]]:
+    results = list(run_parallel(_scan_small, files, "videos", "video"))
+    scans = [r for r in results if isinstance(r, Scan)]
+    return scans, [r for r in results if isinstance(r, Finding)]
+
+
+def _scan_small(file: VideoFile) -> Scan | Finding:
+    # The pictures are not wanted here: the smallest size, and hardly any of them.
+    return scan(file, FramesConfig(size=16, fraction=0.01))

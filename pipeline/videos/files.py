@@ -1,0 +1,159 @@
+"""Video files: which ones a folder holds, and whose they are."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.errors import UserError
+from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.csv_reader import read_sheet
+from pipeline.records import Finding, Severity
+
+SUFFIXES = (".avi", ".mjpg", ".mkv", ".mov", ".mp4")
+LIST_FILE = "videos.csv"
+"""Optional, in the videos' folder: columns `file`, `object_id` and, where known, `session`."""
+
+
+@dataclass(frozen=True)
+class VideoFile:
+    """A file that says which sample it is."""
+
+    path: Path
+    relative: str
+    """To the data folder, with forward slashes."""
+    object_id: str
+    video_id: str
+    session: str = ""
+    """The recording session that videos.csv names; empty where none is known."""
+
+    def __str__(self) -> str:
+        return self.relative
+
+
+@dataclass(frozen=True)
+class Listing:
+    """What a folder's names say: the files that fit, and what is wrong with the others."""
+
+    files: tuple[VideoFile, ...]
+    findings: tuple[Finding, ...]
+    strangers: tuple[str, ...] = ()
+    """Objects that have videos here but are not in the catalogue, sorted."""
+
+
+def list_videos(folder: Path, catalogue: Catalogue) -> Listing:
+    """The videos of a folder and its subfolders, sorted by object and number; nothing is opened.
+
+    A file is named `<object>_<number>` with one of `SUFFIXES`, or stands in the folder's `videos.csv`, and then only
+    the files of that list count. Videos of objects that the catalogue lacks are left out with one warning.
+    """
+    findings: list[Finding] = []
+    if not folder.is_dir():
+        return Listing((), (_error(str(folder), "no such folder; set data.dir to the folder of the videos"),))
+    paths = _video_files(folder)
+    if not paths:
+        kinds = ", ".join(SUFFIXES)
+        return Listing(
+            (), (_error(str(folder), f"holds no video ({kinds}); set data.dir to the folder of the videos"),)
+        )
+    listed = folder / LIST_FILE
+    named, problems = _from_list(listed, folder, paths) if listed.is_file() else _from_names(folder, paths)
+    findings += problems
+    files = [f for f in named if f.object_id in catalogue.objects]
+    strangers = Counter(f.object_id for f in named if f.object_id not in catalogue.objects)
+    unknown = f"{strangers.total()} videos of {len(strangers)} objects that the catalogue lacks"
+    names = ", ".join(sorted(strangers))
+    if strangers and not files and all(f.severity is not Severity.ERROR for f in problems):
+        message = f"holds no video of an object of the catalogue; there are {unknown}: {names}; add them to objects.csv"
+        findings.append(_error(str(folder), message))
+    elif strangers:
+        message = f"{unknown} are left out; list them in objects.csv to use them: {names}"
+        findings.append(Finding(check="name", item=str(folder), measured=message, severity=Severity.WARNING))
+    files.sort(key=lambda f: (f.object_id, int(f.video_id.rpartition("_")[2]), f.relative))
+    return Listing(tuple(files), (*findings, *_contested(files)), tuple(sorted(strangers)))
+
+
+def raise_errors(folder: Path, findings: Sequence[Finding]) -> None:
+    """Raise the first error as a UserError that names the file."""
+    for finding in findings:
+        if finding.severity is Severity.ERROR:
+            where = folder if finding.item == str(folder) else folder / finding.item
+            raise UserError(f"{where}: {finding.measured}")
+
+
+def _error(item: str, message: str) -> Finding:
+    return Finding(check="name", item=item, measured=message, severity=Severity.ERROR)
+
+
+def _video_files(folder: Path) -> list[Path]:
+    """Files that look like videos, sorted; nothing hidden. A dead link counts, so that reading it says so."""
+    return sorted(
+        path
+        for path in folder.rglob("*")
+        if path.suffix.lower() in SUFFIXES
+        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+        and not path.is_dir()
+    )
+
+
+def _from_names(folder: Path, paths: Sequence[Path]) -> tuple[list[VideoFile], list[Finding]]:
+    files, findings = [], []
+    for path in paths:
+        relative = path.relative_to(folder).as_posix()
+        match = re.fullmatch(r"(.+)_(\d+)", unicodedata.normalize("NFC", path.stem), flags=re.ASCII)
+        if match is None:
+            message = "not named <object>_<number>, e.g. baseball_0.mov; rename it, move it, or list it in videos.csv"
+            findings.append(_error(relative, message))
+        else:
+            files.append(VideoFile(path, relative, match[1], f"{match[1]}_{int(match[2])}"))
+    return files, findings
+
+
+def _from_list(listed: Path, folder: Path, paths: Sequence[Path]) -> tuple[list[VideoFile], list[Finding]]:
+    """The files that videos.csv names; numbers count up within an object, in the list's order."""
+    try:
+        _, rows = read_sheet(listed, ("file", "object_id"))
+    except UserError as problem:
+        return [], [_error(LIST_FILE, str(problem).removeprefix(str(listed)).lstrip(":, "))]
+    files: dict[str, VideoFile] = {}
+    findings: list[Finding] = []
+    numbers: Counter[str] = Counter()
+    there = {unicodedata.normalize("NFC", path.relative_to(folder).as_posix()): path for path in paths}
+    for place, row in rows:
+        line = place.removeprefix(str(listed)).lstrip(", ")
+        name, object_id = (unicodedata.normalize("NFC", row[column]) for column in ("file", "object_id"))
+        if name not in there:
+            findings.append(
+                _error(LIST_FILE, f"{line}: no video {name!r} in the folder; correct the line or remove it")
+            )
+        elif name in files:
+            findings.append(_error(LIST_FILE, f"{line}: {name} is listed twice; keep one line"))
+        elif not object_id:
+            findings.append(_error(LIST_FILE, f"{line}: {name} has no object_id; fill it in, or remove the line"))
+        else:
+            relative = there[name].relative_to(folder).as_posix()
+            video_id = f"{object_id}_{numbers[object_id]}"
+            files[name] = VideoFile(there[name], relative, object_id, video_id, row.get("session", ""))
+            numbers[object_id] += 1
+    if not rows:
+        findings.append(_error(LIST_FILE, "lists no video; add a line for each, or remove the list"))
+    left = len(paths) - len(files)
+    if left and not findings:
+        message = f"{left} videos of the folder are not listed and are left out"
+        findings.append(Finding(check="name", item=LIST_FILE, measured=message, severity=Severity.WARNING))
+    return list(files.values()), findings
+
+
+def _contested(files: Sequence[VideoFile]) -> list[Finding]:
+    rivals = defaultdict(list)
+    for file in files:
+        rivals[file.video_id].append(file.relative)
+    return [
+        _error(names[0], f"{video_id} is also {', '.join(names[1:])}; keep one of them")
+        for video_id, names in rivals.items()
+        if len(names) > 1
+    ]

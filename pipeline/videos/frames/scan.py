@@ -1,0 +1,136 @@
+"""Everything about one video: its hash and true length, the frames to keep, its reference, what the audit wants."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from pipeline.videos.decoding import Image
+from pipeline.videos.frames.probing import Course, reference_from_end, run_pass
+from pipeline.videos.frames.reference import detail, starts_touching, strength
+from pipeline.videos.frames.selection import Kept
+from pipeline.records import Finding, Probe, Severity, Video
+from pipeline.config import FramesConfig
+from pipeline.videos.files import VideoFile
+
+THUMBNAIL_SIZE = (8, 6)
+SIGNATURE_SIZE = (24, 18)
+
+
+@dataclass(frozen=True)
+class Scan:
+    """What was found. `kept` is empty only where the published rule leaves the video out."""
+
+    video: Video
+    probe: Probe
+    kept: tuple[Kept, ...]
+    reference: Image
+    """size x size x RGB."""
+
+
+def scan(file: VideoFile, config: FramesConfig) -> Scan | Finding:
+    """Look at one video; what is wrong with it comes back as a finding, so that one bad file hides no other.
+
+    One decode, unless the header lies about the number of frames or the video starts in contact.
+    """
+    try:
+        size = file.path.stat().st_size
+        with file.path.open("rb") as stream:
+            sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as problem:
+        return _wrong(file, f"unreadable ({problem.strerror}); mend its access, or copy it again")
+    if size == 0:
+        return _wrong(file, "empty (0 bytes); copy it again, or remove it")
+    course = run_pass(file.path, config)
+    if course.frames == 0:
+        return _wrong(file, "no frame decodes; copy it again, convert it, or remove it")
+    if len(course.sizes) > 1:
+        return _wrong(file, f"frames of {len(course.sizes)} sizes; convert it to one size, or remove it")
+    # The published rule believes the header; all others go by what really decodes.
+    count = course.header.frames if config.selection == "release" else course.frames
+    if count != course.header.frames:
+        course = run_pass(file.path, config, count)
+    assert course.first is not None, "set where there are frames"
+    assert course.last is not None, "set where there are frames"
+    touching = starts_touching(course.first, course.last)
+    if touching:
+        course = run_pass(file.path, config, count, reference_from_end(file.path, course.frames, config))
+    assert course.reference is not None, "set where there are frames"
+    video = Video(
+        video_id=file.video_id,
+        object_id=file.object_id,
+        path=file.relative,
+        sha256=sha256,
+        frames=course.frames,
+        fps=course.header.fps,
+        height=next(iter(course.sizes))[0],
+        width=next(iter(course.sizes))[1],
+    )
+    return Scan(video, _probe(file, video, course, touching), tuple(course.kept), course.reference.picture)
+
+
+def _probe(file: VideoFile, video: Video, course: Course, touching: bool) -> Probe:
+    assert course.reference is not None, "set where there are frames"
+    assert course.first is not None, "set where there are frames"
+    assert course.last is not None, "set where there are frames"
+    shown = course.last if course.strongest is None else course.strongest
+    still = course.reference.thumb
+    return Probe(
+        video_id=file.video_id,
+        object_id=file.object_id,
+        path=file.relative,
+        session=file.session,
+        header_frames=course.header.frames,
+        frames=course.frames,
+        fps=video.fps,
+        width=video.width,
+        height=video.height,
+        rotation=course.rotation,
+        irregular=_irregular(course.times),
+        kept=len(course.kept),
+        brightness=float(still[:, :, 0].mean()),
+        brightness_step=max((abs(b - a) for a, b in itertools.pairwise(course.brightness)), default=0.0),
+        saturated=float(np.mean((shown[:, :, 0] == 0) | (shown[:, :, 0] == 255))),
+        contact=course.contact,
+        quiet=min(course.strengths, default=0.0),
+        contact_end=strength(course.last, still),
+        starts_touching=touching,
+        texture_start=detail(course.first),
+        texture_end=detail(course.last),
+        thumbnail=_flat(cv2.resize(still, THUMBNAIL_SIZE, interpolation=cv2.INTER_AREA)),
+        signature=_signature(course.glances, still),
+    )
+
+
+def _irregular(times: list[tuple[int, float]]) -> float:
+    """Longest over shortest time a frame between probed frames; 0 where the file has no rising time stamps."""
+    steps = [(b[1] - a[1]) / (b[0] - a[0]) for a, b in itertools.pairwise(times)]
+    return max(steps) / min(steps) if steps and min(steps) > 0 else 0.0
+
+
+def _signature(glances: list[Image], reference: Image) -> tuple[float, ...]:
+    """What the contact looks like, for finding copies: the mean of the quarter of the pictures that show most of it.
+
+    A mean of several survives a copy that is shortened or encoded anew, which moves the one strongest picture.
+    """
+    still = np.ascontiguousarray(reference[:, :, 0])
+    ranked = sorted(glances, key=lambda g: strength(g, still), reverse=True)
+    strongest = ranked[: max(1, len(ranked) // 4)] or [still]
+    change = np.mean(strongest, axis=0, dtype=np.float32) - still.astype(np.float32)
+    small = cv2.resize(change, SIGNATURE_SIZE, interpolation=cv2.INTER_AREA)
+    small -= small.mean()
+    norm = float(np.linalg.norm(small))
+    return _flat(small / norm if norm > 0 else small)
+
+
+def _flat(array: np.ndarray) -> tuple[float, ...]:
+    flat: list[float] = array.astype(np.float64).round(4).ravel().tolist()
+    return tuple(flat)
+
+
+def _wrong(file: VideoFile, message: str) -> Finding:
+    return Finding(check="decodes", item=file.relative, measured=message, severity=Severity.ERROR)

@@ -1,0 +1,120 @@
+"""Which objects are for training, validation and test; no object ever stands in two of them."""
+
+from __future__ import annotations
+
+import random
+from collections import defaultdict
+from collections.abc import Collection, Sequence
+
+from pipeline.errors import UserError
+from pipeline.videos.catalogue import RULED_SPLITS, Catalogue
+from pipeline.records import Assignment, Part, Record, Video
+from pipeline.runtime import derive_seed
+from pipeline.config import SplitConfig
+
+CANDIDATES = 2000
+"""Random sets of test objects that the development split chooses the best balanced one from."""
+FEWEST_TRAINING_OBJECTS = 3
+"""A superlative or a matching question needs three objects."""
+ORIGIN = "paper"
+"""The split of the catalogue that the development split is made from."""
+
+
+class Split(Record):
+    """The part of every video, and the objects that a part should have but has no video of."""
+
+    assignments: tuple[Assignment, ...]
+    missing: dict[Part, tuple[str, ...]]
+    """Validation and test only; an empty tuple where nothing is missing."""
+
+
+def assign(catalogue: Catalogue, videos: Sequence[Video], config: SplitConfig) -> Split:
+    """Put every video into a part of the split, by its object.
+
+    `development` tests on some of the paper's training objects and leaves the paper's test objects unused. `kfold`
+    deals all objects that have videos into folds: fold `fold` is for test, the next one for validation, so that over
+    all folds every object is tested once. Any other name is that of a `split_` column of the catalogue.
+
+    Raises:
+        UserError: if there is no such split, no training video remains, there are too few objects for the test
+            objects or folds asked for, or (with `missing: error`) a validation or test object has no video.
+    """
+    check_split(catalogue, config.name)
+    present = {video.object_id for video in videos}
+    if config.name == "kfold":
+        parts = _deal(present, config)
+    elif config.name == "development":
+        parts = _develop(catalogue, present, config)
+    else:
+        parts = {o.object_id: o.splits[config.name] for o in catalogue.objects.values()}
+    missing = {
+        part: tuple(sorted(o for o, where in parts.items() if where == part and o not in present))
+        for part in (Part.VALIDATION, Part.TEST)
+    }
+    absent = [object_id for objects in missing.values() for object_id in objects]
+    if absent and config.missing == "error":
+        raise UserError(
+            f"split {config.name}: no video of {', '.join(absent)}; add videos to data.dir, or set "
+            "split.missing=report to go on without them"
+        )
+    if not any(parts.get(object_id) == Part.TRAIN for object_id in present):
+        raise UserError(f"split {config.name}: no video of a training object; add videos, or choose another split.name")
+    assignments = tuple(
+        Assignment(video_id=v.video_id, object_id=v.object_id, part=parts.get(v.object_id, Part.UNUSED)) for v in videos
+    )
+    return Split(assignments=assignments, missing=missing)
+
+
+def check_split(catalogue: Catalogue, name: str) -> None:
+    """Make sure that the catalogue allows a split of this name.
+
+    Raises:
+        UserError: listing the names that it allows.
+    """
+    columns = catalogue.split_names
+    ruled = [rule for rule in RULED_SPLITS if rule != "development" or ORIGIN in columns]
+    if name not in (*columns, *ruled):
+        why = f" needs the column split_{ORIGIN}" if name in RULED_SPLITS else " is no split of the catalogue"
+        raise UserError(f"split.name={name}{why}; allowed: {', '.join((*columns, *ruled))} (see objects.csv)")
+
+
+def _deal(present: Collection[str], config: SplitConfig) -> dict[str, Part]:
+    """Shuffle the objects and deal them out, so that fold sizes differ by one at the most."""
+    if len(present) < config.folds:
+        raise UserError(f"split.folds is {config.folds}, but only {len(present)} objects have videos; lower it")
+    objects = sorted(present)
+    random.Random(derive_seed(config.seed, "kfold")).shuffle(objects)
+    part_of_fold = {config.fold: Part.TEST, (config.fold + 1) % config.folds: Part.VALIDATION}
+    return {o: part_of_fold.get(i % config.folds, Part.TRAIN) for i, o in enumerate(objects)}
+
+
+def _develop(catalogue: Catalogue, present: Collection[str], config: SplitConfig) -> dict[str, Part]:
+    """The paper's split with its test objects unused and a balanced choice of its training objects for test."""
+    paper = {o.object_id: o.splits[ORIGIN] for o in catalogue.objects.values()}
+    candidates = sorted(o for o, part in paper.items() if part == Part.TRAIN and o in present)
+    most = len(candidates) - FEWEST_TRAINING_OBJECTS
+    if config.test_objects > most:
+        raise UserError(
+            f"split.test_objects is {config.test_objects}, but {len(candidates)} training objects with videos allow "
+            f"{max(most, 0)} ({FEWEST_TRAINING_OBJECTS} must be left to train on); lower it or add videos"
+        )
+    rng = random.Random(derive_seed(config.seed, "development"))
+    drawn = (rng.sample(candidates, config.test_objects) for _ in range(CANDIDATES))
+    whole = _shares(catalogue, candidates)
+    chosen = min(drawn, key=lambda objects: _distance(_shares(catalogue, objects), whole))
+    held_out = {**dict.fromkeys(candidates, Part.TRAIN), **dict.fromkeys(chosen, Part.TEST)}
+    return {o: held_out.get(o, Part.UNUSED if part == Part.TEST else part) for o, part in paper.items()}
+
+
+def _shares(catalogue: Catalogue, objects: Collection[str]) -> dict[tuple[int, int], float]:
+    """The share of each class (property index, level) among the objects."""
+    shares: dict[tuple[int, int], float] = defaultdict(float)
+    for object_id in objects:
+        for key in enumerate(catalogue.labels(object_id)):
+            shares[key] += 1 / len(objects)
+    return shares
+
+
+def _distance(some: dict[tuple[int, int], float], whole: dict[tuple[int, int], float]) -> float:
+    """Sum of squared differences; `some` is drawn from `whole`, so it has no class that `whole` lacks."""
+    return sum((some.get(key, 0.0) - share) ** 2 for key, share in whole.items())

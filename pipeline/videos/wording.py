@@ -1,0 +1,147 @@
+"""How a data set's properties are spoken of: the shape of properties.yaml, and what must hold for it to be gradable."""
+
+from __future__ import annotations
+
+from string import Formatter
+from typing import Annotated, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from pipeline.videos.phrases import mentioned, plain
+
+OPENING = "Overall"
+"""How the structured description begins: the grader reads an answer from its last such word on."""
+TAKEN = ("object_id", "name", "material", "part_of", "part", "combined", "choice", "loss")
+"""Columns of objects.csv and measures of the report; no property may bear one of these names."""
+PREFIXES = ("label_", "split_")
+
+Phrase = Annotated[str, Field(pattern=r"\w")]
+
+
+class Entry(BaseModel):
+    """A frozen part of a catalogue; unknown keys are errors."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Property(Entry):
+    """One physical property with its ordered classes and the words for them."""
+
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
+    levels: tuple[Phrase, ...] = Field(min_length=2)
+    more: Phrase
+    less: Phrase
+    most: Phrase
+    least: Phrase
+    alone: str
+    phrases: tuple[tuple[Phrase, ...], ...]
+    cues: tuple[tuple[Phrase, ...], ...] = ()
+    """By class, words by which a text of another author names it; empty, or one tuple (also an empty one) a class."""
+
+    @property
+    def spoken(self) -> str:
+        """The name as a sentence has it."""
+        return self.name.replace("_", " ")
+
+    @property
+    def wordings(self) -> dict[str, int]:
+        """Every wording of a class, plain, with that class: its name, its phrases and its cues."""
+        cues = self.cues or ((),) * len(self.levels)
+        return {
+            plain(word): level
+            for level, (name, phrases, more) in enumerate(zip(self.levels, self.phrases, cues, strict=True))
+            for word in (name, *phrases, *more)
+        }
+
+    @model_validator(mode="after")
+    def _name_is_free(self) -> Self:
+        if self.name in TAKEN or self.name.startswith(PREFIXES):
+            raise ValueError(
+                f"{self.name}: no name for a property, nor is {', '.join(TAKEN)} or what begins with "
+                f"{' or '.join(PREFIXES)}; rename it"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _words_fit(self) -> Self:
+        if len(self.phrases) != len(self.levels) or not all(self.phrases):
+            raise ValueError(f"{self.name}: phrases need one non-empty list a level")
+        if self.cues and len(self.cues) != len(self.levels):
+            raise ValueError(f"{self.name}: cues need one list a level (an empty one where there are none)")
+        if _placeholders(self.alone) != {"level"}:
+            raise ValueError(f"{self.name}: alone must hold {{level}} and no other placeholder")
+        for level, name in enumerate(self.levels):
+            for word in (name, *self.phrases[level], *(self.cues[level] if self.cues else ())):
+                if self.wordings[plain(word)] != level:
+                    raise ValueError(f"{self.name}: {word!r} stands for two levels; keep it at one")
+        return self
+
+
+class Scenario(Entry):
+    """A situation and the classes that suit it (PSR)."""
+
+    name: str
+    question: str
+    object: str | None = None
+    target: dict[str, tuple[int, ...]] = Field(min_length=1)
+    other: dict[str, tuple[int, ...]] = Field(min_length=1)
+
+
+class Language(Entry):
+    """Everything in properties.yaml."""
+
+    dataset: str = ""
+    """The published data set that the catalogue is of; empty for any other."""
+    properties: tuple[Property, ...] = Field(min_length=1)
+    unstructured: str
+    structured: str
+    scenarios: tuple[Scenario, ...] = ()
+
+    @model_validator(mode="after")
+    def _names_fit(self) -> Self:
+        names = [p.name for p in self.properties]
+        if len(set(names)) < len(names):
+            raise ValueError(f"properties {', '.join(names)}: a name stands twice")
+        for template in (self.unstructured, self.structured):
+            missing, unknown = set(names) - _placeholders(template), _placeholders(template) - set(names)
+            if missing:
+                raise ValueError(f"template {template!r} does not name {', '.join(sorted(missing))}")
+            if unknown:
+                raise ValueError(f"template {template!r} names {', '.join(sorted(unknown))}, which is no property")
+        if not self.structured.startswith(f"{OPENING} ") and not self.structured.startswith(f"{OPENING},"):
+            raise ValueError(f"structured must begin with {OPENING!r}: answers are read from that word on")
+        return self
+
+    @model_validator(mode="after")
+    def _scenarios_fit(self) -> Self:
+        classes = {p.name: range(len(p.levels)) for p in self.properties}
+        for scenario in self.scenarios:
+            unknown = (scenario.target.keys() | scenario.other.keys()) - classes.keys()
+            if unknown:
+                raise ValueError(f"scenario {scenario.name}: unknown property {', '.join(sorted(unknown))}")
+            for name, levels in (*scenario.target.items(), *scenario.other.items()):
+                if not levels or not set(levels) <= set(classes[name]):
+                    raise ValueError(
+                        f"scenario {scenario.name}: {name} is {list(levels)}; allowed: classes from 0 to "
+                        f"{len(classes[name]) - 1}"
+                    )
+        return self
+
+    @model_validator(mode="after")
+    def _classes_are_told_apart(self) -> Self:
+        """An answer names all properties in one sentence, so no class may be read where another property is meant."""
+        around = "|".join(text for text, *_ in Formatter().parse(self.structured))
+        for p in self.properties:
+            for level in p.levels:
+                others = [(q.name, word) for q in self.properties if q is not p for word in q.levels]
+                for where, word in (*others, ("structured", around)):
+                    if mentioned(word, [level]):
+                        raise ValueError(
+                            f"{p.name}: class {level!r} can also be read in {where} ({word!r}), so no answer could be "
+                            "graded; choose other words"
+                        )
+        return self
+
+
+def _placeholders(template: str) -> set[str]:
+    return {name for _, name, _, _ in Formatter().parse(template) if name is not None}

@@ -1,0 +1,247 @@
+"""Another lab's data: a made-up catalogue with a fourth property of four classes and no optional column."""
+
+from __future__ import annotations
+
+import csv
+import json
+import random
+import re
+from collections import Counter
+from itertools import islice
+from pathlib import Path
+from textwrap import dedent
+
+import pytest
+import yaml
+from safetensors.numpy import load_file
+
+from pipeline.io import read_jsonl, read_table
+from pipeline.errors import UserError
+from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.videos.descriptions import levels_named
+from pipeline.records import Opd, Part, Prediction, Question, Score, Task
+from pipeline.reporting import write_report
+from pipeline.scenes.recipe import recipe_of
+from pipeline.videos.split import check_split
+from pipeline.tasks import TASKS
+from pipeline.tasks.base import Pool
+from pipeline.videos.files import list_videos
+from tests.closure import ROOT
+from tests.fake_chain import fake_params, write_chain
+from tests.project import OBJECTS, REDUCED, Project, copy_project
+
+PHYSICLEAR = ROOT / "pipeline" / "physiclear"
+LEVELS = ["not sticky", "slightly sticky", "sticky", "very sticky"]
+PARTS = ("train",) * 4 + ("validation",) + ("test",) * 4
+
+
+def write_catalogue(folder: Path, *, name: str = "stickiness", split: str = "mine") -> Path:
+    """Nine of PhysiCLeAR's objects, their ratings, and ratings of `name` by a number of people of its own."""
+    language = yaml.safe_load((PHYSICLEAR / "properties.yaml").read_text())
+    del language["dataset"]
+    for prop in language["properties"]:
+        del prop["cues"]
+    language["properties"].append(
+        {
+            "name": name,
+            "levels": LEVELS,
+            "more": "stickier",
+            "less": "less sticky",
+            "most": "stickiest",
+            "least": "least sticky",
+            "alone": "Overall, it is {level} to the touch.",
+            "phrases": [[f"it lets go like number {n}"] for n in range(4)],
+        }
+    )
+    language["unstructured"] = language["unstructured"].replace(" and", ",").replace(".", f", and {{{name}}}.")
+    language["structured"] = language["structured"].replace(".", f" that is {{{name}}}.")
+    target, other = {name: [2, 3]}, {name: [0, 1]}
+    language["scenarios"] = [{"name": "note", "question": "Which one holds a note?", "target": target, "other": other}]
+    folder.mkdir(parents=True)
+    (folder / "properties.yaml").write_text(yaml.safe_dump(language, sort_keys=False))
+    known = load_catalogue(PHYSICLEAR).objects
+    with (folder / "objects.csv").open("w", newline="") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(["object_id", f"split_{split}", "name", "hardness", "roughness", "bumpiness", name])
+        for number, (object_id, part) in enumerate(zip(OBJECTS, PARTS, strict=True)):
+            ratings = [" ".join(map(str, r)) for r in known[object_id].ratings]
+            writer.writerow([object_id, part, known[object_id].name, *ratings, f"{number % 4} {number % 4}"])
+    return folder
+
+
+def rows(folder: Path, table: str) -> list[dict[str, str]]:
+    with (folder / "tables" / f"{table}.csv").open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def check_tables(report: Path, name: str) -> None:
+    """Rows for the fourth property wherever there are rows for properties, and nothing of the paper's."""
+    for table in ("property_description", "encoder_property", "lora_property", "all_variants"):
+        found = [r for r in rows(report, table) if r["row"] == name]
+        assert found, table
+        assert all(float(r["chance"]) == 25 for r in found)
+        assert all(
+            float(r["chance"]) == pytest.approx(100 / 108, abs=1e-3)
+            for r in rows(report, table)
+            if r["row"] == "combined"
+        )
+    heads = next(r for r in rows(report, "property_description") if (r["row"], r["system"]) == (name, "FT CLIP"))
+    assert heads["value"] != ""
+    confused = [r for r in rows(report, "confusion_matrices") if r["property"] == name]
+    assert [(r["expected"], r["predicted"]) for r in confused] == [(a, b) for a in LEVELS for b in LEVELS]
+    assert sum(int(r["videos"]) for r in confused) == int(heads["n"])
+    assert [r["level"] for r in rows(report, "property_counts") if r["property"] == name] == LEVELS
+    assert [int(r["objects"]) for r in rows(report, "property_counts") if r["property"] == name] == [3, 2, 2, 2]
+    assert len(rows(report, "property_combinations")) == 3 * 3 * 3 * 4
+    assert any(r["row"] == name for r in rows(report, "annotator_agreement"))
+    for file in (report / "tables").glob("*.csv"):
+        for row in rows(report, file.stem):
+            assert not any(value for column, value in row.items() if column.startswith("published")), file.name
+    page = (report / "README.md").read_text()
+    assert "ublished" not in page
+    assert "paper's" not in page
+    assert name in page
+
+
+@pytest.fixture(scope="module")
+def tacky(tmp_path_factory: pytest.TempPathFactory) -> Catalogue:
+    """A catalogue whose fourth property has a name of two words."""
+    return load_catalogue(write_catalogue(tmp_path_factory.mktemp("other") / "catalogue", name="surface_tack"))
+
+
+def drafted(catalogue: Catalogue, task: Task) -> list[Question]:
+    """A question of every stratum that the nine objects have one of."""
+    pool = Pool(Part.TEST, catalogue, {o: [f"{o}_0"] for o in catalogue.objects})
+    definition, rng, questions = TASKS[task], random.Random(0), []
+    for stratum in range(definition.strata(catalogue)):
+        drafts = (definition.draft(pool, stratum, rng) for _ in range(500))
+        for draft in islice(filter(None, drafts), 1):
+            fields = {key: getattr(draft, key) for key in ("videos", "objects", "dialogues", "gold")}
+            questions.append(Question(question_id=f"{task}-{stratum}", task=task, part=pool.part, **fields))
+    return questions
+
+
+@pytest.mark.parametrize("task", list(Task))
+def test_every_task_asks_about_it_and_reads_its_own_answers(tacky: Catalogue, task: Task) -> None:
+    questions = drafted(tacky, task)
+    assert any("surface_tack" in q.gold.properties for q in questions)
+    for question in questions:
+        assert all(len(labels) == 4 for labels in question.gold.labels)
+        for dialogue in question.dialogues:
+            said = " ".join(part for turn in dialogue.turns for part in (turn.user, turn.assistant))
+            assert "_" not in said, "a name is spoken in words"
+            outputs = tuple(turn.assistant for turn in dialogue.turns)
+            answer = Prediction(question_id="x", task=task, outputs=outputs, truncated=False, tokens=1)
+            assert all(s.correct for s in TASKS[task].grade(question, answer, tacky)), outputs
+
+
+def test_a_described_fourth_property_is_graded(tacky: Catalogue) -> None:
+    question = next(q for q in drafted(tacky, Task.OPD) if q.gold.labels[0][3] == 2)
+    dialogue = question.dialogue(Opd.ALL)
+    assert dialogue is not None
+    (turn,) = dialogue.turns
+    for said, right in (("slightly sticky", False), ("sticky", True), ("", False)):
+        text = turn.assistant.replace("is sticky.", f"is {said}.")
+        answer = Prediction(question_id="x", task=Task.OPD, outputs=(text,), truncated=False, tokens=1)
+        scores = {s.measure: s for s in TASKS[Task.OPD].grade(question, answer, tacky)}
+        assert list(scores) == ["hardness", "roughness", "bumpiness", "surface_tack", "combined"]
+        assert scores["surface_tack"].predicted == said
+        assert [scores[m].correct for m in ("hardness", "surface_tack", "combined")] == [True, right, right]
+    assert TASKS[Task.OPD].chance(tacky)["combined"] == pytest.approx(1 / 108)
+
+
+def test_scenes_need_three_properties_and_take_more(tacky: Catalogue) -> None:
+    assert recipe_of("rug", narrowed(tacky, slice(3)), 0) == recipe_of("rug", tacky, 0)
+    with pytest.raises(UserError, match=r"hardness.*data\.source=videos"):
+        recipe_of("rug", narrowed(tacky, slice(1, None)), 0)
+
+
+def narrowed(catalogue: Catalogue, kept: slice) -> Catalogue:
+    """The catalogue with some of its properties."""
+    language = catalogue.language.model_copy(update={"properties": catalogue.properties[kept]})
+    few = {o.object_id: o.model_copy(update={"ratings": o.ratings[kept]}) for o in catalogue.objects.values()}
+    return Catalogue.model_construct(language=language, objects=few)
+
+
+def test_the_report_has_its_rows(tmp_path: Path) -> None:
+    folder = write_catalogue(tmp_path / "catalogue", split="paper")
+    params = fake_params(f"data.catalogue='{folder}'", f"scenes.objects=[{','.join(OBJECTS)}]")
+    write_chain(tmp_path, params)
+    write_report(params, tmp_path)
+    check_tables(tmp_path / "reports" / params.report_name, "stickiness")
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
+    project = copy_project(tmp_path_factory.mktemp("other") / "project")
+    write_catalogue(project.folder / "my catalogue")
+    few = ("questions.train={opd:8,pc:24,pss:24,pom:6}", "questions.evaluation={opd:8,pc:24,pss:24,pom:6,psr:4}")
+    project.run("octopi", "scale", *REDUCED, *few, "data.catalogue='my catalogue'", "split.name=mine")
+    project.run("dvc", "repro")
+    return project
+
+
+def test_the_whole_chain_runs_on_it(project: Project) -> None:
+    data = project.folder / "data"
+    for part in ("train", "evaluation"):
+        asked = read_jsonl(data / "questions" / f"{part}.jsonl", Question)
+        about = Counter(q.task for q in asked if "stickiness" in q.gold.properties)
+        assert {Task.OPD, Task.PC, Task.PSS, Task.POM} <= about.keys()
+        assert (Task.PSR in about) == (part == "evaluation")
+        assert all(len(labels) == 4 for q in asked for labels in q.gold.labels)
+        assert any("stickiness of both" in turn.user for q in asked for d in q.dialogues for turn in d.turns)
+    heads = load_file(data / "encoder" / "0" / "encoder.safetensors")
+    assert [len(heads[f"heads.{i}.bias"]) for i in range(4)] == [3, 3, 3, 4]
+    assert "heads.4.bias" not in heads
+    scores = read_table(data / "scores" / "finetuned-with-all-0" / "scores.parquet", Score)
+    measures = Counter(s.measure for s in scores if s.task == Task.OPD)
+    assert set(measures) == {"hardness", "roughness", "bumpiness", "stickiness", "combined"}
+    assert len(set(measures.values())) == 1
+    report = project.folder / "reports" / "smoke-scenes"
+    check_tables(report, "stickiness")
+    assert "ft-clip.stickiness" in json.loads((report / "metrics.json").read_text())
+    for figure in ("confusion_matrices", "embedding_map"):
+        assert (report / "figures" / f"{figure}.png").is_file()
+    assert "split mine" in (report / "README.md").read_text()
+    counts = [r for r in rows(report, "property_counts") if r["property"] == "stickiness"]
+    assert [sum(int(r[part]) for r in counts) for part in ("train", "validation", "test")] == [4, 1, 4]
+
+
+def blocks(page: str, language: str) -> list[str]:
+    """The fenced blocks of a page in one language, without the indentation that lists give them."""
+    return [dedent(text) for text in re.findall(rf"^ *```{language}\n(.*?)^ *```$", page, re.M | re.S)]
+
+
+def test_the_documented_example_is_valid(tmp_path: Path) -> None:
+    page = (ROOT / "docs" / "data.md").read_text()
+    for name, text in re.findall(r"^`my-lab/([^`]+)`\n\n```\w+\n(.*?)^```$", page, re.M | re.S):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    example = load_catalogue(tmp_path / "catalogue")
+    assert example.split_names == ("lab",)
+    assert example.objects["jar"].name == "a jar, half full"
+    assert example.objects["tape"].stated == (None, 1)
+    assert example.describe("tile").endswith("Overall, it is not sticky and feels cold.")
+    named = {p.name: levels_named(example.objects["tape"].description, p) for p in example.properties}
+    assert named == {"stickiness": {1}, "warmth": set()}
+    check_split(example, "lab")
+    for name in ("monday/tape first try", "monday/tape second try", "tuesday/foam", "tuesday/tile"):
+        (tmp_path / "videos" / f"{name}.mp4").parent.mkdir(exist_ok=True)
+        (tmp_path / "videos" / f"{name}.mp4").touch()
+    listing = list_videos(tmp_path / "videos", example)
+    assert not listing.findings
+    assert [v.video_id for v in listing.files] == ["foam_0", "tape_0", "tape_1", "tile_0"]
+
+
+def test_the_documented_fourth_property_is_valid(tmp_path: Path) -> None:
+    added, sentences = blocks((ROOT / "docs" / "data.md").read_text(), "yaml")[1:]
+    language = yaml.safe_load((PHYSICLEAR / "properties.yaml").read_text())
+    del language["dataset"]
+    language["properties"] += yaml.safe_load(added)
+    language.update(yaml.safe_load(sentences))
+    (tmp_path / "properties.yaml").write_text(yaml.safe_dump(language, sort_keys=False))
+    lines = (PHYSICLEAR / "objects.csv").read_text().splitlines()
+    (tmp_path / "objects.csv").write_text("\n".join([f"{lines[0]},stickiness", *(f"{line},3 2" for line in lines[1:])]))
+    four = load_catalogue(tmp_path)
+    assert four.property_names == ("hardness", "roughness", "bumpiness", "stickiness")
+    assert four.structured((2, 0, 0, 1)).endswith("a hard and smooth surface with no bumps that is slightly sticky.")

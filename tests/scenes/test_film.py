@@ -1,0 +1,45 @@
+"""Files as the real videos are coded."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from pipeline.videos.decoding import Decoder, decode
+from pipeline.errors import UserError
+from pipeline.scenes.film import KEY_EVERY, write_film
+
+
+def frames(count: int) -> list[np.ndarray]:
+    y, x = np.mgrid[:48, :64]
+    return [np.stack([x + 50, y + 60, x + y + 2 * n], axis=-1).astype(np.uint8) for n in range(count)]
+
+
+@pytest.mark.parametrize(("count", "fps"), [(2, 25.0), (30, 10.0), (13, 12.5)])
+def test_what_is_written_is_read(tmp_path: Path, count: int, fps: float) -> None:
+    path = tmp_path / "a b.avi"
+    write_film(path, frames(count), fps)
+    with Decoder(path) as decoder:
+        kinds = [frame.key_frame for frame in decoder.frames()]
+        assert (decoder.header.frames, decoder.header.fps) == (count, fps)
+    assert kinds == [n % KEY_EVERY == 0 for n in range(count)]
+    error = np.stack(list(decode(path))).astype(int) - np.stack(frames(count))
+    assert np.abs(error).mean() < 3, "colour is coded at half the resolution"
+
+
+def test_equal_frames_give_equal_files(tmp_path: Path) -> None:
+    paths = [tmp_path / name for name in ("a.avi", "b.avi")]
+    for path in paths:
+        write_film(path, frames(20), 25.0)
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+    with av.open(str(paths[0])) as container:
+        assert container.streams.video[0].codec_context.name == "mpeg4"
+
+
+def test_an_unwritable_place_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="cannot be written") as problem:
+        write_film(tmp_path / "none" / "a.avi", frames(2), 25.0)
+    assert "\n" not in str(problem.value)

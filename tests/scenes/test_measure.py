@@ -1,0 +1,114 @@
+"""Classes measured from scenes: of plain shapes whose classes are known, and of every object of the catalogue."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.errors import UserError
+from pipeline.videos.catalogue import Catalogue
+from pipeline.scenes.contact import Body, Method
+from pipeline.scenes.geometry import IMAGE_MM, Heights, heights
+from pipeline.scenes.measure import BIG_SHARE, VISIBLE_MM, Measured, bump_share, check_recipe, measure, texture
+from pipeline.scenes.recipe import Recipe, load_recipes, recipe_of
+from tests.conftest import ROOT
+
+WIDTH, HEIGHT, SIDE = 160, 120, 263
+PITCH = IMAGE_MM[0] / WIDTH
+FORCE_N = 8.0
+"""A firm press; a light one does not bring every bump out, which scenes.csv shows."""
+RECIPES = "pipeline/physiclear"
+
+
+def look(recipe: Recipe, seed: int) -> Measured:
+    """The measures of one press onto the middle of a patch."""
+    cv2.setNumThreads(1)
+    patch = heights(recipe.surface, SIDE, PITCH, np.random.default_rng(seed))
+    skin = Body(patch, recipe.modulus, PITCH).press(Method("layer", 128), np.array([FORCE_N])).skins[0]
+    top, left = (SIDE - HEIGHT) // 2, (SIDE - WIDTH) // 2
+    view = (slice(top, top + HEIGHT), slice(left, left + WIDTH))
+    return measure(recipe.modulus, patch[view], skin[view], PITCH)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_scenes_show_what_the_labels_say(catalogue: Catalogue, seed: int) -> None:
+    """All 74 objects, all three properties; nothing is measured from the labels."""
+    for object_id, recipe in load_recipes(ROOT / RECIPES, catalogue, 0).items():
+        check_recipe(object_id, look(recipe, seed), catalogue)
+
+
+def test_drawn_scenes_show_what_the_labels_say(catalogue: Catalogue) -> None:
+    shown = 0
+    for object_id in catalogue.objects:
+        found = look(recipe_of(object_id, catalogue, 0), 0)
+        shown += (found.hardness, found.roughness, found.bumpiness) == catalogue.labels(object_id)
+    assert shown >= 70
+
+
+@pytest.mark.parametrize(
+    ("measured", "message"),
+    [
+        (Measured(30, 0.02, 0.4), r"rug: .*hardness 2 \(hard; modulus 30 MPa.*objects\.csv says 1 \(moderately hard\)"),
+        (Measured(0.3, 0.001, 0.4), r"rug: .*roughness 0 \(smooth.*says 2 \(rough\); correct the recipe"),
+        (Measured(0.3, 0.02, 0.0), r"rug: .*bumpiness 0 \(.*0\.00 of the image's height.*says 2"),
+    ],
+)
+def test_a_contradiction_is_named(catalogue: Catalogue, measured: Measured, message: str) -> None:
+    check_recipe("rug", Measured(0.3, 0.02, 0.4), catalogue)
+    with pytest.raises(UserError, match=message):
+        check_recipe("rug", measured, catalogue)
+
+
+def waves(length: float, amplitude: float) -> Heights:
+    x, y = np.meshgrid(np.arange(WIDTH) * PITCH, np.arange(HEIGHT) * PITCH)
+    return (amplitude * np.sin(2 * np.pi * x / length) * np.sin(2 * np.pi * y / length)).astype(np.float32)
+
+
+def bowl(depth: float, radius: float) -> Heights:
+    """A smooth contact without any relief."""
+    x, y = np.meshgrid((np.arange(WIDTH) - WIDTH / 2) * PITCH, (np.arange(HEIGHT) - HEIGHT / 2) * PITCH)
+    return np.maximum(depth * (1 - (x * x + y * y) / radius**2), 0).astype(np.float32)
+
+
+def test_texture_passes_short_waves_and_stops_long_ones() -> None:
+    short = waves(0.5, 0.02)
+    assert texture(short, PITCH) == pytest.approx(short[short > 0].std(), rel=0.1), "the upper half passes whole"
+    assert texture(waves(5.0, 0.2), PITCH) < 0.002
+    assert texture(waves(0.4, 0), PITCH) == 0
+
+
+@given(st.floats(5, 1e3), st.floats(5, 1e3))
+def test_curvature_is_no_texture(across: float, along: float) -> None:
+    recipe = Recipe.model_validate({"modulus": 1, "body": {"kind": "round", "radii": [across, along]}})
+    assert texture(heights(recipe.surface, WIDTH, PITCH, np.random.default_rng(0)), PITCH) < 2e-4
+
+
+@pytest.mark.parametrize("radius", [3.0, 5.0, 8.0])
+def test_a_smooth_contact_has_no_bumps(radius: float) -> None:
+    skin = cv2.GaussianBlur(bowl(0.8, radius), (0, 0), 3)
+    assert bump_share(skin, PITCH) == 0
+
+
+@pytest.mark.parametrize("width", [1.5, 2.5, 4.5, 6.0])
+def test_a_lattice_of_caps_measures_as_wide_as_it_is(width: float) -> None:
+    x, y = np.meshgrid(np.arange(WIDTH) * PITCH, np.arange(HEIGHT) * PITCH)
+    spacing = 1.3 * width
+    du, dv = x - np.round(x / spacing) * spacing, y - np.round(y / spacing) * spacing
+    skin = (0.3 + 0.3 * np.maximum(1 - (du * du + dv * dv) / (width / 2) ** 2, 0)).astype(np.float32)
+    share = bump_share(skin, PITCH)
+    assert share * IMAGE_MM[1] == pytest.approx(width, rel=0.15)
+    assert (share > BIG_SHARE) == (width > IMAGE_MM[1] / 4)
+
+
+def test_what_cannot_be_seen_is_no_bump() -> None:
+    assert bump_share(0.3 + waves(4, VISIBLE_MM / 4), PITCH) == 0
+    assert bump_share(0.3 + waves(4, 4 * VISIBLE_MM), PITCH) > 0
+    assert bump_share(np.zeros((HEIGHT, WIDTH), np.float32), PITCH) == 0
+
+
+def test_measures_do_not_depend_on_the_pitch() -> None:
+    fine = 0.3 + cv2.resize(waves(4, 0.1), (2 * WIDTH, 2 * HEIGHT), interpolation=cv2.INTER_CUBIC)
+    assert bump_share(fine, PITCH / 2) == pytest.approx(bump_share(0.3 + waves(4, 0.1), PITCH), rel=0.05)

@@ -1,0 +1,144 @@
+"""From recipes to videos: what follows from a seed, what a press and a twist show, and the files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.videos.decoding import decode
+from pipeline.errors import UserError
+from pipeline.videos.frames.scan import Scan, scan
+from pipeline.videos.catalogue import Catalogue
+from pipeline.scenes.geometry import IMAGE_MM, Round
+from pipeline.scenes.light import make_sensor
+from pipeline.scenes.recipe import Recipe, load_recipes
+from pipeline.scenes.relief import Rough
+from pipeline.scenes.render import Scene, make_scene, measure_scene, render
+from pipeline.scenes.video import share_as_labelled, synthesize
+from pipeline.config import FramesConfig, ScenesConfig
+from pipeline.videos.files import list_videos
+from tests.conftest import ROOT
+
+SMALL = ScenesConfig(objects=("rug",), videos_per_object=2, frames=8, width=64, height=48)
+PLAIN = Recipe(modulus=100.0, body=Round(kind="round", radii=(30.0, 30.0)))
+PHYSICLEAR = ROOT / "pipeline" / "physiclear"
+
+
+@pytest.fixture(scope="module")
+def recipes(catalogue: Catalogue) -> dict[str, Recipe]:
+    return load_recipes(PHYSICLEAR, catalogue, 0)
+
+
+def film(recipe: Recipe, config: ScenesConfig, seed: int) -> tuple[Scene, np.ndarray]:
+    scene = make_scene(recipe, config, int(config.frames), seed)
+    sensor = make_sensor(config.width, config.height, 1)
+    return scene, np.stack(list(render(scene, config, sensor, seed)))
+
+
+def test_a_video_follows_from_its_seed(recipes: dict[str, Recipe]) -> None:
+    first, again, other = (film(recipes["basket"], SMALL, seed)[1] for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert first.shape == (8, 48, 64, 3)
+    assert first.dtype == np.uint8
+    assert (first != other).any()
+
+
+@pytest.mark.parametrize("tier", ["auto", "winkler", "layer", "half_space"])
+def test_every_tier_shows_a_contact(recipes: dict[str, Recipe], tier: str) -> None:
+    config = SMALL.model_copy(update={"tier": tier, "cells": 48, "frames": 20, "width": 96, "height": 72})
+    scene, frames = film(recipes["egg"], config, 3)
+    assert tier == "auto" or scene.imprint.method.tier == tier
+    assert (scene.imprint.error is not None) == (tier == "auto")
+    strongest = int(scene.motion.force.argmax())
+    change = np.abs(frames.astype(int) - frames[0]).mean((1, 2, 3))
+    assert change[strongest] > 2 * np.median(change[scene.motion.force == 0])
+
+
+def strongest_change(recipe: Recipe) -> np.ndarray:
+    """The fullest contact of a video less its first frame, in 8-bit steps."""
+    scene, frames = film(recipe, ScenesConfig(frames=12, width=160, height=120), 4)
+    return frames[int(scene.motion.force.argmax())].astype(int) - frames[0]
+
+
+def test_classes_look_different() -> None:
+    plain = strongest_change(PLAIN)
+    soft = strongest_change(PLAIN.model_copy(update={"modulus": 0.03}))
+    rough = strongest_change(PLAIN.model_copy(update={"relief": (Rough(kind="rough", rms=0.04, longest=0.8),)}))
+    assert np.abs(plain).mean() > 2 * np.abs(soft).mean()
+    assert np.abs(np.diff(rough, axis=1)).mean() > 1.6 * np.abs(np.diff(plain, axis=1)).mean()
+
+
+def test_a_scene_is_the_same_at_other_resolutions(recipes: dict[str, Recipe]) -> None:
+    """Lengths are in mm: the depth of a plain body's imprint does not depend on the pixels."""
+    depths = []
+    for width in (80, 160, 320):
+        config = ScenesConfig(frames=10, width=width, height=width * 3 // 4, tolerance=0.02)
+        scene = make_scene(PLAIN, config, 10, 5)
+        assert scene.pitch == pytest.approx(IMAGE_MM[0] / width)
+        depths.append(float(scene.imprint.skins[-1].max()))
+    np.testing.assert_allclose(depths, depths[-1], rtol=0.02)
+
+
+def test_two_frames_are_enough(recipes: dict[str, Recipe]) -> None:
+    _, frames = film(recipes["rice"], SMALL.model_copy(update={"frames": 2}), 1)
+    assert len(frames) == 2
+
+
+def test_files_are_equal_for_equal_seeds(recipes: dict[str, Recipe], catalogue: Catalogue, tmp_path: Path) -> None:
+    folders = [tmp_path / "a b", tmp_path / "c"]
+    first, second = (synthesize(recipes, SMALL, folder) for folder in folders)
+    assert first == second
+    names = [row.video for row in first]
+    assert names == sorted(p.name for p in folders[0].iterdir()), "nothing else is left there"
+    assert [(folders[0] / n).read_bytes() for n in names] == [(folders[1] / n).read_bytes() for n in names]
+    assert (folders[0] / names[0]).read_bytes() != (folders[0] / names[1]).read_bytes()
+    for file in list_videos(folders[0], catalogue).files:
+        found = scan(file, FramesConfig(size=16))
+        assert isinstance(found, Scan)
+        video = found.video
+        assert (video.frames, video.width, video.height, video.fps) == (8, 64, 48, 25.0)
+
+
+def test_a_file_shows_what_was_rendered(recipes: dict[str, Recipe], tmp_path: Path) -> None:
+    config = ScenesConfig(objects=("basket",), videos_per_object=1, frames=10, width=160, height=120)
+    (row,) = synthesize(recipes, config, tmp_path)
+    frames = np.stack(list(decode(tmp_path / row.video))).astype(int)
+    assert frames.shape == (10, 120, 160, 3)
+    change = np.abs(frames - frames[0]).mean((1, 2, 3))
+    assert change.max() > 3 * max(change[1], 0.5)
+    assert row.force > 0
+    assert row.error is not None
+
+
+def test_recorded_lengths_are_those_of_the_public_videos(recipes: dict[str, Recipe], tmp_path: Path) -> None:
+    config = SMALL.model_copy(update={"frames": "recorded", "videos_per_object": 12, "width": 32, "height": 24})
+    rows = synthesize(recipes, config, tmp_path)
+    assert {(row.frames, row.fps) for row in rows} <= {(126, 25.0), (50, 10.0)}
+    assert len({row.frames for row in rows}) == 2
+
+
+def test_rows_say_what_scenes_measure_as(recipes: dict[str, Recipe], catalogue: Catalogue, tmp_path: Path) -> None:
+    config = ScenesConfig(objects=("egg", "potato", "basket"), videos_per_object=1, frames=4, width=160, height=120)
+    rows = synthesize(recipes, config, tmp_path)
+    for row in rows:
+        assert row.hardness == catalogue.labels(row.object_id)[catalogue.property_index("hardness")]
+    share = share_as_labelled(rows, catalogue)
+    agreeing = [(r.hardness, r.roughness, r.bumpiness) == catalogue.labels(r.object_id) for r in rows]
+    assert share == pytest.approx(np.mean(agreeing), abs=1e-4)
+    scene = make_scene(recipes["egg"], config, 4, 1)
+    assert measure_scene(scene, recipes["egg"], config).modulus == recipes["egg"].modulus
+
+
+def test_an_unknown_object_is_named(recipes: dict[str, Recipe], tmp_path: Path) -> None:
+    config = ScenesConfig(objects=("rug", "yoyo"))
+    with pytest.raises(UserError, match=r"scenes\.objects: yoyo"):
+        synthesize(recipes, config, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_cannot_be_written_is_named(recipes: dict[str, Recipe], tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises((UserError, OSError), match="file"):
+        synthesize(recipes, SMALL, tmp_path / "file")

@@ -1,0 +1,120 @@
+"""Question sets: seeded, distinct, balanced, and only about the videos of their part."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+
+from pipeline.videos.catalogue import load_catalogue
+from pipeline.tasks.questions import build_questions, pool_of
+from pipeline.records import Part, Question, Task
+from pipeline.config import SplitConfig
+from pipeline.videos.split import assign
+from pipeline.tasks.base import Pool
+from tests.conftest import ROOT, fake_videos
+
+CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")
+VIDEOS = fake_videos(sorted(CATALOGUE.objects), 5)
+ASSIGNMENTS = assign(CATALOGUE, VIDEOS, SplitConfig(name="paper")).assignments
+COUNTS = {Task.OPD: 40, Task.PC: 36, Task.PSS: 36, Task.POM: 36, Task.PSR: 12}
+POOLS = {part: pool_of(part, ASSIGNMENTS, CATALOGUE) for part in (Part.TRAIN, Part.VALIDATION, Part.TEST)}
+
+
+def key(question: Question) -> tuple[object, ...]:
+    return question.task, question.videos, question.gold.properties, question.dialogues[-1].turns[-1].assistant
+
+
+def by_task(questions: list[Question]) -> Counter[Task]:
+    return Counter(q.task for q in questions)
+
+
+@pytest.mark.parametrize("part", list(POOLS))
+def test_questions_stay_in_their_part(part: Part) -> None:
+    own = {a.video_id for a in ASSIGNMENTS if a.part == part}
+    questions = build_questions(POOLS[part], COUNTS, seed=1, distinct=part != Part.TRAIN)
+    assert questions
+    for question in questions:
+        assert question.part == part
+        assert set(question.videos) <= own
+        assert [v.rpartition("_")[0] for v in question.videos] == list(question.objects)
+    assert len({q.question_id for q in questions}) == len(questions)
+
+
+def test_counts_are_met_where_there_is_enough_to_ask() -> None:
+    assert by_task(build_questions(POOLS[Part.TRAIN], COUNTS, seed=1, distinct=False)) == COUNTS
+    test = by_task(build_questions(POOLS[Part.TEST], COUNTS, seed=1, distinct=True))
+    assert test[Task.OPD] == 35, "each of the 35 videos is described once"
+    assert all(test[task] == COUNTS[task] for task in (Task.PC, Task.POM, Task.PSR))
+
+
+def test_equal_seeds_give_equal_questions() -> None:
+    first, again, other = (build_questions(POOLS[Part.TEST], COUNTS, seed=s, distinct=True) for s in (1, 1, 2))
+    assert first == again
+    assert {key(q) for q in first} != {key(q) for q in other}
+
+
+def test_a_task_does_not_depend_on_the_others() -> None:
+    alone = build_questions(POOLS[Part.TEST], {Task.POM: 36}, seed=1, distinct=True)
+    among = build_questions(POOLS[Part.TEST], COUNTS, seed=1, distinct=True)
+    assert {key(q) for q in alone} == {key(q) for q in among if q.task == Task.POM}
+
+
+@pytest.mark.parametrize("part", [Part.VALIDATION, Part.TEST])
+def test_distinct_questions_differ_in_more_than_wording(part: Part) -> None:
+    many = dict.fromkeys(Task, 300)
+    questions = build_questions(POOLS[part], many, seed=3, distinct=True)
+    assert len({key(q) for q in questions}) == len(questions)
+
+
+def test_tasks_are_mixed() -> None:
+    questions = build_questions(POOLS[Part.TRAIN], COUNTS, seed=1, distinct=False)
+    assert len({q.task for q in questions[:20]}) > 2
+
+
+def test_strata_are_balanced() -> None:
+    counts = {Task.OPD: 120, Task.PC: 180, Task.PSS: 180, Task.POM: 180, Task.PSR: 60}
+    questions = build_questions(POOLS[Part.TRAIN], counts, seed=5, distinct=False)
+    for task, choices in ((Task.PC, 3), (Task.PSS, 3), (Task.POM, 6), (Task.PSR, 2)):
+        found = Counter(q.gold.choice for q in questions if q.task == task)
+        assert len(found) == choices
+        assert max(found.values()) == min(found.values()) == counts[task] / choices
+    for task in (Task.PC, Task.PSS):
+        found = Counter(q.gold.properties for q in questions if q.task == task)
+        assert set(found.values()) == {60}
+    described = Counter(q.objects for q in questions if q.task == Task.OPD)
+    assert len(described) == 60
+    assert set(described.values()) == {2}, "every object of the part is described equally often"
+
+
+def test_facts_stand_before_the_same_matching_questions() -> None:
+    plain = build_questions(POOLS[Part.TEST], COUNTS, seed=1, distinct=True)
+    told = build_questions(POOLS[Part.TEST], COUNTS, seed=1, distinct=True, facts=True)
+    orders = set()
+    for without, question in zip(plain, told, strict=True):
+        if question.task != Task.POM:
+            assert question == without
+            continue
+        assert question.model_copy(update={"dialogues": without.dialogues}) == without
+        for bare, dialogue in zip(without.dialogues, question.dialogues, strict=True):
+            facts = dialogue.turns[0].user.removesuffix(bare.turns[0].user)
+            assert facts != dialogue.turns[0].user
+            assert dialogue.turns[0].assistant == bare.turns[0].assistant
+            for object_id in question.objects:
+                levels = zip(CATALOGUE.properties, CATALOGUE.labels(object_id), strict=True)
+                classes = ", ".join(p.levels[level] for p, level in levels)
+                assert f"{classes} is {CATALOGUE.objects[object_id].name}." in facts
+        first = [facts.index(f" {CATALOGUE.objects[o].name}.") for o in question.objects]
+        orders.add(tuple(sorted(range(3), key=first.__getitem__)))
+    assert len(orders) == 6, "the order of the facts gives nothing away"
+
+
+def test_an_empty_part_has_no_questions() -> None:
+    assert build_questions(Pool(Part.TEST, CATALOGUE, {}), COUNTS, seed=0, distinct=True) == []
+
+
+def test_few_objects_give_few_questions() -> None:
+    pool = Pool(Part.TEST, CATALOGUE, {"rug": ["rug_0"], "potato": ["potato_0"]})
+    questions = build_questions(pool, COUNTS, seed=0, distinct=True)
+    assert by_task(questions)[Task.OPD] == 2
+    assert not by_task(questions).keys() & {Task.PSS, Task.POM}

@@ -1,0 +1,306 @@
+"""The whole audit of a folder and of the chain, on files good and bad, and on the public videos."""
+
+from __future__ import annotations
+
+import csv
+import os
+import re
+import runpy
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from pipeline.io import read_csv, write_csv, write_table
+from pipeline.videos.audit import leakage
+from pipeline.videos.audit.run import audit_chain, audit_folder, by_severity, check_folder, stop_on_errors, summary
+from pipeline.errors import UserError
+from pipeline.videos.catalogue import Catalogue
+from pipeline.records import Assignment, Finding, Part, Probe, Video
+from pipeline.config import SplitConfig
+from tests.audit_records import ERROR, GOOD_SPLIT, INFO, WARNING, assigned, look_at, odd, of, probe, probes, video
+from tests.closure import ROOT
+from tests.conftest import moving_square, write_video
+from tests.fake_chain import fake_params
+
+
+@pytest.fixture
+def broken(tmp_path: Path) -> Path:
+    """A folder with a file of every kind that can be wrong beside some that are right."""
+    folder = tmp_path / "videos with é"
+    for seed, name in enumerate(("baseball_0", "potato_0", "rug_0", "rug_1", "lemon_0")):
+        write_video(folder / f"{name}.avi", moving_square(16, seed))
+    good = (folder / "rug_0.avi").read_bytes()
+    (folder / "rug_2.avi").write_bytes(b"")
+    (folder / "rug_3.mov").write_bytes(b"not a video at all " * 400)
+    (folder / "rug_4.avi").write_bytes(good[:300])
+    (folder / "rug_5.avi").write_bytes(good[: len(good) * 2 // 3])
+    (folder / "rug_6.avi").write_bytes(good)
+    (folder / "rug_7.mkv").symlink_to(folder / "nowhere.mkv")
+    (folder / "rug_8.mov").mkdir()
+    (folder / "rug_01.avi").write_bytes((folder / "rug_1.avi").read_bytes())
+    (folder / "nameless.avi").write_bytes(good)
+    (folder / "cotton_bal_0.avi").write_bytes(good)
+    (folder / "pillow_0.mp4").write_bytes(os.urandom(500))
+    write_video(folder / "sub" / "millet_0.avi", moving_square(1, 9))
+    (folder / "sub" / "orange_0.avi").write_bytes(good)
+    (folder / "notes.txt").write_text("no video")
+    return folder
+
+
+@pytest.mark.parametrize("split", ["", "paper", "kfold", "development", "nonsense"])
+def test_every_broken_file_is_found_and_raises_nothing(broken: Path, catalogue: Catalogue, split: str) -> None:
+    findings = audit_folder(broken, catalogue, SplitConfig(name=split) if split else None)
+    severities = [f.severity for f in findings]
+    assert severities == sorted(severities, key=[ERROR, WARNING, INFO].index)
+    errors = {(f.check, f.item) for f in findings if f.severity is ERROR}
+    assert errors >= {
+        *(("decodes", n) for n in ("rug_2.avi", "rug_3.mov", "rug_4.avi", "rug_7.mkv", "pillow_0.mp4")),
+        *(("name", n) for n in ("nameless.avi", "rug_01.avi")),
+    }
+    warned = {(f.check, f.item) for f in findings if f.severity is WARNING}
+    assert ("spelling", "cotton_bal") in warned
+    assert ("frames that decode", "rug_5.avi") in warned
+    assert {"rug_6.avi", "sub/orange_0.avi"} & {f.item for f in of(findings, "same content")}
+    assert (("split", split) in errors) == (split in ("development", "nonsense"))
+    named = {(f.check, f.item) for f in check_folder(broken, catalogue)}
+    assert {e for e in errors if e[0] in ("name", "decodes")} <= named
+
+
+def test_a_copy_in_two_parts_of_real_files_is_an_error(tmp_path: Path, catalogue: Catalogue) -> None:
+    trained, tested = (
+        next(o for o, e in sorted(catalogue.objects.items()) if e.splits["paper"] == part)
+        for part in (Part.TRAIN, Part.TEST)
+    )
+    source = write_video(tmp_path / f"{trained}_0.avi", moving_square(12))
+    (tmp_path / f"{tested}_0.avi").write_bytes(source.read_bytes())
+    with_split = audit_folder(tmp_path, catalogue, SplitConfig(name="paper"))
+    assert [f.check for f in with_split if f.severity is ERROR] == ["same content"]
+    without = audit_folder(tmp_path, catalogue)
+    assert [f.severity for f in of(without, "same content")] == [WARNING, INFO]
+
+
+def test_sessions_of_a_list_are_taken_as_they_are_named(tmp_path: Path, catalogue: Catalogue) -> None:
+    listed = [("x.avi", "baseball", "monday"), ("y.avi", "potato", "tuesday"), ("z.avi", "bath_towel", "monday")]
+    for seed, (name, _, _) in enumerate(listed):
+        write_video(tmp_path / name, moving_square(12, seed))
+    lines = ["file,object_id,session", *(",".join(line) for line in listed)]
+    (tmp_path / "videos.csv").write_text("\n".join(lines) + "\n")
+    findings = audit_folder(tmp_path, catalogue, SplitConfig(name="paper"))
+    assert [f.item for f in of(findings, "session")] == ["monday", "tuesday"]
+    shared = of(findings, "session in two parts")
+    assert [(f.item, f.measured, f.severity) for f in shared] == [("monday", "1 train, 1 test", WARNING)]
+
+
+@pytest.mark.parametrize("make", [lambda folder: folder.mkdir(), lambda folder: None])
+def test_no_folder_or_an_empty_one_is_an_error_beside_the_labels(
+    tmp_path: Path, catalogue: Catalogue, make: object
+) -> None:
+    assert callable(make)
+    make(tmp_path / "videos")
+    findings = audit_folder(tmp_path / "videos", catalogue, SplitConfig(name="paper"))
+    assert [f.check for f in findings if f.severity is ERROR] == ["name"]
+    assert of(findings, "stated label"), "labels need no video"
+    assert [f.severity for f in check_folder(tmp_path / "videos", catalogue)] == [ERROR]
+
+
+def test_videos_without_motion_do_not_stop_the_audit(tmp_path: Path, catalogue: Catalogue) -> None:
+    for name, shade in (("rug_0", 90), ("potato_0", 91), ("lemon_0", 92)):
+        write_video(tmp_path / f"{name}.avi", [np.full((36, 48, 3), shade, np.uint8)] * 8)
+    findings = audit_folder(tmp_path, catalogue, SplitConfig(name="paper"))
+    assert not [f for f in findings if f.severity is ERROR]
+    assert len([f for f in of(findings, "contact") if f.severity is WARNING]) == 3
+
+
+def pressed(kind: str) -> list[np.ndarray]:
+    """Twenty-four frames in which something textured is pressed against a plain sensor at some time."""
+    ground = np.full((60, 80, 3), 100, np.uint8)
+    rng = np.random.default_rng(3)
+    grain = cv2.GaussianBlur(rng.normal(size=(60, 80)), (0, 0), 1.2)
+    grain = 60 * grain / np.abs(grain).max()
+    times = {"middle": range(8, 18), "end": range(8, 24), "start": range(14), "never": range(0)}[kind]
+    noise = rng.normal(0, 6, (24, 60, 80, 3))
+    return [
+        np.clip(ground + noise[t] + (grain[..., None] if t in times else 0), 0, 255).astype(np.uint8) for t in range(24)
+    ]
+
+
+def test_real_files_show_when_they_are_touched(tmp_path: Path, catalogue: Catalogue) -> None:
+    for number in range(4):
+        write_video(tmp_path / f"pillow_{number}.avi", pressed("middle"))
+    for name, kind in (("rug_0", "never"), ("rug_1", "end"), ("rug_2", "start")):
+        write_video(tmp_path / f"{name}.avi", pressed(kind))
+    found = {(f.check, f.item) for f in check_folder(tmp_path, catalogue) if f.check.startswith("contact")}
+    assert found == {
+        ("contact", "all"),
+        ("contact", "rug_0.avi"),
+        ("contact at the end", "rug_1.avi"),
+        ("contact at the start", "rug_2.avi"),
+    }
+
+
+def test_real_files_of_other_sizes_lengths_and_light(tmp_path: Path, catalogue: Catalogue) -> None:
+    for number in range(6):
+        write_video(tmp_path / f"pillow_{number}.avi", pressed("middle"))
+    write_video(tmp_path / "rug_0.avi", [f // 3 for f in pressed("middle")])
+    write_video(tmp_path / "rug_1.avi", pressed("middle")[:10])
+    write_video(tmp_path / "rug_2.avi", [cv2.resize(f, (160, 120)) for f in pressed("middle")])
+    frames = pressed("middle")
+    write_video(tmp_path / "rug_3.avi", [*frames[:12], *(f + np.uint8(40) for f in frames[12:])])
+    write_video(tmp_path / "rug_4.mkv", pressed("middle"))
+    write_video(tmp_path / "rug_5.avi", [np.where(np.arange(80)[:, None] < 20, 255, f) for f in frames])
+    found = {(f.check, f.item) for f in odd(check_folder(tmp_path, catalogue)) if f.item not in ("all",)}
+    assert found >= {
+        ("brightness", "rug_0.avi"),
+        ("length", "rug_1.avi"),
+        ("resolution", "160x120"),
+        ("brightness", "rug_3.avi"),
+        ("saturation", "rug_5.avi"),
+    }
+    assert not {item for check, item in found if check == "frames that decode"}, "Matroska promises no number of frames"
+
+
+def test_the_first_error_is_one_line() -> None:
+    def error(item: str) -> Finding:
+        return Finding(check="same content", item=item, measured="equal bytes with x", severity=ERROR)
+
+    mild = Finding(check="length", item="y", measured="3 frames", severity=WARNING)
+    stop_on_errors([mild], Path("data/audit/audit.csv"))
+    with pytest.raises(UserError) as one:
+        stop_on_errors([mild, error("a")], Path("data/audit/audit.csv"))
+    assert str(one.value) == "same content: a: equal bytes with x; all findings stand in data/audit/audit.csv"
+    with pytest.raises(UserError, match=r"^same content: a: .*2 more.*audit\.csv$") as several:
+        stop_on_errors([error("a"), error("b"), error("c")], Path("data/audit/audit.csv"))
+    assert "\n" not in str(several.value)
+    assert summary([mild, error("a"), error("b")]) == {"errors": 2, "warnings": 1}
+    assert [f.item for f in by_severity([mild, error("b"), error("a")])] == ["b", "a", "y"], "otherwise as found"
+
+
+@pytest.fixture
+def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """What the stage reads: parameters, measurements, a split, and files that only have to have names."""
+    params = fake_params("data.source=videos", f"data.dir='{tmp_path / 'videos'}'")
+    (tmp_path / "params.yaml").write_text(yaml.safe_dump(params.model_dump(mode="json"), sort_keys=False))
+    (tmp_path / "videos").mkdir()
+    monkeypatch.chdir(tmp_path)
+    fill(tmp_path, probes(2), GOOD_SPLIT)
+    return tmp_path
+
+
+def fill(root: Path, found: Sequence[Probe], parts: dict[str, Part]) -> None:
+    for p in found:
+        (root / "videos" / p.path).touch()
+    write_table(root / "data" / "frames" / "probes.parquet", Probe, found)
+    write_table(root / "data" / "videos.parquet", Video, [video(p) for p in found])
+    write_table(root / "data" / "splits.parquet", Assignment, assigned(found, parts))
+
+
+def run_stage() -> None:
+    runpy.run_path(str(ROOT / "stages" / "audit.py"), run_name="__main__")
+
+
+@pytest.mark.usefixtures("few_permutations")
+def test_the_gate_has_the_same_bytes_whatever_the_warnings(workplace: Path) -> None:
+    run_stage()
+    gate, table = workplace / "data" / "audit" / "passed", workplace / "data" / "audit" / "audit.csv"
+    before, findings = gate.read_bytes(), read_csv(table, Finding)
+    odd_ones = [probe(p.video_id, contact=0.1) if p.object_id == "rug" else p for p in probes(2)]
+    fill(workplace, odd_ones, GOOD_SPLIT)
+    run_stage()
+    assert gate.read_bytes() == before
+    assert len(odd(read_csv(table, Finding))) == len(odd(findings)) + 2
+    metrics = (workplace / "data" / "metrics" / "audit.json").read_text()
+    assert yaml.safe_load(metrics) == {"errors": 0, "warnings": len(odd(findings)) + 2}
+
+
+def test_an_error_stops_the_chain_in_one_line(workplace: Path) -> None:
+    fill(workplace, probes(2), {**GOOD_SPLIT, "rug_1": Part.TEST, "baseball_0": Part.TEST})
+    done = subprocess.run(
+        [sys.executable, ROOT / "stages" / "audit.py"],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        text=True,
+        capture_output=True,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert done.stderr.splitlines() == [
+        "audit: object in two parts: baseball: test, train (and 1 more); all findings stand in data/audit/audit.csv"
+    ]
+    assert not (workplace / "data" / "audit" / "passed").exists()
+    assert not (workplace / "data" / "metrics").exists()
+    with (workplace / "data" / "audit" / "audit.csv").open(newline="") as stream:
+        lines = list(csv.DictReader(stream))
+    assert [line["item"] for line in lines if line["severity"] == "error"] == ["baseball", "rug"]
+
+
+@pytest.mark.usefixtures("few_permutations")
+def test_the_chains_audit_and_the_folders_agree(tmp_path: Path, catalogue: Catalogue) -> None:
+    names = ("baseball", "potato", "rug")
+    for seed, name in enumerate(names):
+        write_video(tmp_path / f"{name}_0.avi", moving_square(20, seed))
+    both = [look_at(tmp_path / f"{n}_0.avi", f"{n}_0") for n in names]
+    parts = assigned([p for p, _ in both], {o: catalogue.objects[o].splits["paper"] for o in names})
+    chained = audit_chain(tmp_path, [p for p, _ in both], [v for _, v in both], parts, catalogue)
+    assert chained == audit_folder(tmp_path, catalogue, SplitConfig(name="paper"))
+
+
+def test_findings_survive_the_csv(tmp_path: Path) -> None:
+    findings = [Finding(check="a, b", item='c "d"', measured="e\tf|g", expected="", severity=WARNING)]
+    write_csv(tmp_path / "audit.csv", Finding, findings)
+    assert (tmp_path / "audit.csv").read_text().splitlines()[0] == "check,item,measured,expected,severity"
+    assert read_csv(tmp_path / "audit.csv", Finding) == findings
+
+
+# The public videos
+
+
+@pytest.fixture(scope="module")
+def public(real_data: Path, catalogue: Catalogue) -> list[Finding]:
+    return audit_folder(real_data, catalogue, SplitConfig(name="development"))
+
+
+@pytest.mark.real
+def test_the_public_videos_decode_and_none_is_a_copy(public: list[Finding]) -> None:
+    assert [f for f in public if f.severity is ERROR] == []
+    assert [f.measured for f in of(public, "frames that decode")] == ["0 of 370 videos differ from their header"]
+    assert [f.item for f in of(public, "same content")] == ["all"]
+    near = [f for f in of(public, "near-duplicate") if f.item != "all"]
+    assert odd(near) == []
+    assert all("the same object" in f.measured for f in near)
+
+
+@pytest.mark.real
+def test_odd_public_videos_are_found_without_being_told(public: list[Finding]) -> None:
+    short = {f.item: f.measured for f in of(odd(public), "length")}
+    assert short["hairbrush_bristles_side_4.mov"] == "3 frames"
+    assert short["tv_remote_back_3.mov"] == "7 frames"
+    assert set(short) == {"all", "hairbrush_bristles_side_4.mov", "tv_remote_back_3.mov"}
+    assert [(f.item, f.measured) for f in of(odd(public), "frame rate")] == [("10 frames/s", "66 videos")]
+    still = {f.item for f in of(public, "contact at the end")}
+    assert still >= {"scissor_handle_1.mov", "gauze_pad_0.mov"}
+    assert len(still) <= 15
+    unclear = {f.item.rpartition("_")[0] for f in of(odd(public), "contact")}
+    assert unclear >= {"cotton_ball", "sponge_soft"}
+    assert len(of(odd(public), "contact")) <= 25
+
+
+@pytest.mark.real
+def test_public_sessions_stand_in_two_parts_and_tell_the_hardness(public: list[Finding]) -> None:
+    shared = of(public, "session in two parts")
+    assert shared
+    assert {f.severity for f in shared} == {WARNING}
+    assert len(of(public, "session")) >= len(shared)
+    hardness = of(public, "predicted from the no-contact reference alone")[0]
+    assert hardness.item == "hardness"
+    assert hardness.severity is WARNING
+    share, p = map(float, re.findall(r"[\d.]+", hardness.measured))
+    mean, deviation = map(float, re.findall(r"\d+\.\d", hardness.expected))
+    assert share > mean + deviation
+    assert share == pytest.approx(52, abs=6)
+    assert mean == pytest.approx(40, abs=4)
+    assert p < leakage.ALPHA

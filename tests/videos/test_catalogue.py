@@ -1,0 +1,235 @@
+"""The catalogue against the paper's tables, and bad catalogues."""
+
+from __future__ import annotations
+
+import shutil
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from pipeline.errors import UserError
+from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.records import Part
+from tests.conftest import ROOT
+
+PHYSICLEAR = ROOT / "pipeline" / "physiclear"
+PAPER_TEST = {
+    "bath_towel",
+    "ice_block",
+    "clothes_peg",
+    "hairbrush_handle",
+    "microfiber_cloth",
+    "toilet_brush_bristles",
+    "hairbrush_bristles",
+}
+
+
+def members(catalogue: Catalogue, split: str, part: Part) -> set[str]:
+    return {o.object_id for o in catalogue.objects.values() if o.splits[split] == part}
+
+
+def test_objects_and_parts(catalogue: Catalogue) -> None:
+    assert len(catalogue.objects) == 74
+    counts = Counter(o.splits["paper"] for o in catalogue.objects.values())
+    assert counts == {Part.TRAIN: 60, Part.VALIDATION: 7, Part.TEST: 7}
+    assert members(catalogue, "paper", Part.TEST) == PAPER_TEST
+
+
+def test_release_split_differs_as_published(catalogue: Catalogue) -> None:
+    assert members(catalogue, "release", Part.TEST) == PAPER_TEST - {"ice_block", "clothes_peg"} | {"orange", "eraser"}
+    paper, release = (members(catalogue, s, Part.VALIDATION) for s in ("paper", "release"))
+    assert (paper - release, release - paper) == ({"bubble_wrap"}, {"lemon"})
+
+
+@pytest.mark.parametrize(
+    ("name", "counts"), [("hardness", (11, 31, 32)), ("roughness", (28, 23, 23)), ("bumpiness", (25, 38, 11))]
+)
+def test_class_counts_follow_from_the_ratings(catalogue: Catalogue, name: str, counts: tuple[int, ...]) -> None:
+    index = catalogue.property_index(name)
+    found = Counter(catalogue.labels(o)[index] for o in catalogue.objects)
+    assert tuple(found[level] for level in range(3)) == counts
+
+
+def test_a_mean_is_rounded_to_the_nearest_class(catalogue: Catalogue) -> None:
+    assert catalogue.objects["gauze_pad"].ratings[0] == (1, 2, 2)
+    assert catalogue.labels("gauze_pad")[0] == 2
+
+
+def test_every_object_has_three_raters_and_a_name_of_its_own(catalogue: Catalogue) -> None:
+    names = [o.name.lower() for o in catalogue.objects.values()]
+    assert len(set(names)) == len(names), "options of a matching question are told apart by name"
+    assert all(len(r) == 3 for o in catalogue.objects.values() for r in o.ratings)
+    assert all(o.material for o in catalogue.objects.values())
+
+
+def test_descriptions_name_every_class(catalogue: Catalogue) -> None:
+    assert catalogue.structured((2, 0, 0)) == "Overall, it presents a hard and smooth surface with no bumps."
+    assert catalogue.describe_one("gauze_pad", "hardness") == "Overall, it presents a hard surface."
+    for object_id in catalogue.objects:
+        assert catalogue.describe(object_id).endswith(catalogue.structured(catalogue.labels(object_id)))
+
+
+def test_phrases_are_told_apart(catalogue: Catalogue) -> None:
+    for p in catalogue.properties:
+        phrases = [phrase for level in p.phrases for phrase in level]
+        assert len(set(phrases)) == len(phrases)
+
+
+HEADER = "object_id,name,material,part_of,part,split_paper,split_release,hardness,roughness,bumpiness"
+GOOD = "ball,a ball,rubber,,,train,train,1 1 2,0 0 0,0 0 1"
+SHORT = "object_id,name,hardness,roughness,bumpiness"
+BALL = "ball,a ball,1 1 2,0,0 0 1"
+
+
+def write(folder: Path, *lines: str, described: Sequence[str] = (), encoding: str = "utf-8") -> Path:
+    """A catalogue with PhysiCLeAR's language and these lines."""
+    shutil.copy(PHYSICLEAR / "properties.yaml", folder)
+    (folder / "objects.csv").write_text("\n".join(lines) + "\n", encoding=encoding)
+    if described:
+        (folder / "descriptions.csv").write_text("\n".join(described) + "\n", encoding=encoding)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        ([HEADER], ["objects.csv", "no object"]),
+        ([""], ["objects.csv", "object_id", "missing"]),
+        ([HEADER.replace(",hardness", ""), GOOD], ["objects.csv", "hardness", "missing"]),
+        ([HEADER.replace(",", ";"), GOOD], ["objects.csv", "missing", "commas"]),
+        ([HEADER + ",hardness", GOOD + ",1"], ["hardness", "twice"]),
+        ([HEADER, GOOD, GOOD], ["line 3", "ball", "twice"]),
+        ([HEADER, GOOD, GOOD.replace("ball,a ball", "bowl,A Ball")], ["line 3", "A Ball", "name of ball"]),
+        ([HEADER, GOOD.replace("1 1 2", "1 1 3")], ["line 2", "hardness", "0 to 2"]),
+        ([HEADER, GOOD.replace("1 1 2", "-1")], ["line 2", "hardness", "0 to 2"]),
+        ([HEADER, GOOD.replace("1 1 2", "1.5")], ["line 2", "hardness", "0 to 2"]),
+        ([HEADER, GOOD.replace("1 1 2", "1 one 2")], ["line 2", "hardness"]),
+        ([HEADER, GOOD.replace("1 1 2", "")], ["line 2", "hardness"]),
+        ([HEADER, "ball,a ball"], ["line 2", "hardness"]),
+        ([HEADER, GOOD.replace("a ball", "a ball, red")], ["line 2", "11 fields for 10 columns", "quotation marks"]),
+        ([HEADER, GOOD.replace("train,train", "train,trian")], ["line 2", "split_release", "trian", "validation"]),
+        ([HEADER, GOOD.replace("a ball", "")], ["line 2", "name"]),
+        ([HEADER, "," + GOOD.partition(",")[2]], ["line 2", "object_id"]),
+        ([f"{SHORT},label_hardness", f"{BALL},3"], ["line 2", "label_hardness", "'3'", "0 to 2"]),
+        ([f"{SHORT},label_hardness", f"{BALL},1 2"], ["line 2", "label_hardness", "one number"]),
+        ([f"{SHORT},label_hardnes", f"{BALL},1"], ["objects.csv", "label_hardnes ", "no property"]),
+        ([f"{SHORT},split_kfold", f"{BALL},train"], ["split_kfold", "rename"]),
+        ([f"{SHORT},split_My own", f"{BALL},train"], ["split_My own", "small letter"]),
+    ],
+)
+def test_a_bad_table_is_one_clear_line(tmp_path: Path, lines: list[str], words: list[str]) -> None:
+    with pytest.raises(UserError) as caught:
+        load_catalogue(write(tmp_path, *lines))
+    message = str(caught.value)
+    assert "\n" not in message
+    assert all(word in message for word in words), message
+
+
+def test_a_table_of_what_is_needed_alone_will_do(tmp_path: Path) -> None:
+    loaded = load_catalogue(write(tmp_path, SHORT, BALL))
+    ball = loaded.objects["ball"]
+    assert (ball.material, ball.part_of, ball.part, ball.description, ball.splits) == ("", "", "", "", {})
+    assert ball.stated == (None, None, None)
+    assert ball.ratings == ((1, 1, 2), (0,), (0, 0, 1))
+    assert ball.labels == (1, 0, 0)
+    assert loaded.split_names == ()
+
+
+def test_what_publishers_add(tmp_path: Path) -> None:
+    lines = [f"label_roughness,{SHORT},label_hardness,split_mine,remark", f"2,{BALL},,validation,dented", f",{BALL}"]
+    lines[2] = lines[2].replace("ball,a ball", "bowl,a bowl")
+    described = ["description,object_id", '"Smooth, and soft.\nOld.",ball']
+    loaded = load_catalogue(write(tmp_path, *lines, described=described))
+    assert loaded.objects["ball"].stated == (None, 2, None)
+    assert loaded.labels("ball") == (1, 0, 0), "labels follow from the ratings, whatever is stated"
+    assert loaded.objects["bowl"].stated == (None, None, None)
+    assert loaded.objects["ball"].description == "Smooth, and soft.\nOld."
+    assert loaded.objects["bowl"].description == ""
+    assert [loaded.objects[o].splits for o in ("ball", "bowl")] == [{"mine": Part.VALIDATION}, {"mine": Part.UNUSED}]
+    assert loaded.split_names == ("mine",)
+
+
+def test_a_spreadsheet_s_csv_is_read(tmp_path: Path) -> None:
+    lines = [SHORT.replace(",", " , "), "", BALL.replace(",", ", "), ",,,,"]
+    loaded = load_catalogue(write(tmp_path, *lines, described=["object_id,description"], encoding="utf-8-sig"))
+    assert loaded.objects["ball"].name == "a ball"
+    write(tmp_path, SHORT, BALL.replace("a ball", "a käse"), encoding="latin-1")
+    with pytest.raises(UserError, match=r"objects\.csv.*UTF-8"):
+        load_catalogue(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("described", "words"),
+    [
+        (["object_id,text", "ball,round"], ["description", "missing"]),
+        (["object_id,description", "ball,round", "balll,round"], ["line 3", "'balll'", "objects.csv"]),
+        (["object_id,description", "ball,round", "ball,round"], ["line 3", "ball", "twice"]),
+        (["object_id,description", "ball,round, red"], ["line 2", "quotation marks"]),
+    ],
+)
+def test_a_bad_description_is_one_clear_line(tmp_path: Path, described: list[str], words: list[str]) -> None:
+    with pytest.raises(UserError) as caught:
+        load_catalogue(write(tmp_path, SHORT, BALL, described=described))
+    message = str(caught.value)
+    assert "\n" not in message
+    assert all(word in message for word in ["descriptions.csv", *words]), message
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"properties\.yaml.*data\.catalogue"):
+        load_catalogue(tmp_path)
+
+
+def test_broken_language_is_one_line(tmp_path: Path) -> None:
+    shutil.copy(PHYSICLEAR / "objects.csv", tmp_path)
+    for text in ("properties: [", "properties: []\nunstructured: x\nstructured: y\n", ""):
+        (tmp_path / "properties.yaml").write_text(text)
+        with pytest.raises(UserError, match=r"properties\.yaml") as caught:
+            load_catalogue(tmp_path)
+        assert "\n" not in str(caught.value)
+
+
+def change(**changes: object) -> Callable[[dict[str, Any]], None]:
+    """Set keys of the last property."""
+    return lambda language: language["properties"][-1].update(changes)
+
+
+@pytest.mark.parametrize(
+    ("edit", "words"),
+    [
+        (change(name="Bumps"), ["properties.2.name"]),
+        (change(name="combined"), ["combined", "rename"]),
+        (change(name="label_x"), ["label_x", "rename"]),
+        (change(name="hardness"), ["hardness", "twice"]),
+        (change(levels=["flat"]), ["properties.2.levels"]),
+        (change(levels=["flat", "bumpy"]), ["bumpiness", "phrases", "a level"]),
+        (change(levels=["flat", "hard to grip", "bumpy"]), ["hardness", "'hard'", "'hard to grip'"]),
+        (change(levels=["surface", "raised", "bumpy"]), ["bumpiness", "'surface'", "structured"]),
+        (change(cues=[["even"]]), ["bumpiness", "cues"]),
+        (change(cues=[["even"], [], ["small bumps"]]), ["bumpiness", "'small bumps'", "two levels"]),
+        (change(alone="Overall, it has bumps."), ["bumpiness", "alone", "{level}"]),
+        (change(colour="red"), ["properties.2.colour"]),
+        (lambda x: x.update(structured="It is {hardness}, {roughness}, {bumpiness}."), ["structured", "Overall"]),
+        (lambda x: x.update(unstructured="{hardness}, {roughness}, {bumpiness}, {warmth}."), ["warmth"]),
+        (lambda x: x.update(unstructured="{hardness}, {roughness}."), ["does not name bumpiness"]),
+        (lambda x: x.update(unstructured="{hardness, {roughness}, {bumpiness}"), ["properties.yaml"]),
+        (lambda x: x["scenarios"][0]["target"].update(warmth=[1]), ["stains", "warmth"]),
+        (lambda x: x["scenarios"][0]["target"].update(hardness=[3]), ["stains", "hardness", "0 to 2"]),
+    ],
+)
+def test_a_language_that_cannot_be_graded_is_refused(
+    tmp_path: Path, edit: Callable[[dict[str, Any]], None], words: list[str]
+) -> None:
+    language = yaml.safe_load((PHYSICLEAR / "properties.yaml").read_text())
+    edit(language)
+    write(tmp_path, SHORT, BALL)
+    (tmp_path / "properties.yaml").write_text(yaml.safe_dump(language))
+    with pytest.raises(UserError) as caught:
+        load_catalogue(tmp_path)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert all(word in message for word in words), message

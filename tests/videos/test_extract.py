@@ -1,0 +1,276 @@
+"""The extraction as a whole: what lies in its files, and how it goes on after a kill."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pipeline.parallel
+from pipeline.io import read_table
+from pipeline.errors import UserError
+from pipeline.videos.frames import extract
+from pipeline.videos.frames.extract import HEADER_BYTES, _header, _Pile
+from pipeline.videos.frames.fit import fit
+from pipeline.videos.frames.reference import reference_indices
+from pipeline.videos.frames.scan import Scan, scan
+from pipeline.videos.catalogue import Catalogue
+from pipeline.records import Finding, Frame, Probe
+from pipeline.config import FramesConfig
+from pipeline.videos.files import VideoFile
+from tests.conftest import moving_square, write_video
+from tests.frame_rules import CONFIG, FILES, Place, frames_of, luma, published, salience
+
+NAMES = ["baseball_0", "baseball_1", "baseball_10", "potato_0", "potato_2", "rug_0", "rug_1"]
+"""The videos of `tiny_videos`, sorted by object and number."""
+
+
+@pytest.fixture
+def place(tiny_videos: Path, tmp_path: Path, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> Place:
+    """A copy of the tiny videos whose scans are noted in a file: they run in other processes."""
+    shutil.copytree(tiny_videos, tmp_path / "my videos")
+    place = Place(tmp_path / "my videos", tmp_path, catalogue)
+
+    def noted(file: VideoFile, config: FramesConfig) -> Scan | Finding:
+        with place.log.open("a") as stream:
+            stream.write(file.video_id + "\n")
+        return scan(file, config)
+
+    monkeypatch.setattr(extract, "scan", noted)
+    return place
+
+
+def test_files_hold_what_the_table_says(place: Place) -> None:
+    found = place.extract()
+    assert read_table(place.out / "frames.parquet", Frame) == list(found.frames)
+    assert read_table(place.out / "probes.parquet", Probe) == list(found.probes)
+    pixels = np.load(place.out / "frames.npy", mmap_mode="r")
+    references = np.load(place.out / "references.npy", mmap_mode="r")
+    assert (pixels.shape, pixels.dtype) == ((len(found.frames), 16, 16, 3), np.uint8)
+    assert (references.shape, references.dtype) == ((7, 16, 16, 3), np.uint8)
+    assert [f.row for f in found.frames] == list(range(len(found.frames)))
+    assert [v.video_id for v in found.videos] == [p.video_id for p in found.probes] == NAMES
+    assert [v.frames for v in found.videos] == [12, 1, 3, 20, 9, 31, 7]
+    assert found.videos[-1].path == "sub folder é/rug_1.AVI"
+    for video, probe, reference in zip(found.videos, found.probes, references, strict=True):
+        path = place.folder / video.path
+        raw = frames_of(path)
+        own = [f for f in found.frames if f.video_id == video.video_id]
+        assert [(f.frame_index, f.score) for f in own] == salience(luma(path), "0.3")
+        for frame in own:
+            np.testing.assert_array_equal(pixels[frame.row], fit(raw[frame.frame_index], CONFIG))
+        if not probe.starts_touching:
+            first = [fit(raw[i], CONFIG).astype(float) for i in reference_indices(len(raw))]
+            np.testing.assert_array_equal(reference, np.rint(np.mean(first, axis=0)))
+        assert (video.width, video.height, video.fps) == (48, 36, 25.0)
+        assert video.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+        assert (probe.kept, probe.frames, probe.header_frames) == (len(own), video.frames, video.frames)
+    assert sorted(p.name for p in place.out.iterdir()) == sorted(FILES)
+    assert list(place.partial.iterdir()) == []
+
+
+def test_the_number_of_processes_changes_nothing(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pipeline.parallel, "cores", lambda: 1)
+    place.extract()
+    alone = place.bytes()
+    monkeypatch.setattr(pipeline.parallel, "cores", lambda: 5)
+    place.extract()
+    assert place.bytes() == alone
+
+
+def kill_after(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Interrupt the extraction when it puts the next video on the pile."""
+    add, added = _Pile.add, []
+
+    def until(self: _Pile, *args: object) -> None:
+        if len(added) == count:
+            raise KeyboardInterrupt
+        added.append(add(self, *args))  # type: ignore[arg-type, func-returns-value]
+
+    monkeypatch.setattr(_Pile, "add", until)
+
+
+@pytest.mark.parametrize("count", [0, 3, 6])
+@pytest.mark.parametrize("left", ["as it was", "pixels", "half a line", "a line without its end", "no line"])
+def test_a_killed_extraction_goes_on_where_it_was(
+    place: Place, count: int, left: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place.extract()
+    whole = place.bytes()
+    shutil.rmtree(place.out)
+    with monkeypatch.context() as patch:
+        kill_after(count, patch)
+        with pytest.raises(KeyboardInterrupt):
+            place.extract()
+    assert not place.out.exists()
+    (work,) = place.partial.iterdir()
+    lines = (work / "done.jsonl").read_bytes().splitlines(keepends=True)
+    assert len(lines) == count
+    finished = count
+    if left == "pixels":
+        for name in ("frames.npy", "references.npy"):
+            with (work / name).open("ab") as stream:
+                stream.write(b"left over")
+    elif left != "as it was" and lines:
+        cut = {"half a line": len(lines[-1]) // 2, "a line without its end": len(lines[-1]) - 1, "no line": 0}[left]
+        (work / "done.jsonl").write_bytes(b"".join(lines[:-1]) + lines[-1][:cut])
+        finished -= 1
+    place.decoded()
+    place.extract()
+    assert place.decoded() == sorted(NAMES[finished:])
+    assert place.bytes() == whole
+    assert list(place.partial.iterdir()) == []
+
+
+def test_twice_killed(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    place.extract()
+    whole = place.bytes()
+    for _ in range(2):
+        with monkeypatch.context() as patch:
+            kill_after(2, patch)
+            with pytest.raises(KeyboardInterrupt):
+                place.extract()
+    place.decoded()
+    place.extract()
+    assert (place.decoded(), place.bytes()) == (sorted(NAMES[4:]), whole)
+
+
+def test_a_kill_after_the_pixels_have_moved_leaves_no_black_pictures(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place.extract()
+    whole = place.bytes()
+
+    def full(*_: object) -> None:
+        raise OSError("disk full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(extract, "write_table", full)
+        with pytest.raises(OSError, match="disk full"):
+            place.extract()
+    place.extract()
+    assert place.bytes() == whole
+
+
+def test_what_changed_after_a_kill_is_read_anew(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        kill_after(5, patch)
+        with pytest.raises(KeyboardInterrupt):
+            place.extract()
+    place.decoded()
+    write_video(place.folder / "potato_0.avi", moving_square(15, 77))
+    found = place.extract()
+    assert place.decoded() == sorted(NAMES[3:]), "the changed video and all behind it"
+    assert found.videos[3].frames == 15
+    resumed = place.bytes()
+    place.extract()
+    assert place.bytes() == resumed
+
+
+def test_what_videos_csv_says_after_a_kill_counts(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    listed = place.folder / "videos.csv"
+    listed.write_text("file,object_id,session\nbaseball_0.avi,baseball,one\npotato_0.avi,potato,one\n")
+    with monkeypatch.context() as patch:
+        kill_after(1, patch)
+        with pytest.raises(KeyboardInterrupt):
+            place.extract()
+    listed.write_text("file,object_id,session\nbaseball_0.avi,baseball,two\npotato_0.avi,potato,one\n")
+    found = place.extract()
+    assert [p.session for p in found.probes] == ["two", "one"]
+
+
+def test_other_parameters_start_anew(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    place.extract(FramesConfig(size=32))
+    expected = place.bytes()
+    with monkeypatch.context() as patch:
+        kill_after(4, patch)
+        with pytest.raises(KeyboardInterrupt):
+            place.extract()
+    place.decoded()
+    place.extract(FramesConfig(size=32))
+    assert place.decoded() == NAMES
+    assert place.bytes() == expected
+    place.extract()
+    assert place.decoded() == NAMES[4:], "and what was killed waits"
+
+
+def test_a_file_that_went_away_after_a_kill_is_named(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    kill_after(3, monkeypatch)
+    with pytest.raises(KeyboardInterrupt):
+        place.extract()
+    path = place.folder / "baseball_1.avi"
+    path.unlink()
+    path.symlink_to(place.folder / "gone.avi")
+    with pytest.raises(UserError, match=r"baseball_1\.avi: unreadable"):
+        place.extract()
+
+
+def test_an_error_names_its_video_and_keeps_what_is_finished(place: Place) -> None:
+    (place.folder / "potato_1.mov").write_text("no video")
+    with pytest.raises(UserError, match=r"my videos/potato_1\.mov: no frame decodes"):
+        place.extract()
+    assert not place.out.exists()
+    (place.folder / "potato_1.mov").unlink()
+    place.decoded()
+    assert len(place.extract().videos) == 7
+    assert place.decoded() == NAMES[4:]
+
+
+def test_a_process_that_dies_is_an_error_that_names_the_place(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    def dying(file: VideoFile, config: FramesConfig) -> Scan | Finding:
+        if file.video_id == "potato_0":
+            os._exit(9)
+        return scan(file, config)
+
+    monkeypatch.setattr(extract, "scan", dying)
+    monkeypatch.setattr(pipeline.parallel, "cores", lambda: 1)
+    with pytest.raises(UserError, match=r"a process died at or soon after [a-z_0-9]+\.avi; .*Run again") as caught:
+        place.extract()
+    assert "\n" not in str(caught.value)
+    monkeypatch.setattr(extract, "scan", scan)
+    assert len(place.extract().videos) == 7
+
+
+def test_short_videos_are_left_out_by_the_published_rule(place: Place, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        found = place.extract(FramesConfig(size=16, selection="release"))
+    assert [v.video_id for v in found.videos] == ["potato_0", "rug_0"]
+    assert [p.video_id for p in found.probes] == NAMES
+    assert [p.kept for p in found.probes] == [0, 0, 0, 6, 0, 9, 0]
+    assert len([r for r in caplog.records if "too few" in r.message]) == 5
+    for video in found.videos:
+        own = [(f.frame_index, int(f.score)) for f in found.frames if f.video_id == video.video_id]
+        assert own == published(place.folder / video.path, video.frames)
+    assert len(np.load(place.out / "references.npy")) == 2
+
+
+def test_nothing_to_keep_is_an_error(tmp_path: Path, catalogue: Catalogue) -> None:
+    place = Place(tmp_path / "v", tmp_path, catalogue)
+    write_video(place.folder / "rug_0.avi", moving_square(3))
+    with pytest.raises(UserError, match=r"no video has a frame to keep; choose another frames\.selection"):
+        place.extract(FramesConfig(size=16, selection="release"))
+    assert not place.out.exists()
+
+
+@pytest.mark.parametrize("size", [16, 99, 100, 224, 999, 1000, 1024])
+@pytest.mark.parametrize("count", [0, 1, 999, 10**9])
+def test_headers_are_of_one_length(tmp_path: Path, size: int, count: int) -> None:
+    header = _header((count, size, size, 3))
+    assert len(header) == HEADER_BYTES
+    if count < 1000 and size < 100:
+        (tmp_path / "x.npy").write_bytes(header + bytes(count * size * size * 3))
+        assert np.load(tmp_path / "x.npy").shape == (count, size, size, 3)
+
+
+def test_objects_outside_the_catalogue_cost_one_line(place: Place, caplog: pytest.LogCaptureFixture) -> None:
+    for name in ("yoyo_0", "yoyo_1", "kite_0"):
+        shutil.copy(place.folder / "potato_0.avi", place.folder / f"{name}.avi")
+    with caplog.at_level(logging.WARNING):
+        assert len(place.extract().videos) == 7
+    (record,) = [r for r in caplog.records if r.levelno == logging.WARNING]
+    assert "3 videos of 2 objects" in record.getMessage()

@@ -1,0 +1,272 @@
+"""Which frames are kept, by every rule, against slow second implementations."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.videos.decoding import Decoder, Header, picture
+from pipeline.videos.frames import selection
+from pipeline.videos.frames.probing import Course, run_pass
+from pipeline.videos.frames.fit import fit
+from pipeline.videos.frames.reference import reference_indices, strength, thumbnail
+from pipeline.videos.frames.selection import TOUCHING, Kept, Pool, difference, kept_count, thin, uniform_indices
+from pipeline.config import FramesConfig
+from tests.conftest import encode, moving_square, write_video
+from tests.frame_rules import CONFIG, constant, frames_of, luma, pillow, pressing, published, salience
+
+
+def flashing(count: int) -> list[np.ndarray]:
+    """Black and white by turns: uint8 arithmetic would wrap 0 - 255 around to 1."""
+    return [np.full((30, 40, 3), 255 * (i % 2), np.uint8) for i in range(count)]
+
+
+def chosen(course: Course) -> list[tuple[int, float]]:
+    return [(k.index, k.score) for k in course.kept]
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [moving_square(40), moving_square(3), flashing(11), constant(9), moving_square(1), moving_square(9, 1, 98, 17)],
+)
+@pytest.mark.parametrize("fraction", ["0.01", "0.07", "0.3", "1.0"])
+def test_salience_equals_the_reference(tmp_path: Path, frames: list[np.ndarray], fraction: str) -> None:
+    path = write_video(tmp_path / "v.avi", frames)
+    course = run_pass(path, FramesConfig(size=16, fraction=float(fraction)))
+    assert course.frames == len(frames)
+    assert chosen(course) == salience(luma(path), fraction)
+    for kept in course.kept:
+        np.testing.assert_array_equal(kept.image, fit(frames_of(path)[kept.index], CONFIG))
+
+
+values_and_count = st.integers(1, 30).flatmap(
+    lambda n: st.tuples(st.lists(st.sampled_from([0, 1, 127, 255]), min_size=n, max_size=n), st.integers(1, n))
+)
+
+
+@given(values_and_count)
+def test_ties_go_to_the_earlier_frame(case: tuple[list[int], int]) -> None:
+    scores, capacity = case
+    pool = Pool(capacity, CONFIG)
+    frame = av.VideoFrame.from_ndarray(np.full((24, 16), 128, np.uint8), format="yuv420p")
+    for index, score in enumerate(scores):
+        pool.offer(score, index, frame)
+    best = sorted(sorted(range(len(scores)), key=lambda i: -scores[i])[:capacity])
+    assert [(k.index, k.score) for k in pool.kept()] == [(i, scores[i]) for i in best]
+
+
+def test_a_pool_of_nothing_keeps_nothing() -> None:
+    pool = Pool(0, CONFIG)
+    pool.offer(1.0, 0, av.VideoFrame(16, 16, "yuv420p"))
+    assert pool.kept() == []
+
+
+@pytest.mark.parametrize("name", ["salient", "release", "contact", "adaptive", "uniform"])
+def test_what_is_held_in_memory_changes_nothing(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_video(tmp_path / "v.avi", pressing(40))
+    config = FramesConfig(size=16, selection=name)
+    held = run_pass(path, config).kept
+    monkeypatch.setattr(selection, "HELD_BYTES", 0)
+    at_once = run_pass(path, config).kept
+    assert [(k.index, k.score) for k in held] == [(k.index, k.score) for k in at_once]
+    for one, other in zip(held, at_once, strict=True):
+        np.testing.assert_array_equal(one.image, other.image)
+
+
+def test_what_stands_behind_a_lines_end_does_not_count() -> None:
+    white, padded = np.full((30, 40), 255, np.uint8), np.zeros((30, 64), np.uint8)
+    padded[:, 40:] = 99
+    assert difference(padded[:, :40], white) == 255 * 30 * 40
+
+
+@given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**32))
+def test_differences_are_exact(height: int, width: int, seed: int) -> None:
+    one, other = np.random.default_rng(seed).integers(0, 256, (2, height, width), np.uint8)
+    assert difference(one, other) == np.abs(one.astype(np.int64) - other).sum()
+
+
+@pytest.mark.parametrize(("frames", "fraction", "count"), [(1, 0.3, 1), (2, 0.3, 1), (3, 0.3, 1), (101, 0.3, 30)])
+def test_top_thirty_percent(frames: int, fraction: float, count: int) -> None:
+    assert kept_count(frames, FramesConfig(fraction=fraction)) == count
+
+
+def test_the_fraction_is_taken_as_written() -> None:
+    assert math.ceil(0.07 * 100) == 8, "what floating point would say"
+    assert kept_count(101, FramesConfig(fraction=0.07)) == 7
+    assert kept_count(100, FramesConfig(fraction=0.07, selection="uniform")) == 7
+    assert int(0.29 * 100) == 28 == kept_count(100, FramesConfig(fraction=0.29, selection="release")), "as published"
+
+
+@given(st.integers(2, 2000), st.floats(0.001, 1), st.sampled_from(["salient", "uniform", "contact", "adaptive"]))
+def test_as_many_as_the_fraction_rounded_up(frames: int, fraction: float, name: str) -> None:
+    count = kept_count(frames, FramesConfig(fraction=fraction, selection=name))
+    candidates = frames - (name == "salient")
+    assert 1 <= count <= candidates
+    assert count - 1 < Fraction(str(fraction)) * candidates <= count
+
+
+@pytest.mark.parametrize("count", [1, 3, 16, 17, 40])
+@pytest.mark.parametrize("header", [-14, 0, 7])
+@pytest.mark.parametrize("make", [moving_square, pressing, constant])
+def test_the_published_rule(
+    tmp_path: Path, count: int, header: int, make: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert callable(make)
+    path = write_video(tmp_path / "v.avi", make(count))
+    promised = max(1, count + header)
+    config = FramesConfig(size=16, selection="release")
+    course = run_pass(path, config, promised)
+    assert chosen(course) == published(path, promised)
+    for kept in course.kept:
+        np.testing.assert_array_equal(kept.image, fit(frames_of(path)[kept.index], config))
+
+
+@given(st.integers(1, 500), st.integers(1, 500))
+def test_uniform_places(frames: int, count: int) -> None:
+    count = min(frames, count)
+    places = uniform_indices(frames, count)
+    assert len(set(places)) == count
+    assert places == sorted(places)
+    if count == 1:
+        assert places == [frames // 2]
+    else:
+        exact = np.linspace(0, frames - 1, count)
+        assert (places[0], places[-1]) == (0, frames - 1)
+        assert np.abs(np.array(places) - exact).max() < 1
+        assert np.ptp(np.diff(places)) <= 1
+
+
+@pytest.mark.parametrize(("count", "fraction"), [(1, 0.3), (2, 0.3), (7, 0.3), (30, 0.1), (30, 1.0)])
+def test_uniform_frames(tmp_path: Path, count: int, fraction: float) -> None:
+    path = write_video(tmp_path / "v.avi", moving_square(count))
+    config = FramesConfig(size=16, selection="uniform", fraction=fraction)
+    kept = run_pass(path, config).kept
+    assert [k.index for k in kept] == uniform_indices(count, kept_count(count, config))
+    for k in kept:
+        np.testing.assert_array_equal(k.image, fit(frames_of(path)[k.index], config))
+
+
+def strengths(path: Path) -> list[float]:
+    """Strength of contact of every frame by its definition, in float64; those of the reference count as untouched."""
+    thumbs = [thumbnail(frame).astype(np.float64) for frame in frames_of(path)]
+    first = reference_indices(len(thumbs))
+    still = np.rint(np.mean([thumbs[i] for i in first], axis=0))
+    return [
+        -1.0 if i <= first[-1] else np.abs(t - still).mean() - np.abs((t - still).mean(axis=(0, 1))).mean()
+        for i, t in enumerate(thumbs)
+    ]
+
+
+@pytest.mark.parametrize("fraction", [0.05, 0.3])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_contact_frames_are_those_most_unlike_the_reference(tmp_path: Path, fraction: float, seed: int) -> None:
+    path = write_video(tmp_path / "v.avi", pressing(50, seed))
+    course = run_pass(path, FramesConfig(size=16, selection="contact", fraction=fraction))
+    expected = strengths(path)
+    best = sorted(sorted(range(50), key=lambda i: -expected[i])[: math.ceil(fraction * 50)])
+    assert [k.index for k in course.kept] == best
+    assert [k.score for k in course.kept] == pytest.approx([expected[i] for i in best], abs=1e-9)
+    assert course.contact == pytest.approx(max(expected), abs=1e-9)
+
+
+def gap(one: Kept, other: Kept) -> float:
+    assert one.thumb is not None
+    assert other.thumb is not None
+    return strength(one.thumb, other.thumb)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("tolerance", [0.0, 0.3, 0.7, 2.0])
+def test_adaptive_frames_cover_the_contact_and_differ_from_each_other(
+    tmp_path: Path, seed: int, tolerance: float
+) -> None:
+    path = write_video(tmp_path / "v.avi", pressing(60, seed))
+    # At no tolerance at all, nothing that is in contact is thinned out but what noise could have made.
+    pool = run_pass(path, FramesConfig(size=16, selection="adaptive", tolerance=0.0)).kept
+    course = run_pass(path, FramesConfig(size=16, selection="adaptive", tolerance=tolerance))
+    noise = min(course.strengths)
+    reach = max(k.score for k in pool) - noise
+    near = tolerance * reach + math.sqrt(2) * noise
+    taken = {k.index: k for k in course.kept}
+    assert list(taken) == sorted(taken)
+    assert set(taken) <= {k.index for k in pool}
+    assert len(taken) <= kept_count(60, FramesConfig())
+    assert all(k.score - noise >= TOUCHING * reach for k in course.kept)
+    assert all(gap(a, b) > near for a, b in itertools.combinations(taken.values(), 2))
+    assert all(min(gap(k, t) for t in taken.values()) <= near for k in pool if k.index not in taken)
+
+
+@given(st.integers(1, 12), st.integers(0, 2**32), st.floats(0, 3), st.floats(0, 20))
+def test_what_is_thinned_out_looks_like_what_is_left(count: int, seed: int, tolerance: float, noise: float) -> None:
+    rng = np.random.default_rng(seed)
+    kept = made_up(
+        [rng.integers(0, 256, (4, 5, 3), np.uint8) for _ in range(count)], rng.uniform(0, 60, count).tolist()
+    )
+    taken = thin(kept, tolerance, noise)
+    reach = max(0.0, max(k.score for k in kept) - noise)
+    near = tolerance * reach + math.sqrt(2) * noise
+    assert [k.index for k in taken] == sorted({k.index for k in taken})
+    assert all(gap(a, b) > near - 1e-9 for a, b in itertools.combinations(taken, 2))
+    for k in kept:
+        if k not in taken and k.score - noise >= TOUCHING * reach:
+            assert min(gap(k, t) for t in taken) <= near + 1e-9
+
+
+def made_up(thumbs: Sequence[np.ndarray], scores: Sequence[float]) -> list[Kept]:
+    return [Kept(i, s, np.zeros((1, 1, 3), np.uint8), t) for i, (t, s) in enumerate(zip(thumbs, scores, strict=True))]
+
+
+@given(st.integers(1, 12), st.integers(0, 2**32), st.floats(0, 3), st.floats(0, 3), st.floats(0, 20))
+def test_less_tolerance_keeps_more(count: int, seed: int, one: float, other: float, noise: float) -> None:
+    """Whatever is taken, a lower tolerance takes it too: it goes on where the higher one stopped."""
+    rng = np.random.default_rng(seed)
+    thumbs = [rng.integers(0, 256, (4, 5, 3), np.uint8) for _ in range(count)]
+    kept = made_up(thumbs, rng.uniform(0, 60, count).tolist())
+    less, more = sorted((one, other))
+    wide, narrow = ({k.index for k in thin(kept, t, noise)} for t in (less, more))
+    assert narrow <= wide
+    strongest = max(kept, key=lambda k: k.score)
+    assert strongest.index in narrow
+    reach = max(0.0, strongest.score - noise)
+    assert all(kept[i].score - noise >= TOUCHING * reach for i in wide - {strongest.index})
+
+
+@pytest.mark.parametrize("name", ["contact", "adaptive", "uniform", "salient"])
+@pytest.mark.parametrize("frames", [constant(30), constant(30, 0), constant(30, 255), constant(1), constant(2)])
+def test_without_contact_something_is_kept(tmp_path: Path, name: str, frames: list[np.ndarray]) -> None:
+    path = write_video(tmp_path / "v.avi", frames)
+    config = FramesConfig(size=16, selection=name)
+    kept = run_pass(path, config).kept
+    assert 1 <= len(kept) <= kept_count(len(frames), config)
+    assert all(k.score == 0 for k in kept)
+    if name == "adaptive":
+        assert len(kept) == 1, "more of the same adds nothing"
+
+
+def test_a_header_without_a_number_of_frames(tmp_path: Path) -> None:
+    path = encode(tmp_path / "v.mkv", pressing(12))
+    assert Decoder(path).header == Header(0, 25.0)
+    for name in ("salient", "uniform", "contact", "adaptive"):
+        assert len(run_pass(path, FramesConfig(size=16, selection=name)).kept) == 1
+    assert run_pass(path, FramesConfig(size=16, selection="release")).kept == []
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("name", ["hairbrush_bristles_side_4", "tv_remote_back_3", "rice_spatula_base_1"])
+def test_real_frames(real_data: Path, name: str) -> None:
+    path = real_data / f"{name}.mov"
+    assert chosen(run_pass(path, FramesConfig(size=64))) == salience(luma(path), "0.3")
+    promised = Decoder(path).header.frames
+    assert chosen(run_pass(path, FramesConfig(size=64, selection="release"))) == published(path, promised)
+    for frame in frames_of(path)[::40]:
+        expected = pillow(picture(frame)[..., ::-1], 64, "crop").astype(int)
+        assert np.abs(fit(frame, FramesConfig(size=64)).astype(int) - expected).mean() < 1.5

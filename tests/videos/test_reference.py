@@ -1,0 +1,208 @@
+"""The no-contact reference, the strength of contact, and pictures of the difference, against float64."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.videos.decoding import Decoder, brightness
+from pipeline.videos.frames.fit import fit
+from pipeline.videos.frames.reference import LONGEST, MOST_FRAMES, reference_indices, starts_touching, strength, thumbnail
+from pipeline.videos.frames.scan import Scan, scan
+from pipeline.videos.frames.subtraction import subtract
+from pipeline.config import FramesConfig
+from pipeline.videos.files import VideoFile
+from tests.conftest import encode, write_video
+
+WIDTH, HEIGHT = 160, 120
+
+
+def film(depths: list[float], seed: int = 0, light: list[float] | None = None) -> list[np.ndarray]:
+    """A pattern of bumps pressed as deep as `depths` says, under a light that is `light` steps brighter."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
+    bumps = np.sin(x / 4) * np.sin(y / 4) * np.exp(-(((x - 80) / 40) ** 2) - ((y - 60) / 30) ** 2)
+    frames = []
+    for depth, more in zip(depths, light or [0.0] * len(depths), strict=True):
+        grey = 110 + 25 * x / WIDTH + depth * bumps + more + rng.normal(0, 0.5, x.shape)
+        frames.append(np.clip(np.stack([grey - 20, grey, grey + 15], axis=2), 0, 255).astype(np.uint8))
+    return frames
+
+
+def scanned(path: Path, frames: list[np.ndarray], name: str = "contact") -> Scan:
+    write_video(path, frames)
+    found = scan(VideoFile(path, path.name, "rug", "rug_0"), FramesConfig(size=32, selection=name))
+    assert isinstance(found, Scan)
+    return found
+
+
+def rise(count: int) -> list[float]:
+    """Untouched for a fifth of the time, then contact to the end."""
+    return [90 * max(0.0, (i / count - 0.2) / 0.8) for i in range(count)]
+
+
+@given(st.integers(0, 5000))
+def test_the_reference_spans_a_tenth_at_most(frames: int) -> None:
+    indices = reference_indices(frames)
+    assert indices[0] == 0
+    assert 1 <= len(indices) <= MOST_FRAMES
+    assert indices[-1] < max(1, min(LONGEST, frames // 10))
+    assert len(set(np.diff(indices).tolist())) <= 1
+
+
+@pytest.mark.parametrize(("count", "expected"), [(1, (0,)), (3, (0,)), (50, (0, 2, 4)), (126, (0, 2, 4, 6))])
+def test_the_reference_of_usual_lengths(tmp_path: Path, count: int, expected: tuple[int, ...]) -> None:
+    """50 and 126 frames: five seconds at 10 and 25 frames a second."""
+    assert reference_indices(count) == expected
+    path = tmp_path / "v.avi"
+    found = scanned(path, film(rise(count)))
+    with Decoder(path) as decoder:
+        fitted = [fit(frame, FramesConfig(size=32)).astype(np.float64) for frame in decoder.frames()]
+    np.testing.assert_array_equal(found.reference, np.rint(np.mean([fitted[i] for i in expected], axis=0)))
+    assert not found.probe.starts_touching
+    if count > 3:
+        assert found.probe.contact_end > 2
+        assert found.probe.contact == pytest.approx(found.probe.contact_end, rel=0.2)
+        assert found.probe.quiet < 1
+
+
+@pytest.mark.parametrize("count", [12, 50, 126])
+@pytest.mark.parametrize("name", ["salient", "contact", "adaptive"])
+def test_a_video_that_starts_in_contact_takes_its_reference_from_the_end(tmp_path: Path, count: int, name: str) -> None:
+    backward = rise(count)[::-1]
+    found = scanned(tmp_path / "back.avi", film(backward), name)
+    still = scanned(tmp_path / "still.avi", film([0.0] * count, seed=1))
+    assert found.probe.starts_touching
+    assert not still.probe.starts_touching
+    assert np.abs(found.reference.astype(int) - still.reference).mean() < 1.5, "no trace of contact"
+    assert found.probe.contact_end < 1 < 2 < found.probe.contact
+    if name != "salient":
+        assert found.kept[0].index <= 1, "contact is strongest in the first frames"
+        assert max(k.score for k in found.kept) == pytest.approx(found.probe.contact)
+
+
+def test_contact_throughout_is_not_taken_for_a_start_in_contact(tmp_path: Path) -> None:
+    found = scanned(tmp_path / "v.avi", film([80.0] * 40))
+    assert not found.probe.starts_touching
+    assert found.probe.contact < 1
+
+
+def test_a_step_of_the_light_is_no_contact(tmp_path: Path) -> None:
+    light = [0.0] * 25 + [12.0] * 25
+    found = scanned(tmp_path / "light.avi", film([0.0] * 50, light=light))
+    without = scanned(tmp_path / "dark.avi", film([0.0] * 50))
+    touched = scanned(tmp_path / "touched.avi", film(rise(50)))
+    assert found.probe.brightness_step == pytest.approx(12, abs=1)
+    assert without.probe.brightness_step < 0.5
+    assert found.probe.contact < without.probe.contact + 0.5 < touched.probe.contact / 3
+
+
+thumbs = st.tuples(st.integers(1, 12), st.integers(1, 12), st.integers(0, 2**32)).map(
+    lambda case: np.random.default_rng(case[2]).integers(0, 256, (2, case[0], case[1], 3), np.uint8)
+)
+
+
+@given(thumbs)
+def test_strength_is_its_definition(pair: np.ndarray) -> None:
+    one, other = pair.astype(np.float64)
+    change = one - other
+    expected = np.abs(change).mean() - np.abs(change.mean(axis=(0, 1))).mean()
+    assert strength(pair[0], pair[1]) == pytest.approx(expected, abs=1e-9)
+    assert strength(pair[0], pair[1]) == strength(pair[1], pair[0]) >= 0
+    assert strength(pair[0], pair[0]) == 0
+
+
+@given(thumbs, st.tuples(*[st.integers(-60, 60)] * 3), st.integers(0, 60))
+def test_light_alone_has_no_strength(pair: np.ndarray, shift: tuple[int, int, int], depth: int) -> None:
+    still = (60 + pair[0] % 130).astype(np.uint8)
+    assert strength((still.astype(int) + shift).astype(np.uint8), still) == pytest.approx(0, abs=1e-9)
+    touched = still.copy()
+    touched[0, 0, 0] += depth
+    assert strength(touched, still) <= depth / still[..., 0].size + 1e-9
+
+
+def test_detail_starts_the_decision() -> None:
+    flat, dotted = np.full((60, 80, 3), 90, np.uint8), np.full((60, 80, 3), 90, np.uint8)
+    dotted[::6, ::6] = 160
+    assert starts_touching(dotted, flat)
+    for first, last in ((flat, dotted), (flat, flat), (dotted, dotted), (dotted, dotted + np.uint8(20))):
+        assert not starts_touching(first, last)
+
+
+@pytest.mark.parametrize(("height", "width"), [(240, 320), (17, 97), (1, 9), (1, 1), (600, 4), (13, 17)])
+def test_thumbnails_keep_the_shape(tmp_path: Path, height: int, width: int) -> None:
+    picture = np.full((height, width, 3), 128, np.uint8)
+    with Decoder(encode(tmp_path / "v.mkv", [picture], "ffv1", "yuv420p")) as decoder:
+        frame = next(decoder.frames())
+        thumb = thumbnail(frame)
+        assert thumb.shape == (
+            max(1, round(80 * min(1, height / width))),
+            max(1, round(80 * min(1, width / height))),
+            3,
+        )
+        assert (thumb[..., 0] == brightness(frame)[0, 0]).all()
+
+
+def slow(frame: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Pixel by pixel in floats: twice the difference less its median over the outer eighth, about 128."""
+    height, width, channels = frame.shape
+    shown = np.zeros(frame.shape)
+    top, left = max(1, height // 8), max(1, width // 8)
+    for c in range(channels):
+        change = [[float(frame[y, x, c]) - float(reference[y, x, c]) for x in range(width)] for y in range(height)]
+        ring = sorted(
+            change[y][x]
+            for y in range(height)
+            for x in range(width)
+            if y < top or y >= height - top or x < left or x >= width - left
+        )
+        middle = (ring[(len(ring) - 1) // 2] + ring[len(ring) // 2]) / 2
+        for y, x in itertools.product(range(height), range(width)):
+            shown[y, x, c] = min(255.0, max(0.0, 128 + 2 * (change[y][x] - math.floor(middle + 0.5))))
+    return shown
+
+
+sides = st.tuples(st.integers(1, 20), st.integers(1, 20), st.integers(0, 2**32), st.sampled_from([3, 40, 256]))
+pairs = sides.map(
+    lambda case: np.random.default_rng(case[2]).integers(0, case[3], (3, case[0], case[1], 3)).astype(np.uint8)
+)
+
+
+@given(pairs)
+def test_subtraction_equals_the_slow_one(pictures: np.ndarray) -> None:
+    found = subtract(pictures[:2], pictures[2])
+    assert (found.dtype, found.shape) == (np.uint8, pictures[:2].shape)
+    for frame, shown in zip(pictures[:2], found, strict=True):
+        np.testing.assert_array_equal(shown, slow(frame, pictures[2]))
+
+
+@given(pairs)
+def test_what_does_not_differ_is_exactly_grey(pictures: np.ndarray) -> None:
+    assert (subtract(pictures[2:], pictures[2]) == 128).all()
+
+
+@given(pairs, st.tuples(*[st.integers(-50, 50)] * 3))
+def test_a_change_of_the_light_changes_no_picture(pictures: np.ndarray, shift: tuple[int, int, int]) -> None:
+    dim = (60 + pictures % 140).astype(np.uint8)
+    brighter = (dim[:2].astype(int) + shift).astype(np.uint8)
+    np.testing.assert_array_equal(subtract(brighter, dim[2]), subtract(dim[:2], dim[2]))
+
+
+@pytest.mark.parametrize("side", [1, 2, 3, 7, 8, 64])
+def test_nothing_wraps_around(side: int) -> None:
+    black, white = np.zeros((side, side, 3), np.uint8), np.full((side, side, 3), 255, np.uint8)
+    assert (subtract(black[None], white) == 128).all(), "all of it is taken for light"
+    assert subtract(black[:0].reshape(0, side, side, 3), white).shape == (0, side, side, 3)
+    if side > 4:
+        spot = black.copy()
+        spot[side // 2, side // 2] = 255
+        bright, dark = subtract(spot[None], black)[0], subtract(black[None], spot)[0]
+        assert (bright[side // 2, side // 2] == 255).all()
+        assert (dark[side // 2, side // 2] == 0).all()
+        assert (np.delete(bright.reshape(-1, 3), side // 2 * side + side // 2, axis=0) == 128).all()

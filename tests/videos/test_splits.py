@@ -1,0 +1,162 @@
+"""Splits: a partition by object, with nothing leaking between parts."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.errors import UserError
+from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.records import Part
+from pipeline.config import SplitConfig
+from pipeline.videos.split import Split, assign, check_split
+from tests.conftest import ROOT, fake_videos
+
+CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")
+OBJECTS = sorted(CATALOGUE.objects)
+NAMES = ["paper", "release", "development", "kfold"]
+TRAIN = {o for o in OBJECTS if CATALOGUE.objects[o].splits["paper"] == Part.TRAIN}
+
+
+def objects_of(split: Split, part: Part) -> set[str]:
+    return {a.object_id for a in split.assignments if a.part == part}
+
+
+@given(
+    st.sampled_from(NAMES), st.integers(0, 2**31 - 1), st.sets(st.sampled_from(OBJECTS), min_size=60), st.integers(0, 4)
+)
+def test_every_video_has_one_part_and_every_object_too(name: str, seed: int, objects: set[str], fold: int) -> None:
+    videos = fake_videos(sorted(objects), 2)
+    config = SplitConfig(name=name, seed=seed, fold=fold)
+    split = assign(CATALOGUE, videos, config)
+    assert [a.video_id for a in split.assignments] == [v.video_id for v in videos]
+    parts = defaultdict(set)
+    for a in split.assignments:
+        parts[a.object_id].add(a.part)
+    assert all(len(p) == 1 for p in parts.values())
+    parts = {o: {a.part for a in split.assignments if a.object_id == o} for o in objects}
+    assert all(len(where) == 1 for where in parts.values())
+    assert split == assign(CATALOGUE, videos, config)
+    present = {v.object_id for v in videos}
+    for part, missing in split.missing.items():
+        assert part in (Part.VALIDATION, Part.TEST)
+        assert not present & set(missing)
+    assert set(split.missing) == {Part.VALIDATION, Part.TEST}
+
+
+@given(st.integers(3, 50), st.integers(0, 2**31 - 1), st.sets(st.sampled_from(OBJECTS), min_size=3))
+def test_kfold_tests_every_object_once(folds: int, seed: int, objects: set[str]) -> None:
+    videos = fake_videos(sorted(objects), 1)
+    if len(objects) < folds:
+        with pytest.raises(UserError, match=r"split\.folds"):
+            assign(CATALOGUE, videos, SplitConfig(name="kfold", folds=folds, seed=seed))
+        return
+    tested: Counter[str] = Counter()
+    validated: Counter[str] = Counter()
+    for fold in range(folds):
+        split = assign(CATALOGUE, videos, SplitConfig(name="kfold", folds=folds, fold=fold, seed=seed))
+        tested.update(objects_of(split, Part.TEST))
+        validated.update(objects_of(split, Part.VALIDATION))
+        assert len(objects_of(split, Part.TEST)) in (len(objects) // folds, -(-len(objects) // folds))
+    assert tested == validated == Counter(objects)
+
+
+@pytest.mark.parametrize("name", ["paper", "release"])
+def test_published_splits_follow_the_catalogue(name: str) -> None:
+    split = assign(CATALOGUE, fake_videos(OBJECTS), SplitConfig(name=name))
+    for part in Part:
+        assert objects_of(split, part) == {o for o in OBJECTS if CATALOGUE.objects[o].splits[name] == part}
+    assert split.missing == {Part.VALIDATION: (), Part.TEST: ()}
+
+
+@settings(max_examples=25)
+@given(st.integers(0, 2**31 - 1), st.integers(1, 12))
+def test_development_keeps_away_from_the_test_set(seed: int, count: int) -> None:
+    videos = fake_videos(OBJECTS, 1)
+    split = assign(CATALOGUE, videos, SplitConfig(name="development", seed=seed, test_objects=count))
+    test = objects_of(split, Part.TEST)
+    assert len(test) == count
+    assert test <= TRAIN
+    assert objects_of(split, Part.TRAIN) == TRAIN - test
+    assert objects_of(split, Part.UNUSED) == {o for o in OBJECTS if CATALOGUE.objects[o].splits["paper"] == Part.TEST}
+
+
+def test_development_is_stratified_and_seeded() -> None:
+    chosen = set()
+    for seed in range(8):
+        split = assign(CATALOGUE, fake_videos(OBJECTS, 1), SplitConfig(name="development", seed=seed))
+        test = objects_of(split, Part.TEST)
+        chosen.add(frozenset(test))
+        for index in range(3):
+            whole = Counter(CATALOGUE.labels(o)[index] for o in TRAIN)
+            part = Counter(CATALOGUE.labels(o)[index] for o in test)
+            for level, number in whole.items():
+                assert abs(part[level] - number / 60 * 7) < 1.5, "within one and a half objects of proportion"
+    assert len(chosen) > 4
+
+
+def test_development_draws_from_objects_that_have_videos() -> None:
+    present = sorted(TRAIN)[::3]
+    split = assign(CATALOGUE, fake_videos(present), SplitConfig(name="development"))
+    assert len(objects_of(split, Part.TEST)) == 7
+    with pytest.raises(UserError, match=r"split\.test_objects is 18, but 20 training .* allow 17"):
+        assign(CATALOGUE, fake_videos(present), SplitConfig(name="development", test_objects=18))
+
+
+def test_missing_objects_are_reported_or_refused() -> None:
+    present = [o for o in OBJECTS if CATALOGUE.objects[o].splits["paper"] != Part.TEST and o != "denim"]
+    split = assign(CATALOGUE, fake_videos(present), SplitConfig(name="paper"))
+    assert split.missing[Part.VALIDATION] == ("denim",)
+    assert len(split.missing[Part.TEST]) == 7
+    assert not objects_of(split, Part.TEST)
+    with pytest.raises(UserError) as caught:
+        assign(CATALOGUE, fake_videos(present), SplitConfig(name="paper", missing="error"))
+    for words in ("denim", "ice_block", "split.missing"):
+        assert words in str(caught.value)
+
+
+def renamed(**columns: str) -> Catalogue:
+    """The catalogue with other split columns: new name to old."""
+    objects = {
+        o.object_id: o.model_copy(update={"splits": {new: o.splits[old] for new, old in columns.items()}})
+        for o in CATALOGUE.objects.values()
+    }
+    return CATALOGUE.model_copy(update={"objects": objects})
+
+
+def test_a_column_of_any_name_is_a_split() -> None:
+    mine, videos = renamed(mine="paper"), fake_videos(OBJECTS)
+    assert assign(mine, videos, SplitConfig(name="mine")) == assign(CATALOGUE, videos, SplitConfig(name="paper"))
+
+
+@pytest.mark.parametrize(
+    ("columns", "name", "words"),
+    [
+        ({}, "paper", "split.name=paper is no split of the catalogue; allowed: kfold "),
+        ({}, "development", "split.name=development needs the column split_paper; allowed: kfold "),
+        ({"mine": "paper"}, "sideways", "allowed: mine, kfold "),
+        ({"paper": "paper"}, "mine", "allowed: paper, development, kfold "),
+    ],
+)
+def test_a_split_that_is_not_there_is_refused(columns: dict[str, str], name: str, words: str) -> None:
+    other = renamed(**columns)
+    for attempt in (
+        lambda: check_split(other, name),
+        lambda: assign(other, fake_videos(OBJECTS), SplitConfig(name=name)),
+    ):
+        with pytest.raises(UserError) as caught:
+            attempt()
+        assert words in str(caught.value)
+    check_split(other, "kfold")
+    assert assign(other, fake_videos(OBJECTS), SplitConfig(name="kfold")).assignments
+
+
+@pytest.mark.parametrize("name", ["paper", "development"])
+def test_nothing_to_train_on(name: str) -> None:
+    with pytest.raises(UserError, match="train"):
+        assign(CATALOGUE, fake_videos(["denim", "ice_block"]), SplitConfig(name=name))
+    with pytest.raises(UserError):
+        assign(CATALOGUE, [], SplitConfig(name=name))

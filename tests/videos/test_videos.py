@@ -1,0 +1,239 @@
+"""Which videos a folder holds, by names or by its videos.csv, and every way in which that may be wrong."""
+
+from __future__ import annotations
+
+import shutil
+import unicodedata
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from pipeline.errors import UserError
+from pipeline.videos.catalogue import Catalogue
+from pipeline.records import Severity
+from pipeline.videos.files import LIST_FILE, Listing, list_videos, raise_errors
+
+
+def touch(folder: Path, *names: str) -> Path:
+    """Files are not opened to list them: empty ones will do."""
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+    return folder
+
+
+def ids(listing: Listing) -> list[str]:
+    return [f.video_id for f in listing.files]
+
+
+def errors(listing: Listing) -> list[tuple[str, str]]:
+    return [(f.item, f.measured) for f in listing.findings if f.severity is Severity.ERROR]
+
+
+def warnings(listing: Listing) -> list[str]:
+    return [f.measured for f in listing.findings if f.severity is Severity.WARNING]
+
+
+def test_a_good_folder(tiny_videos: Path, catalogue: Catalogue) -> None:
+    listing = list_videos(tiny_videos, catalogue)
+    assert ids(listing) == [*("baseball_0", "baseball_1", "baseball_10", "potato_0", "potato_2", "rug_0", "rug_1")], (
+        "sorted by object, then by number"
+    )
+    assert [f.relative for f in listing.files][-1] == "sub folder é/rug_1.AVI"
+    assert str(listing.files[-1]) == "sub folder é/rug_1.AVI"
+    assert all(f.path == tiny_videos / f.relative for f in listing.files)
+    assert {f.session for f in listing.files} == {""}
+    assert (listing.findings, listing.strangers) == ((), ())
+    assert list_videos(tiny_videos, catalogue) == listing
+
+
+def test_hidden_and_other_files_do_not_count(tmp_path: Path, catalogue: Catalogue) -> None:
+    touch(tmp_path, "rug_0.MKV", "rug_1.Mp4", "readme.txt", "._rug_0.mov", ".cache/rug_0.mov", "rug_2.mp3")
+    (tmp_path / "rug_7.mov").mkdir()
+    listing = list_videos(tmp_path, catalogue)
+    assert [f.relative for f in listing.files] == ["rug_0.MKV", "rug_1.Mp4"]
+    assert listing.findings == ()
+
+
+def test_accents_are_one_however_they_are_written(tmp_path: Path, catalogue: Catalogue) -> None:
+    """A Mac writes an accent as a character of its own."""
+    decomposed = unicodedata.normalize("NFD", "café_0.mov")
+    assert decomposed != "café_0.mov"
+    listing = list_videos(touch(tmp_path, decomposed, "rug_0.mov"), catalogue)
+    assert listing.strangers == ("café",)
+    (tmp_path / LIST_FILE).write_text("file,object_id\ncafé_0.mov,rug\n")
+    (file,) = list_videos(tmp_path, catalogue).files
+    assert (file.video_id, file.path) == ("rug_0", tmp_path / decomposed)
+
+
+def test_objects_outside_the_catalogue_are_left_out_with_one_line(tmp_path: Path, catalogue: Catalogue) -> None:
+    listing = list_videos(touch(tmp_path, "rug_0.mov", "yoyo_0.mov", "yoyo_1.mov", "kite_0.mov"), catalogue)
+    assert (ids(listing), listing.strangers) == (["rug_0"], ("kite", "yoyo"))
+    (message,) = warnings(listing)
+    for words in ("3 videos", "2 objects", "kite, yoyo", "objects.csv"):
+        assert words in message
+
+
+def test_a_dead_link_is_listed_so_that_reading_it_says_so(tmp_path: Path, catalogue: Catalogue) -> None:
+    (tmp_path / "rug_0.mov").symlink_to(tmp_path / "gone.mov")
+    assert ids(list_videos(tmp_path, catalogue)) == ["rug_0"]
+
+
+Make = Callable[[Path], object]
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda folder: folder.rmdir(), ["no such folder", "data.dir"]),
+        (lambda folder: touch(folder, "notes.txt"), ["no video", ".mov", "data.dir"]),
+        (lambda folder: touch(folder, "yoyo_0.mov"), ["no video of an object", "yoyo", "objects.csv"]),
+        (lambda folder: touch(folder, "rug.avi"), ["rug.avi", "<object>_<number>", "rename", "videos.csv"]),
+        (lambda folder: touch(folder, "rug_٣.avi"), ["<object>_<number>"]),
+        (lambda folder: touch(folder, "rug_0.avi", "sub/rug_00.mp4"), ["rug_0.avi", "sub/rug_00.mp4", "keep one"]),
+    ],
+    ids=["no folder", "no video", "strangers", "no number", "digits of another script", "rivals"],
+)
+def test_bad_names_are_one_line_with_their_mend(
+    tmp_path: Path, catalogue: Catalogue, make: Make, words: list[str]
+) -> None:
+    folder = tmp_path / "my videos"
+    folder.mkdir()
+    make(folder)
+    listing = list_videos(folder, catalogue)
+    with pytest.raises(UserError) as caught:
+        raise_errors(folder, listing.findings)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message.startswith(str(folder))
+    assert all(word in message for word in words), message
+    assert len(errors(listing)) == 1
+
+
+def test_all_errors_are_listed_and_the_first_is_raised(tmp_path: Path, catalogue: Catalogue) -> None:
+    folder = touch(tmp_path, "egg.mov", "rug_1.mov", "rug_01.mov", "rug 3.mov", "potato_0.mov")
+    listing = list_videos(folder, catalogue)
+    assert [item for item, _ in errors(listing)] == ["egg.mov", "rug 3.mov", "rug_01.mov"]
+    with pytest.raises(UserError, match=r"egg\.mov"):
+        raise_errors(folder, listing.findings)
+    raise_errors(folder, [f for f in listing.findings if f.severity is not Severity.ERROR])
+
+
+def listed(folder: Path, text: str, *names: str) -> Path:
+    touch(folder, *(names or ("a.mov", "b c.mp4", "tag 3/é.avi")))
+    (folder / LIST_FILE).write_text(text, encoding="utf-8")
+    return folder
+
+
+def test_a_list_names_files_of_any_name(tmp_path: Path, catalogue: Catalogue) -> None:
+    """Numbers count up within an object in the list's order; names that look like numbers mean nothing."""
+    text = "file,object_id,session\nrug_7.mov,potato,s1\ntag 3/é.avi,rug,s1\nb c.mp4,potato,s2\na.mov,rug,\n"
+    listing = list_videos(listed(tmp_path, text, "rug_7.mov", "tag 3/é.avi", "b c.mp4", "a.mov"), catalogue)
+    assert [(f.video_id, f.object_id, f.relative, f.session) for f in listing.files] == [
+        ("potato_0", "potato", "rug_7.mov", "s1"),
+        ("potato_1", "potato", "b c.mp4", "s2"),
+        ("rug_0", "rug", "tag 3/é.avi", "s1"),
+        ("rug_1", "rug", "a.mov", ""),
+    ]
+    assert listing.findings == ()
+
+
+def test_more_than_ten_videos_are_sorted_by_number(tmp_path: Path, catalogue: Catalogue) -> None:
+    names = [f"{letter}.mov" for letter in "zyxwvutsrqpo"]
+    text = "object_id,file\n" + "".join(f"rug,{name}\n" for name in names)
+    listing = list_videos(listed(tmp_path, text, *names), catalogue)
+    assert [f.relative for f in listing.files] == names
+    assert ids(listing) == [f"rug_{i}" for i in range(12)]
+
+
+def test_what_a_list_lacks_is_left_out_with_one_line(tmp_path: Path, catalogue: Catalogue) -> None:
+    listing = list_videos(listed(tmp_path, "file,object_id\na.mov,rug\n"), catalogue)
+    assert ids(listing) == ["rug_0"]
+    assert warnings(listing) == ["2 videos of the folder are not listed and are left out"]
+    assert errors(listing) == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "\ufefffile,object_id\na.mov,rug\nb c.mp4,potato\n",
+        "file , object_id\n a.mov , rug \n\n,\nb c.mp4,potato\n",
+        'object_id,note,file\nrug,"one, two",a.mov\npotato,,b c.mp4',
+        "file,object_id\r\na.mov,rug\r\nb c.mp4,potato\r\n",
+        "file,object_id,session\na.mov,rug\nb c.mp4,potato,\n",
+    ],
+    ids=["byte order mark", "spaces and empty lines", "other columns", "Windows", "short lines"],
+)
+def test_lists_are_read_as_people_write_them(tmp_path: Path, catalogue: Catalogue, text: str) -> None:
+    folder = listed(tmp_path, "", "a.mov", "b c.mp4")
+    (folder / LIST_FILE).write_bytes(text.encode())
+    listing = list_videos(folder, catalogue)
+    assert [(f.relative, f.video_id, f.session) for f in listing.files] == [
+        ("b c.mp4", "potato_0", ""),
+        ("a.mov", "rug_0", ""),
+    ]
+    assert listing.findings == ()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("name,object_id\na.mov,rug\n", "column file is missing"),
+        ("name,object\na.mov,rug\n", "column file, object_id is missing"),
+        ("", "column file, object_id is missing"),
+        ("file,object_id\n", "lists no video; add a line for each"),
+        ("file,object_id,file\na.mov,rug,b\n", "column file stands twice"),
+        ("file,object_id\na.mov,rug\ngone.mov,rug\n", "line 3: no video 'gone.mov' in the folder; correct the line"),
+        ("file,object_id\na.mov,rug\n\na.mov,potato\n", "line 4: a.mov is listed twice; keep one line"),
+        ("file,object_id\na.mov,\n", "line 2: a.mov has no object_id"),
+        ("file,object_id\n,rug\n", "line 2: no video '' in the folder"),
+        ("file,object_id\na.mov,rug,s,t\n", "line 2: 4 fields for 2 columns"),
+        ("file,object_id\n../a.mov,rug\n", "line 2: no video '../a.mov' in the folder"),
+        ("file,object_id\na.mov,yoyo\n", "no video of an object of the catalogue"),
+    ],
+)
+def test_bad_lists_are_one_line_with_their_mend(tmp_path: Path, catalogue: Catalogue, text: str, words: str) -> None:
+    listing = list_videos(listed(tmp_path, text), catalogue)
+    ((item, message),) = errors(listing)
+    assert item == (str(tmp_path) if "catalogue" in words else LIST_FILE)
+    assert message.startswith(words) or "catalogue" in words
+    assert words in message
+    with pytest.raises(UserError) as caught:
+        raise_errors(tmp_path, listing.findings)
+    assert str(caught.value).count(str(tmp_path)) == 1
+    assert "\n" not in str(caught.value)
+
+
+def test_a_list_in_another_encoding_is_named(tmp_path: Path, catalogue: Catalogue) -> None:
+    folder = listed(tmp_path, "")
+    (folder / LIST_FILE).write_bytes("file,object_id\né.avi,rug\n".encode("latin-1"))
+    ((item, message),) = errors(list_videos(folder, catalogue))
+    assert (item, "no CSV in UTF-8" in message) == (LIST_FILE, True)
+
+
+def test_all_bad_lines_of_a_list_are_found_at_once(tmp_path: Path, catalogue: Catalogue) -> None:
+    listing = list_videos(listed(tmp_path, "file,object_id\nx.mov,rug\na.mov,rug\na.mov,rug\ny.mov,rug\n"), catalogue)
+    assert [message.split(":")[0] for _, message in errors(listing)] == ["line 2", "line 4", "line 5"]
+    assert warnings(listing) == [], "what else is not listed matters once the list is right"
+
+
+def test_strangers_in_a_list(tmp_path: Path, catalogue: Catalogue) -> None:
+    listing = list_videos(listed(tmp_path, "file,object_id\na.mov,yoyo\nb c.mp4,rug\ntag 3/é.avi,yoyo\n"), catalogue)
+    assert (ids(listing), listing.strangers) == (["rug_0"], ("yoyo",))
+    (message,) = warnings(listing)
+    assert "2 videos of 1 objects" in message
+
+
+def test_without_its_list_a_folder_goes_by_names(tiny_videos: Path, tmp_path: Path, catalogue: Catalogue) -> None:
+    shutil.copytree(tiny_videos, tmp_path / "v")
+    (tmp_path / "v" / "sub folder é" / LIST_FILE).write_text("file,object_id\nrug_1.AVI,potato\n")
+    assert ids(list_videos(tmp_path / "v", catalogue))[-1] == "rug_1", "a list counts in the folder itself"
+
+
+@pytest.mark.real
+def test_real_videos(real_data: Path, catalogue: Catalogue) -> None:
+    listing = list_videos(real_data, catalogue)
+    objects = {f.object_id for f in listing.files}
+    assert (len(listing.files), len(objects)) in {(370, 67), (408, 74)}, "all labelled videos, or all but the test set"
+    assert errors(listing) == []
