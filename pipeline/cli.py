@@ -31,12 +31,10 @@ def scale(
     params = compose(name, overrides or ())
     check_inputs(params)
     changed = write_params(params)
-    prune(params.plan, Path("data"))
-    if changed:
-        # What stages of another run cost would be shown as the cost of this one's.
-        for file in Path("runs").glob("*.json"):
-            file.unlink()
-    typer.echo(f"params.yaml {'written' if changed else 'unchanged'}: {name}, {len(params.plan.variants)} variants")
+    prune(params, Path("data"))
+    typer.echo(
+        f"params.yaml {'written' if changed else 'unchanged'}: {name}, {len(params.ablation.variants())} variants"
+    )
     typer.echo(f"`dvc repro` runs it; its tables go to reports/{params.report_name}/")
 
 
@@ -63,11 +61,11 @@ def audit(
     out: Annotated[Path, typer.Option(help="Where all findings go.")] = Path("audit.csv"),
 ) -> None:
     """Measure what can be trusted: files, contact, labels, copies, sessions, leaks; status 1 where errors are found."""
+    from pipeline.config import SplitConfig
     from pipeline.io import write_csv
+    from pipeline.records import Finding
     from pipeline.videos.audit.run import audit_folder
     from pipeline.videos.catalogue import load_catalogue
-    from pipeline.records import Finding
-    from pipeline.config import SplitConfig
 
     # Not validated: a name that no split can have is a finding, like one that this catalogue's splits do not.
     config = SplitConfig.model_construct(name=split) if split else None
@@ -83,44 +81,6 @@ def _show(findings: Sequence[Finding]) -> None:
         typer.echo(f"{f.severity:8} {f.check}: {f.item}: {f.measured}{expected}")
     if any(f.severity == "error" for f in findings):
         raise typer.Exit(1)
-
-
-@app.command()
-def publish() -> None:
-    """Show the reproduction in params.yaml and dvc.lock in MLflow; a second time adds nothing."""
-    from pipeline.params import load_params
-    from pipeline.tracking.publishing import publish as publish_runs
-
-    typer.echo(str(publish_runs(load_params(), Path())))
-
-
-@app.command()
-def page() -> None:
-    """Gather speed against error and write reports/index.html: all reports on one page, to open from disk."""
-    from pipeline.review import write_page
-    from pipeline.speed.gather import write_speed_error
-
-    write_speed_error(Path())
-    typer.echo(f"{write_page(Path())}: all reports on one page; open it in a browser")
-
-
-@app.command()
-def compare(
-    old: Annotated[str, typer.Argument(help="A Git revision: a hash, a tag, a branch, HEAD~1.")],
-    new: Annotated[str, typer.Argument(help="Another one; without it, what lies on disk now.")] = "",
-    json: Annotated[Path | None, typer.Option(help="Also write everything to this file, for machines.")] = None,
-) -> None:
-    """Say what differs between two revisions: parameters, stages, figures, and whether accuracies really changed."""
-    from dataclasses import asdict
-
-    from pipeline.io import write_json
-    from pipeline.comparison import compare as compare_states
-    from pipeline.comparison import describe
-
-    found = compare_states(Path(), old, new)
-    if json is not None:
-        write_json(json, {"differs": found.differs, **asdict(found)})
-    typer.echo(describe(found))
 
 
 def main() -> None:

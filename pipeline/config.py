@@ -1,6 +1,7 @@
-"""The sections of params.yaml: every key with its range and meaning.
+"""The schema of params.yaml: every key with its range and meaning.
 
-A function receives its own section, never the root.
+`conf/` holds the scales and `octopi scale` composes one of them into params.yaml; `pipeline.params` reads it. A function
+receives its own section, never the root.
 """
 
 from __future__ import annotations
@@ -8,11 +9,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from pipeline.encoder.candidates import CONTESTANTS
-from pipeline.plan import PlanName
-from pipeline.records import Task, Touch
+from pipeline.records import Encoder, Lora, Opd, Task, Touch, Variant
 from pipeline.runtime import DeviceName, DtypeName, Quantization
 
 Fraction = Annotated[float, Field(gt=0, le=1)]
@@ -20,7 +19,7 @@ Positive = Annotated[int, Field(ge=1)]
 Rate = Annotated[float, Field(gt=0, lt=10)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
 
-Recipe = Literal["paper", "release", "strong"]
+Recipe = Literal["paper", "release", "pretrained"]
 Selection = Literal["salient", "release", "uniform", "contact", "adaptive"]
 
 SCENES_DIR = Path("data/scenes/videos")
@@ -142,10 +141,10 @@ class EncoderConfig(Section):
     """The tactile encoder and its training on property labels."""
 
     recipe: Recipe = "paper"
-    """`paper`: CLIP with visual prompts, three heads. `release`: the same as the published code has it. `strong`: a
+    """`paper`: CLIP with visual prompts, three heads. `release`: the same as the published code has it. `pretrained`: a
     convolutional network pretrained on scenes (section `pretrain`), whose frames vote."""
     weights: str
-    """Folder of the CLIP in open_clip's format: open_clip_config.json and open_clip_model.safetensors. With `strong`
+    """Folder of the CLIP in open_clip's format: open_clip_config.json and open_clip_model.safetensors. With `pretrained`
     it is the ablation's base encoder only."""
     prompts: Annotated[int, Field(ge=1, le=256)] = 8
     """Learnable prompts at each layer."""
@@ -156,7 +155,7 @@ class EncoderConfig(Section):
     learning_rate: Rate = 1e-3
     weight_decay: Annotated[float, Field(ge=0, lt=1)] = 0.0
     flip_probability: Annotated[float, Field(ge=0, le=1)] = 0.5
-    """Chance of each of the two flips in training. None of these from `prompts` on concerns `strong`."""
+    """Chance of each of the two flips in training. None of these from `prompts` on concerns `pretrained`."""
     reference: Literal["none", "subtract"] = "none"
     """`subtract`: show each frame's difference to the video's no-contact reference in place of the frame."""
     standardize: bool = False
@@ -165,14 +164,14 @@ class EncoderConfig(Section):
     """Frames at a time when embeddings are computed."""
 
     @model_validator(mode="after")
-    def _strong_sees_differences(self) -> Self:
-        if self.recipe == "strong" and self.reference != "subtract":
-            raise ValueError("encoder.recipe=strong was pretrained on differences: set encoder.reference=subtract")
+    def _pretrained_sees_differences(self) -> Self:
+        if self.recipe == "pretrained" and self.reference != "subtract":
+            raise ValueError("encoder.recipe=pretrained was pretrained on differences: set encoder.reference=subtract")
         return self
 
 
 class PretrainConfig(Section):
-    """Pretraining of the strong recipe's encoder on pictures of invented objects."""
+    """Pretraining of the pretrained recipe's encoder on pictures of invented objects."""
 
     objects: Annotated[int, Field(ge=8, le=1_000_000)] = 4000
     """Objects that are invented; each is drawn once."""
@@ -192,23 +191,13 @@ class PretrainConfig(Section):
 class CrossValidationConfig(Section):
     """Grouped cross-validation of encoders and their rivals over all objects with videos."""
 
-    models: tuple[str, ...] = ()
+    models: tuple[str, ...] = Field(default=("constant",), min_length=1)
     """Which, of those that `pipeline.encoder.candidates` lists; each is a stage."""
     folds: Annotated[int, Field(ge=2, le=50)] = 5
     """Parts that objects are dealt into; all videos of an object are in one."""
     repeats: Positive = 3
     """How often they are dealt anew."""
     seed: Seed = 0
-
-    @field_validator("models")
-    @classmethod
-    def _models_are_known(cls, models: tuple[str, ...]) -> tuple[str, ...]:
-        if not models:
-            raise ValueError("names no model, but every report has a comparison; [constant] is the cheapest")
-        unknown = [name for name in models if name not in CONTESTANTS]
-        if unknown:
-            raise ValueError(f"{unknown[0]} is no model; known: {', '.join(CONTESTANTS)}")
-        return models
 
 
 class LanguageConfig(Section):
@@ -261,25 +250,42 @@ class LoraTrainConfig(TrainConfig):
 
 
 class AblationConfig(Section):
-    """Which variants of the system are trained and compared."""
+    """Which variants of the system are trained and compared: the product of the lists.
 
-    plan: PlanName = "paper"
-    """`paper`: the four variants of the paper's tables. `factorial`: encoder x LoRA x OPD. `single`: no ablation."""
+    The full system (fine-tuned encoder, with LoRA, all descriptions) is always among them, since every effect is a
+    difference to it.
+    """
+
+    encoders: tuple[Encoder, ...] = (Encoder.FINETUNED, Encoder.BASE)
+    """What the language model is given; the fine-tuned encoder is trained in any case, for the encoder's own table."""
+    lora: tuple[Lora, ...] = (Lora.WITH, Lora.WITHOUT)
+    """`without` answers with the alignment's checkpoint."""
+    opd: tuple[Opd, ...] = (Opd.ALL, Opd.NONE)
+    """How much an answer describes before it concludes: `all`, what is `needed` for the question, or `none`."""
     seeds: tuple[Seed, ...] = Field(default=(0,), min_length=1)
-    counterfactuals: tuple[Literal[Touch.REMOVED, Touch.SWAPPED, Touch.NOISE], ...] = ()
-    """What the full system is also asked about in place of its videos, to see whether it feels them."""
+    touch: tuple[Literal[Touch.REMOVED, Touch.SWAPPED, Touch.NOISE], ...] = ()
+    """Input ablations: what the full system is also given in place of its videos, to see whether it feels them."""
 
     @model_validator(mode="after")
-    def _counterfactuals_differ(self) -> Self:
-        if len(set(self.counterfactuals)) < len(self.counterfactuals):
-            raise ValueError(f"ablation.counterfactuals {list(map(str, self.counterfactuals))} repeats one")
+    def _lists_make_sense(self) -> Self:
+        full = {"encoders": Encoder.FINETUNED, "lora": Lora.WITH, "opd": Opd.ALL}
+        for name in type(self).model_fields:
+            values = [str(v) for v in getattr(self, name)]
+            if len(set(values)) < len(values):
+                raise ValueError(f"ablation.{name} [{', '.join(values)}] repeats a value")
+            if name in full and full[name] not in values:
+                raise ValueError(f"ablation.{name} [{', '.join(values)}] lacks the full system's value {full[name]}")
         return self
 
-    @model_validator(mode="after")
-    def _seeds_differ(self) -> Self:
-        if len(set(self.seeds)) < len(self.seeds):
-            raise ValueError(f"ablation.seeds {list(self.seeds)} repeats a seed")
-        return self
+    def variants(self) -> list[Variant]:
+        """All answering systems, in the lists' order; input ablations belong to the full system alone."""
+        return [
+            Variant(encoder, lora, opd, seed)
+            for seed in self.seeds
+            for encoder in self.encoders
+            for lora in self.lora
+            for opd in self.opd
+        ]
 
 
 class TrackingConfig(Section):
@@ -305,3 +311,36 @@ class RuntimeConfig(Section):
     save_steps: Annotated[int, Field(ge=0)] = 0
     """Optimiser steps between checkpoints that a killed training resumes from; 0 writes none."""
     gradient_checkpointing: bool = False
+
+
+class Params(Section):
+    """The whole of params.yaml."""
+
+    scale: Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]*$")]
+    """Name of the file in conf/ that this comes from."""
+    seed: Seed = 0
+    data: DataConfig
+    scenes: ScenesConfig
+    frames: FramesConfig
+    split: SplitConfig
+    questions: QuestionsConfig
+    encoder: EncoderConfig
+    pretrain: PretrainConfig
+    cross_validation: CrossValidationConfig
+    language: LanguageConfig
+    align: TrainConfig
+    lora: LoraTrainConfig
+    ablation: AblationConfig
+    tracking: TrackingConfig
+    runtime: RuntimeConfig
+
+    @model_validator(mode="after")
+    def _scenes_have_their_place(self) -> Self:
+        if self.data.source == "scenes" and Path(self.data.dir) != SCENES_DIR:
+            raise ValueError(f"data.dir must be {SCENES_DIR} where data.source is scenes (set data.source=videos?)")
+        return self
+
+    @property
+    def report_name(self) -> str:
+        """The folder in reports/ that this scale and source report into."""
+        return f"{self.scale}-{self.data.source}"

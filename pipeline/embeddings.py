@@ -9,8 +9,8 @@ from typing import Protocol
 
 import torch
 
-from pipeline.io import load_tensors, read_table
 from pipeline.errors import UserError
+from pipeline.io import load_tensors, read_table
 from pipeline.records import Embedding, Flip
 
 FLIPS: tuple[Flip, ...] = ("none", "horizontal", "vertical", "both")

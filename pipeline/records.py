@@ -7,7 +7,7 @@ checks every row against the model.
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
@@ -45,8 +45,22 @@ class Opd(StrEnum):
     ALL = "all"
 
 
+class Encoder(StrEnum):
+    """Which tactile encoder a variant uses (the ablation axis encoder)."""
+
+    FINETUNED = "finetuned"
+    BASE = "base"
+
+
+class Lora(StrEnum):
+    """Whether the language model was fine-tuned end to end (the ablation axis LoRA)."""
+
+    WITH = "with"
+    WITHOUT = "without"
+
+
 class Touch(StrEnum):
-    """What the language model gets to feel: the question's videos, or something else to see whether it minds."""
+    """What the language model is given: the question's videos, or an input ablation in their place."""
 
     REAL = "real"
     REMOVED = "removed"
@@ -55,6 +69,25 @@ class Touch(StrEnum):
     """A video of another object."""
     NOISE = "noise"
     """Normal noise with each dimension's mean and deviation."""
+
+
+class Variant(NamedTuple):
+    """One answering system of the ablation."""
+
+    encoder: Encoder
+    lora: Lora
+    opd: Opd
+    seed: int
+
+    @property
+    def key(self) -> str:
+        """Its name in folders and behind the @ of its stages, such as `finetuned-with-all-0`."""
+        return f"{self.encoder}-{self.lora}-{self.opd}-{self.seed}"
+
+    @property
+    def full(self) -> bool:
+        """Whether it is the system as the paper proposes it."""
+        return (self.encoder, self.lora, self.opd) == (Encoder.FINETUNED, Lora.WITH, Opd.ALL)
 
 
 class Video(Record):
@@ -233,6 +266,21 @@ class Score(Record):
     """Tokens generated for the answer, over all turns; 0 where no language model answered."""
 
 
+class Graded(Score):
+    """A score and whose it is."""
+
+    encoder: Encoder
+    lora: Lora
+    opd: Opd
+    seed: int
+    touch: Touch
+
+    @property
+    def variant(self) -> Variant:
+        """The answering system."""
+        return Variant(self.encoder, self.lora, self.opd, self.seed)
+
+
 class GateRow(Record):
     """What a base language model can conclude from perfect descriptions in words, before it ever felt anything."""
 
@@ -265,7 +313,7 @@ class Classification(Record):
     probabilities: tuple[float, ...]
 
 
-class Judged(Record):
+class OutOfFold(Record):
     """What a model said of one video in one repeat of a cross-validation, without having seen the video's object."""
 
     video_id: str

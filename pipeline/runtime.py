@@ -6,6 +6,7 @@ import hashlib
 import os
 import random
 import sys
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -74,3 +75,12 @@ def limit_threads(count: int) -> None:
 def cores() -> int:
     """Processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def quiet_libraries() -> None:
+    """Silence what libraries say that a person can do nothing about: a bar a loaded file, and their own deprecations."""
+    os.environ.setdefault("TRANSFORMERS_VERBOSITY", "error")
+    os.environ.setdefault("HF_HUB_DISABLE_PROGRESS_BARS", "1")
+    warnings.filterwarnings(
+        "ignore", category=FutureWarning, module=r"(torch|transformers|peft|accelerate|open_clip|timm)\b"
+    )

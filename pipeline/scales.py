@@ -8,12 +8,13 @@ from pathlib import Path
 
 import yaml
 
-from pipeline.io import write_text
-from pipeline.params import PARAMS_FILE, Params, resolve
-from pipeline.errors import UserError
 from pipeline import weights
+from pipeline.config import Params
+from pipeline.encoder.candidates import check_candidates
+from pipeline.errors import UserError
+from pipeline.io import write_text
+from pipeline.params import PARAMS_FILE, validate
 from pipeline.videos.catalogue import load_catalogue
-from pipeline.plan import Plan
 from pipeline.videos.split import check_split
 
 CONF = Path("conf")
@@ -56,13 +57,14 @@ def compose(name: str, overrides: Sequence[str] = (), conf: Path = CONF) -> Para
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(f"scale {name}: {' '.join(str(error).split())}") from None
     assert isinstance(values, dict)
-    return resolve({str(k): v for k, v in values.items()}, f"scale {name}")
+    return validate({str(k): v for k, v in values.items()}, f"scale {name}")
 
 
 def check_inputs(params: Params) -> None:
     """Raise UserError where something that the scale needs is not there: videos, catalogue, objects, weights."""
     catalogue = load_catalogue(Path(params.data.catalogue))
     check_split(catalogue, params.split.name)
+    check_candidates(params.cross_validation.models, params.encoder.recipe)
     folder = Path(params.data.dir)
     if params.data.source == "videos" and not folder.is_dir():
         raise UserError(
@@ -78,42 +80,39 @@ def check_inputs(params: Params) -> None:
 
 def write_params(params: Params, path: Path = PARAMS_FILE) -> bool:
     """Write params.yaml if that changes it; return whether it did."""
-    text = HEADER + yaml.safe_dump(params.model_dump(mode="json"), sort_keys=False, allow_unicode=True, width=120)
+    values = params.model_dump(mode="json")
+    text = HEADER + yaml.dump(values, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)
     if path.is_file() and path.read_text(encoding="utf-8") == text:
         return False
     write_text(path, text)
     return True
 
 
-def prune(plan: Plan, data: Path) -> None:
-    """Remove outputs of variants outside the plan from `data`; DVC's cache brings them back when they are asked for.
+class _Dumper(yaml.SafeDumper):
+    """Writes lists in one line, so that params.yaml stays readable."""
 
-    Stages that read a whole folder (the report) would otherwise take them for their own.
+    def represent_list(self, data: list[object]) -> yaml.nodes.Node:
+        return self.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=True)
+
+
+_Dumper.add_representer(list, _Dumper.represent_list)
+
+
+def prune(params: Params, data: Path) -> None:
+    """Remove outputs of variants that params.yaml no longer names; DVC's cache brings them back when asked for.
+
+    Stages that read a whole folder (`embed`, `grade`, `report`) would otherwise rerun because of what they do not use.
     """
+    variants, ablation = params.ablation.variants(), params.ablation
+    trained = {f"{v.encoder}-{v.opd}-{v.seed}" for v in variants}
     keep = {
-        "pretrained": set(plan.pretrain),
-        "cross_validation": set(plan.cross_validation),
-        "encoder": {str(s) for s in plan.encoder_seeds},
-        "embeddings": set(plan.embeddings),
-        "align": set(plan.align),
-        "lora": set(plan.lora),
-        "answers": set(plan.variants),
-        "scores": set(plan.variants),
+        "cross_validation": set(params.cross_validation.models),
+        "encoder": {str(seed) for seed in ablation.seeds},
+        "models/without": trained,
+        "models/with": trained,
+        "answers": {v.key for v in variants},
     }
     for folder, keys in keep.items():
         for entry in (data / folder).glob("*"):
             if entry.name not in keys:
                 shutil.rmtree(entry)
-    stages = {
-        "answers": "answer",
-        "scores": "grade",
-        "embeddings": "embed",
-        "encoder": "finetune_encoder",
-        "pretrained": "pretrain",
-        "cross_validation": "cross_validate",
-    }
-    named = {f"{stages.get(folder, folder)}@{key}" for folder, keys in keep.items() for key in keys}
-    named |= {f"synthesize@{key}" for key in plan.scenes}
-    for file in (data / "metrics").glob("*@*.json"):
-        if file.stem not in named:
-            file.unlink()

@@ -1,4 +1,4 @@
-"""What every DVC stage does around its one library call: parameters, lock, clear errors, metrics, cost."""
+"""What every DVC stage does around its one library call: parameters, lock, clear errors, a line at each end, cost."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from pipeline.io import write_json
-from pipeline.params import Params, load_params
+from pipeline.config import Params
 from pipeline.errors import UserError
+from pipeline.io import write_json
+from pipeline.params import load_params
 from pipeline.records import Measurement
-from pipeline.runtime import limit_threads
+from pipeline.runtime import limit_threads, quiet_libraries
 
 DATA = Path("data")
 RUNS = Path("runs")
@@ -27,7 +28,7 @@ RUNS = Path("runs")
 
 @dataclass
 class Stage:
-    """A running stage. `metrics` is written when it ends well."""
+    """A running stage. `metrics` are written beside its cost when it ends well."""
 
     name: str
     params: Params
@@ -46,23 +47,26 @@ class Stage:
 
 @contextmanager
 def stage(name: str, key: str | None = None) -> Iterator[Stage]:
-    """Run the body as the DVC stage `name` (with `@key` in a foreach).
+    """Run the body as the DVC stage `name` (with `@key` in a matrix).
 
-    A UserError, a full disk or want of memory ends the process with one line and status 1. The metrics go to
-    data/metrics/ (an output that DVC restores), time and memory to runs/ (which is nobody's input, so that results
-    stay identical from run to run).
+    A UserError, a full disk or want of memory ends the process with one line and status 1. Metrics, time and memory go
+    to runs/, which is nobody's input, so that results stay identical from run to run; tracking shows them.
     """
     started = time.time()
     full = f"{name}@{key}" if key else name
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
+    quiet_libraries()
     try:
         with _alone(full):
             running = Stage(full, load_params())
             limit_threads(running.params.runtime.threads)
+            if _main_process():
+                print(f"{full}: starts ({running.params.report_name})", flush=True)
             yield running
             if _main_process():
-                write_json(DATA / "metrics" / f"{full}.json", running.metrics)
-                _write_cost(full, started)
+                _write_run(running, started)
+                said = ", ".join(f"{k} {v:g}" for k, v in list(running.metrics.items())[:4])
+                print(f"{full}: done in {time.time() - started:.1f} s{': ' if said else ''}{said}", flush=True)
     except UserError as error:
         sys.exit(f"{full}: {error}")
     except MemoryError:
@@ -91,7 +95,7 @@ def _main_process() -> bool:
     return os.environ.get("RANK", "0") == "0"
 
 
-def _write_cost(name: str, started: float) -> None:
+def _write_run(running: Stage, started: float) -> None:
     import psutil
 
     process = psutil.Process()
@@ -102,11 +106,13 @@ def _write_cost(name: str, started: float) -> None:
         unit = 1 if sys.platform == "darwin" else 1024
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
     write_json(
-        RUNS / f"{name}.json",
+        RUNS / f"{running.name}.json",
         {
-            "started": datetime.fromtimestamp(started, UTC).isoformat(timespec="seconds"),
+            "started": datetime.fromtimestamp(started, UTC).isoformat(timespec="milliseconds"),
+            "ended": datetime.now(UTC).isoformat(timespec="milliseconds"),
             "startup_seconds": round(started - process.create_time(), 3),
             "seconds": round(time.time() - started, 3),
             "peak_memory_mb": round(peak, 1),
+            "metrics": running.metrics,
         },
     )

@@ -18,12 +18,12 @@ from torch.utils.data import Sampler
 from transformers import PrinterCallback, Trainer, TrainerCallback, TrainerControl, TrainerState, TrainingArguments
 from transformers.trainer_utils import get_last_checkpoint
 
-from pipeline.sampling import EpochDataset
+from pipeline.config import RuntimeConfig
 from pipeline.errors import UserError
-from pipeline.trainable import trainable_state
 from pipeline.records import Measurement
 from pipeline.runtime import CHECKPOINTS
-from pipeline.config import RuntimeConfig
+from pipeline.sampling import EpochDataset
+from pipeline.trainable import trainable_state
 
 Log = Callable[[int, dict[str, float]], None]
 """Receives step and values while a training runs."""

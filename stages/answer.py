@@ -1,39 +1,40 @@
-"""Let one variant answer the evaluation questions."""
+"""Let one variant answer the evaluation questions; the full system also under every input ablation."""
 
 import sys
 
-from pipeline.io import read_jsonl, write_jsonl
-from pipeline.language.input_ablation import feel
 from pipeline.embeddings import EmbeddingStore
+from pipeline.io import read_jsonl, write_jsonl
 from pipeline.language.generate import Asking, answer
+from pipeline.language.input_ablation import feel
 from pipeline.language.octopi import OctopiForCausalLM
-from pipeline.records import Question, Touch
+from pipeline.records import Encoder, Lora, Opd, Question, Touch, Variant
 from pipeline.runtime import resolve_device
 from pipeline.stage import DATA, stage
 
 
 def main() -> None:
-    key = sys.argv[1]
-    with stage("answer", key) as run:
-        params, variant = run.params, run.params.plan.variants[key]
-        language = params.language
-        store = EmbeddingStore(DATA / "embeddings" / variant.embeddings)
+    variant = Variant(Encoder(sys.argv[1]), Lora(sys.argv[2]), Opd(sys.argv[3]), int(sys.argv[4]))
+    with stage("answer", variant.key) as run:
+        params, language = run.params, run.params.language
+        store = EmbeddingStore(DATA / "embeddings" / f"{variant.encoder}-{variant.seed}")
+        folder = DATA / "models" / variant.lora / f"{variant.encoder}-{variant.opd}-{variant.seed}"
         model = OctopiForCausalLM.from_pretrained(
-            variant.model_dir, base=language.weights, dtype=language.dtype, quantization=language.quantization
-        )
-        asking = Asking(
-            system_prompt=language.system_prompt,
-            per_video=0 if variant.touch is Touch.REMOVED else params.frames.per_video,
-            max_new_tokens=language.max_new_tokens,
-            batch_size=language.generation_batch_size,
-        )
+            folder, base=language.weights, dtype=language.dtype, quantization=language.quantization
+        ).to(resolve_device(params.runtime.device))
         questions = read_jsonl(DATA / "questions" / "evaluation.jsonl", Question)
-        felt = feel(store, variant.touch, questions, variant.seed)
-        predictions = answer(model.to(resolve_device(params.runtime.device)), felt, questions, variant.opd, asking)
-        write_jsonl(DATA / "answers" / key / "predictions.jsonl", predictions)
-        run.metrics["answers"] = len(predictions)
-        run.metrics["tokens"] = sum(p.tokens for p in predictions)
-        run.metrics["truncated"] = sum(p.truncated for p in predictions)
+        for touch in (Touch.REAL, *(params.ablation.touch if variant.full else ())):
+            asking = Asking(
+                system_prompt=language.system_prompt,
+                per_video=0 if touch is Touch.REMOVED else params.frames.per_video,
+                max_new_tokens=language.max_new_tokens,
+                batch_size=language.generation_batch_size,
+            )
+            given = feel(store, touch, questions, variant.seed)
+            predictions = answer(model, given, questions, variant.opd, asking)
+            write_jsonl(DATA / "answers" / variant.key / f"{touch}.jsonl", predictions)
+            run.metrics[f"{touch}.answers"] = len(predictions)
+            run.metrics[f"{touch}.tokens"] = sum(p.tokens for p in predictions)
+            run.metrics[f"{touch}.truncated"] = sum(p.truncated for p in predictions)
 
 
 if __name__ == "__main__":

@@ -3,11 +3,11 @@
 from pathlib import Path
 
 from pipeline.io import read_table, write_csv, write_text
-from pipeline.videos.audit.run import AUDIT_FILE, audit_chain, stop_on_errors, summary
-from pipeline.videos.frames.store import PROBES_FILE
-from pipeline.videos.catalogue import load_catalogue
 from pipeline.records import Assignment, Finding, Probe, Video
 from pipeline.stage import DATA, stage
+from pipeline.videos.audit.run import AUDIT_FILE, audit_chain, stop_on_errors, summary
+from pipeline.videos.catalogue import load_catalogue
+from pipeline.videos.frames.store import PROBES_FILE
 
 
 def main() -> None:

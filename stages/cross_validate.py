@@ -3,13 +3,13 @@
 import sys
 from pathlib import Path
 
-from pipeline.io import read_table, write_table
-from pipeline.encoder.candidates import CONTESTANTS
-from pipeline.weights import check_encoder
-from pipeline.videos.catalogue import load_catalogue
-from pipeline.records import Judged, Video
-from pipeline.stage import DATA, stage
+from pipeline.encoder.candidates import CANDIDATES
 from pipeline.encoder.cross_validation import Arena, judge
+from pipeline.io import read_table, write_table
+from pipeline.records import OutOfFold, Video
+from pipeline.stage import DATA, stage
+from pipeline.videos.catalogue import load_catalogue
+from pipeline.weights import check_encoder
 
 
 def main() -> None:
@@ -26,10 +26,10 @@ def main() -> None:
             per_video=params.frames.per_video,
             encoder=params.encoder,
             runtime=params.runtime,
-            pretrained=Path(params.plan.cross_validation[name].pretrained) / "encoder.safetensors",
+            pretrained=DATA / "pretrained" / "encoder.safetensors",
         )
-        judged = judge(CONTESTANTS[name], arena, params.cross_validation)
-        write_table(DATA / "cross_validation" / name / "judged.parquet", Judged, judged)
+        judged = judge(CANDIDATES[name], arena, params.cross_validation)
+        write_table(DATA / "cross_validation" / name / "out_of_fold.parquet", OutOfFold, judged)
         right = [j.expected == j.predicted for j in judged]
         run.metrics["combined.accuracy"] = sum(right) / len(right)
 

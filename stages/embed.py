@@ -1,52 +1,59 @@
-"""Compute the embeddings of one encoder, base or fine-tuned."""
+"""Compute the embeddings of every kept frame, by the base encoder and each fine-tuned one."""
 
-import sys
+import shutil
 from pathlib import Path
 
-from pipeline.io import read_table, save_tensors, write_table
+from pipeline.config import EncoderConfig
 from pipeline.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE
-from pipeline.videos.frames.store import FrameStore
-from pipeline.encoder.recipes import base_encoder, property_classifier
+from pipeline.encoder.embed import embed_videos, standardize
 from pipeline.encoder.model import FrameEncoder
-from pipeline.trainable import load_trainable
-from pipeline.weights import check_encoder
-from pipeline.videos.catalogue import load_catalogue
-from pipeline.plan import Encoder
-from pipeline.records import Assignment, Embedding, Part
+from pipeline.encoder.recipes import base_encoder, property_classifier
+from pipeline.io import read_table, save_tensors, write_table
+from pipeline.records import Assignment, Embedding, Encoder, Part
 from pipeline.runtime import resolve_device
 from pipeline.stage import DATA, stage
-from pipeline.encoder.embed import embed_videos, standardize
+from pipeline.trainable import load_trainable
+from pipeline.videos.catalogue import load_catalogue
+from pipeline.videos.frames.store import FrameStore
+from pipeline.weights import check_encoder
+
+
+def load_encoder(config: EncoderConfig, catalogue: Path, which: Encoder, seed: int) -> FrameEncoder:
+    if which is Encoder.BASE:
+        return base_encoder(config)
+    classifier = property_classifier(config, [len(p.levels) for p in load_catalogue(catalogue).properties])
+    load_trainable(classifier, DATA / "encoder" / str(seed) / "encoder.safetensors")
+    return classifier.encoder
 
 
 def main() -> None:
-    key = sys.argv[1]
-    with stage("embed", key) as run:
+    with stage("embed") as run:
         params = run.params
-        weights = Path(params.encoder.weights)
-        check_encoder(weights, params.frames.size)
-        job = params.plan.embeddings[key]
-        if job.encoder is Encoder.BASE:
-            encoder: FrameEncoder = base_encoder(params.encoder)
-        else:
-            classes = [len(p.levels) for p in load_catalogue(Path(params.data.catalogue)).properties]
-            classifier = property_classifier(params.encoder, classes)
-            load_trainable(classifier, Path(job.encoder_dir) / "encoder.safetensors")
-            encoder = classifier.encoder
+        check_encoder(Path(params.encoder.weights), params.frames.size)
         assignments = read_table(DATA / "splits.parquet", Assignment)
-        tensor, index = embed_videos(
-            encoder,
-            FrameStore(DATA / "frames", params.encoder.reference),
-            assignments,
-            batch_size=params.encoder.embed_batch_size,
-            device=resolve_device(params.runtime.device),
-        )
-        if params.encoder.standardize:
-            tensor = standardize(tensor, index, {a.video_id for a in assignments if a.part == Part.TRAIN})
-        out = DATA / "embeddings" / key
-        save_tensors(out / TENSOR_FILE, {TENSOR: tensor})
-        write_table(out / INDEX_FILE, Embedding, index)
-        run.metrics["rows"] = len(index)
-        run.metrics["norm"] = float(tensor.norm(dim=1).mean())
+        store = FrameStore(DATA / "frames", params.encoder.reference)
+        training = {a.video_id for a in assignments if a.part == Part.TRAIN}
+        first, *others = params.ablation.seeds
+        for which in params.ablation.encoders:
+            for seed in params.ablation.seeds:
+                out = DATA / "embeddings" / f"{which}-{seed}"
+                if which is Encoder.BASE and seed != first:
+                    continue
+                encoder = load_encoder(params.encoder, Path(params.data.catalogue), which, seed)
+                device = resolve_device(params.runtime.device)
+                size = params.encoder.embed_batch_size
+                tensor, index = embed_videos(encoder, store, assignments, batch_size=size, device=device)
+                if params.encoder.standardize:
+                    tensor = standardize(tensor, index, training)
+                save_tensors(out / TENSOR_FILE, {TENSOR: tensor})
+                write_table(out / INDEX_FILE, Embedding, index)
+                run.metrics[f"{which}-{seed}.rows"] = len(index)
+                run.metrics[f"{which}-{seed}.norm"] = float(tensor.norm(dim=1).mean())
+        if Encoder.BASE in params.ablation.encoders:
+            # The base encoder has no seed: every seed's variants get the same embeddings.
+            for seed in others:
+                base = DATA / "embeddings" / Encoder.BASE
+                shutil.copytree(f"{base}-{first}", f"{base}-{seed}", dirs_exist_ok=True)
 
 
 if __name__ == "__main__":

@@ -3,11 +3,11 @@
 from pathlib import Path
 
 from pipeline.io import write_table
-from pipeline.videos.frames.extract import extract_frames
-from pipeline.videos.catalogue import load_catalogue
 from pipeline.records import Video
 from pipeline.runtime import CHECKPOINTS
 from pipeline.stage import DATA, stage
+from pipeline.videos.catalogue import load_catalogue
+from pipeline.videos.frames.extract import extract_frames
 
 
 def main() -> None:

@@ -3,16 +3,16 @@
 import sys
 from pathlib import Path
 
+from pipeline.encoder.finetune import EncoderData, classify, finetune
 from pipeline.io import read_table, write_table
-from pipeline.videos.frames.store import REFERENCES_FILE, TABLE_FILE, FrameStore
-from pipeline.trainable import save_trainable
-from pipeline.weights import check_encoder, clip_file
-from pipeline.videos.catalogue import load_catalogue
 from pipeline.records import Assignment, Classification, Measurement, Part
 from pipeline.runtime import resolve_device
 from pipeline.stage import DATA, stage
 from pipeline.tracking import live_run
-from pipeline.encoder.finetune import EncoderData, classify, finetune
+from pipeline.trainable import save_trainable
+from pipeline.videos.catalogue import load_catalogue
+from pipeline.videos.frames.store import REFERENCES_FILE, TABLE_FILE, FrameStore
+from pipeline.weights import check_encoder, clip_file
 
 
 def main() -> None:
@@ -35,7 +35,7 @@ def main() -> None:
                 params.runtime,
                 seed=params.seed + seed,
                 inputs=inputs,
-                pretrained=Path(params.plan.pretrained) / "encoder.safetensors",
+                pretrained=DATA / "pretrained" / "encoder.safetensors",
                 log=live.log,
             )
         device = resolve_device(params.runtime.device)

@@ -1,25 +1,26 @@
-"""Grade the answers of one variant."""
+"""Grade the answers of all variants, each task by its own grader."""
 
-import sys
 from pathlib import Path
 
+from pipeline.evaluation.grading import grade
 from pipeline.io import read_jsonl, write_table
-from pipeline.evaluation.grading import grade, summarise
-from pipeline.videos.catalogue import load_catalogue
-from pipeline.records import Prediction, Question, Score
+from pipeline.records import Graded, Prediction, Question, Touch
 from pipeline.stage import DATA, stage
+from pipeline.videos.catalogue import load_catalogue
 
 
 def main() -> None:
-    key = sys.argv[1]
-    with stage("grade", key) as run:
-        scores = grade(
-            read_jsonl(DATA / "questions" / "evaluation.jsonl", Question),
-            read_jsonl(DATA / "answers" / key / "predictions.jsonl", Prediction),
-            load_catalogue(Path(run.params.data.catalogue)),
-        )
-        write_table(DATA / "scores" / key / "scores.parquet", Score, scores)
-        run.metrics.update(summarise(scores))
+    with stage("grade") as run:
+        questions = read_jsonl(DATA / "questions" / "evaluation.jsonl", Question)
+        catalogue = load_catalogue(Path(run.params.data.catalogue))
+        graded = []
+        for variant in run.params.ablation.variants():
+            for touch in (Touch.REAL, *(run.params.ablation.touch if variant.full else ())):
+                predictions = read_jsonl(DATA / "answers" / variant.key / f"{touch}.jsonl", Prediction)
+                whose = {**variant._asdict(), "touch": touch}
+                graded += [Graded(**score.model_dump(), **whose) for score in grade(questions, predictions, catalogue)]
+        write_table(DATA / "graded.parquet", Graded, graded)
+        run.metrics["answers"] = len({(g.variant, g.touch, g.question_id) for g in graded})
 
 
 if __name__ == "__main__":

@@ -3,32 +3,33 @@
 import sys
 from pathlib import Path
 
-from pipeline.io import read_jsonl, write_table
 from pipeline.embeddings import TENSOR_FILE, EmbeddingStore
+from pipeline.io import read_jsonl, write_table
 from pipeline.language.octopi import CONNECTOR_FILE
-from pipeline.records import Measurement, Question
+from pipeline.language.training import Job, Material, add_lora, assemble, finetune_lora
+from pipeline.records import Encoder, Measurement, Opd, Question
 from pipeline.stage import DATA, stage
 from pipeline.tracking import live_run
-from pipeline.language.training import Job, Material, add_lora, assemble, finetune_lora
 
 
 def main() -> None:
-    key = sys.argv[1]
+    encoder, opd, seed = Encoder(sys.argv[1]), Opd(sys.argv[2]), int(sys.argv[3])
+    key = f"{encoder}-{opd}-{seed}"
     with stage("lora", key) as run:
-        params, plan = run.params, run.params.plan.lora[key]
+        params = run.params
         inputs = (
             DATA / "questions" / "train.jsonl",
-            DATA / "embeddings" / plan.embeddings / TENSOR_FILE,
-            DATA / "align" / key / CONNECTOR_FILE,
+            DATA / "embeddings" / f"{encoder}-{seed}" / TENSOR_FILE,
+            DATA / "models" / "without" / key / CONNECTOR_FILE,
         )
         material = Material(
             questions=read_jsonl(inputs[0], Question),
             store=EmbeddingStore(inputs[1].parent),
-            opd=plan.opd,
+            opd=opd,
             language=params.language,
             per_video=params.frames.per_video,
             flip_probability=params.encoder.flip_probability,
-            seed=params.seed + plan.seed,
+            seed=params.seed + seed,
         )
         model, data = assemble(material, params.lora.samples, "lora", aligned=inputs[2].parent)
         add_lora(model, params.lora)
@@ -38,7 +39,7 @@ def main() -> None:
                 model, data, params.lora, params.runtime, Job(run.name, mark, material.seed, live.log)
             )
         run.finish_training(trained.history)
-        out = DATA / "lora" / key
+        out = DATA / "models" / "with" / key
         model.save_pretrained(out, trained.state)
         write_table(out / "history.parquet", Measurement, trained.history)
 

@@ -1,23 +1,27 @@
-"""Pretrain the strong recipe's encoder on pictures of invented objects."""
+"""Pretrain an encoder on pictures of invented objects, where the recipe or a compared model begins with that."""
 
-import sys
 from pathlib import Path
 
+from pipeline.encoder.candidates import needs_pretraining
 from pipeline.io import write_table
-from pipeline.trainable import save_trainable
 from pipeline.records import Measurement
 from pipeline.stage import DATA, stage
 from pipeline.tracking import live_run
-from pipeline.encoder.pretrain import pretrain
 
 
 def main() -> None:
-    key = sys.argv[1]
-    with stage("pretrain", key) as run:
+    with stage("pretrain") as run:
         params = run.params
+        out = DATA / "pretrained"
+        if not needs_pretraining(params.encoder.recipe, params.cross_validation.models):
+            write_table(out / "history.parquet", Measurement, [])
+            return
+        # Imported here, since most runs end above and need no torch.
+        from pipeline.encoder.pretrain import pretrain
+        from pipeline.trainable import save_trainable
+
         with live_run(params, run.name, Path()) as live:
             encoder, history = pretrain(params.pretrain, params.frames, params.runtime, live.log)
-        out = DATA / "pretrained" / key
         save_trainable(encoder, out / "encoder.safetensors")
         write_table(out / "history.parquet", Measurement, history)
         run.finish_training(history)

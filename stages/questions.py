@@ -3,10 +3,10 @@
 from pathlib import Path
 
 from pipeline.io import read_table, write_jsonl
-from pipeline.videos.catalogue import load_catalogue
-from pipeline.tasks.questions import build_questions, pool_of
 from pipeline.records import Assignment, Part
 from pipeline.stage import DATA, stage
+from pipeline.tasks.questions import build_questions, pool_of
+from pipeline.videos.catalogue import load_catalogue
 
 
 def main() -> None:

@@ -3,10 +3,10 @@
 from pathlib import Path
 
 from pipeline.io import read_table, write_table
-from pipeline.videos.catalogue import load_catalogue
 from pipeline.records import Assignment, Part, Video
-from pipeline.videos.split import assign
 from pipeline.stage import DATA, stage
+from pipeline.videos.catalogue import load_catalogue
+from pipeline.videos.split import assign
 
 
 def main() -> None:

@@ -1,23 +1,26 @@
-"""Make the synthetic videos."""
+"""Make the synthetic videos, where they are the source of the data; otherwise leave an empty folder."""
 
 from pathlib import Path
 
+from pipeline.config import SCENES_DIR
 from pipeline.io import write_csv
-from pipeline.videos.catalogue import load_catalogue
 from pipeline.scenes.recipe import load_recipes
 from pipeline.scenes.video import SceneRow, share_as_labelled, synthesize
-from pipeline.config import SCENES_DIR
 from pipeline.stage import stage
+from pipeline.videos.catalogue import load_catalogue
 
 
 def main() -> None:
-    with stage("synthesize", "scenes") as run:
+    with stage("synthesize") as run:
         folder, config = Path(run.params.data.catalogue), run.params.scenes
         catalogue = load_catalogue(folder)
-        rows = synthesize(load_recipes(folder, catalogue, config.seed), config, SCENES_DIR)
+        SCENES_DIR.mkdir(parents=True, exist_ok=True)
+        rows = []
+        if run.params.data.source == "scenes":
+            rows = synthesize(load_recipes(folder, catalogue, config.seed), config, SCENES_DIR)
         write_csv(SCENES_DIR.with_name("scenes.csv"), SceneRow, rows)
         run.metrics["videos"] = len(rows)
-        run.metrics["as_labelled"] = share_as_labelled(rows, catalogue)
+        run.metrics["as_labelled"] = share_as_labelled(rows, catalogue) if rows else 0.0
 
 
 if __name__ == "__main__":

@@ -18,13 +18,13 @@ from typing import TYPE_CHECKING, Literal
 
 import torch
 
-from pipeline.videos.catalogue import Catalogue
 from pipeline.language.chat import TACTILE, render
 from pipeline.records import Opd, Part, Prediction, Question, Task, Turn
 from pipeline.runtime import derive_seed
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool
 from pipeline.tasks.pom import facts
+from pipeline.videos.catalogue import Catalogue
 from standins.conversing import draw_draft
 from standins.describing import short
 from standins.documents import BLEND, blend_ids

@@ -14,10 +14,10 @@ import yaml
 from pydantic import BaseModel, ConfigDict
 
 import pipeline
-from pipeline.videos.catalogue import Catalogue, Object, Property, Scenario, load_catalogue
 from pipeline.records import Part
 from pipeline.runtime import derive_seed
 from pipeline.tasks.base import Pool
+from pipeline.videos.catalogue import Catalogue, Object, Property, Scenario, load_catalogue
 from standins.settings import FOLDER
 from standins.vocabulary import words_of
 

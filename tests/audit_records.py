@@ -7,16 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.videos.audit.leakage import check_leakage, evidence
-from pipeline.videos.frames.scan import Scan, scan
-from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.config import FramesConfig, ScenesConfig
 from pipeline.records import Assignment, Finding, Part, Probe, Severity, Video
 from pipeline.runtime import derive_seed
 from pipeline.scenes.light import make_sensor
 from pipeline.scenes.recipe import recipe_of
 from pipeline.scenes.render import make_scene, render
-from pipeline.config import FramesConfig, ScenesConfig
+from pipeline.videos.audit.leakage import check_leakage, evidence
+from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.files import VideoFile
+from pipeline.videos.frames.scan import Scan, scan
 from tests.closure import ROOT
 
 ERROR, WARNING, INFO = Severity.ERROR, Severity.WARNING, Severity.INFO

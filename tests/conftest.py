@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.records import Video
+from pipeline.videos.catalogue import Catalogue, load_catalogue
 
 if TYPE_CHECKING:
     import torch

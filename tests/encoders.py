@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from safetensors.torch import load_file, save_file
 
-from pipeline.io import write_table
-from pipeline.videos.frames.store import FRAMES_FILE, REFERENCES_FILE, TABLE_FILE, FrameStore
-from pipeline.videos.catalogue import Catalogue
-from pipeline.records import Assignment, Frame, Part
 from pipeline.config import EncoderConfig, Recipe, RuntimeConfig
 from pipeline.encoder.finetune import EncoderData
 from pipeline.encoder.frame_heads import Votes
+from pipeline.io import write_table
+from pipeline.records import Assignment, Frame, Part
+from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.frames.store import FRAMES_FILE, REFERENCES_FILE, TABLE_FILE, FrameStore
 from tests.checkpoints import write_clip
 
 Floats = np.ndarray
@@ -66,7 +66,7 @@ def config(weights: Path, recipe: Recipe, **changes: object) -> EncoderConfig:
             "recipe": recipe,
             "weights": str(weights),
             "prompts": 3,
-            "reference": "subtract" if recipe == "strong" else "none",
+            "reference": "subtract" if recipe == "pretrained" else "none",
             **changes,
         }
     )

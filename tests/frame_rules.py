@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 from PIL import Image as Pillow
 
+from pipeline.config import FramesConfig
+from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.decoding import Decoder, planes
 from pipeline.videos.frames.extract import Extraction, extract_frames
-from pipeline.videos.catalogue import Catalogue
-from pipeline.config import FramesConfig
 
 CONFIG = FramesConfig(size=16)
 FILES = ("frames.npy", "references.npy", "frames.parquet", "probes.parquet")

@@ -5,16 +5,16 @@ from __future__ import annotations
 import pytest
 import torch
 
-from pipeline.io import save_tensors, write_table
+from pipeline.config import LanguageConfig, TrainConfig
 from pipeline.embeddings import FLIPS, INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
+from pipeline.io import save_tensors, write_table
 from pipeline.language.generate import Asking
 from pipeline.language.octopi import OctopiForCausalLM
-from pipeline.videos.catalogue import load_catalogue
-from pipeline.tasks.questions import build_questions, pool_of
+from pipeline.language.training import Material
 from pipeline.records import Assignment, Embedding, Opd, Part, Question, Task
 from pipeline.runtime import seed_everything
-from pipeline.config import LanguageConfig, TrainConfig
-from pipeline.language.training import Material
+from pipeline.tasks.questions import build_questions, pool_of
+from pipeline.videos.catalogue import load_catalogue
 from tests.checkpoints import write_llama
 from tests.closure import ROOT
 

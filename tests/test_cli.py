@@ -11,8 +11,8 @@ import pytest
 from typer.testing import CliRunner
 
 from pipeline.cli import app
-from pipeline.params import load_params
 from pipeline.errors import UserError
+from pipeline.params import load_params
 from tests.closure import ROOT
 from tests.conftest import moving_square, write_video
 

@@ -8,14 +8,14 @@ from typing import get_args
 
 import pytest
 import yaml
+from pipeline.plan import resolve_plan
 
-from pipeline.params import load_params
+from pipeline.config import Recipe
 from pipeline.encoder.candidates import RELEASE
 from pipeline.errors import UserError
-from pipeline.plan import resolve_plan
+from pipeline.params import load_params
 from pipeline.records import Opd
 from pipeline.scales import check_inputs, compose, prune, shipped_scales, write_params
-from pipeline.config import Recipe
 from tests.closure import ROOT
 
 CONF = ROOT / "conf"
@@ -158,7 +158,7 @@ def test_a_recipe_brings_its_settings_and_gives_way_to_yours() -> None:
         composed = compose("smoke", [f"encoder.recipe={recipe}"], conf=CONF)
         assert composed.encoder.recipe == recipe
         assert composed.language == smoke.language
-        assert composed.plan.pretrain == (("scenes",) if recipe == "strong" else ())
+        assert composed.plan.pretrain == (("scenes",) if recipe == "pretrained" else ())
     release = compose("small", ["encoder.recipe=release"], conf=CONF).encoder
     assert {name: getattr(release, name) for name in RELEASE} == RELEASE, "the contestant is the recipe"
     own = compose("small", ["encoder.recipe=release", "encoder.epochs=3"], conf=CONF).encoder
@@ -166,5 +166,5 @@ def test_a_recipe_brings_its_settings_and_gives_way_to_yours() -> None:
     with pytest.raises(UserError, match=r"cross_validation.models: paper would be trained with the settings of"):
         compose("small", ["encoder.recipe=release", "cross_validation.models=[trees,paper]"], conf=CONF)
     compose("small", ["encoder.recipe=release", "cross_validation.models=[trees,release]"], conf=CONF)
-    with pytest.raises(UserError, match=r"encoder.recipe=strong .* set encoder.reference=subtract"):
-        compose("smoke", ["encoder.recipe=strong", "encoder.reference=none"], conf=CONF)
+    with pytest.raises(UserError, match=r"encoder.recipe=pretrained .* set encoder.reference=subtract"):
+        compose("smoke", ["encoder.recipe=pretrained", "encoder.reference=none"], conf=CONF)

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import UserError
-from pipeline.videos.catalogue import Catalogue
 from pipeline.scenes.bumps import Domes, Ridges
 from pipeline.scenes.geometry import IMAGE_MM
 from pipeline.scenes.measure import HARD_ABOVE_MPA, SOFT_BELOW_MPA
 from pipeline.scenes.recipe import BUMP_SHARE, MODULUS_MPA, ROUGH_RMS_MM, load_recipes, recipe_of
 from pipeline.scenes.relief import Rough
+from pipeline.videos.catalogue import Catalogue
 from tests.conftest import ROOT
 
 PHYSICLEAR = ROOT / "pipeline" / "physiclear"

@@ -12,6 +12,7 @@ from filelock import FileLock
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.errors import UserError
 from pipeline.io import (
     atomic,
     load_tensors,
@@ -22,7 +23,6 @@ from pipeline.io import (
     write_jsonl,
     write_table,
 )
-from pipeline.errors import UserError
 from pipeline.records import Assignment, Measurement, Part, Score, Task, Video
 from pipeline.scales import compose, write_params
 from pipeline.stage import stage

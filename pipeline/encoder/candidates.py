@@ -1,27 +1,30 @@
-"""The encoders and their rivals that a cross-validation can compare: what each is made of."""
+"""The encoders and baselines that a cross-validation can compare: what each is made of."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import difflib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
+
+from pipeline.errors import UserError
 
 Kind = Literal["constant", "trees", "votes", "gradient"]
 
 
 @dataclass(frozen=True)
-class Contestant:
+class Candidate:
     """One model. What does not concern its kind has no meaning."""
 
     title: str
     kind: Kind
     """`constant`: the training objects' most frequent combination. `trees`: hand-made features of whole frames and
-    tree ensembles. `votes`: the strong recipe's heads on frozen features of frames. `gradient`: trained by the
+    tree ensembles. `votes`: the pretrained recipe's heads on frozen features of frames. `gradient`: trained by the
     Trainer."""
     encoder: Literal["clip", "scenes", "untrained"] = "clip"
     """`scenes`: pretrained on them; `untrained`: the same network with random weights."""
     recipe: Literal["paper", "release", "scratch"] = "paper"
-    """`gradient`: which. `scratch` trains the strong recipe's network end to end from random weights."""
+    """`gradient`: which. `scratch` trains the pretrained recipe's network end to end from random weights."""
     reference: Literal["none", "own", "mean"] = "none"
     """What is subtracted from a frame: nothing, its video's own no-contact picture, or the mean of the training
     videos' ones."""
@@ -44,29 +47,54 @@ class Contestant:
         return self.encoder == "scenes" and self.kind == "votes"
 
 
-STRONG = Contestant("pretrained on scenes, frames vote, decided jointly", "votes", "scenes", reference="own")
-PAPER = Contestant("CLIP with visual prompts, three heads", "gradient")
+PRETRAINED = Candidate("pretrained on scenes, frames vote, decided jointly", "votes", "scenes", reference="own")
+PAPER = Candidate("CLIP with visual prompts, three heads", "gradient")
 RELEASE = {"epochs": 40, "batch_size": 4, "learning_rate": 1e-3, "weight_decay": 0.01}
 LEARNING_CURVE = (10, 20, 30, 40)
 
-CONTESTANTS: dict[str, Contestant] = {
-    "constant": Contestant("the training objects' most frequent combination of classes", "constant"),
-    "trees": Contestant("hand-made features of five uniform frames, random trees, decided jointly", "trees"),
-    "probe": Contestant("frozen CLIP, frames vote, decided jointly", "votes"),
-    "probe-difference": Contestant("frozen CLIP on difference pictures, likewise", "votes", reference="own"),
+CANDIDATES: dict[str, Candidate] = {
+    "constant": Candidate("the training objects' most frequent combination of classes", "constant"),
+    "trees": Candidate("hand-made features of five uniform frames, random trees, decided jointly", "trees"),
+    "probe": Candidate("frozen CLIP, frames vote, decided jointly", "votes"),
+    "probe-difference": Candidate("frozen CLIP on difference pictures, likewise", "votes", reference="own"),
     "paper": PAPER,
     "paper-difference": replace(PAPER, title="the paper's recipe on difference pictures", reference="own"),
     "release": replace(PAPER, title="the published code's recipe", recipe="release", settings=RELEASE),
-    "scratch": replace(PAPER, title="the strong recipe's network, from scratch", recipe="scratch", reference="own"),
-    "strong": STRONG,
-    "strong-untrained": replace(STRONG, title="without pretraining", encoder="untrained", parent="strong"),
-    "strong-raw": replace(STRONG, title="without each video's own reference", reference="mean", parent="strong"),
-    "strong-independent": replace(STRONG, title="without the joint decision", joint=False, parent="strong"),
-    "strong-pooled": replace(STRONG, title="features averaged in place of votes", pooled=True, parent="strong"),
-    "strong-one-frame": replace(STRONG, title="one frame a video", frames=1, parent="strong"),
-    "strong-ten-frames": replace(STRONG, title="ten frames a video", frames=10, parent="strong"),
+    "scratch": replace(PAPER, title="the pretrained recipe's network, from scratch", recipe="scratch", reference="own"),
+    "pretrained": PRETRAINED,
+    "pretrained-untrained": replace(PRETRAINED, title="without pretraining", encoder="untrained", parent="pretrained"),
+    "pretrained-raw": replace(
+        PRETRAINED, title="without each video's own reference", reference="mean", parent="pretrained"
+    ),
+    "pretrained-independent": replace(PRETRAINED, title="without the joint decision", joint=False, parent="pretrained"),
+    "pretrained-pooled": replace(
+        PRETRAINED, title="features averaged in place of votes", pooled=True, parent="pretrained"
+    ),
+    "pretrained-one-frame": replace(PRETRAINED, title="one frame a video", frames=1, parent="pretrained"),
+    "pretrained-ten-frames": replace(PRETRAINED, title="ten frames a video", frames=10, parent="pretrained"),
     **{
-        f"strong-{count}-objects": replace(STRONG, title=f"{count} training objects", objects=count, parent="strong")
+        f"pretrained-{count}-objects": replace(
+            PRETRAINED, title=f"{count} training objects", objects=count, parent="pretrained"
+        )
         for count in LEARNING_CURVE
     },
 }
+
+
+def check_candidates(names: Sequence[str], recipe: str) -> None:
+    """Raise UserError where a name of `cross_validation.models` is none, or lacks settings under this recipe."""
+    for name in names:
+        if name not in CANDIDATES:
+            close = difflib.get_close_matches(name, CANDIDATES, n=1)
+            hint = f"did you mean {close[0]}? " if close else ""
+            raise UserError(f"cross_validation.models: {name} is no model; {hint}known: {', '.join(CANDIDATES)}")
+        if CANDIDATES[name].kind == "gradient" and not CANDIDATES[name].settings and recipe == "release":
+            raise UserError(
+                f"cross_validation.models: {name} would be trained with the settings of encoder.recipe=release; "
+                "compare it under recipe paper or pretrained"
+            )
+
+
+def needs_pretraining(recipe: str, models: Sequence[str]) -> bool:
+    """Whether the encoder's recipe, or one of the compared models, begins with synthetic pretraining."""
+    return recipe == "pretrained" or any(CANDIDATES[name].pretrained for name in models)

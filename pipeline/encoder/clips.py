@@ -9,10 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from pipeline.sampling import EpochDataset
-from pipeline.sampling import sample_evaluation, sample_training
-from pipeline.videos.frames.store import FrameStore
 from pipeline.runtime import derive_seed
+from pipeline.sampling import EpochDataset, sample_evaluation, sample_training
+from pipeline.videos.frames.store import FrameStore
 
 
 @dataclass(frozen=True)

@@ -9,25 +9,25 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.io import read_json, read_table, write_json
+from pipeline.config import CrossValidationConfig, EncoderConfig, RuntimeConfig
 from pipeline.encoder.baseline.predictor import Labels
 from pipeline.encoder.baseline.recordings import Recording, recording_features
 from pipeline.encoder.baseline.validation import Fold, Predict, cross_validate, deal, forest
-from pipeline.encoder.candidates import Contestant
-from pipeline.errors import UserError
-from pipeline.videos.frames.store import PROBES_FILE, REFERENCES_FILE, TABLE_FILE, FrameStore
+from pipeline.encoder.candidates import Candidate
+from pipeline.encoder.finetune import EncoderData, classify, describe_clips, train_classifier
+from pipeline.encoder.frame_heads import Clips, choose_strength, fit_votes
+from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
 from pipeline.encoder.recipes import base_encoder, property_classifier
 from pipeline.encoder.scene_encoder import SceneEncoder
-from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
-from pipeline.trainable import load_trainable
-from pipeline.weights import clip_file
-from pipeline.videos.catalogue import Catalogue
-from pipeline.records import Assignment, Judged, Part, Probe, Video
+from pipeline.errors import UserError
+from pipeline.io import read_json, read_table, write_json
+from pipeline.records import Assignment, OutOfFold, Part, Probe, Video
 from pipeline.runtime import CHECKPOINTS, derive_seed, resolve_device, seed_everything
-from pipeline.config import CrossValidationConfig, EncoderConfig, RuntimeConfig
-from pipeline.encoder.finetune import EncoderData, classify, describe_clips, train_classifier
+from pipeline.trainable import load_trainable
 from pipeline.training import fingerprint
-from pipeline.encoder.frame_heads import Clips, choose_strength, fit_votes
+from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.frames.store import PROBES_FILE, REFERENCES_FILE, TABLE_FILE, FrameStore
+from pipeline.weights import clip_file
 
 VALIDATION = 8
 """One in so many training objects is set aside where a training chooses its best epoch."""
@@ -70,12 +70,12 @@ class Arena:
         """What results depend on besides the catalogue and the parameters."""
         return [self.frames / TABLE_FILE, self.frames / REFERENCES_FILE, clip_file(Path(self.encoder.weights))]
 
-    def store(self, contestant: Contestant) -> FrameStore:
+    def store(self, contestant: Candidate) -> FrameStore:
         """The frames as the contestant sees them."""
         return FrameStore(self.frames, "subtract" if contestant.reference == "own" else "none")
 
 
-def judge(contestant: Contestant, arena: Arena, config: CrossValidationConfig) -> list[Judged]:
+def judge(contestant: Candidate, arena: Arena, config: CrossValidationConfig) -> list[OutOfFold]:
     """Cross-validate one contestant; finished folds survive a kill.
 
     Folds depend on the objects and `config` alone, so all contestants share them.
@@ -101,7 +101,7 @@ def judge(contestant: Contestant, arena: Arena, config: CrossValidationConfig) -
     )
     shutil.rmtree(work, ignore_errors=True)
     return [
-        Judged(
+        OutOfFold(
             video_id=video.video_id,
             object_id=video.object_id,
             repeat=repeat,
@@ -123,7 +123,7 @@ def _remembered(predict: Predict, work: Path) -> Predict:
     return lookup
 
 
-def _limited(predict: Predict, contestant: Contestant, arena: Arena) -> Predict:
+def _limited(predict: Predict, contestant: Candidate, arena: Arena) -> Predict:
     """Leave only so many training objects, drawn anew in each fold."""
     count = contestant.objects
     if count is None:
@@ -139,7 +139,7 @@ def _limited(predict: Predict, contestant: Contestant, arena: Arena) -> Predict:
     return fewer
 
 
-def _constant(_: Contestant, arena: Arena) -> Predict:
+def _constant(_: Candidate, arena: Arena) -> Predict:
     def predict(fold: Fold) -> Labels:
         seen = dict(zip(np.array(arena.objects)[fold.trained], map(tuple, arena.labels[fold.trained]), strict=True))
         combinations, counts = np.unique(np.array(list(seen.values())), axis=0, return_counts=True)
@@ -148,7 +148,7 @@ def _constant(_: Contestant, arena: Arena) -> Predict:
     return predict
 
 
-def _trees(_: Contestant, arena: Arena) -> Predict:
+def _trees(_: Candidate, arena: Arena) -> Predict:
     touching = {p.video_id for p in read_table(arena.frames / PROBES_FILE, Probe) if p.starts_touching}
     features = recording_features(
         [Recording(arena.recordings / video.path, video.video_id in touching) for video in arena.videos]
@@ -156,7 +156,7 @@ def _trees(_: Contestant, arena: Arena) -> Predict:
     return forest(features, arena.labels, arena.objects, arena.classes)
 
 
-def _votes(contestant: Contestant, arena: Arena) -> Predict:
+def _votes(contestant: Candidate, arena: Arena) -> Predict:
     """Features come from an encoder that has seen no label, so they are computed once for all folds."""
     labels, owners = arena.labels, np.array(arena.objects)
     encoder = frozen_encoder(contestant, arena)
@@ -180,7 +180,7 @@ def _votes(contestant: Contestant, arena: Arena) -> Predict:
     return predict
 
 
-def frozen_encoder(contestant: Contestant, arena: Arena) -> FrameEncoder:
+def frozen_encoder(contestant: Candidate, arena: Arena) -> FrameEncoder:
     """The encoder whose frames vote."""
     if contestant.encoder == "clip":
         # As CLIP reads it, whatever the recipe of the chain.
@@ -192,7 +192,7 @@ def frozen_encoder(contestant: Contestant, arena: Arena) -> FrameEncoder:
     return encoder
 
 
-def _features(encoder: FrameEncoder, contestant: Contestant, arena: Arena, store: FrameStore) -> Clips:
+def _features(encoder: FrameEncoder, contestant: Candidate, arena: Arena, store: FrameStore) -> Clips:
     per_video = contestant.frames or arena.per_video
     data = EncoderData(store, arena.catalogue, _assignments(arena, {}), per_video)
     device, batch = resolve_device(arena.runtime.device), arena.encoder.embed_batch_size
@@ -200,7 +200,7 @@ def _features(encoder: FrameEncoder, contestant: Contestant, arena: Arena, store
     return clips.mean(axis=1, keepdims=True) if contestant.pooled else clips
 
 
-def _gradient(contestant: Contestant, arena: Arena) -> Predict:
+def _gradient(contestant: Candidate, arena: Arena) -> Predict:
     recipe = "release" if contestant.recipe == "release" else "paper"
     config = arena.encoder.model_copy(update={"recipe": recipe, **contestant.settings})
     store = arena.store(contestant)
@@ -245,7 +245,7 @@ def _assignments(arena: Arena, parts: dict[str, Part]) -> list[Assignment]:
     ]
 
 
-KINDS: dict[str, Callable[[Contestant, Arena], Predict]] = {
+KINDS: dict[str, Callable[[Candidate, Arena], Predict]] = {
     "constant": _constant,
     "trees": _trees,
     "votes": _votes,

@@ -9,10 +9,10 @@ import torch
 from tqdm import tqdm
 
 from pipeline.embeddings import FLIPS
-from pipeline.errors import UserError
-from pipeline.videos.frames.store import FrameStore
 from pipeline.encoder.model import FrameEncoder
+from pipeline.errors import UserError
 from pipeline.records import Assignment, Embedding, Flip, Part
+from pipeline.videos.frames.store import FrameStore
 
 AXES: dict[Flip, tuple[int, ...]] = {"none": (), "horizontal": (2,), "vertical": (1,), "both": (1, 2)}
 """Axes of frames x height x width that a flip reverses."""

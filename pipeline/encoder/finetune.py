@@ -18,17 +18,16 @@ from torch.nn import functional as F
 from torch.utils.data import DataLoader
 from transformers import EvalPrediction
 
+from pipeline.config import EncoderConfig, RuntimeConfig
 from pipeline.encoder.clips import ClipDataset, LabelledVideo, collate_clips
-from pipeline.errors import UserError
-from pipeline.videos.frames.store import FrameStore
 from pipeline.encoder.frame_classifier import FrameVotes
-from pipeline.encoder.recipes import property_classifier
+from pipeline.encoder.frame_heads import Clips, choose_strength, fit_votes
 from pipeline.encoder.model import FrameEncoder, PropertyClassifier
-from pipeline.trainable import load_trainable
-from pipeline.videos.catalogue import Catalogue
+from pipeline.encoder.recipes import property_classifier
+from pipeline.errors import UserError
 from pipeline.records import Assignment, Classification, Measurement, Part
 from pipeline.runtime import resolve_device, seed_everything
-from pipeline.config import EncoderConfig, RuntimeConfig
+from pipeline.trainable import load_trainable
 from pipeline.training import (
     Log,
     TrainableTrainer,
@@ -38,7 +37,8 @@ from pipeline.training import (
     train,
     training_arguments,
 )
-from pipeline.encoder.frame_heads import Clips, choose_strength, fit_votes
+from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.frames.store import FrameStore
 
 
 @dataclass(frozen=True)

@@ -10,16 +10,14 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from pipeline.config import FramesConfig, PretrainConfig, RuntimeConfig
 from pipeline.encoder import synthetic as lessons_module
-from pipeline.sampling import EpochDataset
-from pipeline.encoder.synthetic import Lessons, draw_lessons
-from pipeline.videos.frames import subtraction
-from pipeline.videos.frames.subtraction import MIDDLE
 from pipeline.encoder.scene_encoder import LessonModel, SceneEncoder
+from pipeline.encoder.synthetic import Lessons, draw_lessons
 from pipeline.records import Measurement
 from pipeline.runtime import CHECKPOINTS, derive_seed, seed_everything
+from pipeline.sampling import EpochDataset
 from pipeline.scenes import invent
-from pipeline.config import FramesConfig, PretrainConfig, RuntimeConfig
 from pipeline.training import (
     Log,
     TrainableTrainer,
@@ -29,6 +27,8 @@ from pipeline.training import (
     train,
     training_arguments,
 )
+from pipeline.videos.frames import subtraction
+from pipeline.videos.frames.subtraction import MIDDLE
 
 WARMUP = 0.04
 """Share of the updates."""

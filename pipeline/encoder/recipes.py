@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from pipeline.config import EncoderConfig
 from pipeline.encoder.clip import load_visual_tower
 from pipeline.encoder.frame_classifier import FrameVotes
+from pipeline.encoder.model import Heads, PropertyClassifier, TactileEncoder
 from pipeline.encoder.release import PublishedEncoder, PublishedHeads
 from pipeline.encoder.scene_encoder import SceneEncoder
-from pipeline.encoder.model import Heads, PropertyClassifier, TactileEncoder
 from pipeline.encoder.vpt import VisualPrompts
-from pipeline.config import EncoderConfig
 
 
 def base_encoder(config: EncoderConfig) -> TactileEncoder:
@@ -26,7 +26,7 @@ def property_classifier(config: EncoderConfig, classes: Sequence[int]) -> Proper
     Args:
         classes: How many classes each property has.
     """
-    if config.recipe == "strong":
+    if config.recipe == "pretrained":
         return FrameVotes(SceneEncoder(), classes)
     tower = load_visual_tower(Path(config.weights))
     paper = config.recipe == "paper"

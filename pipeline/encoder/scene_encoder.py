@@ -8,8 +8,8 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from pipeline.videos.frames.subtraction import GAIN, MIDDLE
 from pipeline.encoder.model import FrameEncoder
+from pipeline.videos.frames.subtraction import GAIN, MIDDLE
 
 STEPS = 12
 """8-bit steps of difference that count as 1: about the deviation where something touches."""

@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.config import FramesConfig, PretrainConfig
 from pipeline.io import atomic
-from pipeline.videos.frames.subtraction import subtract
 from pipeline.parallel import run_parallel
 from pipeline.runtime import derive_seed
 from pipeline.scenes.contact import Body, Method
@@ -26,7 +26,7 @@ from pipeline.scenes.geometry import IMAGE_MM, Heights, heights
 from pipeline.scenes.invent import LAYERS, invent
 from pipeline.scenes.light import Image, Sensor, make_sensor, shade
 from pipeline.scenes.measure import CUTOFF, bump_share, texture
-from pipeline.config import FramesConfig, PretrainConfig
+from pipeline.videos.frames.subtraction import subtract
 
 WIDTH, HEIGHT = 160, 120
 """Pixels that lessons are drawn at before they are fitted to the encoder's size."""

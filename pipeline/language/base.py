@@ -17,9 +17,9 @@ from transformers import (
 )
 
 from pipeline.errors import UserError
-from pipeline.weights import GET_LLM, check_language
 from pipeline.language.chat import add_tactile_tokens
 from pipeline.runtime import Quantization
+from pipeline.weights import GET_LLM, check_language
 
 
 def load_tokenizer(folder: Path) -> PreTrainedTokenizerBase:

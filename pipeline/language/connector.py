@@ -8,8 +8,8 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import nn
 
-from pipeline.io import read_json
 from pipeline.errors import UserError
+from pipeline.io import read_json
 from pipeline.language.chat import TACTILE_TOKENS
 
 CONFIG_FILE = "config.json"

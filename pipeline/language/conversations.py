@@ -10,12 +10,11 @@ import torch
 from transformers import PreTrainedTokenizerBase
 
 from pipeline.embeddings import FLIPS, EmbeddingStore, TactileFeatures
-from pipeline.sampling import EpochDataset
 from pipeline.errors import UserError
-from pipeline.sampling import sample_evaluation, sample_training
 from pipeline.language.chat import IGNORE_INDEX, Encoded, encode, render
 from pipeline.records import Opd, Question
 from pipeline.runtime import derive_seed
+from pipeline.sampling import EpochDataset, sample_evaluation, sample_training
 
 
 class Sample(TypedDict):

@@ -10,11 +10,11 @@ import torch
 from tqdm import tqdm
 from transformers import PreTrainedTokenizerBase, StoppingCriteria, StoppingCriteriaList
 
-from pipeline.language.conversations import check_length, evaluation_features, pad_features
 from pipeline.embeddings import TactileFeatures
 from pipeline.errors import UserError
-from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.chat import encode, render
+from pipeline.language.conversations import check_length, evaluation_features, pad_features
+from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.records import Opd, Prediction, Question, Turn
 
 

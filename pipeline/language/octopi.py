@@ -12,15 +12,15 @@ from torch.nn import functional as F
 from transformers import PreTrainedModel, PreTrainedTokenizerBase
 from transformers.modeling_outputs import CausalLMOutput
 
-from pipeline.io import save_tensors, write_json
 from pipeline.errors import UserError
+from pipeline.io import save_tensors, write_json
 from pipeline.language.adapter import load_adapter, save_adapter
-from pipeline.language.cache import roomy_cache
-from pipeline.language.connector import CONFIG_FILE, Connector, OctopiConfig, read_config
 from pipeline.language.base import load_llm, load_tokenizer
-from pipeline.trainable import load_trainable
+from pipeline.language.cache import roomy_cache
 from pipeline.language.chat import IGNORE_INDEX, TACTILE_TOKENS
+from pipeline.language.connector import CONFIG_FILE, Connector, OctopiConfig, read_config
 from pipeline.runtime import DtypeName, Quantization, resolve_dtype
+from pipeline.trainable import load_trainable
 
 CONNECTOR_FILE = "connector.safetensors"
 ADAPTER_DIR = "adapter"

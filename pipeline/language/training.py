@@ -9,14 +9,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.language.buckets import LengthBuckets
-from pipeline.language.conversations import ConversationCollator, ConversationDataset
+from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig, TrainConfig
 from pipeline.embeddings import EmbeddingStore
 from pipeline.errors import UserError
+from pipeline.language.buckets import LengthBuckets
+from pipeline.language.conversations import ConversationCollator, ConversationDataset
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.records import Opd, Question
 from pipeline.runtime import derive_seed, seed_everything
-from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig, TrainConfig
 from pipeline.training import (
     Log,
     TrainableTrainer,

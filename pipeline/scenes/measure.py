@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.errors import UserError
-from pipeline.videos.catalogue import Catalogue
 from pipeline.scenes.grid import Heights
+from pipeline.videos.catalogue import Catalogue
 
 SOFT_BELOW_MPA = 0.12
 """Reduced modulus under which an object yields with little force: half the gel's, so that it is the object that gives

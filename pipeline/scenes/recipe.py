@@ -15,11 +15,11 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from pipeline.errors import UserError
-from pipeline.videos.catalogue import Catalogue, Object
 from pipeline.runtime import derive_seed
 from pipeline.scenes.bumps import Domes, Ridges
 from pipeline.scenes.geometry import IMAGE_MM, Body, Flat, Round, Surface
 from pipeline.scenes.relief import AnyLayer, Rough
+from pipeline.videos.catalogue import Catalogue, Object
 
 SCENES = "scenes.yaml"
 Range = tuple[float, float]

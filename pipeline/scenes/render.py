@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from pipeline.config import ScenesConfig
 from pipeline.runtime import derive_seed
 from pipeline.scenes.contact import GEL, Imprint, Method, press
 from pipeline.scenes.elastic.torsion import slip_turn, twist
@@ -17,7 +18,6 @@ from pipeline.scenes.light import Image, Sensor, shade
 from pipeline.scenes.measure import Measured, measure
 from pipeline.scenes.motion import REACH_MM, Motion, make_motion
 from pipeline.scenes.recipe import Recipe
-from pipeline.config import ScenesConfig
 
 MARGIN_MM = REACH_MM
 """How far a patch reaches beyond the view at every angle."""

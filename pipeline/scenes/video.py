@@ -12,9 +12,9 @@ from statistics import fmean
 import cv2
 import numpy as np
 
+from pipeline.config import ScenesConfig
 from pipeline.errors import UserError
 from pipeline.parallel import run_parallel
-from pipeline.videos.catalogue import Catalogue
 from pipeline.records import Record
 from pipeline.runtime import derive_seed
 from pipeline.scenes.film import write_film
@@ -22,7 +22,7 @@ from pipeline.scenes.light import make_sensor
 from pipeline.scenes.motion import draw_length
 from pipeline.scenes.recipe import Recipe
 from pipeline.scenes.render import make_scene, measure_scene, render
-from pipeline.config import ScenesConfig
+from pipeline.videos.catalogue import Catalogue
 
 cv2.setNumThreads(1)  # Videos are what runs in parallel.
 

@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+from pipeline.records import Dialogue, Gold, Opd, Part, Prediction, Question, Score, Task, Turn
 from pipeline.videos.catalogue import Catalogue, Property
 from pipeline.videos.phrases import mentioned, plain
-from pipeline.records import Dialogue, Gold, Opd, Part, Prediction, Question, Score, Task, Turn
 
 LETTERS = "abc"
 ORDINALS = ("First", "Second")

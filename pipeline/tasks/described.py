@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import re
 
+from pipeline.records import Prediction, Question
+from pipeline.tasks.base import LETTERS, ORDINALS, find_level
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.descriptions import levels_named
 from pipeline.videos.wording import OPENING, Property
-from pipeline.records import Prediction, Question
-from pipeline.tasks.base import LETTERS, ORDINALS, find_level
 
 Classes = tuple[tuple[int | None, ...], ...]
 """Object by object, the class of each property that the question asks about; None where none was named, or several."""

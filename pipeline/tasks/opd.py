@@ -6,10 +6,10 @@ import math
 import random
 import re
 
-from pipeline.videos.catalogue import Catalogue
-from pipeline.videos.wording import OPENING
 from pipeline.records import Opd, Prediction, Question, Score, Task
 from pipeline.tasks.base import Draft, Pool, draw_videos, find_level, gold, single_turn
+from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.wording import OPENING
 
 TEMPLATES = ("Describe the physical properties of {tactile}.", "How does this tactile video {tactile} feel?")
 

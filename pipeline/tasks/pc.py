@@ -5,7 +5,6 @@ from __future__ import annotations
 import random
 import re
 
-from pipeline.videos.catalogue import Catalogue
 from pipeline.records import Opd, Prediction, Question, Score, Task
 from pipeline.tasks.base import (
     ORDINALS,
@@ -18,6 +17,7 @@ from pipeline.tasks.base import (
     gold,
     single_turn,
 )
+from pipeline.videos.catalogue import Catalogue
 
 TEMPLATES = (
     "Is the object in the tactile video {tactile} COMPARATIVE than the one in {tactile}?",

@@ -8,7 +8,6 @@ import re
 from collections.abc import Iterable
 from dataclasses import replace
 
-from pipeline.videos.catalogue import Catalogue
 from pipeline.records import Dialogue, Opd, Prediction, Question, Score, Task
 from pipeline.tasks.base import (
     LETTERS,
@@ -22,6 +21,7 @@ from pipeline.tasks.base import (
     lettered,
     single_turn,
 )
+from pipeline.videos.catalogue import Catalogue
 
 OPENINGS = ("Given three tactile videos: {videos}.", "You have tactile videos of one object each: {videos}.")
 REQUEST = "atch each video to one of the following objects in alphabetical order: {options}."

@@ -6,9 +6,9 @@ import random
 import re
 from collections.abc import Mapping
 
-from pipeline.videos.catalogue import Catalogue, Scenario
 from pipeline.records import Dialogue, Opd, Prediction, Question, Score, Task, Turn
 from pipeline.tasks.base import LETTERS, Draft, Pool, choice_score, descriptions, draw_videos, gold, lettered
+from pipeline.videos.catalogue import Catalogue, Scenario
 
 BASED = " based on physical property descriptions of the two objects"
 REQUEST = (

@@ -5,7 +5,6 @@ from __future__ import annotations
 import random
 import re
 
-from pipeline.videos.catalogue import Catalogue
 from pipeline.records import Opd, Prediction, Question, Score, Task
 from pipeline.tasks.base import (
     LETTERS,
@@ -19,6 +18,7 @@ from pipeline.tasks.base import (
     lettered,
     single_turn,
 )
+from pipeline.videos.catalogue import Catalogue
 
 TEMPLATES = (
     ("Given three tactile videos: {videos}.", "select the {superlative}."),

@@ -6,12 +6,12 @@ import random
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 
-from pipeline.videos.catalogue import Catalogue
 from pipeline.records import Assignment, Part, Question, Task
 from pipeline.runtime import derive_seed
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool
 from pipeline.tasks.pom import with_facts
+from pipeline.videos.catalogue import Catalogue
 
 ATTEMPTS = 60
 """Draws a question before its stratum is given up for this round (a rare class may need many)."""

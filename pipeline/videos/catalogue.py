@@ -17,10 +17,10 @@ import yaml
 from pydantic import ValidationError
 
 from pipeline.errors import UserError
-from pipeline.videos.wording import Entry, Language, Property, Scenario
-from pipeline.videos.csv_reader import Row, read_sheet
 from pipeline.records import Part
 from pipeline.runtime import derive_seed
+from pipeline.videos.csv_reader import Row, read_sheet
+from pipeline.videos.wording import Entry, Language, Property, Scenario
 
 __all__ = ["RULED_SPLITS", "Catalogue", "Language", "Object", "Property", "Scenario", "load_catalogue"]
 

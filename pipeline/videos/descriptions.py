@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from pipeline.videos.wording import Property
 from pipeline.videos.phrases import mentioned
+from pipeline.videos.wording import Property
 
 
 def levels_named(text: str, prop: Property) -> frozenset[int]:

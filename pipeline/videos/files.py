@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import UserError
+from pipeline.records import Finding, Severity
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.csv_reader import read_sheet
-from pipeline.records import Finding, Severity
 
 SUFFIXES = (".avi", ".mjpg", ".mkv", ".mov", ".mp4")
 LIST_FILE = "videos.csv"

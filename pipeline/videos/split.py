@@ -6,11 +6,11 @@ import random
 from collections import defaultdict
 from collections.abc import Collection, Sequence
 
+from pipeline.config import SplitConfig
 from pipeline.errors import UserError
-from pipeline.videos.catalogue import RULED_SPLITS, Catalogue
 from pipeline.records import Assignment, Part, Record, Video
 from pipeline.runtime import derive_seed
-from pipeline.config import SplitConfig
+from pipeline.videos.catalogue import RULED_SPLITS, Catalogue
 
 CANDIDATES = 2000
 """Random sets of test objects that the development split chooses the best balanced one from."""

@@ -13,19 +13,19 @@ from textwrap import dedent
 
 import pytest
 import yaml
+from pipeline.reporting import write_report
 from safetensors.numpy import load_file
 
-from pipeline.io import read_jsonl, read_table
 from pipeline.errors import UserError
-from pipeline.videos.catalogue import Catalogue, load_catalogue
-from pipeline.videos.descriptions import levels_named
+from pipeline.io import read_jsonl, read_table
 from pipeline.records import Opd, Part, Prediction, Question, Score, Task
-from pipeline.reporting import write_report
 from pipeline.scenes.recipe import recipe_of
-from pipeline.videos.split import check_split
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool
+from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.videos.descriptions import levels_named
 from pipeline.videos.files import list_videos
+from pipeline.videos.split import check_split
 from tests.closure import ROOT
 from tests.fake_chain import fake_params, write_chain
 from tests.project import OBJECTS, REDUCED, Project, copy_project

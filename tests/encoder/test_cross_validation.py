@@ -14,32 +14,32 @@ import torch
 from pydantic import ValidationError
 from torch.optim.optimizer import register_optimizer_step_pre_hook
 
-from pipeline.io import write_table
+from pipeline.config import CrossValidationConfig, EncoderConfig, RuntimeConfig
+from pipeline.encoder import cross_validation as module
+from pipeline.encoder import frame_heads as voting
 from pipeline.encoder.baseline.features import video_features
 from pipeline.encoder.baseline.predictor import PropertyPredictor
 from pipeline.encoder.baseline.recordings import Recording, describe, recording_features
 from pipeline.encoder.baseline.validation import Fold, Predict, Verdict, deal
 from pipeline.encoder.baseline.validation import cross_validate as fold_by_fold
-from pipeline.encoder.candidates import CONTESTANTS, LEARNING_CURVE, Contestant
-from pipeline.videos.decoding import decode
-from pipeline.errors import UserError
-from pipeline.videos.frames.reference import reference_indices
-from pipeline.videos.frames.store import FrameStore
-from pipeline.videos.frames.subtraction import subtract
-from pipeline.encoder.scene_encoder import SceneEncoder
+from pipeline.encoder.candidates import CANDIDATES, LEARNING_CURVE, Candidate
+from pipeline.encoder.cross_validation import Arena, frozen_encoder, judge
+from pipeline.encoder.finetune import EncoderData
+from pipeline.encoder.frame_heads import Clips, Votes, fit_votes
 from pipeline.encoder.model import FrameEncoder, PropertyClassifier
-from pipeline.trainable import save_trainable, trainable_state
-from pipeline.videos.catalogue import Catalogue
+from pipeline.encoder.scene_encoder import SceneEncoder
+from pipeline.errors import UserError
+from pipeline.io import write_table
 from pipeline.records import Measurement, Part, Probe
 from pipeline.runtime import derive_seed, seed_everything
 from pipeline.scales import compose
 from pipeline.scenes.film import write_film
-from pipeline.config import CrossValidationConfig, EncoderConfig, RuntimeConfig
-from pipeline.encoder import cross_validation as module
-from pipeline.encoder import frame_heads as voting
-from pipeline.encoder.cross_validation import Arena, frozen_encoder, judge
-from pipeline.encoder.finetune import EncoderData
-from pipeline.encoder.frame_heads import Clips, Votes, fit_votes
+from pipeline.trainable import save_trainable, trainable_state
+from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.decoding import decode
+from pipeline.videos.frames.reference import reference_indices
+from pipeline.videos.frames.store import FrameStore
+from pipeline.videos.frames.subtraction import subtract
 from tests.audit_records import probe
 from tests.closure import ROOT
 from tests.conftest import encode, fake_videos, moving_square
@@ -126,13 +126,13 @@ def folds(monkeypatch: pytest.MonkeyPatch) -> Folds:
 # Who learns from what
 
 
-@pytest.mark.parametrize("name", ["probe", "strong-independent", "strong-10-objects", "strong-3"])
+@pytest.mark.parametrize("name", ["probe", "pretrained-independent", "pretrained-10-objects", "pretrained-3"])
 def test_votes_learn_from_no_object_that_they_are_tested_on(
     name: str, arena: Arena, folds: Folds, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Told by the objects' names and by the pictures themselves, in the final fits and in those that choose."""
-    limit = {"strong-10-objects": 10, "strong-3": 3}.get(name)
-    contestant = replace(CONTESTANTS["probe"], objects=limit, joint=name != "strong-independent")
+    limit = {"pretrained-10-objects": 10, "pretrained-3": 3}.get(name)
+    contestant = replace(CANDIDATES["probe"], objects=limit, joint=name != "pretrained-independent")
     monkeypatch.setattr(module, "frozen_encoder", lambda *_: Telling())
     fits: list[int] = []
 
@@ -174,7 +174,7 @@ def test_votes_learn_from_no_object_that_they_are_tested_on(
 def test_gradients_learn_from_no_object_that_they_are_tested_on(
     name: str, arena: Arena, folds: Folds, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    contestant = CONTESTANTS[name]
+    contestant = CANDIDATES[name]
     chosen: list[frozenset[str]] = []
 
     def spy(
@@ -206,7 +206,7 @@ def test_gradients_learn_from_no_object_that_they_are_tested_on(
 def test_a_limited_contestant_draws_anew_in_each_fold_and_nests(arena: Arena, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: dict[int, list[frozenset[str]]] = {}
 
-    def fake(contestant: Contestant, arena: Arena) -> Predict:
+    def fake(contestant: Candidate, arena: Arena) -> Predict:
         def predict(fold: Fold) -> np.ndarray:
             used = frozenset(o for o, t in zip(arena.objects, fold.trained, strict=True) if t)
             drawn.setdefault(contestant.objects or 99, []).append(used)
@@ -219,7 +219,7 @@ def test_a_limited_contestant_draws_anew_in_each_fold_and_nests(arena: Arena, mo
 
     monkeypatch.setitem(module.KINDS, "votes", fake)
     for count in (2, 3, None):
-        judge(replace(CONTESTANTS["strong"], objects=count), arena, CONFIG)
+        judge(replace(CANDIDATES["pretrained"], objects=count), arena, CONFIG)
     assert {len(s) for s in drawn[2]} == {2}
     assert {len(s) for s in drawn[3]} == {3}
     places = {
@@ -236,7 +236,7 @@ def test_all_contestants_share_their_folds(arena: Arena, folds: Folds, monkeypat
     for kind in ("trees", "votes", "gradient"):
         monkeypatch.setitem(module.KINDS, kind, none)
     seen = []
-    for contestant in CONTESTANTS.values():
+    for contestant in CANDIDATES.values():
         folds.clear()
         judge(contestant, arena, CONFIG)
         seen.append([(f.repeat, f.number, f.tested.tobytes(), f.trained.tobytes()) for f in folds])
@@ -248,7 +248,7 @@ def test_all_contestants_share_their_folds(arena: Arena, folds: Folds, monkeypat
 
 
 def test_each_video_is_judged_once_a_repeat(arena: Arena) -> None:
-    judged = judge(CONTESTANTS["constant"], arena, CONFIG)
+    judged = judge(CANDIDATES["constant"], arena, CONFIG)
     assert [(j.video_id, j.repeat) for j in judged] == [(v.video_id, r) for v in arena.videos for r in (0, 1)]
     assert all(j.expected == arena.catalogue.labels(j.object_id) for j in judged)
 
@@ -258,7 +258,7 @@ def test_each_video_is_judged_once_a_repeat(arena: Arena) -> None:
 
 def test_constant_by_hand(arena: Arena) -> None:
     """Each object counts once, however many videos it has; of equals the lowest classes."""
-    judged = judge(CONTESTANTS["constant"], arena, CONFIG)
+    judged = judge(CANDIDATES["constant"], arena, CONFIG)
     for repeat in range(2):
         for held in deal(OBJECTS, 3, derive_seed(4, "folds", repeat)):
             counts = Counter(arena.catalogue.labels(o) for o in OBJECTS if o not in held)
@@ -276,7 +276,7 @@ def test_what_the_pictures_tell_is_found(arena: Arena, monkeypatch: pytest.Monke
         pixels[3 * position : 3 * position + 3] = 100 * arena.catalogue.labels(video.object_id)[0]
     np.save(folder / "frames.npy", pixels)
     monkeypatch.setattr(module, "frozen_encoder", lambda *_: Telling())
-    contestant = replace(CONTESTANTS["probe"], joint=False)
+    contestant = replace(CANDIDATES["probe"], joint=False)
     monkeypatch.setattr(voting, "STRENGTHS", (10.0,))
     seen = judge(contestant, arena, CrossValidationConfig(folds=7, repeats=1))
     shared = [j for j in seen if sum(arena.catalogue.labels(o)[0] == j.expected[0] for o in OBJECTS) > 1]
@@ -284,9 +284,11 @@ def test_what_the_pictures_tell_is_found(arena: Arena, monkeypatch: pytest.Monke
     assert all(j.predicted[0] == j.expected[0] for j in shared), "classes that another object has, too"
 
 
-@pytest.mark.parametrize("name", ["probe", "probe-difference", "strong-untrained", "strong-pooled", "strong-raw"])
+@pytest.mark.parametrize(
+    "name", ["probe", "probe-difference", "pretrained-untrained", "pretrained-pooled", "pretrained-raw"]
+)
 def test_a_verdict_is_repeatable_and_independent_of_the_order(name: str, arena: Arena) -> None:
-    contestant = CONTESTANTS[name]
+    contestant = CANDIDATES[name]
     if contestant.pretrained:
         contestant = replace(contestant, encoder="untrained")
     setting = CrossValidationConfig(folds=2, repeats=1)
@@ -303,17 +305,17 @@ def test_a_verdict_is_repeatable_and_independent_of_the_order(name: str, arena: 
 def test_the_untrained_network_is_always_the_same_and_the_pretrained_one_is_loaded(arena: Arena) -> None:
     def state(contestant: str, arena: Arena) -> dict[str, torch.Tensor]:
         seed_everything(int(torch.randint(100, (1,))))
-        return trainable_state(frozen_encoder(CONTESTANTS[contestant], arena))
+        return trainable_state(frozen_encoder(CANDIDATES[contestant], arena))
 
-    one, other = state("strong-untrained", arena), state("strong-untrained", arena)
+    one, other = state("pretrained-untrained", arena), state("pretrained-untrained", arena)
     assert all(torch.equal(one[n], other[n]) for n in one)
     with pytest.raises(UserError, match="encoder.safetensors: no such file"):
-        state("strong", arena)
+        state("pretrained", arena)
     seed_everything(77)
     pretrained = SceneEncoder()
     file = arena.frames / "encoder.safetensors"
     save_trainable(pretrained, file)
-    loaded = state("strong", replace(arena, pretrained=file))
+    loaded = state("pretrained", replace(arena, pretrained=file))
     assert all(torch.equal(v, loaded[n]) for n, v in trainable_state(pretrained).items())
     assert not torch.equal(loaded["layers.0.weight"], one["layers.0.weight"])
 
@@ -324,18 +326,18 @@ def test_frames_and_pooling_are_what_their_names_say(arena: Arena, monkeypatch: 
 
     def spy(clips: Clips, *args: object, **settings: bool) -> Votes:
         shapes.setdefault(name, set()).add(clips.shape[1:])
-        if name == "strong-pooled":
+        if name == "pretrained-pooled":
             np.testing.assert_allclose(clips[:, 0, 1], 1.5)
         return fit_votes(clips, *args, **settings)  # type: ignore[arg-type]
 
     monkeypatch.setattr(module, "fit_votes", spy)
-    for name in ("strong", "strong-one-frame", "strong-ten-frames", "strong-pooled"):
-        judge(CONTESTANTS[name], arena, CrossValidationConfig(folds=2, repeats=1))
+    for name in ("pretrained", "pretrained-one-frame", "pretrained-ten-frames", "pretrained-pooled"):
+        judge(CANDIDATES[name], arena, CrossValidationConfig(folds=2, repeats=1))
     assert shapes == {
-        "strong": {(2, 3)},
-        "strong-one-frame": {(1, 3)},
-        "strong-ten-frames": {(10, 3)},
-        "strong-pooled": {(1, 3)},
+        "pretrained": {(2, 3)},
+        "pretrained-one-frame": {(1, 3)},
+        "pretrained-ten-frames": {(10, 3)},
+        "pretrained-pooled": {(1, 3)},
     }
 
 
@@ -351,7 +353,7 @@ def test_the_mean_reference_is_of_training_videos_alone(
         share(store, video_ids)
 
     monkeypatch.setattr(FrameStore, "share_reference", spy)
-    judge(replace(CONTESTANTS["strong-raw"], encoder="untrained"), arena, CrossValidationConfig(folds=3, repeats=1))
+    judge(replace(CANDIDATES["pretrained-raw"], encoder="untrained"), arena, CrossValidationConfig(folds=3, repeats=1))
     assert len(used) == 3
 
 
@@ -377,7 +379,7 @@ def kill_after(count: int, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, i
     """Make all contestants constant and interrupt them when asked for one more fold; returns the folds begun."""
     begun: list[tuple[int, int]] = []
 
-    def until(contestant: Contestant, arena: Arena) -> Predict:
+    def until(contestant: Candidate, arena: Arena) -> Predict:
         predict = CONSTANT(contestant, arena)
 
         def counting(fold: Fold) -> np.ndarray:
@@ -397,14 +399,14 @@ def kill_after(count: int, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, i
 def test_finished_folds_survive_a_kill(
     count: int, arena: Arena, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = judge(CONTESTANTS["constant"], arena, CONFIG)
+    whole = judge(CANDIDATES["constant"], arena, CONFIG)
     assert not any(tmp_path.glob("checkpoints/cross_validation/*"))
     with monkeypatch.context() as patch:
         kill_after(count, patch)
         with pytest.raises(KeyboardInterrupt):
-            judge(CONTESTANTS["constant"], arena, CONFIG)
+            judge(CANDIDATES["constant"], arena, CONFIG)
     begun = kill_after(99, monkeypatch)
-    assert judge(CONTESTANTS["constant"], arena, CONFIG) == whole
+    assert judge(CANDIDATES["constant"], arena, CONFIG) == whole
     assert begun == [(r, n) for r in range(2) for n in range(3)][count:]
     assert not any(tmp_path.glob("checkpoints/cross_validation/*")), "kept no longer than needed"
 
@@ -413,12 +415,12 @@ def test_folds_of_other_settings_are_not_taken_for_these(arena: Arena, monkeypat
     with monkeypatch.context() as patch:
         kill_after(2, patch)
         with pytest.raises(KeyboardInterrupt):
-            judge(CONTESTANTS["constant"], arena, CONFIG)
+            judge(CANDIDATES["constant"], arena, CONFIG)
     begun = kill_after(99, monkeypatch)
     other = CONFIG.model_copy(update={"seed": 5})
-    judge(CONTESTANTS["constant"], arena, other)
+    judge(CANDIDATES["constant"], arena, other)
     assert len(begun) == 6
-    judge(replace(CONTESTANTS["constant"], joint=False), arena, CONFIG)
+    judge(replace(CANDIDATES["constant"], joint=False), arena, CONFIG)
     assert len(begun) == 12
 
 
@@ -445,9 +447,9 @@ def test_folds_of_other_inputs_are_not_taken_for_these(
     with monkeypatch.context() as patch:
         kill_after(2, patch)
         with pytest.raises(KeyboardInterrupt):
-            judge(CONTESTANTS["strong"], arena, CONFIG)
+            judge(CANDIDATES["pretrained"], arena, CONFIG)
     begun = kill_after(99, monkeypatch)
-    judge(CONTESTANTS["strong"], change(arena), CONFIG)
+    judge(CANDIDATES["pretrained"], change(arena), CONFIG)
     assert len(begun) == 6
 
 
@@ -499,8 +501,8 @@ def test_a_killed_training_goes_on_only_with_its_own_objects(
     monkeypatch.setattr(module, "train_classifier", counting)
     setting = CrossValidationConfig(folds=2, repeats=1, seed=4)
     with pytest.raises(KeyboardInterrupt):
-        judge(CONTESTANTS["paper"], arena, setting)
-    judge(CONTESTANTS["paper"], arena, setting.model_copy(update=change))
+        judge(CANDIDATES["paper"], arena, setting)
+    judge(CANDIDATES["paper"], arena, setting.model_copy(update=change))
     assert epochs == [left, 2]
 
 
@@ -548,7 +550,7 @@ def test_trees_are_the_baseline_on_whole_recordings(catalogue: Catalogue, weight
         runtime=RuntimeConfig(device="cpu"),
         pretrained=tmp_path / "none",
     )
-    judged = judge(CONTESTANTS["trees"], arena, CrossValidationConfig(folds=2, repeats=1, seed=3))
+    judged = judge(CANDIDATES["trees"], arena, CrossValidationConfig(folds=2, repeats=1, seed=3))
     features = np.stack([describe(Recording(tmp_path / v.path, v.video_id in touching)) for v in videos])
     recordings = [Recording(tmp_path / v.path, v.video_id in touching) for v in videos]
     np.testing.assert_array_equal(recording_features(recordings), features)
@@ -568,17 +570,17 @@ def test_trees_are_the_baseline_on_whole_recordings(catalogue: Catalogue, weight
 
 
 def test_each_variation_changes_one_thing_of_its_parent() -> None:
-    for name, contestant in CONTESTANTS.items():
+    for name, contestant in CANDIDATES.items():
         if not contestant.parent:
             continue
-        parent = CONTESTANTS[contestant.parent]
+        parent = CANDIDATES[contestant.parent]
         assert not parent.parent, name
         changed = [k for k, v in asdict(contestant).items() if v != asdict(parent)[k] and k not in ("title", "parent")]
         assert len(changed) == 1, name
-    titles = [c.title for c in CONTESTANTS.values()]
+    titles = [c.title for c in CANDIDATES.values()]
     assert len(set(titles)) == len(titles)
-    assert {CONTESTANTS[f"strong-{n}-objects"].objects for n in LEARNING_CURVE} == set(LEARNING_CURVE)
-    assert "trees" in CONTESTANTS
+    assert {CANDIDATES[f"pretrained-{n}-objects"].objects for n in LEARNING_CURVE} == set(LEARNING_CURVE)
+    assert "trees" in CANDIDATES
 
 
 def test_an_unknown_model_is_one_clear_line(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -590,7 +592,7 @@ def test_an_unknown_model_is_one_clear_line(monkeypatch: pytest.MonkeyPatch) -> 
     assert "\n" not in str(caught.value)
     with pytest.raises(UserError, match=r"cross_validation.models: names no model.*\[constant\] is the cheapest"):
         compose("smoke", ["cross_validation.models=[]"], conf=ROOT / "conf")
-    assert CrossValidationConfig(models=tuple(CONTESTANTS)).models == tuple(CONTESTANTS)
+    assert CrossValidationConfig(models=tuple(CANDIDATES)).models == tuple(CANDIDATES)
 
 
 @pytest.mark.parametrize(("key", "value"), [("folds", 1), ("folds", 51), ("repeats", 0), ("seed", -1)])

@@ -10,16 +10,16 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from pipeline.io import save_tensors, write_table
+from pipeline.config import EncoderConfig, Recipe
 from pipeline.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
-from pipeline.errors import UserError
 from pipeline.encoder.clip import load_visual_tower
+from pipeline.encoder.embed import standardize
 from pipeline.encoder.recipes import base_encoder, property_classifier
+from pipeline.errors import UserError
+from pipeline.io import save_tensors, write_table
+from pipeline.records import Embedding
 from pipeline.trainable import load_trainable, save_trainable, trainable_state
 from pipeline.weights import check_encoder, check_language
-from pipeline.records import Embedding
-from pipeline.config import EncoderConfig, Recipe
-from pipeline.encoder.embed import standardize
 from tests.checkpoints import write_clip, write_llama
 
 
@@ -30,7 +30,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def config(weights: Path, prompts: int = 2, recipe: Recipe = "paper") -> EncoderConfig:
     return EncoderConfig(
-        recipe=recipe, weights=str(weights), prompts=prompts, reference="subtract" if recipe == "strong" else "none"
+        recipe=recipe, weights=str(weights), prompts=prompts, reference="subtract" if recipe == "pretrained" else "none"
     )
 
 

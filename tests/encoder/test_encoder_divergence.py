@@ -10,22 +10,21 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from pipeline.encoder.candidates import CONTESTANTS
-from pipeline.encoder.synthetic import Lessons
-from pipeline.errors import UserError
-from pipeline.encoder.frame_classifier import FrameVotes
-from pipeline.encoder.scene_encoder import LessonModel, SceneEncoder
-from pipeline.trainable import trainable_state
-from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.config import CrossValidationConfig, EncoderConfig, FramesConfig, PretrainConfig, RuntimeConfig
 from pipeline.encoder import pretrain as pretraining
+from pipeline.encoder.candidates import CANDIDATES
 from pipeline.encoder.cross_validation import Arena, judge
 from pipeline.encoder.finetune import EncoderData, fit_heads, train_classifier
+from pipeline.encoder.frame_classifier import FrameVotes
 from pipeline.encoder.pretrain import pretrain
+from pipeline.encoder.scene_encoder import LessonModel, SceneEncoder
+from pipeline.encoder.synthetic import Lessons
+from pipeline.errors import UserError
+from pipeline.trainable import trainable_state
+from pipeline.videos.catalogue import Catalogue, load_catalogue
 from tests.closure import ROOT
 from tests.conftest import fake_videos
-from tests.encoders import CPU, PARTS, encoder_data, write_frames, write_tower
-from tests.test_encoder_stability import (
+from tests.encoder.test_encoder_stability import (
     CLASSES,
     Hook,
     Sick,
@@ -35,6 +34,7 @@ from tests.test_encoder_stability import (
     settings_of,
     with_a_bright_video,
 )
+from tests.encoders import CPU, PARTS, encoder_data, write_frames, write_tower
 
 __all__ = ["before_updates"]
 """A fixture."""
@@ -82,7 +82,7 @@ def test_features_that_are_not_finite_are_named_when_heads_are_fitted(
     data = with_a_bright_video(tmp_path, catalogue, PARTS, "pillow_0")
     data = EncoderData(data.store, catalogue, data.assignments, 4)
     with pytest.raises(UserError, match="pillow_0"):
-        fit_heads(FrameVotes(Sick(float("nan")), CLASSES), data, settings_of("strong", weights), CPU, 0)
+        fit_heads(FrameVotes(Sick(float("nan")), CLASSES), data, settings_of("pretrained", weights), CPU, 0)
 
 
 def test_a_last_step_that_diverges_is_told(weights: Path, catalogue: Catalogue, tmp_path: Path) -> None:
@@ -144,9 +144,9 @@ def two_objects(tmp_path: Path) -> Arena:
 
 def test_more_folds_than_objects_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"cross_validation.folds is 5 but only 2 objects"):
-        judge(CONTESTANTS["constant"], two_objects(tmp_path), CrossValidationConfig(folds=5))
+        judge(CANDIDATES["constant"], two_objects(tmp_path), CrossValidationConfig(folds=5))
 
 
 def test_one_training_object_leaves_none_to_validate_by(tmp_path: Path) -> None:
-    judged = judge(CONTESTANTS["paper"], two_objects(tmp_path), CrossValidationConfig(folds=2, repeats=1))
+    judged = judge(CANDIDATES["paper"], two_objects(tmp_path), CrossValidationConfig(folds=2, repeats=1))
     assert len(judged) == 4

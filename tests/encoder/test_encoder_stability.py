@@ -9,34 +9,34 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from pipeline.stability.encoder import hard_frames, seasoned
+from pipeline.stability.heads import HEAVIER, SIZES, cancelling, huge_classifier, huge_features, published_heads
 from torch.nn import functional as F
 from torch.optim.optimizer import register_optimizer_step_pre_hook
 
-from pipeline.encoder.clips import ClipDataset, LabelledVideo
-from pipeline.encoder.synthetic import Lessons
-from pipeline.errors import UserError
-from pipeline.videos.frames.store import FrameStore
-from pipeline.encoder.frame_classifier import FrameVotes
-from pipeline.encoder.recipes import property_classifier
-from pipeline.encoder.scene_encoder import CHANNELS, WEIGHTS, SceneEncoder
-from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
-from pipeline.trainable import trainable_state
-from pipeline.videos.catalogue import Catalogue
-from pipeline.records import Measurement, Part
-from pipeline.runtime import seed_everything
 from pipeline.config import EncoderConfig, FramesConfig, PretrainConfig, RuntimeConfig
-from pipeline.stability.encoder import hard_frames, seasoned
-from pipeline.stability.heads import HEAVIER, SIZES, cancelling, huge_classifier, huge_features, published_heads
 from pipeline.encoder import pretrain as pretraining
+from pipeline.encoder.clips import ClipDataset, LabelledVideo
 from pipeline.encoder.embed import embed_videos
 from pipeline.encoder.finetune import EncoderData, classify, fit_heads, train_classifier
-from pipeline.encoder.pretrain import pretrain
+from pipeline.encoder.frame_classifier import FrameVotes
 from pipeline.encoder.frame_heads import STRENGTHS, fit_votes
+from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
+from pipeline.encoder.pretrain import pretrain
+from pipeline.encoder.recipes import property_classifier
+from pipeline.encoder.scene_encoder import CHANNELS, WEIGHTS, SceneEncoder
+from pipeline.encoder.synthetic import Lessons
+from pipeline.errors import UserError
+from pipeline.records import Measurement, Part
+from pipeline.runtime import seed_everything
+from pipeline.trainable import trainable_state
+from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.frames.store import FrameStore
 from tests.encoders import CPU, MOMENTS, OBJECTS, PARTS, config, encoder_data, write_frames
 
 CLASSES = [3, 3, 3]
 DEVICE = torch.device("cpu")
-KINDS = ("paper", "release", "strong", "scratch")
+KINDS = ("paper", "release", "pretrained", "scratch")
 
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
@@ -54,7 +54,9 @@ def classifier(kind: str, weights: Path, seed: int = 0) -> PropertyClassifier:
 
 
 def settings_of(kind: str, weights: Path, **changes: object) -> EncoderConfig:
-    return config(weights, "release" if kind == "release" else "strong" if kind == "strong" else "paper", **changes)
+    return config(
+        weights, "release" if kind == "release" else "pretrained" if kind == "pretrained" else "paper", **changes
+    )
 
 
 # No signal, and too much
@@ -211,9 +213,9 @@ def test_heads_of_the_strong_recipe_are_fitted_without_a_class(
     weights: Path, catalogue: Catalogue, tmp_path: Path
 ) -> None:
     data = encoder_data(tmp_path, catalogue, {**HARD, "pillow": Part.TEST})
-    model = classifier("strong", weights)
+    model = classifier("pretrained", weights)
     assert isinstance(model, FrameVotes)
-    curve = fit_heads(model, data, settings_of("strong", weights), CPU, 0)
+    curve = fit_heads(model, data, settings_of("pretrained", weights), CPU, 0)
     assert [m.name for m in curve] == ["inner_combined"] * len(STRENGTHS)
     judged = classify(model, data, [Part.TEST], 4, DEVICE)
     assert judged[0].predicted == 2

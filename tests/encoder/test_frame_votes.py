@@ -15,16 +15,16 @@ from hypothesis import strategies as st
 from scipy.special import log_softmax, logsumexp
 from sklearn.linear_model import LogisticRegression
 
-from pipeline.videos.frames.store import FrameStore
-from pipeline.encoder.frame_classifier import FARTHEST, FrameVotes
-from pipeline.encoder.scene_encoder import SceneEncoder
-from pipeline.trainable import save_trainable, trainable_state
-from pipeline.videos.catalogue import Catalogue
-from pipeline.records import Part
-from pipeline.runtime import seed_everything
 from pipeline.encoder import frame_heads as voting
 from pipeline.encoder.finetune import EncoderData, finetune
+from pipeline.encoder.frame_classifier import FARTHEST, FrameVotes
 from pipeline.encoder.frame_heads import STRENGTHS, choose_strength, fit_votes
+from pipeline.encoder.scene_encoder import SceneEncoder
+from pipeline.records import Part
+from pipeline.runtime import seed_everything
+from pipeline.trainable import save_trainable, trainable_state
+from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.frames.store import FrameStore
 from tests.encoders import CPU, OBJECTS, Floats, config, drawn_votes, encoder_data, float64
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
@@ -240,7 +240,7 @@ def test_finetuning_the_strong_recipe_is_fitting_votes_to_evaluation_clips(
     plain = encoder_data(tmp_path, catalogue, parts)
     data = EncoderData(FrameStore(tmp_path, "subtract"), catalogue, plain.assignments, 2)
     model, curve = finetune(
-        data, config(weights, "strong"), CPU, seed=5, inputs=[], pretrained=tmp_path / "pretrained.safetensors"
+        data, config(weights, "pretrained"), CPU, seed=5, inputs=[], pretrained=tmp_path / "pretrained.safetensors"
     )
     assert isinstance(model, FrameVotes)
     pretrained.eval()

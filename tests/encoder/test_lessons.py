@@ -16,7 +16,11 @@ from hypothesis import strategies as st
 from scipy.special import expit
 
 import pipeline.parallel
+from pipeline.config import FramesConfig, PretrainConfig
+from pipeline.encoder import pretrain as pretraining
 from pipeline.encoder import synthetic as module
+from pipeline.encoder.pretrain import STRENGTH, LessonDataset, held_out, lesson_model, vary
+from pipeline.encoder.scene_encoder import LessonModel, SceneEncoder
 from pipeline.encoder.synthetic import (
     BODIES,
     FORCES,
@@ -32,17 +36,13 @@ from pipeline.encoder.synthetic import (
     sensors,
 )
 from pipeline.errors import UserError
-from pipeline.videos.frames.subtraction import subtract
-from pipeline.encoder.scene_encoder import LessonModel, SceneEncoder
 from pipeline.runtime import seed_everything
 from pipeline.scenes.geometry import heights
 from pipeline.scenes.invent import LAYERS, MODULUS_MPA, invent
 from pipeline.scenes.light import Sensor
 from pipeline.scenes.measure import measure
 from pipeline.scenes.recipe import Recipe
-from pipeline.config import FramesConfig, PretrainConfig
-from pipeline.encoder import pretrain as pretraining
-from pipeline.encoder.pretrain import STRENGTH, LessonDataset, held_out, lesson_model, vary
+from pipeline.videos.frames.subtraction import subtract
 from tests.frame_rules import pillow
 
 CONFIG = PretrainConfig(objects=9, presses=3, seed=5)

@@ -17,24 +17,24 @@ from scipy.stats import kstest, norm, uniform
 from torch.optim.optimizer import register_optimizer_step_pre_hook
 from transformers import EvalPrediction, TrainingArguments
 
-from pipeline.encoder.clips import ClipDataset, LabelledVideo
-from pipeline.errors import UserError
-from pipeline.videos.frames.store import FrameStore
-from pipeline.encoder.frame_classifier import FrameVotes
-from pipeline.encoder.release import DROPOUT, PublishedEncoder, PublishedHeads, sinusoid
-from pipeline.encoder.recipes import base_encoder, property_classifier
-from pipeline.encoder.scene_encoder import SceneEncoder
-from pipeline.encoder.model import Heads, PropertyClassifier, TactileEncoder
-from pipeline.trainable import load_trainable, save_trainable, trainable_state
-from pipeline.encoder.vpt import VisualPrompts
-from pipeline.weights import check_encoder
-from pipeline.videos.catalogue import Catalogue
-from pipeline.records import Part
-from pipeline.runtime import seed_everything
 from pipeline.config import Recipe
 from pipeline.encoder import finetune as training
+from pipeline.encoder.clips import ClipDataset, LabelledVideo
 from pipeline.encoder.finetune import accuracies, train_classifier
+from pipeline.encoder.frame_classifier import FrameVotes
+from pipeline.encoder.model import Heads, PropertyClassifier, TactileEncoder
+from pipeline.encoder.recipes import base_encoder, property_classifier
+from pipeline.encoder.release import DROPOUT, PublishedEncoder, PublishedHeads, sinusoid
+from pipeline.encoder.scene_encoder import SceneEncoder
+from pipeline.encoder.vpt import VisualPrompts
+from pipeline.errors import UserError
+from pipeline.records import Part
+from pipeline.runtime import seed_everything
+from pipeline.trainable import load_trainable, save_trainable, trainable_state
 from pipeline.training import TrainableTrainer
+from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.frames.store import FrameStore
+from pipeline.weights import check_encoder
 from tests.checkpoints import CLIP_CONFIG
 from tests.encoders import (
     CPU,
@@ -498,11 +498,11 @@ def test_statistics_of_frozen_layers_are_not_called_trained() -> None:
 
 def test_a_strong_classifier_reloads_exactly(weights: Path, tmp_path: Path) -> None:
     seed_everything(1)
-    model = property_classifier(config(weights, "strong"), [3, 3, 2])
+    model = property_classifier(config(weights, "pretrained"), [3, 3, 2])
     assert isinstance(model, FrameVotes)
     drawn_votes(2, 256, [3, 3, 2], 0.1).put_into(model)
     save_trainable(model, tmp_path / "model.safetensors")
-    other = property_classifier(config(weights, "strong"), [3, 3, 2])
+    other = property_classifier(config(weights, "pretrained"), [3, 3, 2])
     load_trainable(other, tmp_path / "model.safetensors")
     frames = torch.randint(0, 256, (3, 2, 48, 48, 3), dtype=torch.uint8)
     moments = torch.zeros(3, 2, dtype=torch.int64)
@@ -513,7 +513,7 @@ def test_a_strong_classifier_reloads_exactly(weights: Path, tmp_path: Path) -> N
     assert isinstance(other, FrameVotes)
     assert torch.equal(model.dependence, other.dependence)
     with pytest.raises(UserError, match="does not fit the model"):
-        load_trainable(property_classifier(config(weights, "strong"), [3, 3, 3]), tmp_path / "model.safetensors")
+        load_trainable(property_classifier(config(weights, "pretrained"), [3, 3, 3]), tmp_path / "model.safetensors")
     with pytest.raises(UserError, match="does not fit the model"):
         load_trainable(property_classifier(config(weights, "paper"), [3, 3, 2]), tmp_path / "model.safetensors")
 

@@ -12,11 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import UserError
-from pipeline.videos.frames.extract import extract_frames
 from pipeline.sampling import sample_evaluation, sample_training
+from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.frames.extract import extract_frames
 from pipeline.videos.frames.store import FrameStore
 from pipeline.videos.frames.subtraction import subtract
-from pipeline.videos.catalogue import Catalogue
 from tests.frame_rules import CONFIG
 
 

@@ -13,7 +13,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.videos.catalogue import load_catalogue
 from pipeline.statistics import (
     Interval,
     Outcome,
@@ -28,6 +27,7 @@ from pipeline.statistics import (
     resampled,
     wilson,
 )
+from pipeline.videos.catalogue import load_catalogue
 from tests.closure import ROOT
 
 SHROUT_FLEISS = [[9, 2, 5, 8], [6, 1, 3, 2], [8, 4, 6, 8], [7, 1, 2, 6], [10, 5, 6, 9], [6, 2, 4, 7]]

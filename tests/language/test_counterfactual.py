@@ -10,11 +10,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
+from pipeline.errors import UserError
 from pipeline.io import save_tensors, write_table
 from pipeline.language.conversations import evaluation_features
 from pipeline.language.input_ablation import NoisyTouch, SwappedTouch, feel
-from pipeline.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
-from pipeline.errors import UserError
 from pipeline.records import Dialogue, Embedding, Gold, Opd, Part, Question, Task, Touch, Turn
 
 DIM = 6

@@ -10,17 +10,17 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from pipeline.language.conversations import ConversationCollator
+from pipeline import training as shared
+from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig
 from pipeline.embeddings import EmbeddingStore
 from pipeline.errors import UserError
-from pipeline.language.generate import answer
 from pipeline.language.base import load_llm, load_tokenizer
-from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.chat import IGNORE_INDEX
-from pipeline.records import Opd, Question
-from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig
-from pipeline import training as shared
+from pipeline.language.conversations import ConversationCollator
+from pipeline.language.generate import answer
+from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import Job, add_lora, assemble, finetune_lora
+from pipeline.records import Opd, Question
 from tests.checkpoints import write_llama
 from tests.language import DIM, SMALL, asking, language, material, model, questions, store
 

@@ -9,16 +9,16 @@ import pytest
 import torch
 from transformers import DynamicCache, MistralConfig, MistralForCausalLM
 
-from pipeline.language.conversations import evaluation_features
+from pipeline.config import LanguageConfig
 from pipeline.embeddings import EmbeddingStore
 from pipeline.errors import UserError
-from pipeline.language.generate import answer
 from pipeline.language.cache import AHEAD, roomy_cache
-from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.chat import encode, render
-from pipeline.records import Opd, Question, Task
-from pipeline.config import LanguageConfig
+from pipeline.language.conversations import evaluation_features
+from pipeline.language.generate import answer
+from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import assemble
+from pipeline.records import Opd, Question, Task
 from tests.checkpoints import write_llama
 from tests.language import DIM, FRAMES, asking, language, material, model, questions, store
 

@@ -13,13 +13,13 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from pipeline.io import write_jsonl
+from pipeline import training as shared
+from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig
 from pipeline.embeddings import EmbeddingStore
 from pipeline.errors import UserError
-from pipeline.records import Question
-from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig
-from pipeline import training as shared
+from pipeline.io import write_jsonl
 from pipeline.language.training import Job, add_lora, align, assemble, finetune_lora
+from pipeline.records import Question
 from pipeline.training import Trained
 from tests.closure import ROOT
 from tests.language import SMALL, language, material, questions, store
@@ -40,7 +40,7 @@ from pipeline.io import read_jsonl
 from pipeline.embeddings import EmbeddingStore
 from pipeline.records import Question
 from pipeline.config import LanguageConfig
-from tests.test_language_kill import run
+from tests.language.test_language_kill import run
 folder, weights, embeddings, kind, when = sys.argv[1:]
 def die(*_):
     os.kill(os.getpid(), signal.SIGKILL)

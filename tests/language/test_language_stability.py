@@ -9,19 +9,19 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from pipeline.stability.language_ways import ALPHA, RANK
 from torch.nn import functional as F
 
-from pipeline.io import read_table, save_tensors
-from pipeline.language.conversations import ConversationDataset
+from pipeline.config import LanguageConfig, LoraTrainConfig
 from pipeline.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
 from pipeline.errors import UserError
+from pipeline.io import read_table, save_tensors
+from pipeline.language.chat import IGNORE_INDEX, Encoded, encode
+from pipeline.language.conversations import ConversationDataset
 from pipeline.language.generate import answer
 from pipeline.language.octopi import OctopiForCausalLM
-from pipeline.language.chat import IGNORE_INDEX, Encoded, encode
-from pipeline.records import Embedding, Opd, Question
-from pipeline.config import LanguageConfig, LoraTrainConfig
-from pipeline.stability.language_ways import ALPHA, RANK
 from pipeline.language.training import add_lora, assemble
+from pipeline.records import Embedding, Opd, Question
 from tests.language import DIM, asking, language, material, model, questions, store
 
 __all__ = ["language", "model", "questions", "store"]

@@ -10,18 +10,18 @@ from safetensors.torch import save_file
 from torch.optim.optimizer import register_optimizer_step_pre_hook
 from torch.utils.data import SequentialSampler
 
-from pipeline.language.conversations import ConversationCollator
+from pipeline import training as shared
+from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig
 from pipeline.embeddings import EmbeddingStore
 from pipeline.errors import UserError
-from pipeline.language.generate import answer
 from pipeline.language.base import load_llm
-from pipeline.language.octopi import OctopiForCausalLM
-from pipeline.trainable import trainable_state
 from pipeline.language.chat import IGNORE_INDEX, TACT_FRAME
-from pipeline.records import Opd, Question, Task
-from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig
-from pipeline import training as shared
+from pipeline.language.conversations import ConversationCollator
+from pipeline.language.generate import answer
+from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import Job, add_lora, align, assemble, finetune_lora
+from pipeline.records import Opd, Question, Task
+from pipeline.trainable import trainable_state
 from tests.checkpoints import write_llama
 from tests.language import DIM, FRAMES, SMALL, asking, language, material, model, questions, store
 
@@ -152,8 +152,8 @@ def test_running_into_the_limit_is_said(
 def test_answers_equal_generation_by_hand(
     model: OctopiForCausalLM, questions: list[Question], store: EmbeddingStore
 ) -> None:
-    from pipeline.language.conversations import evaluation_features
     from pipeline.language.chat import encode, render
+    from pipeline.language.conversations import evaluation_features
 
     question = next(q for q in questions if q.task is Task.PC)
     dialogue = question.dialogue(Opd.ALL)

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from transformers import PreTrainedTokenizerBase
 
 from pipeline.language.base import load_tokenizer
-from pipeline.videos.catalogue import load_catalogue
 from pipeline.language.chat import IGNORE_INDEX, TACT_END, TACT_FRAME, TACT_START, encode, render
-from pipeline.tasks.questions import build_questions, pool_of
 from pipeline.records import Assignment, Part, Question, Task, Turn
+from pipeline.tasks.questions import build_questions, pool_of
+from pipeline.videos.catalogue import load_catalogue
 from tests.checkpoints import write_llama
 from tests.closure import ROOT
 

@@ -8,9 +8,9 @@ import av
 import numpy as np
 import pytest
 
-from pipeline.videos.decoding import Decoder, decode
 from pipeline.errors import UserError
 from pipeline.scenes.film import KEY_EVERY, write_film
+from pipeline.videos.decoding import Decoder, decode
 
 
 def frames(count: int) -> list[np.ndarray]:

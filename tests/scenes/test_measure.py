@@ -9,11 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import UserError
-from pipeline.videos.catalogue import Catalogue
 from pipeline.scenes.contact import Body, Method
 from pipeline.scenes.geometry import IMAGE_MM, Heights, heights
 from pipeline.scenes.measure import BIG_SHARE, VISIBLE_MM, Measured, bump_share, check_recipe, measure, texture
 from pipeline.scenes.recipe import Recipe, load_recipes, recipe_of
+from pipeline.videos.catalogue import Catalogue
 from tests.conftest import ROOT
 
 WIDTH, HEIGHT, SIDE = 160, 120, 263

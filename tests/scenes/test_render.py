@@ -7,18 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.videos.decoding import decode
+from pipeline.config import FramesConfig, ScenesConfig
 from pipeline.errors import UserError
-from pipeline.videos.frames.scan import Scan, scan
-from pipeline.videos.catalogue import Catalogue
 from pipeline.scenes.geometry import IMAGE_MM, Round
 from pipeline.scenes.light import make_sensor
 from pipeline.scenes.recipe import Recipe, load_recipes
 from pipeline.scenes.relief import Rough
 from pipeline.scenes.render import Scene, make_scene, measure_scene, render
 from pipeline.scenes.video import share_as_labelled, synthesize
-from pipeline.config import FramesConfig, ScenesConfig
+from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.decoding import decode
 from pipeline.videos.files import list_videos
+from pipeline.videos.frames.scan import Scan, scan
 from tests.conftest import ROOT
 
 SMALL = ScenesConfig(objects=("rug",), videos_per_object=2, frames=8, width=64, height=48)

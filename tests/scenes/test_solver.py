@@ -8,12 +8,12 @@ import warnings
 import numpy as np
 import pytest
 import torch
+from pipeline.stability.case import Dtype
+from pipeline.stability.scenes import needle
 
 from pipeline.scenes.elastic.arrays import back
 from pipeline.scenes.elastic.kernels import Gel, Kernel, half_space_table, layer_table, make_kernel
 from pipeline.scenes.elastic.solver import NotConverged, Solution, solve
-from pipeline.stability.case import Dtype
-from pipeline.stability.scenes import needle
 
 RADIUS, MODULUS = 10.0, 1.0
 

@@ -6,12 +6,12 @@ from collections import Counter
 
 import pytest
 
-from pipeline.videos.catalogue import load_catalogue
-from pipeline.tasks.questions import build_questions, pool_of
-from pipeline.records import Part, Question, Task
 from pipeline.config import SplitConfig
-from pipeline.videos.split import assign
+from pipeline.records import Part, Question, Task
 from pipeline.tasks.base import Pool
+from pipeline.tasks.questions import build_questions, pool_of
+from pipeline.videos.catalogue import load_catalogue
+from pipeline.videos.split import assign
 from tests.conftest import ROOT, fake_videos
 
 CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")

@@ -10,17 +10,17 @@ from statistics import fmean
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from pipeline.io import read_jsonl, write_jsonl, write_table, write_text
-from pipeline.params import Params
-from pipeline.evaluation.grading import grade
-from pipeline.videos.catalogue import Catalogue, load_catalogue
-from pipeline.tasks.questions import build_questions, pool_of
-from pipeline.records import Assignment, Opd, Part, Prediction, Question, Score, Task
 from pipeline.reporting import write_report
 from pipeline.reporting.answered import FAILED
+
+from pipeline.evaluation.grading import grade
+from pipeline.io import read_jsonl, write_jsonl, write_table, write_text
+from pipeline.params import Params
+from pipeline.records import Assignment, Opd, Part, Prediction, Question, Score, Task
 from pipeline.statistics import Outcome, clustered
 from pipeline.tasks.described import described_right, read_descriptions
+from pipeline.tasks.questions import build_questions, pool_of
+from pipeline.videos.catalogue import Catalogue, load_catalogue
 from tests.closure import ROOT
 from tests.fake_chain import fake_params, write_chain
 

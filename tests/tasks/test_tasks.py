@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.videos.catalogue import load_catalogue
 from pipeline.language.chat import TACTILE
-from pipeline.tasks.questions import pool_of
 from pipeline.records import Assignment, Opd, Part, Prediction, Question, Score, Task
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool, conclusion, find_level
+from pipeline.tasks.questions import pool_of
+from pipeline.videos.catalogue import load_catalogue
 from tests.conftest import ROOT, fake_videos
 
 CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")

@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.records import Finding
 from pipeline.videos.audit.files import FOUND, check_files
 from pipeline.videos.audit.leakage import check_leakage, evidence
 from pipeline.videos.catalogue import Catalogue
-from pipeline.records import Finding
 from tests.audit_records import INFO, OBJECTS, OTHER, PHYSICLEAR, WARNING, leaks, odd, of, probe, probes
 
 

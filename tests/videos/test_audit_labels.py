@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 
+from pipeline.records import Part
 from pipeline.videos.audit.labels import check_labels, similar_names
 from pipeline.videos.catalogue import Catalogue
-from pipeline.records import Part
 from tests.audit_records import ERROR, INFO, OTHER, WARNING, of, relabelled
 
 

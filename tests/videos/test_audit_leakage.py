@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 import pytest
 
+from pipeline.records import Part, Probe, Severity, Video
 from pipeline.videos.audit import leakage
 from pipeline.videos.audit.leakage import evidence, predictability, sessions
 from pipeline.videos.catalogue import Catalogue
-from pipeline.records import Part, Probe, Severity, Video
 from tests.audit_records import (
     ERROR,
     GOOD_SPLIT,

@@ -12,8 +12,8 @@ import pytest
 import yaml
 
 from pipeline.errors import UserError
-from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.records import Part
+from pipeline.videos.catalogue import Catalogue, load_catalogue
 from tests.conftest import ROOT
 
 PHYSICLEAR = ROOT / "pipeline" / "physiclear"

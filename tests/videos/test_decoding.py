@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.config import FramesConfig
 from pipeline.videos.decoding import Decoder, Header, brightness, decode, picture, planes, to_rgb, turns
 from pipeline.videos.frames.fit import fit
-from pipeline.config import FramesConfig
 from tests.conftest import encode, moving_square, write_video
 
 ONE = 1 << 16

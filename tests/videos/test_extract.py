@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 
 import pipeline.parallel
-from pipeline.io import read_table
+from pipeline.config import FramesConfig
 from pipeline.errors import UserError
+from pipeline.io import read_table
+from pipeline.records import Finding, Frame, Probe
+from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.files import VideoFile
 from pipeline.videos.frames import extract
 from pipeline.videos.frames.extract import HEADER_BYTES, _header, _Pile
 from pipeline.videos.frames.fit import fit
 from pipeline.videos.frames.reference import reference_indices
 from pipeline.videos.frames.scan import Scan, scan
-from pipeline.videos.catalogue import Catalogue
-from pipeline.records import Finding, Frame, Probe
-from pipeline.config import FramesConfig
-from pipeline.videos.files import VideoFile
 from tests.conftest import moving_square, write_video
 from tests.frame_rules import CONFIG, FILES, Place, frames_of, luma, published, salience
 

@@ -8,9 +8,9 @@ import av
 import numpy as np
 import pytest
 
+from pipeline.config import FramesConfig
 from pipeline.videos.decoding import picture
 from pipeline.videos.frames.fit import fit
-from pipeline.config import FramesConfig
 from tests.conftest import encode
 from tests.frame_rules import frames_of, pillow
 

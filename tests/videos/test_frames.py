@@ -14,13 +14,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.config import FramesConfig
 from pipeline.videos.decoding import Decoder, Header, picture
 from pipeline.videos.frames import selection
-from pipeline.videos.frames.probing import Course, run_pass
 from pipeline.videos.frames.fit import fit
+from pipeline.videos.frames.probing import Course, run_pass
 from pipeline.videos.frames.reference import reference_indices, strength, thumbnail
 from pipeline.videos.frames.selection import TOUCHING, Kept, Pool, difference, kept_count, thin, uniform_indices
-from pipeline.config import FramesConfig
 from tests.conftest import encode, moving_square, write_video
 from tests.frame_rules import CONFIG, constant, frames_of, luma, pillow, pressing, published, salience
 

@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.videos.decoding import Decoder, Header
-from pipeline.errors import UserError
-from pipeline.videos.frames.extract import Extraction
-from pipeline.videos.catalogue import Catalogue
-from pipeline.records import Probe
 from pipeline.config import FramesConfig
+from pipeline.errors import UserError
+from pipeline.records import Probe
+from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.decoding import Decoder, Header
+from pipeline.videos.frames.extract import Extraction
 from tests.conftest import encode, moving_square, write_video
 from tests.frame_rules import Place, constant, luma, pressing, salience
 

@@ -11,13 +11,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.config import FramesConfig
 from pipeline.videos.decoding import Decoder, brightness
+from pipeline.videos.files import VideoFile
 from pipeline.videos.frames.fit import fit
-from pipeline.videos.frames.reference import LONGEST, MOST_FRAMES, reference_indices, starts_touching, strength, thumbnail
+from pipeline.videos.frames.reference import (
+    LONGEST,
+    MOST_FRAMES,
+    reference_indices,
+    starts_touching,
+    strength,
+    thumbnail,
+)
 from pipeline.videos.frames.scan import Scan, scan
 from pipeline.videos.frames.subtraction import subtract
-from pipeline.config import FramesConfig
-from pipeline.videos.files import VideoFile
 from tests.conftest import encode, write_video
 
 WIDTH, HEIGHT = 160, 120

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import UserError
-from pipeline.videos.catalogue import Catalogue, load_catalogue
-from pipeline.records import Part
 from pipeline.config import SplitConfig
+from pipeline.errors import UserError
+from pipeline.records import Part
+from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.split import Split, assign, check_split
 from tests.conftest import ROOT, fake_videos
 

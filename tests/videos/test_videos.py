@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import UserError
-from pipeline.videos.catalogue import Catalogue
 from pipeline.records import Severity
+from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import LIST_FILE, Listing, list_videos, raise_errors
 
 

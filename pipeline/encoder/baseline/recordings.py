@@ -10,9 +10,9 @@ import numpy as np
 
 from pipeline.encoder.baseline.features import Plane, video_features
 from pipeline.encoder.baseline.predictor import Features
+from pipeline.parallel import run_parallel
 from pipeline.videos.decoding import Image, decode
 from pipeline.videos.frames.reference import reference_indices
-from pipeline.parallel import run_parallel
 
 FRAMES = 5
 

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.encoder.baseline.predictor import Features, Labels, PropertyPredictor, check_labels
-from pipeline.records import Judged
+from pipeline.records import OutOfFold
 from pipeline.runtime import derive_seed
 from pipeline.statistics import Difference, Interval, Outcome, Spread, clustered, paired, quadratic_kappa
 
@@ -39,9 +39,9 @@ class Verdict:
         return fmean(p[position] == self.expected[position] for p in self.predicted)
 
 
-def collect(records: Iterable[Judged]) -> list[Verdict]:
+def collect(records: Iterable[OutOfFold]) -> list[Verdict]:
     """The verdicts that a stage has written down, in the order of the videos' names."""
-    videos: dict[str, list[Judged]] = {}
+    videos: dict[str, list[OutOfFold]] = {}
     for record in sorted(records, key=lambda r: (r.video_id, r.repeat)):
         videos.setdefault(record.video_id, []).append(record)
     return [Verdict(v[0].object_id, v[0].expected, tuple(r.predicted for r in v)) for v in videos.values()]

@@ -6,9 +6,8 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from statistics import fmean, median
 
-from pipeline.videos.catalogue import Catalogue
 from pipeline.records import Finding, Probe, Severity
-from pipeline.reporting.published import DATASET, find
+from pipeline.videos.catalogue import Catalogue
 
 SHORT = 0.5
 """A video with less than this share of the median length at its frame rate is named."""
@@ -32,7 +31,7 @@ def check_files(probes: Sequence[Probe], catalogue: Catalogue, *, synthetic: boo
     """All checks of this module, over videos that decode; the paper's counts do not stand beside `synthetic` ones."""
     if not probes:
         return
-    yield from _overview(probes, catalogue, of_paper=catalogue.language.dataset == DATASET and not synthetic)
+    yield from _overview(probes, catalogue)
     for group in _by_rate(probes).values():
         yield from _lengths(group)
         yield from _brightness(group)
@@ -50,13 +49,11 @@ def touches(probe: Probe, level: float) -> bool:
     return probe.contact > FOUND * level
 
 
-def _overview(probes: Sequence[Probe], catalogue: Catalogue, *, of_paper: bool) -> Iterator[Finding]:
-    published = find("video_lengths", "average", "frames") if of_paper else None
+def _overview(probes: Sequence[Probe], catalogue: Catalogue) -> Iterator[Finding]:
     videos = Counter(p.object_id for p in probes)
     frames = [p.frames for p in probes]
-    expected = f"{published.n} videos of {len(catalogue.objects)} objects" if published else ""
     measured = f"{len(probes)} videos of {len(videos)} objects"
-    yield _finding("videos", "all", measured, expected, warn=bool(expected) and measured != expected)
+    yield _finding("videos", "all", measured)
     counts = Counter(videos.values())
     spread = ", ".join(f"{n} objects with {count}" for count, n in sorted(counts.items()))
     yield _finding("videos per object", "all", spread)
@@ -64,14 +61,7 @@ def _overview(probes: Sequence[Probe], catalogue: Catalogue, *, of_paper: bool) 
     if absent:
         yield _finding("videos", ", ".join(absent), "no video", "one or more an object", warn=True)
     mean = fmean(frames)
-    yield _finding(
-        "length",
-        "all",
-        f"{min(frames)} to {max(frames)} frames, mean {mean:.1f}",
-        _published_lengths() if published else "",
-        warn=published is not None
-        and _published_lengths() != f"{min(frames)} to {max(frames)} frames, mean {mean:.1f}",
-    )
+    yield _finding("length", "all", f"{min(frames)} to {max(frames)} frames, mean {mean:.1f}")
     for check, groups in (
         ("frame rate", Counter(f"{p.fps:g} frames/s" for p in probes)),
         ("resolution", Counter(f"{p.width}x{p.height}" for p in probes)),
@@ -79,11 +69,6 @@ def _overview(probes: Sequence[Probe], catalogue: Catalogue, *, of_paper: bool) 
         usual = max(groups.items(), key=lambda item: (item[1], item[0]))[0]
         for name, count in sorted(groups.items()):
             yield _finding(check, name, f"{count} videos", "" if name == usual else usual, warn=name != usual)
-
-
-def _published_lengths() -> str:
-    low, high, mean = (find("video_lengths", row, "frames") for row in ("minimum", "maximum", "average"))
-    return f"{low.value:g} to {high.value:g} frames, mean {mean.value:.1f}" if low and high and mean else ""
 
 
 def _by_rate(probes: Sequence[Probe]) -> dict[float, list[Probe]]:

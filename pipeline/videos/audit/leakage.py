@@ -9,10 +9,10 @@ from statistics import fmean, pstdev
 
 import numpy as np
 
-from pipeline.videos.audit.files import quiet_level, touches
-from pipeline.videos.catalogue import Catalogue
 from pipeline.records import Assignment, Finding, Part, Probe, Severity, Video
 from pipeline.runtime import derive_seed
+from pipeline.videos.audit.files import quiet_level, touches
+from pipeline.videos.catalogue import Catalogue
 
 DUPLICATE = 0.965
 """Correlation of two videos' strongest contacts, from which they count as near-duplicates. Measured on 354 real videos:

@@ -6,17 +6,17 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from pipeline.config import FramesConfig, SplitConfig
+from pipeline.errors import UserError
+from pipeline.parallel import run_parallel
+from pipeline.records import Assignment, Finding, Probe, Severity, Video
 from pipeline.videos.audit.files import check_files
 from pipeline.videos.audit.labels import check_labels, similar_names
 from pipeline.videos.audit.leakage import check_leakage, evidence
-from pipeline.errors import UserError
-from pipeline.videos.frames.scan import Scan, scan
-from pipeline.parallel import run_parallel
 from pipeline.videos.catalogue import Catalogue
-from pipeline.records import Assignment, Finding, Probe, Severity, Video
-from pipeline.config import FramesConfig, SplitConfig
-from pipeline.videos.split import assign
 from pipeline.videos.files import VideoFile, list_videos
+from pipeline.videos.frames.scan import Scan, scan
+from pipeline.videos.split import assign
 
 AUDIT_FILE = "audit.csv"
 ORDER = (Severity.ERROR, Severity.WARNING, Severity.INFO)

@@ -15,16 +15,16 @@ from typing import Self
 import numpy as np
 from pydantic import ValidationError
 
-from pipeline.videos import decoding
-from pipeline.io import write_table
+from pipeline.config import FramesConfig
 from pipeline.errors import UserError
+from pipeline.io import write_table
+from pipeline.parallel import run_parallel
+from pipeline.records import Finding, Frame, Probe, Record, Video
+from pipeline.videos import decoding
+from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.files import VideoFile, list_videos, raise_errors
 from pipeline.videos.frames.scan import scan
 from pipeline.videos.frames.store import FRAMES_FILE, PROBES_FILE, REFERENCES_FILE, TABLE_FILE
-from pipeline.parallel import run_parallel
-from pipeline.videos.catalogue import Catalogue
-from pipeline.records import Finding, Frame, Probe, Record, Video
-from pipeline.config import FramesConfig
-from pipeline.videos.files import VideoFile, list_videos, raise_errors
 
 log = logging.getLogger(__name__)
 

@@ -6,8 +6,8 @@ import av
 import cv2
 import numpy as np
 
-from pipeline.videos.decoding import Image, planes, to_rgb, turns
 from pipeline.config import FramesConfig
+from pipeline.videos.decoding import Image, planes, to_rgb, turns
 
 
 def fit(frame: av.VideoFrame, config: FramesConfig) -> Image:

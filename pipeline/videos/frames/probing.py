@@ -10,6 +10,7 @@ import av
 import cv2
 import numpy as np
 
+from pipeline.config import FramesConfig
 from pipeline.videos.decoding import Decoder, Header, Image, brightness, picture, turns
 from pipeline.videos.frames.fit import fit
 from pipeline.videos.frames.reference import glance, reference_indices, strength, thumbnail
@@ -23,7 +24,6 @@ from pipeline.videos.frames.selection import (
     thin,
     uniform_indices,
 )
-from pipeline.config import FramesConfig
 
 PROBES = 8
 """Frames of a video that are measured for the audit, besides the reference's and the last."""

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from pipeline.config import FramesConfig
+from pipeline.records import Finding, Probe, Severity, Video
 from pipeline.videos.decoding import Image
+from pipeline.videos.files import VideoFile
 from pipeline.videos.frames.probing import Course, reference_from_end, run_pass
 from pipeline.videos.frames.reference import detail, starts_touching, strength
 from pipeline.videos.frames.selection import Kept
-from pipeline.records import Finding, Probe, Severity, Video
-from pipeline.config import FramesConfig
-from pipeline.videos.files import VideoFile
 
 THUMBNAIL_SIZE = (8, 6)
 SIGNATURE_SIZE = (24, 18)

@@ -20,10 +20,10 @@ import av
 import cv2
 import numpy as np
 
+from pipeline.config import FramesConfig
 from pipeline.videos.decoding import Image
 from pipeline.videos.frames.fit import fit
 from pipeline.videos.frames.reference import strength
-from pipeline.config import FramesConfig
 
 RELEASE_FEWEST = 5
 HELD_BYTES = 64 * 2**20

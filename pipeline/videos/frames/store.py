@@ -9,10 +9,10 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.io import read_table
 from pipeline.errors import UserError
-from pipeline.videos.frames.subtraction import Pictures, subtract
+from pipeline.io import read_table
 from pipeline.records import Frame
+from pipeline.videos.frames.subtraction import Pictures, subtract
 
 FRAMES_FILE = "frames.npy"
 REFERENCES_FILE = "references.npy"
