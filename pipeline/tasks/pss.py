@@ -31,6 +31,7 @@ class PropertySuperlativeSelection:
     """The right video is the only one of its class, so that the answer is never a matter of taste."""
 
     task = Task.PSS
+    title = "Superlative selection"
     trained = True
 
     def strata(self, catalogue: Catalogue) -> int:
