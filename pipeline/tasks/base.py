@@ -45,8 +45,6 @@ class TaskDefinition(Protocol):
     """One of the tasks. `strata` are balanced: question i of a set asks for stratum i modulo their number."""
 
     task: Task
-    title: str
-    """What it is called in tables."""
     trained: bool
     """Whether the task's questions are also used for training (PSR's are not)."""
 

@@ -18,7 +18,6 @@ class ObjectPropertyDescription:
     """Trained and evaluated; has no `none` mode, since without descriptions there is no task."""
 
     task = Task.OPD
-    title = "Object property description"
     trained = True
 
     def strata(self, catalogue: Catalogue) -> int:

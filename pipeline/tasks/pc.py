@@ -30,7 +30,6 @@ class PropertyComparison:
     """Three answers are possible (yes, no, the same), hence the paper's chance of one third."""
 
     task = Task.PC
-    title = "Property comparison"
     trained = True
 
     def strata(self, catalogue: Catalogue) -> int:

@@ -56,7 +56,6 @@ class PropertyObjectMatching:
     """The three objects differ in at least one property each, or touch could not tell them apart."""
 
     task = Task.POM
-    title = "Object matching"
     trained = True
 
     def strata(self, catalogue: Catalogue) -> int:

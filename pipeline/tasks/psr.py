@@ -21,7 +21,6 @@ class PropertyScenarioReasoning:
     """With OPD the objects are described in a first turn; without, the one turn asks at once."""
 
     task = Task.PSR
-    title = "Scenario reasoning"
     trained = False
 
     def strata(self, catalogue: Catalogue) -> int:

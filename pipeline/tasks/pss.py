@@ -31,7 +31,6 @@ class PropertySuperlativeSelection:
     """The right video is the only one of its class, so that the answer is never a matter of taste."""
 
     task = Task.PSS
-    title = "Superlative selection"
     trained = True
 
     def strata(self, catalogue: Catalogue) -> int:
