@@ -27,16 +27,6 @@ class Part(StrEnum):
     UNUSED = "unused"
 
 
-class Task(StrEnum):
-    """The five tasks of the paper (its table "Task Details")."""
-
-    OPD = "OPD"
-    PC = "PC"
-    PSS = "PSS"
-    POM = "POM"
-    PSR = "PSR"
-
-
 class Opd(StrEnum):
     """How much an answer describes before it concludes (the ablation axis OPD)."""
 
@@ -220,7 +210,8 @@ class Question(Record):
     """One question in every OPD mode that applies; all ablation variants share its id."""
 
     question_id: str
-    task: Task
+    task: str
+    """Name of the task in `pipeline.tasks.TASKS`."""
     part: Part
     videos: tuple[str, ...]
     objects: tuple[str, ...]
@@ -236,7 +227,7 @@ class Prediction(Record):
     """The raw text that a variant generated, one entry a turn."""
 
     question_id: str
-    task: Task
+    task: str
     outputs: tuple[str, ...]
     truncated: bool
     """Whether a turn ran into the token limit before the end token."""
@@ -252,7 +243,7 @@ class Score(Record):
     """One graded measure of one answer; OPD has one a property and `combined`, other tasks `choice`."""
 
     question_id: str
-    task: Task
+    task: str
     measure: str
     correct: bool
     parsed: bool

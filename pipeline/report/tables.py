@@ -85,7 +85,7 @@ def task_title(task: str) -> str:
     titles = {
         HEADS: "Property heads",
         CROSS_VALIDATION: "Cross-validation",
-        **{str(t): d.title for t, d in TASKS.items()},
+        **{name: task.title for name, task in TASKS.items()},
     }
     return f"{titles[task]} ({task})" if task in TASKS else titles.get(task, task)
 
@@ -134,7 +134,7 @@ COLUMNS: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
 
 def _ordered(frame: pd.DataFrame) -> pd.DataFrame:
     """Tasks in the registry's order, whole answers before parts, the full system before what lacks something."""
-    tasks = [*map(str, TASKS), HEADS, CROSS_VALIDATION]
+    tasks = [*TASKS, HEADS, CROSS_VALIDATION]
     rank = pd.DataFrame(index=frame.index)
     rank["task"] = frame["task"].map(lambda task: tasks.index(task) if task in tasks else len(tasks))
     rank["measure"] = frame["measure"].map(lambda measure: measure != COMBINED).astype(int)
@@ -164,6 +164,11 @@ def answers(frame: pd.DataFrame) -> pd.Series[bool]:
     return over & (frame["touch"] == "real")
 
 
+def whole(frame: pd.DataFrame) -> pd.Series[bool]:
+    """Measures that say that an answer is right, not only a part of it."""
+    return frame["measure"].isin({CHOICE, COMBINED, *(task.measure for task in TASKS.values())})
+
+
 def _differs(frame: pd.DataFrame, *axes: str) -> pd.Series[bool]:
     """Variants that are the full system but for these axes; on OPD only with or without."""
     same = pd.Series(True, index=frame.index)
@@ -177,7 +182,7 @@ def _differs(frame: pd.DataFrame, *axes: str) -> pd.Series[bool]:
 
 
 def _untrained(frame: pd.DataFrame) -> pd.Series[bool]:
-    return frame["task"].isin([str(task) for task, definition in TASKS.items() if not definition.trained])
+    return frame["task"].isin([name for name, task in TASKS.items() if not task.trained])
 
 
 def _understanding(*axes: str) -> Select:
@@ -294,7 +299,7 @@ TABLES: tuple[Table, ...] = (
         "variants",
         "All variants",
         "Every combination of encoder, LoRA and OPD that was trained.",
-        lambda f: answers(f) & f["measure"].isin([CHOICE, COMBINED]),
+        lambda f: answers(f) & whole(f),
         ("task", "encoder", "lora", "opd", "measured", "n", "chance", "unread", "published"),
     ),
     Table(
