@@ -11,12 +11,12 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.report.load import ALL_SEEDS, KEYS
+from pipeline.evaluation.scores import ALL_SEEDS, CROSS_VALIDATION, HEADS, VALIDATION_HEADS
+from pipeline.report.load import KEYS
 from pipeline.tasks import TASKS
 
 Select = Callable[[pd.DataFrame], "pd.Series[bool]"]
 FULL = {"encoder": "finetuned", "lora": "with", "opd": "all"}
-HEADS, CROSS_VALIDATION = "heads", "cross_validation"
 CHOICE, COMBINED = "choice", "combined"
 PUBLISHED_MODELS = ("7b", "13b", "CLIP")
 SYSTEM_WORDS = {"base": "base encoder", "without": "without LoRA", "none": "without OPD", "needed": "OPD as needed"}
