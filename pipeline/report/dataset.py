@@ -50,7 +50,10 @@ def dataset_frame(catalogue: Catalogue, videos: Sequence[Video], assignments: Se
         )
     lengths = [v.frames for v in videos]
     figures: dict[str, Callable[[list[int]], float]] = {
-        **{"average": fmean, "median": median, "minimum": min, "maximum": max}
+        "average": fmean,
+        "median": median,
+        "minimum": min,
+        "maximum": max,
     }
     rows += [
         {
