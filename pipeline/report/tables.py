@@ -11,13 +11,14 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.report.load import ALL_SEEDS, KEYS
+from pipeline.report.load import ALL_SEEDS, CROSS_VALIDATION, HEADS, KEYS, VALIDATION_HEADS
 from pipeline.tasks import TASKS
 
 Select = Callable[[pd.DataFrame], "pd.Series[bool]"]
 FULL = {"encoder": "finetuned", "lora": "with", "opd": "all"}
-HEADS, CROSS_VALIDATION = "heads", "cross_validation"
 CHOICE, COMBINED = "choice", "combined"
+NOT_ANSWERED = (HEADS, VALIDATION_HEADS, CROSS_VALIDATION)
+"""Tasks of scores.csv without a language model."""
 PUBLISHED_MODELS = ("7b", "13b", "CLIP")
 SYSTEM_WORDS = {"base": "base encoder", "without": "without LoRA", "none": "without OPD", "needed": "OPD as needed"}
 ENCODERS = {"finetuned": "fine-tuned", "base": "base"}
@@ -84,6 +85,7 @@ def task_title(task: str) -> str:
     """What a task is called in words, such as "Property comparison (PC)"."""
     titles = {
         HEADS: "Property heads",
+        VALIDATION_HEADS: "Property heads, validation videos",
         CROSS_VALIDATION: "Cross-validation",
         **{name: task.title for name, task in TASKS.items()},
     }
@@ -92,7 +94,7 @@ def task_title(task: str) -> str:
 
 def system(row: dict[str, Any]) -> str:
     """A variant by what it leaves out of the full system."""
-    if row["task"] == HEADS:
+    if row["task"] in (HEADS, VALIDATION_HEADS):
         return "property heads, no language model"
     if row["task"] == CROSS_VALIDATION:
         return str(row["encoder"])
@@ -134,7 +136,7 @@ COLUMNS: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
 
 def _ordered(frame: pd.DataFrame) -> pd.DataFrame:
     """Tasks in the registry's order, whole answers before parts, the full system before what lacks something."""
-    tasks = [*TASKS, HEADS, CROSS_VALIDATION]
+    tasks = [*TASKS, *NOT_ANSWERED]
     rank = pd.DataFrame(index=frame.index)
     rank["task"] = frame["task"].map(lambda task: tasks.index(task) if task in tasks else len(tasks))
     rank["measure"] = frame["measure"].map(lambda measure: measure != COMBINED).astype(int)
@@ -160,7 +162,7 @@ def _beside(rows: pd.DataFrame, published: pd.DataFrame) -> dict[str, list[str]]
 
 def answers(frame: pd.DataFrame) -> pd.Series[bool]:
     """Answers of the language model to real touch, over all seeds."""
-    over = ~frame["task"].isin([HEADS, CROSS_VALIDATION]) & (frame["seed"] == ALL_SEEDS)
+    over = ~frame["task"].isin(NOT_ANSWERED) & (frame["seed"] == ALL_SEEDS)
     return over & (frame["touch"] == "real")
 
 
@@ -289,7 +291,7 @@ TABLES: tuple[Table, ...] = (
         "The full system with its touch, and with another object's (swapped), none (removed) or noise.",
         lambda f: (
             (f["seed"] == ALL_SEEDS)
-            & ~f["task"].isin([HEADS, CROSS_VALIDATION])
+            & ~f["task"].isin(NOT_ANSWERED)
             & f["measure"].isin([CHOICE, COMBINED])
             & _differs(f)
         ),
@@ -305,9 +307,9 @@ TABLES: tuple[Table, ...] = (
     Table(
         "heads",
         "Property heads of the tactile encoder",
-        "What the encoder's heads say of the test videos, without a language model.",
-        lambda f: _over_seeds(f, HEADS),
-        ("measure", "encoder", "measured", "n", "chance", "published"),
+        "What the encoder's heads say of test and validation videos, without a language model.",
+        lambda f: _over_seeds(f, HEADS) | _over_seeds(f, VALIDATION_HEADS),
+        ("task", "measure", "encoder", "measured", "n", "chance", "published"),
     ),
     Table(
         "cross_validation",
