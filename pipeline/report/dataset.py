@@ -65,7 +65,9 @@ def dataset_frame(catalogue: Catalogue, videos: Sequence[Video], assignments: Se
         for row, figure in figures.items()
         if lengths
     ]
-    return pd.DataFrame(rows, columns=list(COLUMNS))
+    frame = pd.DataFrame(rows, columns=list(COLUMNS))
+    whole = list(COLUMNS[2:7])
+    return frame.astype(dict.fromkeys(whole, "Int64"))
 
 
 def dataset_tables(folder: Path, dataset: str) -> dict[str, pd.DataFrame]:

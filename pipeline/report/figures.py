@@ -5,7 +5,7 @@ Drawn without pyplot (no global state, no window) and saved without dates, so th
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,9 +22,7 @@ if TYPE_CHECKING:
 MEASURED, PUBLISHED, QUIET, LINE = "#0a5fb4", "#8a4a00", "#555b66", "#c9ced6"
 SERIES = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#000000")
 """Okabe and Ito's colours, safe for the colour-blind."""
-DASHES = ("-", "--", ":", "-.")
-MOST_NAMED = 6
-"""Curves of a panel that a legend names; more would hide what it explains."""
+PARTS = {"lora": "LoRA", "opd": "OPD"}
 DPI = 150
 
 
@@ -35,6 +33,7 @@ def draw_figures(
     confusion: pd.DataFrame,
     curves: pd.DataFrame,
     published: pd.DataFrame,
+    properties: Mapping[str, Sequence[str]],
 ) -> list[str]:
     """Draw what there is figures for and remove figures of an earlier run.
 
@@ -45,6 +44,7 @@ def draw_figures(
         confusion: property, rated, predicted; one row a video.
         curves: stage, name, step, value.
         published: as `load_report` gives it.
+        properties: the classes of each, in rising order.
 
     Returns:
         The names of the files, in reading order.
@@ -52,7 +52,7 @@ def draw_figures(
     wanted: list[tuple[str, pd.DataFrame, Callable[[], Figure]]] = [
         ("tasks.png", headline, lambda: draw_tasks(headline, published)),
         ("effects.png", effects, lambda: draw_effects(effects)),
-        ("confusion.png", confusion, lambda: draw_confusion(confusion)),
+        ("confusion.png", confusion, lambda: draw_confusion(confusion, properties)),
         ("curves.png", curves[curves["name"] == "loss"], lambda: draw_curves(curves)),
     ]
     folder.mkdir(parents=True, exist_ok=True)
@@ -90,12 +90,14 @@ def draw_tasks(headline: pd.DataFrame, published: pd.DataFrame) -> Figure:
     _quiet(axes)
     axes.spines["left"].set_visible(False)
     axes.tick_params(length=0)
-    _legend_of_tasks(axes, bool(printed))
+    _legend_of_tasks(figure, bool(printed))
     return figure
 
 
 def draw_effects(effects: pd.DataFrame) -> Figure:
     """A panel a part of the system: differences with intervals, by task; solid where Holm's p is below .05."""
+    from matplotlib.ticker import MaxNLocator
+
     parts = list(dict.fromkeys(zip(effects["part"], effects["change"], strict=True)))
     labels = list(dict.fromkeys(zip(effects["task"], effects["measure"], strict=True)))
     figure, places = panels(len(parts), 2.7, 1.1 + 0.3 * len(labels), across=4, left=1.3)
@@ -110,7 +112,8 @@ def draw_effects(effects: pd.DataFrame) -> Figure:
             face = MEASURED if row["p_holm"] < 0.05 else "white"
             axes.plot(100 * row["difference"], height, "o", color=MEASURED, markerfacecolor=face, markersize=6)
         axes.axvline(0, color=QUIET, linewidth=0.9)
-        axes.set_title(f"{part}\n{change}", fontsize=10)
+        axes.set_title(f"{PARTS.get(part, part)}\n{change}", fontsize=10)
+        axes.xaxis.set_major_locator(MaxNLocator(4, prune="both"))
         axes.set_xlim(-1.06 * reach, 1.06 * reach)
         axes.set_ylim(-len(labels) + 0.4, 0.6)
         names = [task if measure in ("choice", "combined") else f"{task} {measure}" for task, measure in labels]
@@ -121,15 +124,15 @@ def draw_effects(effects: pd.DataFrame) -> Figure:
     return figure
 
 
-def draw_confusion(confusion: pd.DataFrame) -> Figure:
-    """One matrix a property: rated down, predicted across, in videos."""
+def draw_confusion(confusion: pd.DataFrame, properties: Mapping[str, Sequence[str]]) -> Figure:
+    """One matrix a property, with all its classes: rated down, predicted across, in videos."""
     from sklearn.metrics import ConfusionMatrixDisplay
 
     names = list(dict.fromkeys(confusion["property"]))
     figure, places = panels(len(names), 3.6, 3.4)
     for axes, name in zip(places, names, strict=True):
         rows = confusion[confusion["property"] == name]
-        levels = levels_of(rows)
+        levels = properties[name]
         ConfusionMatrixDisplay.from_predictions(
             rows["rated"], rows["predicted"], labels=levels, ax=axes, cmap="Blues", colorbar=False
         )
@@ -143,35 +146,31 @@ def draw_confusion(confusion: pd.DataFrame) -> Figure:
     return figure
 
 
-def levels_of(rows: pd.DataFrame) -> list[str]:
-    """The classes of one property, by number: `rated_class` and `predicted_class` order the words."""
-    numbered = dict(zip(rows["rated_class"], rows["rated"], strict=True))
-    numbered |= dict(zip(rows["predicted_class"], rows["predicted"], strict=True))
-    return [numbered[number] for number in sorted(numbered)]
-
-
 def draw_curves(curves: pd.DataFrame) -> Figure:
-    """The loss of each training over its optimiser steps, a panel a stage."""
+    """The loss of each training over its optimiser steps: a panel a stage, a colour a variant, a line a seed."""
+    from matplotlib.lines import Line2D
+
     losses = curves[curves["name"].isin(["loss", "validation_loss"])]
     stages = losses["stage"].str.split("@").str[0]
     names = list(dict.fromkeys(stages))
     figure, places = panels(len(names), 3.4, 3.1)
     for axes, name in zip(places, names, strict=True):
         lines = list(losses[stages == name].groupby(["stage", "name"], sort=False))
-        for number, ((stage, measure), points) in enumerate(lines):
-            key = str(stage).partition("@")[2]
-            label = " ".join(word for word in (key, "validation" if measure != "loss" else "") if word) or "training"
-            colour = SERIES[number % len(SERIES)]
-            style = DASHES[number // len(SERIES) % len(DASHES)]
+        labels: dict[str, int] = {}
+        for (stage, measure), points in lines:
+            variant = str(stage).partition("@")[2].rpartition("-")[0]
+            label = variant or {"loss": "training", "validation_loss": "validation"}[measure]
+            number = labels.setdefault(label, len(labels))
             few = "o" if len(points) == 1 else ""
-            axes.plot(points["step"], points["value"], style, marker=few, color=colour, linewidth=1.4, label=label)
+            axes.plot(points["step"], points["value"], marker=few, color=SERIES[number % len(SERIES)], linewidth=1.3)
         axes.set_title(name.replace("_", " "), fontsize=10)
         axes.set_xlabel("optimiser step", fontsize=9)
         axes.set_ylabel("loss" if name == names[0] else "", fontsize=9)
         axes.grid(alpha=0.25)
         _quiet(axes)
-        if len(lines) <= MOST_NAMED:
-            axes.legend(frameon=False, fontsize=7.5)
+        if len(labels) <= len(SERIES):
+            named = [Line2D([], [], color=SERIES[number], label=label) for label, number in labels.items()]
+            axes.legend(handles=named, frameon=False, fontsize=7.5)
     return figure
 
 
@@ -203,7 +202,7 @@ def _quiet(axes: Axes) -> None:
     axes.tick_params(colors=QUIET, labelcolor="#1a1d23", labelsize=9)
 
 
-def _legend_of_tasks(axes: Axes, printed: bool) -> None:
+def _legend_of_tasks(figure: Figure, printed: bool) -> None:
     from matplotlib.lines import Line2D
 
     shown: dict[str, dict[str, Any]] = {
@@ -213,11 +212,5 @@ def _legend_of_tasks(axes: Axes, printed: bool) -> None:
     if printed:
         mark = {"color": PUBLISHED, "marker": "D", "linestyle": ""}
         shown |= {"published, 7b": {**mark, "markerfacecolor": "white"}, "published, 13b": mark}
-    axes.legend(
-        handles=[Line2D([], [], label=label, **style) for label, style in shown.items()],
-        loc="upper center",
-        bbox_to_anchor=(0.4, -0.1),
-        ncols=4,
-        frameon=False,
-        fontsize=8.5,
-    )
+    handles = [Line2D([], [], label=label, **style) for label, style in shown.items()]
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=8.5)

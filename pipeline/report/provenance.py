@@ -19,6 +19,7 @@ from pipeline.config import EncoderConfig, Params
 from pipeline.errors import UserError
 from pipeline.params import PARAMS_FILE
 from pipeline.records import Assignment, Part, Video
+from pipeline.videos.catalogue import Catalogue
 
 CODE = ("pipeline", "stages", "conf", "dvc.yaml")
 """What a result can depend on. A commit of a report alone does not change its revision."""
@@ -32,12 +33,12 @@ ARCHITECTURES = {"llama": "Llama", "mistral": "Mistral", "qwen2": "Qwen2", "gpt_
 
 
 def provenance(
-    params: Params, dataset: str, videos: Sequence[Video], assignments: Sequence[Assignment], root: Path
+    params: Params, catalogue: Catalogue, videos: Sequence[Video], assignments: Sequence[Assignment], root: Path
 ) -> dict[str, Any]:
     """The content of provenance.json, for the report of `root` as it stands.
 
     Args:
-        dataset: name of the data set, as its catalogue has it.
+        catalogue: for the data set's name and its properties.
         videos: all that decode; their hashes are hashed.
         assignments: for the test objects.
     """
@@ -48,7 +49,8 @@ def provenance(
         "report": params.report_name,
         "scale": params.scale,
         "source": params.data.source,
-        "dataset": dataset,
+        "dataset": catalogue.language.dataset,
+        "properties": {p.name: list(p.levels) for p in catalogue.properties},
         "split": params.split.name,
         "test_objects": sorted({a.object_id for a in test}),
         "test_videos": len(test),
@@ -74,12 +76,11 @@ def provenance(
 def encoder_words(config: EncoderConfig) -> str:
     """What the fine-tuned tactile encoder is, in words."""
     words = {
-        "paper": "the base CLIP with visual prompt tuning and property heads",
-        "release": "the base CLIP with visual prompt tuning and property heads, as the published code has them",
-        "pretrained": "a convolutional network with synthetic pretraining, whose frames vote; it is not CLIP",
+        "paper": "the base CLIP with visual prompt tuning",
+        "release": "the base CLIP with visual prompt tuning as the published code has it",
+        "pretrained": "a convolutional network with synthetic pretraining (not CLIP)",
     }[config.recipe]
-    seen = "difference pictures to each video's no-contact frame" if config.reference == "subtract" else "frames"
-    return f"{words}; it sees {seen}"
+    return words + (" on pictures of the difference to the untouched gel" if config.reference == "subtract" else "")
 
 
 def base_model(root: Path, folder: str) -> dict[str, Any]:

@@ -64,6 +64,11 @@ class Table:
         return pd.DataFrame(shown, index=rows.index, dtype=object)
 
 
+def headline(scores: pd.DataFrame) -> pd.DataFrame:
+    """One row a task that was asked: whole answers of the full system to real touch, over all seeds."""
+    return _ordered(scores[answers(scores) & whole(scores) & _differs(scores)])
+
+
 def number(value: float, digits: int = 1, scale: float = 1.0) -> str:
     """A number with fixed digits; nothing for NaN."""
     return "" if pd.isna(value) else f"{value * scale:.{digits}f}"
