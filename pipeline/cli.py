@@ -38,6 +38,15 @@ def scale(
     typer.echo(f"`dvc repro` runs it; its tables go to reports/{params.report_name}/")
 
 
+@app.command()
+def page() -> None:
+    """Write reports/index.html, one page over all reports that opens from disk."""
+    from pipeline.report.page import write_page
+
+    file = write_page(Path())
+    typer.echo(f"{file}: {file.stat().st_size / 1000:.0f} kB")
+
+
 CATALOGUE = typer.Option(help="Folder with objects.csv and properties.yaml.")
 
 
