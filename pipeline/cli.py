@@ -83,6 +83,14 @@ def _show(findings: Sequence[Finding]) -> None:
         raise typer.Exit(1)
 
 
+@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
+def repro(context: typer.Context) -> None:
+    """Run `dvc repro`: say how many stages will run, and write the page of all reports behind it."""
+    from pipeline.reproduce import reproduce
+
+    raise typer.Exit(reproduce(Path(), context.args))
+
+
 def main() -> None:
     """Run the command; bad input ends it with one line and status 1."""
     try:
