@@ -20,13 +20,13 @@ from pipeline.config import SplitConfig
 from pipeline.errors import UserError
 from pipeline.io import read_csv, write_csv, write_table
 from pipeline.records import Assignment, Finding, Part, Probe, Video
+from pipeline.scales import compose as fake_params
 from pipeline.videos.audit import leakage
 from pipeline.videos.audit.run import audit_chain, audit_folder, by_severity, check_folder, stop_on_errors, summary
 from pipeline.videos.catalogue import Catalogue
 from tests.audit_records import ERROR, GOOD_SPLIT, INFO, WARNING, assigned, look_at, odd, of, probe, probes, video
 from tests.closure import ROOT
 from tests.conftest import moving_square, write_video
-from tests.fake_chain import fake_params
 
 
 @pytest.fixture

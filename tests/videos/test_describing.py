@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.videos.catalogue import load_catalogue
-from pipeline.videos.descriptions import contradiction, levels_named
-from pipeline.videos.phrases import mentioned, plain
+from pipeline.videos.wording import contradiction, levels_named, mentioned, plain
 from tests.conftest import ROOT
 
 CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")

@@ -19,7 +19,7 @@ from pipeline.records import Finding, Frame, Probe
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import VideoFile
 from pipeline.videos.frames import extract
-from pipeline.videos.frames.extract import HEADER_BYTES, _header, _Pile
+from pipeline.videos.frames.extract import HEADER_BYTES, _header, _PixelFiles
 from pipeline.videos.frames.fit import fit
 from pipeline.videos.frames.reference import reference_indices
 from pipeline.videos.frames.scan import Scan, scan
@@ -85,14 +85,14 @@ def test_the_number_of_processes_changes_nothing(place: Place, monkeypatch: pyte
 
 def kill_after(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Interrupt the extraction when it puts the next video on the pile."""
-    add, added = _Pile.add, []
+    add, added = _PixelFiles.add, []
 
-    def until(self: _Pile, *args: object) -> None:
+    def until(self: _PixelFiles, *args: object) -> None:
         if len(added) == count:
             raise KeyboardInterrupt
         added.append(add(self, *args))  # type: ignore[arg-type, func-returns-value]
 
-    monkeypatch.setattr(_Pile, "add", until)
+    monkeypatch.setattr(_PixelFiles, "add", until)
 
 
 @pytest.mark.parametrize("count", [0, 3, 6])

@@ -18,9 +18,9 @@ from pipeline.videos.frames.fit import fit
 from pipeline.videos.frames.reference import (
     LONGEST,
     MOST_FRAMES,
+    contact_strength,
     reference_indices,
     starts_touching,
-    strength,
     thumbnail,
 )
 from pipeline.videos.frames.scan import Scan, scan
@@ -120,18 +120,18 @@ def test_strength_is_its_definition(pair: np.ndarray) -> None:
     one, other = pair.astype(np.float64)
     change = one - other
     expected = np.abs(change).mean() - np.abs(change.mean(axis=(0, 1))).mean()
-    assert strength(pair[0], pair[1]) == pytest.approx(expected, abs=1e-9)
-    assert strength(pair[0], pair[1]) == strength(pair[1], pair[0]) >= 0
-    assert strength(pair[0], pair[0]) == 0
+    assert contact_strength(pair[0], pair[1]) == pytest.approx(expected, abs=1e-9)
+    assert contact_strength(pair[0], pair[1]) == contact_strength(pair[1], pair[0]) >= 0
+    assert contact_strength(pair[0], pair[0]) == 0
 
 
 @given(thumbs, st.tuples(*[st.integers(-60, 60)] * 3), st.integers(0, 60))
 def test_light_alone_has_no_strength(pair: np.ndarray, shift: tuple[int, int, int], depth: int) -> None:
     still = (60 + pair[0] % 130).astype(np.uint8)
-    assert strength((still.astype(int) + shift).astype(np.uint8), still) == pytest.approx(0, abs=1e-9)
+    assert contact_strength((still.astype(int) + shift).astype(np.uint8), still) == pytest.approx(0, abs=1e-9)
     touched = still.copy()
     touched[0, 0, 0] += depth
-    assert strength(touched, still) <= depth / still[..., 0].size + 1e-9
+    assert contact_strength(touched, still) <= depth / still[..., 0].size + 1e-9
 
 
 def test_detail_starts_the_decision() -> None:
