@@ -15,6 +15,7 @@ from pipeline.errors import UserError
 from pipeline.io import write_text
 from pipeline.params import PARAMS_FILE, validate
 from pipeline.records import Part, Touch
+from pipeline.tasks.questions import counts_by_task
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.files import list_videos, raise_errors
 from pipeline.videos.split import FEWEST_TRAINING_OBJECTS, assign_objects
@@ -63,9 +64,11 @@ def compose(name: str, overrides: Sequence[str] = (), conf: Path = CONF) -> Para
 
 
 def check_inputs(params: Params) -> None:
-    """Raise UserError where something that the scale needs is not there: videos, catalogue, objects, weights."""
+    """Raise UserError where something that the scale needs is not there: videos, catalogue, objects, tasks, weights."""
     catalogue = load_catalogue(Path(params.data.catalogue))
     check_candidates(params.cross_validation.models, params.encoder.recipe)
+    counts_by_task(params.questions, "train")
+    counts_by_task(params.questions, "evaluation")
     folder = Path(params.data.dir)
     if params.data.source == "videos" and not folder.is_dir():
         raise UserError(

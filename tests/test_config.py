@@ -67,7 +67,6 @@ def test_paper_scales_have_the_papers_hyper_parameters(scale: str) -> None:
         (["ablation.lora=[perhaps]"], ["ablation.lora", "'with' or 'without'"]),
         (["ablation.touch=[swapped,swapped]"], ["ablation.touch", "repeats"]),
         (["align.batch_size=10"], ["align", "does not divide"]),
-        (["questions.train.psr=3"], ["questions", "must be 0"]),
         (["data.dir=elsewhere"], ["data.dir", "data/scenes/videos"]),
         (["lora.target_modules=[]"], ["lora.target_modules"]),
         (["encoder.learning_rate=nan"], ["encoder.learning_rate"]),
