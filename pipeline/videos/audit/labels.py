@@ -10,7 +10,7 @@ from statistics import fmean
 from pipeline.records import Finding, Part, Severity
 from pipeline.statistics import icc3k, icc3k_interval
 from pipeline.videos.catalogue import Catalogue
-from pipeline.videos.descriptions import contradiction
+from pipeline.videos.wording import contradiction
 
 
 def check_labels(catalogue: Catalogue) -> Iterator[Finding]:
@@ -33,31 +33,26 @@ def similar_names(unknown: Sequence[str], catalogue: Catalogue) -> Iterator[Find
 def _agreement(catalogue: Catalogue) -> Iterator[Finding]:
     for place, prop in enumerate(catalogue.properties):
         ratings = [o.ratings[place] for o in catalogue.objects.values()]
-        expected = ""
         if len({len(r) for r in ratings}) > 1:
-            yield _info(
-                "agreement, ICC(3,k)", prop.name, "undefined: objects have different numbers of ratings", expected
-            )
+            measured = "undefined: objects have different numbers of ratings"
+            yield _info("agreement, ICC(3,k)", prop.name, measured)
             continue
         value, interval = icc3k(ratings), icc3k_interval(ratings)
         if value is None or interval is None:
-            yield _info("agreement, ICC(3,k)", prop.name, "undefined: one rating, or no variance", expected)
+            yield _info("agreement, ICC(3,k)", prop.name, "undefined: one rating, or no variance")
             continue
         measured = f"{value:.3f} ({interval.low:.3f} to {interval.high:.3f})"
-        warn = bool(expected) and f"{value:.3f}" != expected
-        yield (_warning if warn else _info)("agreement, ICC(3,k)", prop.name, measured, expected)
+        yield _info("agreement, ICC(3,k)", prop.name, measured)
         disputed = sum(len(set(r)) > 1 for r in ratings)
-        yield _info("disputed ratings", prop.name, f"{disputed} of {len(ratings)} objects", "")
+        yield _info("disputed ratings", prop.name, f"{disputed} of {len(ratings)} objects")
 
 
 def _counts(catalogue: Catalogue) -> Iterator[Finding]:
     for place, prop in enumerate(catalogue.properties):
         counts = Counter(o.labels[place] for o in catalogue.objects.values())
         for level, name in enumerate(prop.levels):
-            expected = ""
-            warn = counts[level] == 0 or (bool(expected) and str(counts[level]) != expected)
-            item = f"{prop.name}: {name}"
-            yield (_warning if warn else _info)("objects of a class", item, str(counts[level]), expected)
+            tell = _info if counts[level] else _warning
+            yield tell("objects of a class", f"{prop.name}: {name}", str(counts[level]))
 
 
 def _stated(catalogue: Catalogue) -> Iterator[Finding]:
@@ -99,9 +94,9 @@ def _splits(catalogue: Catalogue) -> Iterator[Finding]:
                     )
 
 
-def _info(check: str, item: str, measured: str, expected: str) -> Finding:
+def _info(check: str, item: str, measured: str, expected: str = "") -> Finding:
     return Finding(check=check, item=item, measured=measured, expected=expected, severity=Severity.INFO)
 
 
-def _warning(check: str, item: str, measured: str, expected: str) -> Finding:
+def _warning(check: str, item: str, measured: str, expected: str = "") -> Finding:
     return Finding(check=check, item=item, measured=measured, expected=expected, severity=Severity.WARNING)
