@@ -251,18 +251,22 @@ def _row(questions: Sequence[Sequence[Answer]], **named: object) -> ScoreRow:
     )
 
 
+def grouped(graded: Iterable[Graded]) -> Table:
+    """Answers by task and measure, then by setting."""
+    found: dict[tuple[str, str], dict[Setting, dict[int, dict[str, Answer]]]] = defaultdict(
+        lambda: defaultdict(lambda: defaultdict(dict))
+    )
+    for g in graded:
+        setting = Setting(g.encoder, g.lora, g.opd, g.touch)
+        found[g.task, g.measure][setting][g.seed][g.question_id] = Answer(g.correct, g.objects, g.parsed)
+    return found
+
+
 def _table(graded: Iterable[Graded], catalogue: Catalogue) -> Table:
     """In the order of the registered tasks and of what each calls its measures."""
-    found: dict[tuple[str, str], dict[Setting, dict[int, dict[str, Answer]]]] = {
-        (task, measure): defaultdict(lambda: defaultdict(dict))
-        for task, definition in TASKS.items()
-        for measure in definition.chance(catalogue)
-    }
-    for g in graded:
-        found[g.task, g.measure][Setting(g.encoder, g.lora, g.opd, g.touch)][g.seed][g.question_id] = Answer(
-            g.correct, g.objects, g.parsed
-        )
-    return found
+    found = grouped(graded)
+    keys = [(task, measure) for task, definition in TASKS.items() for measure in definition.chance(catalogue)]
+    return {key: found[key] for key in keys if key in found}
 
 
 def _videos(records: Iterable[Classification], part: Part) -> dict[str, dict[str, Answer]]:
