@@ -61,7 +61,7 @@ class Table:
             else:
                 heading, cell = COLUMNS[name]
                 shown[heading] = [cell(row) for row in rows.to_dict("records")]
-        return pd.DataFrame(shown, dtype=object)
+        return pd.DataFrame(shown, index=rows.index, dtype=object)
 
 
 def headline(scores: pd.DataFrame) -> pd.DataFrame:
@@ -153,13 +153,12 @@ def _ordered(frame: pd.DataFrame) -> pd.DataFrame:
 
 def _beside(rows: pd.DataFrame, published: pd.DataFrame) -> dict[str, list[str]]:
     """The published cells of these rows, a column a model that has any."""
-    columns = {}
+    columns, keys = {}, list(zip(*(rows[k] for k in KEYS), strict=True))
     for model in PUBLISHED_MODELS:
         cells = published[published["model"] == model]
-        values = {
-            tuple(row[k] for k in KEYS): f"{row['value']:.2f} ({row['n']:.0f})" for row in cells.to_dict("records")
-        }
-        found = [values.get(tuple(row[k] for k in KEYS), "") for row in rows.to_dict("records")]
+        printed = zip(zip(*(cells[k] for k in KEYS), strict=True), cells["value"], cells["n"], strict=True)
+        values = {key: f"{value:.2f} ({n:.0f})" for key, value, n in printed}
+        found = [values.get(key, "") for key in keys]
         if any(found):
             columns[f"Published {model} % (n)"] = found
     return columns
