@@ -38,6 +38,15 @@ def scale(
     typer.echo(f"`dvc repro` runs it; its tables go to reports/{params.report_name}/")
 
 
+@app.command()
+def publish() -> None:
+    """Show what lies in data/ and reports/ in MLflow, as `dvc repro` does at its end; a second call adds nothing."""
+    from pipeline import tracking
+    from pipeline.params import load_params
+
+    typer.echo(tracking.publish(load_params()))
+
+
 CATALOGUE = typer.Option(help="Folder with objects.csv and properties.yaml.")
 
 

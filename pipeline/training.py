@@ -7,7 +7,7 @@ import json
 import math
 import shutil
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -24,10 +24,6 @@ from pipeline.records import Measurement
 from pipeline.runtime import CHECKPOINTS
 from pipeline.sampling import EpochDataset
 from pipeline.trainable import trainable_state
-
-Log = Callable[[int, dict[str, float]], None]
-"""Receives step and values while a training runs."""
-
 
 LOWEST = 0.01
 """Share of the rate at the bottom of a wave."""
@@ -127,11 +123,10 @@ def check_finite(state: Mapping[str, torch.Tensor], step: int) -> None:
 LOSSES = ("loss", "grad_norm", "validation_loss")
 
 
-class Watch(TrainerCallback):
-    """Hands each logged value on, tells a log file how far it is, and stops where the loss is no number any more."""
+class TrainingMonitor(TrainerCallback):
+    """Tells a log file how far a training is, and stops where the loss is no number any more."""
 
-    def __init__(self, log: Log | None) -> None:
-        self.log = log
+    def __init__(self) -> None:
         self._said = 0
 
     def on_log(
@@ -143,14 +138,12 @@ class Watch(TrainerCallback):
         **_: Any,
     ) -> None:
         """Called by the Trainer after each logging step."""
-        values = _measured(logs or {})
+        values = measured(logs or {})
         bad = [name for name in LOSSES if not math.isfinite(values.get(name, 0.0))]
         if bad:
             raise _diverged(f"{bad[0]} is {values[bad[0]]}", state.global_step)
         if not state.is_world_process_zero:
             return
-        if self.log:
-            self.log(state.global_step, values)
         tenth = 10 * state.global_step // max(1, state.max_steps)
         if args.disable_tqdm and "loss" in values and tenth > self._said:
             self._said = tenth
@@ -225,7 +218,7 @@ def train(trainer: Trainer) -> Trained:
         Measurement(step=entry["step"], name=name, value=value)
         for entry in trainer.state.log_history
         # A state that was read back has its names in order, one that was not has them as they were logged.
-        for name, value in sorted(_measured(entry).items())
+        for name, value in sorted(measured(entry).items())
     ]
     whole = trainer.accelerator.get_state_dict(trainer.model_wrapped)
     names = trainable_state(trainer.accelerator.unwrap_model(trainer.model))
@@ -243,7 +236,7 @@ def _drop_unfinished(folder: Path) -> None:
             shutil.rmtree(checkpoint)
 
 
-def _measured(entry: Mapping[str, object]) -> dict[str, float]:
+def measured(entry: Mapping[str, object]) -> dict[str, float]:
     """What of a log entry is a figure of the training: not its bookkeeping, nor wall-clock times."""
     names = {name: "validation_loss" if name == "eval_loss" else name.removeprefix("eval_") for name in entry}
     return {

@@ -1,14 +1,13 @@
 """Align the projection to the language model."""
 
 import sys
-from pathlib import Path
 
 from pipeline.embeddings import TENSOR_FILE, EmbeddingStore
 from pipeline.io import read_jsonl, write_table
 from pipeline.language.training import Job, Material, align, assemble
 from pipeline.records import Encoder, Measurement, Opd, Question
 from pipeline.stage import DATA, stage
-from pipeline.tracking import live_run
+from pipeline.tracking import live
 
 
 def main() -> None:
@@ -28,8 +27,8 @@ def main() -> None:
         )
         model, data = assemble(material, params.align.samples, "align")
         mark = material.mark(params.align, *inputs)
-        with live_run(params, run.name, Path()) as live:
-            trained = align(model, data, params.align, params.runtime, Job(run.name, mark, material.seed, live.log))
+        with live(run) as callbacks:
+            trained = align(model, data, params.align, params.runtime, Job(run.name, mark, material.seed, callbacks))
         run.finish_training(trained.history)
         out = DATA / "models" / "without" / key
         model.save_pretrained(out, trained.state)

@@ -8,7 +8,7 @@ from pipeline.io import read_table, write_table
 from pipeline.records import Assignment, Classification, Measurement, Part
 from pipeline.runtime import resolve_device
 from pipeline.stage import DATA, stage
-from pipeline.tracking import live_run
+from pipeline.tracking import live
 from pipeline.trainable import save_trainable
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.frames.store import REFERENCES_FILE, TABLE_FILE, FrameStore
@@ -28,7 +28,7 @@ def main() -> None:
         )
         inputs = [DATA / "frames" / name for name in (TABLE_FILE, REFERENCES_FILE)] + [DATA / "splits.parquet"]
         inputs.append(clip_file(Path(params.encoder.weights)))
-        with live_run(params, run.name, Path()) as live:
+        with live(run) as callbacks:
             model, history = finetune(
                 data,
                 params.encoder,
@@ -36,7 +36,7 @@ def main() -> None:
                 seed=params.seed + seed,
                 inputs=inputs,
                 pretrained=DATA / "pretrained" / "encoder.safetensors",
-                log=live.log,
+                callbacks=callbacks,
             )
         device = resolve_device(params.runtime.device)
         judged = classify(model, data, [Part.VALIDATION, Part.TEST], params.encoder.batch_size, device)

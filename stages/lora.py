@@ -1,7 +1,6 @@
 """Fine-tune the aligned model end to end, the language model through low-rank adapters."""
 
 import sys
-from pathlib import Path
 
 from pipeline.embeddings import TENSOR_FILE, EmbeddingStore
 from pipeline.io import read_jsonl, write_table
@@ -9,7 +8,7 @@ from pipeline.language.octopi import CONNECTOR_FILE
 from pipeline.language.training import Job, Material, add_lora, assemble, finetune_lora
 from pipeline.records import Encoder, Measurement, Opd, Question
 from pipeline.stage import DATA, stage
-from pipeline.tracking import live_run
+from pipeline.tracking import live
 
 
 def main() -> None:
@@ -34,9 +33,9 @@ def main() -> None:
         model, data = assemble(material, params.lora.samples, "lora", aligned=inputs[2].parent)
         add_lora(model, params.lora)
         mark = material.mark(params.lora, *inputs)
-        with live_run(params, run.name, Path()) as live:
+        with live(run) as callbacks:
             trained = finetune_lora(
-                model, data, params.lora, params.runtime, Job(run.name, mark, material.seed, live.log)
+                model, data, params.lora, params.runtime, Job(run.name, mark, material.seed, callbacks)
             )
         run.finish_training(trained.history)
         out = DATA / "models" / "with" / key

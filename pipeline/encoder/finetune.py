@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 from torch.utils.data import DataLoader
-from transformers import EvalPrediction
+from transformers import EvalPrediction, TrainerCallback
 
 from pipeline.config import EncoderConfig, RuntimeConfig
 from pipeline.encoder.clips import ClipDataset, LabelledVideo, collate_clips
@@ -29,9 +29,8 @@ from pipeline.records import Assignment, Classification, Measurement, Part
 from pipeline.runtime import resolve_device, seed_everything
 from pipeline.trainable import load_trainable
 from pipeline.training import (
-    Log,
     TrainableTrainer,
-    Watch,
+    TrainingMonitor,
     checkpoint_dir,
     fingerprint,
     train,
@@ -70,12 +69,13 @@ def finetune(
     seed: int,
     inputs: Sequence[Path],
     pretrained: Path,
-    log: Log | None = None,
+    callbacks: Sequence[TrainerCallback] = (),
 ) -> tuple[PropertyClassifier, list[Measurement]]:
     """Train the classifier of the recipe.
 
     Args:
         inputs: Files that a training by gradients depends on, for its checkpoints' fingerprint.
+        callbacks: Further callbacks for its Trainer, such as tracking.
         pretrained: File of the encoder that scenes have pretrained; read for `strong` alone.
 
     Returns:
@@ -86,7 +86,7 @@ def finetune(
     if isinstance(model, FrameVotes):
         load_trainable(model.encoder, pretrained)
         return model, fit_heads(model, data, config, runtime, seed)
-    return model, train_classifier(model, data, config, runtime, seed=seed, inputs=inputs, log=log)
+    return model, train_classifier(model, data, config, runtime, seed=seed, inputs=inputs, callbacks=callbacks)
 
 
 def fit_heads(
@@ -111,7 +111,7 @@ def train_classifier(
     *,
     seed: int,
     inputs: Sequence[Path | str],
-    log: Log | None = None,
+    callbacks: Sequence[TrainerCallback] = (),
 ) -> list[Measurement]:
     """Train what is not frozen; the epoch of best combined validation accuracy is kept (ties: the first).
 
@@ -149,7 +149,7 @@ def train_classifier(
         eval_dataset=ClipDataset(data.store, validation, per_video=data.per_video) if validation else None,
         data_collator=collate_clips,
         compute_metrics=lambda prediction: accuracies(prediction, data.catalogue),
-        callbacks=[Watch(log)],
+        callbacks=[TrainingMonitor(), *callbacks],
         wave=math.ceil(len(train_set) / config.batch_size) if config.recipe == "release" else None,
     )
     return train(trainer).history

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from transformers import TrainerCallback
 
 from pipeline.config import FramesConfig, PretrainConfig, RuntimeConfig
 from pipeline.encoder import synthetic as lessons_module
@@ -19,9 +21,8 @@ from pipeline.runtime import CHECKPOINTS, derive_seed, seed_everything
 from pipeline.sampling import EpochDataset
 from pipeline.scenes import invent
 from pipeline.training import (
-    Log,
     TrainableTrainer,
-    Watch,
+    TrainingMonitor,
     checkpoint_dir,
     fingerprint,
     train,
@@ -75,7 +76,7 @@ def vary(pictures: npt.NDArray[np.uint8], rng: np.random.Generator) -> npt.NDArr
 
 
 def pretrain(
-    config: PretrainConfig, frames: FramesConfig, runtime: RuntimeConfig, log: Log | None = None
+    config: PretrainConfig, frames: FramesConfig, runtime: RuntimeConfig, callbacks: Sequence[TrainerCallback] = ()
 ) -> tuple[SceneEncoder, list[Measurement]]:
     """Draw the lessons and train the encoder on them; a killed run goes on where it was.
 
@@ -113,7 +114,7 @@ def pretrain(
         model=model,
         args=arguments,
         train_dataset=LessonDataset(taught, augment=config.augment, seed=config.seed),
-        callbacks=[Watch(log)],
+        callbacks=[TrainingMonitor(), *callbacks],
     )
     history = train(trainer).history
     told = held_out(model.cpu(), LessonDataset(held, augment=False, seed=0))

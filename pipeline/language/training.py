@@ -9,6 +9,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from transformers import TrainerCallback
+
 from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig, TrainConfig
 from pipeline.embeddings import EmbeddingStore
 from pipeline.errors import UserError
@@ -18,10 +20,9 @@ from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.records import Opd, Question
 from pipeline.runtime import derive_seed, seed_everything
 from pipeline.training import (
-    Log,
     TrainableTrainer,
     Trained,
-    Watch,
+    TrainingMonitor,
     checkpoint_dir,
     fingerprint,
     train,
@@ -112,12 +113,12 @@ def assemble(
 
 @dataclass(frozen=True)
 class Job:
-    """One training: its name and fingerprint (where its checkpoints lie), its seed and who listens to its curve."""
+    """One training: its name and fingerprint (where its checkpoints lie), its seed, further callbacks."""
 
     stage: str
     mark: str
     seed: int
-    log: Log | None = None
+    callbacks: Sequence[TrainerCallback] = ()
 
 
 def align(
@@ -164,7 +165,7 @@ def _fit(
         args=arguments,
         train_dataset=data,
         data_collator=ConversationCollator(int(model.tokenizer.pad_token_id)),
-        callbacks=[Watch(job.log)],
+        callbacks=[TrainingMonitor(), *job.callbacks],
         rates=rates,
         sampler=LengthBuckets(data.lengths, config.micro_batch_size, job.seed, lambda: data.epoch),
     )
