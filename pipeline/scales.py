@@ -11,6 +11,7 @@ import yaml
 from pipeline import weights
 from pipeline.config import Params
 from pipeline.encoder.candidates import check_candidates
+from pipeline.encoder.recipes import check_recipe
 from pipeline.errors import UserError
 from pipeline.io import write_text
 from pipeline.params import PARAMS_FILE, validate
@@ -64,6 +65,7 @@ def check_inputs(params: Params) -> None:
     """Raise UserError where something that the scale needs is not there: videos, catalogue, objects, weights."""
     catalogue = load_catalogue(Path(params.data.catalogue))
     check_split(catalogue, params.split.name)
+    check_recipe(params.encoder.recipe)
     check_candidates(params.cross_validation.models, params.encoder.recipe)
     folder = Path(params.data.dir)
     if params.data.source == "videos" and not folder.is_dir():

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from pathlib import Path
+from typing import TYPE_CHECKING
 
-from pipeline.config import Params
-from pipeline.training import Log
+if TYPE_CHECKING:
+    from transformers import TrainerCallback
 
-
-@dataclass(frozen=True)
-class LiveRun:
-    """A run that a training logs into while it goes on."""
-
-    log: Log | None = None
+    from pipeline.stage import Stage
 
 
 @contextmanager
-def live_run(params: Params, name: str, root: Path) -> Iterator[LiveRun]:
-    """Log a training while it runs."""
-    yield LiveRun()
+def live(run: Stage) -> Iterator[Sequence[TrainerCallback]]:
+    """Callbacks that log a training while it runs."""
+    yield ()
