@@ -11,6 +11,7 @@ import yaml
 from pipeline import weights
 from pipeline.config import Params
 from pipeline.encoder.candidates import check_candidates
+from pipeline.encoder.recipes import check_recipe
 from pipeline.errors import UserError
 from pipeline.io import write_text
 from pipeline.params import PARAMS_FILE, validate
@@ -66,6 +67,7 @@ def compose(name: str, overrides: Sequence[str] = (), conf: Path = CONF) -> Para
 def check_inputs(params: Params) -> None:
     """Raise UserError where something that the scale needs is not there: videos, catalogue, objects, tasks, weights."""
     catalogue = load_catalogue(Path(params.data.catalogue))
+    check_recipe(params.encoder.recipe)
     check_candidates(params.cross_validation.models, params.encoder.recipe)
     counts_by_task(params.questions, "train")
     counts_by_task(params.questions, "evaluation")
