@@ -22,11 +22,14 @@ class Error:
     value: float
     low: float | None = None
     high: float | None = None
+    n: int | None = None
+    """Videos, answers or scenes that it is over."""
 
     @property
-    def columns(self) -> dict[str, float | None]:
+    def columns(self) -> dict[str, float]:
         """As a row of the table names them."""
-        return {"error": self.value, "low": self.low, "high": self.high}
+        columns = {"error": self.value, "low": self.low, "high": self.high, "n": self.n}
+        return {name: value for name, value in columns.items() if value is not None}
 
 
 def share_of(wrong: Sequence[float], objects: Sequence[tuple[str, ...]]) -> Error:
@@ -38,7 +41,7 @@ def share_of(wrong: Sequence[float], objects: Sequence[tuple[str, ...]]) -> Erro
     """
     interval = clustered([Outcome(w, o) for w, o in zip(wrong, objects, strict=True)])
     ends = (interval.low, interval.high) if interval else (None, None)
-    return Error(fmean(wrong), *ends)
+    return Error(fmean(wrong), *ends, len(wrong))
 
 
 def mean_of(values: Sequence[float], objects: Sequence[str]) -> Error:
@@ -47,9 +50,9 @@ def mean_of(values: Sequence[float], objects: Sequence[str]) -> Error:
 
     means = [fmean(v for v, o in zip(values, objects, strict=True) if o == own) for own in sorted(set(objects))]
     if len(means) < 2:
-        return Error(fmean(values))
+        return Error(fmean(values), n=len(values))
     half = float(t.ppf(0.975, len(means) - 1)) * stdev(means) / len(means) ** 0.5
-    return Error(fmean(means), max(fmean(means) - half, 0.0), fmean(means) + half)
+    return Error(fmean(means), max(fmean(means) - half, 0.0), fmean(means) + half, len(values))
 
 
 def cross_validated(
@@ -87,4 +90,4 @@ def reported(reports: Path, **keys: str) -> dict[Path, list[dict[str, str]]]:
 def error_of(score: dict[str, str]) -> Error:
     """One less the accuracy of a row of scores.csv."""
     low, high = (1 - float(score[end]) if score.get(end) else None for end in ("high", "low"))
-    return Error(1 - float(score["accuracy"]), low, high)
+    return Error(1 - float(score["accuracy"]), low, high, int(float(score["n"])))

@@ -43,6 +43,8 @@ class Row(Record):
     low: float | None = None
     """Ends of the error's 95 % interval over objects."""
     high: float | None = None
+    n: int | None = None
+    """Videos, answers or scenes that the error is over."""
     front: bool | None = None
     """Whether no other setting of the question costs as little with as little error and less of one of them."""
     machine: str = ""
@@ -97,7 +99,7 @@ def make_rows(
         error = errors.get(name)
         values = {"cost": median(own), "cost_ratio": ratios[name], **counts.get(name, {})}
         if error is not None:
-            values |= {k: v for k, v in error.columns.items() if v is not None}
+            values |= error.columns
         rounded = {column: float(f"{value:.4g}") for column, value in values.items()}
         named = {"question": question, "setting": name, "unit": unit, "machine": machine}
         rows.append(Row.model_validate({**named, "error_of": error_of if errors else "", **rounded}))
