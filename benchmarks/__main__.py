@@ -12,7 +12,7 @@ from benchmarks.table import CSV, Row, merge
 from pipeline.errors import UserError
 
 SECTIONS = ("frames", "encoder", "language", "contact")
-"""Modules beside this one, each with a `measure(root)` that gives rows. Another section is a module and its name here."""
+"""Modules beside this one with a `measure(root)` that gives rows. Another section is a module and its name here."""
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -6,8 +6,9 @@ solver alone against a ball on a half-space, whose answer is known (Johnson, Con
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from statistics import fmean, median
 
@@ -24,7 +25,7 @@ from pipeline.parallel import run_parallel
 from pipeline.params import load_params
 from pipeline.runtime import derive_seed
 from pipeline.scenes.contact import GEL, slope_error
-from pipeline.scenes.elastic.kernels import half_space_table, make_kernel
+from pipeline.scenes.elastic.kernels import Kernel, half_space_table, make_kernel
 from pipeline.scenes.elastic.solver import solve
 from pipeline.scenes.elastic.winkler import press_springs
 from pipeline.scenes.light import Image, make_sensor
@@ -75,13 +76,10 @@ def measure(root: Path, objects: int | None = None, videos: int = 3, repeats: in
 
 def hertz(repeats: int) -> list[Row]:
     """The error in the force at the approach found, mean over `FORCES` with its smallest and largest."""
-    # A rigid ball on a half-space of modulus 1 MPa; the widest force's contact fills three quarters of the grid.
-    settings = {
-        "springs, 256 cells": lambda force: _springs(force),
+    settings: dict[str, Callable[[float], float]] = {
+        "springs, 256 cells": _springs,
         **{
-            f"half-space, {cells} cells, tolerance {tolerance:.0e}": (
-                lambda force, cells=cells, tolerance=tolerance: _half_space(force, cells, tolerance)
-            )
+            f"half-space, {cells} cells, tolerance {tolerance:.0e}": partial(_half_space, cells, tolerance)
             for cells in CELLS
             for tolerance in (1e-2, 1e-4)
         },
@@ -111,21 +109,22 @@ def hertz_approach(force: float) -> float:
     return float((3 * force * RADIUS / 4) ** (2 / 3) / RADIUS)
 
 
-def _ball(cells: int) -> tuple[np.ndarray, float]:
-    """The gap in mm, and a cell's side."""
+@cache
+def _ball(cells: int) -> tuple[np.ndarray, float, Kernel]:
+    """The gap in mm, a cell's side, and how a half-space of modulus 1 MPa sinks."""
     pitch = 2.6 * (3 * RADIUS / 4) ** (1 / 3) / cells
     axis = (np.arange(cells, dtype=np.float32) - (cells - 1) / 2) * pitch
-    return ((axis[None] ** 2 + axis[:, None] ** 2) / (2 * RADIUS)).astype(np.float32), pitch
+    gap = ((axis[None] ** 2 + axis[:, None] ** 2) / (2 * RADIUS)).astype(np.float32)
+    return gap, pitch, make_kernel(half_space_table(gap.shape, pitch, 1.0), gap)
 
 
-def _half_space(force: float, cells: int, tolerance: float) -> float:
-    gap, pitch = _ball(cells)
-    kernel = make_kernel(half_space_table(gap.shape, pitch, 1.0), gap)
+def _half_space(cells: int, tolerance: float, force: float) -> float:
+    gap, pitch, kernel = _ball(cells)
     return float(solve(gap, force, kernel, pitch, tolerance=tolerance).approach[0])
 
 
 def _springs(force: float) -> float:
-    gap, pitch = _ball(256)
+    gap, pitch, _ = _ball(256)
     # By Hertz all goes with force over modulus.
     return float(press_springs(gap, force * GEL.modulus, 1e9, pitch, GEL).approach)
 

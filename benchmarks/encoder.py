@@ -1,9 +1,9 @@
 """Encoders on one core: whole candidates, then number and side of frames, number formats and visual prompts.
 
 A candidate's cost is a video's from the file to the decided classes; weights are random where cost depends on no
-training, and errors are those of the report with most candidates in its cross-validation. The other encoders are frozen,
-have seen no label and are timed alone; each is judged by a grouped cross-validation of its heads. Prompts are trained
-for a few epochs and judged on the development split's validation videos, which also choose the epoch.
+training, and errors are those of the report with most candidates in its cross-validation. The other encoders are
+frozen, have seen no label and are timed alone; each is judged by a grouped cross-validation of its heads. Prompts
+are trained for a few epochs and judged on the development split's validation videos, which also choose the epoch.
 
 `int8` is torch's dynamic quantisation of linear layers, of which the pretrained encoder has none.
 """
@@ -24,44 +24,30 @@ import numpy as np
 import torch
 from torch import nn
 
-from benchmarks.errors import WRONG, Error, cross_validated, error_of, reported, share_of
+from benchmarks.encoder_models import ALONE, FRAMES, SIDE, features, prompts, whole
+from benchmarks.errors import WRONG, Error, cross_validated
 from benchmarks.frames import bench_videos
 from benchmarks.table import Row, make_rows
 from benchmarks.timing import flops_of, interleaved, machine, megabytes, one_thread
-from pipeline.config import EncoderConfig, FramesConfig, RuntimeConfig, SplitConfig
-from pipeline.encoder.baseline.features import VIDEO_FEATURE_NAMES
-from pipeline.encoder.baseline.predictor import Labels, PropertyPredictor
-from pipeline.encoder.baseline.recordings import FRAMES as TREE_FRAMES
-from pipeline.encoder.baseline.recordings import Recording, describe
+from pipeline.config import EncoderConfig, FramesConfig
+from pipeline.encoder.baseline.predictor import Labels
 from pipeline.encoder.baseline.validation import Fold
-from pipeline.encoder.candidates import CANDIDATES, Candidate
 from pipeline.encoder.clips import ClipDataset, LabelledVideo
-from pipeline.encoder.finetune import EncoderData, classify, train_classifier
-from pipeline.encoder.frame_classifier import FrameVotes
 from pipeline.encoder.frame_heads import choose_strength, fit_votes
-from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
-from pipeline.encoder.recipes import base_encoder, property_classifier
+from pipeline.encoder.model import FrameEncoder
+from pipeline.encoder.recipes import base_encoder
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.errors import UserError
 from pipeline.params import load_params
-from pipeline.records import Assignment, Part, Video
-from pipeline.runtime import derive_seed, seed_everything
-from pipeline.sampling import sample_evaluation
+from pipeline.records import Video
+from pipeline.runtime import derive_seed
 from pipeline.trainable import load_trainable
 from pipeline.videos.catalogue import Catalogue
-from pipeline.videos.files import VideoFile, list_videos
+from pipeline.videos.files import list_videos
 from pipeline.videos.frames.extract import extract_frames
-from pipeline.videos.frames.scan import Scan, scan
 from pipeline.videos.frames.store import FrameStore
-from pipeline.videos.frames.subtraction import subtract
-from pipeline.videos.split import assign
 
-SIDE, FRAMES = 120, 5
-"""Pixels and frames a video, where these are not what differs."""
-WHOLE = ("trees", "probe", "paper", "scratch", "pretrained", "pretrained-one-frame", "pretrained-ten-frames")
 PRETRAINED = Path("data") / "pretrained" / "encoder.safetensors"
-ALONE = "ms a video, encoder alone"
-CPU = torch.device("cpu")
 
 Clip = Mapping[str, torch.Tensor]
 
@@ -124,7 +110,7 @@ def measure(root: Path, size: Size | None = None) -> list[Row]:
     pretrained = root / PRETRAINED
     if not pretrained.is_file():
         raise UserError(
-            f"{pretrained}: no such file; `octopi scale small encoder.recipe=pretrained` and `dvc repro pretrain` make it"
+            f"{pretrained}: no such file; `octopi scale small encoder.recipe=pretrained`, `dvc repro pretrain` make it"
         )
     if len({f.object_id for f in list_videos(folder, catalogue).files}) < 2 * size.folds:
         raise UserError(f"{folder}: bench encoder needs videos of {2 * size.folds} objects or more")
@@ -136,75 +122,6 @@ def measure(root: Path, size: Size | None = None) -> list[Row]:
         videos = extract_frames(folder, catalogue, config, frames, Path(made) / "partial").videos
         bed = Bed(folder, frames, videos, catalogue, params.model_copy(update=changed), pretrained, size)
         return [*whole(bed, root / "reports"), *frozen(bed), *prompts(bed)]
-
-
-# --- Whole candidates
-
-
-def whole(bed: Bed, reports: Path) -> list[Row]:
-    """From the file to the classes."""
-    settings: dict[str, Callable[[VideoFile], object]] = {}
-    counts: dict[str, dict[str, float]] = {}
-    for name in WHOLE:
-        candidate = CANDIDATES[name]
-        if candidate.kind == "trees":
-            settings[name], counts[name] = _trees(bed), {"frames": TREE_FRAMES}
-            continue
-        model, frames = _classifier(candidate, bed).eval(), candidate.frames or FRAMES
-        settings[name] = partial(_decide, model, candidate.reference == "own", frames)
-        clip = torch.zeros(1, frames, SIDE, SIDE, 3, dtype=torch.uint8), torch.zeros(1, frames, dtype=torch.int64)
-        flops = flops_of(partial(model, *clip))
-        counts[name] = {"frames": frames, "megabytes": megabytes(model), "flops": flops}
-    files = [VideoFile(bed.folder / v.path, v.path, v.object_id, v.video_id) for v in bed.timed()]
-    judged = reported(reports, task="cross_validation", measure="combined").values()
-    # The report that compares most of them, and of such the one over most videos.
-    scores = max(judged, key=lambda rows: (len(rows), float(rows[0]["n"])), default=[])
-    return make_rows(
-        "encoder",
-        interleaved(settings, files, bed.size.repeats),
-        unit="ms a video",
-        baseline="pretrained",
-        errors={row["encoder"]: error_of(row) for row in scores if row["encoder"] in WHOLE},
-        error_of=WRONG,
-        counts=counts,
-        machine=machine("1 thread"),
-    )
-
-
-def _classifier(candidate: Candidate, bed: Bed) -> PropertyClassifier:
-    """A candidate with heads that have learnt nothing."""
-    seed_everything(0)
-    if candidate.kind == "votes":
-        return FrameVotes(SceneEncoder() if candidate.pretrained else base_encoder(bed.config), bed.classes)
-    if candidate.recipe == "scratch":
-        encoder = SceneEncoder()
-        return PropertyClassifier(encoder, Heads(encoder.dim, bed.classes), bed.classes)
-    return property_classifier(bed.config, bed.classes)
-
-
-def _scan(file: VideoFile) -> Scan:
-    found = scan(file, FramesConfig(selection="salient", size=SIDE))
-    assert isinstance(found, Scan), "all videos were extracted before"
-    return found
-
-
-@torch.inference_mode()
-def _decide(model: PropertyClassifier, differences: bool, frames: int, file: VideoFile) -> torch.Tensor:
-    found = _scan(file)
-    chosen = [found.kept[p] for p in sample_evaluation(len(found.kept), frames)]
-    pictures = np.stack([kept.image for kept in chosen])
-    if differences:
-        pictures = subtract(pictures, found.reference)
-    places = torch.tensor([[kept.index for kept in chosen]])
-    return model.decide(model(torch.from_numpy(pictures)[None], places)["logits"])
-
-
-def _trees(bed: Bed) -> Callable[[VideoFile], object]:
-    """Trees that have grown on random features of as many videos; they decode a second time, whole frames."""
-    shape = len(bed.videos), len(VIDEO_FEATURE_NAMES)
-    features = np.random.default_rng(0).standard_normal(shape, dtype=np.float32)
-    predictor = PropertyPredictor(bed.classes, jobs=1).fit(features, bed.labels, bed.objects)
-    return lambda file: predictor.predict(describe(Recording(file.path, _scan(file).probe.starts_touching))[None])
 
 
 # --- Frozen encoders
@@ -245,7 +162,7 @@ def frozen(bed: Bed) -> list[Row]:
     encoders = {name: _encoder(setting, bed) for name, setting in distinct.items()}
     shown = {name: [_clip(s, bed, video) for video in bed.timed()] for name, s in distinct.items()}
     timed: dict[str, Callable[[int], object]] = {
-        name: lambda i, name=name: _features(encoders[name], shown[name][i])  # type: ignore[misc]
+        name: lambda i, name=name: features(encoders[name], shown[name][i])  # type: ignore[misc]
         for name in distinct
     }
     costs = interleaved(timed, range(len(bed.timed())), bed.size.repeats)
@@ -299,14 +216,9 @@ def _clip(setting: Setting, bed: Bed, video: Video) -> Clip:
     return {**item, "frames": torch.from_numpy(np.stack(smaller))}
 
 
-@torch.inference_mode()
-def _features(encoder: FrameEncoder, clip: Clip) -> torch.Tensor:
-    return encoder.describe(clip["frames"], clip["moments"]).float()
-
-
 def _error(encoder: FrameEncoder, setting: Setting, bed: Bed) -> Error:
     """Of the frozen encoder's heads, whose settings are chosen inside the training folds."""
-    clips = np.stack([_features(encoder, _clip(setting, bed, video)).numpy() for video in bed.videos])
+    clips = np.stack([features(encoder, _clip(setting, bed, video)).numpy() for video in bed.videos])
     labels, owners, classes = bed.labels, np.array(bed.objects), bed.classes
 
     def predict(fold: Fold) -> Labels:
@@ -315,51 +227,3 @@ def _error(encoder: FrameEncoder, setting: Setting, bed: Bed) -> Error:
         return fit_votes(learnt, wanted, inner, classes, strength).predict(clips[fold.tested])
 
     return cross_validated(predict, labels, bed.objects, classes, folds=bed.size.folds, repeats=bed.size.deals)
-
-
-# --- Prompts
-
-
-def prompts(bed: Bed) -> list[Row]:
-    """The paper's recipe with other prompts."""
-    split = assign(bed.catalogue, bed.videos, SplitConfig(name="development"))
-    data = EncoderData(FrameStore(bed.frames), bed.catalogue, split.assignments, FRAMES)
-    clips = [_clip(CLIP, bed, video) for video in bed.timed()]
-    timed: dict[str, Callable[[Clip], object]] = {}
-    errors, counts = {}, {}
-    for count, layers in bed.size.prompts:
-        name = f"{count} at {'the first layer' if layers == 1 else f'{layers} layers' if layers else 'all layers'}"
-        changed = {"prompts": count, "prompt_layers": layers, "epochs": bed.size.epochs}
-        config = bed.config.model_copy(update=changed)
-        seed_everything(0)
-        model = property_classifier(config, bed.classes)
-        runtime = RuntimeConfig(device="cpu", threads=1)
-        train_classifier(model, data, config, runtime, seed=0, inputs=["bench", *_marks(data.assignments)])
-        errors[name] = _validation_error(model.eval(), data, config)
-        timed[name] = partial(_features, model.encoder)
-        # Not in inference mode: the counter fails there at parameters that are put into a layer, as prompts are.
-        flops = flops_of(partial(model.encoder.describe, clips[0]["frames"], clips[0]["moments"]))
-        counts[name] = {"frames": float(FRAMES), "megabytes": megabytes(model), "flops": flops}
-    return make_rows(
-        "prompts",
-        interleaved(timed, clips, bed.size.repeats),
-        unit=ALONE,
-        baseline=next(iter(timed)),
-        errors=errors,
-        error_of="share of validation videos, which also chose the epoch, of which not every property is right",
-        counts=counts,
-        machine=machine("1 thread"),
-    )
-
-
-def _marks(assignments: Sequence[Assignment]) -> list[str]:
-    return [f"{a.video_id} {a.part}" for a in assignments]
-
-
-def _validation_error(model: PropertyClassifier, data: EncoderData, config: EncoderConfig) -> Error:
-    wrong: dict[str, bool] = {}
-    objects: dict[str, tuple[str, ...]] = {}
-    for found in classify(model, data, [Part.VALIDATION], config.batch_size, CPU):
-        wrong[found.video_id] = wrong.get(found.video_id, False) or found.predicted != found.expected
-        objects[found.video_id] = (found.object_id,)
-    return share_of([float(w) for w in wrong.values()], list(objects.values()))

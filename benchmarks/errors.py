@@ -40,8 +40,9 @@ def share_of(wrong: Sequence[float], objects: Sequence[tuple[str, ...]]) -> Erro
         objects: What each is about.
     """
     interval = clustered([Outcome(w, o) for w, o in zip(wrong, objects, strict=True)])
-    ends = (interval.low, interval.high) if interval else (None, None)
-    return Error(fmean(wrong), *ends, len(wrong))
+    if interval is None:
+        return Error(fmean(wrong), n=len(wrong))
+    return Error(fmean(wrong), interval.low, interval.high, len(wrong))
 
 
 def mean_of(values: Sequence[float], objects: Sequence[str]) -> Error:

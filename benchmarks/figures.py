@@ -1,4 +1,4 @@
-"""One figure a question of the table: cost against error with the Pareto front, or costs alone where nothing differs."""
+"""One figure a question: cost against error with the Pareto front, or costs alone where all compute the same."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def draw(rows: Sequence[Row], reports: Path) -> list[Path]:
         figure = Figure(figsize=(9, 6 if judged else 1.5 + 0.4 * len(own)), dpi=100, layout="constrained")
         canvas, axes = FigureCanvasAgg(figure), figure.add_subplot()
         base = next((row.setting for row in own if row.cost_ratio == 1), "")
-        axes.set_title(question)
+        axes.set_title(question, pad=18)
         axes.set_xlabel(f"cost ({own[0].unit}), times that of: {base}")
         if judged:
             _trade(axes, judged, canvas)
@@ -61,10 +61,10 @@ def _bars(axes: Axes, rows: Sequence[Row]) -> None:
 
 def _trade(axes: Axes, rows: Sequence[Row], canvas: Any) -> None:
     axes.set_xscale("log")
-    axes.set_ylabel(f"error: {rows[0].error_of}", wrap=True)
-    if min(row.error or 0 for row in rows) > 0 and max(row.error or 0 for row in rows) > 20 * min(
-        row.error or 0 for row in rows
-    ):
+    axes.set_ylabel("error")
+    axes.text(0.5, 1.005, f"error: {rows[0].error_of}", transform=axes.transAxes, ha="center", fontsize=8)
+    errors = [row.error or 0.0 for row in rows]
+    if 0 < 20 * min(errors) < max(errors):
         axes.set_yscale("log")
     groups = list(dict.fromkeys(row.setting.split(",")[0] for row in rows))
     for row in rows:
@@ -121,7 +121,7 @@ def _names(axes: Axes, rows: Sequence[Row]) -> None:
         def covered(offset: tuple[int, int], box: Any = box, scale: float = scale) -> float:
             moved = box.translated(offset[0] * scale, offset[1] * scale)
             hidden = sum(_shared(moved, other) for other in taken)
-            return hidden + 5 * (box.width * box.height - _shared(moved, frame))
+            return float(hidden + 5 * (box.width * box.height - _shared(moved, frame)))
 
         best = min(OFFSETS, key=covered)
         label.set_position(best)

@@ -1,16 +1,17 @@
 """The language model: what each part of the pipeline's way brings against the published loop, and how much to describe.
 
 The published code (github.com/clear-nus/octopi, train_llm.py and utils/model.py) takes one conversation at a time,
-encodes its videos anew, pads the embeddings to 512 tokens, computes logits for all of them, and steps after 16. To answer
-it first reads the reference answer likewise, and then calls `generate` with the question alone. That it opens a JPEG for
-each frame is left out, in its favour. All ways take the same model (of params.yaml, aligned a little, so that answers are
-as long as answers are), the pipeline's own questions, and pictures of noise, since no cost depends on what they show.
+encodes its videos anew, pads the embeddings to 512 tokens, computes logits for all of them, and steps after 16. To
+answer it first reads the reference answer likewise, and then calls `generate` with the question alone. That it opens a
+JPEG for each frame is left out, in its favour. All ways take the same model (of params.yaml, aligned a little, so that
+answers are as long as answers are), the pipeline's own questions, and pictures of noise: no cost depends on them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from statistics import fmean
 from tempfile import TemporaryDirectory
@@ -35,7 +36,7 @@ from pipeline.language.generate import Asking, answer
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.params import load_params
 from pipeline.records import Assignment, Embedding, Graded, Opd, Part, Prediction, Question
-from pipeline.runtime import seed_everything
+from pipeline.runtime import DtypeName, seed_everything
 from pipeline.tasks.questions import build_questions, pool_of
 from pipeline.videos.catalogue import load_catalogue
 
@@ -225,14 +226,14 @@ def answering(bed: Bed, size: Size) -> list[Row]:
     def one_by_one(**options: bool) -> Callable[[object], list[str]]:
         return lambda _: [_answer(bed, size.limit, place, **options) for place in range(len(bed.asked))]
 
-    def batched(batch: int) -> Callable[[object], list[str]]:
-        return lambda _: [p.outputs[0] for p in ask(bed, bed.model, size.limit, batch)]
-
     ways = {
         PUBLISHED: one_by_one(reads=True),
         "without the published loop's forward pass": one_by_one(),
         "and without a cache of keys and values": one_by_one(cache=False),
-        **{f"the pipeline's way, {batch} at a time": batched(batch) for batch in size.batches},
+        **{
+            f"the pipeline's way, {batch} at a time": partial(_texts, bed, bed.model, size.limit, batch)
+            for batch in size.batches
+        },
     }
     tokens = fmean(p.tokens for p in ask(bed, bed.model, size.limit, size.batches[-1]))
     return _asked("answering", ways, bed, size.repeats, {name: {"tokens": tokens} for name in ways})
@@ -241,12 +242,12 @@ def answering(bed: Bed, size: Size) -> list[Row]:
 def formats(bed: Bed, size: Size) -> list[Row]:
     """The frozen weights in fewer bits; the connector stays in float32."""
     ways = {}
-    for name in ("float32", "bfloat16"):
+    names: tuple[DtypeName, ...] = ("float32", "bfloat16")
+    for name in names:
         base = bed.model.octopi_config
-        model = OctopiForCausalLM.from_base(base.base_model, base.tactile_dim, dtype=name)  # type: ignore[arg-type]
+        model = OctopiForCausalLM.from_base(base.base_model, base.tactile_dim, dtype=name)
         model.connector.load_state_dict(bed.model.connector.state_dict())
-        batch = size.batches[-1]
-        ways[name] = lambda _, model=model: [p.outputs[0] for p in ask(bed, model, size.limit, batch)]
+        ways[name] = partial(_texts, bed, model, size.limit, size.batches[-1])
     return _asked("number format, language model", ways, bed, size.repeats, {name: {} for name in ways})
 
 
@@ -282,6 +283,10 @@ def ask(bed: Bed, model: OctopiForCausalLM, limit: int, batch: int) -> list[Pred
     return answer(model, bed.store, bed.asked, Opd.ALL, asking)
 
 
+def _texts(bed: Bed, model: OctopiForCausalLM, limit: int, batch: int, _: object) -> list[str]:
+    return [prediction.outputs[0] for prediction in ask(bed, model, limit, batch)]
+
+
 @torch.no_grad()
 def _answer(bed: Bed, limit: int, place: int, reads: bool = False, cache: bool = True) -> str:
     """One question, its frames encoded; `reads`: after the reference answer, padded, as the published loop has it."""
@@ -290,17 +295,30 @@ def _answer(bed: Bed, limit: int, place: int, reads: bool = False, cache: bool =
     if reads:
         loss(bed, WAYS[PUBLISHED], [question], [sample], 1)
     ids = sample["input_ids"][: int((sample["labels"] != IGNORE_INDEX).nonzero()[0])][None]
-    new = model.llm.generate(
-        inputs_embeds=model.embed(ids, bed.encode(question)[None]),
-        attention_mask=torch.ones_like(ids),
-        max_new_tokens=limit,
-        do_sample=False,
-        use_cache=cache,
-        eos_token_id=tokenizer.eos_token_id,
-        pad_token_id=tokenizer.pad_token_id,
-    )
+    embeddings = model.embed(ids, bed.encode(question)[None])
+    if cache:
+        new = model.llm.generate(
+            inputs_embeds=embeddings,
+            attention_mask=torch.ones_like(ids),
+            max_new_tokens=limit,
+            do_sample=False,
+            eos_token_id=tokenizer.eos_token_id,
+            pad_token_id=tokenizer.pad_token_id,
+        )
+    else:
+        new = _without_cache(model, embeddings, limit)
     said: str = tokenizer.decode(new[0], skip_special_tokens=True).strip()
     return said
+
+
+def _without_cache(model: OctopiForCausalLM, embeddings: torch.Tensor, limit: int) -> torch.Tensor:
+    """Greedy, all that was said read anew for each token: 1 x tokens. transformers' `generate` always keeps a cache."""
+    said: list[torch.Tensor] = []
+    while len(said) < limit and not (said and said[-1].item() == model.tokenizer.eos_token_id):
+        logits = model.llm(inputs_embeds=embeddings, use_cache=False, logits_to_keep=1).logits
+        said.append(logits[:, -1].argmax(-1, keepdim=True))
+        embeddings = torch.cat([embeddings, model.llm.get_input_embeddings()(said[-1])], dim=1)
+    return torch.cat(said, dim=1)
 
 
 # --- How much to describe
@@ -325,8 +343,9 @@ def describing(root: Path) -> list[Row]:
         tokens = [a.tokens for a in answers if a.opd == opd and a.task in DESCRIBED]
         if len(own) == len(DESCRIBED) and tokens:
             lows, highs = ([e for e in ends if e is not None] for ends in ([x.low for x in own], [x.high for x in own]))
-            ends = (fmean(lows), fmean(highs)) if len(lows) == len(highs) == len(own) else (None, None)
-            errors[opd] = Error(fmean(e.value for e in own), *ends, sum(e.n or 0 for e in own))
+            whole = len(lows) == len(highs) == len(own)
+            low, high = (fmean(lows), fmean(highs)) if whole else (None, None)
+            errors[opd] = Error(fmean(e.value for e in own), low, high, sum(e.n or 0 for e in own))
             costs[opd] = [fmean(tokens)]
     if len(costs) < 2 or "all" not in costs:
         return []
