@@ -40,8 +40,8 @@ dashboard: install
 	mlflow ui --backend-store-uri "sqlite:///$(CURDIR)/mlruns/mlflow.db" --host 127.0.0.1 --port $(PORT)
 
 bench: install
-	@test -n "$(SECTION)" || { echo "make bench: name a section, as in make bench SECTION=startup"; exit 1; }
-	python -m pipeline.benchmarks $(SECTION)
+	@test -n "$(SECTION)" || { echo "make bench: name a section, as in make bench SECTION=frames"; exit 1; }
+	python -m benchmarks $(SECTION)
 
 standins: install
 	dvc repro standins/dvc.yaml
