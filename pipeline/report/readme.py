@@ -57,7 +57,7 @@ def render_readme(report: Report, figures: Sequence[str]) -> str:
         elif len(shown):
             elsewhere.append(table.title)
     more = f"On the page [index.html](../index.html): {'; '.join(elsewhere)}.\n" if elsewhere else ""
-    files = ("scores.csv", "effects.csv", "dataset.csv", "audit.csv", "samples.json")
+    files = (path.name for pattern in ("*.csv", "samples.json") for path in sorted(report.folder.glob(pattern)))
     links = ", ".join(f"[{name}]({name})" for name in files)
     return "\n".join([*sections, f"## More\n\n{more}All figures: {links}."]) + "\n"
 
@@ -101,9 +101,9 @@ def stands_on(said: dict[str, Any]) -> list[str]:
         f"**Tactile encoder:** {said['encoder']}. Base encoder of the ablation: {model_words(encoder)}.",
         f"**Test objects:** {len(objects)}{named}, {said['test_videos']} videos, split `{said['split']}`.",
         f"**Seeds:** {len(said['seeds'])} ({', '.join(map(str, said['seeds']))}).",
-        f"**Chosen on these objects before?** {said['settings'] or 'Nothing is noted in reports/notes.yaml.'}",
-        "**Intervals** are Wilson's with the effective number of questions, since questions share objects; they cover "
-        "about 90 %, not 95, for questions about three of seven objects.",
+        f"**Chosen on these objects before?** {said['settings'] or 'Nothing is noted in pipeline/report/notes.yaml.'}",
+        "**Intervals** are Wilson's with the effective number of questions, since questions share objects. "
+        + said["intervals"],
     ]
     if said["facts_told"]:
         facts.append(
