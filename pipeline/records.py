@@ -125,11 +125,11 @@ class Probe(Record):
     saturated: float
     """Share of values at 0 or 255 where contact is strongest."""
     contact: float
-    """Largest strength of contact in a probed frame (`pipeline.videos.frames.reference.strength`)."""
+    """Largest contact strength in a probed frame (`pipeline.videos.frames.reference.contact_strength`)."""
     quiet: float
-    """Smallest strength in a probed frame after the reference: what noise alone gives in a quiet part of a video."""
+    """Smallest contact strength in a probed frame after the reference: what noise alone gives in a quiet part of a video."""
     contact_end: float
-    """Strength of contact in the last frame."""
+    """Contact strength in the last frame."""
     starts_touching: bool
     """Whether the reference had to be taken from the end."""
     texture_start: float
@@ -168,7 +168,7 @@ class Frame(Record):
     """Position in the video, in decoding order."""
     score: float = Field(ge=0)
     """What the selection went by: `salient` sums absolute differences in brightness to the frame before, over all
-    pixels (8-bit steps); `release` counts changed grey pixels; `contact` and `adaptive` take the strength of contact;
+    pixels (8-bit steps); `release` counts changed grey pixels; `contact` and `adaptive` take the contact strength;
     0 where there was nothing to choose by."""
     row: int = Field(ge=0)
 

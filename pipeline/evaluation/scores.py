@@ -6,6 +6,7 @@ and with it its measures, come from its own module.
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import groupby
@@ -13,22 +14,11 @@ from statistics import fmean
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from pydantic import BeforeValidator
+from pydantic import AfterValidator, BeforeValidator
 
 from pipeline.evaluation.intervals import Objects, accuracy_interval
 from pipeline.evaluation.paired import Difference, holm, paired
-from pipeline.records import (
-    WHOLE,
-    Classification,
-    Encoder,
-    Graded,
-    Lora,
-    Opd,
-    OutOfFold,
-    Part,
-    Record,
-    Touch,
-)
+from pipeline.records import Classification, Encoder, Graded, Lora, Opd, OutOfFold, Part, Record, Touch
 from pipeline.tasks import TASKS
 from pipeline.videos.catalogue import Catalogue
 
@@ -38,7 +28,9 @@ HEADS, VALIDATION_HEADS, CROSS_VALIDATION = "heads", "heads_validation", "cross_
 """What stands as the task where no language model answered: the fine-tuned encoder's property heads on test videos and
 on validation videos, and encoders on objects that they were not trained on."""
 
-Optional = Annotated[float | None, BeforeValidator(lambda value: None if value == "" else value)]
+DIGITS = 6
+Share = Annotated[float, AfterValidator(lambda value: round(value, DIGITS))]
+Optional = Annotated[Share | None, BeforeValidator(lambda value: None if value == "" else value)]
 """Empty in a CSV where it is None."""
 
 
@@ -56,15 +48,15 @@ class ScoreRow(Record):
     """A number or `all`."""
     n: int
     """Questions, or videos; not multiplied by seeds."""
-    right: float
+    right: Share
     """Right answers; over seeds their mean, which need not be whole."""
-    unread: float
+    unread: Share
     """Answers that could not be read, which count as wrong; over seeds their mean."""
-    accuracy: float
+    accuracy: Share
     low: Optional = None
     """Of the 95 % interval over objects; None where the questions cannot show that objects differ."""
     high: Optional = None
-    chance: float
+    chance: Share
 
 
 class EffectRow(Record):
@@ -76,7 +68,7 @@ class EffectRow(Record):
     """Such as `with - without`."""
     task: str
     measure: str
-    difference: float
+    difference: Share
     low: Optional = None
     """Of the 95 % interval for new objects and, with several seeds, new seeds; None as in scores."""
     high: Optional = None
@@ -144,7 +136,8 @@ def score_rows(
         chance = TASKS[task].chance(catalogue)[measure]
         for setting, runs in settings.items():
             rows += _rows(runs, task=task, measure=measure, chance=chance, **setting._asdict())
-    chances = TASKS["OPD"].chance(catalogue)  # The same classes, told without a language model.
+    chances = {p.name: 1 / len(p.levels) for p in catalogue.properties}
+    chances["combined"] = math.prod(chances.values())
     for task_name, part in ((HEADS, Part.TEST), (VALIDATION_HEADS, Part.VALIDATION)):
         found = {seed: _videos(records, part) for seed, records in (classifications or {}).items()}
         for measure, chance in chances.items():
@@ -153,7 +146,7 @@ def score_rows(
                 by_seed, task=task_name, measure=measure, chance=chance, encoder=Encoder.FINETUNED, touch=Touch.REAL
             )
     for name, records in (out_of_fold or {}).items():
-        for place, measure in enumerate((*catalogue.property_names, "combined")):
+        for place, measure in enumerate(chances):
             runs = repeats(records, place if place < len(catalogue.properties) else None)
             rows += _rows(runs, task=CROSS_VALIDATION, measure=measure, chance=chances[measure], encoder=name)[-1:]
     return rows
@@ -162,16 +155,30 @@ def score_rows(
 def effect_rows(graded: Iterable[Graded], catalogue: Catalogue) -> list[EffectRow]:
     """The rows of effects.csv: what each part of the full system brings, task by task, pooled over seeds.
 
-    Only measures that say that an answer is right, on questions and seeds that both settings have. Holm's family is all
+    Only each task's measure of a whole answer, on questions and seeds that both settings have. Holm's family is all
     rows.
     """
     rows = []
     table = _table(graded, catalogue)
     for part, full, less in CHANGES:
         for (task, measure), settings in table.items():
-            if measure in WHOLE and (gap := difference(settings.get(full, {}), settings.get(less, {}))):
+            if measure == TASKS[task].measure and (gap := difference(settings.get(full, {}), settings.get(less, {}))):
                 change = f"{getattr(full, part)} - {getattr(less, part)}"
                 rows.append(effect_row(gap, part=part, change=change, task=task, measure=measure))
+    return with_holm(rows)
+
+
+def candidate_rows(out_of_fold: Mapping[str, Iterable[OutOfFold]], reference: str) -> list[EffectRow]:
+    """Each other encoder less the reference in a cross-validation, every property of a video right at once.
+
+    As effects, with the repeats in place of seeds; a family of its own. Empty where the reference was not run.
+    """
+    runs = {name: repeats(records) for name, records in out_of_fold.items()}
+    rows = [
+        effect_row(gap, part="encoder", change=f"{name} - {reference}", task=CROSS_VALIDATION, measure="combined")
+        for name, videos in runs.items()
+        if name != reference and (gap := difference(videos, runs.get(reference, {})))
+    ]
     return with_holm(rows)
 
 
@@ -235,8 +242,8 @@ def _row(questions: Sequence[Sequence[Answer]], **named: object) -> ScoreRow:
         {
             **{name: str(value) if name != "chance" else value for name, value in named.items()},
             "n": len(right),
-            "right": round(sum(right), 6),
-            "unread": round(sum(fmean(not a.parsed for a in answers) for answers in questions), 6),
+            "right": sum(right),
+            "unread": sum(fmean(not a.parsed for a in answers) for answers in questions),
             "accuracy": fmean(right),
             "low": interval and interval.low,
             "high": interval and interval.high,
@@ -244,18 +251,22 @@ def _row(questions: Sequence[Sequence[Answer]], **named: object) -> ScoreRow:
     )
 
 
+def grouped(graded: Iterable[Graded]) -> Table:
+    """Answers by task and measure, then by setting."""
+    found: dict[tuple[str, str], dict[Setting, dict[int, dict[str, Answer]]]] = defaultdict(
+        lambda: defaultdict(lambda: defaultdict(dict))
+    )
+    for g in graded:
+        setting = Setting(g.encoder, g.lora, g.opd, g.touch)
+        found[g.task, g.measure][setting][g.seed][g.question_id] = Answer(g.correct, g.objects, g.parsed)
+    return found
+
+
 def _table(graded: Iterable[Graded], catalogue: Catalogue) -> Table:
     """In the order of the registered tasks and of what each calls its measures."""
-    found: dict[tuple[str, str], dict[Setting, dict[int, dict[str, Answer]]]] = {
-        (task, measure): defaultdict(lambda: defaultdict(dict))
-        for task, definition in TASKS.items()
-        for measure in definition.chance(catalogue)
-    }
-    for g in graded:
-        found[g.task, g.measure][Setting(g.encoder, g.lora, g.opd, g.touch)][g.seed][g.question_id] = Answer(
-            g.correct, g.objects, g.parsed
-        )
-    return found
+    found = grouped(graded)
+    keys = [(task, measure) for task, definition in TASKS.items() for measure in definition.chance(catalogue)]
+    return {key: found[key] for key in keys if key in found}
 
 
 def _videos(records: Iterable[Classification], part: Part) -> dict[str, dict[str, Answer]]:

@@ -23,7 +23,7 @@ from pipeline.io import write_text
 from pipeline.report.dataset import dataset_tables
 from pipeline.report.drawing import SIZE, draw_table, place_points, share, span
 from pipeline.report.load import KEYS, Report, load_report, read_frame
-from pipeline.report.readme import OTHER_MODELS, finding, origin, stands_on
+from pipeline.report.readme import OTHER_MODELS, SMOKE, finding, origin, stands_on
 from pipeline.report.tables import TABLES, difference, headline, measured, number, task_title, whole
 from pipeline.tasks import TASKS
 
@@ -145,7 +145,7 @@ def _chapter(report: Report, gaps: list[Gap]) -> dict[str, Any]:
         "name": name,
         "scale": scale,
         "source": source,
-        "finding": finding(report),
+        "finding": [*([SMOKE.strip("> \n")] if scale == "smoke" else []), *finding(report)],
         "tasks": tasks,
         "effects": effects,
         "points": points,
@@ -175,7 +175,10 @@ def _tasks(report: Report) -> Iterator[Line]:
             f"{report.name}/scores.csv:{index + 2}",
             measured(row),
             f"{row['right']:g} of {row['n']:g} right",
-            *(share(row[name]) for name in ("accuracy", "low", "high", "chance")),
+            share(row["accuracy"]),
+            share(row["low"]),
+            share(row["high"]),
+            share(row["chance"]),
             {m: (f"{c['value']:.1f}", f"n {c['n']:.0f}", c["value"]) for m, c in cells.items() if c},
         )
 
@@ -186,9 +189,10 @@ def _effects(report: Report) -> tuple[dict[str, list[Line]], float]:
     points = span(100 * rows[["difference", "low", "high"]].abs().max(axis=None)) if len(rows) else 0.0
     groups: dict[str, list[Line]] = {}
     for index, row in zip(rows.index, rows.to_dict("records"), strict=True):
-        ends = (share(0.5 + 50 * row[name] / points) for name in ("difference", "low", "high"))
+        value, low, high = (share(0.5 + 50 * row[name] / points) for name in ("difference", "low", "high"))
         source = f"{report.name}/effects.csv:{index + 2}"
-        line = Line(row["task"], task_title(row["task"]), source, difference(row), number(row["p_holm"], 3), *ends)
+        p = number(row["p_holm"], 3)
+        line = Line(row["task"], task_title(row["task"]), source, difference(row), p, value, low, high)
         groups.setdefault(f"{PARTS.get(row['part'], row['part'])}: {row['change']}", []).append(line)
     return groups, points
 
