@@ -30,7 +30,7 @@ from pipeline.tasks import TASKS
 PAGE = Path("reports/index.html")
 LARGEST = 1_500_000
 """Bytes of the page at most, so that it opens at once on a phone."""
-SPEED = ("question", "setting", "cost", "cost_ratio", "error", "low", "high", "front")
+SPEED = ("question", "setting", "cost", "unit", "cost_ratio", "error", "error_of", "low", "high", "front")
 STABILITY = ("part", "case", "format", "finite", "error", "bound", "verdict")
 MODELS = ("7b", "13b")
 AUDIT = ("check", "item", "measured", "expected", "severity")
@@ -263,12 +263,8 @@ def _speed(folder: Path, gaps: list[Gap]) -> Iterator[dict[str, Any]]:
         shown.columns = [name.replace("_", " ").capitalize() for name in shown]
         yield {
             "question": question,
-            "measures": sorted(
-                {
-                    *group.get("unit", pd.Series(dtype=str)).dropna(),
-                    *group.get("error_of", pd.Series(dtype=str)).dropna(),
-                }
-            ),
+            "costs": "; ".join(group["unit"].dropna().unique()),
+            "errors": "; ".join(group["error_of"].dropna().unique()),
             "points": place_points(group),
             "front": group[group["front"]].sort_values("cost_ratio").map(_said).to_dict("records"),
             "html": draw_table(shown, str(question), "speed_error.csv"),
