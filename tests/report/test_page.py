@@ -73,9 +73,9 @@ def test_every_figure_is_a_cell_of_its_row(page: Page, made: Path) -> None:
     for row in (e for e in page.all("tr") if re.search(r":\d+$", e.get("data-source", ""))):
         file, line = row.get("data-source", "").rsplit(":", 1)
         source = files[made / "reports" / file][int(line) - 2]
-        numbers = {name: float(value) for name, value in source.items() if NUMBER.fullmatch(value)}
-        shares = [100 * numbers["unread"] / numbers["n"]] if "unread" in numbers else []
-        cells = [*numbers.values(), *(100 * number for number in numbers.values()), *shares]
+        numbers = [float(text.replace(",", "")) for value in source.values() for text in NUMBER.findall(value)]
+        shares = [100 * float(source["unread"]) / float(source["n"])] if source.get("unread") else []
+        cells = [*numbers, *(100 * number for number in numbers), *shares]
         for cell in row.iter("td"):
             allowed = printed if cell.get("class") == "published" and "dataset" not in file else cells
             for text in [] if cell.get("class") == "words" else NUMBER.findall(words(cell)):
