@@ -8,9 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean, stdev
 
+import numpy as np
+
 from pipeline.encoder.baseline.predictor import Labels
 from pipeline.encoder.baseline.validation import Predict, cross_validate
-from pipeline.statistics import Outcome, clustered
+from pipeline.evaluation.intervals import accuracy_interval
 
 WRONG = "share of videos of unseen objects of which not every property is right"
 
@@ -39,7 +41,7 @@ def share_of(wrong: Sequence[float], objects: Sequence[tuple[str, ...]]) -> Erro
         wrong: From 0 (right) to 1, of each question or video.
         objects: What each is about.
     """
-    interval = clustered([Outcome(w, o) for w, o in zip(wrong, objects, strict=True)])
+    interval = accuracy_interval(np.array(wrong, dtype=np.float64), objects)
     if interval is None:
         return Error(fmean(wrong), n=len(wrong))
     return Error(fmean(wrong), interval.low, interval.high, len(wrong))
@@ -73,8 +75,9 @@ def cross_validated(
         objects: Each video's object.
         classes: How many classes each property has.
     """
-    judged = cross_validate(predict, labels, objects, classes, folds=folds, repeats=repeats)
-    return share_of([1 - video.correct(None) for video in judged], [(o,) for o in objects])
+    predicted = cross_validate(predict, labels, objects, classes, folds=folds, repeats=repeats)
+    right = (predicted == labels[:, None]).all(axis=-1).mean(axis=-1)
+    return share_of((1 - right).tolist(), [(o,) for o in objects])
 
 
 def reported(reports: Path, **keys: str) -> dict[Path, list[dict[str, str]]]:

@@ -98,6 +98,8 @@ def repro(context: typer.Context) -> None:
     from pipeline.reproduce import reproduce
 
     raise typer.Exit(reproduce(Path(), context.args))
+
+
 @app.command()
 def compare(
     old: Annotated[str, typer.Argument(help="A Git revision: a hash, a tag, a branch, HEAD~1.")],
