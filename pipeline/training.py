@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 import shutil
 import sys
@@ -13,7 +11,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch
-from pydantic import BaseModel
 from torch.utils.data import Sampler
 from transformers import PrinterCallback, Trainer, TrainerCallback, TrainerControl, TrainerState, TrainingArguments
 from transformers.trainer_utils import get_last_checkpoint
@@ -21,7 +18,7 @@ from transformers.trainer_utils import get_last_checkpoint
 from pipeline.config import RuntimeConfig
 from pipeline.errors import UserError
 from pipeline.records import Measurement
-from pipeline.runtime import CHECKPOINTS
+from pipeline.runtime import CHECKPOINTS, LogLines
 from pipeline.sampling import EpochDataset
 from pipeline.trainable import trainable_state
 
@@ -124,10 +121,10 @@ LOSSES = ("loss", "grad_norm", "validation_loss")
 
 
 class TrainingMonitor(TrainerCallback):
-    """Tells a log file how far a training is, and stops where the loss is no number any more."""
+    """Says in a log file how far a training is, and stops it where the loss is no number any more."""
 
     def __init__(self) -> None:
-        self._said = 0
+        self._lines: LogLines | None = None
 
     def on_log(
         self,
@@ -137,41 +134,24 @@ class TrainingMonitor(TrainerCallback):
         logs: dict[str, float] | None = None,
         **_: Any,
     ) -> None:
-        """Called by the Trainer after each logging step."""
+        """Called by the Trainer after each logging step.
+
+        Raises:
+            UserError: where a loss or the gradient's norm is not finite.
+        """
         values = measured(logs or {})
         bad = [name for name in LOSSES if not math.isfinite(values.get(name, 0.0))]
         if bad:
             raise _diverged(f"{bad[0]} is {values[bad[0]]}", state.global_step)
-        if not state.is_world_process_zero:
-            return
-        tenth = 10 * state.global_step // max(1, state.max_steps)
-        if args.disable_tqdm and "loss" in values and tenth > self._said:
-            self._said = tenth
-            print(f"step {state.global_step}/{state.max_steps}, loss {values['loss']:.3f}", flush=True)
+        # At a terminal the Trainer has a bar of its own.
+        if state.is_world_process_zero and args.disable_tqdm and "loss" in values:
+            self._lines = self._lines or LogLines("training", state.max_steps, "step", after=state.global_step)
+            self._lines.reached(state.global_step, f"loss {values['loss']:.3f}")
 
 
-def fingerprint(*parts: BaseModel | str | int | Path) -> str:
-    """A short hash of settings and of input files, or all files of folders: checkpoints of one training are never
-    taken for another's."""
-    digest = hashlib.sha256()
-    for part in parts:
-        if isinstance(part, BaseModel):
-            digest.update(json.dumps(part.model_dump(mode="json"), sort_keys=True).encode())
-        elif isinstance(part, Path):
-            for file in sorted(part.iterdir()) if part.is_dir() else [part]:
-                if file.is_file():
-                    digest.update(file.name.encode())
-                    with file.open("rb") as stream:
-                        digest.update(hashlib.file_digest(stream, "sha256").digest())
-        else:
-            digest.update(str(part).encode())
-        digest.update(b"\0")
-    return digest.hexdigest()[:16]
-
-
-def checkpoint_dir(stage: str, mark: str) -> Path:
+def checkpoint_dir(stage: str, fingerprint: str) -> Path:
     """Where a training keeps its checkpoints, outside DVC's reach (DVC deletes a killed stage's outputs)."""
-    return CHECKPOINTS / stage / mark
+    return CHECKPOINTS / stage / fingerprint
 
 
 @dataclass(frozen=True)

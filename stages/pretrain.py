@@ -1,6 +1,5 @@
 """Pretrain an encoder on pictures of invented objects, where the recipe or a compared model begins with that."""
 
-
 from pipeline.encoder.candidates import needs_pretraining
 from pipeline.io import write_table
 from pipeline.records import Measurement

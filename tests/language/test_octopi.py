@@ -20,10 +20,10 @@ from pipeline.language.conversations import ConversationCollator
 from pipeline.language.generate import answer
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import Job, add_lora, align, assemble, finetune_lora
-from pipeline.records import Opd, Question, Task
+from pipeline.records import Opd, Question
 from pipeline.trainable import trainable_state
 from tests.checkpoints import write_llama
-from tests.language import DIM, FRAMES, SMALL, asking, language, material, model, questions, store
+from tests.language.shared import DIM, FRAMES, SMALL, generation, language, material, model, questions, store
 
 __all__ = ["language", "model", "questions", "store"]
 """Fixtures."""
@@ -130,21 +130,21 @@ def test_unknown_target_module_is_named(model: OctopiForCausalLM) -> None:
 def test_batch_size_changes_no_answer(
     model: OctopiForCausalLM, questions: list[Question], store: EmbeddingStore, opd: Opd
 ) -> None:
-    one = answer(model, store, questions, opd, asking(1))
-    many = answer(model, store, questions, opd, asking(5))
+    one = answer(model, store, questions, opd, generation(1))
+    many = answer(model, store, questions, opd, generation(5))
     assert one == many
-    mixed = answer(model, store, questions[::-1], opd, asking(len(questions)))
+    mixed = answer(model, store, questions[::-1], opd, generation(len(questions)))
     assert sorted(mixed, key=lambda p: p.question_id) == sorted(one, key=lambda p: p.question_id)
     turns = {q.question_id: len(d.turns) for q in questions if (d := q.dialogue(opd))}
     assert {p.question_id: len(p.outputs) for p in one} == turns
     if opd is Opd.NONE:
-        assert not [p for p in one if p.task is Task.OPD], "without descriptions there is nothing to ask"
+        assert not [p for p in one if p.task == "OPD"], "without descriptions there is nothing to ask"
 
 
 def test_running_into_the_limit_is_said(
     model: OctopiForCausalLM, questions: list[Question], store: EmbeddingStore
 ) -> None:
-    predictions = answer(model, store, questions[:2], Opd.ALL, asking(2, tokens=1))
+    predictions = answer(model, store, questions[:2], Opd.ALL, generation(2, tokens=1))
     assert all(p.truncated for p in predictions)
     assert all(p.tokens == len(p.outputs) for p in predictions)
 
@@ -155,7 +155,7 @@ def test_answers_equal_generation_by_hand(
     from pipeline.language.chat import encode, render
     from pipeline.language.conversations import evaluation_features
 
-    question = next(q for q in questions if q.task is Task.PC)
+    question = next(q for q in questions if q.task == "PC")
     dialogue = question.dialogue(Opd.ALL)
     assert dialogue is not None
     ids = list(
@@ -171,7 +171,7 @@ def test_answers_equal_generation_by_hand(
         if said[-1] == model.tokenizer.eos_token_id:
             break
     expected = model.tokenizer.decode(said, skip_special_tokens=True).strip()
-    assert answer(model, store, [question], Opd.ALL, asking(1))[0].outputs == (expected,)
+    assert answer(model, store, [question], Opd.ALL, generation(1))[0].outputs == (expected,)
 
 
 class Killed(Exception):
