@@ -226,7 +226,7 @@ def answering(bed: Bed, size: Size) -> list[Row]:
     def one_by_one(**options: bool) -> Callable[[object], list[str]]:
         return lambda _: [_answer(bed, size.limit, place, **options) for place in range(len(bed.asked))]
 
-    ways = {
+    ways: dict[str, Callable[[object], list[str]]] = {
         PUBLISHED: one_by_one(reads=True),
         "without the published loop's forward pass": one_by_one(),
         "and without a cache of keys and values": one_by_one(cache=False),
@@ -241,7 +241,7 @@ def answering(bed: Bed, size: Size) -> list[Row]:
 
 def formats(bed: Bed, size: Size) -> list[Row]:
     """The frozen weights in fewer bits; the connector stays in float32."""
-    ways = {}
+    ways: dict[str, Callable[[object], list[str]]] = {}
     names: tuple[DtypeName, ...] = ("float32", "bfloat16")
     for name in names:
         base = bed.model.octopi_config
