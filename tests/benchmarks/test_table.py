@@ -17,6 +17,8 @@ from benchmarks.figures import FOLDER, draw
 from benchmarks.table import CSV, Row, cost_ratios, front, make_rows, merge, read_rows
 from benchmarks.timing import counting_ffts, flops_of, interleaved, megabytes
 from pipeline.errors import UserError
+from pipeline.evaluation.scores import ScoreRow
+from pipeline.io import write_csv
 from tests.conftest import ROOT
 
 POINTS = st.lists(st.tuples(st.integers(1, 6), st.integers(0, 6)), min_size=1, max_size=12)
@@ -163,13 +165,15 @@ def test_errors_have_intervals_over_objects() -> None:
 
 
 def test_errors_come_from_the_reports_that_have_them(tmp_path: Path) -> None:
-    for name, text in (("one", "task,n,accuracy,low,high\nheads,9,0.5,0.4,0.7\n"), ("two", "task,n\nother,3\n")):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "scores.csv").write_text(text)
+    shared = {"measure": "m", "encoder": "e", "seed": "all", "right": 4, "unread": 0, "chance": 0.1, "n": 9}
+    for name, task in (("one", "heads"), ("two", "other")):
+        row = ScoreRow.model_validate({**shared, "task": task, "accuracy": 0.5, "low": 0.4, "high": 0.7})
+        write_csv(tmp_path / name / "scores.csv", ScoreRow, [row, row.model_copy(update={"low": None})])
     found = reported(tmp_path, task="heads")
     assert list(found) == [tmp_path / "one"]
-    error = error_of(found[tmp_path / "one"][0])
-    assert error.columns == pytest.approx({"error": 0.5, "low": 0.3, "high": 0.6, "n": 9})
+    whole, half = map(error_of, found[tmp_path / "one"])
+    assert whole.columns == pytest.approx({"error": 0.5, "low": 0.3, "high": 0.6, "n": 9})
+    assert half.columns == {"error": 0.5, "n": 9}
 
 
 def test_the_command_merges_and_names_what_is_allowed(
