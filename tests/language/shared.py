@@ -8,7 +8,7 @@ import torch
 from pipeline.config import LanguageConfig, TrainConfig
 from pipeline.embeddings import FLIPS, INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
 from pipeline.io import save_tensors, write_table
-from pipeline.language.generate import Asking
+from pipeline.language.generate import GenerationSettings
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import Material
 from pipeline.records import Assignment, Embedding, Opd, Part, Question
@@ -59,8 +59,8 @@ def model(language: LanguageConfig) -> OctopiForCausalLM:
     return OctopiForCausalLM.from_base(language.weights, DIM).eval()
 
 
-def asking(batch_size: int, tokens: int = 12) -> Asking:
-    return Asking(system_prompt="", per_video=FRAMES, max_new_tokens=tokens, batch_size=batch_size)
+def generation(batch_size: int, tokens: int = 12) -> GenerationSettings:
+    return GenerationSettings(system_prompt="", per_video=FRAMES, max_new_tokens=tokens, batch_size=batch_size)
 
 
 SMALL = TrainConfig(samples=8, epochs=2, batch_size=4, micro_batch_size=2, projection_learning_rate=1e-3)
