@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,8 @@ import numpy as np
 from pipeline.encoder.baseline.predictor import Labels
 from pipeline.encoder.baseline.validation import Predict, cross_validate
 from pipeline.evaluation.intervals import accuracy_interval
+from pipeline.evaluation.scores import ScoreRow
+from pipeline.io import read_csv
 
 WRONG = "share of videos of unseen objects of which not every property is right"
 
@@ -76,22 +77,22 @@ def cross_validated(
         classes: How many classes each property has.
     """
     predicted = cross_validate(predict, labels, objects, classes, folds=folds, repeats=repeats)
-    right = (predicted == labels[:, None]).all(axis=-1).mean(axis=-1)
-    return share_of((1 - right).tolist(), [(o,) for o in objects])
+    wrong = (predicted != labels[:, None]).any(axis=2).mean(axis=1)
+    return share_of(wrong.tolist(), [(o,) for o in objects])
 
 
-def reported(reports: Path, **keys: str) -> dict[Path, list[dict[str, str]]]:
+def reported(reports: Path, **keys: str) -> dict[Path, list[ScoreRow]]:
     """Rows of every report's scores.csv that have these values, by report, reports without any left out."""
-    found = {}
-    for path in sorted(reports.glob("*/scores.csv")):
-        with path.open(encoding="utf-8", newline="") as stream:
-            rows = [r for r in csv.DictReader(stream) if all(r.get(key) == value for key, value in keys.items())]
-        if rows:
-            found[path.parent] = rows
-    return found
+    tables = {path.parent: read_csv(path, ScoreRow) for path in sorted(reports.glob("*/scores.csv"))}
+    chosen = {
+        report: [row for row in rows if all(getattr(row, key) == value for key, value in keys.items())]
+        for report, rows in tables.items()
+    }
+    return {report: rows for report, rows in chosen.items() if rows}
 
 
-def error_of(score: dict[str, str]) -> Error:
+def error_of(score: ScoreRow) -> Error:
     """One less the accuracy of a row of scores.csv."""
-    low, high = (1 - float(score[end]) if score.get(end) else None for end in ("high", "low"))
-    return Error(1 - float(score["accuracy"]), low, high, int(float(score["n"])))
+    if score.low is None or score.high is None:
+        return Error(1 - score.accuracy, n=score.n)
+    return Error(1 - score.accuracy, 1 - score.high, 1 - score.low, score.n)
