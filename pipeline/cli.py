@@ -83,6 +83,23 @@ def _show(findings: Sequence[Finding]) -> None:
         raise typer.Exit(1)
 
 
+@app.command()
+def compare(
+    old: Annotated[str, typer.Argument(help="A Git revision: a hash, a tag, a branch, HEAD~1.")],
+    new: Annotated[str, typer.Argument(help="Another one; without it, what lies on disk now.")] = "",
+    json: Annotated[Path | None, typer.Option(help="Also write everything to this file, for machines.")] = None,
+) -> None:
+    """Say what differs between two revisions: parameters, stages, figures, and whether accuracies really changed."""
+    from pipeline.compare import compare as compare_states
+    from pipeline.compare import describe
+    from pipeline.io import write_json
+
+    found = compare_states(Path(), old, new)
+    if json is not None:
+        write_json(json, found)
+    typer.echo(describe(found))
+
+
 def main() -> None:
     """Run the command; bad input ends it with one line and status 1."""
     try:

@@ -14,6 +14,7 @@ from pipeline.encoder.candidates import check_candidates
 from pipeline.errors import UserError
 from pipeline.io import write_text
 from pipeline.params import PARAMS_FILE, validate
+from pipeline.tasks.questions import counts_by_task
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.split import check_split
 
@@ -61,10 +62,12 @@ def compose(name: str, overrides: Sequence[str] = (), conf: Path = CONF) -> Para
 
 
 def check_inputs(params: Params) -> None:
-    """Raise UserError where something that the scale needs is not there: videos, catalogue, objects, weights."""
+    """Raise UserError where something that the scale needs is not there: videos, catalogue, objects, tasks, weights."""
     catalogue = load_catalogue(Path(params.data.catalogue))
     check_split(catalogue, params.split.name)
     check_candidates(params.cross_validation.models, params.encoder.recipe)
+    counts_by_task(params.questions, "train")
+    counts_by_task(params.questions, "evaluation")
     folder = Path(params.data.dir)
     if params.data.source == "videos" and not folder.is_dir():
         raise UserError(

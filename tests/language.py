@@ -11,7 +11,7 @@ from pipeline.io import save_tensors, write_table
 from pipeline.language.generate import Asking
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import Material
-from pipeline.records import Assignment, Embedding, Opd, Part, Question, Task
+from pipeline.records import Assignment, Embedding, Opd, Part, Question
 from pipeline.runtime import seed_everything
 from pipeline.tasks.questions import build_questions, pool_of
 from pipeline.videos.catalogue import load_catalogue
@@ -33,7 +33,7 @@ def language(tmp_path_factory: pytest.TempPathFactory) -> LanguageConfig:
 def questions() -> list[Question]:
     catalogue = load_catalogue(ROOT / "pipeline" / "physiclear")
     videos = [Assignment(video_id=f"{o}_0", object_id=o, part=Part.TRAIN) for o in list(catalogue.objects)[::4]]
-    counts = {Task.OPD: 4, Task.PC: 4, Task.PSS: 3, Task.PSR: 3}
+    counts = {"OPD": 4, "PC": 4, "PSS": 3, "PSR": 3}
     return build_questions(pool_of(Part.TRAIN, videos, catalogue), counts, seed=0, distinct=False)
 
 
@@ -49,7 +49,7 @@ def store(tmp_path_factory: pytest.TempPathFactory, questions: list[Question]) -
 
 
 def material(language: LanguageConfig, questions: list[Question], store: EmbeddingStore) -> Material:
-    trained = [q for q in questions if q.task is not Task.PSR]
+    trained = [q for q in questions if q.task != "PSR"]
     return Material(trained, store, Opd.ALL, language, per_video=FRAMES, flip_probability=0.5, seed=3)
 
 

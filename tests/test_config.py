@@ -61,7 +61,6 @@ def test_paper_scales_have_the_papers_hyper_parameters(scale: str) -> None:
         (["split.fold=7"], ["split", "0 to 4"]),
         (["ablation.seeds=[1,1]"], ["ablation", "repeats"]),
         (["align.batch_size=10"], ["align", "does not divide"]),
-        (["questions.train.psr=3"], ["questions", "must be 0"]),
         (["data.dir=elsewhere"], ["data.dir", "data/scenes/videos"]),
         (["lora.target_modules=[]"], ["lora.target_modules"]),
         (["encoder.learning_rate=nan"], ["encoder.learning_rate"]),

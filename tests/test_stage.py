@@ -23,7 +23,7 @@ from pipeline.io import (
     write_jsonl,
     write_table,
 )
-from pipeline.records import Assignment, Measurement, Part, Score, Task, Video
+from pipeline.records import Assignment, Measurement, Part, Score, Video
 from pipeline.scales import compose, write_params
 from pipeline.stage import stage
 from tests.closure import ROOT
@@ -98,7 +98,7 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> 
 
 
 SCORE = Score(
-    question_id="q", task=Task.PC, measure="choice", correct=True, parsed=True, truncated=False, expected="yes",
+    question_id="q", task="PC", measure="choice", correct=True, parsed=True, truncated=False, expected="yes",
     predicted="yes", objects=("a", "b"),
 )  # fmt: skip
 

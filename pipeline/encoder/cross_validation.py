@@ -90,7 +90,7 @@ def judge(contestant: Candidate, arena: Arena, config: CrossValidationConfig) ->
     mark = fingerprint(repr(contestant), config, arena.encoder, arena.per_video, labelled, *made_of)
     work = CHECKPOINTS / "cross_validation" / mark
     predict = _remembered(_limited(KINDS[contestant.kind](contestant, arena), contestant, arena), work)
-    verdicts = cross_validate(
+    predicted = cross_validate(
         predict,
         arena.labels,
         arena.objects,
@@ -105,11 +105,11 @@ def judge(contestant: Candidate, arena: Arena, config: CrossValidationConfig) ->
             video_id=video.video_id,
             object_id=video.object_id,
             repeat=repeat,
-            expected=verdict.expected,
-            predicted=predicted,
+            expected=arena.catalogue.labels(video.object_id),
+            predicted=tuple(classes),
         )
-        for video, verdict in zip(arena.videos, verdicts, strict=True)
-        for repeat, predicted in enumerate(verdict.predicted)
+        for video, repeated in zip(arena.videos, predicted.tolist(), strict=True)
+        for repeat, classes in enumerate(repeated)
     ]
 
 

@@ -6,19 +6,20 @@ import math
 import random
 import re
 
-from pipeline.records import Opd, Prediction, Question, Score, Task
-from pipeline.tasks.base import Draft, Pool, draw_videos, find_level, gold, single_turn
+from pipeline.records import Opd, Prediction, Question, Score
+from pipeline.tasks.base import Draft, Pool, TaskDefinition, draw_videos, find_level, gold, single_turn
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.wording import OPENING
 
 TEMPLATES = ("Describe the physical properties of {tactile}.", "How does this tactile video {tactile} feel?")
 
 
-class ObjectPropertyDescription:
+class ObjectPropertyDescription(TaskDefinition):
     """Trained and evaluated; has no `none` mode, since without descriptions there is no task."""
 
-    task = Task.OPD
-    trained = True
+    name = "OPD"
+    title = "Object Property Description"
+    measure = "combined"
 
     def strata(self, catalogue: Catalogue) -> int:
         return len(catalogue.objects)
@@ -77,3 +78,6 @@ class ObjectPropertyDescription:
             objects=question.objects,
             tokens=prediction.tokens,
         )
+
+
+TASK = ObjectPropertyDescription()

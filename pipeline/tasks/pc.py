@@ -5,11 +5,12 @@ from __future__ import annotations
 import random
 import re
 
-from pipeline.records import Opd, Prediction, Question, Score, Task
+from pipeline.records import Opd, Prediction, Question, Score
 from pipeline.tasks.base import (
     ORDINALS,
     Draft,
     Pool,
+    TaskDefinition,
     choice_score,
     conclusion,
     descriptions,
@@ -26,11 +27,11 @@ TEMPLATES = (
 CHOICES = ("yes", "no", "same")
 
 
-class PropertyComparison:
+class PropertyComparison(TaskDefinition):
     """Three answers are possible (yes, no, the same), hence the paper's chance of one third."""
 
-    task = Task.PC
-    trained = True
+    name = "PC"
+    title = "Property Comparison"
 
     def strata(self, catalogue: Catalogue) -> int:
         return len(CHOICES) * len(catalogue.properties) * 2
@@ -83,3 +84,6 @@ class PropertyComparison:
 
     def chance(self, catalogue: Catalogue) -> dict[str, float]:
         return {"choice": 1 / 3}
+
+
+TASK = PropertyComparison()

@@ -8,11 +8,12 @@ import re
 from collections.abc import Iterable
 from dataclasses import replace
 
-from pipeline.records import Dialogue, Opd, Prediction, Question, Score, Task
+from pipeline.records import Dialogue, Opd, Prediction, Question, Score
 from pipeline.tasks.base import (
     LETTERS,
     Draft,
     Pool,
+    TaskDefinition,
     choice_score,
     conclusion,
     descriptions,
@@ -41,22 +42,11 @@ def facts(catalogue: Catalogue, objects: Iterable[str], rng: random.Random) -> s
     return " ".join(rng.sample(told, len(told)))
 
 
-def with_facts(draft: Draft, catalogue: Catalogue, rng: random.Random) -> Draft:
-    """The same question after the facts about its objects; what is left to find out is which video is of which."""
-    told = facts(catalogue, draft.objects, rng)
-
-    def begin(dialogue: Dialogue) -> Dialogue:
-        first, *rest = dialogue.turns
-        return dialogue.model_copy(update={"turns": (first.model_copy(update={"user": f"{told} {first.user}"}), *rest)})
-
-    return replace(draft, dialogues=tuple(map(begin, draft.dialogues)))
-
-
-class PropertyObjectMatching:
+class PropertyObjectMatching(TaskDefinition):
     """The three objects differ in at least one property each, or touch could not tell them apart."""
 
-    task = Task.POM
-    trained = True
+    name = "POM"
+    title = "Property-object Matching"
 
     def strata(self, catalogue: Catalogue) -> int:
         return len(ORDERS)
@@ -88,6 +78,17 @@ class PropertyObjectMatching:
             gold=gold(pool, objects, order, catalogue.property_names),
         )
 
+    def with_facts(self, draft: Draft, catalogue: Catalogue, rng: random.Random) -> Draft:
+        """The same question after the facts about its objects; what is left to find out is which video is of which."""
+        told = facts(catalogue, draft.objects, rng)
+
+        def begin(dialogue: Dialogue) -> Dialogue:
+            first, *rest = dialogue.turns
+            first = first.model_copy(update={"user": f"{told} {first.user}"})
+            return dialogue.model_copy(update={"turns": (first, *rest)})
+
+        return replace(draft, dialogues=tuple(map(begin, draft.dialogues)))
+
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         """Read from "a) is NAME": each letter must name exactly one option, and no option twice."""
         names = sorted((catalogue.objects[o].name for o in question.objects), key=str.lower)
@@ -100,3 +101,6 @@ class PropertyObjectMatching:
 
     def chance(self, catalogue: Catalogue) -> dict[str, float]:
         return {"choice": 1 / 6}
+
+
+TASK = PropertyObjectMatching()

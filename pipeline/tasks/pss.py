@@ -5,11 +5,12 @@ from __future__ import annotations
 import random
 import re
 
-from pipeline.records import Opd, Prediction, Question, Score, Task
+from pipeline.records import Opd, Prediction, Question, Score
 from pipeline.tasks.base import (
     LETTERS,
     Draft,
     Pool,
+    TaskDefinition,
     choice_score,
     conclusion,
     descriptions,
@@ -27,11 +28,11 @@ TEMPLATES = (
 )
 
 
-class PropertySuperlativeSelection:
+class PropertySuperlativeSelection(TaskDefinition):
     """The right video is the only one of its class, so that the answer is never a matter of taste."""
 
-    task = Task.PSS
-    trained = True
+    name = "PSS"
+    title = "Property Superlative Selection"
 
     def strata(self, catalogue: Catalogue) -> int:
         return 3 * 2 * len(catalogue.properties)
@@ -77,3 +78,6 @@ class PropertySuperlativeSelection:
 
     def chance(self, catalogue: Catalogue) -> dict[str, float]:
         return {"choice": 1 / 3}
+
+
+TASK = PropertySuperlativeSelection()

@@ -20,7 +20,7 @@ from pipeline.encoder import frame_heads as voting
 from pipeline.encoder.baseline.features import video_features
 from pipeline.encoder.baseline.predictor import PropertyPredictor
 from pipeline.encoder.baseline.recordings import Recording, describe, recording_features
-from pipeline.encoder.baseline.validation import Fold, Predict, Verdict, deal
+from pipeline.encoder.baseline.validation import Fold, Predict, deal
 from pipeline.encoder.baseline.validation import cross_validate as fold_by_fold
 from pipeline.encoder.candidates import CANDIDATES, LEARNING_CURVE, Candidate
 from pipeline.encoder.cross_validation import Arena, frozen_encoder, judge
@@ -112,7 +112,7 @@ class Folds(list[Fold]):
 def folds(monkeypatch: pytest.MonkeyPatch) -> Folds:
     seen = Folds()
 
-    def spying(predict: Predict, *args: object, **settings: int) -> Sequence[Verdict]:
+    def spying(predict: Predict, *args: object, **settings: int) -> np.ndarray:
         def noting(fold: Fold) -> np.ndarray:
             seen.append(fold)
             return predict(fold)

@@ -15,7 +15,7 @@ from pipeline.errors import UserError
 from pipeline.io import save_tensors, write_table
 from pipeline.language.conversations import evaluation_features
 from pipeline.language.input_ablation import NoisyTouch, SwappedTouch, feel
-from pipeline.records import Dialogue, Embedding, Gold, Opd, Part, Question, Task, Touch, Turn
+from pipeline.records import Dialogue, Embedding, Gold, Opd, Part, Question, Touch, Turn
 
 DIM = 6
 
@@ -24,7 +24,7 @@ def question(number: int, objects: Sequence[str], video: int = 0) -> Question:
     said = Turn(user="{tactile}" * len(objects), assistant="x")
     return Question(
         question_id=f"q{number}",
-        task=Task.PC,
+        task="PC",
         part=Part.TEST,
         videos=tuple(f"{o}_{video}" for o in objects),
         objects=tuple(objects),

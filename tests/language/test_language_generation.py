@@ -18,7 +18,7 @@ from pipeline.language.conversations import evaluation_features
 from pipeline.language.generate import answer
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import assemble
-from pipeline.records import Opd, Question, Task
+from pipeline.records import Opd, Question
 from tests.checkpoints import write_llama
 from tests.language import DIM, FRAMES, asking, language, material, model, questions, store
 
@@ -31,7 +31,7 @@ def test_one_row_answers_as_transformers_own_generation_does(
 ) -> None:
     """By its own cache, without padding, over more tokens than room is made for at a time."""
     limit = 2 * AHEAD + 20
-    for question in [q for q in questions if q.task is not Task.PSR][:4]:
+    for question in [q for q in questions if q.task != "PSR"][:4]:
         dialogue = question.dialogue(Opd.NEEDED)
         assert dialogue is not None
         text = render(dialogue.turns, system_prompt="", frames=FRAMES, eos="</s>", complete=False)
@@ -70,7 +70,7 @@ def test_an_answer_at_the_limit_is_whole_and_one_beyond_is_cut(
     model: OctopiForCausalLM, questions: list[Question], store: EmbeddingStore
 ) -> None:
     """The end token made the likeliest after some tokens: its column of the head is turned towards a later state."""
-    asked = [q for q in questions if q.task is Task.OPD][:3]
+    asked = [q for q in questions if q.task == "OPD"][:3]
     free = {p.question_id: p for p in answer(model, store, asked, Opd.ALL, asking(4, 8))}
     assert all(p.truncated and p.tokens == 8 for p in free.values())
     for question in asked:
@@ -103,7 +103,7 @@ def test_an_answer_ends_where_the_positions_do_whatever_its_neighbours(
     questions: list[Question], store: EmbeddingStore, tmp_path: Path
 ) -> None:
     """Each row has its own limit; with the end token as padding, the cut must still be seen."""
-    asked = [q for q in questions if q.task in (Task.OPD, Task.PC, Task.PSS)]
+    asked = [q for q in questions if q.task in ("OPD", "PC", "PSS")]
 
     def lengths(model: OctopiForCausalLM) -> dict[str, int]:
         made = {}

@@ -11,7 +11,8 @@ from transformers import PreTrainedTokenizerBase
 
 from pipeline.language.base import load_tokenizer
 from pipeline.language.chat import IGNORE_INDEX, TACT_END, TACT_FRAME, TACT_START, encode, render
-from pipeline.records import Assignment, Part, Question, Task, Turn
+from pipeline.records import Assignment, Part, Question, Turn
+from pipeline.tasks import TASKS
 from pipeline.tasks.questions import build_questions, pool_of
 from pipeline.videos.catalogue import load_catalogue
 from tests.checkpoints import write_llama
@@ -37,7 +38,7 @@ def questions() -> list[Question]:
         for o in list(catalogue.objects)[::3]
         for n in (0, 1)
     ]
-    return build_questions(pool_of(Part.TEST, videos, catalogue), dict.fromkeys(Task, 12), seed=1, distinct=True)
+    return build_questions(pool_of(Part.TEST, videos, catalogue), dict.fromkeys(TASKS, 12), seed=1, distinct=True)
 
 
 def test_vicuna_layout() -> None:

@@ -23,7 +23,7 @@ import numpy as np
 from pipeline.config import FramesConfig
 from pipeline.videos.decoding import Image
 from pipeline.videos.frames.fit import fit
-from pipeline.videos.frames.reference import strength
+from pipeline.videos.frames.reference import contact_strength
 
 RELEASE_FEWEST = 5
 HELD_BYTES = 64 * 2**20
@@ -73,7 +73,7 @@ def changed_pixels(grey: Image, before: Image) -> float:
     return float(cv2.countNonZero(cv2.absdiff(grey, before)))
 
 
-class Pool:
+class BestFrames:
     """The best frames so far: those with the largest scores, equal scores in favour of the earlier frame.
 
     Frames are held as the codec left them and fitted at the end, since most that come are pushed out again; only where
@@ -140,4 +140,4 @@ def thin(kept: Sequence[Kept], tolerance: float, noise: float) -> list[Kept]:
 def _gap(one: Kept, other: Kept) -> float:
     assert one.thumb is not None, "adaptive looks at thumbnails"
     assert other.thumb is not None, "adaptive looks at thumbnails"
-    return strength(one.thumb, other.thumb)
+    return contact_strength(one.thumb, other.thumb)
