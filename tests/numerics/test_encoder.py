@@ -20,6 +20,7 @@ from pipeline.encoder.clips import ClipDataset, LabelledVideo
 from pipeline.encoder.finetune import classify
 from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
 from pipeline.encoder.recipes import base_encoder, property_classifier
+from pipeline.encoder.release import sinusoid
 from pipeline.encoder.scene_encoder import CHANNELS, SceneEncoder
 from pipeline.records import Part
 from pipeline.runtime import seed_everything
@@ -108,6 +109,16 @@ def test_hard_frames_are_embedded(check: Check, kind: str, name: str, fmt: Forma
         return both(encoder(kind, f), FRAMES[name].to(f.device), TIMES.to(f.device))
 
     check(f"{kind}: {name}", fmt, embedded, lambda f: network(kind, name, f))
+
+
+def test_positions_of_late_frames_are_told_apart(check: Check) -> None:
+    """roundings: that to float32, and of angles up to 10^9 in float64; against long doubles."""
+    late = 10**9
+    angles = late * np.longdouble(10_000) ** (-np.arange(0, 64, 2, dtype=np.longdouble) / 64)
+    exact = np.stack([np.sin(angles), np.cos(angles)], axis=-1).ravel()
+    bound = FLOAT32.roundoff + 8 * late * FLOAT64.roundoff
+    check("positions: frame 10^9", FLOAT32, lambda _: sinusoid(torch.tensor([late]), 64)[0], bound, exact)
+    assert not torch.equal(*sinusoid(torch.tensor([late, late + 1]), 64))
 
 
 @pytest.mark.parametrize("kind", [*BASES, *get_args(Recipe)])

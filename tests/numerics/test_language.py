@@ -27,7 +27,7 @@ from pipeline.runtime import seed_everything
 from tests.closure import ROOT
 from tests.numerics.bounds import longest_sum, magnification, rounded, summing
 from tests.numerics.cross_entropy import TARGETS, logits, mean_loss, rounded_loss
-from tests.numerics.harness import FLOAT32, FLOAT64, NETWORKS, SOLVED, Check, Format, formats
+from tests.numerics.harness import BFLOAT16, FLOAT16, FLOAT32, FLOAT64, NETWORKS, SOLVED, Check, Format, formats
 
 PART = "language"
 DIM, FRAMES, LENGTH = 64, 4, 40
@@ -211,6 +211,28 @@ def test_a_merged_adapter_is_the_sum_of_both_weights(check: Check, fmt: Format) 
     bound = float(sizes.max() / exact.abs().max()) * summing(PAPER.rank + 2, fmt)
     merged = model.llm.merge_and_unload().model.layers[1].self_attn.q_proj.weight
     check("adapter: merged weights", fmt, lambda _: merged, bound, exact.numpy())
+
+
+@formats(FLOAT32, BFLOAT16, FLOAT16)
+def test_what_is_trained_is_float32_and_moves_as_adam_says(check: Check, fmt: Format) -> None:
+    """The first step is rate x g / (|g| + eps), however small gradients g are: a half format would lose both the step
+    beside the weight and an eps of 1e-8, whose loss makes 0 / 0 of a gradient of 0.
+
+    roundings: some 8 operations on a step, and that of the weight.
+    """
+    model, rate = octopi(), 1e-5
+    model.llm.to(fmt.torch)
+    trained = [p for p in with_adapter(model, 0.0).to(fmt.device).train().parameters() if p.requires_grad]
+    assert {p.dtype for p in trained} == {torch.float32}
+    ids, features = conversation(model)
+    (1e-6 * model(ids, features, labels=ids.masked_fill(ids > 199, IGNORE_INDEX)).loss).backward()
+    before = torch.cat([p.detach().flatten().double() for p in trained])
+    slope = torch.cat([cast(torch.Tensor, p.grad).flatten().double() for p in trained])
+    torch.optim.AdamW(trained, lr=rate, weight_decay=0).step()
+    after = torch.cat([p.detach().flatten().double() for p in trained])
+    exact = -rate * slope / (slope.abs() + 1e-8)
+    bound = (8 + float(before.abs().max()) / float(exact.abs().max())) * FLOAT32.roundoff
+    check("first step of Adam, gradients of a loss of 1e-6", fmt, lambda _: after - before, bound, exact.cpu().numpy())
 
 
 # Losses
