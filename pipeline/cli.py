@@ -38,6 +38,15 @@ def scale(
     typer.echo(f"`dvc repro` runs it; its tables go to reports/{params.report_name}/")
 
 
+@app.command()
+def publish() -> None:
+    """Show what lies in data/ and reports/ in MLflow, as `dvc repro` does at its end; a second call adds nothing."""
+    from pipeline import tracking
+    from pipeline.params import load_params
+
+    typer.echo(tracking.publish(load_params()))
+
+
 CATALOGUE = typer.Option(help="Folder with objects.csv and properties.yaml.")
 
 
@@ -83,6 +92,12 @@ def _show(findings: Sequence[Finding]) -> None:
         raise typer.Exit(1)
 
 
+@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
+def repro(context: typer.Context) -> None:
+    """Run `dvc repro`: say how many stages will run, and write the page of all reports behind it."""
+    from pipeline.reproduce import reproduce
+
+    raise typer.Exit(reproduce(Path(), context.args))
 @app.command()
 def compare(
     old: Annotated[str, typer.Argument(help="A Git revision: a hash, a tag, a branch, HEAD~1.")],

@@ -14,16 +14,16 @@ from torch.optim.optimizer import register_optimizer_step_pre_hook
 from pipeline.config import CrossValidationConfig, EncoderConfig, FramesConfig, PretrainConfig, RuntimeConfig
 from pipeline.encoder import pretrain as pretraining
 from pipeline.encoder.candidates import CANDIDATES
-from pipeline.encoder.cross_validation import Arena, judge
+from pipeline.encoder.clips import EncoderData, classify
+from pipeline.encoder.cross_validation import CrossValidationData, cross_validate_candidate
 from pipeline.encoder.embed import embed_videos
-from pipeline.encoder.finetune import EncoderData, classify, fit_heads, train_classifier
-from pipeline.encoder.frame_classifier import FrameVotes
-from pipeline.encoder.frame_heads import STRENGTHS, fit_votes
+from pipeline.encoder.finetune import fit_heads, train_classifier
+from pipeline.encoder.frame_classifier import STRENGTHS, JointFrameClassifier, fit_frame_heads
 from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
-from pipeline.encoder.pretrain import pretrain
+from pipeline.encoder.pretrain import WEIGHTS, PretrainingModel, pretrain
 from pipeline.encoder.recipes import property_classifier
-from pipeline.encoder.scene_encoder import CHANNELS, WEIGHTS, LessonModel, SceneEncoder
-from pipeline.encoder.synthetic import Lessons
+from pipeline.encoder.scene_encoder import CHANNELS, SceneEncoder
+from pipeline.encoder.synthetic import SyntheticPictures
 from pipeline.errors import UserError
 from pipeline.records import Measurement, Part
 from pipeline.runtime import seed_everything
@@ -117,7 +117,7 @@ def test_a_class_that_training_lacks_does_not_stop_it(
     assert {catalogue.labels(o)[0] for o in HARD} == {2}
     data = encoder_data(tmp_path, catalogue, {**HARD, "pillow": Part.VALIDATION, "rug": Part.TEST})
     if kind == "pretrained":
-        model: PropertyClassifier = FrameVotes(SceneEncoder(), CLASSES)
+        model: PropertyClassifier = JointFrameClassifier(SceneEncoder(), CLASSES)
         history = fit_heads(model, data, config(weights, "pretrained"), CPU, 0)
         assert [m.name for m in history] == ["inner_combined"] * len(STRENGTHS)
     else:
@@ -134,8 +134,8 @@ def test_a_class_that_training_lacks_does_not_stop_it(
 
 def test_a_single_video_fits() -> None:
     clips = np.random.default_rng(0).normal(size=(1, 3, 4)).astype(np.float32)
-    votes = fit_votes(clips, np.array([[2, 0]]), ["a"], [3, 2], STRENGTHS[0])
-    assert votes.predict(clips).tolist() == votes.predict(-1e6 * clips).tolist() == [[2, 0]]
+    heads = fit_frame_heads(clips, np.array([[2, 0]]), ["a"], [3, 2], STRENGTHS[0])
+    assert heads.predict(clips).tolist() == heads.predict(-1e6 * clips).tolist() == [[2, 0]]
 
 
 # NaN
@@ -148,7 +148,7 @@ class Sick(FrameEncoder):
         super().__init__(256)
         self.value = value
 
-    def forward(self, frames: torch.Tensor, moments: torch.Tensor) -> torch.Tensor:
+    def forward(self, frames: torch.Tensor, frame_indices: torch.Tensor) -> torch.Tensor:
         embedded = frames.flatten(1)[:, :256].float()
         embedded[frames.flatten(1).amin(1) == 255, 3] = self.value
         return embedded
@@ -180,9 +180,9 @@ def test_what_is_not_finite_is_named_by_its_video(
         with pytest.raises(UserError, match=r"^pillow_0: .*not finite"):
             classify(model, data, list(Part), batch, DEVICE)
         with pytest.raises(UserError, match=r"^pillow_0: .*not finite"):
-            classify(FrameVotes(Sick(value), CLASSES), data, list(Part), batch, DEVICE)
+            classify(JointFrameClassifier(Sick(value), CLASSES), data, list(Part), batch, DEVICE)
     with pytest.raises(UserError, match="pillow_0"):
-        fit_heads(FrameVotes(Sick(value), CLASSES), data, config(weights, "pretrained"), CPU, 0)
+        fit_heads(JointFrameClassifier(Sick(value), CLASSES), data, config(weights, "pretrained"), CPU, 0)
 
 
 # Rates that are too high
@@ -283,15 +283,15 @@ def test_a_checkpoint_that_was_being_written_is_passed_over(
 
 
 @pytest.fixture
-def lessons(monkeypatch: pytest.MonkeyPatch) -> Lessons:
+def noise(monkeypatch: pytest.MonkeyPatch) -> SyntheticPictures:
     """Noise in place of scenes, with something to tell of it."""
     rng = np.random.default_rng(0)
-    made = Lessons(
+    made = SyntheticPictures(
         pictures=rng.integers(0, 256, (16, 2, 16, 16, 3), dtype=np.uint8),
         quantities=rng.normal(size=(16, 2, 5)).astype(np.float32),
         kinds=rng.integers(0, 2, (16, 4)).astype(np.uint8),
     )
-    monkeypatch.setattr(pretraining, "draw_lessons", lambda *_: made)
+    monkeypatch.setattr(pretraining, "draw_pictures", lambda *_: made)
     return made
 
 
@@ -300,10 +300,10 @@ def pretrained(steps: int, saved: int, objects: int = 16, side: int = 16) -> tup
     return pretrain(setting, FramesConfig(size=side), RuntimeConfig(device="cpu", save_steps=saved))
 
 
-@pytest.mark.usefixtures("lessons")
+@pytest.mark.usefixtures("noise")
 @pytest.mark.parametrize("killed", [3, 7])
 def test_a_killed_pretraining_ends_as_if_it_had_not_been(killed: int, tmp_path: Path, before_updates: Hook) -> None:
-    """15 lessons make four updates an epoch: the checkpoint after 2 is within the first, after 6 within the second."""
+    """15 objects make four updates an epoch: the checkpoint after 2 is within the first, after 6 within the second."""
     encoder, history = pretrained(8, 2)
     begun: list[int] = []
     before_updates(killed_at(killed, begun=begun))
@@ -317,13 +317,13 @@ def test_a_killed_pretraining_ends_as_if_it_had_not_been(killed: int, tmp_path: 
     assert not any(tmp_path.glob("checkpoints/*/*"))
 
 
-@pytest.mark.usefixtures("lessons")
+@pytest.mark.usefixtures("noise")
 def test_what_diverges_between_two_reports_replaces_no_good_checkpoint(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, before_updates: Hook
 ) -> None:
-    made: list[LessonModel] = []
-    original: Callable[[SceneEncoder, Lessons], LessonModel] = pretraining.lesson_model
-    monkeypatch.setattr(pretraining, "lesson_model", lambda *given: made.append(original(*given)) or made[-1])
+    made: list[PretrainingModel] = []
+    original: Callable[[SceneEncoder, SyntheticPictures], PretrainingModel] = pretraining.pretraining_model
+    monkeypatch.setattr(pretraining, "pretraining_model", lambda *given: made.append(original(*given)) or made[-1])
 
     def poison(update: int) -> None:
         if update == 41:
@@ -346,7 +346,7 @@ def test_a_tiny_pretraining_draws_trains_and_tells_what_it_left_aside(tmp_path: 
     assert [m.step for m in history if m.name == "loss"] == [1, 2, 3, 4]
     assert all(v.isfinite().all() for v in trainable_state(encoder).values())
     counts = [int(b) for n, b in encoder.named_buffers() if n.endswith("num_batches_tracked")]
-    assert counts == [4] * len(CHANNELS), "the lesson left aside has touched no statistics"
+    assert counts == [4] * len(CHANNELS), "the object left aside has touched no statistics"
     assert not any(tmp_path.glob("checkpoints/*/*"))
 
 
@@ -359,7 +359,7 @@ def test_two_objects_are_too_few_for_five_folds_and_enough_for_two(
     """With one object to train on none is left to validate by."""
     videos = fake_videos(OBJECTS[1:3], 2)
     frames = write_frames(tmp_path / "frames", {v.video_id: 1 for v in videos})
-    arena = Arena(
+    data = CrossValidationData(
         videos=videos,
         catalogue=catalogue,
         frames=frames,
@@ -370,5 +370,5 @@ def test_two_objects_are_too_few_for_five_folds_and_enough_for_two(
         pretrained=tmp_path / "none",
     )
     with pytest.raises(UserError, match=r"cross_validation.folds is 5 but only 2 objects"):
-        judge(CANDIDATES["constant"], arena, CrossValidationConfig(folds=5))
-    assert len(judge(CANDIDATES["paper"], arena, CrossValidationConfig(folds=2, repeats=1))) == 4
+        cross_validate_candidate(CANDIDATES["constant"], data, CrossValidationConfig(folds=5))
+    assert len(cross_validate_candidate(CANDIDATES["paper"], data, CrossValidationConfig(folds=2, repeats=1))) == 4

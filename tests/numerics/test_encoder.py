@@ -8,18 +8,17 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
-from typing import cast, get_args
+from typing import cast
 
 import numpy as np
 import pytest
 import torch
 from torch.nn import functional as F
 
-from pipeline.config import EncoderConfig, Recipe
-from pipeline.encoder.clips import ClipDataset, LabelledVideo
-from pipeline.encoder.finetune import classify
+from pipeline.config import EncoderConfig
+from pipeline.encoder.clips import ClipDataset, LabelledVideo, classify
 from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
-from pipeline.encoder.recipes import base_encoder, property_classifier
+from pipeline.encoder.recipes import RECIPES, base_encoder, property_classifier
 from pipeline.encoder.release import sinusoid
 from pipeline.encoder.scene_encoder import CHANNELS, SceneEncoder
 from pipeline.records import Part
@@ -38,7 +37,7 @@ TIMES = torch.tensor([0, 1, 40_000, 10**6])
 """Numbers of the frames in their videos: float32 no longer holds the sinusoid of the last."""
 BASES = {"base": "paper", "base of release": "release"}
 """Encoders without prompts, and the recipe that they are read by."""
-CLASSIFIERS = (*get_args(Recipe), "scratch")
+CLASSIFIERS = (*RECIPES, "scratch")
 
 
 def classifier(kind: str) -> PropertyClassifier:
@@ -59,7 +58,7 @@ def classifier(kind: str) -> PropertyClassifier:
 
 def settings(kind: str) -> EncoderConfig:
     reference = "subtract" if kind == "pretrained" else "none"
-    return EncoderConfig(recipe=cast(Recipe, kind), weights=str(ROOT / "standins" / "clip"), reference=reference)
+    return EncoderConfig(recipe=kind, weights=str(ROOT / "standins" / "clip"), reference=reference)
 
 
 @cache
@@ -102,7 +101,7 @@ def network(kind: str, name: str, fmt: Format) -> float:
 
 @formats(*NETWORKS)
 @pytest.mark.parametrize("name", FRAMES)
-@pytest.mark.parametrize("kind", [*BASES, *get_args(Recipe)])
+@pytest.mark.parametrize("kind", [*BASES, *RECIPES])
 def test_hard_frames_are_embedded(check: Check, kind: str, name: str, fmt: Format) -> None:
     @torch.no_grad()
     def embedded(f: Format) -> torch.Tensor:
@@ -121,7 +120,7 @@ def test_positions_of_late_frames_are_told_apart(check: Check) -> None:
     assert not torch.equal(*sinusoid(torch.tensor([late, late + 1]), 64))
 
 
-@pytest.mark.parametrize("kind", [*BASES, *get_args(Recipe)])
+@pytest.mark.parametrize("kind", [*BASES, *RECIPES])
 def test_a_batch_of_one_equals_a_batch_of_many(check: Check, kind: str) -> None:
     """condition: twice that of the network, as two ways are compared."""
 
@@ -217,6 +216,6 @@ def test_a_video_of_one_frame_is_that_frame_repeated(check: Check, kind: str, tm
     assert (item["frames"] == torch.from_numpy(store.pictures("short_0"))[0]).all()
     assert (drawn["frames"] == drawn["frames"][:1]).all()
     with torch.no_grad():
-        once = model(item["frames"][None, :1], item["moments"][None, :1])["logits"]
-        repeated = model(item["frames"][None], item["moments"][None])["logits"]
+        once = model(item["frames"][None, :1], item["frame_indices"][None, :1])["logits"]
+        repeated = model(item["frames"][None], item["frame_indices"][None])["logits"]
     torch.testing.assert_close(repeated, once, atol=2e-6, rtol=2e-6)

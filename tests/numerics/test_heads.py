@@ -20,10 +20,11 @@ from torch import nn
 from torch.nn import functional as F
 
 from pipeline.encoder.baseline.predictor import decode_jointly, log_dependence
-from pipeline.encoder.frame_classifier import FrameVotes
+from pipeline.encoder.frame_classifier import JointFrameClassifier
 from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
 from pipeline.encoder.release import SHORTEST_FEATURE, PublishedHeads
-from pipeline.encoder.scene_encoder import LessonModel, SceneEncoder
+from pipeline.encoder.pretrain import PretrainingModel
+from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.runtime import seed_everything
 from tests.numerics.bounds import summing
 from tests.numerics.cross_entropy import STEPS, TARGETS, logits, mean_loss, rounded_loss
@@ -103,7 +104,7 @@ def huge_classifier(kind: type[PropertyClassifier], weight: float) -> PropertyCl
     """Heads whose weights are `weight` times as large as fresh ones."""
     seed_everything(0)
     network = SceneEncoder()
-    model = FrameVotes(network, CLASSES) if kind is FrameVotes else kind(network, Heads(256, CLASSES), CLASSES)
+    model = JointFrameClassifier(network, CLASSES) if kind is JointFrameClassifier else kind(network, Heads(256, CLASSES), CLASSES)
     with torch.no_grad():
         for parameter in model.heads.parameters():
             parameter.mul_(weight)
@@ -113,7 +114,7 @@ def huge_classifier(kind: type[PropertyClassifier], weight: float) -> PropertyCl
 @formats(*SOLVED)
 @pytest.mark.parametrize("weight", [1.0, 1e4])
 @pytest.mark.parametrize("size", [1e4, 1e30])
-@pytest.mark.parametrize(("name", "kind"), [("heads", PropertyClassifier), ("frame heads", FrameVotes)])
+@pytest.mark.parametrize(("name", "kind"), [("heads", PropertyClassifier), ("frame heads", JointFrameClassifier)])
 def test_huge_logits_are_finite_and_decided_on(
     check: Check, name: str, kind: type[PropertyClassifier], size: float, weight: float, fmt: Format
 ) -> None:
@@ -129,10 +130,10 @@ def test_huge_logits_are_finite_and_decided_on(
 
     exact, double = said(FLOAT64), huge_classifier(kind, weight).double()
     wild = features.double()
-    terms = double.standardise(wild).abs().flatten(0, 1) if isinstance(double, FrameVotes) else wild.abs().mean(1)
+    terms = double.standardise(wild).abs().flatten(0, 1) if isinstance(double, JointFrameClassifier) else wild.abs().mean(1)
     heads = [cast(nn.Linear, head) for head in double.heads.children()]
     sizes = max((terms @ head.weight.abs().T + head.bias.abs()).max().item() for head in heads)
-    bound = (2 if kind is FrameVotes else 1) * summing(256 + 4, fmt) * sizes / float(exact.abs().max())
+    bound = (2 if kind is JointFrameClassifier else 1) * summing(256 + 4, fmt) * sizes / float(exact.abs().max())
     check(f"{name}: features of {size:g}, weights times {weight:g}", fmt, said, bound)
 
     model, given = huge_classifier(kind, weight).to(fmt.torch), features.to(fmt.torch).requires_grad_()
@@ -193,7 +194,7 @@ def test_decisions_on_logits_are_the_same_in_every_format(check: Check, fmt: For
     """Powers of two, which every format holds; three properties of three classes."""
     rows = [[[1.0, 1.0, 0.5], [0.0, 0.0, 0.0], [-1.0, 0.5, 1.0]], [[0.0, -1.0, -0.5], [0.5, 1.0, 1.0], [1.0] * 3]]
     values = torch.tensor(rows, dtype=torch.float64) * scale
-    model = FrameVotes(FrameEncoder(4), CLASSES)
+    model = JointFrameClassifier(FrameEncoder(4), CLASSES)
     name = f"joint decision: logits of {name}"
     check(name, fmt, lambda f: model.decide(values.flatten(1).to(f.torch)), 0, values.argmax(2).numpy())
 
@@ -223,7 +224,7 @@ def test_losses_of_pretraining_are_hubers_and_cross_entropy(check: Check, fmt: F
     """Of a head that says `size` of everything; roundings: means over twelve numbers each, all terms positive."""
 
     def losses(f: Format) -> torch.Tensor:
-        model = LessonModel(SceneEncoder(), torch.tensor([[0.0] * 3, [1.0] * 3]), 3).to(f.torch).eval()
+        model = PretrainingModel(SceneEncoder(), torch.tensor([[0.0] * 3, [1.0] * 3]), 3).to(f.torch).eval()
         last = cast(nn.Linear, model.head[-1])
         nn.init.zeros_(last.weight)
         nn.init.constant_(last.bias, size)

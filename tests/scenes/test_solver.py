@@ -8,8 +8,6 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from pipeline.stability.case import Dtype
-from pipeline.stability.scenes import needle
 
 from pipeline.scenes.elastic.arrays import back
 from pipeline.scenes.elastic.kernels import Gel, Kernel, half_space_table, layer_table, make_kernel
@@ -155,7 +153,6 @@ def test_more_force_means_more_approach_and_area() -> None:
     assert all(a <= b for a, b in itertools.pairwise(areas))
 
 
-# --- Hard cases; that their forces are carried in every format, pipeline.stability.scenes has.
 
 
 def test_flat_on_flat() -> None:

@@ -63,7 +63,7 @@ def test_a_task_does_not_depend_on_the_others() -> None:
 
 @pytest.mark.parametrize("part", [Part.VALIDATION, Part.TEST])
 def test_distinct_questions_differ_in_more_than_wording(part: Part) -> None:
-    many = dict.fromkeys(TASKS, 300)
+    many = dict.fromkeys(TASKS, 100)
     questions = build_questions(POOLS[part], many, seed=3, distinct=True)
     assert len({key(q) for q in questions}) == len(questions)
 

@@ -44,7 +44,7 @@ def test_a_good_folder(tiny_videos: Path, catalogue: Catalogue) -> None:
     assert str(listing.files[-1]) == "sub folder é/rug_1.AVI"
     assert all(f.path == tiny_videos / f.relative for f in listing.files)
     assert {f.session for f in listing.files} == {""}
-    assert (listing.findings, listing.strangers) == ((), ())
+    assert (listing.findings, listing.unknown_objects) == ((), ())
     assert list_videos(tiny_videos, catalogue) == listing
 
 
@@ -61,7 +61,7 @@ def test_accents_are_one_however_they_are_written(tmp_path: Path, catalogue: Cat
     decomposed = unicodedata.normalize("NFD", "café_0.mov")
     assert decomposed != "café_0.mov"
     listing = list_videos(touch(tmp_path, decomposed, "rug_0.mov"), catalogue)
-    assert listing.strangers == ("café",)
+    assert listing.unknown_objects == ("café",)
     (tmp_path / LIST_FILE).write_text("file,object_id\ncafé_0.mov,rug\n")
     (file,) = list_videos(tmp_path, catalogue).files
     assert (file.video_id, file.path) == ("rug_0", tmp_path / decomposed)
@@ -69,7 +69,7 @@ def test_accents_are_one_however_they_are_written(tmp_path: Path, catalogue: Cat
 
 def test_objects_outside_the_catalogue_are_left_out_with_one_line(tmp_path: Path, catalogue: Catalogue) -> None:
     listing = list_videos(touch(tmp_path, "rug_0.mov", "yoyo_0.mov", "yoyo_1.mov", "kite_0.mov"), catalogue)
-    assert (ids(listing), listing.strangers) == (["rug_0"], ("kite", "yoyo"))
+    assert (ids(listing), listing.unknown_objects) == (["rug_0"], ("kite", "yoyo"))
     (message,) = warnings(listing)
     for words in ("3 videos", "2 objects", "kite, yoyo", "objects.csv"):
         assert words in message
@@ -93,7 +93,7 @@ Make = Callable[[Path], object]
         (lambda folder: touch(folder, "rug_٣.avi"), ["<object>_<number>"]),
         (lambda folder: touch(folder, "rug_0.avi", "sub/rug_00.mp4"), ["rug_0.avi", "sub/rug_00.mp4", "keep one"]),
     ],
-    ids=["no folder", "no video", "strangers", "no number", "digits of another script", "rivals"],
+    ids=["no folder", "no video", "unknown object", "no number", "digits of another script", "one id twice"],
 )
 def test_bad_names_are_one_line_with_their_mend(
     tmp_path: Path, catalogue: Catalogue, make: Make, words: list[str]
@@ -220,7 +220,7 @@ def test_all_bad_lines_of_a_list_are_found_at_once(tmp_path: Path, catalogue: Ca
 
 def test_strangers_in_a_list(tmp_path: Path, catalogue: Catalogue) -> None:
     listing = list_videos(listed(tmp_path, "file,object_id\na.mov,yoyo\nb c.mp4,rug\ntag 3/é.avi,yoyo\n"), catalogue)
-    assert (ids(listing), listing.strangers) == (["rug_0"], ("yoyo",))
+    assert (ids(listing), listing.unknown_objects) == (["rug_0"], ("yoyo",))
     (message,) = warnings(listing)
     assert "2 videos of 1 objects" in message
 
