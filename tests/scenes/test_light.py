@@ -17,12 +17,12 @@ FLAT = np.zeros((HEIGHT, WIDTH), np.float32)
 
 
 def quiet(sensor: Sensor) -> Sensor:
-    """The same without noise and marks."""
-    return dataclasses.replace(sensor, noise=np.zeros_like(sensor.noise), marks=np.ones_like(sensor.marks))
+    """The same without noise and dust."""
+    return dataclasses.replace(sensor, noise=np.zeros_like(sensor.noise), dust=np.ones_like(sensor.dust))
 
 
 def even(directions: tuple[float, float, float], gain: float = 60.0, level: float = 100.0) -> Sensor:
-    """A sensor with equal lights from these directions (degrees) and an even background, without noise and marks."""
+    """A sensor with equal lights from these directions (degrees) and an even background, without noise and dust."""
     side = np.ones((HEIGHT, HEIGHT), np.float32)
     gains = tuple(
         (side * np.float32(gain * np.cos(np.radians(d))), side * np.float32(gain * np.sin(np.radians(d))))
@@ -32,7 +32,7 @@ def even(directions: tuple[float, float, float], gain: float = 60.0, level: floa
         glow=np.full((HEIGHT, HEIGHT, 3), level, np.float32),
         direct=(side * np.float32(DIRECT * level),) * 3,
         gains=gains,
-        marks=np.ones((HEIGHT, HEIGHT, 3), np.float32),
+        dust=np.ones((HEIGHT, HEIGHT, 3), np.float32),
         noise=np.zeros((HEIGHT + HEIGHT // 2, HEIGHT + HEIGHT // 2, 3), np.float32),
     )
 
@@ -132,16 +132,16 @@ def drift(x: float, y: float) -> Drift:
 
 def test_drift_carries_the_marks_and_nothing_else() -> None:
     sensor = make_sensor(WIDTH, HEIGHT, 1)
-    sensor = dataclasses.replace(quiet(sensor), marks=sensor.marks)
-    assert (sensor.marks < 0.9).any()
+    sensor = dataclasses.replace(quiet(sensor), dust=sensor.dust)
+    assert (sensor.dust < 0.9).any()
     skin = bump(0.5, 2.0)
     still = shade(skin, sensor, PITCH, 0)
     np.testing.assert_array_equal(shade(skin, sensor, PITCH, 0, drift(0, 0)), still)
     moved = shade(skin, sensor, PITCH, 0, drift(4 * PITCH, -3 * PITCH))
     assert (moved != still).any()
     bare = shade(skin, quiet(sensor), PITCH, 0)
-    shifted = np.ones_like(sensor.marks)
-    shifted[:-3, 4:] = sensor.marks[3:, :-4]
+    shifted = np.ones_like(sensor.dust)
+    shifted[:-3, 4:] = sensor.dust[3:, :-4]
     assert np.abs(moved - bare * shifted).max() <= 1.01, "right and up"
     np.testing.assert_array_equal(shade(skin, quiet(sensor), PITCH, 0, drift(1, 1)), bare)
 
