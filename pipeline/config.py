@@ -1,7 +1,7 @@
 """The schema of params.yaml: every key with its range and meaning.
 
-`conf/` holds the scales and `octopi scale` composes one of them into params.yaml; `pipeline.params` reads it. A function
-receives its own section, never the root.
+`conf/` holds the scales and `octopi scale` composes one of them into params.yaml; `pipeline.params` reads it. A
+function receives its own section, never the root.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ Seed = Annotated[int, Field(ge=0, lt=2**31)]
 QuestionCounts = dict[str, Annotated[int, Field(ge=0)]]
 """Questions of each task; `pipeline.tasks.questions.counts_by_task` knows which tasks there are."""
 
-Recipe = Literal["paper", "release", "pretrained"]
+Recipe = Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]*$")]
+"""A name in `pipeline.encoder.recipes.RECIPES`; `octopi scale` checks that it is one."""
 Selection = Literal["salient", "release", "uniform", "contact", "adaptive"]
 
 SCENES_DIR = Path("data/scenes/videos")
@@ -125,10 +126,10 @@ class EncoderConfig(Section):
 
     recipe: Recipe = "paper"
     """`paper`: CLIP with visual prompts, three heads. `release`: the same as the published code has it. `pretrained`: a
-    convolutional network pretrained on scenes (section `pretrain`), whose frames vote."""
+    convolutional network pretrained on synthetic pictures (section `pretrain`), with a per-frame classifier."""
     weights: str
-    """Folder of the CLIP in open_clip's format: open_clip_config.json and open_clip_model.safetensors. With `pretrained`
-    it is the ablation's base encoder only."""
+    """Folder of the CLIP in open_clip's format: open_clip_config.json and open_clip_model.safetensors. With
+    `pretrained` it is the ablation's base encoder only."""
     prompts: Annotated[int, Field(ge=1, le=256)] = 8
     """Learnable prompts at each layer."""
     prompt_layers: Annotated[int, Field(ge=0)] = 0

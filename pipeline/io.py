@@ -7,6 +7,7 @@ Tables are Parquet with one column a field, dialogues are JSON lines, weights ar
 from __future__ import annotations
 
 import csv
+import hashlib
 import json
 import os
 import types
@@ -17,7 +18,7 @@ from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from pipeline.errors import UserError
 from pipeline.records import Record
@@ -158,6 +159,27 @@ def load_tensors(path: Path) -> dict[str, torch.Tensor]:
             "code: convert it with safetensors.torch.save_file, or run `dvc repro` again"
         ) from None
     return tensors
+
+
+def fingerprint(*parts: BaseModel | str | int | Path) -> str:
+    """A short hash of settings and of input files (or all files of folders), by which unfinished work is known again.
+
+    A checkpoint of one training is so never taken for another's.
+    """
+    digest = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, BaseModel):
+            digest.update(json.dumps(part.model_dump(mode="json"), sort_keys=True).encode())
+        elif isinstance(part, Path):
+            for file in sorted(part.iterdir()) if part.is_dir() else [part]:
+                if file.is_file():
+                    digest.update(file.name.encode())
+                    with file.open("rb") as stream:
+                        digest.update(hashlib.file_digest(stream, "sha256").digest())
+        else:
+            digest.update(str(part).encode())
+        digest.update(b"\0")
+    return digest.hexdigest()[:16]
 
 
 def _schema(model: type[Record]) -> pa.Schema:

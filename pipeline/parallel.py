@@ -9,10 +9,8 @@ from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, TypeVar
 
-from tqdm import tqdm
-
 from pipeline.errors import UserError
-from pipeline.runtime import cores
+from pipeline.runtime import cores, progress
 
 J = TypeVar("J")
 R = TypeVar("R")
@@ -35,9 +33,11 @@ def run_parallel(work: Callable[[J], R], jobs: Sequence[J], label: str, unit: st
         results: Any = pool.map(work, jobs, chunksize=max(1, min(4, len(jobs) // (8 * cores()))))
         done = 0
         try:
-            for result in tqdm(results, total=len(jobs), desc=label, unit=unit, disable=None):
-                yield result
-                done += 1
+            with progress(len(jobs), label, unit) as advance:
+                for result in results:
+                    yield result
+                    done += 1
+                    advance()
         except BrokenProcessPool:
             raise UserError(
                 f"{label}: a process died at or soon after {jobs[done]}; was it killed for want of memory? Run again: "

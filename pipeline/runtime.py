@@ -1,4 +1,4 @@
-"""Seeds, devices and number formats: the only place that decides where a tensor lives."""
+"""Seeds, devices, number formats (only this decides where a tensor lives), and how far a long run is."""
 
 from __future__ import annotations
 
@@ -6,14 +6,19 @@ import hashlib
 import os
 import random
 import sys
+import time
 import warnings
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 from pipeline.errors import UserError
 
 if TYPE_CHECKING:
     import torch
+
+T = TypeVar("T")
 
 CHECKPOINTS = Path("checkpoints")
 """Where unfinished work waits to be resumed, outside DVC's reach: DVC deletes the outputs of a killed stage."""
@@ -65,7 +70,7 @@ def resolve_dtype(name: DtypeName) -> torch.dtype:
 
 
 def limit_threads(count: int) -> None:
-    """Let torch use this many CPU threads, where it is in use at all; 0 leaves it as it is."""
+    """Let torch use this many CPU threads, where it is imported by now; 0 leaves it as it is."""
     if count and "torch" in sys.modules:
         import torch
 
@@ -77,10 +82,65 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+QUICK = 2.0
+"""Seconds between two lines of progress in a log file at least: what is quick says nothing."""
+
+
+class LogLines:
+    """Says in a log file how far something is: a line each tenth, with what is left.
+
+    Args:
+        label: What it is.
+        total: How many units there are.
+        unit: Their name.
+        after: Units that were done before, in a run that is resumed.
+    """
+
+    def __init__(self, label: str, total: int, unit: str, after: int = 0) -> None:
+        self.label, self.total, self.unit, self.after = label, total, unit, after
+        self._started = self._said = time.monotonic()
+        self._tenth = 10 * after // max(1, total)
+
+    def reached(self, done: int, note: str = "") -> None:
+        """So many units are done now."""
+        now, tenth = time.monotonic(), 10 * done // max(1, self.total)
+        if tenth > self._tenth and now - self._said >= QUICK:
+            self._tenth, self._said = tenth, now
+            left = (now - self._started) * (self.total - done) / max(1, done - self.after)
+            note = f", {note}" if note else ""
+            print(f"{self.label}: {self.unit} {done} of {self.total}{note}, {left:.0f} s left", flush=True)
+
+
+@contextmanager
+def progress(total: int, label: str, unit: str) -> Iterator[Callable[[], object]]:
+    """Give a function to be called once a finished unit: a bar with what is left at a terminal, else `LogLines`."""
+    if sys.stderr.isatty():
+        from tqdm import tqdm
+
+        with tqdm(total=total, desc=label, unit=unit) as bar:
+            yield bar.update
+    else:
+        lines, done = LogLines(label, total, unit), iter(range(1, total + 1))
+        yield lambda: lines.reached(next(done, total))
+
+
+def track(items: Collection[T], label: str, unit: str) -> Iterator[T]:
+    """Go through items and show how far it is."""
+    with progress(len(items), label, unit) as advance:
+        for item in items:
+            yield item
+            advance()
+
+
 def quiet_libraries() -> None:
-    """Silence what libraries say that a person can do nothing about: a bar a loaded file, and their own deprecations."""
+    """Silence what a person can do nothing about: libraries' bars for loaded files, and their own deprecations."""
     os.environ.setdefault("TRANSFORMERS_VERBOSITY", "error")
     os.environ.setdefault("HF_HUB_DISABLE_PROGRESS_BARS", "1")
-    warnings.filterwarnings(
-        "ignore", category=FutureWarning, module=r"(torch|transformers|peft|accelerate|open_clip|timm)\b"
-    )
+    if "transformers" in sys.modules:
+        # The variables are read when it is imported, which may have been before.
+        from transformers.utils import logging
+
+        logging.set_verbosity_error()
+        logging.disable_progress_bar()
+    libraries = r"(torch|transformers|peft|accelerate|open_clip|timm)\b"
+    warnings.filterwarnings("ignore", category=FutureWarning, module=libraries)

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 import shutil
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
 import torch
-from pydantic import BaseModel
 from torch.utils.data import Sampler
 from transformers import PrinterCallback, Trainer, TrainerCallback, TrainerControl, TrainerState, TrainingArguments
 from transformers.trainer_utils import get_last_checkpoint
@@ -21,13 +18,9 @@ from transformers.trainer_utils import get_last_checkpoint
 from pipeline.config import RuntimeConfig
 from pipeline.errors import UserError
 from pipeline.records import Measurement
-from pipeline.runtime import CHECKPOINTS
+from pipeline.runtime import CHECKPOINTS, LogLines
 from pipeline.sampling import EpochDataset
 from pipeline.trainable import trainable_state
-
-Log = Callable[[int, dict[str, float]], None]
-"""Receives step and values while a training runs."""
-
 
 LOWEST = 0.01
 """Share of the rate at the bottom of a wave."""
@@ -127,12 +120,11 @@ def check_finite(state: Mapping[str, torch.Tensor], step: int) -> None:
 LOSSES = ("loss", "grad_norm", "validation_loss")
 
 
-class Watch(TrainerCallback):
-    """Hands each logged value on, tells a log file how far it is, and stops where the loss is no number any more."""
+class TrainingMonitor(TrainerCallback):
+    """Says in a log file how far a training is, and stops it where the loss is no number any more."""
 
-    def __init__(self, log: Log | None) -> None:
-        self.log = log
-        self._said = 0
+    def __init__(self) -> None:
+        self._lines: LogLines | None = None
 
     def on_log(
         self,
@@ -142,43 +134,24 @@ class Watch(TrainerCallback):
         logs: dict[str, float] | None = None,
         **_: Any,
     ) -> None:
-        """Called by the Trainer after each logging step."""
-        values = _measured(logs or {})
+        """Called by the Trainer after each logging step.
+
+        Raises:
+            UserError: where a loss or the gradient's norm is not finite.
+        """
+        values = measured(logs or {})
         bad = [name for name in LOSSES if not math.isfinite(values.get(name, 0.0))]
         if bad:
             raise _diverged(f"{bad[0]} is {values[bad[0]]}", state.global_step)
-        if not state.is_world_process_zero:
-            return
-        if self.log:
-            self.log(state.global_step, values)
-        tenth = 10 * state.global_step // max(1, state.max_steps)
-        if args.disable_tqdm and "loss" in values and tenth > self._said:
-            self._said = tenth
-            print(f"step {state.global_step}/{state.max_steps}, loss {values['loss']:.3f}", flush=True)
+        # At a terminal the Trainer has a bar of its own.
+        if state.is_world_process_zero and args.disable_tqdm and "loss" in values:
+            self._lines = self._lines or LogLines("training", state.max_steps, "step", after=state.global_step)
+            self._lines.reached(state.global_step, f"loss {values['loss']:.3f}")
 
 
-def fingerprint(*parts: BaseModel | str | int | Path) -> str:
-    """A short hash of settings and of input files, or all files of folders: checkpoints of one training are never
-    taken for another's."""
-    digest = hashlib.sha256()
-    for part in parts:
-        if isinstance(part, BaseModel):
-            digest.update(json.dumps(part.model_dump(mode="json"), sort_keys=True).encode())
-        elif isinstance(part, Path):
-            for file in sorted(part.iterdir()) if part.is_dir() else [part]:
-                if file.is_file():
-                    digest.update(file.name.encode())
-                    with file.open("rb") as stream:
-                        digest.update(hashlib.file_digest(stream, "sha256").digest())
-        else:
-            digest.update(str(part).encode())
-        digest.update(b"\0")
-    return digest.hexdigest()[:16]
-
-
-def checkpoint_dir(stage: str, mark: str) -> Path:
+def checkpoint_dir(stage: str, fingerprint: str) -> Path:
     """Where a training keeps its checkpoints, outside DVC's reach (DVC deletes a killed stage's outputs)."""
-    return CHECKPOINTS / stage / mark
+    return CHECKPOINTS / stage / fingerprint
 
 
 @dataclass(frozen=True)
@@ -225,7 +198,7 @@ def train(trainer: Trainer) -> Trained:
         Measurement(step=entry["step"], name=name, value=value)
         for entry in trainer.state.log_history
         # A state that was read back has its names in order, one that was not has them as they were logged.
-        for name, value in sorted(_measured(entry).items())
+        for name, value in sorted(measured(entry).items())
     ]
     whole = trainer.accelerator.get_state_dict(trainer.model_wrapped)
     names = trainable_state(trainer.accelerator.unwrap_model(trainer.model))
@@ -243,7 +216,7 @@ def _drop_unfinished(folder: Path) -> None:
             shutil.rmtree(checkpoint)
 
 
-def _measured(entry: Mapping[str, object]) -> dict[str, float]:
+def measured(entry: Mapping[str, object]) -> dict[str, float]:
     """What of a log entry is a figure of the training: not its bookkeeping, nor wall-clock times."""
     names = {name: "validation_loss" if name == "eval_loss" else name.removeprefix("eval_") for name in entry}
     return {

@@ -4,8 +4,8 @@ import sys
 
 from pipeline.embeddings import EmbeddingStore
 from pipeline.io import read_jsonl, write_jsonl
-from pipeline.language.generate import Asking, answer
-from pipeline.language.input_ablation import feel
+from pipeline.language.generate import GenerationSettings, answer
+from pipeline.language.input_ablation import ablate_input
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.records import Encoder, Lora, Opd, Question, Touch, Variant
 from pipeline.runtime import resolve_device
@@ -23,14 +23,14 @@ def main() -> None:
         ).to(resolve_device(params.runtime.device))
         questions = read_jsonl(DATA / "questions" / "evaluation.jsonl", Question)
         for touch in (Touch.REAL, *(params.ablation.touch if variant.full else ())):
-            asking = Asking(
+            settings = GenerationSettings(
                 system_prompt=language.system_prompt,
                 per_video=0 if touch is Touch.REMOVED else params.frames.per_video,
                 max_new_tokens=language.max_new_tokens,
                 batch_size=language.generation_batch_size,
             )
-            given = feel(store, touch, questions, variant.seed)
-            predictions = answer(model, given, questions, variant.opd, asking)
+            given = ablate_input(store, touch, questions, variant.seed)
+            predictions = answer(model, given, questions, variant.opd, settings)
             write_jsonl(DATA / "answers" / variant.key / f"{touch}.jsonl", predictions)
             run.metrics[f"{touch}.answers"] = len(predictions)
             run.metrics[f"{touch}.tokens"] = sum(p.tokens for p in predictions)

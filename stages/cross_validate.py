@@ -1,10 +1,10 @@
-"""Cross-validate one encoder or rival over all objects with videos."""
+"""Cross-validate one encoder or baseline over all objects with videos."""
 
 import sys
 from pathlib import Path
 
 from pipeline.encoder.candidates import CANDIDATES
-from pipeline.encoder.cross_validation import Arena, judge
+from pipeline.encoder.cross_validation import CrossValidationData, cross_validate_candidate
 from pipeline.io import read_table, write_table
 from pipeline.records import OutOfFold, Video
 from pipeline.stage import DATA, stage
@@ -18,7 +18,7 @@ def main() -> None:
         params = run.params
         check_encoder(Path(params.encoder.weights), params.frames.size)
         catalogue = load_catalogue(Path(params.data.catalogue))
-        arena = Arena(
+        data = CrossValidationData(
             videos=read_table(DATA / "videos.parquet", Video),
             catalogue=catalogue,
             frames=DATA / "frames",
@@ -28,9 +28,9 @@ def main() -> None:
             runtime=params.runtime,
             pretrained=DATA / "pretrained" / "encoder.safetensors",
         )
-        judged = judge(CANDIDATES[name], arena, params.cross_validation)
-        write_table(DATA / "cross_validation" / name / "out_of_fold.parquet", OutOfFold, judged)
-        right = [j.expected == j.predicted for j in judged]
+        predictions = cross_validate_candidate(CANDIDATES[name], data, params.cross_validation)
+        write_table(DATA / "cross_validation" / name / "out_of_fold.parquet", OutOfFold, predictions)
+        right = [p.expected == p.predicted for p in predictions]
         run.metrics["combined.accuracy"] = sum(right) / len(right)
 
 

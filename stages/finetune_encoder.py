@@ -3,12 +3,13 @@
 import sys
 from pathlib import Path
 
-from pipeline.encoder.finetune import EncoderData, classify, finetune
+from pipeline.encoder.clips import EncoderData, classify
+from pipeline.encoder.finetune import finetune, write_encoder_card
 from pipeline.io import read_table, write_table
 from pipeline.records import Assignment, Classification, Measurement, Part
 from pipeline.runtime import resolve_device
 from pipeline.stage import DATA, stage
-from pipeline.tracking import live_run
+from pipeline.tracking import live
 from pipeline.trainable import save_trainable
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.frames.store import REFERENCES_FILE, TABLE_FILE, FrameStore
@@ -28,25 +29,27 @@ def main() -> None:
         )
         inputs = [DATA / "frames" / name for name in (TABLE_FILE, REFERENCES_FILE)] + [DATA / "splits.parquet"]
         inputs.append(clip_file(Path(params.encoder.weights)))
-        with live_run(params, run.name, Path()) as live:
+        pretrained = DATA / "pretrained" / "encoder.safetensors"
+        with live(run) as callbacks:
             model, history = finetune(
                 data,
                 params.encoder,
                 params.runtime,
                 seed=params.seed + seed,
                 inputs=inputs,
-                pretrained=DATA / "pretrained" / "encoder.safetensors",
-                log=live.log,
+                pretrained=pretrained,
+                callbacks=callbacks,
             )
         device = resolve_device(params.runtime.device)
-        judged = classify(model, data, [Part.VALIDATION, Part.TEST], params.encoder.batch_size, device)
+        classified = classify(model, data, [Part.VALIDATION, Part.TEST], params.encoder.batch_size, device)
         out = DATA / "encoder" / str(seed)
         save_trainable(model, out / "encoder.safetensors")
         write_table(out / "history.parquet", Measurement, history)
-        write_table(out / "classifications.parquet", Classification, judged)
+        write_table(out / "classifications.parquet", Classification, classified)
+        write_encoder_card(out, data, params.encoder, params.seed + seed, pretrained, params.data.source)
         run.finish_training(history)
         for part in (Part.VALIDATION, Part.TEST):
-            chosen = [c for c in judged if c.part == part]
+            chosen = [c for c in classified if c.part == part]
             for name in dict.fromkeys(c.property for c in chosen):
                 right = [c.expected == c.predicted for c in chosen if c.property == name]
                 run.metrics[f"{part}.{name}.accuracy"] = sum(right) / len(right)

@@ -1,12 +1,10 @@
 """Pretrain an encoder on pictures of invented objects, where the recipe or a compared model begins with that."""
 
-from pathlib import Path
-
 from pipeline.encoder.candidates import needs_pretraining
 from pipeline.io import write_table
 from pipeline.records import Measurement
 from pipeline.stage import DATA, stage
-from pipeline.tracking import live_run
+from pipeline.tracking import live
 
 
 def main() -> None:
@@ -20,8 +18,8 @@ def main() -> None:
         from pipeline.encoder.pretrain import pretrain
         from pipeline.trainable import save_trainable
 
-        with live_run(params, run.name, Path()) as live:
-            encoder, history = pretrain(params.pretrain, params.frames, params.runtime, live.log)
+        with live(run) as callbacks:
+            encoder, history = pretrain(params.pretrain, params.frames, params.runtime, callbacks)
         save_trainable(encoder, out / "encoder.safetensors")
         write_table(out / "history.parquet", Measurement, history)
         run.finish_training(history)

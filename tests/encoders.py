@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from pipeline.encoder.frame_heads import FittedHeads
 from safetensors.torch import load_file, save_file
 
 from pipeline.config import EncoderConfig, Recipe, RuntimeConfig
 from pipeline.encoder.finetune import EncoderData
-from pipeline.encoder.frame_heads import Votes
 from pipeline.io import write_table
 from pipeline.records import Assignment, Frame, Part
 from pipeline.videos.catalogue import Catalogue
@@ -20,7 +20,7 @@ from tests.checkpoints import write_clip
 
 Floats = np.ndarray
 CPU = RuntimeConfig(device="cpu", save_steps=2)
-MOMENTS = torch.tensor([[0, 5, 9], [1, 2, 40_000], [7, 7, 7], [3, 10**6, 4]])
+FRAME_INDICES = torch.tensor([[0, 5, 9], [1, 2, 40_000], [7, 7, 7], [3, 10**6, 4]])
 OBJECTS = ("baseball", "rug", "pillow", "potato", "cotton_ball", "ice_block", "millet")
 PARTS = {o: Part.VALIDATION if i > 4 else Part.TRAIN for i, o in enumerate(OBJECTS)}
 """Five videos to train on, two to choose by."""
@@ -82,10 +82,10 @@ def close(found: torch.Tensor, expected: Floats, rtol: float = 1e-5) -> None:
     np.testing.assert_allclose(float64(found), expected, rtol=0, atol=rtol * max(1, np.abs(expected).max()))
 
 
-def drawn_votes(seed: int, dim: int, classes: Sequence[int], strength: float) -> Votes:
-    """Votes that nobody fitted."""
+def random_heads(seed: int, dim: int, classes: Sequence[int], strength: float) -> FittedHeads:
+    """FittedHeads that nobody fitted."""
     rng = np.random.default_rng(seed)
-    return Votes(
+    return FittedHeads(
         centre=rng.normal(size=dim).astype(np.float32),
         spread=rng.uniform(0.1, 3, dim).astype(np.float32),
         weights=[strength * rng.normal(size=(c, dim)) for c in classes],

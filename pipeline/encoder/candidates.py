@@ -9,7 +9,7 @@ from typing import Literal
 
 from pipeline.errors import UserError
 
-Kind = Literal["constant", "trees", "votes", "gradient"]
+Kind = Literal["constant", "trees", "frame_heads", "gradient"]
 
 
 @dataclass(frozen=True)
@@ -19,19 +19,19 @@ class Candidate:
     title: str
     kind: Kind
     """`constant`: the training objects' most frequent combination. `trees`: hand-made features of whole frames and
-    tree ensembles. `votes`: the pretrained recipe's heads on frozen features of frames. `gradient`: trained by the
-    Trainer."""
+    tree ensembles. `frame_heads`: the recipe `pretrained`'s heads on frozen features of single frames. `gradient`:
+    trained by the Trainer."""
     encoder: Literal["clip", "scenes", "untrained"] = "clip"
-    """`scenes`: pretrained on them; `untrained`: the same network with random weights."""
+    """`scenes`: pretrained on synthetic pictures; `untrained`: the same network with random weights."""
     recipe: Literal["paper", "release", "scratch"] = "paper"
-    """`gradient`: which. `scratch` trains the pretrained recipe's network end to end from random weights."""
+    """`gradient`: which. `scratch` trains the network of the recipe `pretrained` end to end from random weights."""
     reference: Literal["none", "own", "mean"] = "none"
     """What is subtracted from a frame: nothing, its video's own no-contact picture, or the mean of the training
     videos' ones."""
     joint: bool = True
-    """`votes`: whether the properties are decided together."""
+    """`frame_heads`: whether the properties are decided together."""
     pooled: bool = False
-    """`votes`: whether features, and not probabilities, are averaged over frames."""
+    """`frame_heads`: whether features, and not probabilities, are averaged over frames."""
     settings: Mapping[str, float] = field(default_factory=dict)
     """`gradient`: what differs from the section `encoder`; as the recipe's file in conf/ has it."""
     frames: int | None = None
@@ -43,11 +43,13 @@ class Candidate:
 
     @property
     def pretrained(self) -> bool:
-        """Whether it needs the encoder that scenes have pretrained."""
-        return self.encoder == "scenes" and self.kind == "votes"
+        """Whether it needs the encoder that synthetic pictures have pretrained."""
+        return self.encoder == "scenes" and self.kind == "frame_heads"
 
 
-PRETRAINED = Candidate("pretrained on scenes, frames vote, decided jointly", "votes", "scenes", reference="own")
+PRETRAINED = Candidate(
+    "pretrained on synthetic pictures, frame classifier, decided jointly", "frame_heads", "scenes", reference="own"
+)
 PAPER = Candidate("CLIP with visual prompts, three heads", "gradient")
 RELEASE = {"epochs": 40, "batch_size": 4, "learning_rate": 1e-3, "weight_decay": 0.01}
 LEARNING_CURVE = (10, 20, 30, 40)
@@ -55,12 +57,12 @@ LEARNING_CURVE = (10, 20, 30, 40)
 CANDIDATES: dict[str, Candidate] = {
     "constant": Candidate("the training objects' most frequent combination of classes", "constant"),
     "trees": Candidate("hand-made features of five uniform frames, random trees, decided jointly", "trees"),
-    "probe": Candidate("frozen CLIP, frames vote, decided jointly", "votes"),
-    "probe-difference": Candidate("frozen CLIP on difference pictures, likewise", "votes", reference="own"),
+    "probe": Candidate("frozen CLIP, frame classifier, decided jointly", "frame_heads"),
+    "probe-difference": Candidate("frozen CLIP on difference pictures, likewise", "frame_heads", reference="own"),
     "paper": PAPER,
     "paper-difference": replace(PAPER, title="the paper's recipe on difference pictures", reference="own"),
     "release": replace(PAPER, title="the published code's recipe", recipe="release", settings=RELEASE),
-    "scratch": replace(PAPER, title="the pretrained recipe's network, from scratch", recipe="scratch", reference="own"),
+    "scratch": replace(PAPER, title="the pretrained network's layers, from scratch", recipe="scratch", reference="own"),
     "pretrained": PRETRAINED,
     "pretrained-untrained": replace(PRETRAINED, title="without pretraining", encoder="untrained", parent="pretrained"),
     "pretrained-raw": replace(
@@ -68,7 +70,7 @@ CANDIDATES: dict[str, Candidate] = {
     ),
     "pretrained-independent": replace(PRETRAINED, title="without the joint decision", joint=False, parent="pretrained"),
     "pretrained-pooled": replace(
-        PRETRAINED, title="features averaged in place of votes", pooled=True, parent="pretrained"
+        PRETRAINED, title="features averaged in place of probabilities", pooled=True, parent="pretrained"
     ),
     "pretrained-one-frame": replace(PRETRAINED, title="one frame a video", frames=1, parent="pretrained"),
     "pretrained-ten-frames": replace(PRETRAINED, title="ten frames a video", frames=10, parent="pretrained"),

@@ -1,4 +1,4 @@
-"""Clips for the encoder: a few frames of each video, freshly drawn in each epoch of training."""
+"""Clips for the encoder: a few frames of each video, drawn for training or at even distances, and what models say."""
 
 from __future__ import annotations
 
@@ -7,10 +7,17 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 import torch
+from torch.nn import functional as F
+from torch.utils.data import DataLoader
 
+from pipeline.encoder.model import FrameEncoder, PropertyClassifier
+from pipeline.errors import UserError
+from pipeline.records import Assignment, Classification, Part
 from pipeline.runtime import derive_seed
 from pipeline.sampling import EpochDataset, sample_evaluation, sample_training
+from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
 
 
@@ -23,7 +30,7 @@ class LabelledVideo:
 
 
 class ClipDataset(EpochDataset[dict[str, torch.Tensor]]):
-    """Items: `frames`, uint8, k x side x side x RGB; their numbers in the video, `moments`, int64, k; `labels`, int64.
+    """Items: `frames`, uint8, k x side x side x RGB; `frame_indices` in the video, int64, k; `labels`, int64.
 
     What is drawn depends on seed, epoch and video alone, so a resumed training sees what an uninterrupted one does.
 
@@ -69,7 +76,9 @@ class ClipDataset(EpochDataset[dict[str, torch.Tensor]]):
         frames = np.flip(frames, flips) if flips else frames
         return {
             "frames": torch.from_numpy(np.ascontiguousarray(frames)),
-            "moments": torch.tensor([self.store.index[rows[p]].frame_index for p in positions], dtype=torch.int64),
+            "frame_indices": torch.tensor(
+                [self.store.index[rows[p]].frame_index for p in positions], dtype=torch.int64
+            ),
             "labels": torch.tensor(video.labels, dtype=torch.int64),
         }
 
@@ -78,3 +87,87 @@ def collate_clips(items: Iterable[dict[str, torch.Tensor]]) -> dict[str, torch.T
     """Stack clips of equal length."""
     items = list(items)
     return {name: torch.stack([item[name] for item in items]) for name in items[0]}
+
+
+@dataclass(frozen=True)
+class EncoderData:
+    """Frames, labels and parts: what an encoder is trained and evaluated on."""
+
+    store: FrameStore
+    catalogue: Catalogue
+    assignments: Sequence[Assignment]
+    per_video: int
+
+    def videos(self, part: Part) -> list[LabelledVideo]:
+        """The labelled videos of a part."""
+        return [
+            LabelledVideo(a.video_id, self.catalogue.labels(a.object_id)) for a in self.assignments if a.part == part
+        ]
+
+    @property
+    def classes(self) -> list[int]:
+        """Number of classes of each property."""
+        return [len(p.levels) for p in self.catalogue.properties]
+
+
+@torch.inference_mode()
+def describe_clips(
+    encoder: FrameEncoder, data: EncoderData, videos: Sequence[LabelledVideo], batch_size: int, device: torch.device
+) -> npt.NDArray[np.float32]:
+    """What the encoder says of the frames of each video's evaluation clip: float32, videos x frames x features."""
+    encoder = encoder.to(device).eval()
+    clips = ClipDataset(data.store, videos, per_video=data.per_video)
+    features = []
+    for batch in DataLoader(clips, batch_size=max(1, batch_size // data.per_video), collate_fn=collate_clips):
+        frames, frame_indices = batch["frames"].to(device), batch["frame_indices"].to(device)
+        described = encoder.describe(frames.flatten(0, 1), frame_indices.flatten())
+        features.append(described.view(*frames.shape[:2], -1).float().cpu())
+    found = torch.cat(features)
+    _check_finite(found.flatten(1), videos)
+    return found.numpy()
+
+
+@torch.inference_mode()
+def classify(
+    model: PropertyClassifier, data: EncoderData, parts: Sequence[Part], batch_size: int, device: torch.device
+) -> list[Classification]:
+    """What the heads say about the evaluation clip of each video of these parts."""
+    model = model.to(device).eval()
+    objects = {a.video_id: a.object_id for a in data.assignments}
+    records = []
+    for part in parts:
+        videos = data.videos(part)
+        clips = ClipDataset(data.store, videos, per_video=data.per_video)
+        outputs = [
+            model(batch["frames"].to(device), batch["frame_indices"].to(device))["logits"].cpu()
+            for batch in DataLoader(clips, batch_size=batch_size, collate_fn=collate_clips)
+        ]
+        if not outputs:
+            continue
+        logits = torch.cat(outputs)
+        _check_finite(logits, videos)
+        decided = model.decide(logits)
+        for index, property_ in enumerate(data.catalogue.properties):
+            rows = F.softmax(logits.split(data.classes, dim=1)[index].double(), dim=1)
+            for video, row, classes in zip(videos, rows, decided.tolist(), strict=True):
+                records.append(
+                    Classification(
+                        video_id=video.video_id,
+                        object_id=objects[video.video_id],
+                        part=part,
+                        property=property_.name,
+                        expected=video.labels[index],
+                        predicted=classes[index],
+                        probabilities=tuple(row.tolist()),
+                    )
+                )
+    return records
+
+
+def _check_finite(values: torch.Tensor, videos: Sequence[LabelledVideo]) -> None:
+    """Values are videos x whatever."""
+    for video, finite in zip(videos, values.isfinite().all(1).tolist(), strict=True):
+        if not finite:
+            raise UserError(
+                f"{video.video_id}: what the encoder says of it is not finite; check the video and encoder.weights"
+            )

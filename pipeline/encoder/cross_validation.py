@@ -1,4 +1,7 @@
-"""Grouped cross-validation of any contestant over all videos: nobody is judged on an object that it learnt from."""
+"""Grouped cross-validation of any candidate over all videos: no model is tested on an object that it learnt from.
+
+What needs torch is imported where it is used: `constant` and `trees` need none.
+"""
 
 from __future__ import annotations
 
@@ -6,36 +9,33 @@ import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.config import CrossValidationConfig, EncoderConfig, RuntimeConfig
 from pipeline.encoder.baseline.predictor import Labels
-from pipeline.encoder.baseline.recordings import Recording, recording_features
 from pipeline.encoder.baseline.validation import Fold, Predict, cross_validate, deal, forest
 from pipeline.encoder.candidates import Candidate
-from pipeline.encoder.finetune import EncoderData, classify, describe_clips, train_classifier
-from pipeline.encoder.frame_heads import Clips, choose_strength, fit_votes
-from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
-from pipeline.encoder.recipes import base_encoder, property_classifier
-from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.errors import UserError
-from pipeline.io import read_json, read_table, write_json
+from pipeline.io import fingerprint, read_json, read_table, write_json
 from pipeline.records import Assignment, OutOfFold, Part, Probe, Video
-from pipeline.runtime import CHECKPOINTS, derive_seed, resolve_device, seed_everything
-from pipeline.trainable import load_trainable
-from pipeline.training import fingerprint
+from pipeline.runtime import CHECKPOINTS, derive_seed, limit_threads, progress, resolve_device, seed_everything
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import PROBES_FILE, REFERENCES_FILE, TABLE_FILE, FrameStore
 from pipeline.weights import clip_file
+
+if TYPE_CHECKING:
+    from pipeline.encoder.frame_classifier import Clips
+    from pipeline.encoder.model import FrameEncoder, PropertyClassifier
 
 VALIDATION = 8
 """One in so many training objects is set aside where a training chooses its best epoch."""
 
 
 @dataclass(frozen=True)
-class Arena:
-    """What all contestants share."""
+class CrossValidationData:
+    """What all candidates share."""
 
     videos: Sequence[Video]
     """All with labels, in the order of the results."""
@@ -48,7 +48,7 @@ class Arena:
     encoder: EncoderConfig
     runtime: RuntimeConfig
     pretrained: Path
-    """File of the encoder that scenes have pretrained; need not exist where no contestant takes it."""
+    """File of the encoder that synthetic pictures have pretrained; need not exist where no candidate takes it."""
 
     @property
     def objects(self) -> list[str]:
@@ -70,184 +70,207 @@ class Arena:
         """What results depend on besides the catalogue and the parameters."""
         return [self.frames / TABLE_FILE, self.frames / REFERENCES_FILE, clip_file(Path(self.encoder.weights))]
 
-    def store(self, contestant: Candidate) -> FrameStore:
-        """The frames as the contestant sees them."""
-        return FrameStore(self.frames, "subtract" if contestant.reference == "own" else "none")
+    def store(self, candidate: Candidate) -> FrameStore:
+        """The frames as the candidate sees them."""
+        return FrameStore(self.frames, "subtract" if candidate.reference == "own" else "none")
+
+    def assignments(self, parts: dict[str, Part]) -> list[Assignment]:
+        """All videos, in these parts; unused where `parts` does not say."""
+        return [
+            Assignment(video_id=v.video_id, object_id=v.object_id, part=parts.get(v.video_id, Part.UNUSED))
+            for v in self.videos
+        ]
 
 
-def judge(contestant: Candidate, arena: Arena, config: CrossValidationConfig) -> list[OutOfFold]:
-    """Cross-validate one contestant; finished folds survive a kill.
+def cross_validate_candidate(
+    candidate: Candidate, data: CrossValidationData, config: CrossValidationConfig
+) -> list[OutOfFold]:
+    """Out-of-fold predictions of one candidate; finished folds survive a kill.
 
-    Folds depend on the objects and `config` alone, so all contestants share them.
+    Folds depend on the objects and `config` alone, so all candidates share them.
+
+    Raises:
+        UserError: where fewer objects than folds have videos.
     """
-    made_of = [*arena.files, *([arena.pretrained] if arena.pretrained.is_file() else [])]
-    objects = len(set(arena.objects))
+    made_of = [*data.files, *([data.pretrained] if data.pretrained.is_file() else [])]
+    objects = len(set(data.objects))
     if objects < config.folds:
         raise UserError(
             f"cross_validation.folds is {config.folds} but only {objects} objects have videos; lower it, to 2 at least"
         )
-    labelled = repr([(v.video_id, arena.catalogue.labels(v.object_id)) for v in arena.videos])
-    mark = fingerprint(repr(contestant), config, arena.encoder, arena.per_video, labelled, *made_of)
-    work = CHECKPOINTS / "cross_validation" / mark
-    predict = _remembered(_limited(KINDS[contestant.kind](contestant, arena), contestant, arena), work)
-    verdicts = cross_validate(
-        predict,
-        arena.labels,
-        arena.objects,
-        arena.classes,
-        folds=config.folds,
-        repeats=config.repeats,
-        seed=config.seed,
+    labelled = repr([(v.video_id, data.catalogue.labels(v.object_id)) for v in data.videos])
+    work = (
+        CHECKPOINTS
+        / "cross_validation"
+        / fingerprint(repr(candidate), config, data.encoder, data.per_video, labelled, *made_of)
     )
+    predict = _limited(KINDS[candidate.kind](candidate, data), candidate, data)
+    with progress(config.folds * config.repeats, "cross-validation", "fold") as advance:
+
+        def resumed(fold: Fold) -> Labels:
+            file = work / f"{fold.repeat}-{fold.number}.json"
+            if not file.is_file():
+                write_json(file, predict(fold).tolist())
+            advance()
+            return np.array(read_json(file), dtype=np.int64)
+
+        predicted = cross_validate(
+            resumed,
+            data.labels,
+            data.objects,
+            data.classes,
+            folds=config.folds,
+            repeats=config.repeats,
+            seed=config.seed,
+        )
     shutil.rmtree(work, ignore_errors=True)
     return [
         OutOfFold(
             video_id=video.video_id,
             object_id=video.object_id,
             repeat=repeat,
-            expected=verdict.expected,
-            predicted=predicted,
+            expected=data.catalogue.labels(video.object_id),
+            predicted=tuple(classes),
         )
-        for video, verdict in zip(arena.videos, verdicts, strict=True)
-        for repeat, predicted in enumerate(verdict.predicted)
+        for video, repeated in zip(data.videos, predicted.tolist(), strict=True)
+        for repeat, classes in enumerate(repeated)
     ]
 
 
-def _remembered(predict: Predict, work: Path) -> Predict:
-    def lookup(fold: Fold) -> Labels:
-        file = work / f"{fold.repeat}-{fold.number}.json"
-        if not file.is_file():
-            write_json(file, predict(fold).tolist())
-        return np.array(read_json(file), dtype=np.int64)
-
-    return lookup
-
-
-def _limited(predict: Predict, contestant: Candidate, arena: Arena) -> Predict:
+def _limited(predict: Predict, candidate: Candidate, data: CrossValidationData) -> Predict:
     """Leave only so many training objects, drawn anew in each fold."""
-    count = contestant.objects
+    count = candidate.objects
     if count is None:
         return predict
-    owners = np.array(arena.objects)
+    owners = np.array(data.objects)
 
     def fewer(fold: Fold) -> Labels:
-        known = np.unique(owners[fold.trained])
+        trained = np.unique(owners[fold.trained])
         rng = np.random.default_rng(derive_seed("objects", fold.repeat, fold.number))
-        kept = rng.permutation(known)[:count]
+        kept = rng.permutation(trained)[:count]
         return predict(Fold(fold.trained & np.isin(owners, kept), fold.tested, fold.repeat, fold.number))
 
     return fewer
 
 
-def _constant(_: Candidate, arena: Arena) -> Predict:
+def _constant(_: Candidate, data: CrossValidationData) -> Predict:
     def predict(fold: Fold) -> Labels:
-        seen = dict(zip(np.array(arena.objects)[fold.trained], map(tuple, arena.labels[fold.trained]), strict=True))
-        combinations, counts = np.unique(np.array(list(seen.values())), axis=0, return_counts=True)
+        labels = dict(zip(np.array(data.objects)[fold.trained], map(tuple, data.labels[fold.trained]), strict=True))
+        combinations, counts = np.unique(np.array(list(labels.values())), axis=0, return_counts=True)
         return np.tile(combinations[counts.argmax()], (int(fold.tested.sum()), 1))
 
     return predict
 
 
-def _trees(_: Candidate, arena: Arena) -> Predict:
-    touching = {p.video_id for p in read_table(arena.frames / PROBES_FILE, Probe) if p.starts_touching}
+def _trees(_: Candidate, data: CrossValidationData) -> Predict:
+    from pipeline.encoder.baseline.recordings import Recording, recording_features
+
+    touching = {p.video_id for p in read_table(data.frames / PROBES_FILE, Probe) if p.starts_touching}
     features = recording_features(
-        [Recording(arena.recordings / video.path, video.video_id in touching) for video in arena.videos]
+        [Recording(data.recordings / video.path, video.video_id in touching) for video in data.videos]
     )
-    return forest(features, arena.labels, arena.objects, arena.classes)
+    return forest(features, data.labels, data.objects, data.classes)
 
 
-def _votes(contestant: Candidate, arena: Arena) -> Predict:
+def _frame_heads(candidate: Candidate, data: CrossValidationData) -> Predict:
     """Features come from an encoder that has seen no label, so they are computed once for all folds."""
-    labels, owners = arena.labels, np.array(arena.objects)
-    encoder = frozen_encoder(contestant, arena)
-    own = None if contestant.reference == "mean" else _features(encoder, contestant, arena, arena.store(contestant))
+    from pipeline.encoder import frame_classifier
+
+    limit_threads(data.runtime.threads)
+    labels, owners = data.labels, np.array(data.objects)
+    encoder = frozen_encoder(candidate, data)
+    own = None if candidate.reference == "mean" else _features(encoder, candidate, data, data.store(candidate))
 
     def predict(fold: Fold) -> Labels:
         clips = own
         if clips is None:
-            store = FrameStore(arena.frames, "subtract")
-            assert store.references is not None, "they were asked for"
-            learnt = [v.video_id for v, known in zip(arena.videos, fold.trained, strict=True) if known]
-            store.share_reference(learnt)
-            clips = _features(encoder, contestant, arena, store)
-        inner = owners[fold.trained].tolist()
-        learnt_clips, learnt_labels = clips[fold.trained], labels[fold.trained]
+            store = FrameStore(data.frames, "subtract")
+            store.share_reference([v.video_id for v, trained in zip(data.videos, fold.trained, strict=True) if trained])
+            clips = _features(encoder, candidate, data, store)
+        training = (clips[fold.trained], labels[fold.trained], owners[fold.trained].tolist(), data.classes)
         seed = derive_seed("votes", fold.repeat, fold.number)
-        strength, _ = choose_strength(learnt_clips, learnt_labels, inner, arena.classes, seed, joint=contestant.joint)
-        votes = fit_votes(learnt_clips, learnt_labels, inner, arena.classes, strength, joint=contestant.joint)
-        return votes.predict(clips[fold.tested])
+        strength, _ = frame_classifier.choose_strength(*training, seed, joint=candidate.joint)
+        heads = frame_classifier.fit_frame_heads(*training, strength, joint=candidate.joint)
+        return heads.predict(clips[fold.tested])
 
     return predict
 
 
-def frozen_encoder(contestant: Candidate, arena: Arena) -> FrameEncoder:
-    """The encoder whose frames vote."""
-    if contestant.encoder == "clip":
+def frozen_encoder(candidate: Candidate, data: CrossValidationData) -> FrameEncoder:
+    """The encoder that gives a `frame_heads` candidate its features."""
+    from pipeline.encoder.recipes import base_encoder
+    from pipeline.encoder.scene_encoder import SceneEncoder
+    from pipeline.trainable import load_trainable
+
+    if candidate.encoder == "clip":
         # As CLIP reads it, whatever the recipe of the chain.
-        return base_encoder(arena.encoder.model_copy(update={"recipe": "paper"}))
+        return base_encoder(data.encoder.model_copy(update={"recipe": "paper"}))
     seed_everything(0)
     encoder = SceneEncoder()
-    if contestant.encoder == "scenes":
-        load_trainable(encoder, arena.pretrained)
+    if candidate.encoder == "scenes":
+        load_trainable(encoder, data.pretrained)
     return encoder
 
 
-def _features(encoder: FrameEncoder, contestant: Candidate, arena: Arena, store: FrameStore) -> Clips:
-    per_video = contestant.frames or arena.per_video
-    data = EncoderData(store, arena.catalogue, _assignments(arena, {}), per_video)
-    device, batch = resolve_device(arena.runtime.device), arena.encoder.embed_batch_size
-    clips = describe_clips(encoder, data, data.videos(Part.UNUSED), batch, device)
-    return clips.mean(axis=1, keepdims=True) if contestant.pooled else clips
+def _features(encoder: FrameEncoder, candidate: Candidate, data: CrossValidationData, store: FrameStore) -> Clips:
+    from pipeline.encoder.clips import EncoderData, describe_clips
+
+    clips = EncoderData(store, data.catalogue, data.assignments({}), candidate.frames or data.per_video)
+    device = resolve_device(data.runtime.device)
+    found = describe_clips(encoder, clips, clips.videos(Part.UNUSED), data.encoder.embed_batch_size, device)
+    return found.mean(axis=1, keepdims=True) if candidate.pooled else found
 
 
-def _gradient(contestant: Candidate, arena: Arena) -> Predict:
-    recipe = "release" if contestant.recipe == "release" else "paper"
-    config = arena.encoder.model_copy(update={"recipe": recipe, **contestant.settings})
-    store = arena.store(contestant)
+def _gradient(candidate: Candidate, data: CrossValidationData) -> Predict:
+    from pipeline.encoder import finetune
+    from pipeline.encoder.clips import EncoderData, classify
+    from pipeline.encoder.recipes import property_classifier
+
+    limit_threads(data.runtime.threads)
+    recipe = "release" if candidate.recipe == "release" else "paper"
+    config = data.encoder.model_copy(update={"recipe": recipe, **candidate.settings})
+    store, device = data.store(candidate), resolve_device(data.runtime.device)
 
     def predict(fold: Fold) -> Labels:
         seed = derive_seed("gradient", fold.repeat, fold.number) % 2**31
         seed_everything(seed)
-        known = np.unique(np.array(arena.objects)[fold.trained]).tolist()
-        chosen = deal(known, min(VALIDATION, len(known)), seed)[0] if len(known) > 1 else frozenset()
+        trained = np.unique(np.array(data.objects)[fold.trained]).tolist()
+        chosen = deal(trained, min(VALIDATION, len(trained)), seed)[0] if len(trained) > 1 else frozenset()
         parts = {
             video.video_id: Part.TEST if tested else Part.VALIDATION if video.object_id in chosen else Part.TRAIN
-            for video, trained, tested in zip(arena.videos, fold.trained, fold.tested, strict=True)
+            for video, trained, tested in zip(data.videos, fold.trained, fold.tested, strict=True)
             if trained or tested
         }
-        data = EncoderData(store, arena.catalogue, _assignments(arena, parts), arena.per_video)
-        model = (
-            _from_scratch(arena.classes)
-            if contestant.recipe == "scratch"
-            else property_classifier(config, arena.classes)
-        )
-        marks = [repr(contestant), repr(arena.labels.tolist()), repr(sorted(parts.items()))]
-        train_classifier(model, data, config, arena.runtime, seed=seed, inputs=[*marks, *arena.files])
-        judged = classify(model, data, [Part.TEST], config.batch_size, resolve_device(arena.runtime.device))
+        clips = EncoderData(store, data.catalogue, data.assignments(parts), data.per_video)
+        scratch = candidate.recipe == "scratch"
+        model = _from_scratch(data.classes) if scratch else property_classifier(config, data.classes)
+        inputs: list[Path | str] = [
+            repr(candidate),
+            repr(data.labels.tolist()),
+            repr(sorted(parts.items())),
+            *data.files,
+        ]
+        finetune.train_classifier(model, clips, config, data.runtime, seed=seed, inputs=inputs)
         found: dict[str, list[int]] = {}
-        for record in judged:
+        for record in classify(model, clips, [Part.TEST], config.batch_size, device):
             found.setdefault(record.video_id, []).append(record.predicted)
-        tested = [v.video_id for v, wanted in zip(arena.videos, fold.tested, strict=True) if wanted]
+        tested = [v.video_id for v, wanted in zip(data.videos, fold.tested, strict=True) if wanted]
         return np.array([found[video] for video in tested], dtype=np.int64)
 
     return predict
 
 
 def _from_scratch(classes: Sequence[int]) -> PropertyClassifier:
+    from pipeline.encoder.model import Heads, PropertyClassifier
+    from pipeline.encoder.scene_encoder import SceneEncoder
+
     encoder = SceneEncoder()
     return PropertyClassifier(encoder, Heads(encoder.dim, classes), classes)
 
 
-def _assignments(arena: Arena, parts: dict[str, Part]) -> list[Assignment]:
-    return [
-        Assignment(video_id=v.video_id, object_id=v.object_id, part=parts.get(v.video_id, Part.UNUSED))
-        for v in arena.videos
-    ]
-
-
-KINDS: dict[str, Callable[[Candidate, Arena], Predict]] = {
+KINDS: dict[str, Callable[[Candidate, CrossValidationData], Predict]] = {
     "constant": _constant,
     "trees": _trees,
-    "votes": _votes,
+    "frame_heads": _frame_heads,
     "gradient": _gradient,
 }

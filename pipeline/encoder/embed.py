@@ -6,12 +6,12 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from pipeline.embeddings import FLIPS
 from pipeline.encoder.model import FrameEncoder
 from pipeline.errors import UserError
 from pipeline.records import Assignment, Embedding, Flip, Part
+from pipeline.runtime import track
 from pipeline.videos.frames.store import FrameStore
 
 AXES: dict[Flip, tuple[int, ...]] = {"none": (), "horizontal": (2,), "vertical": (1,), "both": (1, 2)}
@@ -39,14 +39,14 @@ def embed_videos(
     blocks: list[torch.Tensor] = []
     index: list[Embedding] = []
     used = [a for a in assignments if a.part != Part.UNUSED]
-    for assignment in tqdm(used, desc="embed", unit="video", disable=None):
+    for assignment in track(used, "embed", "video"):
         rows = store.rows(assignment.video_id)
         pixels = store.pictures(assignment.video_id)
         flips = FLIPS if assignment.part == Part.TRAIN else FLIPS[:1]
         # All mirrored versions in one tensor: larger batches cost less a frame.
         frames = torch.from_numpy(np.concatenate([np.flip(pixels, AXES[flip]) for flip in flips]))
-        moments = torch.tensor([store.index[row].frame_index for row in rows] * len(flips))
-        batches = zip(frames.split(batch_size), moments.split(batch_size), strict=True)
+        frame_indices = torch.tensor([store.index[row].frame_index for row in rows] * len(flips))
+        batches = zip(frames.split(batch_size), frame_indices.split(batch_size), strict=True)
         block = torch.cat([encoder(some.to(device), when.to(device)).float().cpu() for some, when in batches])
         if not block.isfinite().all():
             raise UserError(f"{assignment.video_id}: its embedding is not finite; check the video and the encoder")

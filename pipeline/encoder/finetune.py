@@ -1,65 +1,37 @@
 """Training of the tactile encoder on property labels.
 
-`paper` and `release` learn visual prompts and heads on a frozen CLIP by gradients (the paper's section III-A); `strong`
-fits heads to the frozen features of an encoder that scenes have pretrained.
+`paper` and `release` learn visual prompts and heads on a frozen CLIP by gradients (the paper's section III-A);
+`pretrained` fits heads to the frozen features of an encoder that synthetic pictures have pretrained.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
-import torch
-from torch.nn import functional as F
-from torch.utils.data import DataLoader
-from transformers import EvalPrediction
 
+from pipeline.card import write_card
 from pipeline.config import EncoderConfig, RuntimeConfig
-from pipeline.encoder.clips import ClipDataset, LabelledVideo, collate_clips
-from pipeline.encoder.frame_classifier import FrameVotes
-from pipeline.encoder.frame_heads import Clips, choose_strength, fit_votes
-from pipeline.encoder.model import FrameEncoder, PropertyClassifier
+from pipeline.encoder.clips import ClipDataset, EncoderData, collate_clips, describe_clips
+from pipeline.encoder.frame_classifier import JointFrameClassifier, choose_strength, fit_frame_heads
+from pipeline.encoder.model import PropertyClassifier
 from pipeline.encoder.recipes import property_classifier
-from pipeline.errors import UserError
-from pipeline.records import Assignment, Classification, Measurement, Part
+from pipeline.io import fingerprint
+from pipeline.records import Measurement, Part
 from pipeline.runtime import resolve_device, seed_everything
 from pipeline.trainable import load_trainable
-from pipeline.training import (
-    Log,
-    TrainableTrainer,
-    Watch,
-    checkpoint_dir,
-    fingerprint,
-    train,
-    training_arguments,
-)
 from pipeline.videos.catalogue import Catalogue
-from pipeline.videos.frames.store import FrameStore
 
+if TYPE_CHECKING:
+    from transformers import EvalPrediction, TrainerCallback
 
-@dataclass(frozen=True)
-class EncoderData:
-    """What the encoder is trained and judged on."""
-
-    store: FrameStore
-    catalogue: Catalogue
-    assignments: Sequence[Assignment]
-    per_video: int
-
-    def videos(self, part: Part) -> list[LabelledVideo]:
-        """The labelled videos of a part."""
-        return [
-            LabelledVideo(a.video_id, self.catalogue.labels(a.object_id)) for a in self.assignments if a.part == part
-        ]
-
-    @property
-    def classes(self) -> list[int]:
-        """Number of classes of each property."""
-        return [len(p.levels) for p in self.catalogue.properties]
+GRADIENT_SETTINGS = {
+    *("prompts", "prompt_layers", "epochs", "batch_size", "learning_rate", "weight_decay", "flip_probability")
+}
+"""Of the section `encoder`: they mean nothing where heads are fitted."""
 
 
 def finetune(
@@ -70,36 +42,37 @@ def finetune(
     seed: int,
     inputs: Sequence[Path],
     pretrained: Path,
-    log: Log | None = None,
+    callbacks: Sequence[TrainerCallback] = (),
 ) -> tuple[PropertyClassifier, list[Measurement]]:
     """Train the classifier of the recipe.
 
     Args:
         inputs: Files that a training by gradients depends on, for its checkpoints' fingerprint.
-        pretrained: File of the encoder that scenes have pretrained; read for `strong` alone.
+        callbacks: Further callbacks for its Trainer, such as tracking.
+        pretrained: File of the encoder that synthetic pictures have pretrained; read for `pretrained` alone.
 
     Returns:
         The classifier, and its training's curve.
     """
     seed_everything(seed)
     model = property_classifier(config, data.classes)
-    if isinstance(model, FrameVotes):
+    if isinstance(model, JointFrameClassifier):
         load_trainable(model.encoder, pretrained)
         return model, fit_heads(model, data, config, runtime, seed)
-    return model, train_classifier(model, data, config, runtime, seed=seed, inputs=inputs, log=log)
+    return model, train_classifier(model, data, config, runtime, seed=seed, inputs=inputs, callbacks=callbacks)
 
 
 def fit_heads(
-    model: FrameVotes, data: EncoderData, config: EncoderConfig, runtime: RuntimeConfig, seed: int
+    model: JointFrameClassifier, data: EncoderData, config: EncoderConfig, runtime: RuntimeConfig, seed: int
 ) -> list[Measurement]:
-    """Fit a strong classifier's heads to the evaluation clips of the training videos."""
+    """Fit a per-frame classifier's heads to the evaluation clips of the training videos."""
     videos = data.videos(Part.TRAIN)
     clips = describe_clips(model.encoder, data, videos, config.embed_batch_size, resolve_device(runtime.device))
     labels = np.array([video.labels for video in videos])
     owners = {a.video_id: a.object_id for a in data.assignments}
     objects = [owners[video.video_id] for video in videos]
     strength, curve = choose_strength(clips, labels, objects, data.classes, seed)
-    fit_votes(clips, labels, objects, data.classes, strength).put_into(model)
+    fit_frame_heads(clips, labels, objects, data.classes, strength).copy_into(model)
     return curve
 
 
@@ -111,12 +84,15 @@ def train_classifier(
     *,
     seed: int,
     inputs: Sequence[Path | str],
-    log: Log | None = None,
+    callbacks: Sequence[TrainerCallback] = (),
 ) -> list[Measurement]:
     """Train what is not frozen; the epoch of best combined validation accuracy is kept (ties: the first).
 
     Without validation videos there is nothing to choose by, and the last epoch is kept.
     """
+    # Imported here, since fitted heads need no Trainer, and importing it takes seconds.
+    from pipeline.training import TrainableTrainer, TrainingMonitor, checkpoint_dir, train, training_arguments
+
     train_set = ClipDataset(
         data.store,
         data.videos(Part.TRAIN),
@@ -125,9 +101,9 @@ def train_classifier(
         flip_probability=config.flip_probability,
     )
     validation = data.videos(Part.VALIDATION)
-    mark = fingerprint(config, seed, data.per_video, *inputs)
+    folder = checkpoint_dir(f"finetune_encoder-{seed}", fingerprint(config, seed, data.per_video, *inputs))
     arguments = training_arguments(
-        checkpoint_dir(f"finetune_encoder-{seed}", mark),
+        folder,
         runtime,
         seed,
         num_train_epochs=config.epochs,
@@ -149,10 +125,37 @@ def train_classifier(
         eval_dataset=ClipDataset(data.store, validation, per_video=data.per_video) if validation else None,
         data_collator=collate_clips,
         compute_metrics=lambda prediction: accuracies(prediction, data.catalogue),
-        callbacks=[Watch(log)],
-        wave=math.ceil(len(train_set) / config.batch_size) if config.recipe == "release" else None,
+        callbacks=[TrainingMonitor(), *callbacks],
+        wave=math.ceil(len(train_set) / config.batch_size) if model.cosine_per_epoch else None,
     )
     return train(trainer).history
+
+
+def write_encoder_card(
+    folder: Path, data: EncoderData, config: EncoderConfig, seed: int, pretrained: Path, source: str
+) -> None:
+    """Write the card of a fine-tuned encoder beside it."""
+    fitted = config.recipe == "pretrained"
+    names = [p.name for p in data.catalogue.properties]
+    training = [a for a in data.assignments if a.part == Part.TRAIN]
+    unused = {"weights", "standardize", "embed_batch_size"} | (GRADIENT_SETTINGS if fitted else set())
+    write_card(
+        folder,
+        f"Tactile encoder with property heads, recipe {config.recipe}",
+        bases={"network pretrained on synthetic pictures": pretrained} if fitted else {"CLIP": Path(config.weights)},
+        data={
+            f"training videos ({source})": len(training),
+            "training objects": len({a.object_id for a in training}),
+            "frames a video": data.per_video,
+            "properties": names,
+        },
+        settings={**config.model_dump(exclude=unused), "seed": seed},
+        limits=(
+            f"It gives classes of {', '.join(names)} as annotators rated them, and no physical quantity.",
+            "It knows objects and sensors only as its training videos show them.",
+            "Weights of the base model that were frozen are not in this folder.",
+        )[: 2 if fitted else 3],
+    )
 
 
 def accuracies(prediction: EvalPrediction, catalogue: Catalogue) -> dict[str, float]:
@@ -163,66 +166,3 @@ def accuracies(prediction: EvalPrediction, catalogue: Catalogue) -> dict[str, fl
     right = guesses == labels
     single = {f"validation_{p.name}": float(r.mean()) for p, r in zip(catalogue.properties, right.T, strict=True)}
     return {**single, "validation_combined": float(right.all(1).mean())}
-
-
-@torch.inference_mode()
-def describe_clips(
-    encoder: FrameEncoder, data: EncoderData, videos: Sequence[LabelledVideo], batch_size: int, device: torch.device
-) -> Clips:
-    """What the encoder says of the frames of each video's evaluation clip: float32, videos x frames x features."""
-    encoder = encoder.to(device).eval()
-    clips = ClipDataset(data.store, videos, per_video=data.per_video)
-    features = []
-    for batch in DataLoader(clips, batch_size=max(1, batch_size // data.per_video), collate_fn=collate_clips):
-        frames, moments = batch["frames"].to(device), batch["moments"].to(device)
-        described = encoder.describe(frames.flatten(0, 1), moments.flatten())
-        features.append(described.view(*frames.shape[:2], -1).float().cpu())
-    found = torch.cat(features)
-    _check_finite(found.flatten(1), videos)
-    return found.numpy()
-
-
-@torch.inference_mode()
-def classify(
-    model: PropertyClassifier, data: EncoderData, parts: Sequence[Part], batch_size: int, device: torch.device
-) -> list[Classification]:
-    """What the heads say about the evaluation clip of each video of these parts."""
-    model = model.to(device).eval()
-    objects = {a.video_id: a.object_id for a in data.assignments}
-    records = []
-    for part in parts:
-        videos = data.videos(part)
-        clips = ClipDataset(data.store, videos, per_video=data.per_video)
-        outputs = [
-            model(batch["frames"].to(device), batch["moments"].to(device))["logits"].cpu()
-            for batch in DataLoader(clips, batch_size=batch_size, collate_fn=collate_clips)
-        ]
-        if not outputs:
-            continue
-        logits = torch.cat(outputs)
-        _check_finite(logits, videos)
-        decided = model.decide(logits)
-        for index, property_ in enumerate(data.catalogue.properties):
-            rows = F.softmax(logits.split(data.classes, dim=1)[index].double(), dim=1)
-            for video, row, classes in zip(videos, rows, decided.tolist(), strict=True):
-                records.append(
-                    Classification(
-                        video_id=video.video_id,
-                        object_id=objects[video.video_id],
-                        part=part,
-                        property=property_.name,
-                        expected=video.labels[index],
-                        predicted=classes[index],
-                        probabilities=tuple(row.tolist()),
-                    )
-                )
-    return records
-
-
-def _check_finite(values: torch.Tensor, videos: Sequence[LabelledVideo]) -> None:
-    """Values are videos x whatever."""
-    for video, finite in zip(videos, values.isfinite().all(1).tolist(), strict=True):
-        if not finite:
-            raise UserError(
-                f"{video.video_id}: what the encoder says of it is not finite; check the video and encoder.weights"
-            )

@@ -1,20 +1,46 @@
-"""The classifier of the strong recipe: each frame votes, and the properties are decided together."""
+"""The recipe `pretrained`: a per-frame classifier on frozen features of a pretrained network, with joint decoding.
+
+Each property has a logistic regression on the standardised features of single frames. A video's probabilities are the
+mean over its frames. The properties are then decided together, as objects that share one class often share others.
+Logistic regression is convex, so there is nothing to schedule; its one setting, the penalty on weights, is chosen by a
+cross-validation inside the training objects.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import nn
 
-from pipeline.encoder.baseline.predictor import decode_jointly
-from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
+from pipeline.config import EncoderConfig
+from pipeline.encoder.baseline.predictor import Labels, decode_jointly, log_dependence
+from pipeline.encoder.baseline.validation import deal
+from pipeline.encoder.clip import load_visual_tower
+from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier, TactileEncoder
+from pipeline.encoder.scene_encoder import SceneEncoder
+from pipeline.records import Measurement
+from pipeline.runtime import derive_seed
 
 FARTHEST = 5.0
-"""Standardised features are held within: one wild frame must not outvote all others."""
+"""Standardised features are held within: one wild frame must not outweigh all others."""
+STRENGTHS = (3e-4, 1e-3, 3e-3, 1e-2)
+"""Inverse weights of the penalty (scikit-learn's C) that are tried."""
+FOLDS = 5
+ROUNDS = 500
+"""Of the solver, at most."""
+ABSENT = -10.0
+"""Bias of a class that training lacks: a probability of some 5e-5."""
+
+Clips = npt.NDArray[np.float32]
+"""Videos x frames x features."""
 
 
-class FrameVotes(PropertyClassifier):
+class JointFrameClassifier(PropertyClassifier):
     """Standardised features, one linear layer a property, probabilities averaged over frames, one joint decision.
 
     The decision is the combination of classes that maximises the sum of log probabilities and the log of how much more
@@ -35,11 +61,120 @@ class FrameVotes(PropertyClassifier):
 
     def classify(self, features: torch.Tensor) -> list[torch.Tensor]:
         """Log of the mean probability a property, batch x classes, of features, batch x frames x dim."""
-        votes: list[torch.Tensor] = self.heads(self.standardise(features))
+        logits: list[torch.Tensor] = self.heads(self.standardise(features))
         # In logarithms throughout: a frame that is sure of a class gives the others a probability of 0 in float32.
-        return [v.log_softmax(-1).logsumexp(1) - torch.tensor(float(v.shape[1])).log() for v in votes]
+        return [z.log_softmax(-1).logsumexp(1) - torch.tensor(float(z.shape[1])).log() for z in logits]
 
     def decide(self, logits: torch.Tensor) -> torch.Tensor:
         """The most probable combination: int64, batch x properties."""
         evidence = [z.log_softmax(1).numpy() for z in logits.detach().cpu().double().split(self.classes, dim=1)]
         return torch.from_numpy(decode_jointly(evidence, self.dependence.detach().cpu().double().numpy()))
+
+
+@dataclass(frozen=True)
+class FittedHeads:
+    """What `fit_frame_heads` finds, in the form in which `JointFrameClassifier` holds it."""
+
+    centre: npt.NDArray[np.float32]
+    spread: npt.NDArray[np.float32]
+    weights: list[npt.NDArray[np.float64]]
+    """Classes x features of each property."""
+    biases: list[npt.NDArray[np.float64]]
+    dependence: npt.NDArray[np.float64]
+
+    def evidence(self, clips: Clips) -> list[npt.NDArray[np.float64]]:
+        """Log of the mean probability over frames, videos x classes of each property."""
+        from scipy.special import log_softmax, logsumexp
+
+        scaled = np.clip((clips - self.centre) / self.spread, -FARTHEST, FARTHEST).astype(np.float64)
+        logits = [scaled @ w.T + b for w, b in zip(self.weights, self.biases, strict=True)]
+        return [logsumexp(log_softmax(z, axis=-1), axis=1) - np.log(clips.shape[1]) for z in logits]
+
+    def predict(self, clips: Clips) -> Labels:
+        """The most probable combination, videos x properties."""
+        return decode_jointly(self.evidence(clips), self.dependence)
+
+    def copy_into(self, model: JointFrameClassifier) -> None:
+        """Copy into a model's parameters."""
+        own = [model.centre, model.spread, model.dependence, *model.heads.parameters()]
+        heads = [array for pair in zip(self.weights, self.biases, strict=True) for array in pair]
+        with torch.no_grad():
+            for parameter, value in zip(own, [self.centre, self.spread, self.dependence, *heads], strict=True):
+                parameter.copy_(torch.from_numpy(value))
+
+
+def fit_frame_heads(
+    clips: Clips, labels: Labels, objects: Sequence[str], classes: Sequence[int], strength: float, *, joint: bool = True
+) -> FittedHeads:
+    """Fit the heads of all properties.
+
+    Args:
+        clips: Of the training videos.
+        labels: Videos x properties.
+        objects: Each video's object.
+        classes: How many classes each property has; one that training lacks gets a probability near 0.
+        strength: One of `STRENGTHS`.
+        joint: Whether decisions weigh how often classes occur together.
+    """
+    from sklearn.linear_model import LogisticRegression
+    from threadpoolctl import threadpool_limits
+
+    frames = clips.reshape(-1, clips.shape[2])
+    centre, spread = frames.mean(axis=0), frames.std(axis=0)
+    spread = np.where(spread > 1e-6, spread, 1).astype(np.float32)
+    scaled = np.clip((frames - centre) / spread, -FARTHEST, FARTHEST)
+    weights, biases = [], []
+    for position, count in enumerate(classes):
+        wanted = np.repeat(labels[:, position], clips.shape[1])
+        present = np.unique(wanted)
+        weight, bias = np.zeros((count, scaled.shape[1])), np.full(count, ABSENT)
+        if len(present) > 1:
+            # Small matrices: threads that wait for each other were seven times slower on two busy cores.
+            with threadpool_limits(1):
+                fitted = LogisticRegression(C=strength, max_iter=ROUNDS).fit(scaled, wanted)
+            rows, offsets = fitted.coef_, fitted.intercept_
+            if len(present) == 2:  # scikit-learn gives one row for the second class alone.
+                rows, offsets = np.concatenate([-rows, rows]) / 2, np.concatenate([-offsets, offsets]) / 2
+            weight[present], bias[present] = rows, offsets
+        else:
+            bias[present] = 0
+        weights.append(weight)
+        biases.append(bias)
+    # Rounded as a model holds it, so that both decide alike.
+    dependence = log_dependence(labels, objects, classes).astype(np.float32).astype(np.float64)
+    return FittedHeads(centre, spread, weights, biases, dependence if joint else np.zeros_like(dependence))
+
+
+def choose_strength(
+    clips: Clips, labels: Labels, objects: Sequence[str], classes: Sequence[int], seed: int, *, joint: bool = True
+) -> tuple[float, list[Measurement]]:
+    """The strength with the best combined accuracy in a grouped cross-validation over these objects (ties: the first).
+
+    Returns:
+        The strength, and what each reached: step i is the i-th of `STRENGTHS`. With fewer than two objects there is
+        nothing to compare, and the second is taken.
+    """
+    if len(set(objects)) < 2:
+        return STRENGTHS[1], []
+    folds = deal(objects, min(FOLDS, len(set(objects))), derive_seed(seed, "strength"))
+    reached = []
+    for strength in STRENGTHS:
+        right = np.zeros(len(objects), bool)
+        for held in folds:
+            tested = np.array([o in held for o in objects])
+            inner = [o for o in objects if o not in held]
+            heads = fit_frame_heads(clips[~tested], labels[~tested], inner, classes, strength, joint=joint)
+            right[tested] = (heads.predict(clips[tested]) == labels[tested]).all(axis=1)
+        reached.append(float(right.mean()))
+    curve = [Measurement(step=i, name="inner_combined", value=value) for i, value in enumerate(reached)]
+    return STRENGTHS[int(np.argmax(reached))], curve
+
+
+def base_encoder(config: EncoderConfig) -> TactileEncoder:
+    """CLIP as it comes: the ablation's base stays the same under every recipe that reads CLIP as the paper does."""
+    return TactileEncoder(load_visual_tower(Path(config.weights)))
+
+
+def property_classifier(_: EncoderConfig, classes: Sequence[int]) -> JointFrameClassifier:
+    """The network that synthetic pictures have pretrained; its weights are loaded by `finetune`."""
+    return JointFrameClassifier(SceneEncoder(), classes)

@@ -1,15 +1,17 @@
-"""Tactile encoders: frames to embeddings, and the classifier that fine-tunes an encoder on property labels."""
+"""Tactile encoders and property classifiers, and the paper's recipe: CLIP with visual prompts and three heads."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import cast
+from pathlib import Path
+from typing import ClassVar, cast
 
 import torch
 from torch import nn
 from torch.nn import functional as F
 
-from pipeline.encoder.clip import ImageFormat, VisualTower
+from pipeline.config import EncoderConfig
+from pipeline.encoder.clip import ImageFormat, VisualTower, load_visual_tower
 from pipeline.encoder.vpt import VisualPrompts
 
 
@@ -24,21 +26,21 @@ class FrameEncoder(nn.Module):
         super().__init__()
         self.dim = dim
 
-    def forward(self, frames: torch.Tensor, moments: torch.Tensor) -> torch.Tensor:
+    def forward(self, frames: torch.Tensor, frame_indices: torch.Tensor) -> torch.Tensor:
         """Embed frames as the language model is given them.
 
         Args:
             frames: uint8, batch x side x side x RGB.
-            moments: int64, batch: each frame's number in its video.
+            frame_indices: int64, batch: each frame's number in its video.
 
         Returns:
             float32, batch x dim.
         """
         raise NotImplementedError
 
-    def describe(self, frames: torch.Tensor, moments: torch.Tensor) -> torch.Tensor:
+    def describe(self, frames: torch.Tensor, frame_indices: torch.Tensor) -> torch.Tensor:
         """What the classifier is given of each frame: the same as `forward`, unless a recipe says otherwise."""
-        described: torch.Tensor = self(frames, moments)
+        described: torch.Tensor = self(frames, frame_indices)
         return described
 
 
@@ -68,7 +70,7 @@ class TactileEncoder(FrameEncoder):
         self.visual.eval()
         return self
 
-    def forward(self, frames: torch.Tensor, moments: torch.Tensor) -> torch.Tensor:
+    def forward(self, frames: torch.Tensor, frame_indices: torch.Tensor) -> torch.Tensor:
         """CLIP's own embeddings: float32, batch x dim, of frames, uint8, batch x side x side x RGB."""
         return cast(torch.Tensor, self.visual(self.pixels(frames)))
 
@@ -95,6 +97,8 @@ class PropertyClassifier(nn.Module):
     """ViFi-CLIP's mean over frames (Rasheed et al. 2023), then the properties' heads."""
 
     _keys_to_ignore_on_save = None  # read by transformers' Trainer when it reloads a checkpoint
+    cosine_per_epoch: ClassVar[bool] = False
+    """Whether the learning rate falls and rises again by a cosine as long as one epoch, or falls once in all."""
 
     def __init__(self, encoder: FrameEncoder, heads: nn.Module, classes: Sequence[int]) -> None:
         super().__init__()
@@ -103,20 +107,20 @@ class PropertyClassifier(nn.Module):
         self.classes = tuple(classes)
 
     def forward(
-        self, frames: torch.Tensor, moments: torch.Tensor, labels: torch.Tensor | None = None
+        self, frames: torch.Tensor, frame_indices: torch.Tensor, labels: torch.Tensor | None = None
     ) -> dict[str, torch.Tensor]:
         """Classify videos.
 
         Args:
             frames: uint8, batch x frames x side x side x RGB.
-            moments: int64, batch x frames: each frame's number in its video.
+            frame_indices: int64, batch x frames: each frame's number in its video.
             labels: int64, batch x properties.
 
         Returns:
             `logits`, batch x (classes of all properties, side by side), and with labels `loss`: the sum of the
             properties' cross-entropies, so that the heads are trained simultaneously.
         """
-        features = self.encoder.describe(frames.flatten(0, 1), moments.flatten())
+        features = self.encoder.describe(frames.flatten(0, 1), frame_indices.flatten())
         logits = self.classify(features.view(*frames.shape[:2], -1))
         output = {"logits": torch.cat(logits, dim=1)}
         if labels is not None:
@@ -132,3 +136,21 @@ class PropertyClassifier(nn.Module):
     def decide(self, logits: torch.Tensor) -> torch.Tensor:
         """The class of each property: int64, batch x properties, of `forward`'s logits."""
         return torch.stack([z.argmax(1) for z in logits.split(self.classes, dim=1)], dim=1)
+
+
+def base_encoder(config: EncoderConfig) -> TactileEncoder:
+    """CLIP as it comes."""
+    return TactileEncoder(load_visual_tower(Path(config.weights)))
+
+
+def property_classifier(config: EncoderConfig, classes: Sequence[int]) -> PropertyClassifier:
+    """CLIP with visual prompts that pass one shared linear map, and one linear head a property."""
+    tower = load_visual_tower(Path(config.weights))
+    encoder = TactileEncoder(tower, visual_prompts(config, tower, shared=True))
+    return PropertyClassifier(encoder, Heads(encoder.dim, classes), classes)
+
+
+def visual_prompts(config: EncoderConfig, tower: VisualTower, *, shared: bool) -> VisualPrompts:
+    """Fresh prompts that fit the tower, at as many of its layers as `encoder.prompt_layers` says (0: all)."""
+    layers = min(tower.layers, config.prompt_layers or tower.layers)
+    return VisualPrompts(layers, config.prompts, tower.width, tower.patch_area, shared=shared)

@@ -1,71 +1,115 @@
-"""Pretraining of the strong recipe's encoder: telling of pictures of invented objects what is known of them."""
+"""Synthetic pretraining of the recipe `pretrained`: predicting what is known of invented objects from pictures."""
 
 from __future__ import annotations
 
 import math
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch import nn
+from torch.nn import functional as F
+from transformers import TrainerCallback
 
 from pipeline.config import FramesConfig, PretrainConfig, RuntimeConfig
-from pipeline.encoder import synthetic as lessons_module
-from pipeline.encoder.scene_encoder import LessonModel, SceneEncoder
-from pipeline.encoder.synthetic import Lessons, draw_lessons
+from pipeline.encoder import synthetic
+from pipeline.encoder.scene_encoder import SceneEncoder
+from pipeline.encoder.synthetic import SyntheticPictures, draw_pictures
+from pipeline.io import fingerprint
 from pipeline.records import Measurement
 from pipeline.runtime import CHECKPOINTS, derive_seed, seed_everything
 from pipeline.sampling import EpochDataset
 from pipeline.scenes import invent
-from pipeline.training import (
-    Log,
-    TrainableTrainer,
-    Watch,
-    checkpoint_dir,
-    fingerprint,
-    train,
-    training_arguments,
-)
+from pipeline.training import TrainableTrainer, TrainingMonitor, checkpoint_dir, train, training_arguments
 from pipeline.videos.frames import subtraction
 from pipeline.videos.frames.subtraction import MIDDLE
 
+HIDDEN = 192
+WEIGHTS = {"quantities": 2.0, "kinds": 0.6}
+"""Of the two parts of the loss."""
 WARMUP = 0.04
 """Share of the updates."""
 HELD_OUT = 0.04
-"""Share of the lessons that the loss is told on at the end."""
+"""Share of the objects that the loss is measured on at the end."""
 REPORTS = 24
 """Points of the curve."""
 STRENGTH = (0.7, 1.4)
 """How much weaker or stronger the light of a picture may be."""
 
 
-class LessonDataset(EpochDataset[dict[str, torch.Tensor]]):
-    """Lessons as `LessonModel` takes them; what is done to pictures depends on seed, epoch and lesson alone."""
+class PretrainingModel(nn.Module):
+    """The encoder with a head that predicts, from single pictures, what is known of invented objects.
 
-    def __init__(self, lessons: Lessons, *, augment: bool, seed: int) -> None:
+    Args:
+        encoder: To be pretrained.
+        quantities: Mean and deviation of each quantity over the pictures, 2 x quantities.
+        kinds: How many flags there are.
+    """
+
+    _keys_to_ignore_on_save = None  # read by transformers' Trainer when it reloads a checkpoint
+
+    def __init__(self, encoder: SceneEncoder, quantities: torch.Tensor, kinds: int) -> None:
         super().__init__()
-        self.lessons = lessons
+        self.encoder = encoder
+        self.scale = quantities
+        outputs = quantities.shape[1] + kinds
+        self.head = nn.Sequential(
+            nn.Dropout(0.1), nn.Linear(encoder.dim, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, outputs)
+        )
+
+    def forward(self, frames: torch.Tensor, quantities: torch.Tensor, kinds: torch.Tensor) -> dict[str, torch.Tensor]:
+        """The loss on some objects: quantities, standardised, by Huber's loss, kinds by cross-entropy.
+
+        Args:
+            frames: uint8, objects x presses x side x side x RGB.
+            quantities: float32, objects x presses x quantities.
+            kinds: float32, objects x kinds.
+
+        Returns:
+            `loss`, and its two parts before they are weighed.
+        """
+        objects, presses = frames.shape[:2]
+        features = self.encoder(frames.flatten(0, 1), torch.zeros(objects * presses, dtype=torch.int64))
+        numbers, flags = self.head(features).split([quantities.shape[2], kinds.shape[1]], dim=1)
+        mean, deviation = self.scale.to(quantities)
+        wanted = ((quantities - mean) / deviation).flatten(0, 1)
+        parts = {
+            "quantities": F.smooth_l1_loss(numbers, wanted),
+            "kinds": F.binary_cross_entropy_with_logits(flags, kinds.repeat_interleave(presses, dim=0)),
+        }
+        return {"loss": cast(torch.Tensor, sum(WEIGHTS[name] * part for name, part in parts.items())), **parts}
+
+
+class PretrainingDataset(EpochDataset[dict[str, torch.Tensor]]):
+    """Pictures as `PretrainingModel` takes them; what is done to them depends on seed, epoch and object alone."""
+
+    def __init__(self, drawn: SyntheticPictures, *, augment: bool, seed: int) -> None:
+        super().__init__()
+        self.drawn = drawn
         self.augment = augment
         self.seed = seed
 
     def __len__(self) -> int:
-        return len(self.lessons.pictures)
+        return len(self.drawn.pictures)
 
     def __getitem__(self, index: int) -> dict[str, torch.Tensor]:
-        pictures = self.lessons.pictures[index]
+        pictures = self.drawn.pictures[index]
         if self.augment:
             rng = np.random.default_rng(derive_seed(self.seed, self.epoch, index))
             pictures = vary(pictures, rng)
         return {
             "frames": torch.from_numpy(np.ascontiguousarray(pictures)),
-            "quantities": torch.from_numpy(self.lessons.quantities[index]),
-            "kinds": torch.from_numpy(self.lessons.kinds[index].astype(np.float32)),
+            "quantities": torch.from_numpy(self.drawn.quantities[index]),
+            "kinds": torch.from_numpy(self.drawn.kinds[index].astype(np.float32)),
         }
 
 
 def vary(pictures: npt.NDArray[np.uint8], rng: np.random.Generator) -> npt.NDArray[np.uint8]:
-    """Mirror a lesson's pictures, all alike, and vary the light of each: uint8, presses x side x side x RGB."""
+    """Mirror an object's pictures, all alike, and vary the light of each: uint8, presses x side x side x RGB."""
     axes = tuple(axis for axis in (1, 2) if rng.random() < 0.5)
     low, high = map(math.log, STRENGTH)
     strength = np.exp(rng.uniform(low, high, (len(pictures), 1, 1, 1))).astype(np.float32)
@@ -75,30 +119,27 @@ def vary(pictures: npt.NDArray[np.uint8], rng: np.random.Generator) -> npt.NDArr
 
 
 def pretrain(
-    config: PretrainConfig, frames: FramesConfig, runtime: RuntimeConfig, log: Log | None = None
+    config: PretrainConfig, frames: FramesConfig, runtime: RuntimeConfig, callbacks: Sequence[TrainerCallback] = ()
 ) -> tuple[SceneEncoder, list[Measurement]]:
-    """Draw the lessons and train the encoder on them; a killed run goes on where it was.
+    """Draw the pictures and train the encoder on them; a killed run goes on where it was.
 
     Returns:
-        The encoder, and the curve of its loss; `held_out_*` at the last step are over lessons that it never saw.
+        The encoder, and the curve of its loss; `held_out_*` at the last step are over objects that it never saw.
     """
     seed_everything(config.seed)
-    drawing = [
-        *sorted(Path(invent.__file__).parent.rglob("*.py")),
-        Path(lessons_module.__file__),
-        Path(subtraction.__file__),
-    ]
-    mark = fingerprint(config, frames.fit, frames.size, *drawing)
-    work = CHECKPOINTS / "lessons" / mark
-    lessons = draw_lessons(config, frames, work)
-    border = len(lessons.pictures) - max(1, round(HELD_OUT * len(lessons.pictures)))
-    taught, held = (
-        Lessons(**{name: rows[part] for name, rows in vars(lessons).items()})
+    # What decides how pictures look, so that half of them are never drawn by one version and half by another.
+    code = [*sorted(Path(invent.__file__).parent.rglob("*.py")), Path(synthetic.__file__), Path(subtraction.__file__)]
+    key = fingerprint(config, frames.fit, frames.size, *code)
+    work = CHECKPOINTS / "synthetic_pictures" / key
+    drawn = draw_pictures(config, frames, work)
+    border = len(drawn.pictures) - max(1, round(HELD_OUT * len(drawn.pictures)))
+    training, held = (
+        SyntheticPictures(**{name: rows[part] for name, rows in vars(drawn).items()})
         for part in (slice(border), slice(border, None))
     )
-    model = lesson_model(SceneEncoder(), taught)
+    model = pretraining_model(SceneEncoder(), training)
     arguments = training_arguments(
-        checkpoint_dir("pretrain", mark),
+        checkpoint_dir("pretrain", key),
         runtime,
         config.seed,
         max_steps=config.steps,
@@ -112,28 +153,28 @@ def pretrain(
     trainer = TrainableTrainer(
         model=model,
         args=arguments,
-        train_dataset=LessonDataset(taught, augment=config.augment, seed=config.seed),
-        callbacks=[Watch(log)],
+        train_dataset=PretrainingDataset(training, augment=config.augment, seed=config.seed),
+        callbacks=[TrainingMonitor(), *callbacks],
     )
     history = train(trainer).history
-    told = held_out(model.cpu(), LessonDataset(held, augment=False, seed=0))
+    measured = held_out(model.cpu(), PretrainingDataset(held, augment=False, seed=0))
     shutil.rmtree(work, ignore_errors=True)
-    return model.encoder, [*history, *(Measurement(step=config.steps, name=n, value=v) for n, v in told.items())]
+    return model.encoder, [*history, *(Measurement(step=config.steps, name=n, value=v) for n, v in measured.items())]
 
 
-def lesson_model(encoder: SceneEncoder, lessons: Lessons) -> LessonModel:
-    """The encoder with a head scaled to these lessons."""
-    flat = lessons.quantities.reshape(-1, lessons.quantities.shape[2])
+def pretraining_model(encoder: SceneEncoder, drawn: SyntheticPictures) -> PretrainingModel:
+    """The encoder with a head scaled to these pictures."""
+    flat = drawn.quantities.reshape(-1, drawn.quantities.shape[2])
     scale = torch.from_numpy(np.stack([flat.mean(axis=0), flat.std(axis=0) + 1e-6]))
-    return LessonModel(encoder, scale, lessons.kinds.shape[1])
+    return PretrainingModel(encoder, scale, drawn.kinds.shape[1])
 
 
 @torch.inference_mode()
-def held_out(model: LessonModel, lessons: LessonDataset) -> dict[str, float]:
-    """Parts of the loss over lessons, each a mean."""
+def held_out(model: PretrainingModel, data: PretrainingDataset) -> dict[str, float]:
+    """Parts of the loss over objects, each a mean."""
     model.eval()
     parts = []
-    for i in range(len(lessons)):
-        item = {name: value[None] for name, value in lessons[i].items()}
+    for i in range(len(data)):
+        item = {name: value[None] for name, value in data[i].items()}
         parts.append({name: float(value) for name, value in model(**item).items()})
     return {f"held_out_{name}": float(np.mean([p[name] for p in parts])) for name in parts[0]}

@@ -1,37 +1,55 @@
-"""Which encoder and heads a recipe is made of: the one place that knows the recipes by name."""
+"""The registry of encoder recipes. A new backbone is a module with the two functions below, and a line in `RECIPES`."""
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Sequence
-from pathlib import Path
+from importlib import import_module
+from typing import TYPE_CHECKING
 
 from pipeline.config import EncoderConfig
-from pipeline.encoder.clip import load_visual_tower
-from pipeline.encoder.frame_classifier import FrameVotes
-from pipeline.encoder.model import Heads, PropertyClassifier, TactileEncoder
-from pipeline.encoder.release import PublishedEncoder, PublishedHeads
-from pipeline.encoder.scene_encoder import SceneEncoder
-from pipeline.encoder.vpt import VisualPrompts
+from pipeline.errors import UserError
+
+if TYPE_CHECKING:
+    from pipeline.encoder.model import FrameEncoder, PropertyClassifier
+
+RECIPES = {
+    "paper": "pipeline.encoder.model",
+    "release": "pipeline.encoder.release",
+    "pretrained": "pipeline.encoder.frame_classifier",
+}
+"""Values of `encoder.recipe` and their modules: named, not imported, as `octopi scale` checks them without torch."""
 
 
-def base_encoder(config: EncoderConfig) -> TactileEncoder:
-    """The off-the-shelf CLIP encoder (the ablation's base), read as the recipe reads a fine-tuned one."""
-    kind = PublishedEncoder if config.recipe == "release" else TactileEncoder
-    return kind(load_visual_tower(Path(config.weights)))
+def check_recipe(name: str) -> None:
+    """Raise UserError where no recipe has this name."""
+    if name not in RECIPES:
+        close = difflib.get_close_matches(name, RECIPES, n=1)
+        hint = f"did you mean {close[0]}? " if close else ""
+        raise UserError(f"encoder.recipe: {name} is no recipe; {hint}known: {', '.join(RECIPES)}")
+
+
+def base_encoder(config: EncoderConfig) -> FrameEncoder:
+    """The ablation's base: the off-the-shelf encoder, read as the recipe reads a fine-tuned one.
+
+    Raises:
+        UserError: for an unknown recipe, or weights that do not fit.
+    """
+    check_recipe(config.recipe)
+    encoder: FrameEncoder = import_module(RECIPES[config.recipe]).base_encoder(config)
+    return encoder
 
 
 def property_classifier(config: EncoderConfig, classes: Sequence[int]) -> PropertyClassifier:
-    """The classifier to fine-tune, or to load a fine-tuned state into.
+    """The classifier to fine-tune, or to load a fine-tuned state into. It is drawn from torch's seed.
 
     Args:
+        config: The section `encoder`.
         classes: How many classes each property has.
+
+    Raises:
+        UserError: for an unknown recipe, or weights that do not fit.
     """
-    if config.recipe == "pretrained":
-        return FrameVotes(SceneEncoder(), classes)
-    tower = load_visual_tower(Path(config.weights))
-    paper = config.recipe == "paper"
-    layers = min(tower.layers, config.prompt_layers or tower.layers)
-    prompts = VisualPrompts(layers, config.prompts, tower.width, tower.patch_area, shared=paper)
-    encoder = (TactileEncoder if paper else PublishedEncoder)(tower, prompts)
-    heads = (Heads if paper else PublishedHeads)(encoder.dim, classes)
-    return PropertyClassifier(encoder, heads, classes)
+    check_recipe(config.recipe)
+    classifier: PropertyClassifier = import_module(RECIPES[config.recipe]).property_classifier(config, classes)
+    return classifier

@@ -9,13 +9,16 @@ no trained class token: there the average takes its place.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
+from typing import ClassVar
 
 import torch
 from torch import nn
 from torch.nn import functional as F
 
-from pipeline.encoder.clip import VisualTower
-from pipeline.encoder.model import Heads, TactileEncoder
+from pipeline.config import EncoderConfig
+from pipeline.encoder.clip import VisualTower, load_visual_tower
+from pipeline.encoder.model import Heads, PropertyClassifier, TactileEncoder, visual_prompts
 from pipeline.encoder.vpt import VisualPrompts
 
 HIDDEN = 512
@@ -39,16 +42,16 @@ class PublishedEncoder(TactileEncoder):
     def _keep(self, _: nn.Module, __: tuple[torch.Tensor, ...], tokens: torch.Tensor) -> None:
         self._token = tokens[:, 1:].mean(1) if self.averages else tokens[:, 0]
 
-    def forward(self, frames: torch.Tensor, moments: torch.Tensor) -> torch.Tensor:
+    def forward(self, frames: torch.Tensor, frame_indices: torch.Tensor) -> torch.Tensor:
         """The class token, and the frame's number: float32, batch x width."""
         self.visual(self.pixels(frames))
-        return self._token + sinusoid(moments, self.dim).to(self._token.dtype)
+        return self._token + sinusoid(frame_indices, self.dim).to(self._token.dtype)
 
-    def describe(self, frames: torch.Tensor, moments: torch.Tensor) -> torch.Tensor:
+    def describe(self, frames: torch.Tensor, frame_indices: torch.Tensor) -> torch.Tensor:
         """The same with the class token normalised."""
         self.visual(self.pixels(frames))
         normalised: torch.Tensor = self.visual.get_submodule("ln_post")(self._token)
-        return normalised + sinusoid(moments, self.dim).to(normalised.dtype)
+        return normalised + sinusoid(frame_indices, self.dim).to(normalised.dtype)
 
 
 class PublishedHeads(nn.Module):
@@ -67,12 +70,30 @@ class PublishedHeads(nn.Module):
         return logits
 
 
-def sinusoid(moments: torch.Tensor, dim: int) -> torch.Tensor:
-    """sin and cos of t / 10000^(2 i / dim) by turns: float32, moments x dim.
+class PublishedClassifier(PropertyClassifier):
+    """Trained with a cosine as long as one epoch, so that the rate oscillates."""
+
+    cosine_per_epoch: ClassVar[bool] = True
+
+
+def base_encoder(config: EncoderConfig) -> PublishedEncoder:
+    """CLIP as it comes, read at its class token."""
+    return PublishedEncoder(load_visual_tower(Path(config.weights)))
+
+
+def property_classifier(config: EncoderConfig, classes: Sequence[int]) -> PropertyClassifier:
+    """CLIP with visual prompts of their own at every layer, a shared hidden layer and one linear head a property."""
+    tower = load_visual_tower(Path(config.weights))
+    encoder = PublishedEncoder(tower, visual_prompts(config, tower, shared=False))
+    return PublishedClassifier(encoder, PublishedHeads(encoder.dim, classes), classes)
+
+
+def sinusoid(frame_indices: torch.Tensor, dim: int) -> torch.Tensor:
+    """sin and cos of t / 10000^(2 i / dim) by turns: float32, frame_indices x dim.
 
     Computed in float64, on the CPU since not every device has it: in float32 late frames lose digits, in half precision
     the first rates already fall together.
     """
     rates = LONGEST_WAVE ** (-torch.arange(0, dim, 2, dtype=torch.float64) / dim)
-    angles = moments.cpu().double()[:, None] * rates
-    return torch.stack([angles.sin(), angles.cos()], dim=-1).flatten(1)[:, :dim].float().to(moments.device)
+    angles = frame_indices.cpu().double()[:, None] * rates
+    return torch.stack([angles.sin(), angles.cos()], dim=-1).flatten(1)[:, :dim].float().to(frame_indices.device)

@@ -1,8 +1,8 @@
 """Pictures of invented objects with all that is known of each: what an encoder is pretrained on.
 
-A lesson is one invented object (`pipeline.scenes.invent`), pressed at a few forces into as many sensors of different
-light. Its pictures are differences to the no-contact frame, made as those of real videos are. Nothing of any real
-object goes in but the sensor's measured light.
+Each invented object (`pipeline.scenes.invent`) is pressed at a few forces into as many sensors of different light. Its
+pictures are differences to the no-contact frame, made as those of real videos are. Nothing of any real object goes in
+but the sensor's measured light.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from pipeline.scenes.measure import CUTOFF, bump_share, texture
 from pipeline.videos.frames.subtraction import subtract
 
 WIDTH, HEIGHT = 160, 120
-"""Pixels that lessons are drawn at before they are fitted to the encoder's size."""
+"""Pixels that pictures are drawn at before they are fitted to the encoder's size."""
 PITCH = IMAGE_MM[0] / WIDTH
 SIDE = int(np.hypot(WIDTH, HEIGHT) + 8 / PITCH) | 1
 """Of the pressed patch: the view at every angle and 4 mm around it; odd, so that a pixel is in the middle."""
@@ -43,7 +43,7 @@ SENSORS = 24
 QUALITY = (60, 96)
 """JPEG quality between which a picture is coded: real frames went through a lossy codec too."""
 BANDS_MM = (0.3, 0.6, 1.2, 2.4, 4.8)
-"""Borders between the wavelengths whose heights are to be told."""
+"""Borders between the wavelengths whose heights are to be predicted."""
 BODIES = ("flat", "round", "bar", "wedge")
 
 QUANTITIES: tuple[str, ...] = (
@@ -56,24 +56,24 @@ QUANTITIES: tuple[str, ...] = (
     *(f"log10 surface below {band} mm" for band in BANDS_MM),
     *(f"log10 skin below {band} mm" for band in BANDS_MM),
 )
-"""What is to be told of each press as a number."""
+"""What is to be predicted of each press as a number."""
 KINDS: tuple[str, ...] = (*LAYERS, *BODIES)
-"""What is to be told of each object as present or absent."""
+"""What is to be predicted of each object as present or absent."""
 
 CHUNK = 50
-"""Lessons that one process draws at a time, and that a killed drawing loses at most for each process."""
+"""Objects that one process draws at a time, and that a killed drawing loses at most for each process."""
 
 
 @dataclass(frozen=True)
-class Lessons:
-    """Lessons drawn; arrays have one row a lesson."""
+class SyntheticPictures:
+    """Drawn pictures and what is known of them; arrays have one row an object."""
 
     pictures: npt.NDArray[np.uint8]
-    """Lessons x presses x size x size x RGB."""
+    """Objects x presses x size x size x RGB."""
     quantities: npt.NDArray[np.float32]
-    """Lessons x presses x `QUANTITIES`."""
+    """Objects x presses x `QUANTITIES`."""
     kinds: npt.NDArray[np.uint8]
-    """Lessons x `KINDS`."""
+    """Objects x `KINDS`."""
 
 
 @dataclass(frozen=True)
@@ -85,25 +85,27 @@ class _Job:
     file: Path
 
     def __str__(self) -> str:
-        return f"lessons {self.first} to {self.last}"
+        return f"synthetic objects {self.first} to {self.last}"
 
 
-def draw_lessons(config: PretrainConfig, frames: FramesConfig, folder: Path) -> Lessons:
-    """Draw all lessons, in as many processes as there are cores; what is finished waits in `folder`.
+def draw_pictures(config: PretrainConfig, frames: FramesConfig, folder: Path) -> SyntheticPictures:
+    """Draw all objects, in as many processes as there are cores; what is finished waits in `folder`.
 
-    Lesson i depends on the seed and i alone.
+    Object i depends on the seed and i alone.
     """
     folder.mkdir(parents=True, exist_ok=True)
     borders = range(0, config.objects, CHUNK)
     jobs = [_Job(i, min(i + CHUNK, config.objects), config, frames, folder / f"{i:06d}.npz") for i in borders]
-    for _ in run_parallel(_draw, [job for job in jobs if not job.file.is_file()], "lessons", "chunk"):
+    for _ in run_parallel(_draw, [job for job in jobs if not job.file.is_file()], "synthetic pictures", "chunk"):
         pass
     parts = [np.load(job.file) for job in jobs]
-    return Lessons(*(np.concatenate([part[name] for part in parts]) for name in Lessons.__dataclass_fields__))
+    return SyntheticPictures(
+        *(np.concatenate([part[name] for part in parts]) for name in SyntheticPictures.__dataclass_fields__)
+    )
 
 
-def draw_lesson(number: int, config: PretrainConfig, frames: FramesConfig) -> Lessons:
-    """One lesson, in arrays of one row."""
+def draw_object(number: int, config: PretrainConfig, frames: FramesConfig) -> SyntheticPictures:
+    """One object, in arrays of one row."""
     rng = np.random.default_rng(derive_seed(config.seed, "lesson", number))
     recipe = invent(rng)
     surface = heights(recipe.surface, SIDE, PITCH, rng)
@@ -125,7 +127,7 @@ def draw_lesson(number: int, config: PretrainConfig, frames: FramesConfig) -> Le
         quantities.append(known)
         pictures.append(_picture(skin, sensors()[int(rng.integers(SENSORS))], rng, frames))
     present = {layer.kind for layer in recipe.relief} | {recipe.body.kind}
-    return Lessons(
+    return SyntheticPictures(
         pictures=np.stack(pictures)[None],
         quantities=np.array(quantities, np.float32)[None],
         kinds=np.array([[kind in present for kind in KINDS]], np.uint8),
@@ -134,14 +136,14 @@ def draw_lesson(number: int, config: PretrainConfig, frames: FramesConfig) -> Le
 
 @lru_cache(maxsize=1)
 def sensors() -> list[Sensor]:
-    """The sensors that lessons are seen through; each has its own background, tints and dust."""
+    """The sensors that objects are seen through; each has its own background, tints and dust."""
     return [make_sensor.__wrapped__(WIDTH, HEIGHT, seed) for seed in range(SENSORS)]
 
 
 def _draw(job: _Job) -> None:
     cv2.setNumThreads(1)
-    drawn = [draw_lesson(number, job.config, job.frames) for number in range(job.first, job.last)]
-    names = Lessons.__dataclass_fields__
+    drawn = [draw_object(number, job.config, job.frames) for number in range(job.first, job.last)]
+    names = SyntheticPictures.__dataclass_fields__
     with atomic(job.file) as temporary, temporary.open("wb") as stream:
         rows: dict[str, Any] = {name: np.concatenate([getattr(d, name) for d in drawn]) for name in names}
         np.savez(stream, **rows)

@@ -1,7 +1,12 @@
-"""Loading of the language model and its tokenizer from a folder, never from a hub."""
+"""Loading of the language model, its tokenizer and its adapter from folders, never from a hub.
+
+Adapters are in PEFT's own format: plain `PeftModel.from_pretrained(base, folder)` loads them. PEFT is imported where it
+is needed: a model without an adapter is ready seconds sooner.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -17,9 +22,13 @@ from transformers import (
 )
 
 from pipeline.errors import UserError
+from pipeline.io import read_json, write_json
 from pipeline.language.chat import add_tactile_tokens
 from pipeline.runtime import Quantization
 from pipeline.weights import GET_LLM, check_language
+
+ADAPTER_CONFIG = "adapter_config.json"
+ADAPTER_WEIGHTS = "adapter_model.safetensors"
 
 
 def load_tokenizer(folder: Path) -> PreTrainedTokenizerBase:
@@ -92,3 +101,39 @@ def _four_bits(dtype: torch.dtype) -> dict[str, Any]:
         bnb_4bit_compute_dtype=dtype,
     )
     return {"quantization_config": config, "device_map": {"": torch.cuda.current_device()}}
+
+
+def save_adapter(llm: PreTrainedModel, folder: Path, state: Mapping[str, torch.Tensor]) -> None:
+    """Write the adapter of a PEFT model, the same bytes for the same values; of others nothing.
+
+    Args:
+        state: The language model's parameters by name, whole even where its own are sharded.
+    """
+    from peft import PeftModel
+
+    if isinstance(llm, PeftModel):
+        llm.save_pretrained(str(folder), state_dict=dict(state))
+        # PEFT writes a set, whose order differs from process to process, and an empty model card.
+        values = read_json(folder / ADAPTER_CONFIG)
+        write_json(folder / ADAPTER_CONFIG, {**values, "target_modules": sorted(values["target_modules"])})
+        (folder / "README.md").unlink(missing_ok=True)
+
+
+def load_adapter(llm: PreTrainedModel, folder: Path) -> PreTrainedModel:
+    """The language model with the adapter of a folder on it (float32, frozen).
+
+    Raises:
+        UserError: for a missing file, a pickle, or an adapter of another language model.
+    """
+    from peft import PeftModel
+
+    for name in (ADAPTER_CONFIG, ADAPTER_WEIGHTS):
+        if not (folder / name).is_file():
+            raise UserError(f"{folder / name}: no such file (pickled adapters are refused); `dvc repro` makes it")
+    try:
+        return PeftModel.from_pretrained(llm, str(folder))
+    except (OSError, RuntimeError, ValueError, KeyError, TypeError, SafetensorError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise UserError(
+            f"{folder}: its adapter is broken or of another language model ({reason}); run `dvc repro`"
+        ) from None

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 import torch
-from tqdm import tqdm
 from transformers import PreTrainedTokenizerBase, StoppingCriteria, StoppingCriteriaList
 
 from pipeline.embeddings import TactileFeatures
@@ -16,10 +15,11 @@ from pipeline.language.chat import encode, render
 from pipeline.language.conversations import check_length, evaluation_features, pad_features
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.records import Opd, Prediction, Question, Turn
+from pipeline.runtime import track
 
 
 @dataclass(frozen=True)
-class Asking:
+class GenerationSettings:
     """How questions are put: the same for every variant."""
 
     system_prompt: str
@@ -30,7 +30,7 @@ class Asking:
 
 
 @dataclass(frozen=True)
-class _Said:
+class _Generated:
     text: str
     tokens: int
     truncated: bool
@@ -52,7 +52,7 @@ def answer(
     store: TactileFeatures,
     questions: Sequence[Question],
     opd: Opd,
-    asking: Asking,
+    settings: GenerationSettings,
 ) -> list[Prediction]:
     """Answer every question that has a dialogue in this OPD mode; later turns see the model's own earlier answers.
 
@@ -70,22 +70,23 @@ def answer(
     model.eval()
     tokenizer = model.tokenizer
     asked = [(q, d) for q in questions if (d := q.dialogue(opd))]
-    said: dict[str, list[_Said]] = {q.question_id: [] for q, _ in asked}
+    said: dict[str, list[_Generated]] = {q.question_id: [] for q, _ in asked}
     for number in range(max((len(d.turns) for _, d in asked), default=0)):
         waiting = []
         for question, dialogue in asked:
             if number < len(dialogue.turns):
                 before = [s.text for s in said[question.question_id]]
                 turns = [Turn(user=t.user, assistant=a) for t, a in zip(dialogue.turns, [*before, ""], strict=False)]
-                prompt = _prompt(turns, tokenizer, asking)
+                prompt = _prompt(turns, tokenizer, settings)
                 check_length(question.question_id, len(prompt) + 1, model.positions)
                 waiting.append((question, prompt))
         # Neighbours of like length share a batch, so little is spent on padding.
         waiting.sort(key=lambda item: len(item[1]))
-        for start in tqdm(range(0, len(waiting), asking.batch_size), desc=f"turn {number + 1}", disable=None):
-            batch = waiting[start : start + asking.batch_size]
-            features = [evaluation_features(q, store, asking.per_video) for q, _ in batch]
-            texts = _generate(model, [ids for _, ids in batch], features, asking.max_new_tokens)
+        starts = range(0, len(waiting), settings.batch_size)
+        for start in track(starts, f"answers, turn {number + 1}", "batch"):
+            batch = waiting[start : start + settings.batch_size]
+            features = [evaluation_features(q, store, settings.per_video) for q, _ in batch]
+            texts = _generate(model, [ids for _, ids in batch], features, settings.max_new_tokens)
             for (question, _), text in zip(batch, texts, strict=True):
                 said[question.question_id].append(text)
     return [
@@ -100,11 +101,11 @@ def answer(
     ]
 
 
-def _prompt(turns: Sequence[Turn], tokenizer: PreTrainedTokenizerBase, asking: Asking) -> tuple[int, ...]:
+def _prompt(turns: Sequence[Turn], tokenizer: PreTrainedTokenizerBase, settings: GenerationSettings) -> tuple[int, ...]:
     rendered = render(
         turns,
-        system_prompt=asking.system_prompt,
-        frames=asking.per_video,
+        system_prompt=settings.system_prompt,
+        frames=settings.per_video,
         eos=str(tokenizer.eos_token),
         complete=False,
     )
@@ -113,7 +114,7 @@ def _prompt(turns: Sequence[Turn], tokenizer: PreTrainedTokenizerBase, asking: A
 
 def _generate(
     model: OctopiForCausalLM, prompts: Sequence[Sequence[int]], features: Sequence[torch.Tensor], max_new_tokens: int
-) -> list[_Said]:
+) -> list[_Generated]:
     """Generate one answer a prompt; prompts are padded on the left, so that all answers start at one column."""
     tokenizer = model.tokenizer
     device = model.connector.delimiters.device
@@ -139,10 +140,10 @@ def _generate(
     return [_read(row[:most], tokenizer) for row, most in zip(new.tolist(), room.tolist(), strict=True)]
 
 
-def _read(tokens: list[int], tokenizer: PreTrainedTokenizerBase) -> _Said:
+def _read(tokens: list[int], tokenizer: PreTrainedTokenizerBase) -> _Generated:
     """What one row says, up to its end token; behind that is padding."""
     end = tokenizer.eos_token_id
     truncated = end not in tokens
     kept = tokens if truncated else tokens[: tokens.index(end)]
     text = tokenizer.decode(kept, skip_special_tokens=True).strip()
-    return _Said(text=text, tokens=len(kept) + (not truncated), truncated=truncated)
+    return _Generated(text=text, tokens=len(kept) + (not truncated), truncated=truncated)

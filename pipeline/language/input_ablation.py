@@ -66,7 +66,7 @@ class NoisyTouch:
         return self._mean + self._deviation * torch.randn(self.dim, generator=generator)
 
 
-def feel(store: EmbeddingStore, touch: Touch, questions: Sequence[Question], seed: int) -> TactileFeatures:
+def ablate_input(store: EmbeddingStore, touch: Touch, questions: Sequence[Question], seed: int) -> TactileFeatures:
     """What a variant feels of the questions' videos.
 
     `removed` is no matter of the embeddings but of the prompt, which then has no frame to put one at.

@@ -14,8 +14,7 @@ from transformers.modeling_outputs import CausalLMOutput
 
 from pipeline.errors import UserError
 from pipeline.io import save_tensors, write_json
-from pipeline.language.adapter import load_adapter, save_adapter
-from pipeline.language.base import load_llm, load_tokenizer
+from pipeline.language.base import load_adapter, load_llm, load_tokenizer, save_adapter
 from pipeline.language.cache import roomy_cache
 from pipeline.language.chat import IGNORE_INDEX, TACTILE_TOKENS
 from pipeline.language.connector import CONFIG_FILE, Connector, OctopiConfig, read_config

@@ -5,28 +5,24 @@ from __future__ import annotations
 import logging
 import os
 import random
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
-from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig, TrainConfig
-from pipeline.embeddings import EmbeddingStore
+from transformers import TrainerCallback
+
+from pipeline.card import write_card
+from pipeline.config import LanguageConfig, LoraTrainConfig, Params, RuntimeConfig, TrainConfig
+from pipeline.embeddings import TENSOR_FILE, EmbeddingStore
 from pipeline.errors import UserError
-from pipeline.language.buckets import LengthBuckets
-from pipeline.language.conversations import ConversationCollator, ConversationDataset
+from pipeline.io import fingerprint, read_jsonl
+from pipeline.language.conversations import ConversationCollator, ConversationDataset, LengthBuckets
 from pipeline.language.octopi import OctopiForCausalLM
-from pipeline.records import Opd, Question
+from pipeline.records import Encoder, Opd, Question
 from pipeline.runtime import derive_seed, seed_everything
-from pipeline.training import (
-    Log,
-    TrainableTrainer,
-    Trained,
-    Watch,
-    checkpoint_dir,
-    fingerprint,
-    train,
-    training_arguments,
-)
+from pipeline.training import TrainableTrainer, Trained, TrainingMonitor, checkpoint_dir, train, training_arguments
 
 logger = logging.getLogger(__name__)
 
@@ -60,14 +56,32 @@ class Material:
     per_video: int
     flip_probability: float
     seed: int
+    source: str = "videos"
+    """`data.source`: whether the videos are synthetic."""
+    files: tuple[Path, ...] = ()
+    """Of the questions and the embeddings."""
 
-    def mark(self, config: TrainConfig, *inputs: Path) -> str:
-        """A fingerprint of all that a training depends on; `inputs` are the files of questions and embeddings, and
-        what was trained before."""
-        weights = Path(self.language.weights)
-        return fingerprint(
-            config, self.language, self.opd, self.per_video, str(self.flip_probability), self.seed, weights, *inputs
+    @classmethod
+    def load(cls, folder: Path, params: Params, encoder: Encoder, opd: Opd, seed: int) -> Self:
+        """Read the questions and one encoder's embeddings from the chain's data folder."""
+        files = (folder / "questions" / "train.jsonl", folder / "embeddings" / f"{encoder}-{seed}" / TENSOR_FILE)
+        return cls(
+            questions=read_jsonl(files[0], Question),
+            store=EmbeddingStore(files[1].parent),
+            opd=opd,
+            language=params.language,
+            per_video=params.frames.per_video,
+            flip_probability=params.encoder.flip_probability,
+            seed=params.seed + seed,
+            source=params.data.source,
+            files=files,
         )
+
+    def fingerprint(self, config: TrainConfig, *inputs: Path) -> str:
+        """A short hash of all that a training depends on; `inputs` are files of what was trained before."""
+        weights = Path(self.language.weights)
+        settings = (config, self.language, self.opd, self.per_video, str(self.flip_probability), self.seed)
+        return fingerprint(*settings, weights, *self.files, *inputs)
 
 
 def assemble(
@@ -112,12 +126,12 @@ def assemble(
 
 @dataclass(frozen=True)
 class Job:
-    """One training: its name and fingerprint (where its checkpoints lie), its seed and who listens to its curve."""
+    """One training: its name and fingerprint (where its checkpoints lie), its seed, further callbacks."""
 
     stage: str
-    mark: str
+    fingerprint: str
     seed: int
-    log: Log | None = None
+    callbacks: Sequence[TrainerCallback] = ()
 
 
 def align(
@@ -135,6 +149,38 @@ def finetune_lora(
     return _fit(model, data, config, runtime, job, rates)
 
 
+def write_model_card(folder: Path, material: Material, data: ConversationDataset, config: TrainConfig) -> None:
+    """Write the card of a model that was aligned, or fine-tuned with LoRA, beside it."""
+    tasks = Counter(str(question.task) for question in data.questions)
+    lora = isinstance(config, LoraTrainConfig)
+    write_card(
+        folder,
+        f"Octopi: a language model with touch, {'fine-tuned with LoRA' if lora else 'aligned'}",
+        bases={"language model": Path(material.language.weights)},
+        data={
+            "tactile embeddings": f"{material.store.folder.name}, {material.per_video} frames a video",
+            "questions": ", ".join(f"{count} {task}" for task, count in sorted(tasks.items())),
+            "objects": len({o for q in data.questions for o in q.objects}),
+            f"videos ({material.source})": len({v for q in data.questions for v in q.videos}),
+            "OPD": material.opd,
+        },
+        settings={
+            **config.model_dump(),
+            "flip_probability": material.flip_probability,
+            "number format": f"{material.language.dtype}, quantization {material.language.quantization}",
+            "seed": material.seed,
+        },
+        limits=(
+            "It reads embeddings of the one encoder above; those of another mean nothing to it.",
+            "It was trained on templates of "
+            + ", ".join(sorted(tasks))
+            + " alone: other questions, and scenarios (PSR), were not trained on.",
+            "It knows objects and sensors only as its training videos show them.",
+            "The language model's own weights are not in this folder and have limits of their own.",
+        ),
+    )
+
+
 def _fit(
     model: OctopiForCausalLM,
     data: ConversationDataset,
@@ -148,7 +194,7 @@ def _fit(
     seed_everything(job.seed)
     steps = config.epochs * -(-len(data) // config.batch_size)
     arguments = training_arguments(
-        checkpoint_dir(job.stage, job.mark),
+        checkpoint_dir(job.stage, job.fingerprint),
         runtime,
         job.seed,
         num_train_epochs=config.epochs,
@@ -164,7 +210,7 @@ def _fit(
         args=arguments,
         train_dataset=data,
         data_collator=ConversationCollator(int(model.tokenizer.pad_token_id)),
-        callbacks=[Watch(job.log)],
+        callbacks=[TrainingMonitor(), *job.callbacks],
         rates=rates,
         sampler=LengthBuckets(data.lengths, config.micro_batch_size, job.seed, lambda: data.epoch),
     )

@@ -1,4 +1,4 @@
-"""The contestants' cross-validation: honest, shared folds, kept over kills."""
+"""The candidates' cross-validation: honest, shared folds, kept over kills."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from pipeline.encoder.frame_heads import Clips, FittedHeads, fit_frame_heads
 from pydantic import ValidationError
 from torch.optim.optimizer import register_optimizer_step_pre_hook
 
@@ -20,12 +21,11 @@ from pipeline.encoder import frame_heads as voting
 from pipeline.encoder.baseline.features import video_features
 from pipeline.encoder.baseline.predictor import PropertyPredictor
 from pipeline.encoder.baseline.recordings import Recording, describe, recording_features
-from pipeline.encoder.baseline.validation import Fold, Predict, Verdict, deal
+from pipeline.encoder.baseline.validation import Fold, Predict, deal
 from pipeline.encoder.baseline.validation import cross_validate as fold_by_fold
 from pipeline.encoder.candidates import CANDIDATES, LEARNING_CURVE, Candidate
-from pipeline.encoder.cross_validation import Arena, frozen_encoder, judge
+from pipeline.encoder.cross_validation import CrossValidationData, cross_validate_candidate, frozen_encoder
 from pipeline.encoder.finetune import EncoderData
-from pipeline.encoder.frame_heads import Clips, Votes, fit_votes
 from pipeline.encoder.model import FrameEncoder, PropertyClassifier
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.errors import UserError
@@ -58,7 +58,7 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def arena(weights: Path, catalogue: Catalogue, tmp_path: Path) -> Arena:
+def arena(weights: Path, catalogue: Catalogue, tmp_path: Path) -> CrossValidationData:
     """Two videos an object and one more of the first; the pictures of an object are all of one grey of its own."""
     videos = [v for v in fake_videos(OBJECTS, 3) if v.video_id.endswith(("_0", "_1")) or v.object_id == "baseball"]
     folder = write_frames(tmp_path / "frames", {v.video_id: 3 for v in videos})
@@ -66,7 +66,7 @@ def arena(weights: Path, catalogue: Catalogue, tmp_path: Path) -> Arena:
     for position, video in enumerate(videos):
         pixels[3 * position : 3 * position + 3] = grey(video.object_id)
     np.save(folder / "frames.npy", pixels)
-    return Arena(
+    return CrossValidationData(
         videos=videos,
         catalogue=catalogue,
         frames=folder,
@@ -88,8 +88,8 @@ class Telling(FrameEncoder):
     def __init__(self) -> None:
         super().__init__(3)
 
-    def forward(self, frames: torch.Tensor, moments: torch.Tensor) -> torch.Tensor:
-        return torch.stack([frames[:, 0, 0, 0].float(), moments.float(), moments.float() ** 2], dim=1)
+    def forward(self, frames: torch.Tensor, frame_indices: torch.Tensor) -> torch.Tensor:
+        return torch.stack([frames[:, 0, 0, 0].float(), frame_indices.float(), frame_indices.float() ** 2], dim=1)
 
 
 def owners(clips: Clips) -> list[str]:
@@ -101,10 +101,10 @@ def owners(clips: Clips) -> list[str]:
 class Folds(list[Fold]):
     """The folds as they are asked for; the last is the one being predicted."""
 
-    def tested(self, arena: Arena) -> set[str]:
+    def tested(self, arena: CrossValidationData) -> set[str]:
         return {o for o, tested in zip(arena.objects, self[-1].tested, strict=True) if tested}
 
-    def known(self, arena: Arena) -> set[str]:
+    def known(self, arena: CrossValidationData) -> set[str]:
         return {o for o, known in zip(arena.objects, self[-1].trained, strict=True) if known}
 
 
@@ -112,7 +112,7 @@ class Folds(list[Fold]):
 def folds(monkeypatch: pytest.MonkeyPatch) -> Folds:
     seen = Folds()
 
-    def spying(predict: Predict, *args: object, **settings: int) -> Sequence[Verdict]:
+    def spying(predict: Predict, *args: object, **settings: int) -> np.ndarray:
         def noting(fold: Fold) -> np.ndarray:
             seen.append(fold)
             return predict(fold)
@@ -128,11 +128,11 @@ def folds(monkeypatch: pytest.MonkeyPatch) -> Folds:
 
 @pytest.mark.parametrize("name", ["probe", "pretrained-independent", "pretrained-10-objects", "pretrained-3"])
 def test_votes_learn_from_no_object_that_they_are_tested_on(
-    name: str, arena: Arena, folds: Folds, monkeypatch: pytest.MonkeyPatch
+    name: str, arena: CrossValidationData, folds: Folds, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Told by the objects' names and by the pictures themselves, in the final fits and in those that choose."""
     limit = {"pretrained-10-objects": 10, "pretrained-3": 3}.get(name)
-    contestant = replace(CANDIDATES["probe"], objects=limit, joint=name != "pretrained-independent")
+    candidate = replace(CANDIDATES["probe"], objects=limit, joint=name != "pretrained-independent")
     monkeypatch.setattr(module, "frozen_encoder", lambda *_: Telling())
     fits: list[int] = []
 
@@ -144,25 +144,25 @@ def test_votes_learn_from_no_object_that_they_are_tested_on(
         strength: float,
         *,
         joint: bool,
-    ) -> Votes:
+    ) -> FittedHeads:
         assert owners(clips) == list(objects)
         assert labels.tolist() == [list(arena.catalogue.labels(o)) for o in objects]
         assert not set(objects) & folds.tested(arena)
         assert set(objects) <= folds.known(arena)
-        assert joint == contestant.joint
+        assert joint == candidate.joint
         fits.append(len(set(objects)))
-        votes = fit_votes(clips, labels, objects, classes, strength, joint=joint)
+        votes = fit_frame_heads(clips, labels, objects, classes, strength, joint=joint)
 
-        class Spied(Votes):
+        class Spied(FittedHeads):
             def predict(self, clips: Clips) -> np.ndarray:
                 assert not set(owners(clips)) & set(objects)
                 return super().predict(clips)
 
         return Spied(**vars(votes))
 
-    monkeypatch.setattr(module, "fit_votes", spy)
-    monkeypatch.setattr(voting, "fit_votes", spy)
-    judged = judge(contestant, arena, CONFIG)
+    monkeypatch.setattr(module, "fit_frame_heads", spy)
+    monkeypatch.setattr(voting, "fit_frame_heads", spy)
+    judged = cross_validate_candidate(candidate, arena, CONFIG)
     assert len(judged) == 2 * 15
     assert len(folds) == 6
     assert len(fits) == 6 * (2 * 2 + 1), "two strengths on two inner folds, and the fit itself"
@@ -172,9 +172,9 @@ def test_votes_learn_from_no_object_that_they_are_tested_on(
 
 @pytest.mark.parametrize("name", ["paper", "paper-difference", "release", "scratch"])
 def test_gradients_learn_from_no_object_that_they_are_tested_on(
-    name: str, arena: Arena, folds: Folds, monkeypatch: pytest.MonkeyPatch
+    name: str, arena: CrossValidationData, folds: Folds, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    contestant = CANDIDATES[name]
+    candidate = CANDIDATES[name]
     chosen: list[frozenset[str]] = []
 
     def spy(
@@ -192,24 +192,24 @@ def test_gradients_learn_from_no_object_that_they_are_tested_on(
         assert config.recipe == ("release" if name == "release" else "paper")
         assert (data.store.references is None) == (name in ("paper", "release"))
         assert isinstance(model.encoder, SceneEncoder) == (name == "scratch")
-        for key, value in contestant.settings.items():
+        for key, value in candidate.settings.items():
             assert getattr(config, key) == value
         return []
 
     monkeypatch.setattr(module, "train_classifier", spy)
-    judged = judge(contestant, arena, CONFIG)
+    judged = cross_validate_candidate(candidate, arena, CONFIG)
     assert len(chosen) == len(folds) == 6
     assert len(set(chosen)) > 1, "drawn anew in each fold"
     assert all(0 <= p < 3 for j in judged for p in j.predicted)
 
 
-def test_a_limited_contestant_draws_anew_in_each_fold_and_nests(arena: Arena, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_limited_contestant_draws_anew_in_each_fold_and_nests(arena: CrossValidationData, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: dict[int, list[frozenset[str]]] = {}
 
-    def fake(contestant: Candidate, arena: Arena) -> Predict:
+    def fake(candidate: Candidate, arena: CrossValidationData) -> Predict:
         def predict(fold: Fold) -> np.ndarray:
             used = frozenset(o for o, t in zip(arena.objects, fold.trained, strict=True) if t)
-            drawn.setdefault(contestant.objects or 99, []).append(used)
+            drawn.setdefault(candidate.objects or 99, []).append(used)
             held = {o for o, t in zip(arena.objects, fold.tested, strict=True) if t}
             assert not used & held
             assert all(t == (o in used) for o, t in zip(arena.objects, fold.trained, strict=True)), "all their videos"
@@ -219,7 +219,7 @@ def test_a_limited_contestant_draws_anew_in_each_fold_and_nests(arena: Arena, mo
 
     monkeypatch.setitem(module.KINDS, "votes", fake)
     for count in (2, 3, None):
-        judge(replace(CANDIDATES["pretrained"], objects=count), arena, CONFIG)
+        cross_validate_candidate(replace(CANDIDATES["pretrained"], objects=count), arena, CONFIG)
     assert {len(s) for s in drawn[2]} == {2}
     assert {len(s) for s in drawn[3]} == {3}
     places = {
@@ -229,16 +229,16 @@ def test_a_limited_contestant_draws_anew_in_each_fold_and_nests(arena: Arena, mo
     assert all(a <= b <= c for a, b, c in zip(drawn[2], drawn[3], drawn[99], strict=True)), "fewer are some of more"
 
 
-def test_all_contestants_share_their_folds(arena: Arena, folds: Folds, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_contestants_share_their_folds(arena: CrossValidationData, folds: Folds, monkeypatch: pytest.MonkeyPatch) -> None:
     def none(*_: object) -> Predict:
         return lambda fold: np.zeros((int(fold.tested.sum()), 3), np.int64)
 
     for kind in ("trees", "votes", "gradient"):
         monkeypatch.setitem(module.KINDS, kind, none)
     seen = []
-    for contestant in CANDIDATES.values():
+    for candidate in CANDIDATES.values():
         folds.clear()
-        judge(contestant, arena, CONFIG)
+        cross_validate_candidate(candidate, arena, CONFIG)
         seen.append([(f.repeat, f.number, f.tested.tobytes(), f.trained.tobytes()) for f in folds])
     assert all(one == seen[0] for one in seen)
     dealt = [deal(OBJECTS, 3, derive_seed(4, "folds", repeat)) for repeat in range(2)]
@@ -247,8 +247,8 @@ def test_all_contestants_share_their_folds(arena: Arena, folds: Folds, monkeypat
     assert all((f.trained != f.tested).all() for f in folds)
 
 
-def test_each_video_is_judged_once_a_repeat(arena: Arena) -> None:
-    judged = judge(CANDIDATES["constant"], arena, CONFIG)
+def test_each_video_is_judged_once_a_repeat(arena: CrossValidationData) -> None:
+    judged = cross_validate_candidate(CANDIDATES["constant"], arena, CONFIG)
     assert [(j.video_id, j.repeat) for j in judged] == [(v.video_id, r) for v in arena.videos for r in (0, 1)]
     assert all(j.expected == arena.catalogue.labels(j.object_id) for j in judged)
 
@@ -256,9 +256,9 @@ def test_each_video_is_judged_once_a_repeat(arena: Arena) -> None:
 # What they say
 
 
-def test_constant_by_hand(arena: Arena) -> None:
+def test_constant_by_hand(arena: CrossValidationData) -> None:
     """Each object counts once, however many videos it has; of equals the lowest classes."""
-    judged = judge(CANDIDATES["constant"], arena, CONFIG)
+    judged = cross_validate_candidate(CANDIDATES["constant"], arena, CONFIG)
     for repeat in range(2):
         for held in deal(OBJECTS, 3, derive_seed(4, "folds", repeat)):
             counts = Counter(arena.catalogue.labels(o) for o in OBJECTS if o not in held)
@@ -268,7 +268,7 @@ def test_constant_by_hand(arena: Arena) -> None:
     assert len({j.predicted for j in judged}) > 1, "folds differ here"
 
 
-def test_what_the_pictures_tell_is_found(arena: Arena, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_the_pictures_tell_is_found(arena: CrossValidationData, monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures that show the class itself, by frozen features of the same; and by those that show nothing."""
     folder = arena.frames
     pixels = np.load(folder / "frames.npy")
@@ -276,9 +276,9 @@ def test_what_the_pictures_tell_is_found(arena: Arena, monkeypatch: pytest.Monke
         pixels[3 * position : 3 * position + 3] = 100 * arena.catalogue.labels(video.object_id)[0]
     np.save(folder / "frames.npy", pixels)
     monkeypatch.setattr(module, "frozen_encoder", lambda *_: Telling())
-    contestant = replace(CANDIDATES["probe"], joint=False)
+    candidate = replace(CANDIDATES["probe"], joint=False)
     monkeypatch.setattr(voting, "STRENGTHS", (10.0,))
-    seen = judge(contestant, arena, CrossValidationConfig(folds=7, repeats=1))
+    seen = cross_validate_candidate(candidate, arena, CrossValidationConfig(folds=7, repeats=1))
     shared = [j for j in seen if sum(arena.catalogue.labels(o)[0] == j.expected[0] for o in OBJECTS) > 1]
     assert len(shared) > 8
     assert all(j.predicted[0] == j.expected[0] for j in shared), "classes that another object has, too"
@@ -287,25 +287,25 @@ def test_what_the_pictures_tell_is_found(arena: Arena, monkeypatch: pytest.Monke
 @pytest.mark.parametrize(
     "name", ["probe", "probe-difference", "pretrained-untrained", "pretrained-pooled", "pretrained-raw"]
 )
-def test_a_verdict_is_repeatable_and_independent_of_the_order(name: str, arena: Arena) -> None:
-    contestant = CANDIDATES[name]
-    if contestant.pretrained:
-        contestant = replace(contestant, encoder="untrained")
+def test_a_verdict_is_repeatable_and_independent_of_the_order(name: str, arena: CrossValidationData) -> None:
+    candidate = CANDIDATES[name]
+    if candidate.pretrained:
+        candidate = replace(candidate, encoder="untrained")
     setting = CrossValidationConfig(folds=2, repeats=1)
     pixels = np.load(arena.frames / "frames.npy")
     pixels += np.random.default_rng(0).integers(0, 20, pixels.shape, dtype=np.uint8)
     np.save(arena.frames / "frames.npy", pixels)
-    first = judge(contestant, arena, setting)
+    first = cross_validate_candidate(candidate, arena, setting)
     torch.rand(7)
-    assert judge(contestant, arena, setting) == first
-    turned = judge(contestant, replace(arena, videos=arena.videos[::-1]), setting)
+    assert cross_validate_candidate(candidate, arena, setting) == first
+    turned = cross_validate_candidate(candidate, replace(arena, videos=arena.videos[::-1]), setting)
     assert sorted(turned, key=lambda j: j.video_id) == sorted(first, key=lambda j: j.video_id)
 
 
-def test_the_untrained_network_is_always_the_same_and_the_pretrained_one_is_loaded(arena: Arena) -> None:
-    def state(contestant: str, arena: Arena) -> dict[str, torch.Tensor]:
+def test_the_untrained_network_is_always_the_same_and_the_pretrained_one_is_loaded(arena: CrossValidationData) -> None:
+    def state(candidate: str, arena: CrossValidationData) -> dict[str, torch.Tensor]:
         seed_everything(int(torch.randint(100, (1,))))
-        return trainable_state(frozen_encoder(CANDIDATES[contestant], arena))
+        return trainable_state(frozen_encoder(CANDIDATES[candidate], arena))
 
     one, other = state("pretrained-untrained", arena), state("pretrained-untrained", arena)
     assert all(torch.equal(one[n], other[n]) for n in one)
@@ -320,19 +320,19 @@ def test_the_untrained_network_is_always_the_same_and_the_pretrained_one_is_load
     assert not torch.equal(loaded["layers.0.weight"], one["layers.0.weight"])
 
 
-def test_frames_and_pooling_are_what_their_names_say(arena: Arena, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_and_pooling_are_what_their_names_say(arena: CrossValidationData, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "frozen_encoder", lambda *_: Telling())
     shapes: dict[str, set[tuple[int, ...]]] = {}
 
-    def spy(clips: Clips, *args: object, **settings: bool) -> Votes:
+    def spy(clips: Clips, *args: object, **settings: bool) -> FittedHeads:
         shapes.setdefault(name, set()).add(clips.shape[1:])
         if name == "pretrained-pooled":
             np.testing.assert_allclose(clips[:, 0, 1], 1.5)
-        return fit_votes(clips, *args, **settings)  # type: ignore[arg-type]
+        return fit_frame_heads(clips, *args, **settings)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(module, "fit_votes", spy)
+    monkeypatch.setattr(module, "fit_frame_heads", spy)
     for name in ("pretrained", "pretrained-one-frame", "pretrained-ten-frames", "pretrained-pooled"):
-        judge(CANDIDATES[name], arena, CrossValidationConfig(folds=2, repeats=1))
+        cross_validate_candidate(CANDIDATES[name], arena, CrossValidationConfig(folds=2, repeats=1))
     assert shapes == {
         "pretrained": {(2, 3)},
         "pretrained-one-frame": {(1, 3)},
@@ -342,7 +342,7 @@ def test_frames_and_pooling_are_what_their_names_say(arena: Arena, monkeypatch: 
 
 
 def test_the_mean_reference_is_of_training_videos_alone(
-    arena: Arena, folds: Folds, monkeypatch: pytest.MonkeyPatch
+    arena: CrossValidationData, folds: Folds, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     share, used = FrameStore.share_reference, []
 
@@ -353,11 +353,11 @@ def test_the_mean_reference_is_of_training_videos_alone(
         share(store, video_ids)
 
     monkeypatch.setattr(FrameStore, "share_reference", spy)
-    judge(replace(CANDIDATES["pretrained-raw"], encoder="untrained"), arena, CrossValidationConfig(folds=3, repeats=1))
+    cross_validate_candidate(replace(CANDIDATES["pretrained-raw"], encoder="untrained"), arena, CrossValidationConfig(folds=3, repeats=1))
     assert len(used) == 3
 
 
-def test_a_shared_reference_by_hand(arena: Arena) -> None:
+def test_a_shared_reference_by_hand(arena: CrossValidationData) -> None:
     store, plain = FrameStore(arena.frames, "subtract"), FrameStore(arena.frames)
     references = np.load(arena.frames / "references.npy").astype(float)
     chosen = [arena.videos[i].video_id for i in (1, 4, 7)]
@@ -376,11 +376,11 @@ CONSTANT = module.KINDS["constant"]
 
 
 def kill_after(count: int, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
-    """Make all contestants constant and interrupt them when asked for one more fold; returns the folds begun."""
+    """Make all candidates constant and interrupt them when asked for one more fold; returns the folds begun."""
     begun: list[tuple[int, int]] = []
 
-    def until(contestant: Candidate, arena: Arena) -> Predict:
-        predict = CONSTANT(contestant, arena)
+    def until(candidate: Candidate, arena: CrossValidationData) -> Predict:
+        predict = CONSTANT(candidate, arena)
 
         def counting(fold: Fold) -> np.ndarray:
             if len(begun) == count:
@@ -397,34 +397,34 @@ def kill_after(count: int, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, i
 
 @pytest.mark.parametrize("count", [0, 1, 4, 5])
 def test_finished_folds_survive_a_kill(
-    count: int, arena: Arena, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    count: int, arena: CrossValidationData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = judge(CANDIDATES["constant"], arena, CONFIG)
+    whole = cross_validate_candidate(CANDIDATES["constant"], arena, CONFIG)
     assert not any(tmp_path.glob("checkpoints/cross_validation/*"))
     with monkeypatch.context() as patch:
         kill_after(count, patch)
         with pytest.raises(KeyboardInterrupt):
-            judge(CANDIDATES["constant"], arena, CONFIG)
+            cross_validate_candidate(CANDIDATES["constant"], arena, CONFIG)
     begun = kill_after(99, monkeypatch)
-    assert judge(CANDIDATES["constant"], arena, CONFIG) == whole
+    assert cross_validate_candidate(CANDIDATES["constant"], arena, CONFIG) == whole
     assert begun == [(r, n) for r in range(2) for n in range(3)][count:]
     assert not any(tmp_path.glob("checkpoints/cross_validation/*")), "kept no longer than needed"
 
 
-def test_folds_of_other_settings_are_not_taken_for_these(arena: Arena, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_folds_of_other_settings_are_not_taken_for_these(arena: CrossValidationData, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         kill_after(2, patch)
         with pytest.raises(KeyboardInterrupt):
-            judge(CANDIDATES["constant"], arena, CONFIG)
+            cross_validate_candidate(CANDIDATES["constant"], arena, CONFIG)
     begun = kill_after(99, monkeypatch)
     other = CONFIG.model_copy(update={"seed": 5})
-    judge(CANDIDATES["constant"], arena, other)
+    cross_validate_candidate(CANDIDATES["constant"], arena, other)
     assert len(begun) == 6
-    judge(replace(CANDIDATES["constant"], joint=False), arena, CONFIG)
+    cross_validate_candidate(replace(CANDIDATES["constant"], joint=False), arena, CONFIG)
     assert len(begun) == 12
 
 
-def relabelled(arena: Arena) -> Arena:
+def relabelled(arena: CrossValidationData) -> CrossValidationData:
     """Another rating of one object, as a corrected objects.csv has it."""
     rug = arena.catalogue.objects["rug"]
     other = rug.model_copy(update={"ratings": ((0, 0, 0), *rug.ratings[1:])})
@@ -432,7 +432,7 @@ def relabelled(arena: Arena) -> Arena:
     return replace(arena, catalogue=Catalogue(language=arena.catalogue.language, objects=objects))
 
 
-def pretrained_anew(arena: Arena) -> Arena:
+def pretrained_anew(arena: CrossValidationData) -> CrossValidationData:
     seed_everything(1)
     save_trainable(SceneEncoder(), arena.pretrained)
     return arena
@@ -440,16 +440,16 @@ def pretrained_anew(arena: Arena) -> Arena:
 
 @pytest.mark.parametrize("change", [relabelled, pretrained_anew])
 def test_folds_of_other_inputs_are_not_taken_for_these(
-    change: Callable[[Arena], Arena], arena: Arena, monkeypatch: pytest.MonkeyPatch
+    change: Callable[[CrossValidationData], CrossValidationData], arena: CrossValidationData, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A stage that was killed begins anew where its inputs have changed since."""
     save_trainable(SceneEncoder(), arena.pretrained)
     with monkeypatch.context() as patch:
         kill_after(2, patch)
         with pytest.raises(KeyboardInterrupt):
-            judge(CANDIDATES["pretrained"], arena, CONFIG)
+            cross_validate_candidate(CANDIDATES["pretrained"], arena, CONFIG)
     begun = kill_after(99, monkeypatch)
-    judge(CANDIDATES["pretrained"], change(arena), CONFIG)
+    cross_validate_candidate(CANDIDATES["pretrained"], change(arena), CONFIG)
     assert len(begun) == 6
 
 
@@ -483,7 +483,7 @@ def updates() -> Iterator[Updates]:
     ids=["the same", "other folds"],
 )
 def test_a_killed_training_goes_on_only_with_its_own_objects(
-    change: dict[str, int], left: int, arena: Arena, updates: Updates, monkeypatch: pytest.MonkeyPatch
+    change: dict[str, int], left: int, arena: CrossValidationData, updates: Updates, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Killed in the second epoch of two. Else a model would be judged on objects that it learnt from."""
     original, epochs = module.train_classifier, []
@@ -501,8 +501,8 @@ def test_a_killed_training_goes_on_only_with_its_own_objects(
     monkeypatch.setattr(module, "train_classifier", counting)
     setting = CrossValidationConfig(folds=2, repeats=1, seed=4)
     with pytest.raises(KeyboardInterrupt):
-        judge(CANDIDATES["paper"], arena, setting)
-    judge(CANDIDATES["paper"], arena, setting.model_copy(update=change))
+        cross_validate_candidate(CANDIDATES["paper"], arena, setting)
+    cross_validate_candidate(CANDIDATES["paper"], arena, setting.model_copy(update=change))
     assert epochs == [left, 2]
 
 
@@ -540,7 +540,7 @@ def test_trees_are_the_baseline_on_whole_recordings(catalogue: Catalogue, weight
         Probe,
         [probe(v.video_id, starts_touching=v.video_id in touching) for v in videos],
     )
-    arena = Arena(
+    arena = CrossValidationData(
         videos=videos,
         catalogue=catalogue,
         frames=tmp_path / "frames",
@@ -550,7 +550,7 @@ def test_trees_are_the_baseline_on_whole_recordings(catalogue: Catalogue, weight
         runtime=RuntimeConfig(device="cpu"),
         pretrained=tmp_path / "none",
     )
-    judged = judge(CANDIDATES["trees"], arena, CrossValidationConfig(folds=2, repeats=1, seed=3))
+    judged = cross_validate_candidate(CANDIDATES["trees"], arena, CrossValidationConfig(folds=2, repeats=1, seed=3))
     features = np.stack([describe(Recording(tmp_path / v.path, v.video_id in touching)) for v in videos])
     recordings = [Recording(tmp_path / v.path, v.video_id in touching) for v in videos]
     np.testing.assert_array_equal(recording_features(recordings), features)
@@ -570,12 +570,12 @@ def test_trees_are_the_baseline_on_whole_recordings(catalogue: Catalogue, weight
 
 
 def test_each_variation_changes_one_thing_of_its_parent() -> None:
-    for name, contestant in CANDIDATES.items():
-        if not contestant.parent:
+    for name, candidate in CANDIDATES.items():
+        if not candidate.parent:
             continue
-        parent = CANDIDATES[contestant.parent]
+        parent = CANDIDATES[candidate.parent]
         assert not parent.parent, name
-        changed = [k for k, v in asdict(contestant).items() if v != asdict(parent)[k] and k not in ("title", "parent")]
+        changed = [k for k, v in asdict(candidate).items() if v != asdict(parent)[k] and k not in ("title", "parent")]
         assert len(changed) == 1, name
     titles = [c.title for c in CANDIDATES.values()]
     assert len(set(titles)) == len(titles)

@@ -34,7 +34,7 @@ def config(weights: Path, prompts: int = 2, recipe: Recipe = "paper") -> Encoder
     )
 
 
-MOMENTS = torch.tensor([[0, 5, 9]] * 4)
+FRAME_INDICES = torch.tensor([[0, 5, 9]] * 4)
 
 
 def test_base_encoder_is_open_clips_own_embedding(weights: Path, frames: torch.Tensor) -> None:
@@ -48,7 +48,7 @@ def test_base_encoder_is_open_clips_own_embedding(weights: Path, frames: torch.T
     pictures = torch.stack([transform(Image.fromarray(f.numpy())) for f in frames[:, 0]])
     with torch.inference_mode():
         torch.testing.assert_close(
-            base_encoder(config(weights))(frames[:, 0], MOMENTS[:, 0]), model.encode_image(pictures), atol=1e-5, rtol=0
+            base_encoder(config(weights))(frames[:, 0], FRAME_INDICES[:, 0]), model.encode_image(pictures), atol=1e-5, rtol=0
         )
 
 
@@ -59,7 +59,7 @@ def test_prompts_reach_every_layer_and_leave_no_trace(weights: Path, frames: tor
         block.attn.register_forward_pre_hook(
             lambda _, a, k: seen.append((k.get("query", a[0] if a else None)).shape[1]), with_kwargs=True
         )
-    output = model(frames, MOMENTS, torch.tensor([[0, 1, 1]] * 4))
+    output = model(frames, FRAME_INDICES, torch.tensor([[0, 1, 1]] * 4))
     patches = (32 // 16) ** 2 + 1
     assert seen == [patches + 3] * 2, "each layer sees its own prompts, and only its own"
     output["loss"].backward()
@@ -70,14 +70,14 @@ def test_prompts_reach_every_layer_and_leave_no_trace(weights: Path, frames: tor
 
 def test_zero_prompts_would_differ_from_the_base(weights: Path, frames: torch.Tensor) -> None:
     tuned = property_classifier(config(weights, 3), [2]).encoder
-    assert not torch.allclose(tuned(frames[0], MOMENTS[0]), base_encoder(config(weights))(frames[0], MOMENTS[0]))
+    assert not torch.allclose(tuned(frames[0], FRAME_INDICES[0]), base_encoder(config(weights))(frames[0], FRAME_INDICES[0]))
 
 
 def test_loss_is_the_sum_over_properties_of_the_mean_frame(weights: Path, frames: torch.Tensor) -> None:
     model = property_classifier(config(weights, 2), [3, 2]).eval()
     labels = torch.tensor([[0, 1], [2, 0], [1, 1], [2, 1]])
-    output = model(frames, MOMENTS, labels)
-    pooled = torch.stack([model.encoder(clip, MOMENTS[0]).mean(0) for clip in frames])
+    output = model(frames, FRAME_INDICES, labels)
+    pooled = torch.stack([model.encoder(clip, FRAME_INDICES[0]).mean(0) for clip in frames])
     expected = sum(F.cross_entropy(head(pooled), y) for head, y in zip(model.heads, labels.T, strict=True))
     torch.testing.assert_close(output["loss"], expected)
     assert output["logits"].shape == (4, 5)
@@ -88,7 +88,7 @@ def test_backbone_is_bit_identical_after_a_step(weights: Path, frames: torch.Ten
     assert not model.encoder.visual.training
     before = {k: v.clone() for k, v in model.encoder.visual.state_dict().items()}
     optimiser = torch.optim.AdamW([p for p in model.parameters() if p.requires_grad], lr=0.1)
-    model(frames, MOMENTS, torch.zeros(4, 2, dtype=torch.long))["loss"].backward()
+    model(frames, FRAME_INDICES, torch.zeros(4, 2, dtype=torch.long))["loss"].backward()
     optimiser.step()
     for name, value in model.encoder.visual.state_dict().items():
         assert torch.equal(before[name], value)
@@ -102,7 +102,7 @@ def test_saved_state_is_only_what_is_trained_and_reloads_exactly(
     assert all("visual" not in name for name in trainable_state(model))
     other = property_classifier(config(weights, 2), [3, 3]).eval()
     load_trainable(other, tmp_path / "encoder.safetensors")
-    assert torch.equal(model(frames, MOMENTS)["logits"], other(frames, MOMENTS)["logits"])
+    assert torch.equal(model(frames, FRAME_INDICES)["logits"], other(frames, FRAME_INDICES)["logits"])
     with pytest.raises(UserError, match="does not fit"):
         load_trainable(property_classifier(config(weights, 5), [3, 3]), tmp_path / "encoder.safetensors")
     with pytest.raises(UserError, match="does not fit"):
@@ -111,8 +111,8 @@ def test_saved_state_is_only_what_is_trained_and_reloads_exactly(
 
 def test_batch_of_one_equals_batch_of_many(weights: Path, frames: torch.Tensor) -> None:
     model = property_classifier(config(weights, 2), [3, 3]).eval()
-    whole = model(frames, MOMENTS)["logits"]
-    single = torch.cat([model(clip[None], MOMENTS[:1])["logits"] for clip in frames])
+    whole = model(frames, FRAME_INDICES)["logits"]
+    single = torch.cat([model(clip[None], FRAME_INDICES[:1])["logits"] for clip in frames])
     torch.testing.assert_close(whole, single, atol=1e-6, rtol=0)
 
 

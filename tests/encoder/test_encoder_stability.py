@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from pipeline.encoder.frame_heads import STRENGTHS, fit_votes
 from pipeline.stability.encoder import hard_frames, seasoned
 from pipeline.stability.heads import HEAVIER, SIZES, cancelling, huge_classifier, huge_features, published_heads
 from torch.nn import functional as F
@@ -20,7 +21,6 @@ from pipeline.encoder.clips import ClipDataset, LabelledVideo
 from pipeline.encoder.embed import embed_videos
 from pipeline.encoder.finetune import EncoderData, classify, fit_heads, train_classifier
 from pipeline.encoder.frame_classifier import FrameVotes
-from pipeline.encoder.frame_heads import STRENGTHS, fit_votes
 from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
 from pipeline.encoder.pretrain import pretrain
 from pipeline.encoder.recipes import property_classifier

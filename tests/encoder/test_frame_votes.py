@@ -12,20 +12,20 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from pipeline.encoder.frame_heads import STRENGTHS, choose_strength, fit_frame_heads
 from scipy.special import log_softmax, logsumexp
 from sklearn.linear_model import LogisticRegression
 
 from pipeline.encoder import frame_heads as voting
 from pipeline.encoder.finetune import EncoderData, finetune
-from pipeline.encoder.frame_classifier import FARTHEST, FrameVotes
-from pipeline.encoder.frame_heads import STRENGTHS, choose_strength, fit_votes
+from pipeline.encoder.frame_classifier import FARTHEST, JointFrameClassifier
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.records import Part
 from pipeline.runtime import seed_everything
 from pipeline.trainable import save_trainable, trainable_state
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
-from tests.encoders import CPU, OBJECTS, Floats, config, drawn_votes, encoder_data, float64
+from tests.encoders import CPU, OBJECTS, Floats, config, encoder_data, float64, random_heads
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
 
@@ -49,9 +49,9 @@ def test_votes_are_logs_of_mean_probabilities(
     seed: int, classes: list[int], frames: int, strength: float, scale: float
 ) -> None:
     """Strong weights make the frames so sure that the other classes' probabilities are 0 in float32."""
-    votes = drawn_votes(seed, 5, classes, strength)
-    model = FrameVotes(Bare(5), classes)
-    votes.put_into(model)
+    votes = random_heads(seed, 5, classes, strength)
+    model = JointFrameClassifier(Bare(5), classes)
+    votes.copy_into(model)
     clips = (scale * np.random.default_rng(seed).normal(size=(3, frames, 5))).astype(np.float32)
     with torch.no_grad():
         found = model.classify(torch.from_numpy(clips))
@@ -78,7 +78,7 @@ def test_votes_are_logs_of_mean_probabilities(
 @given(st.integers(0, 10**6), st.lists(st.integers(1, 4), min_size=1, max_size=3), st.sampled_from([0.0, 1.0, 30.0]))
 def test_the_decision_is_the_best_of_all_combinations(seed: int, classes: list[int], dependence: float) -> None:
     rng = np.random.default_rng(seed)
-    model = FrameVotes(Bare(4), classes)
+    model = JointFrameClassifier(Bare(4), classes)
     with torch.no_grad():
         model.dependence.copy_(torch.from_numpy(dependence * rng.normal(size=tuple(classes))))
     logits = rng.normal(scale=3, size=(6, sum(classes))).astype(np.float32)
@@ -112,9 +112,9 @@ def planted(seed: int, objects: int = 12, videos: int = 2, frames: int = 3, dim:
 @pytest.mark.parametrize("joint", [True, False])
 def test_fitted_votes_say_in_the_model_what_they_said_outside(joint: bool) -> None:
     clips, labels, objects = planted(0)
-    votes = fit_votes(clips, labels, objects, [3, 2], 0.01, joint=joint)
-    model = FrameVotes(Bare(6), [3, 2])
-    votes.put_into(model)
+    votes = fit_frame_heads(clips, labels, objects, [3, 2], 0.01, joint=joint)
+    model = JointFrameClassifier(Bare(6), [3, 2])
+    votes.copy_into(model)
     unseen = 2 * planted(1)[0]
     with torch.no_grad():
         logits = torch.cat(model.classify(torch.from_numpy(unseen)), dim=1)
@@ -142,7 +142,7 @@ def test_votes_are_scikit_learns_logistic_regression(strength: float) -> None:
     """Of three and of two classes; the latter it fits with one row of weights, which the penalty treats otherwise."""
     clips, labels, objects = planted(0)
     unseen = planted(1)[0]
-    votes = fit_votes(clips, labels, objects, [3, 2], strength)
+    votes = fit_frame_heads(clips, labels, objects, [3, 2], strength)
     for position, logs in enumerate(votes.evidence(unseen)):
         probabilities, _ = reference(clips, labels[:, position], strength)
         np.testing.assert_allclose(np.exp(logs), probabilities(unseen).mean(axis=1), atol=2e-4)
@@ -153,7 +153,7 @@ def test_a_class_that_training_lacks_is_all_but_impossible(kept: tuple[int, ...]
     clips, labels, objects = planted(0, objects=18)
     some = np.isin(labels[:, 0], kept)
     clips, labels, objects = clips[some], labels[some], [o for o, s in zip(objects, some, strict=True) if s]
-    votes = fit_votes(clips, labels, objects, [4, 2], STRENGTHS[-1])
+    votes = fit_frame_heads(clips, labels, objects, [4, 2], STRENGTHS[-1])
     unseen = np.concatenate([planted(1)[0], 1e6 * planted(2)[0], -1e6 * planted(3)[0], np.zeros((1, 3, 6), np.float32)])
     found = np.exp(votes.evidence(unseen)[0])
     lacking = [c for c in range(4) if c not in kept]
@@ -161,8 +161,8 @@ def test_a_class_that_training_lacks_is_all_but_impossible(kept: tuple[int, ...]
     assert found[:, lacking].max() < 1e-3
     assert found.sum(axis=1) == pytest.approx(1)
     assert set(votes.predict(unseen)[:, 0].tolist()) <= set(kept)
-    model = FrameVotes(Bare(6), [4, 2])
-    votes.put_into(model)
+    model = JointFrameClassifier(Bare(6), [4, 2])
+    votes.copy_into(model)
     with torch.no_grad():
         logits = torch.cat(model.classify(torch.from_numpy(unseen)), dim=1)
     assert logits.isfinite().all()
@@ -207,7 +207,7 @@ def test_the_strength_is_chosen_inside_and_ties_go_to_the_first(
         folds.setdefault(strength, []).append(frozenset(seen))
         return Scripted(seen, right[STRENGTHS.index(strength)])
 
-    monkeypatch.setattr(voting, "fit_votes", fit)
+    monkeypatch.setattr(voting, "fit_frame_heads", fit)
     labels = np.ones((len(owners), 1), np.int64)
     strength, curve = choose_strength(clips, labels, [f"o{i}" for i in owners], [2], seed=4)
     reached = [min(r, objects) / objects for r in right]
@@ -223,7 +223,7 @@ def test_the_strength_is_chosen_inside_and_ties_go_to_the_first(
 
 
 def test_one_object_leaves_nothing_to_choose_by(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(voting, "fit_votes", None)
+    monkeypatch.setattr(voting, "fit_frame_heads", None)
     clips, labels, _ = planted(0, objects=1)
     assert choose_strength(clips, labels, ["o0"] * 2, [3, 2], seed=0) == (STRENGTHS[1], [])
 
@@ -242,7 +242,7 @@ def test_finetuning_the_strong_recipe_is_fitting_votes_to_evaluation_clips(
     model, curve = finetune(
         data, config(weights, "pretrained"), CPU, seed=5, inputs=[], pretrained=tmp_path / "pretrained.safetensors"
     )
-    assert isinstance(model, FrameVotes)
+    assert isinstance(model, JointFrameClassifier)
     pretrained.eval()
     with torch.no_grad():
         clips = np.stack(
@@ -253,7 +253,7 @@ def test_finetuning_the_strong_recipe_is_fitting_votes_to_evaluation_clips(
         )
     labels = np.array([catalogue.labels(o) for o in OBJECTS[:5]])
     strength, expected = choose_strength(clips, labels, OBJECTS[:5], [3, 3, 3], 5)
-    votes = fit_votes(clips, labels, OBJECTS[:5], [3, 3, 3], strength)
+    votes = fit_frame_heads(clips, labels, OBJECTS[:5], [3, 3, 3], strength)
     assert curve == expected
     for head, weight in zip(model.heads.children(), votes.weights, strict=True):
         assert isinstance(head, torch.nn.Linear)

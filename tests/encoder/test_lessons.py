@@ -1,4 +1,4 @@
-"""Lessons: each follows from seed and number alone, says what is so of its object, and survives kills and bad light."""
+"""SyntheticPictures: each follows from seed and number alone, says what is so of its object, and survives kills and bad light."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ import pipeline.parallel
 from pipeline.config import FramesConfig, PretrainConfig
 from pipeline.encoder import pretrain as pretraining
 from pipeline.encoder import synthetic as module
-from pipeline.encoder.pretrain import STRENGTH, LessonDataset, held_out, lesson_model, vary
-from pipeline.encoder.scene_encoder import LessonModel, SceneEncoder
+from pipeline.encoder.pretrain import STRENGTH, PretrainingDataset, held_out, pretraining_model, vary
+from pipeline.encoder.scene_encoder import PretrainingModel, SceneEncoder
 from pipeline.encoder.synthetic import (
     BODIES,
     FORCES,
@@ -30,9 +30,9 @@ from pipeline.encoder.synthetic import (
     QUANTITIES,
     SIDE,
     WIDTH,
-    Lessons,
-    draw_lesson,
-    draw_lessons,
+    SyntheticPictures,
+    draw_object,
+    draw_pictures,
     sensors,
 )
 from pipeline.errors import UserError
@@ -50,48 +50,48 @@ FRAMES = FramesConfig(size=32)
 ARRAYS = ("pictures", "quantities", "kinds")
 
 
-def equal(one: Lessons, other: Lessons) -> bool:
+def equal(one: SyntheticPictures, other: SyntheticPictures) -> bool:
     pairs = [(getattr(one, name), getattr(other, name)) for name in ARRAYS]
     return all(a.dtype == b.dtype and np.array_equal(a, b) for a, b in pairs)
 
 
-def row(lessons: Lessons, number: int) -> Lessons:
-    return Lessons(*(getattr(lessons, name)[number : number + 1] for name in ARRAYS))
+def row(lessons: SyntheticPictures, number: int) -> SyntheticPictures:
+    return SyntheticPictures(*(getattr(lessons, name)[number : number + 1] for name in ARRAYS))
 
 
 @pytest.fixture(scope="module")
-def drawn(tmp_path_factory: pytest.TempPathFactory) -> Lessons:
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> SyntheticPictures:
     """Drawn in three chunks, by as many processes as there are cores."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "CHUNK", 4)
-        return draw_lessons(CONFIG, FRAMES, tmp_path_factory.mktemp("lessons"))
+        return draw_pictures(CONFIG, FRAMES, tmp_path_factory.mktemp("lessons"))
 
 
 # Drawing
 
 
 @pytest.mark.parametrize("number", [0, 3, 4, 8])
-def test_a_lesson_alone_is_the_same_as_among_others(number: int, drawn: Lessons) -> None:
+def test_a_lesson_alone_is_the_same_as_among_others(number: int, drawn: SyntheticPictures) -> None:
     """Whatever else the settings say, and whatever was drawn before."""
     np.random.seed(number)
     other = PretrainConfig(objects=5000, presses=3, seed=5, steps=7, batch_size=1, augment=False)
-    assert equal(draw_lesson(number, other, FRAMES), row(drawn, number))
+    assert equal(draw_object(number, other, FRAMES), row(drawn, number))
 
 
-def test_lessons_differ_by_number_and_by_seed(drawn: Lessons) -> None:
+def test_lessons_differ_by_number_and_by_seed(drawn: SyntheticPictures) -> None:
     assert len({drawn.pictures[i].tobytes() for i in range(9)}) == 9
-    elsewhere = draw_lesson(0, CONFIG.model_copy(update={"seed": 6}), FRAMES)
+    elsewhere = draw_object(0, CONFIG.model_copy(update={"seed": 6}), FRAMES)
     assert not any(np.array_equal(elsewhere.pictures[0], p) for p in drawn.pictures)
     assert (elsewhere.quantities[0, 0, 0] != drawn.quantities[:, 0, 0]).all()
 
 
 @pytest.mark.parametrize(("processes", "chunk"), [(1, 50), (3, 1)])
 def test_the_number_of_processes_and_chunks_changes_nothing(
-    processes: int, chunk: int, drawn: Lessons, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    processes: int, chunk: int, drawn: SyntheticPictures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pipeline.parallel, "cores", lambda: processes)
     monkeypatch.setattr(module, "CHUNK", chunk)
-    assert equal(draw_lessons(CONFIG, FRAMES, tmp_path), drawn)
+    assert equal(draw_pictures(CONFIG, FRAMES, tmp_path), drawn)
 
 
 def interrupt() -> None:
@@ -106,7 +106,7 @@ def interrupt() -> None:
 def test_a_killed_drawing_keeps_what_is_finished_and_ends_the_same(
     death: Callable[[], None],
     error: type[BaseException],
-    drawn: Lessons,
+    drawn: SyntheticPictures,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -114,31 +114,31 @@ def test_a_killed_drawing_keeps_what_is_finished_and_ends_the_same(
     monkeypatch.setattr(module, "CHUNK", 4)
     with monkeypatch.context() as patch:
 
-        def until(number: int, config: PretrainConfig, frames: FramesConfig) -> Lessons:
+        def until(number: int, config: PretrainConfig, frames: FramesConfig) -> SyntheticPictures:
             if number == 5:
                 death()
-            return draw_lesson(number, config, frames)
+            return draw_object(number, config, frames)
 
-        patch.setattr(module, "draw_lesson", until)
+        patch.setattr(module, "draw_object", until)
         with pytest.raises(error):
-            draw_lessons(CONFIG, FRAMES, tmp_path)
+            draw_pictures(CONFIG, FRAMES, tmp_path)
     finished = {int(f.stem) for f in tmp_path.glob("[0-9]*.npz")}
     assert 0 in finished
     assert 4 not in finished
     assert finished <= {0, 8}
 
-    def only_others(number: int, config: PretrainConfig, frames: FramesConfig) -> Lessons:
+    def only_others(number: int, config: PretrainConfig, frames: FramesConfig) -> SyntheticPictures:
         assert number // 4 * 4 not in finished, "drawn again"
-        return draw_lesson(number, config, frames)
+        return draw_object(number, config, frames)
 
-    monkeypatch.setattr(module, "draw_lesson", only_others)
-    assert equal(draw_lessons(CONFIG, FRAMES, tmp_path), drawn)
+    monkeypatch.setattr(module, "draw_object", only_others)
+    assert equal(draw_pictures(CONFIG, FRAMES, tmp_path), drawn)
 
 
 # What is told
 
 
-def test_lessons_have_their_shapes_and_ranges(drawn: Lessons) -> None:
+def test_lessons_have_their_shapes_and_ranges(drawn: SyntheticPictures) -> None:
     assert (drawn.pictures.shape, drawn.pictures.dtype) == ((9, 3, 32, 32, 3), np.uint8)
     assert (drawn.quantities.shape, drawn.quantities.dtype) == ((9, 3, len(QUANTITIES)), np.float32)
     assert (drawn.kinds.shape, drawn.kinds.dtype) == ((9, len(KINDS)), np.uint8)
@@ -174,7 +174,7 @@ def test_quantities_are_measured_where_they_are_shown(number: int, monkeypatch: 
 
     monkeypatch.setattr(module, "texture", note_surface)
     monkeypatch.setattr(module, "bump_share", note_skin)
-    told = draw_lesson(number, CONFIG, FRAMES).quantities[0].astype(np.float64)
+    told = draw_object(number, CONFIG, FRAMES).quantities[0].astype(np.float64)
     (surface,) = surfaces
     assert surface.shape == (SIDE, SIDE)
     assert {skin.shape for skin in skins} == {(HEIGHT, WIDTH)}
@@ -205,7 +205,7 @@ def test_bands_tell_a_wave_as_the_filters_transfer_says(length: float) -> None:
 # Pictures
 
 
-def test_pictures_are_differences_to_the_untouched_gel(drawn: Lessons) -> None:
+def test_pictures_are_differences_to_the_untouched_gel(drawn: SyntheticPictures) -> None:
     """Where it touches least, at the border, every channel lies about 128."""
     ring = np.ones((32, 32), bool)
     ring[4:-4, 4:-4] = False
@@ -220,7 +220,7 @@ def test_a_press_that_touches_nothing_shows_128(monkeypatch: pytest.MonkeyPatch)
     shade = module.shade
     monkeypatch.setattr(module, "shade", lambda skin, *rest: shade(np.zeros_like(skin), *rest))
     for number in range(4):
-        pictures = draw_lesson(number, CONFIG, FRAMES).pictures.astype(float)
+        pictures = draw_object(number, CONFIG, FRAMES).pictures.astype(float)
         assert np.abs(pictures.mean(axis=(2, 3)) - 128).max() < 1
         assert pictures.std(axis=(2, 3)).max() < 4
         assert np.abs(pictures - 128).max() < 25
@@ -244,7 +244,7 @@ def test_frames_are_fitted_as_those_of_videos(fit: str, size: int, monkeypatch: 
 
     monkeypatch.setattr(module, "shade", light)
     monkeypatch.setattr(module, "subtract", note)
-    lesson = draw_lesson(2, CONFIG, FramesConfig(size=size, fit=fit))
+    lesson = draw_object(2, CONFIG, FramesConfig(size=size, fit=fit))
     assert lesson.pictures.shape == (1, 3, size, size, 3)
     for sensor, (frame, reference), shown in zip(seen, taken, lesson.pictures[0], strict=True):
         for found, whole in ((frame, waves), (reference, cv2.convertScaleAbs(sensor.background))):
@@ -318,16 +318,16 @@ def test_varied_pictures_stay_pictures(value: int) -> None:
         assert (found.astype(int) - 128).min() * (value - 128) >= 0, "nothing wraps around"
 
 
-def test_a_lesson_of_a_training_depends_on_seed_epoch_and_number_alone(drawn: Lessons) -> None:
-    data = LessonDataset(drawn, augment=True, seed=1)
+def test_a_lesson_of_a_training_depends_on_seed_epoch_and_number_alone(drawn: SyntheticPictures) -> None:
+    data = PretrainingDataset(drawn, augment=True, seed=1)
     first = data[3]["frames"]
-    assert torch.equal(first, LessonDataset(drawn, augment=True, seed=1)[3]["frames"])
-    assert not torch.equal(first, LessonDataset(drawn, augment=True, seed=2)[3]["frames"])
+    assert torch.equal(first, PretrainingDataset(drawn, augment=True, seed=1)[3]["frames"])
+    assert not torch.equal(first, PretrainingDataset(drawn, augment=True, seed=2)[3]["frames"])
     data.follow(lambda: 1)
     assert not torch.equal(first, data[3]["frames"])
     data.follow(lambda: 0)
     assert torch.equal(first, data[3]["frames"])
-    plain = LessonDataset(drawn, augment=False, seed=1)
+    plain = PretrainingDataset(drawn, augment=False, seed=1)
     assert len(plain) == 9
     for name, kind in (("frames", torch.uint8), ("quantities", torch.float32), ("kinds", torch.float32)):
         assert plain[3][name].dtype == kind
@@ -376,7 +376,7 @@ def test_bodies_and_layers_come_as_often_as_said() -> None:
 def test_the_loss_by_hand(constant: bool) -> None:
     """In float64; `constant`: a quantity that never changes."""
     rng = np.random.default_rng(1)
-    lessons = Lessons(
+    lessons = SyntheticPictures(
         pictures=rng.integers(0, 256, (6, 2, 32, 32, 3), dtype=np.uint8),
         quantities=rng.normal(3, 5, size=(6, 2, 4)).astype(np.float32),
         kinds=rng.integers(0, 2, (6, 3)).astype(np.uint8),
@@ -384,7 +384,7 @@ def test_the_loss_by_hand(constant: bool) -> None:
     if constant:
         lessons.quantities[..., 0] = 7
     seed_everything(0)
-    model = lesson_model(SceneEncoder(), lessons).eval()
+    model = pretraining_model(SceneEncoder(), lessons).eval()
     batch = slice(1, 5)
     arrays = (lessons.pictures[batch], lessons.quantities[batch], lessons.kinds[batch].astype(np.float32))
     with torch.no_grad():
@@ -406,12 +406,12 @@ def test_the_loss_by_hand(constant: bool) -> None:
     assert found["loss"] == pytest.approx(2 * quantities + 0.6 * flags, rel=1e-5)
 
 
-def test_held_out_parts_are_means_over_lessons(drawn: Lessons) -> None:
+def test_held_out_parts_are_means_over_lessons(drawn: SyntheticPictures) -> None:
     seed_everything(0)
-    model = lesson_model(SceneEncoder(), drawn)
-    data = LessonDataset(drawn, augment=False, seed=0)
+    model = pretraining_model(SceneEncoder(), drawn)
+    data = PretrainingDataset(drawn, augment=False, seed=0)
     found = held_out(model, data)
-    assert isinstance(model, LessonModel)
+    assert isinstance(model, PretrainingModel)
     assert not model.training
     with torch.no_grad():
         single = [model(**{n: v[None] for n, v in data[i].items()}) for i in range(9)]

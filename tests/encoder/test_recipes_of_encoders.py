@@ -21,7 +21,7 @@ from pipeline.config import Recipe
 from pipeline.encoder import finetune as training
 from pipeline.encoder.clips import ClipDataset, LabelledVideo
 from pipeline.encoder.finetune import accuracies, train_classifier
-from pipeline.encoder.frame_classifier import FrameVotes
+from pipeline.encoder.frame_classifier import JointFrameClassifier
 from pipeline.encoder.model import Heads, PropertyClassifier, TactileEncoder
 from pipeline.encoder.recipes import base_encoder, property_classifier
 from pipeline.encoder.release import DROPOUT, PublishedEncoder, PublishedHeads, sinusoid
@@ -38,14 +38,14 @@ from pipeline.weights import check_encoder
 from tests.checkpoints import CLIP_CONFIG
 from tests.encoders import (
     CPU,
-    MOMENTS,
+    FRAME_INDICES,
     PARTS,
     Floats,
     close,
     config,
-    drawn_votes,
     encoder_data,
     float64,
+    random_heads,
     write_frames,
     write_tower,
 )
@@ -114,12 +114,12 @@ class Tower:
         return self.norm(token, "ln_post") @ self.state["proj"]
 
 
-def waves(moments: Floats, dim: int) -> Floats:
+def waves(frame_indices: Floats, dim: int) -> Floats:
     """Vaswani et al. 2017, section 3.5, one number at a time."""
-    table = np.empty((len(moments), dim))
-    for row, moment in enumerate(moments.tolist()):
+    table = np.empty((len(frame_indices), dim))
+    for row, frame_index in enumerate(frame_indices.tolist()):
         for k in range(dim):
-            angle = moment / 10_000 ** (2 * (k // 2) / dim)
+            angle = frame_index / 10_000 ** (2 * (k // 2) / dim)
             table[row, k] = math.cos(angle) if k % 2 else math.sin(angle)
     return table
 
@@ -129,9 +129,9 @@ def waves(moments: Floats, dim: int) -> Floats:
 
 def test_base_of_release_is_the_class_token_before_the_last_normalisation(weights: Path, frames: torch.Tensor) -> None:
     tower, encoder = Tower(weights), base_encoder(config(weights, "release"))
-    token, moments = tower.token(frames[:, 0].numpy()), MOMENTS[:, 2]
-    close(encoder(frames[:, 0], moments), token + waves(moments.numpy(), 32))
-    close(encoder.describe(frames[:, 0], moments), tower.norm(token, "ln_post") + waves(moments.numpy(), 32))
+    token, frame_indices = tower.token(frames[:, 0].numpy()), FRAME_INDICES[:, 2]
+    close(encoder(frames[:, 0], frame_indices), token + waves(frame_indices.numpy(), 32))
+    close(encoder.describe(frames[:, 0], frame_indices), tower.norm(token, "ln_post") + waves(frame_indices.numpy(), 32))
     assert encoder.dim == 32
 
 
@@ -144,12 +144,12 @@ def test_prompts_of_release_enter_as_published(layers: int, prompted: int, weigh
     assert encoder.prompts is not None
     with torch.no_grad():
         encoder.prompts.prompts.mul_(50)  # As drawn they are so small that a wrong place would hardly show.
-    tower, moments = Tower(weights), MOMENTS[:, 1]
+    tower, frame_indices = Tower(weights), FRAME_INDICES[:, 1]
     prompts = list(float64(encoder.prompts.prompts))
     assert len(prompts) == prompted
     token = tower.token(frames[:, 1].numpy(), prompts, normed=True)
-    close(encoder(frames[:, 1], moments), token + waves(moments.numpy(), 32))
-    close(encoder.describe(frames[:, 1], moments), tower.norm(token, "ln_post") + waves(moments.numpy(), 32))
+    close(encoder(frames[:, 1], frame_indices), token + waves(frame_indices.numpy(), 32))
+    close(encoder.describe(frames[:, 1], frame_indices), tower.norm(token, "ln_post") + waves(frame_indices.numpy(), 32))
     wrong = tower.token(frames[:, 1].numpy(), prompts, normed=False)
     assert np.abs(wrong - token).max() > 1e-2, "the place of the first prompts matters here"
 
@@ -166,27 +166,27 @@ def test_prompts_of_the_paper_pass_the_shared_map(layers: int, weights: Path, fr
     mapped = float64(encoder.prompts.prompts) @ float64(encoder.prompts.shared.weight).T
     tower = Tower(weights)
     token = tower.token(frames[:, 0].numpy(), list(mapped + float64(encoder.prompts.shared.bias)))
-    close(encoder(frames[:, 0], MOMENTS[:, 0]), tower.embedding(token))
-    assert torch.equal(encoder(frames[:, 0], MOMENTS[:, 0]), encoder.describe(frames[:, 0], MOMENTS[:, 2]))
+    close(encoder(frames[:, 0], FRAME_INDICES[:, 0]), tower.embedding(token))
+    assert torch.equal(encoder(frames[:, 0], FRAME_INDICES[:, 0]), encoder.describe(frames[:, 0], FRAME_INDICES[:, 2]))
 
 
 def test_a_tower_that_averages_is_read_by_its_patches(frames: torch.Tensor, tmp_path: Path) -> None:
     """It has no trained class token; prompts are no patches."""
     folder = write_tower(tmp_path / "averaging", averages=True)
-    tower, moments = Tower(folder), MOMENTS[:, 0]
+    tower, frame_indices = Tower(folder), FRAME_INDICES[:, 0]
     plain = tower.tokens(frames[:, 0].numpy())
-    close(base_encoder(config(folder, "paper"))(frames[:, 0], moments), tower.embedding(plain)[:, 1:].mean(axis=1))
+    close(base_encoder(config(folder, "paper"))(frames[:, 0], frame_indices), tower.embedding(plain)[:, 1:].mean(axis=1))
     close(
-        base_encoder(config(folder, "release"))(frames[:, 0], moments),
-        plain[:, 1:].mean(axis=1) + waves(moments.numpy(), 32),
+        base_encoder(config(folder, "release"))(frames[:, 0], frame_indices),
+        plain[:, 1:].mean(axis=1) + waves(frame_indices.numpy(), 32),
     )
     tuned = property_classifier(config(folder, "release"), [2]).encoder
     assert isinstance(tuned, PublishedEncoder)
     assert tuned.prompts is not None
     patches = tower.tokens(frames[:, 0].numpy(), list(float64(tuned.prompts.prompts)), normed=True)[:, 1:]
-    close(tuned(frames[:, 0], moments), patches.mean(axis=1) + waves(moments.numpy(), 32))
-    described = tower.norm(patches.mean(axis=1), "ln_post") + waves(moments.numpy(), 32)
-    close(tuned.describe(frames[:, 0], moments), described)
+    close(tuned(frames[:, 0], frame_indices), patches.mean(axis=1) + waves(frame_indices.numpy(), 32))
+    described = tower.norm(patches.mean(axis=1), "ln_post") + waves(frame_indices.numpy(), 32)
+    close(tuned.describe(frames[:, 0], frame_indices), described)
 
 
 @pytest.mark.parametrize("shared", [False, True])
@@ -211,12 +211,12 @@ def test_heads_of_release_stand_on_the_direction_of_the_mean(weights: Path, fram
     tower = Tower(weights)
     flat = frames.flatten(0, 1).numpy()
     token = tower.token(flat, list(float64(encoder.prompts.prompts)), normed=True)
-    mean = (tower.norm(token, "ln_post") + waves(MOMENTS.flatten().numpy(), 32)).reshape(4, 3, 32).mean(axis=1)
+    mean = (tower.norm(token, "ln_post") + waves(FRAME_INDICES.flatten().numpy(), 32)).reshape(4, 3, 32).mean(axis=1)
     shared = heads.shared
     hidden = mean / np.sqrt((mean**2).sum(axis=1, keepdims=True)) @ float64(shared.weight).T + float64(shared.bias)
     expected = [np.maximum(hidden, 0) @ float64(h.weight).T + float64(h.bias) for h in heads.properties]
     labels = torch.tensor([[0, 2, 1], [2, 0, 0], [1, 1, 1], [0, 0, 0]])
-    found = model(frames, MOMENTS, labels)
+    found = model(frames, FRAME_INDICES, labels)
     close(found["logits"], np.concatenate(expected, axis=1))
     loss = sum(-log_softmax(z, axis=1)[range(4), y].mean() for z, y in zip(expected, labels.T.numpy(), strict=True))
     assert found["loss"].item() == pytest.approx(loss, rel=1e-5)
@@ -249,10 +249,10 @@ def test_dropout_of_release_keeps_the_mean_and_half_of_the_units() -> None:
 
 
 @given(st.lists(st.integers(0, 10**6), min_size=1, max_size=5), st.sampled_from([1, 2, 7, 32, 33, 1024]))
-def test_sinusoid_against_its_formula(moments: list[int], dim: int) -> None:
-    found = sinusoid(torch.tensor(moments), dim)
+def test_sinusoid_against_its_formula(frame_indices: list[int], dim: int) -> None:
+    found = sinusoid(torch.tensor(frame_indices), dim)
     assert found.dtype == torch.float32
-    np.testing.assert_allclose(float64(found), waves(np.array(moments), dim), rtol=0, atol=1e-7)
+    np.testing.assert_allclose(float64(found), waves(np.array(frame_indices), dim), rtol=0, atol=1e-7)
 
 
 def test_sinusoid_tells_late_neighbours_apart() -> None:
@@ -358,7 +358,7 @@ def test_a_clip_depends_on_seed_epoch_and_video_alone(tmp_path: Path) -> None:
         data = ClipDataset(store, videos[::order], per_video=3, seed=seed, flip_probability=0.5)
         data.follow(lambda: epoch)
         item = data[0 if order > 0 else 1]
-        return item["moments"].tolist(), item["frames"].numpy().tobytes()
+        return item["frame_indices"].tolist(), item["frames"].numpy().tobytes()
 
     assert clip(1, 4) == clip(1, 4) == clip(1, 4, -1)
     assert len({clip(1, epoch)[1] for epoch in range(20)}) > 15
@@ -418,14 +418,14 @@ def test_frames_of_a_whole_multiple_are_block_means(factor: int, kind: str, weig
     side = 32 * factor
     frames = np.random.default_rng(factor).integers(0, 256, (2, side, side, 3), dtype=np.uint8)
     means = frames.astype(np.float64).reshape(2, 32, factor, 32, factor, 3).mean(axis=(2, 4))
-    tower, moments = Tower(weights), torch.tensor([3, 8])
+    tower, frame_indices = Tower(weights), torch.tensor([3, 8])
     token = tower.token(means, prompts)
-    expected = token + waves(moments.numpy(), 32) if kind == "release" else tower.embedding(token)
-    close(encoder(torch.from_numpy(frames), moments), expected)
+    expected = token + waves(frame_indices.numpy(), 32) if kind == "release" else tower.embedding(token)
+    close(encoder(torch.from_numpy(frames), frame_indices), expected)
     fine = np.repeat(np.repeat(frames[:, :32, :32], factor, axis=1), factor, axis=2)
     torch.testing.assert_close(
-        encoder(torch.from_numpy(fine), moments),
-        encoder(torch.from_numpy(frames[:, :32, :32]), moments),
+        encoder(torch.from_numpy(fine), frame_indices),
+        encoder(torch.from_numpy(frames[:, :32, :32]), frame_indices),
         atol=1e-5,
         rtol=0,
     )
@@ -461,11 +461,11 @@ def test_running_statistics_are_saved_with_the_network_and_reload_exactly(tmp_pa
     seed_everything(0)
     model = PropertyClassifier(SceneEncoder(), Heads(256, [3, 2]), [3, 2]).train()
     frames = torch.randint(0, 256, (4, 2, 32, 32, 3), dtype=torch.uint8)
-    labels, moments = torch.tensor([[0, 1], [2, 0], [1, 1], [0, 0]]), torch.zeros(4, 2, dtype=torch.int64)
+    labels, frame_indices = torch.tensor([[0, 1], [2, 0], [1, 1], [0, 0]]), torch.zeros(4, 2, dtype=torch.int64)
     optimiser = torch.optim.AdamW(model.parameters(), lr=1e-2)
     for _ in range(3):
         optimiser.zero_grad()
-        model(frames, moments, labels)["loss"].backward()
+        model(frames, frame_indices, labels)["loss"].backward()
         optimiser.step()
     state = trainable_state(model)
     assert state.keys() == model.state_dict().keys(), "nothing is frozen, so everything is there"
@@ -476,9 +476,9 @@ def test_running_statistics_are_saved_with_the_network_and_reload_exactly(tmp_pa
     load_trainable(other, tmp_path / "model.safetensors")
     assert all(torch.equal(v, other.state_dict()[n]) for n, v in model.state_dict().items())
     with torch.no_grad():
-        assert torch.equal(model.eval()(frames, moments)["logits"], other.eval()(frames, moments)["logits"])
+        assert torch.equal(model.eval()(frames, frame_indices)["logits"], other.eval()(frames, frame_indices)["logits"])
         untrained = PropertyClassifier(SceneEncoder(), other.heads, [3, 2]).eval()
-        assert not torch.allclose(untrained(frames, moments)["logits"], other(frames, moments)["logits"])
+        assert not torch.allclose(untrained(frames, frame_indices)["logits"], other(frames, frame_indices)["logits"])
 
 
 def test_statistics_of_frozen_layers_are_not_called_trained() -> None:
@@ -499,18 +499,18 @@ def test_statistics_of_frozen_layers_are_not_called_trained() -> None:
 def test_a_strong_classifier_reloads_exactly(weights: Path, tmp_path: Path) -> None:
     seed_everything(1)
     model = property_classifier(config(weights, "pretrained"), [3, 3, 2])
-    assert isinstance(model, FrameVotes)
-    drawn_votes(2, 256, [3, 3, 2], 0.1).put_into(model)
+    assert isinstance(model, JointFrameClassifier)
+    random_heads(2, 256, [3, 3, 2], 0.1).copy_into(model)
     save_trainable(model, tmp_path / "model.safetensors")
     other = property_classifier(config(weights, "pretrained"), [3, 3, 2])
     load_trainable(other, tmp_path / "model.safetensors")
     frames = torch.randint(0, 256, (3, 2, 48, 48, 3), dtype=torch.uint8)
-    moments = torch.zeros(3, 2, dtype=torch.int64)
+    frame_indices = torch.zeros(3, 2, dtype=torch.int64)
     with torch.no_grad():
-        first, second = (m.eval()(frames, moments)["logits"] for m in (model, other))
+        first, second = (m.eval()(frames, frame_indices)["logits"] for m in (model, other))
     assert torch.equal(first, second)
     assert torch.equal(model.decide(first), other.decide(second))
-    assert isinstance(other, FrameVotes)
+    assert isinstance(other, JointFrameClassifier)
     assert torch.equal(model.dependence, other.dependence)
     with pytest.raises(UserError, match="does not fit the model"):
         load_trainable(property_classifier(config(weights, "pretrained"), [3, 3, 3]), tmp_path / "model.safetensors")

@@ -12,7 +12,6 @@ from statistics import NormalDist
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
 from pipeline.statistics import (
     Interval,
     Outcome,
@@ -27,6 +26,7 @@ from pipeline.statistics import (
     resampled,
     wilson,
 )
+
 from pipeline.videos.catalogue import load_catalogue
 from tests.closure import ROOT
 

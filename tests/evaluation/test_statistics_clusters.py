@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from scipy import stats
-
 from pipeline.statistics import Interval, Outcome, clustered, resampled, wilson
 from pipeline.statistics.clusters import clusters_of, components, overlapping_variance, variance
 from pipeline.statistics.flips import DRAWS, flip_units, least_p, sign_flip
+from scipy import stats
 
 About = tuple[tuple[str, ...], ...]
 

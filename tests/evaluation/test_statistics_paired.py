@@ -13,9 +13,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy import stats
-from scipy.integrate import quad
-
 from pipeline.statistics import (
     Answer,
     Factor,
@@ -31,6 +28,8 @@ from pipeline.statistics import (
     planned_error,
     smallest_effect,
 )
+from scipy import stats
+from scipy.integrate import quad
 
 
 def test_paired_by_hand() -> None:

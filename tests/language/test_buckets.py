@@ -7,9 +7,8 @@ from itertools import pairwise
 
 from hypothesis import given
 from hypothesis import strategies as st
-from torch.utils.data import BatchSampler
-
 from pipeline.language.buckets import POOL, LengthBuckets
+from torch.utils.data import BatchSampler
 
 LENGTHS = st.lists(st.integers(1, 500), max_size=300)
 

@@ -14,7 +14,7 @@ from pipeline.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
 from pipeline.errors import UserError
 from pipeline.io import save_tensors, write_table
 from pipeline.language.conversations import evaluation_features
-from pipeline.language.input_ablation import NoisyTouch, SwappedTouch, feel
+from pipeline.language.input_ablation import NoisyTouch, SwappedTouch, ablate_input
 from pipeline.records import Dialogue, Embedding, Gold, Opd, Part, Question, Touch, Turn
 
 DIM = 6
@@ -105,9 +105,9 @@ def test_noise_is_the_same_at_each_call_and_differs_between_frames_videos_and_se
 
 def test_real_touch_is_the_store_and_removed_asks_for_nothing(store: EmbeddingStore) -> None:
     for touch in (Touch.REAL, Touch.REMOVED):
-        assert feel(store, touch, QUESTIONS, 0) is store
+        assert ablate_input(store, touch, QUESTIONS, 0) is store
     assert evaluation_features(QUESTIONS[0], store, per_video=0).shape == (0, DIM)
-    swapped, noise = (feel(store, touch, QUESTIONS, 0) for touch in (Touch.SWAPPED, Touch.NOISE))
+    swapped, noise = (ablate_input(store, touch, QUESTIONS, 0) for touch in (Touch.SWAPPED, Touch.NOISE))
     real = evaluation_features(QUESTIONS[0], store, 3)
     for felt in (swapped, noise):
         felt_features = evaluation_features(QUESTIONS[0], felt, 3)

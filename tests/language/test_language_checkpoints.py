@@ -22,7 +22,7 @@ from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import Job, add_lora, assemble, finetune_lora
 from pipeline.records import Opd, Question
 from tests.checkpoints import write_llama
-from tests.language import DIM, SMALL, asking, language, material, model, questions, store
+from tests.language.shared import DIM, SMALL, generation, language, material, model, questions, store
 
 __all__ = ["language", "model", "questions", "store"]
 """Fixtures."""
@@ -123,7 +123,7 @@ def test_any_padding_token_leaves_the_end_to_be_learnt(
         assert torch.equal(kept, sample["labels"][sample["labels"] != IGNORE_INDEX])
         opening = model.tokenizer.convert_ids_to_tokens(sample["input_ids"][:1].tolist())
         assert (opening[0] == "<s>") == bos
-    one, many = (answer(model, store, questions, Opd.NEEDED, asking(size, 6)) for size in (1, 7))
+    one, many = (answer(model, store, questions, Opd.NEEDED, generation(size, 6)) for size in (1, 7))
     assert one == many
     assert all(p.tokens <= 6 * len(p.outputs) for p in one)
 
@@ -238,4 +238,4 @@ def test_embeddings_of_another_length_are_refused(
 ) -> None:
     model = OctopiForCausalLM.from_base(language.weights, DIM + 1)
     with pytest.raises(UserError, match=f"embeddings of {DIM}, but the model reads {DIM + 1}"):
-        answer(model, store, [], Opd.ALL, asking(1))
+        answer(model, store, [], Opd.ALL, generation(1))

@@ -20,7 +20,7 @@ from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import assemble
 from pipeline.records import Opd, Question
 from tests.checkpoints import write_llama
-from tests.language import DIM, FRAMES, asking, language, material, model, questions, store
+from tests.language.shared import DIM, FRAMES, generation, language, material, model, questions, store
 
 __all__ = ["language", "model", "questions", "store"]
 """Fixtures."""
@@ -45,7 +45,7 @@ def test_one_row_answers_as_transformers_own_generation_does(
             eos_token_id=model.tokenizer.eos_token_id,
             pad_token_id=0,
         )[0].tolist()
-        prediction = answer(model, store, [question], Opd.NEEDED, asking(1, limit))[0]
+        prediction = answer(model, store, [question], Opd.NEEDED, generation(1, limit))[0]
         assert prediction.outputs == (model.tokenizer.decode(new, skip_special_tokens=True).strip(),)
         assert prediction.tokens == len(new)
 
@@ -71,7 +71,7 @@ def test_an_answer_at_the_limit_is_whole_and_one_beyond_is_cut(
 ) -> None:
     """The end token made the likeliest after some tokens: its column of the head is turned towards a later state."""
     asked = [q for q in questions if q.task == "OPD"][:3]
-    free = {p.question_id: p for p in answer(model, store, asked, Opd.ALL, asking(4, 8))}
+    free = {p.question_id: p for p in answer(model, store, asked, Opd.ALL, generation(4, 8))}
     assert all(p.truncated and p.tokens == 8 for p in free.values())
     for question in asked:
         dialogue = question.dialogue(Opd.ALL)
@@ -91,7 +91,7 @@ def test_an_answer_at_the_limit_is_whole_and_one_beyond_is_cut(
         tokenizer.eos_token = tokenizer.convert_ids_to_tokens(new[place])
         other = copy.copy(model)
         other.tokenizer = tokenizer
-        whole, cut = (answer(other, store, [question], Opd.ALL, asking(1, limit))[0] for limit in (place + 1, place))
+        whole, cut = (answer(other, store, [question], Opd.ALL, generation(1, limit))[0] for limit in (place + 1, place))
         assert (whole.truncated, whole.tokens) == (False, place + 1)
         assert (cut.truncated, cut.tokens) == (True, place)
         assert whole.outputs == cut.outputs, "the end token says nothing"
@@ -119,7 +119,7 @@ def test_an_answer_ends_where_the_positions_do_whatever_its_neighbours(
     folder = write_llama(tmp_path / "tight", pad="</s>", max_position_embeddings=max(prompts.values()) + 5)
     torch.manual_seed(0)
     tight = OctopiForCausalLM.from_base(folder, DIM)
-    alone, together = (answer(tight, store, asked, Opd.ALL, asking(size, 40)) for size in (1, 50))
+    alone, together = (answer(tight, store, asked, Opd.ALL, generation(size, 40)) for size in (1, 50))
     assert alone == together
     room = {name: min(40, max(prompts.values()) + 5 - length) for name, length in prompts.items()}
     assert len(set(room.values())) > 2
@@ -137,4 +137,4 @@ def test_a_question_longer_than_the_positions_is_named_with_the_key(
         assemble(material(setting, questions, store), 4, "test")
     model = OctopiForCausalLM.from_base(setting.weights, DIM)
     with pytest.raises(UserError, match=r"^[A-Z]+-train-\d+: .*language.system_prompt.*language.weights$"):
-        answer(model, store, questions, Opd.ALL, asking(2))
+        answer(model, store, questions, Opd.ALL, generation(2))

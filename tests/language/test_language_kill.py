@@ -22,7 +22,7 @@ from pipeline.language.training import Job, add_lora, align, assemble, finetune_
 from pipeline.records import Question
 from pipeline.training import Trained
 from tests.closure import ROOT
-from tests.language import SMALL, language, material, questions, store
+from tests.language.shared import SMALL, language, material, questions, store
 
 __all__ = ["language", "questions", "store"]
 """Fixtures."""

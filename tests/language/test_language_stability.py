@@ -22,7 +22,7 @@ from pipeline.language.generate import answer
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import add_lora, assemble
 from pipeline.records import Embedding, Opd, Question
-from tests.language import DIM, asking, language, material, model, questions, store
+from tests.language.shared import DIM, asking, language, material, model, questions, store
 
 __all__ = ["language", "model", "questions", "store"]
 """Fixtures."""

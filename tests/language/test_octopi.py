@@ -23,7 +23,7 @@ from pipeline.language.training import Job, add_lora, align, assemble, finetune_
 from pipeline.records import Opd, Question
 from pipeline.trainable import trainable_state
 from tests.checkpoints import write_llama
-from tests.language import DIM, FRAMES, SMALL, asking, language, material, model, questions, store
+from tests.language.shared import DIM, FRAMES, SMALL, generation, language, material, model, questions, store
 
 __all__ = ["language", "model", "questions", "store"]
 """Fixtures."""
@@ -130,10 +130,10 @@ def test_unknown_target_module_is_named(model: OctopiForCausalLM) -> None:
 def test_batch_size_changes_no_answer(
     model: OctopiForCausalLM, questions: list[Question], store: EmbeddingStore, opd: Opd
 ) -> None:
-    one = answer(model, store, questions, opd, asking(1))
-    many = answer(model, store, questions, opd, asking(5))
+    one = answer(model, store, questions, opd, generation(1))
+    many = answer(model, store, questions, opd, generation(5))
     assert one == many
-    mixed = answer(model, store, questions[::-1], opd, asking(len(questions)))
+    mixed = answer(model, store, questions[::-1], opd, generation(len(questions)))
     assert sorted(mixed, key=lambda p: p.question_id) == sorted(one, key=lambda p: p.question_id)
     turns = {q.question_id: len(d.turns) for q in questions if (d := q.dialogue(opd))}
     assert {p.question_id: len(p.outputs) for p in one} == turns
@@ -144,7 +144,7 @@ def test_batch_size_changes_no_answer(
 def test_running_into_the_limit_is_said(
     model: OctopiForCausalLM, questions: list[Question], store: EmbeddingStore
 ) -> None:
-    predictions = answer(model, store, questions[:2], Opd.ALL, asking(2, tokens=1))
+    predictions = answer(model, store, questions[:2], Opd.ALL, generation(2, tokens=1))
     assert all(p.truncated for p in predictions)
     assert all(p.tokens == len(p.outputs) for p in predictions)
 
@@ -171,7 +171,7 @@ def test_answers_equal_generation_by_hand(
         if said[-1] == model.tokenizer.eos_token_id:
             break
     expected = model.tokenizer.decode(said, skip_special_tokens=True).strip()
-    assert answer(model, store, [question], Opd.ALL, asking(1))[0].outputs == (expected,)
+    assert answer(model, store, [question], Opd.ALL, generation(1))[0].outputs == (expected,)
 
 
 class Killed(Exception):

@@ -1,0 +1,77 @@
+"""The model card beside every trained model: what it is made of, how it was trained and what it cannot do.
+
+It holds facts alone and no score, as none is known when a model has been trained. Equal trainings write equal bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from pipeline.io import write_text
+
+CARD_FILE = "README.md"
+
+
+def write_card(
+    folder: Path,
+    title: str,
+    *,
+    bases: Mapping[str, Path],
+    data: Mapping[str, object],
+    settings: Mapping[str, object],
+    limits: Sequence[str],
+) -> None:
+    """Write README.md with the front matter of Hugging Face's model cards.
+
+    Args:
+        folder: Of the trained model.
+        title: What it is, in one line.
+        bases: Folder or file of the weights of each model that it was made from, by its part.
+        data: What it was trained on.
+        settings: Hyper-parameters by name.
+        limits: What it cannot do, a sentence each.
+    """
+    licences = {part: _licence(path) for part, path in bases.items()}
+    stated = set(licences.values())
+    front = {
+        "license": stated.pop() if len(stated) == 1 and None not in stated else "other",
+        "base_model": [path.as_posix() for path in bases.values()],
+        "tags": ["tactile", "gelsight", "octopi"],
+    }
+    lines = ["---", yaml.safe_dump(front, sort_keys=False).rstrip(), "---", f"# {title}", "", "## Base models", ""]
+    for part, path in bases.items():
+        lines.append(f"- {part}: `{path.as_posix()}`, licence: {licences[part] or 'not stated beside the weights'}")
+        lines += [f"  - `{file.name}`, sha256 {_sha256(file)}" for file in _weights(path)]
+    for heading, values in (("Training data", data), ("Hyper-parameters", settings)):
+        lines += ["", f"## {heading}", "", "| | |", "|---|---|"]
+        lines += [f"| {name} | {_shown(value)} |" for name, value in values.items()]
+    lines += ["", "## What it cannot do", "", *(f"- {limit}" for limit in limits)]
+    write_text(folder / CARD_FILE, "\n".join(lines) + "\n")
+
+
+def _weights(path: Path) -> list[Path]:
+    return sorted(path.glob("*.safetensors")) if path.is_dir() else [path]
+
+
+def _sha256(file: Path) -> str:
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _licence(path: Path) -> str | None:
+    """What the card beside the weights says in its front matter."""
+    card = (path if path.is_dir() else path.parent) / CARD_FILE
+    text = card.read_text(encoding="utf-8") if card.is_file() else ""
+    if not text.startswith("---\n"):
+        return None
+    front: Any = yaml.safe_load(text.split("---\n")[1])
+    return str(front["license"]) if isinstance(front, dict) and "license" in front else None
+
+
+def _shown(value: object) -> str:
+    return ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
