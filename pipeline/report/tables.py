@@ -54,13 +54,14 @@ class Table:
             published: likewise; joined by (task, measure, encoder, lora, opd), in columns of their own.
         """
         rows = self.select(scores, effects)
+        records = rows.to_dict("records")
         shown: dict[str, list[str]] = {}
         for name in self.columns:
             if name == "published":
                 shown |= _beside(rows, published)
             else:
                 heading, cell = COLUMNS[name]
-                shown[heading] = [cell(row) for row in rows.to_dict("records")]
+                shown[heading] = [cell(row) for row in records]
         return pd.DataFrame(shown, index=rows.index, dtype=object)
 
 
