@@ -15,7 +15,7 @@ from pipeline.report.build import write_report
 from pipeline.report.load import Report, load_report
 from pipeline.report.tables import TABLES
 from pipeline.tasks import TASKS
-from pipeline.tasks.base import Draft, Pool, single_turn
+from pipeline.tasks.base import Draft, Pool
 from tests.fake_run import fake_params, write_run
 from tests.tasks.test_registry import Hardest
 
@@ -25,8 +25,10 @@ class Hard(Hardest):
 
     def draft(self, pool: Pool, stratum: int, rng: random.Random) -> Draft | None:
         draft = super().draft(pool, stratum, rng)
-        asked = dict.fromkeys((Opd.NONE, Opd.ALL), "Is {tactile} hard?")
-        return draft and replace(draft, dialogues=single_turn(asked, dict.fromkeys(asked, draft.gold.choice)))
+        if draft is None:
+            return None
+        (short,) = draft.dialogues
+        return replace(draft, dialogues=(short, short.model_copy(update={"opd": Opd.ALL})))
 
 
 @pytest.fixture(scope="module")
