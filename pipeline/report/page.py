@@ -74,6 +74,7 @@ class Block(NamedTuple):
     caption: str
     html: Markup
     file: str
+    """Below reports/."""
     open: bool = False
 
 
@@ -151,7 +152,7 @@ def _chapter(report: Report, gaps: list[Gap]) -> dict[str, Any]:
         "points": points,
         "stands_on": stands_on(report.provenance),
         "origin": origin(report.provenance),
-        "blocks": [*_tables(report, scale != "smoke", gaps), *_dataset(report), *_audit(report)],
+        "blocks": list(_tables(report, scale != "smoke", gaps)),
         "samples": report.samples,
         "files": files,
     }
@@ -198,58 +199,44 @@ def _effects(report: Report) -> tuple[dict[str, list[Line]], float]:
 
 
 def _tables(report: Report, unfold: bool, gaps: list[Gap]) -> Iterator[Block]:
-    """The registry's tables; one without a row is a gap."""
+    """The registry's tables, then those about data and encoders; one of the registry without a row is a gap."""
     for table in TABLES:
-        frame = table.build(report.scores, report.effects, report.published)
-        if frame.empty:
-            gaps.append(
-                (report.name, table.title, f"no row of its {table.source}.csv belongs there: nothing such was run")
-            )
-            continue
-        file = f"{report.name}/{table.source}.csv"
-        html = draw_table(frame, table.title, file)
-        yield Block(f"{report.name}-{table.key}", table.title, table.caption, html, file, unfold and not table.folded)
-
-
-def _dataset(report: Report) -> Iterator[Block]:
-    """The paper's tables about its data set."""
+        file, frame = f"{table.source}.csv", table.build(report.scores, report.effects, report.published)
+        if len(frame):
+            shown = unfold and not table.folded
+            yield _block(report, table.key, table.title, table.caption, frame, file)._replace(open=shown)
+        else:
+            gaps.append((report.name, table.title, f"no row of its {file} belongs there: nothing such was run"))
+    errors = report.folder / "encoder_errors.csv"
+    if errors.is_file() and len(frame := _shown(pd.read_csv(errors))):
+        caption = "Classes are ordinal: how many classes an answer is off on average, and Cohen's kappa with quadratic weights."
+        yield _block(report, "errors", "How far encoders are off", caption, frame, errors.name)
     for title, frame in dataset_tables(report.folder, report.provenance["dataset"]).items():
-        file = f"{report.name}/{'audit' if 'Measured' in frame else 'dataset'}.csv"
-        yield Block(
-            f"{report.name}-{title.partition(':')[0].partition(',')[0].replace(' ', '-')}",
-            title,
-            "",
-            draw_table(frame, title, file),
-            file,
-        )
-
-
-def _audit(report: Report) -> Iterator[Block]:
-    """The audit's findings, counted by check; what needs attention first."""
+        file = "audit.csv" if "Measured" in frame else "dataset.csv"
+        yield _block(report, re.split("[:,]", title)[0].replace(" ", "-").lower(), title, "", frame, file)
     audit = read_frame(report.folder / "audit.csv", AUDIT)
     if len(audit):
-        file, counts = f"{report.name}/audit.csv", audit["severity"].value_counts()
-        groups = [
-            (RANK.get(severity, 3), -len(rows), check, severity, rows.iloc[0])
-            for (severity, check), rows in audit.groupby(["severity", "check"])
-        ]
-        shown = pd.DataFrame(
-            {
-                "Severity": severity,
-                "Check": check,
-                "Findings": str(-n),
-                "The first of them": f"{first['item']}: {first['measured']}",
-            }
-            for _, n, check, severity, first in sorted(groups, key=lambda g: g[:3])
-        )
-        caption = ", ".join(f"{counts[name]} {name}" for name in sorted(counts.index, key=lambda s: RANK.get(s, 3)))
-        yield Block(
-            f"{report.name}-audit",
-            "Data audit",
-            f"{caption}; counted by check.",
-            draw_table(shown, "Data audit", file, at_lines=False),
-            file,
-        )
+        yield _audit(report, audit.sort_values("severity", key=lambda s: s.map(RANK).fillna(3), kind="stable"))
+
+
+def _audit(report: Report, audit: pd.DataFrame) -> Block:
+    """The audit's findings, counted by check; what needs attention first."""
+    groups = audit.groupby(["severity", "check"], sort=False)
+    first = groups.first()
+    cells = {
+        "Findings": groups.size().astype(str),
+        "The first of them": first["item"] + ": " + first["measured"].astype(str),
+    }
+    frame = pd.DataFrame(cells).reset_index().rename(columns=str.capitalize)
+    caption = ", ".join(f"{n} {severity}" for severity, n in audit["severity"].value_counts(sort=False).items())
+    return _block(report, "audit", "Data audit", f"{caption}; counted by check.", frame, "audit.csv", at_lines=False)
+
+
+def _block(
+    report: Report, key: str, title: str, caption: str, frame: pd.DataFrame, file: str, at_lines: bool = True
+) -> Block:
+    file = f"{report.name}/{file}"
+    return Block(f"{report.name}-{key}", title, caption, draw_table(frame, title, file, at_lines), file)
 
 
 def _speed(folder: Path, gaps: list[Gap]) -> Iterator[dict[str, Any]]:
@@ -259,15 +246,13 @@ def _speed(folder: Path, gaps: list[Gap]) -> Iterator[dict[str, Any]]:
         gaps.append(("speed", "speed_error.csv", "nothing was measured yet: `make bench` measures it"))
     rows["front"] = rows["front"].astype(str).eq("True")
     for question, group in rows.groupby("question", sort=False):
-        shown = group.drop(columns="question").dropna(axis="columns", how="all").map(_said)
-        shown.columns = [name.replace("_", " ").capitalize() for name in shown]
         yield {
             "question": question,
             "costs": "; ".join(group["unit"].dropna().unique()),
             "errors": "; ".join(group["error_of"].dropna().unique()),
             "points": place_points(group),
             "front": group[group["front"]].sort_values("cost_ratio").map(_said).to_dict("records"),
-            "html": draw_table(shown, str(question), "speed_error.csv"),
+            "html": draw_table(_shown(group.drop(columns="question")), str(question), "speed_error.csv"),
         }
 
 
@@ -284,9 +269,15 @@ def _stability(folder: Path, gaps: list[Gap]) -> dict[str, Any]:
     return {
         "cases": len(rows),
         "failed": len(failed),
-        "failures": draw_table(failed.map(_said), "Cases that failed", "stability.csv") if len(failed) else "",
+        "failures": draw_table(_shown(failed), "Cases that failed", "stability.csv") if len(failed) else "",
         "table": draw_table(cells, "Cases that passed, by part and number format", "stability.csv", at_lines=False),
     }
+
+
+def _shown(rows: pd.DataFrame) -> pd.DataFrame:
+    """Rows of a CSV as text, without empty columns."""
+    rows = rows.dropna(axis="columns", how="all").map(_said)
+    return rows.rename(columns=lambda name: name.replace("_", " ").capitalize())
 
 
 def _said(value: Any) -> str:
