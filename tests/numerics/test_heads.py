@@ -22,8 +22,8 @@ from torch.nn import functional as F
 from pipeline.encoder.baseline.predictor import decode_jointly, log_dependence
 from pipeline.encoder.frame_classifier import JointFrameClassifier
 from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
-from pipeline.encoder.release import SHORTEST_FEATURE, PublishedHeads
 from pipeline.encoder.pretrain import PretrainingModel
+from pipeline.encoder.release import SHORTEST_FEATURE, PublishedHeads
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.runtime import seed_everything
 from tests.numerics.bounds import summing
