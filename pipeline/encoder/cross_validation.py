@@ -114,7 +114,7 @@ def cross_validate_candidate(
             advance()
             return np.array(read_json(file), dtype=np.int64)
 
-        results = cross_validate(
+        predicted = cross_validate(
             resumed,
             data.labels,
             data.objects,
@@ -129,11 +129,11 @@ def cross_validate_candidate(
             video_id=video.video_id,
             object_id=video.object_id,
             repeat=repeat,
-            expected=result.expected,
-            predicted=predicted,
+            expected=data.catalogue.labels(video.object_id),
+            predicted=tuple(classes),
         )
-        for video, result in zip(data.videos, results, strict=True)
-        for repeat, predicted in enumerate(result.predicted)
+        for video, repeats in zip(data.videos, predicted.tolist(), strict=True)
+        for repeat, classes in enumerate(repeats)
     ]
 
 
