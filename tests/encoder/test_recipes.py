@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -16,42 +14,19 @@ from hypothesis import strategies as st
 from safetensors.torch import load_file
 from scipy.special import log_softmax
 from scipy.stats import kstest, norm, uniform
-from torch.optim.optimizer import register_optimizer_step_pre_hook
-from transformers import EvalPrediction, TrainerCallback, TrainingArguments
 
-from pipeline.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
-from pipeline.encoder import finetune as training
-from pipeline.encoder.clip import load_visual_tower
-from pipeline.encoder.clips import ClipDataset, LabelledVideo
-from pipeline.encoder.embed import standardize
-from pipeline.encoder.finetune import accuracies, finetune, train_classifier, write_encoder_card
-from pipeline.encoder.frame_classifier import JointFrameClassifier
-from pipeline.encoder.model import Heads, PropertyClassifier, TactileEncoder
-from pipeline.encoder.recipes import RECIPES, base_encoder, check_recipe, property_classifier
+from pipeline.encoder.model import Heads, TactileEncoder
+from pipeline.encoder.recipes import base_encoder, property_classifier
 from pipeline.encoder.release import DROPOUT, PublishedHeads, sinusoid
-from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.encoder.vpt import VisualPrompts
-from pipeline.errors import UserError
-from pipeline.io import save_tensors, write_table
-from pipeline.records import Embedding, Part
 from pipeline.runtime import seed_everything
-from pipeline.trainable import load_trainable, save_trainable, trainable_state
-from pipeline.training import TrainableTrainer
-from pipeline.videos.catalogue import Catalogue
-from pipeline.videos.frames.store import FrameStore
-from pipeline.weights import check_encoder, check_language
-from tests.checkpoints import CLIP_CONFIG, write_clip, write_llama
+from tests.checkpoints import CLIP_CONFIG
 from tests.encoders import (
-    CPU,
     FRAME_INDICES,
-    PARTS,
     Floats,
     close,
     config,
-    encoder_data,
     float64,
-    random_heads,
-    write_frames,
     write_tower,
 )
 
