@@ -4,6 +4,9 @@ VENV := .venv
 BIN := $(CURDIR)/$(VENV)/bin
 PORT ?= 5000
 DONE := $(VENV)/.installed
+# uv, where it is installed, does the same in a fraction of the time.
+UV := $(shell command -v uv)
+PIP := $(if $(UV),uv pip install --quiet --python $(BIN)/python,python -m pip install --quiet --disable-pip-version-check)
 # Stages are started by DVC as plain `python`; this makes it the one in .venv.
 export PATH := $(BIN):$(PATH)
 export PYTHONUNBUFFERED := 1
@@ -15,16 +18,13 @@ install: $(DONE)
 
 $(DONE): requirements.lock pyproject.toml
 	"$(PYTHON)" -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "Python 3.11 or newer is needed; set PYTHON=...")'
-	"$(PYTHON)" -m venv $(VENV)
-	python -m pip install --quiet --disable-pip-version-check --requirement requirements.lock
-	python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	$(if $(UV),uv venv --quiet --allow-existing --python "$(PYTHON)" $(VENV),"$(PYTHON)" -m venv $(VENV))
+	$(PIP) --requirement requirements.lock
+	$(PIP) --no-deps --no-build-isolation --editable .
 	touch $(DONE)
 
 repro: install
-	dvc repro
-	@octopi page
-	@python -c 'from pipeline.config import load_params; print(f"\nTables and figures: reports/{load_params().report_name}/README.md")'
-	@echo "Dashboard:          make dashboard, then open http://127.0.0.1:$(PORT)"
+	@octopi repro
 
 test: install
 	python -m pytest
@@ -37,11 +37,12 @@ lint: install
 dashboard: install
 	@mkdir -p mlruns
 	MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false \
-	mlflow ui --backend-store-uri "sqlite:///$(CURDIR)/mlruns/mlflow.db" --host 127.0.0.1 --port $(PORT)
+	mlflow ui --backend-store-uri sqlite:///mlruns/mlflow.db --default-artifact-root mlruns/artifacts \
+		--host 127.0.0.1 --port $(PORT)
 
 bench: install
-	@test -n "$(SECTION)" || { echo "make bench: name a section, as in make bench SECTION=startup"; exit 1; }
-	python -m pipeline.benchmarks $(SECTION)
+	@test -n "$(SECTION)" || { echo "make bench: name a section, as in make bench SECTION=frames"; exit 1; }
+	python -m benchmarks $(SECTION)
 
 standins: install
 	dvc repro standins/dvc.yaml

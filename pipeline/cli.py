@@ -38,6 +38,24 @@ def scale(
     typer.echo(f"`dvc repro` runs it; its tables go to reports/{params.report_name}/")
 
 
+@app.command()
+def page() -> None:
+    """Write reports/index.html, one page over all reports that opens from disk."""
+    from pipeline.report.page import write_page
+
+    file = write_page(Path())
+    typer.echo(f"{file}: {file.stat().st_size / 1000:.0f} kB")
+
+
+@app.command()
+def publish() -> None:
+    """Show what lies in data/ and reports/ in MLflow, as `dvc repro` does at its end; a second call adds nothing."""
+    from pipeline import tracking
+    from pipeline.params import load_params
+
+    typer.echo(tracking.publish(load_params()))
+
+
 CATALOGUE = typer.Option(help="Folder with objects.csv and properties.yaml.")
 
 
@@ -81,6 +99,31 @@ def _show(findings: Sequence[Finding]) -> None:
         typer.echo(f"{f.severity:8} {f.check}: {f.item}: {f.measured}{expected}")
     if any(f.severity == "error" for f in findings):
         raise typer.Exit(1)
+
+
+@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
+def repro(context: typer.Context) -> None:
+    """Run `dvc repro`: say how many stages will run, and write the page of all reports behind it."""
+    from pipeline.reproduce import reproduce
+
+    raise typer.Exit(reproduce(Path(), context.args))
+
+
+@app.command()
+def compare(
+    old: Annotated[str, typer.Argument(help="A Git revision: a hash, a tag, a branch, HEAD~1.")],
+    new: Annotated[str, typer.Argument(help="Another one; without it, what lies on disk now.")] = "",
+    json: Annotated[Path | None, typer.Option(help="Also write everything to this file, for machines.")] = None,
+) -> None:
+    """Say what differs between two revisions: parameters, stages, figures, and whether accuracies really changed."""
+    from pipeline.compare import compare as compare_states
+    from pipeline.compare import describe
+    from pipeline.io import write_json
+
+    found = compare_states(Path(), old, new)
+    if json is not None:
+        write_json(json, found)
+    typer.echo(describe(found))
 
 
 def main() -> None:

@@ -11,13 +11,15 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from pipeline.records import Encoder, Lora, Opd, Task, Touch, Variant
+from pipeline.records import Encoder, Lora, Opd, Touch, Variant
 from pipeline.runtime import DeviceName, DtypeName, Quantization
 
 Fraction = Annotated[float, Field(gt=0, le=1)]
 Positive = Annotated[int, Field(ge=1)]
 Rate = Annotated[float, Field(gt=0, lt=10)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
+QuestionCounts = dict[str, Annotated[int, Field(ge=0)]]
+"""Questions of each task; `pipeline.tasks.questions.counts_by_task` knows which tasks there are."""
 
 Recipe = Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]*$")]
 """A name in `pipeline.encoder.recipes.RECIPES`; `octopi scale` checks that it is one."""
@@ -107,35 +109,16 @@ class SplitConfig(Section):
         return self
 
 
-class QuestionCounts(Section):
-    """Questions a task."""
-
-    opd: Annotated[int, Field(ge=0)]
-    pc: Annotated[int, Field(ge=0)]
-    pss: Annotated[int, Field(ge=0)]
-    pom: Annotated[int, Field(ge=0)]
-    psr: Annotated[int, Field(ge=0)] = 0
-
-    def by_task(self) -> dict[Task, int]:
-        """The counts keyed by task."""
-        return {task: getattr(self, task.lower()) for task in Task}
-
-
 class QuestionsConfig(Section):
     """How many questions are built; fewer come where the objects allow no more without repeating."""
 
     seed: Seed = 0
     train: QuestionCounts
+    """By the task's name in lower case; a task without a number gets none."""
     evaluation: QuestionCounts
     facts: bool = False
     """Begin matching questions with what the named objects are like, for a language model that has never heard of
     them: then touch and reasoning are asked for and no knowledge of the world. Tables say so."""
-
-    @model_validator(mode="after")
-    def _psr_is_not_trained(self) -> Self:
-        if self.train.psr:
-            raise ValueError("questions.train.psr must be 0: scenarios are for evaluation only")
-        return self
 
 
 class EncoderConfig(Section):

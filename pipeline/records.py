@@ -27,16 +27,6 @@ class Part(StrEnum):
     UNUSED = "unused"
 
 
-class Task(StrEnum):
-    """The five tasks of the paper (its table "Task Details")."""
-
-    OPD = "OPD"
-    PC = "PC"
-    PSS = "PSS"
-    POM = "POM"
-    PSR = "PSR"
-
-
 class Opd(StrEnum):
     """How much an answer describes before it concludes (the ablation axis OPD)."""
 
@@ -135,11 +125,11 @@ class Probe(Record):
     saturated: float
     """Share of values at 0 or 255 where contact is strongest."""
     contact: float
-    """Largest strength of contact in a probed frame (`pipeline.videos.frames.reference.strength`)."""
+    """Largest contact strength in a probed frame (`pipeline.videos.frames.reference.contact_strength`)."""
     quiet: float
-    """Smallest strength in a probed frame after the reference: what noise alone gives in a quiet part of a video."""
+    """Smallest contact strength in a probed frame after the reference: what noise alone gives in a quiet part."""
     contact_end: float
-    """Strength of contact in the last frame."""
+    """Contact strength in the last frame."""
     starts_touching: bool
     """Whether the reference had to be taken from the end."""
     texture_start: float
@@ -178,7 +168,7 @@ class Frame(Record):
     """Position in the video, in decoding order."""
     score: float = Field(ge=0)
     """What the selection went by: `salient` sums absolute differences in brightness to the frame before, over all
-    pixels (8-bit steps); `release` counts changed grey pixels; `contact` and `adaptive` take the strength of contact;
+    pixels (8-bit steps); `release` counts changed grey pixels; `contact` and `adaptive` take the contact strength;
     0 where there was nothing to choose by."""
     row: int = Field(ge=0)
 
@@ -220,7 +210,8 @@ class Question(Record):
     """One question in every OPD mode that applies; all ablation variants share its id."""
 
     question_id: str
-    task: Task
+    task: str
+    """Name of the task in `pipeline.tasks.TASKS`."""
     part: Part
     videos: tuple[str, ...]
     objects: tuple[str, ...]
@@ -236,7 +227,7 @@ class Prediction(Record):
     """The raw text that a variant generated, one entry a turn."""
 
     question_id: str
-    task: Task
+    task: str
     outputs: tuple[str, ...]
     truncated: bool
     """Whether a turn ran into the token limit before the end token."""
@@ -252,7 +243,7 @@ class Score(Record):
     """One graded measure of one answer; OPD has one a property and `combined`, other tasks `choice`."""
 
     question_id: str
-    task: Task
+    task: str
     measure: str
     correct: bool
     parsed: bool

@@ -15,8 +15,11 @@ from pipeline.encoder.recipes import check_recipe
 from pipeline.errors import UserError
 from pipeline.io import write_text
 from pipeline.params import PARAMS_FILE, validate
-from pipeline.videos.catalogue import load_catalogue
-from pipeline.videos.split import check_split
+from pipeline.records import Part, Touch
+from pipeline.tasks.questions import counts_by_task
+from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.videos.files import list_videos, raise_errors
+from pipeline.videos.split import FEWEST_TRAINING_OBJECTS, assign_objects
 
 CONF = Path("conf")
 RECIPE = "encoder.recipe"
@@ -62,11 +65,12 @@ def compose(name: str, overrides: Sequence[str] = (), conf: Path = CONF) -> Para
 
 
 def check_inputs(params: Params) -> None:
-    """Raise UserError where something that the scale needs is not there: videos, catalogue, objects, weights."""
+    """Raise UserError where something that the scale needs is not there: videos, catalogue, objects, tasks, weights."""
     catalogue = load_catalogue(Path(params.data.catalogue))
-    check_split(catalogue, params.split.name)
     check_recipe(params.encoder.recipe)
     check_candidates(params.cross_validation.models, params.encoder.recipe)
+    counts_by_task(params.questions, "train")
+    counts_by_task(params.questions, "evaluation")
     folder = Path(params.data.dir)
     if params.data.source == "videos" and not folder.is_dir():
         raise UserError(
@@ -76,8 +80,36 @@ def check_inputs(params: Params) -> None:
     unknown = [o for o in params.scenes.objects if o not in catalogue.objects]
     if unknown:
         raise UserError(f"scenes.objects: {unknown[0]} is not in {params.data.catalogue}/objects.csv")
+    check_objects(params, catalogue)
     weights.check_encoder(Path(params.encoder.weights), params.frames.size)
     weights.check_language(Path(params.language.weights))
+
+
+def check_objects(params: Params, catalogue: Catalogue) -> None:
+    """Raise UserError where the objects that have videos are too few for what was chosen, before hours of training."""
+    if params.data.source == "scenes":
+        present = set(params.scenes.objects or catalogue.objects)
+    else:
+        present = {file.object_id for file in list_videos(Path(params.data.dir), catalogue).files}
+        if not present:
+            raise_errors(Path(params.data.dir), list_videos(Path(params.data.dir), catalogue).findings)
+    parts = assign_objects(catalogue, present, params.split)
+    training, tested = (sorted(o for o in present if parts.get(o) == part) for part in (Part.TRAIN, Part.TEST))
+    if len(training) < FEWEST_TRAINING_OBJECTS:
+        raise UserError(
+            f"split.name={params.split.name}: {len(training)} training objects have videos, but questions about three "
+            "objects need three; add objects, or choose another split.name"
+        )
+    if len(tested) == 1 and Touch.SWAPPED in params.ablation.touch:
+        raise UserError(
+            f"ablation.touch: swapped gives a test object the touch of another, but only {tested[0]} has videos; leave "
+            "swapped out, or add test objects"
+        )
+    if len(present) < params.cross_validation.folds:
+        raise UserError(
+            f"cross_validation.folds is {params.cross_validation.folds}, but only {len(present)} objects have videos; "
+            "lower it"
+        )
 
 
 def write_params(params: Params, path: Path = PARAMS_FILE) -> bool:
@@ -93,11 +125,10 @@ def write_params(params: Params, path: Path = PARAMS_FILE) -> bool:
 class _Dumper(yaml.SafeDumper):
     """Writes lists in one line, so that params.yaml stays readable."""
 
-    def represent_list(self, data: list[object]) -> yaml.nodes.Node:
-        return self.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=True)
 
-
-_Dumper.add_representer(list, _Dumper.represent_list)
+_Dumper.add_representer(
+    list, lambda dumper, data: dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=True)
+)
 
 
 def prune(params: Params, data: Path) -> None:

@@ -32,6 +32,8 @@ class Stage:
 
     name: str
     params: Params
+    started: float = field(default_factory=time.time)
+    """Seconds since 1970."""
     metrics: dict[str, float] = field(default_factory=dict)
 
     def finish_training(self, history: Sequence[Measurement]) -> None:
@@ -58,7 +60,7 @@ def stage(name: str, key: str | None = None) -> Iterator[Stage]:
     quiet_libraries()
     try:
         with _alone(full):
-            running = Stage(full, load_params())
+            running = Stage(full, load_params(), started)
             limit_threads(running.params.runtime.threads)
             if _main_process():
                 print(f"{full}: starts ({running.params.report_name})", flush=True)

@@ -18,7 +18,6 @@ def main() -> None:
             read_table(DATA / "videos.parquet", Video),
             read_table(DATA / "splits.parquet", Assignment),
             load_catalogue(Path(run.params.data.catalogue)),
-            synthetic=run.params.data.source == "scenes",
         )
         out = DATA / "audit"
         write_csv(out / AUDIT_FILE, Finding, findings)

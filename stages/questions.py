@@ -5,7 +5,7 @@ from pathlib import Path
 from pipeline.io import read_table, write_jsonl
 from pipeline.records import Assignment, Part
 from pipeline.stage import DATA, stage
-from pipeline.tasks.questions import build_questions, pool_of
+from pipeline.tasks.questions import build_questions, counts_by_task, pool_of
 from pipeline.videos.catalogue import load_catalogue
 
 
@@ -15,13 +15,13 @@ def main() -> None:
         catalogue = load_catalogue(Path(run.params.data.catalogue))
         assignments = read_table(DATA / "splits.parquet", Assignment)
         for name, part, counts, distinct in (
-            ("train", Part.TRAIN, config.train, False),
-            ("evaluation", Part.TEST, config.evaluation, True),
+            ("train", Part.TRAIN, counts_by_task(config, "train"), False),
+            ("evaluation", Part.TEST, counts_by_task(config, "evaluation"), True),
         ):
             pool = pool_of(part, assignments, catalogue)
-            questions = build_questions(pool, counts.by_task(), seed=config.seed, distinct=distinct, facts=config.facts)
+            questions = build_questions(pool, counts, seed=config.seed, distinct=distinct, facts=config.facts)
             write_jsonl(DATA / "questions" / f"{name}.jsonl", questions)
-            for task in counts.by_task():
+            for task in counts:
                 run.metrics[f"{name}.{task}"] = sum(q.task == task for q in questions)
 
 

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
-from pipeline.records import Task
 from pipeline.tasks.base import LETTERS, ORDINALS
 from standins.describing import Style, described
 from standins.documents import NOTHING, Builder, Document, Hint
@@ -55,7 +54,7 @@ def listing(world: World, style: Style, distance: Distance, rng: random.Random) 
     compare = rng.random() < 0.5
     objects = rng.sample(world.pool.objects, 2 if compare else 3)
     names = [f"{o} object:" for o in ORDINALS] if compare else [f"{letter})" for letter in LETTERS]
-    builder = Builder(Task.PC if compare else Task.PSS)
+    builder = Builder("PC" if compare else "PSS")
     for number, (name, object_id) in enumerate(zip(names, objects, strict=True)):
         hint = Hint(thing=number, labels=world.catalogue.labels(object_id))
         builder.given(f"{' ' if number else ''}{name} {described(world, object_id, style, rng)}", hint)

@@ -7,7 +7,7 @@ import re
 from dataclasses import dataclass, replace
 
 from pipeline.language.chat import TACTILE, render
-from pipeline.records import Opd, Task, Turn
+from pipeline.records import Opd, Turn
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Draft
 from pipeline.tasks.pom import fact
@@ -46,7 +46,7 @@ class Manner:
     """At most so many short questions about the same objects after the conversation."""
 
 
-def draw_draft(world: World, task: Task, rng: random.Random) -> Draft:
+def draw_draft(world: World, task: str, rng: random.Random) -> Draft:
     """A question of the pipeline's own making, of a random stratum."""
     definition = TASKS[task]
     while True:
@@ -55,7 +55,7 @@ def draw_draft(world: World, task: Task, rng: random.Random) -> Draft:
             return draft
 
 
-def converse(world: World, task: Task, mode: Opd, rng: random.Random, manner: Manner = Manner()) -> Document:
+def converse(world: World, task: str, mode: Opd, rng: random.Random, manner: Manner = Manner()) -> Document:
     """One conversation of a task under an OPD mode."""
     draft = draw_draft(world, task, rng)
     felt = misread(world, draft.objects, rng) if manner.misread else world
@@ -71,7 +71,7 @@ def converse(world: World, task: Task, mode: Opd, rng: random.Random, manner: Ma
         writer.question(rendered.text[position:start])
         writer.answer(rendered.text[start : stop - len(EOS)])
         position = stop
-    if manner.follow_ups and len(draft.objects) == (2 if task == Task.PC else 3):
+    if manner.follow_ups and len(draft.objects) == (2 if task == "PC" else 3):
         # Not tested: many easy ones would hide whether the first question, asked before the descriptions, is.
         count = rng.randint(1, manner.follow_ups)
         ask_all(writer.builder, world, draft.objects, Distance.CHAT, rng, at_most=count, tested=False)
@@ -92,7 +92,7 @@ class _Writer:
 
     def question(self, text: str) -> None:
         """Append what is read before an answer, with the classes in the videos' places."""
-        self.asked = asked_number(self.world, Task(self.builder.kind), text, self.asked)
+        self.asked = asked_number(self.world, self.builder.kind, text, self.asked)
         # The space before a word is part of its token.
         for part in re.split(f"( ?[{VIDEOS}{FACTS}])", text):
             if part and part[-1] in VIDEOS:
@@ -121,7 +121,7 @@ class _Writer:
             self._describe(body)
             self.builder.said(marker, PLAIN, Hint(asked=self.asked))
             self._conclude(verdict.strip())
-        elif self.asked == UNKNOWN and self.builder.kind != Task.POM:
+        elif self.asked == UNKNOWN and self.builder.kind != "POM":
             self._describe(text)
             self.builder.said(EOS, PLAIN)
         else:
@@ -129,7 +129,7 @@ class _Writer:
 
     def _conclude(self, verdict: str) -> None:
         hints = [Hint(asked=self.asked)]
-        if self.builder.kind == Task.POM:
+        if self.builder.kind == "POM":
             labels = map(self.world.catalogue.labels, self.draft.objects)
             hints = [Hint(thing=number, recalled=each) for number, each in enumerate(labels)]
         conclude(self.builder, verdict, weight=MAIN, hints=hints)
@@ -150,7 +150,7 @@ class _Writer:
         words = "|".join(w for p in self.world.catalogue.properties for w in sorted(p.levels, key=len, reverse=True))
         # Only the closing sentence names classes as such; the free one may hold the same words in its phrases.
         closing = max(text.rfind("Overall"), 0)
-        kind = Task.OPD if self.builder.kind == Task.OPD else RESTATED
+        kind = "OPD" if self.builder.kind == "OPD" else RESTATED
         found = list(re.compile(rf" ({words})(?!\w)").finditer(text, closing))
         for match in found:
             self.builder.said(text[position : match.start()], PLAIN, thing)
@@ -168,16 +168,16 @@ def tell(builder: Builder, world: World, object_id: str, space: str = " ") -> No
     builder.given(space + classes, Hint(labels=labels)).given(name, Hint(named=labels, copied=True))
 
 
-def asked_number(world: World, task: Task, text: str, before: int = UNKNOWN) -> int:
+def asked_number(world: World, task: str, text: str, before: int = UNKNOWN) -> int:
     """Which property and direction a question asks for: twice the property's number, plus one for the lower end."""
     properties = world.catalogue.properties
-    if task == Task.PSR:
+    if task == "PSR":
         for scenario in world.catalogue.language.scenarios:
             if scenario.question in text:
                 name, (level, *_) = next(iter(scenario.target.items()))
                 return 2 * world.catalogue.property_index(name) + (level == 0)
         return before
-    ends = {Task.PC: ("more", "less"), Task.PSS: ("most", "least")}.get(task, ())
+    ends = {"PC": ("more", "less"), "PSS": ("most", "least")}.get(task, ())
     for index, p in enumerate(properties):
         for falling, end in enumerate(ends):
             if f" {getattr(p, end)}" in text:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 
-from pipeline.records import Opd, Task
+from pipeline.records import Opd
 from standins.asking import Distance, listing
 from standins.conversing import RESTATED, Manner, converse
 from standins.describing import Style, property_words
@@ -128,7 +128,7 @@ def told(world: World, rng: random.Random) -> Document:
     """Classes in the question, said as descriptions in the answer: one object's or, before the conclusion, several'."""
     style = rng.choice((Style.STRUCTURED, Style.FULL))
     if rng.random() < 0.35:
-        return converse(world, Task.OPD, Opd.ALL, rng, Manner(style, slots=True, blended=_often(rng)))
+        return converse(world, "OPD", Opd.ALL, rng, Manner(style, slots=True, blended=_often(rng)))
     mode = rng.choice((Opd.ALL, Opd.NEEDED))
     return converse(world, _comparing(rng), mode, rng, Manner(style, slots=True, blended=_often(rng)))
 
@@ -165,7 +165,7 @@ def situations(world: World, rng: random.Random) -> Document:
     mode = rng.choice(tuple(Opd))
     style = rng.choice((Style.SHORT, Style.STRUCTURED, Style.FULL))
     known = mode == Opd.NONE or rng.random() < 0.5
-    return converse(world, Task.PSR, mode, rng, Manner(style, slots=known, blended=_often(rng)))
+    return converse(world, "PSR", mode, rng, Manner(style, slots=known, blended=_often(rng)))
 
 
 def rephrased(world: World, rng: random.Random) -> Document:
@@ -201,7 +201,7 @@ def matched_fully(world: World, rng: random.Random) -> Document:
     """The pipeline's matching, after facts about the named objects."""
     mode = rng.choice((Opd.ALL, Opd.ALL, Opd.NONE))
     known = mode == Opd.NONE or rng.random() < 0.5
-    return converse(world, Task.POM, mode, rng, Manner(slots=known, blended=_often(rng), facts=True))
+    return converse(world, "POM", mode, rng, Manner(slots=known, blended=_often(rng), facts=True))
 
 
 def matched_by_likeness(world: World, rng: random.Random) -> Document:
@@ -209,7 +209,7 @@ def matched_by_likeness(world: World, rng: random.Random) -> Document:
     mode = rng.choice((Opd.ALL, Opd.ALL, Opd.NONE))
     known = mode == Opd.NONE or rng.random() < 0.5
     manner = Manner(slots=known, blended=_often(rng), facts=True, misread=True)
-    return converse(world, Task.POM, mode, rng, manner)
+    return converse(world, "POM", mode, rng, manner)
 
 
 def everything(world: World, rng: random.Random) -> Document:
@@ -225,11 +225,11 @@ def _often(rng: random.Random) -> bool:
     return rng.random() < 0.5
 
 
-def _comparing(rng: random.Random) -> Task:
-    return rng.choice((Task.PC, Task.PSS))
+def _comparing(rng: random.Random) -> str:
+    return rng.choice(("PC", "PSS"))
 
 
-COMPARING = (Task.PC, Task.PSS)
+COMPARING = ("PC", "PSS")
 FORMATS = (
     Format("compressed", compressed, COMPARING, replay=0.3),
     Format("bridge", bridge, COMPARING, replay=0.3),
@@ -238,11 +238,11 @@ FORMATS = (
     Format("asked first", asked_first, COMPARING),
     Format("full", full, COMPARING, replay=2.0),
     Format("slots", slots, COMPARING, most=36, replay=3.0),
-    Format("told", told, (Task.OPD, RESTATED, *COMPARING), most=108, replay=3.0),
+    Format("told", told, ("OPD", RESTATED, *COMPARING), most=108, replay=3.0),
     Format("free", free, COMPARING, most=36),
-    Format("situations", situations, (Task.PSR,), earlier=0.3, replay=2.0, most=60),
+    Format("situations", situations, ("PSR",), earlier=0.3, replay=2.0, most=60),
     Format("repeated", repeat, ("repetition",), earlier=0.3, enlarge=6.0),
-    Format("named", named, (Task.POM,), earlier=0.3, replay=2.0, most=102),
-    Format("matched", matched, (Task.POM,), earlier=0.25, replay=2.0, most=102),
-    Format("everything", everything, (Task.OPD, RESTATED, *COMPARING, Task.PSR, Task.POM), earlier=0.15, most=60),
+    Format("named", named, ("POM",), earlier=0.3, replay=2.0, most=102),
+    Format("matched", matched, ("POM",), earlier=0.25, replay=2.0, most=102),
+    Format("everything", everything, ("OPD", RESTATED, *COMPARING, "PSR", "POM"), earlier=0.15, most=60),
 )

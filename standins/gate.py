@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Literal
 import torch
 
 from pipeline.language.chat import TACTILE, render
-from pipeline.records import Opd, Part, Prediction, Question, Task, Turn
+from pipeline.records import Opd, Part, Prediction, Question, Turn
 from pipeline.runtime import derive_seed
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool
@@ -41,9 +41,9 @@ HEADER = ("task", "accuracy", "low", "high", "n", "goal", "passed")
 QUESTIONS_A_WORLD = 20
 NEW_TOKENS = 200
 BATCH = 50
-COMPARING = (Task.PC, Task.PSS)
+COMPARING = ("PC", "PSS")
 SLOTS: tuple[Literal["words", "blends"], ...] = ("words", "blends")
-GOALS = {Task.OPD: 0.95, Task.PC: 0.95, Task.PSS: 0.97, Task.POM: 0.7, Task.PSR: 0.85}
+GOALS = {"OPD": 0.95, "PC": 0.95, "PSS": 0.97, "POM": 0.7, "PSR": 0.85}
 Row = tuple[str, float, float, float, int, float, str]
 
 
@@ -52,7 +52,7 @@ class Exam:
     """One row of the gate."""
 
     name: str
-    task: Task
+    task: str
     goal: float
     mode: Opd = Opd.ALL
     slots: Literal["none", "words", "blends"] = "none"
@@ -79,16 +79,16 @@ def exams() -> tuple[Exam, ...]:
     test = [Exam(f"{t} test objects", t, 0.9, objects="test") for t in COMPARING]
     alone = [Exam(f"{t} test objects free sentences", t, 0.9, objects="test, own sentence alone") for t in COMPARING]
     matching = [
-        Exam("POM", Task.POM, GOALS[Task.POM]),
-        Exam("POM test objects", Task.POM, GOALS[Task.POM], objects="test"),
-        Exam("POM whole catalogue", Task.POM, GOALS[Task.POM], objects="all"),
+        Exam("POM", "POM", GOALS["POM"]),
+        Exam("POM test objects", "POM", GOALS["POM"], objects="test"),
+        Exam("POM whole catalogue", "POM", GOALS["POM"], objects="all"),
     ]
     suited = [
-        Exam("PSR seen kinds", Task.PSR, GOALS[Task.PSR], scenarios="seen"),
-        Exam("PSR unseen kinds", Task.PSR, 0.65, scenarios="unseen"),
-        Exam("PSR test objects", Task.PSR, 0.65, objects="test"),
+        Exam("PSR seen kinds", "PSR", GOALS["PSR"], scenarios="seen"),
+        Exam("PSR unseen kinds", "PSR", 0.65, scenarios="unseen"),
+        Exam("PSR test objects", "PSR", 0.65, objects="test"),
     ]
-    modes = {Task.OPD: (Opd.ALL,), Task.POM: (Opd.ALL, Opd.NONE)}
+    modes = {"OPD": (Opd.ALL,), "POM": (Opd.ALL, Opd.NONE)}
     return (
         *(*made, *test, *alone, *matching, *suited),
         *(
@@ -99,10 +99,10 @@ def exams() -> tuple[Exam, ...]:
                 mode,
                 slots,
                 scenarios="seen",
-                measure="combined" if task == Task.OPD else "choice",
+                measure="combined" if task == "OPD" else "choice",
             )
             for slots in SLOTS
-            for task in (Task if slots == "words" else (Task.OPD, *COMPARING))
+            for task in (TASKS if slots == "words" else ("OPD", *COMPARING))
             for mode in modes.get(task, (Opd.ALL, Opd.NEEDED, Opd.NONE))
         ),
     )
@@ -151,10 +151,10 @@ def _item(exam: Exam, world: World, number: int, rng: random.Random) -> Item:
             blends.append(tuple(p.levels[level] for p, level in zip(catalogue.properties, labels, strict=True)))
         if exam.objects == "test, own sentence alone":
             said = [text.replace(f" {catalogue.structured(labels)}", "") for text in said]
-    if exam.task == Task.POM:
+    if exam.task == "POM":
         first = f"{facts(catalogue, draft.objects, rng)} {first}"
     asked = [first, *(t.user for t in turns[1:])]
-    given = "" if exam.slots != "none" or exam.task == Task.PSR else f" {said[-1].rpartition(MARKER)[0]}{MARKER}"
+    given = "" if exam.slots != "none" or exam.task == "PSR" else f" {said[-1].rpartition(MARKER)[0]}{MARKER}"
     filled = tuple(Turn(user=user, assistant=text) for user, text in zip(asked, said, strict=True))
     return Item(question, catalogue, filled, given, tuple(blends))
 

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from enum import IntEnum
 
-from pipeline.records import Task
 from pipeline.tasks.base import LETTERS
 from standins.asking import conclude
 from standins.conversing import draw_draft, tell
@@ -30,12 +29,12 @@ class Reach(IntEnum):
 
 def matching(world: World, style: Style, reach: Reach, rng: random.Random) -> Document:
     """Facts about three named objects, descriptions, and which is which."""
-    objects = draw_draft(world, Task.POM, rng).objects
+    objects = draw_draft(world, "POM", rng).objects
     catalogue = world.catalogue
     hints = [Hint(labels=catalogue.labels(o)) for o in objects]
     names = [catalogue.objects[o].name for o in objects]
     owned = [Hint(named=hint.labels) for hint in hints]
-    builder = Builder(Task.POM)
+    builder = Builder("POM")
     for number, object_id in enumerate(rng.sample(objects, len(objects))):
         tell(builder, world, object_id, " " if number else "")
     for number, (letter, object_id) in enumerate(zip(LETTERS, objects, strict=True)):
@@ -65,7 +64,7 @@ def matching_one(world: World, rng: random.Random) -> Document:
     count = rng.randint(2, len(prop.levels))
     names = [world.catalogue.objects[o].name for o in rng.sample(world.pool.objects, count)]
     told = list(zip(rng.sample(range(len(prop.levels)), count), names, strict=True))
-    builder = Builder(Task.POM)
+    builder = Builder("POM")
     for number, (level, name) in enumerate(told):
         labels = tuple(level if i == index else UNKNOWN for i in range(len(world.catalogue.properties)))
         builder.given(f"{' ' if number else ''}{prop.levels[level]} is", Hint(labels=labels))

@@ -23,7 +23,7 @@ ERROR, WARNING, INFO = Severity.ERROR, Severity.WARNING, Severity.INFO
 PHYSICLEAR = load_catalogue(ROOT / "pipeline" / "physiclear")
 OBJECTS = ("baseball", "cotton_ball", "pillow", "potato", "rug", "millet", "lemon", "orange")
 GOOD_SPLIT = {o: (Part.TRAIN, Part.VALIDATION, Part.TEST)[i % 3] for i, o in enumerate(OBJECTS)}
-SCENE = ScenesConfig(frames=40, width=160, height=120)
+SCENE = ScenesConfig(frames=24, width=128, height=96)
 OTHER = Catalogue(
     language=PHYSICLEAR.language.model_copy(update={"dataset": ""}),
     objects={o: PHYSICLEAR.objects[o] for o in OBJECTS},

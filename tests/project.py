@@ -10,10 +10,7 @@ from pathlib import Path
 
 from tests.closure import ROOT
 
-PARTS = (
-    *("pipeline", "stages", "conf", "standins", "dvc.yaml", "pyproject.toml", ".gitignore", ".dvcignore"),
-    "reports/bench/encoder.json",
-)
+PARTS = ("pipeline", "stages", "conf", "standins", "dvc.yaml", "pyproject.toml", ".gitignore", ".dvcignore")
 OBJECTS = (
     *("baseball", "controller_base", "cotton_ball", "pillow", "rug"),
     "millet",
@@ -22,7 +19,9 @@ OBJECTS = (
 """To train on, to choose the encoder by, and to test on in the paper's split."""
 REDUCED = (
     "smoke",
-    "ablation.plan=single",
+    "ablation.encoders=[finetuned]",
+    "ablation.lora=[with]",
+    "ablation.opd=[all]",
     f"scenes.objects=[{','.join(OBJECTS)}]",
     "scenes.videos_per_object=2",
     "scenes.frames=12",

@@ -7,14 +7,11 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
-import yaml
-from pipeline.plan import resolve_plan
 
 from pipeline.config import Recipe
-from pipeline.encoder.candidates import RELEASE
+from pipeline.encoder.candidates import RELEASE, needs_pretraining
 from pipeline.errors import UserError
 from pipeline.params import load_params
-from pipeline.records import Opd
 from pipeline.scales import check_inputs, compose, prune, shipped_scales, write_params
 from tests.closure import ROOT
 
@@ -29,8 +26,14 @@ def test_shipped_scale_is_valid_and_survives_writing(scale: str, tmp_path: Path)
     assert not write_params(params, tmp_path / "params.yaml"), "an unchanged file is not written again"
 
 
-def test_no_other_scale_is_shipped() -> None:
-    assert shipped_scales(CONF) == ["paper-13b", "paper-7b", "small", "smoke"]
+def test_a_new_scale_is_a_file(tmp_path: Path) -> None:
+    conf = shutil.copytree(CONF, tmp_path / "conf")
+    (conf / "lab.yaml").write_text("defaults: [small, _self_]\nscale: lab\nlora: {rank: 4}\n")
+    assert shipped_scales(conf) == ["lab", "paper-13b", "paper-7b", "small", "smoke"]
+    params = compose("lab", conf=conf)
+    assert (params.scale, params.lora.rank, params.report_name) == ("lab", 4, "lab-scenes")
+    write_params(params, tmp_path / "params.yaml")
+    assert load_params(tmp_path / "params.yaml") == params
 
 
 def test_committed_params_are_the_default_scale() -> None:
@@ -59,9 +62,11 @@ def test_paper_scales_have_the_papers_hyper_parameters(scale: str) -> None:
         (["frames.fraction=1.5"], ["frames.fraction", "less than or equal to 1"]),
         (["split.name='Side ways'"], ["split.name", "Side ways", "pattern"]),
         (["split.fold=7"], ["split", "0 to 4"]),
-        (["ablation.seeds=[1,1]"], ["ablation", "repeats"]),
+        (["ablation.seeds=[1,1]"], ["ablation.seeds", "repeats"]),
+        (["ablation.opd=[none]"], ["ablation.opd", "lacks the full system's value all"]),
+        (["ablation.lora=[perhaps]"], ["ablation.lora", "'with' or 'without'"]),
+        (["ablation.touch=[swapped,swapped]"], ["ablation.touch", "repeats"]),
         (["align.batch_size=10"], ["align", "does not divide"]),
-        (["questions.train.psr=3"], ["questions", "must be 0"]),
         (["data.dir=elsewhere"], ["data.dir", "data/scenes/videos"]),
         (["lora.target_modules=[]"], ["lora.target_modules"]),
         (["encoder.learning_rate=nan"], ["encoder.learning_rate"]),
@@ -96,14 +101,6 @@ def test_broken_params_file(text: str | None, word: str, tmp_path: Path) -> None
         load_params(path)
 
 
-def test_edited_plan_is_refused(tmp_path: Path) -> None:
-    values = compose("smoke", conf=CONF).model_dump(mode="json")
-    values["plan"]["encoder_seeds"] = [0, 1]
-    (tmp_path / "params.yaml").write_text(yaml.safe_dump(values))
-    with pytest.raises(UserError, match="octopi scale"):
-        load_params(tmp_path / "params.yaml")
-
-
 def test_missing_inputs_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     with pytest.raises(UserError, match="data.dir"):
@@ -116,40 +113,68 @@ def test_missing_inputs_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         check_inputs(compose("smoke", ["scenes.objects=[unicorn]"]))
     with pytest.raises(UserError, match="frames.size"):
         check_inputs(compose("smoke", ["frames.size=48"]))
+    with pytest.raises(UserError, match="pretrained is no model|did you mean paper"):
+        check_inputs(compose("smoke", ["cross_validation.models=[papers]"]))
+    with pytest.raises(UserError, match="paper would be trained with the settings of encoder.recipe=release"):
+        check_inputs(compose("smoke", ["encoder.recipe=release", "cross_validation.models=[trees,paper]"]))
+    check_inputs(compose("smoke", ["encoder.recipe=release", "cross_validation.models=[trees,release]"]))
 
 
-def test_plan_names() -> None:
-    paper, factorial = resolve_plan("scenes", "paper", [0]), resolve_plan("videos", "factorial", [0, 1])
-    assert list(paper.variants) == [
-        "finetuned-with-all-0",
-        "finetuned-with-none-0",
-        "base-with-all-0",
-        "finetuned-without-all-0",
-    ]
-    assert len(factorial.variants) == 2 * 12
-    assert set(factorial.embeddings) == {"base", "finetuned-0", "finetuned-1"}, "the base encoder has no seed"
-    assert len(factorial.align) == 2 * 2 * len(Opd) == len(factorial.lora)
-    assert not factorial.scenes
-    assert paper.scenes
+TRAINED = "baseball,pillow,rug,potato,millet"
 
 
-def test_prune_keeps_the_plan_and_removes_the_rest(tmp_path: Path) -> None:
-    plan = resolve_plan("scenes", "paper", [0])
-    for name in ("align/base-all-0", "align/base-all-1", "scores/finetuned-with-all-0", "scores/old", "encoder/3"):
+@pytest.mark.parametrize(
+    ("objects", "override", "words"),
+    [
+        (f"{TRAINED},bath_towel", "seed=0", "ablation.touch: swapped .* only bath_towel"),
+        (f"{TRAINED},bath_towel", "ablation.touch=[removed]", None),
+        (f"{TRAINED},bath_towel,ice_block", "seed=0", None),
+        (TRAINED, "seed=0", None),
+        ("baseball,pillow,millet,bath_towel,ice_block", "seed=0", "2 training objects"),
+        ("bath_towel,ice_block", "seed=0", "no video of a training object"),
+        (f"{TRAINED},bath_towel,ice_block", "cross_validation.folds=8", "folds is 8, but only 7 objects"),
+    ],
+)
+def test_too_few_objects_are_found_before_any_training(
+    objects: str, override: str, words: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(ROOT)
+    params = compose("smoke", [f"scenes.objects=[{objects}]", override])
+    if words is None:
+        check_inputs(params)
+    else:
+        with pytest.raises(UserError, match=words):
+            check_inputs(params)
+
+
+def test_variants_are_the_product_of_the_lists() -> None:
+    params = compose(
+        "smoke", ["ablation.encoders=[finetuned,base]", "ablation.opd=[all,needed]", "ablation.seeds=[3,5]"]
+    )
+    keys = [v.key for v in params.ablation.variants()]
+    assert len(keys) == len(set(keys)) == 2 * 2 * 2 * 2
+    assert keys[0] == "finetuned-with-all-3"
+    assert [v.key for v in params.ablation.variants() if v.full] == ["finetuned-with-all-3", "finetuned-with-all-5"]
+
+
+def test_prune_keeps_what_params_name_and_removes_the_rest(tmp_path: Path) -> None:
+    params = compose("smoke", conf=CONF)
+    names = (
+        "models/with/base-all-0",
+        "models/without/base-all-1",
+        "answers/finetuned-with-all-0",
+        "answers/old",
+        "encoder/3",
+    )
+    for name in (*names, "cross_validation/trees", "cross_validation/paper"):
         (tmp_path / name).mkdir(parents=True)
-    (tmp_path / "metrics").mkdir()
-    for name in ("align@base-all-0", "align@base-all-1", "split", "synthesize@scenes", "grade@old"):
-        (tmp_path / "metrics" / f"{name}.json").touch()
-    prune(plan, tmp_path)
-    assert sorted(str(p.relative_to(tmp_path)) for p in tmp_path.glob("*/*")) == [
-        "align/base-all-0",
-        "metrics/align@base-all-0.json",
-        "metrics/split.json",
-        "metrics/synthesize@scenes.json",
-        "scores/finetuned-with-all-0",
-    ]
+    prune(params, tmp_path)
+    left = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_dir() and not list(p.iterdir())}
+    assert left == {
+        "models/with/base-all-0", "models/without", "answers/finetuned-with-all-0", "encoder", "cross_validation/trees",
+    }  # fmt: skip
     shutil.rmtree(tmp_path)
-    prune(plan, tmp_path)
+    prune(params, tmp_path)
 
 
 def test_a_recipe_brings_its_settings_and_gives_way_to_yours() -> None:
@@ -158,13 +183,10 @@ def test_a_recipe_brings_its_settings_and_gives_way_to_yours() -> None:
         composed = compose("smoke", [f"encoder.recipe={recipe}"], conf=CONF)
         assert composed.encoder.recipe == recipe
         assert composed.language == smoke.language
-        assert composed.plan.pretrain == (("scenes",) if recipe == "pretrained" else ())
+        assert needs_pretraining(recipe, composed.cross_validation.models) == (recipe == "pretrained")
     release = compose("small", ["encoder.recipe=release"], conf=CONF).encoder
-    assert {name: getattr(release, name) for name in RELEASE} == RELEASE, "the contestant is the recipe"
+    assert {name: getattr(release, name) for name in RELEASE} == RELEASE, "the candidate is the recipe"
     own = compose("small", ["encoder.recipe=release", "encoder.epochs=3"], conf=CONF).encoder
     assert (own.epochs, own.batch_size) == (3, RELEASE["batch_size"])
-    with pytest.raises(UserError, match=r"cross_validation.models: paper would be trained with the settings of"):
-        compose("small", ["encoder.recipe=release", "cross_validation.models=[trees,paper]"], conf=CONF)
-    compose("small", ["encoder.recipe=release", "cross_validation.models=[trees,release]"], conf=CONF)
     with pytest.raises(UserError, match=r"encoder.recipe=pretrained .* set encoder.reference=subtract"):
         compose("smoke", ["encoder.recipe=pretrained", "encoder.reference=none"], conf=CONF)

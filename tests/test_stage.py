@@ -23,7 +23,7 @@ from pipeline.io import (
     write_jsonl,
     write_table,
 )
-from pipeline.records import Assignment, Measurement, Part, Score, Task, Video
+from pipeline.records import Assignment, Measurement, Part, Score, Video
 from pipeline.scales import compose, write_params
 from pipeline.stage import stage
 from tests.closure import ROOT
@@ -36,14 +36,17 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_metrics_and_cost_are_written_apart(here: Path) -> None:
+def test_a_stage_says_when_it_starts_and_ends_and_what_it_cost(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with stage("align", "x") as run:
         run.finish_training([Measurement(step=1, name="loss", value=2.0), Measurement(step=5, name="loss", value=1.5)])
-    assert json.loads((here / "data/metrics/align@x.json").read_text()) == {"loss": 1.5, "steps": 5}
-    cost = json.loads((here / "runs/align@x.json").read_text())
-    assert cost["seconds"] >= 0
-    assert cost["startup_seconds"] >= 0
-    assert cost["peak_memory_mb"] > 0
+    written = json.loads((here / "runs/align@x.json").read_text())
+    assert written["metrics"] == {"loss": 1.5, "steps": 5}
+    assert written["started"] <= written["ended"]
+    assert min(written[k] for k in ("seconds", "startup_seconds", "peak_memory_mb")) >= 0
+    first, last = capsys.readouterr().out.splitlines()
+    assert first == "align@x: starts (smoke-scenes)"
+    assert last.startswith("align@x: done in ")
+    assert "loss 1.5" in last
 
 
 @pytest.mark.parametrize(
@@ -98,7 +101,7 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> 
 
 
 SCORE = Score(
-    question_id="q", task=Task.PC, measure="choice", correct=True, parsed=True, truncated=False, expected="yes",
+    question_id="q", task="PC", measure="choice", correct=True, parsed=True, truncated=False, expected="yes",
     predicted="yes", objects=("a", "b"),
 )  # fmt: skip
 

@@ -1,20 +1,10 @@
-"""The tasks, by name. To add one: write its module beside the others and list it here and in `records.Task`."""
+"""The tasks, by name. To add one: write its module beside the others and name it in `MODULES`."""
 
-from pipeline.records import Task
+from importlib import import_module
+
 from pipeline.tasks.base import TaskDefinition
-from pipeline.tasks.opd import ObjectPropertyDescription
-from pipeline.tasks.pc import PropertyComparison
-from pipeline.tasks.pom import PropertyObjectMatching
-from pipeline.tasks.psr import PropertyScenarioReasoning
-from pipeline.tasks.pss import PropertySuperlativeSelection
 
-TASKS: dict[Task, TaskDefinition] = {
-    t.task: t
-    for t in (
-        ObjectPropertyDescription(),
-        PropertyComparison(),
-        PropertySuperlativeSelection(),
-        PropertyObjectMatching(),
-        PropertyScenarioReasoning(),
-    )
-}
+MODULES = ("opd", "pc", "pss", "pom", "psr")
+"""One module a task, in the order of tables; each defines `TASK`."""
+
+TASKS: dict[str, TaskDefinition] = {t.name: t for t in (import_module(f"{__name__}.{m}").TASK for m in MODULES)}

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import random
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
-from pipeline.records import Dialogue, Gold, Opd, Part, Prediction, Question, Score, Task, Turn
+from pipeline.records import Dialogue, Gold, Opd, Part, Prediction, Question, Score, Turn
 from pipeline.videos.catalogue import Catalogue, Property
-from pipeline.videos.phrases import mentioned, plain
+from pipeline.videos.wording import mentioned, plain
 
 LETTERS = "abc"
 ORDINALS = ("First", "Second")
@@ -41,29 +41,61 @@ class Draft:
     gold: Gold
 
 
-class TaskDefinition(Protocol):
-    """One of the tasks. `strata` are balanced: question i of a set asks for stratum i modulo their number."""
+class TaskDefinition(ABC):
+    """One task: how it asks, what a right answer is, what a guess would score and what tables call it."""
 
-    task: Task
-    trained: bool
-    """Whether the task's questions are also used for training (PSR's are not)."""
+    name: str
+    """Short, unique; stands in question ids, files and tables. Its lower case is the key of its question counts."""
+    title: str
+    """Written out, as tables head it."""
+    trained = True
+    """Whether its questions may be used for training (PSR's may not)."""
+    measure = "choice"
+    """The measure that says that a whole answer is right; `chance` lists all measures."""
 
-    def strata(self, catalogue: Catalogue) -> int: ...
+    @abstractmethod
+    def strata(self, catalogue: Catalogue) -> int:
+        """How many kinds of question are balanced: question i of a set asks for stratum i modulo this number."""
 
+    @abstractmethod
     def draft(self, pool: Pool, stratum: int, rng: random.Random) -> Draft | None:
         """Draw a question of a stratum; None where this draw found none (the caller tries again)."""
-        ...
 
-    def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]: ...
+    @abstractmethod
+    def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
+        """One score for each measure; an answer that cannot be read is wrong and not `parsed`."""
 
+    @abstractmethod
     def chance(self, catalogue: Catalogue) -> dict[str, float]:
-        """Accuracy of a uniform guess, by measure."""
-        ...
+        """Accuracy of a uniform guess, 0 to 1, by measure."""
+
+    def with_facts(self, draft: Draft, catalogue: Catalogue, rng: random.Random) -> Draft:
+        """The question for a language model that knows nothing of the objects: as it is, unless it names objects."""
+        return draft
 
 
 def draw_videos(pool: Pool, objects: Sequence[str], rng: random.Random) -> tuple[str, ...]:
     """One random video of each object."""
     return tuple(rng.choice(list(pool.videos[o])) for o in objects)
+
+
+def draft_single_turn(
+    pool: Pool,
+    objects: Sequence[str],
+    rng: random.Random,
+    *,
+    user: Mapping[Opd, str],
+    answer: Mapping[Opd, str],
+    choice: str,
+    properties: Sequence[str],
+) -> Draft:
+    """A question of one turn about these objects, one dialogue for each OPD mode that `user` names."""
+    return Draft(
+        videos=draw_videos(pool, objects, rng),
+        objects=tuple(objects),
+        dialogues=tuple(Dialogue(opd=m, turns=(Turn(user=user[m], assistant=answer[m]),)) for m in Opd if m in user),
+        gold=gold(pool, objects, choice, properties),
+    )
 
 
 def gold(pool: Pool, objects: Sequence[str], choice: str, properties: Sequence[str]) -> Gold:
@@ -86,9 +118,13 @@ def descriptions(
     return " ".join(texts)
 
 
-def single_turn(user: Mapping[Opd, str], assistant: Mapping[Opd, str]) -> tuple[Dialogue, ...]:
-    """One-turn dialogues, one for each OPD mode that both mappings name."""
-    return tuple(Dialogue(opd=m, turns=(Turn(user=user[m], assistant=assistant[m]),)) for m in Opd if m in user)
+def concluded(
+    catalogue: Catalogue, objects: Sequence[str], prefixes: Sequence[str], verdict: str, only: Sequence[str] = ()
+) -> dict[Opd, str]:
+    """The answer in every OPD mode: descriptions of all objects, then the verdict; `needed` describes `only` these."""
+    described = {Opd.NEEDED: descriptions(catalogue, objects, prefixes, only)}
+    described[Opd.ALL] = descriptions(catalogue, objects, prefixes)
+    return {Opd.NONE: verdict, **{mode: f"{text} Conclusion: {verdict}" for mode, text in described.items()}}
 
 
 def lettered(count: int) -> str:

@@ -5,17 +5,16 @@ from __future__ import annotations
 import random
 import re
 
-from pipeline.records import Opd, Prediction, Question, Score, Task
+from pipeline.records import Opd, Prediction, Question, Score
 from pipeline.tasks.base import (
     ORDINALS,
     Draft,
     Pool,
+    TaskDefinition,
     choice_score,
+    concluded,
     conclusion,
-    descriptions,
-    draw_videos,
-    gold,
-    single_turn,
+    draft_single_turn,
 )
 from pipeline.videos.catalogue import Catalogue
 
@@ -26,11 +25,11 @@ TEMPLATES = (
 CHOICES = ("yes", "no", "same")
 
 
-class PropertyComparison:
+class PropertyComparison(TaskDefinition):
     """Three answers are possible (yes, no, the same), hence the paper's chance of one third."""
 
-    task = Task.PC
-    trained = True
+    name = "PC"
+    title = "Property Comparison"
 
     def strata(self, catalogue: Catalogue) -> int:
         return len(CHOICES) * len(catalogue.properties) * 2
@@ -59,17 +58,8 @@ class PropertyComparison:
             Opd.NEEDED: f"{ask} Describe the {prop.spoken} of both objects before answering.",
             Opd.ALL: f"{ask} Describe both objects before answering.",
         }
-        answer = {
-            Opd.NONE: verdict,
-            Opd.NEEDED: f"{descriptions(pool.catalogue, objects, prefixes, [prop.name])} Conclusion: {verdict}",
-            Opd.ALL: f"{descriptions(pool.catalogue, objects, prefixes)} Conclusion: {verdict}",
-        }
-        return Draft(
-            videos=draw_videos(pool, objects, rng),
-            objects=tuple(objects),
-            dialogues=single_turn(user, answer),
-            gold=gold(pool, objects, choice, [prop.name]),
-        )
+        answer = concluded(pool.catalogue, objects, prefixes, verdict, [prop.name])
+        return draft_single_turn(pool, objects, rng, user=user, answer=answer, choice=choice, properties=[prop.name])
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         """Read from how the conclusion begins: "Yes", "No" or "Both"; "yes and no" is none of them."""
@@ -83,3 +73,6 @@ class PropertyComparison:
 
     def chance(self, catalogue: Catalogue) -> dict[str, float]:
         return {"choice": 1 / 3}
+
+
+TASK = PropertyComparison()

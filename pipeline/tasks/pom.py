@@ -8,18 +8,17 @@ import re
 from collections.abc import Iterable
 from dataclasses import replace
 
-from pipeline.records import Dialogue, Opd, Prediction, Question, Score, Task
+from pipeline.records import Dialogue, Opd, Prediction, Question, Score
 from pipeline.tasks.base import (
     LETTERS,
     Draft,
     Pool,
+    TaskDefinition,
     choice_score,
+    concluded,
     conclusion,
-    descriptions,
-    draw_videos,
-    gold,
+    draft_single_turn,
     lettered,
-    single_turn,
 )
 from pipeline.videos.catalogue import Catalogue
 
@@ -41,22 +40,11 @@ def facts(catalogue: Catalogue, objects: Iterable[str], rng: random.Random) -> s
     return " ".join(rng.sample(told, len(told)))
 
 
-def with_facts(draft: Draft, catalogue: Catalogue, rng: random.Random) -> Draft:
-    """The same question after the facts about its objects; what is left to find out is which video is of which."""
-    told = facts(catalogue, draft.objects, rng)
-
-    def begin(dialogue: Dialogue) -> Dialogue:
-        first, *rest = dialogue.turns
-        return dialogue.model_copy(update={"turns": (first.model_copy(update={"user": f"{told} {first.user}"}), *rest)})
-
-    return replace(draft, dialogues=tuple(map(begin, draft.dialogues)))
-
-
-class PropertyObjectMatching:
+class PropertyObjectMatching(TaskDefinition):
     """The three objects differ in at least one property each, or touch could not tell them apart."""
 
-    task = Task.POM
-    trained = True
+    name = "POM"
+    title = "Property-object Matching"
 
     def strata(self, catalogue: Catalogue) -> int:
         return len(ORDERS)
@@ -76,17 +64,24 @@ class PropertyObjectMatching:
         request = REQUEST.format(options=listed)
         names = [f"{letter}) is {catalogue.objects[o].name}" for letter, o in zip(LETTERS, objects, strict=True)]
         verdict = f"{names[0]}, {names[1]} and {names[2]}."
-        described = f"{descriptions(catalogue, objects, [f'{x})' for x in LETTERS])} Conclusion: {verdict}"
         asked = f"{opening} Describe the object in each video, then m{request}"
         # Every property may tell the objects apart, so `needed` is `all`.
         user = {Opd.NONE: f"{opening} M{request}", Opd.NEEDED: asked, Opd.ALL: asked}
-        answer = {Opd.NONE: verdict, Opd.NEEDED: described, Opd.ALL: described}
-        return Draft(
-            videos=draw_videos(pool, objects, rng),
-            objects=tuple(objects),
-            dialogues=single_turn(user, answer),
-            gold=gold(pool, objects, order, catalogue.property_names),
+        answer = concluded(catalogue, objects, [f"{x})" for x in LETTERS], verdict)
+        return draft_single_turn(
+            pool, objects, rng, user=user, answer=answer, choice=order, properties=catalogue.property_names
         )
+
+    def with_facts(self, draft: Draft, catalogue: Catalogue, rng: random.Random) -> Draft:
+        """The same question after the facts about its objects; touch and reasoning remain to be asked for."""
+        told = facts(catalogue, draft.objects, rng)
+
+        def begin(dialogue: Dialogue) -> Dialogue:
+            first, *rest = dialogue.turns
+            first = first.model_copy(update={"user": f"{told} {first.user}"})
+            return dialogue.model_copy(update={"turns": (first, *rest)})
+
+        return replace(draft, dialogues=tuple(map(begin, draft.dialogues)))
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         """Read from "a) is NAME": each letter must name exactly one option, and no option twice."""
@@ -100,3 +95,6 @@ class PropertyObjectMatching:
 
     def chance(self, catalogue: Catalogue) -> dict[str, float]:
         return {"choice": 1 / 6}
+
+
+TASK = PropertyObjectMatching()

@@ -6,8 +6,18 @@ import random
 import re
 from collections.abc import Mapping
 
-from pipeline.records import Dialogue, Opd, Prediction, Question, Score, Task, Turn
-from pipeline.tasks.base import LETTERS, Draft, Pool, choice_score, descriptions, draw_videos, gold, lettered
+from pipeline.records import Dialogue, Opd, Prediction, Question, Score, Turn
+from pipeline.tasks.base import (
+    LETTERS,
+    Draft,
+    Pool,
+    TaskDefinition,
+    choice_score,
+    descriptions,
+    draw_videos,
+    gold,
+    lettered,
+)
 from pipeline.videos.catalogue import Catalogue, Scenario
 
 BASED = " based on physical property descriptions of the two objects"
@@ -17,10 +27,11 @@ REQUEST = (
 )
 
 
-class PropertyScenarioReasoning:
+class PropertyScenarioReasoning(TaskDefinition):
     """With OPD the objects are described in a first turn; without, the one turn asks at once."""
 
-    task = Task.PSR
+    name = "PSR"
+    title = "Property Scenario Reasoning"
     trained = False
 
     def strata(self, catalogue: Catalogue) -> int:
@@ -90,3 +101,6 @@ def _matching(pool: Pool, classes: Mapping[str, tuple[int, ...]]) -> list[str]:
         return all(labels[pool.catalogue.property_index(name)] in allowed for name, allowed in classes.items())
 
     return [o for o in pool.objects if fits(o)]
+
+
+TASK = PropertyScenarioReasoning()

@@ -5,18 +5,17 @@ from __future__ import annotations
 import random
 import re
 
-from pipeline.records import Opd, Prediction, Question, Score, Task
+from pipeline.records import Opd, Prediction, Question, Score
 from pipeline.tasks.base import (
     LETTERS,
     Draft,
     Pool,
+    TaskDefinition,
     choice_score,
+    concluded,
     conclusion,
-    descriptions,
-    draw_videos,
-    gold,
+    draft_single_turn,
     lettered,
-    single_turn,
 )
 from pipeline.videos.catalogue import Catalogue
 
@@ -27,11 +26,11 @@ TEMPLATES = (
 )
 
 
-class PropertySuperlativeSelection:
+class PropertySuperlativeSelection(TaskDefinition):
     """The right video is the only one of its class, so that the answer is never a matter of taste."""
 
-    task = Task.PSS
-    trained = True
+    name = "PSS"
+    title = "Property Superlative Selection"
 
     def strata(self, catalogue: Catalogue) -> int:
         return 3 * 2 * len(catalogue.properties)
@@ -58,16 +57,9 @@ class PropertySuperlativeSelection:
             Opd.NEEDED: f"{opening} Describe the {prop.spoken} of each object and then {request}",
             Opd.ALL: f"{opening} Describe each object and then {request}",
         }
-        answer = {
-            Opd.NONE: verdict,
-            Opd.NEEDED: f"{descriptions(pool.catalogue, objects, prefixes, [prop.name])} Conclusion: {verdict}",
-            Opd.ALL: f"{descriptions(pool.catalogue, objects, prefixes)} Conclusion: {verdict}",
-        }
-        return Draft(
-            videos=draw_videos(pool, objects, rng),
-            objects=tuple(objects),
-            dialogues=single_turn(user, answer),
-            gold=gold(pool, objects, LETTERS[position], [prop.name]),
+        answer = concluded(pool.catalogue, objects, prefixes, verdict, [prop.name])
+        return draft_single_turn(
+            pool, objects, rng, user=user, answer=answer, choice=LETTERS[position], properties=[prop.name]
         )
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
@@ -77,3 +69,6 @@ class PropertySuperlativeSelection:
 
     def chance(self, catalogue: Catalogue) -> dict[str, float]:
         return {"choice": 1 / 3}
+
+
+TASK = PropertySuperlativeSelection()

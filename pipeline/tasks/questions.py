@@ -5,12 +5,15 @@ from __future__ import annotations
 import random
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
+from typing import Literal
 
-from pipeline.records import Assignment, Part, Question, Task
+from pipeline.config import QuestionsConfig
+from pipeline.errors import UserError
+from pipeline.records import Assignment, Part, Question
 from pipeline.runtime import derive_seed
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool
-from pipeline.tasks.pom import with_facts
 from pipeline.videos.catalogue import Catalogue
 
 ATTEMPTS = 60
@@ -26,14 +29,32 @@ def pool_of(part: Part, assignments: Sequence[Assignment], catalogue: Catalogue)
     return Pool(part, catalogue, dict(videos))
 
 
+def counts_by_task(config: QuestionsConfig, section: Literal["train", "evaluation"]) -> dict[str, int]:
+    """The questions that one section of the configuration wants of every registered task, in the registry's order.
+
+    Raises:
+        UserError: for a name that is no task, or training questions of a task that is for evaluation only.
+    """
+    wanted: dict[str, int] = getattr(config, section)
+    keys = {name.lower(): name for name in TASKS}
+    for key, count in wanted.items():
+        if key not in keys:
+            close = get_close_matches(key, keys, n=1)
+            hint = f"did you mean {close[0]}? " if close else ""
+            raise UserError(f"questions.{section}.{key} is not a task; {hint}allowed here: {', '.join(keys)}")
+        if section == "train" and count and not TASKS[keys[key]].trained:
+            raise UserError(f"questions.train.{key} must be 0: {keys[key]} is for evaluation only")
+    return {name: wanted.get(key, 0) for key, name in keys.items()}
+
+
 def build_questions(
-    pool: Pool, counts: Mapping[Task, int], *, seed: int, distinct: bool, facts: bool = False
+    pool: Pool, counts: Mapping[str, int], *, seed: int, distinct: bool, facts: bool = False
 ) -> list[Question]:
     """Build up to `counts[task]` questions of each task, in random order.
 
     Fewer come back where the pool has no more to ask (too few objects, a class without objects): strata that yield
     nothing after `ATTEMPTS` draws are left out, and with `distinct` no question is asked twice. With `facts` the same
-    matching questions begin with what the named objects are like.
+    questions come as each task's `with_facts` makes them.
     """
     questions: list[Question] = []
     for task, count in counts.items():
@@ -42,7 +63,7 @@ def build_questions(
     return questions
 
 
-def _build_task(pool: Pool, task: Task, count: int, seed: int, distinct: bool, facts: bool) -> list[Question]:
+def _build_task(pool: Pool, task: str, count: int, seed: int, distinct: bool, facts: bool) -> list[Question]:
     definition = TASKS[task]
     rng = random.Random(derive_seed(seed, pool.part, task))
     # A stream of its own: with facts and without, the same questions are drawn.
@@ -64,8 +85,8 @@ def _build_task(pool: Pool, task: Task, count: int, seed: int, distinct: bool, f
                 if distinct and key in seen:
                     continue
                 seen.add(key)
-                if facts and task == Task.POM:
-                    draft = with_facts(draft, pool.catalogue, order)
+                if facts:
+                    draft = definition.with_facts(draft, pool.catalogue, order)
                 questions.append(
                     Question(
                         question_id=f"{task}-{pool.part}-{len(questions):05d}",

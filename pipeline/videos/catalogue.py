@@ -19,7 +19,7 @@ from pydantic import ValidationError
 from pipeline.errors import UserError
 from pipeline.records import Part
 from pipeline.runtime import derive_seed
-from pipeline.videos.csv_reader import Row, read_sheet
+from pipeline.videos.csv_reader import Row, read_rows
 from pipeline.videos.wording import Entry, Language, Property, Scenario
 
 __all__ = ["RULED_SPLITS", "Catalogue", "Language", "Object", "Property", "Scenario", "load_catalogue"]
@@ -118,7 +118,7 @@ def load_catalogue(folder: Path) -> Catalogue:
                 f"{folder / name}: no such file; data.catalogue must name a folder with {OBJECTS} and {PROPERTIES}"
             )
     language = _read_language(folder / PROPERTIES)
-    header, rows = read_sheet(folder / OBJECTS, ["object_id", "name", *(p.name for p in language.properties)])
+    header, rows = read_rows(folder / OBJECTS, ["object_id", "name", *(p.name for p in language.properties)])
     splits = _split_columns(folder / OBJECTS, header, language)
     entries = [(where, _read_object(row, language, splits, where)) for where, row in rows]
     if not entries:
@@ -208,7 +208,7 @@ def _classes(text: str, most: int) -> tuple[int, ...]:
 def _read_descriptions(file: Path, objects: dict[str, Object]) -> dict[str, str]:
     """Object id to its publishers' description; nothing where there is no such file."""
     described: dict[str, str] = {}
-    rows = read_sheet(file, ["object_id", "description"])[1] if file.is_file() else []
+    rows = read_rows(file, ["object_id", "description"])[1] if file.is_file() else []
     for where, row in rows:
         object_id = row["object_id"]
         if object_id not in objects:

@@ -12,7 +12,7 @@ from pipeline.errors import UserError
 Row = dict[str, str]
 
 
-def read_sheet(file: Path, needed: Sequence[str]) -> tuple[list[str], list[tuple[str, Row]]]:
+def read_rows(file: Path, needed: Sequence[str]) -> tuple[list[str], list[tuple[str, Row]]]:
     """The header, and each line with its place as an error names it.
 
     Cells are stripped and absent ones empty; empty lines are passed over, and other columns than `needed` are kept.

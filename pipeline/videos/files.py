@@ -12,7 +12,7 @@ from pathlib import Path
 from pipeline.errors import UserError
 from pipeline.records import Finding, Severity
 from pipeline.videos.catalogue import Catalogue
-from pipeline.videos.csv_reader import read_sheet
+from pipeline.videos.csv_reader import read_rows
 
 SUFFIXES = (".avi", ".mjpg", ".mkv", ".mov", ".mp4")
 LIST_FILE = "videos.csv"
@@ -41,7 +41,7 @@ class Listing:
 
     files: tuple[VideoFile, ...]
     findings: tuple[Finding, ...]
-    strangers: tuple[str, ...] = ()
+    unknown_objects: tuple[str, ...] = ()
     """Objects that have videos here but are not in the catalogue, sorted."""
 
 
@@ -64,17 +64,17 @@ def list_videos(folder: Path, catalogue: Catalogue) -> Listing:
     named, problems = _from_list(listed, folder, paths) if listed.is_file() else _from_names(folder, paths)
     findings += problems
     files = [f for f in named if f.object_id in catalogue.objects]
-    strangers = Counter(f.object_id for f in named if f.object_id not in catalogue.objects)
-    unknown = f"{strangers.total()} videos of {len(strangers)} objects that the catalogue lacks"
-    names = ", ".join(sorted(strangers))
-    if strangers and not files and all(f.severity is not Severity.ERROR for f in problems):
-        message = f"holds no video of an object of the catalogue; there are {unknown}: {names}; add them to objects.csv"
+    unknown_objects = Counter(f.object_id for f in named if f.object_id not in catalogue.objects)
+    counted = f"{unknown_objects.total()} videos of {len(unknown_objects)} objects that the catalogue lacks"
+    names = ", ".join(sorted(unknown_objects))
+    if unknown_objects and not files and all(f.severity is not Severity.ERROR for f in problems):
+        message = f"holds no video of an object of the catalogue; there are {counted}: {names}; add them to objects.csv"
         findings.append(_error(str(folder), message))
-    elif strangers:
-        message = f"{unknown} are left out; list them in objects.csv to use them: {names}"
+    elif unknown_objects:
+        message = f"{counted} are left out; list them in objects.csv to use them: {names}"
         findings.append(Finding(check="name", item=str(folder), measured=message, severity=Severity.WARNING))
     files.sort(key=lambda f: (f.object_id, int(f.video_id.rpartition("_")[2]), f.relative))
-    return Listing(tuple(files), (*findings, *_contested(files)), tuple(sorted(strangers)))
+    return Listing(tuple(files), (*findings, *_same_id(files)), tuple(sorted(unknown_objects)))
 
 
 def raise_errors(folder: Path, findings: Sequence[Finding]) -> None:
@@ -116,7 +116,7 @@ def _from_names(folder: Path, paths: Sequence[Path]) -> tuple[list[VideoFile], l
 def _from_list(listed: Path, folder: Path, paths: Sequence[Path]) -> tuple[list[VideoFile], list[Finding]]:
     """The files that videos.csv names; numbers count up within an object, in the list's order."""
     try:
-        _, rows = read_sheet(listed, ("file", "object_id"))
+        _, rows = read_rows(listed, ("file", "object_id"))
     except UserError as problem:
         return [], [_error(LIST_FILE, str(problem).removeprefix(str(listed)).lstrip(":, "))]
     files: dict[str, VideoFile] = {}
@@ -141,19 +141,19 @@ def _from_list(listed: Path, folder: Path, paths: Sequence[Path]) -> tuple[list[
             numbers[object_id] += 1
     if not rows:
         findings.append(_error(LIST_FILE, "lists no video; add a line for each, or remove the list"))
-    left = len(paths) - len(files)
-    if left and not findings:
-        message = f"{left} videos of the folder are not listed and are left out"
+    unlisted = len(paths) - len(files)
+    if unlisted and not findings:
+        message = f"{unlisted} videos of the folder are not listed and are left out"
         findings.append(Finding(check="name", item=LIST_FILE, measured=message, severity=Severity.WARNING))
     return list(files.values()), findings
 
 
-def _contested(files: Sequence[VideoFile]) -> list[Finding]:
-    rivals = defaultdict(list)
+def _same_id(files: Sequence[VideoFile]) -> list[Finding]:
+    same = defaultdict(list)
     for file in files:
-        rivals[file.video_id].append(file.relative)
+        same[file.video_id].append(file.relative)
     return [
         _error(names[0], f"{video_id} is also {', '.join(names[1:])}; keep one of them")
-        for video_id, names in rivals.items()
+        for video_id, names in same.items()
         if len(names) > 1
     ]

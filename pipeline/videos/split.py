@@ -39,19 +39,32 @@ def assign(catalogue: Catalogue, videos: Sequence[Video], config: SplitConfig) -
         UserError: if there is no such split, no training video remains, there are too few objects for the test
             objects or folds asked for, or (with `missing: error`) a validation or test object has no video.
     """
-    check_split(catalogue, config.name)
     present = {video.object_id for video in videos}
+    parts = assign_objects(catalogue, present, config)
+    missing = {
+        part: tuple(sorted(o for o, where in parts.items() if where == part and o not in present))
+        for part in (Part.VALIDATION, Part.TEST)
+    }
+    assignments = tuple(
+        Assignment(video_id=v.video_id, object_id=v.object_id, part=parts.get(v.object_id, Part.UNUSED)) for v in videos
+    )
+    return Split(assignments=assignments, missing=missing)
+
+
+def assign_objects(catalogue: Catalogue, present: Collection[str], config: SplitConfig) -> dict[str, Part]:
+    """The part of each object, by id; `present` are the objects that have videos.
+
+    Raises:
+        UserError: as `assign`.
+    """
+    check_split(catalogue, config.name)
     if config.name == "kfold":
         parts = _deal(present, config)
     elif config.name == "development":
         parts = _develop(catalogue, present, config)
     else:
         parts = {o.object_id: o.splits[config.name] for o in catalogue.objects.values()}
-    missing = {
-        part: tuple(sorted(o for o, where in parts.items() if where == part and o not in present))
-        for part in (Part.VALIDATION, Part.TEST)
-    }
-    absent = [object_id for objects in missing.values() for object_id in objects]
+    absent = [o for o, part in sorted(parts.items()) if part in (Part.VALIDATION, Part.TEST) and o not in present]
     if absent and config.missing == "error":
         raise UserError(
             f"split {config.name}: no video of {', '.join(absent)}; add videos to data.dir, or set "
@@ -59,10 +72,7 @@ def assign(catalogue: Catalogue, videos: Sequence[Video], config: SplitConfig) -
         )
     if not any(parts.get(object_id) == Part.TRAIN for object_id in present):
         raise UserError(f"split {config.name}: no video of a training object; add videos, or choose another split.name")
-    assignments = tuple(
-        Assignment(video_id=v.video_id, object_id=v.object_id, part=parts.get(v.object_id, Part.UNUSED)) for v in videos
-    )
-    return Split(assignments=assignments, missing=missing)
+    return parts
 
 
 def check_split(catalogue: Catalogue, name: str) -> None:

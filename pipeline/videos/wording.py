@@ -1,13 +1,14 @@
-"""How a data set's properties are spoken of: the shape of properties.yaml, and what must hold for it to be gradable."""
+"""How a data set's properties are spoken of: the shape of properties.yaml, what must hold for it to be gradable, and
+which classes a free text names."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable
 from string import Formatter
 from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
-
-from pipeline.videos.phrases import mentioned, plain
 
 OPENING = "Overall"
 """How the structured description begins: the grader reads an answer from its last such word on."""
@@ -16,6 +17,24 @@ TAKEN = ("object_id", "name", "material", "part_of", "part", "combined", "choice
 PREFIXES = ("label_", "split_")
 
 Phrase = Annotated[str, Field(pattern=r"\w")]
+
+
+def plain(text: str) -> str:
+    """In small letters, with one space wherever spaces, line breaks or hyphens stood."""
+    return " ".join(re.split(r"[\s-]+", text.lower()))
+
+
+def mentioned(text: str, phrases: Iterable[str]) -> list[str]:
+    """The phrases (as `plain` writes them) that a text holds, longest first.
+
+    Each stretch of text counts once, for the longest phrase: "no roughness" is not also "roughness", and "moderately
+    hard" not also "hard", whatever stands between its words.
+    """
+    rest, found = plain(text), []
+    for phrase in sorted(set(map(plain, phrases)), key=lambda p: (-len(p), p)):
+        rest, times = re.subn(rf"(?<!\w){re.escape(phrase)}(?!\w)", "|", rest)
+        found += [phrase] if times else []
+    return found
 
 
 class Entry(BaseModel):
@@ -141,6 +160,18 @@ class Language(Entry):
                             "graded; choose other words"
                         )
         return self
+
+
+def levels_named(text: str, prop: Property) -> frozenset[int]:
+    """The classes that a text names by their names, phrases or cues; empty where it is silent about the property."""
+    wordings = prop.wordings
+    return frozenset(wordings[phrase] for phrase in mentioned(text, wordings))
+
+
+def contradiction(text: str, prop: Property, label: int) -> frozenset[int]:
+    """The classes that a text names in place of `label`; empty where it names that one too, or none."""
+    named = levels_named(text, prop)
+    return frozenset() if label in named else named
 
 
 def _placeholders(template: str) -> set[str]:

@@ -1,4 +1,4 @@
-"""The catalogue against the paper's tables, and bad catalogues."""
+"""The catalogue against the paper's tables, bad catalogues, and which classes a free text names."""
 
 from __future__ import annotations
 
@@ -10,20 +10,18 @@ from typing import Any
 
 import pytest
 import yaml
+from hypothesis import given
+from hypothesis import strategies as st
 
 from pipeline.errors import UserError
 from pipeline.records import Part
 from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.videos.wording import contradiction, levels_named, mentioned, plain
 from tests.conftest import ROOT
 
 PHYSICLEAR = ROOT / "pipeline" / "physiclear"
 PAPER_TEST = {
-    "bath_towel",
-    "ice_block",
-    "clothes_peg",
-    "hairbrush_handle",
-    "microfiber_cloth",
-    "toilet_brush_bristles",
+    *("bath_towel", "ice_block", "clothes_peg", "hairbrush_handle", "microfiber_cloth", "toilet_brush_bristles"),
     "hairbrush_bristles",
 }
 
@@ -32,11 +30,14 @@ def members(catalogue: Catalogue, split: str, part: Part) -> set[str]:
     return {o.object_id for o in catalogue.objects.values() if o.splits[split] == part}
 
 
-def test_objects_and_parts(catalogue: Catalogue) -> None:
-    assert len(catalogue.objects) == 74
+def test_objects_parts_and_names(catalogue: Catalogue) -> None:
     counts = Counter(o.splits["paper"] for o in catalogue.objects.values())
     assert counts == {Part.TRAIN: 60, Part.VALIDATION: 7, Part.TEST: 7}
     assert members(catalogue, "paper", Part.TEST) == PAPER_TEST
+    names = {o.name.lower() for o in catalogue.objects.values()}
+    assert len(names) == 74 == len(catalogue.objects), "options of a matching question are told apart by name"
+    assert all(len(r) == 3 for o in catalogue.objects.values() for r in o.ratings)
+    assert all(o.material for o in catalogue.objects.values())
 
 
 def test_release_split_differs_as_published(catalogue: Catalogue) -> None:
@@ -45,35 +46,21 @@ def test_release_split_differs_as_published(catalogue: Catalogue) -> None:
     assert (paper - release, release - paper) == ({"bubble_wrap"}, {"lemon"})
 
 
-@pytest.mark.parametrize(
-    ("name", "counts"), [("hardness", (11, 31, 32)), ("roughness", (28, 23, 23)), ("bumpiness", (25, 38, 11))]
-)
-def test_class_counts_follow_from_the_ratings(catalogue: Catalogue, name: str, counts: tuple[int, ...]) -> None:
-    index = catalogue.property_index(name)
-    found = Counter(catalogue.labels(o)[index] for o in catalogue.objects)
-    assert tuple(found[level] for level in range(3)) == counts
+def test_labels_are_rounded_means_of_the_ratings(catalogue: Catalogue) -> None:
+    for place, expected in enumerate([(11, 31, 32), (28, 23, 23), (25, 38, 11)]):
+        found = Counter(catalogue.labels(o)[place] for o in catalogue.objects)
+        assert tuple(found[level] for level in range(3)) == expected
+    assert (catalogue.objects["gauze_pad"].ratings[0], catalogue.labels("gauze_pad")[0]) == ((1, 2, 2), 2)
 
 
-def test_a_mean_is_rounded_to_the_nearest_class(catalogue: Catalogue) -> None:
-    assert catalogue.objects["gauze_pad"].ratings[0] == (1, 2, 2)
-    assert catalogue.labels("gauze_pad")[0] == 2
-
-
-def test_every_object_has_three_raters_and_a_name_of_its_own(catalogue: Catalogue) -> None:
-    names = [o.name.lower() for o in catalogue.objects.values()]
-    assert len(set(names)) == len(names), "options of a matching question are told apart by name"
-    assert all(len(r) == 3 for o in catalogue.objects.values() for r in o.ratings)
-    assert all(o.material for o in catalogue.objects.values())
-
-
-def test_descriptions_name_every_class(catalogue: Catalogue) -> None:
+def test_descriptions_name_every_class_and_no_other(catalogue: Catalogue) -> None:
     assert catalogue.structured((2, 0, 0)) == "Overall, it presents a hard and smooth surface with no bumps."
     assert catalogue.describe_one("gauze_pad", "hardness") == "Overall, it presents a hard surface."
     for object_id in catalogue.objects:
         assert catalogue.describe(object_id).endswith(catalogue.structured(catalogue.labels(object_id)))
-
-
-def test_phrases_are_told_apart(catalogue: Catalogue) -> None:
+        for p, label in zip(catalogue.properties, catalogue.labels(object_id), strict=True):
+            for text in (catalogue.unstructured(object_id), catalogue.describe(object_id)):
+                assert levels_named(text, p) == {label}, text
     for p in catalogue.properties:
         phrases = [phrase for level in p.phrases for phrase in level]
         assert len(set(phrases)) == len(phrases)
@@ -92,6 +79,15 @@ def write(folder: Path, *lines: str, described: Sequence[str] = (), encoding: st
     if described:
         (folder / "descriptions.csv").write_text("\n".join(described) + "\n", encoding=encoding)
     return folder
+
+
+def refused(folder: Path, words: Sequence[str]) -> None:
+    """The folder's catalogue is refused in one line with all of these words."""
+    with pytest.raises(UserError) as caught:
+        load_catalogue(folder)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert all(word in message for word in words), message
 
 
 @pytest.mark.parametrize(
@@ -122,11 +118,8 @@ def write(folder: Path, *lines: str, described: Sequence[str] = (), encoding: st
     ],
 )
 def test_a_bad_table_is_one_clear_line(tmp_path: Path, lines: list[str], words: list[str]) -> None:
-    with pytest.raises(UserError) as caught:
-        load_catalogue(write(tmp_path, *lines))
-    message = str(caught.value)
-    assert "\n" not in message
-    assert all(word in message for word in words), message
+    write(tmp_path, *lines)
+    refused(tmp_path, words)
 
 
 def test_a_table_of_what_is_needed_alone_will_do(tmp_path: Path) -> None:
@@ -172,25 +165,16 @@ def test_a_spreadsheet_s_csv_is_read(tmp_path: Path) -> None:
     ],
 )
 def test_a_bad_description_is_one_clear_line(tmp_path: Path, described: list[str], words: list[str]) -> None:
-    with pytest.raises(UserError) as caught:
-        load_catalogue(write(tmp_path, SHORT, BALL, described=described))
-    message = str(caught.value)
-    assert "\n" not in message
-    assert all(word in message for word in ["descriptions.csv", *words]), message
+    write(tmp_path, SHORT, BALL, described=described)
+    refused(tmp_path, ["descriptions.csv", *words])
 
 
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"properties\.yaml.*data\.catalogue"):
-        load_catalogue(tmp_path)
-
-
-def test_broken_language_is_one_line(tmp_path: Path) -> None:
+def test_a_missing_or_broken_language_is_one_line(tmp_path: Path) -> None:
+    refused(tmp_path, ["properties.yaml", "data.catalogue"])
     shutil.copy(PHYSICLEAR / "objects.csv", tmp_path)
     for text in ("properties: [", "properties: []\nunstructured: x\nstructured: y\n", ""):
         (tmp_path / "properties.yaml").write_text(text)
-        with pytest.raises(UserError, match=r"properties\.yaml") as caught:
-            load_catalogue(tmp_path)
-        assert "\n" not in str(caught.value)
+        refused(tmp_path, ["properties.yaml"])
 
 
 def change(**changes: object) -> Callable[[dict[str, Any]], None]:
@@ -228,8 +212,75 @@ def test_a_language_that_cannot_be_graded_is_refused(
     edit(language)
     write(tmp_path, SHORT, BALL)
     (tmp_path / "properties.yaml").write_text(yaml.safe_dump(language))
-    with pytest.raises(UserError) as caught:
-        load_catalogue(tmp_path)
-    message = str(caught.value)
-    assert "\n" not in message
-    assert all(word in message for word in words), message
+    refused(tmp_path, words)
+
+
+# Free text
+
+CATALOGUE = load_catalogue(PHYSICLEAR)
+
+
+@pytest.mark.parametrize(
+    ("text", "hardness", "roughness", "bumpiness"),
+    [
+        ("", set(), set(), set()),
+        ("Hard and smooth, with no bumps.", {2}, {0}, {0}),
+        ("It is MODERATELY\nhard.", {1}, set(), set()),
+        ("moderately-hard", {1}, set(), set()),
+        ("It lacks noticeable roughness.", set(), {0}, set()),
+        ("noticeable roughness", set(), {2}, set()),
+        ("not rough, and without bumps", set(), {0}, {0}),
+        ("a slight roughness and small irregularities", set(), {1}, {1}),
+        ("no prominent bumps", set(), set(), {0}),
+        ("prominent bumps, but not bumpy all over", set(), set(), {0, 2}),
+        ("It is squishy where it is not hard.", {0}, set(), set()),
+        ("hardly softened, roughly smoothed", set(), set(), set()),
+        ("neither hard nor soft", {1}, set(), set()),
+    ],
+)
+def test_classes_are_read_from_free_text(
+    text: str, hardness: set[int], roughness: set[int], bumpiness: set[int]
+) -> None:
+    assert [levels_named(text, p) for p in CATALOGUE.properties] == [hardness, roughness, bumpiness]
+
+
+def test_a_text_contradicts_a_label_that_it_names_another_class_for() -> None:
+    assert contradiction("It is soft.", CATALOGUE.properties[0], 2) == {0}
+    assert not contradiction("It is soft.", CATALOGUE.properties[0], 0)
+    assert not contradiction("It is soft on a hard core.", CATALOGUE.properties[0], 2)
+    assert not contradiction("It is red.", CATALOGUE.properties[0], 2)
+
+
+@given(
+    st.sampled_from(CATALOGUE.properties).flatmap(
+        lambda p: st.tuples(st.just(p), st.sampled_from(sorted(p.wordings.items())))
+    ),
+    st.sampled_from(["It feels {}.", "{}", "({}), they say", "X {}\t-", "One: {}; two."]),
+    st.sampled_from([str.upper, str.title, lambda w: w.replace(" ", "-"), lambda w: w.replace(" ", " \n ")]),
+)
+def test_every_wording_names_its_class_alone(pair: tuple, frame: str, disguise) -> None:
+    prop, (wording, level) = pair
+    assert levels_named(frame.format(disguise(wording)), prop) == {level}
+
+
+@given(
+    st.text("ab -", max_size=30),
+    st.lists(st.text("ab ", min_size=1, max_size=6).filter(lambda t: bool(t.strip())), max_size=5),
+)
+def test_phrases_are_whole_words_of_the_text(text: str, phrases: list[str]) -> None:
+    found = mentioned(text, phrases)
+    assert set(found) <= {plain(p) for p in phrases}
+    assert [len(p) for p in found] == sorted(map(len, found), reverse=True)
+    for phrase in found:
+        assert f" {phrase} " in f" {plain(text)} "
+    for phrase in map(plain, phrases):
+        if f" {phrase} " in f" {plain(text)} " and phrase not in found:
+            assert any(phrase in longer or _overlap(phrase, longer) for longer in found)
+
+
+def _overlap(one: str, two: str) -> bool:
+    return any(one[:n] == two[-n:] or one[-n:] == two[:n] for n in range(1, min(len(one), len(two)) + 1))
+
+
+def test_a_phrase_need_not_end_in_a_letter() -> None:
+    assert mentioned("It is 100% (wet)!", ["100%", "wet)", "00%"]) == ["100%", "wet)"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import logging
 import os
 import shutil
@@ -19,7 +20,7 @@ from pipeline.records import Finding, Frame, Probe
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import VideoFile
 from pipeline.videos.frames import extract
-from pipeline.videos.frames.extract import HEADER_BYTES, _header, _Pile
+from pipeline.videos.frames.extract import HEADER_BYTES, _header, _PixelFiles
 from pipeline.videos.frames.fit import fit
 from pipeline.videos.frames.reference import reference_indices
 from pipeline.videos.frames.scan import Scan, scan
@@ -74,82 +75,75 @@ def test_files_hold_what_the_table_says(place: Place) -> None:
     assert list(place.partial.iterdir()) == []
 
 
-def test_the_number_of_processes_changes_nothing(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pipeline.parallel, "cores", lambda: 1)
+@pytest.mark.parametrize("cores", [1, 5])
+def test_the_number_of_processes_changes_nothing(
+    place: Place, whole: list[bytes], cores: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pipeline.parallel, "cores", lambda: cores)
     place.extract()
-    alone = place.bytes()
-    monkeypatch.setattr(pipeline.parallel, "cores", lambda: 5)
-    place.extract()
-    assert place.bytes() == alone
+    assert place.bytes() == whole
 
 
-def kill_after(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Interrupt the extraction when it puts the next video on the pile."""
-    add, added = _Pile.add, []
+def kill_after(count: int, place: Place, config: FramesConfig = CONFIG) -> None:
+    """Interrupt an extraction when it appends the next video after `count`."""
+    add, added = _PixelFiles.add, []
 
-    def until(self: _Pile, *args: object) -> None:
+    def until(self: _PixelFiles, *args: object) -> None:
         if len(added) == count:
             raise KeyboardInterrupt
         added.append(add(self, *args))  # type: ignore[arg-type, func-returns-value]
 
-    monkeypatch.setattr(_Pile, "add", until)
-
-
-@pytest.mark.parametrize("count", [0, 3, 6])
-@pytest.mark.parametrize("left", ["as it was", "pixels", "half a line", "a line without its end", "no line"])
-def test_a_killed_extraction_goes_on_where_it_was(
-    place: Place, count: int, left: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    place.extract()
-    whole = place.bytes()
-    shutil.rmtree(place.out)
-    with monkeypatch.context() as patch:
-        kill_after(count, patch)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_PixelFiles, "add", until)
         with pytest.raises(KeyboardInterrupt):
-            place.extract()
+            place.extract(config)
+
+
+@pytest.fixture(scope="module")
+def whole(tiny_videos: Path, tmp_path_factory: pytest.TempPathFactory, catalogue: Catalogue) -> list[bytes]:
+    """What an extraction that nothing interrupts writes."""
+    place = Place(tiny_videos, tmp_path_factory.mktemp("whole"), catalogue)
+    place.extract()
+    return place.bytes()
+
+
+@pytest.mark.parametrize(
+    ("count", "rest"),
+    [(0, "as it was"), *((6, rest) for rest in ("as it was", "pixels", "half a line", "a line without its end"))],
+)
+def test_a_killed_extraction_goes_on_where_it_was(place: Place, whole: list[bytes], count: int, rest: str) -> None:
+    kill_after(count, place)
     assert not place.out.exists()
     (work,) = place.partial.iterdir()
     lines = (work / "done.jsonl").read_bytes().splitlines(keepends=True)
     assert len(lines) == count
-    finished = count
-    if left == "pixels":
+    if rest == "pixels":
         for name in ("frames.npy", "references.npy"):
             with (work / name).open("ab") as stream:
-                stream.write(b"left over")
-    elif left != "as it was" and lines:
-        cut = {"half a line": len(lines[-1]) // 2, "a line without its end": len(lines[-1]) - 1, "no line": 0}[left]
+                stream.write(b"more than is listed")
+    elif "line" in rest:
+        cut = len(lines[-1]) // 2 if rest == "half a line" else len(lines[-1]) - 1
         (work / "done.jsonl").write_bytes(b"".join(lines[:-1]) + lines[-1][:cut])
-        finished -= 1
     place.decoded()
     place.extract()
-    assert place.decoded() == sorted(NAMES[finished:])
+    assert place.decoded() == sorted(NAMES[count - ("line" in rest) :])
     assert place.bytes() == whole
     assert list(place.partial.iterdir()) == []
 
 
-def test_twice_killed(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    place.extract()
-    whole = place.bytes()
+def test_twice_killed(place: Place, whole: list[bytes]) -> None:
     for _ in range(2):
-        with monkeypatch.context() as patch:
-            kill_after(2, patch)
-            with pytest.raises(KeyboardInterrupt):
-                place.extract()
+        kill_after(2, place)
     place.decoded()
     place.extract()
     assert (place.decoded(), place.bytes()) == (sorted(NAMES[4:]), whole)
 
 
-def test_a_kill_after_the_pixels_have_moved_leaves_no_black_pictures(
-    place: Place, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    place.extract()
-    whole = place.bytes()
-
+def test_a_kill_after_the_pixels_have_moved_leaves_no_black_pictures(place: Place, whole: list[bytes]) -> None:
     def full(*_: object) -> None:
         raise OSError("disk full")
 
-    with monkeypatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr(extract, "write_table", full)
         with pytest.raises(OSError, match="disk full"):
             place.extract()
@@ -157,11 +151,8 @@ def test_a_kill_after_the_pixels_have_moved_leaves_no_black_pictures(
     assert place.bytes() == whole
 
 
-def test_what_changed_after_a_kill_is_read_anew(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    with monkeypatch.context() as patch:
-        kill_after(5, patch)
-        with pytest.raises(KeyboardInterrupt):
-            place.extract()
+def test_what_changed_after_a_kill_is_read_anew(place: Place) -> None:
+    kill_after(5, place)
     place.decoded()
     write_video(place.folder / "potato_0.avi", moving_square(15, 77))
     found = place.extract()
@@ -172,25 +163,19 @@ def test_what_changed_after_a_kill_is_read_anew(place: Place, monkeypatch: pytes
     assert place.bytes() == resumed
 
 
-def test_what_videos_csv_says_after_a_kill_counts(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_videos_csv_says_after_a_kill_counts(place: Place) -> None:
     listed = place.folder / "videos.csv"
     listed.write_text("file,object_id,session\nbaseball_0.avi,baseball,one\npotato_0.avi,potato,one\n")
-    with monkeypatch.context() as patch:
-        kill_after(1, patch)
-        with pytest.raises(KeyboardInterrupt):
-            place.extract()
+    kill_after(1, place)
     listed.write_text("file,object_id,session\nbaseball_0.avi,baseball,two\npotato_0.avi,potato,one\n")
     found = place.extract()
     assert [p.session for p in found.probes] == ["two", "one"]
 
 
-def test_other_parameters_start_anew(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_parameters_start_anew(place: Place) -> None:
     place.extract(FramesConfig(size=32))
     expected = place.bytes()
-    with monkeypatch.context() as patch:
-        kill_after(4, patch)
-        with pytest.raises(KeyboardInterrupt):
-            place.extract()
+    kill_after(4, place)
     place.decoded()
     place.extract(FramesConfig(size=32))
     assert place.decoded() == NAMES
@@ -199,10 +184,8 @@ def test_other_parameters_start_anew(place: Place, monkeypatch: pytest.MonkeyPat
     assert place.decoded() == NAMES[4:], "and what was killed waits"
 
 
-def test_a_file_that_went_away_after_a_kill_is_named(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    kill_after(3, monkeypatch)
-    with pytest.raises(KeyboardInterrupt):
-        place.extract()
+def test_a_file_that_went_away_after_a_kill_is_named(place: Place) -> None:
+    kill_after(3, place)
     path = place.folder / "baseball_1.avi"
     path.unlink()
     path.symlink_to(place.folder / "gone.avi")
@@ -257,14 +240,13 @@ def test_nothing_to_keep_is_an_error(tmp_path: Path, catalogue: Catalogue) -> No
     assert not place.out.exists()
 
 
-@pytest.mark.parametrize("size", [16, 99, 100, 224, 999, 1000, 1024])
-@pytest.mark.parametrize("count", [0, 1, 999, 10**9])
-def test_headers_are_of_one_length(tmp_path: Path, size: int, count: int) -> None:
-    header = _header((count, size, size, 3))
-    assert len(header) == HEADER_BYTES
-    if count < 1000 and size < 100:
-        (tmp_path / "x.npy").write_bytes(header + bytes(count * size * size * 3))
-        assert np.load(tmp_path / "x.npy").shape == (count, size, size, 3)
+def test_headers_are_of_one_length(tmp_path: Path) -> None:
+    for size, count in itertools.product((16, 99, 100, 224, 999, 1000, 1024), (0, 1, 999, 10**9)):
+        header = _header((count, size, size, 3))
+        assert len(header) == HEADER_BYTES
+        if count < 1000 and size == 16:
+            (tmp_path / "x.npy").write_bytes(header + bytes(count * size * size * 3))
+            assert np.load(tmp_path / "x.npy").shape == (count, size, size, 3)
 
 
 def test_objects_outside_the_catalogue_cost_one_line(place: Place, caplog: pytest.LogCaptureFixture) -> None:

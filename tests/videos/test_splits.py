@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import Counter
 
 import pytest
 from hypothesis import given, settings
@@ -25,6 +25,7 @@ def objects_of(split: Split, part: Part) -> set[str]:
     return {a.object_id for a in split.assignments if a.part == part}
 
 
+@settings(max_examples=16)
 @given(
     st.sampled_from(NAMES), st.integers(0, 2**31 - 1), st.sets(st.sampled_from(OBJECTS), min_size=60), st.integers(0, 4)
 )
@@ -33,10 +34,6 @@ def test_every_video_has_one_part_and_every_object_too(name: str, seed: int, obj
     config = SplitConfig(name=name, seed=seed, fold=fold)
     split = assign(CATALOGUE, videos, config)
     assert [a.video_id for a in split.assignments] == [v.video_id for v in videos]
-    parts = defaultdict(set)
-    for a in split.assignments:
-        parts[a.object_id].add(a.part)
-    assert all(len(p) == 1 for p in parts.values())
     parts = {o: {a.part for a in split.assignments if a.object_id == o} for o in objects}
     assert all(len(where) == 1 for where in parts.values())
     assert split == assign(CATALOGUE, videos, config)
@@ -47,6 +44,7 @@ def test_every_video_has_one_part_and_every_object_too(name: str, seed: int, obj
     assert set(split.missing) == {Part.VALIDATION, Part.TEST}
 
 
+@settings(max_examples=25)
 @given(st.integers(3, 50), st.integers(0, 2**31 - 1), st.sets(st.sampled_from(OBJECTS), min_size=3))
 def test_kfold_tests_every_object_once(folds: int, seed: int, objects: set[str]) -> None:
     videos = fake_videos(sorted(objects), 1)
@@ -72,7 +70,7 @@ def test_published_splits_follow_the_catalogue(name: str) -> None:
     assert split.missing == {Part.VALIDATION: (), Part.TEST: ()}
 
 
-@settings(max_examples=25)
+@settings(max_examples=8)
 @given(st.integers(0, 2**31 - 1), st.integers(1, 12))
 def test_development_keeps_away_from_the_test_set(seed: int, count: int) -> None:
     videos = fake_videos(OBJECTS, 1)
@@ -86,7 +84,7 @@ def test_development_keeps_away_from_the_test_set(seed: int, count: int) -> None
 
 def test_development_is_stratified_and_seeded() -> None:
     chosen = set()
-    for seed in range(8):
+    for seed in range(6):
         split = assign(CATALOGUE, fake_videos(OBJECTS, 1), SplitConfig(name="development", seed=seed))
         test = objects_of(split, Part.TEST)
         chosen.add(frozenset(test))

@@ -27,8 +27,8 @@ DEVIATION = 1.4826
 """Median absolute deviation to standard deviation, for a normal distribution."""
 
 
-def check_files(probes: Sequence[Probe], catalogue: Catalogue, *, synthetic: bool = False) -> Iterator[Finding]:
-    """All checks of this module, over videos that decode; the paper's counts do not stand beside `synthetic` ones."""
+def check_files(probes: Sequence[Probe], catalogue: Catalogue) -> Iterator[Finding]:
+    """All checks of this module, over videos that decode."""
     if not probes:
         return
     yield from _overview(probes, catalogue)

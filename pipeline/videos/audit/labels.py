@@ -8,9 +8,11 @@ from difflib import get_close_matches
 from statistics import fmean
 
 from pipeline.records import Finding, Part, Severity
-from pipeline.statistics import icc3k, icc3k_interval
 from pipeline.videos.catalogue import Catalogue
-from pipeline.videos.descriptions import contradiction
+from pipeline.videos.wording import contradiction
+
+TINY = 1e-12
+"""Variances up to it are rounding."""
 
 
 def check_labels(catalogue: Catalogue) -> Iterator[Finding]:
@@ -20,6 +22,37 @@ def check_labels(catalogue: Catalogue) -> Iterator[Finding]:
     yield from _stated(catalogue)
     yield from _descriptions(catalogue)
     yield from _splits(catalogue)
+
+
+def icc3k(ratings: Sequence[Sequence[float]]) -> tuple[float, float, float] | None:
+    """Agreement of the mean of k raters and its 95 % interval: two-way mixed, consistency (Shrout and Fleiss 1979).
+
+    Written out, as the import of pingouin, whose `intraclass_corr` gives the same, takes longer than the whole audit of
+    the labels.
+
+    Args:
+        ratings: Targets x raters, all rows of equal length.
+
+    Returns:
+        Value, low and high, each at most 1; None for fewer than two targets or raters, or targets that do not differ.
+    """
+    import numpy as np
+    from scipy.stats import f
+
+    table = np.array(ratings, dtype=np.float64)
+    if table.ndim != 2 or min(table.shape) < 2:
+        return None
+    targets, raters = table.shape
+    free, free_error = targets - 1, (targets - 1) * (raters - 1)
+    between = float(raters * table.mean(axis=1).var(ddof=1))
+    rest = table - table.mean(axis=1, keepdims=True) - table.mean(axis=0) + table.mean()
+    if between <= TINY:
+        return None
+    unlike = float((rest**2).sum()) / free_error / between
+    if unlike <= TINY:
+        return 1.0, 1.0, 1.0
+    low, high = float(f.ppf(0.975, free, free_error)), 1 / float(f.ppf(0.975, free_error, free))
+    return 1 - unlike, 1 - unlike * low, 1 - unlike * high
 
 
 def similar_names(unknown: Sequence[str], catalogue: Catalogue) -> Iterator[Finding]:
@@ -33,31 +66,26 @@ def similar_names(unknown: Sequence[str], catalogue: Catalogue) -> Iterator[Find
 def _agreement(catalogue: Catalogue) -> Iterator[Finding]:
     for place, prop in enumerate(catalogue.properties):
         ratings = [o.ratings[place] for o in catalogue.objects.values()]
-        expected = ""
         if len({len(r) for r in ratings}) > 1:
-            yield _info(
-                "agreement, ICC(3,k)", prop.name, "undefined: objects have different numbers of ratings", expected
-            )
+            measured = "undefined: objects have different numbers of ratings"
+            yield _info("agreement, ICC(3,k)", prop.name, measured)
             continue
-        value, interval = icc3k(ratings), icc3k_interval(ratings)
-        if value is None or interval is None:
-            yield _info("agreement, ICC(3,k)", prop.name, "undefined: one rating, or no variance", expected)
+        found = icc3k(ratings)
+        if found is None:
+            yield _info("agreement, ICC(3,k)", prop.name, "undefined: one rating, or no variance")
             continue
-        measured = f"{value:.3f} ({interval.low:.3f} to {interval.high:.3f})"
-        warn = bool(expected) and f"{value:.3f}" != expected
-        yield (_warning if warn else _info)("agreement, ICC(3,k)", prop.name, measured, expected)
+        value, low, high = found
+        yield _info("agreement, ICC(3,k)", prop.name, f"{value:.3f} ({low:.3f} to {high:.3f})")
         disputed = sum(len(set(r)) > 1 for r in ratings)
-        yield _info("disputed ratings", prop.name, f"{disputed} of {len(ratings)} objects", "")
+        yield _info("disputed ratings", prop.name, f"{disputed} of {len(ratings)} objects")
 
 
 def _counts(catalogue: Catalogue) -> Iterator[Finding]:
     for place, prop in enumerate(catalogue.properties):
         counts = Counter(o.labels[place] for o in catalogue.objects.values())
         for level, name in enumerate(prop.levels):
-            expected = ""
-            warn = counts[level] == 0 or (bool(expected) and str(counts[level]) != expected)
-            item = f"{prop.name}: {name}"
-            yield (_warning if warn else _info)("objects of a class", item, str(counts[level]), expected)
+            tell = _info if counts[level] else _warning
+            yield tell("objects of a class", f"{prop.name}: {name}", str(counts[level]))
 
 
 def _stated(catalogue: Catalogue) -> Iterator[Finding]:
@@ -99,9 +127,9 @@ def _splits(catalogue: Catalogue) -> Iterator[Finding]:
                     )
 
 
-def _info(check: str, item: str, measured: str, expected: str) -> Finding:
+def _info(check: str, item: str, measured: str, expected: str = "") -> Finding:
     return Finding(check=check, item=item, measured=measured, expected=expected, severity=Severity.INFO)
 
 
-def _warning(check: str, item: str, measured: str, expected: str) -> Finding:
+def _warning(check: str, item: str, measured: str, expected: str = "") -> Finding:
     return Finding(check=check, item=item, measured=measured, expected=expected, severity=Severity.WARNING)

@@ -32,7 +32,7 @@ LEARNT_FROM = (Part.TRAIN, Part.VALIDATION)
 
 @dataclass(frozen=True)
 class Evidence:
-    """What is known of the videos; `parts` is empty where no split was asked for."""
+    """What was measured of the videos; `parts` is empty where no split was asked for."""
 
     probes: Sequence[Probe]
     videos: Sequence[Video]
@@ -54,7 +54,7 @@ def check_leakage(found: Evidence, catalogue: Catalogue, seed: int = 0) -> Itera
     yield from _near_copies(found)
     names = sessions(found.probes)
     yield from _sessions(found, names, catalogue)
-    yield from _tell_tales(found, names, catalogue, seed)
+    yield from _untouched_predictions(found, names, catalogue, seed)
 
 
 def sessions(probes: Sequence[Probe]) -> list[str]:
@@ -125,8 +125,8 @@ def predictability(
         # of an object share their label, so their weights can be added up before any label is looked at.
         owner = np.eye(len(names))[member[~test]]
         share = owner.mean(0)
-        votes = weights @ owner + (1 - weights.sum(1, keepdims=True)) * share
-        scores = np.einsum("vn,onc->ovc", votes, classes, optimize=True)
+        chances = weights @ owner + (1 - weights.sum(1, keepdims=True)) * share
+        scores = np.einsum("vn,onc->ovc", chances, classes, optimize=True)
         # Rounded, since sessions make classes exactly equally likely: the first then wins on every processor.
         right += (scores.round(9).argmax(2) == orders[:, member[test]]).sum(1)
     shares = right / len(member)
@@ -222,13 +222,13 @@ def _shares(name: str, place: int, objects: set[str], catalogue: Catalogue) -> s
     return f"{name} {percent} %"
 
 
-def _tell_tales(found: Evidence, names: Sequence[str], catalogue: Catalogue, seed: int) -> Iterator[Finding]:
+def _untouched_predictions(found: Evidence, names: Sequence[str], catalogue: Catalogue, seed: int) -> Iterator[Finding]:
     """Whether the untouched sensor, or the session alone, tells the property of an object never seen."""
     objects = [p.object_id for p in found.probes]
-    known = sorted(set(names))
+    distinct = sorted(set(names))
     inputs = {
         "no-contact reference": np.array([p.thumbnail for p in found.probes]),
-        "session": np.eye(len(known))[[known.index(n) for n in names]],
+        "session": np.eye(len(distinct))[[distinct.index(n) for n in names]],
     }
     for place, prop in enumerate(catalogue.properties):
         labels = [catalogue.labels(o)[place] for o in objects]

@@ -29,7 +29,7 @@ def audit_folder(folder: Path, catalogue: Catalogue, split: SplitConfig | None =
         split: also look for what leaks between its parts.
     """
     listing = list_videos(folder, catalogue)
-    findings: list[Finding] = [*listing.findings, *similar_names(listing.strangers, catalogue)]
+    findings: list[Finding] = [*listing.findings, *similar_names(listing.unknown_objects, catalogue)]
     scans, broken = _scan_all(listing.files)
     findings += broken
     probes = [s.probe for s in scans]
@@ -61,17 +61,15 @@ def audit_chain(
     videos: Sequence[Video],
     assignments: Sequence[Assignment],
     catalogue: Catalogue,
-    *,
-    synthetic: bool = False,
 ) -> list[Finding]:
     """The audit of what the chain has decoded and split, errors first; opens no video."""
     listing = list_videos(folder, catalogue)
     return by_severity(
         [
             *listing.findings,
-            *similar_names(listing.strangers, catalogue),
+            *similar_names(listing.unknown_objects, catalogue),
             *check_labels(catalogue),
-            *_measured(probes, videos, assignments, catalogue, synthetic=synthetic),
+            *_measured(probes, videos, assignments, catalogue),
         ]
     )
 
@@ -101,11 +99,9 @@ def _measured(
     videos: Sequence[Video],
     assignments: Sequence[Assignment],
     catalogue: Catalogue,
-    *,
-    synthetic: bool = False,
 ) -> list[Finding]:
     found = evidence(probes, videos, assignments)
-    return [*check_files(probes, catalogue, synthetic=synthetic), *check_leakage(found, catalogue)]
+    return [*check_files(probes, catalogue), *check_leakage(found, catalogue)]
 
 
 def _scan_all(files: Sequence[VideoFile]) -> tuple[list[Scan], list[Finding]]:

@@ -41,7 +41,7 @@ class Extraction:
 
 
 class _Done(Record):
-    """A finished video: a line of `done.jsonl`, whose pixels lie in the pile at this line's place."""
+    """A finished video: a line of `done.jsonl`, whose pixels stand in the files at this line's place."""
 
     stamp: tuple[str, str, str, str, int, int]
     """What the file was listed as, its size and time of change."""
@@ -93,14 +93,14 @@ def extract_frames(folder: Path, catalogue: Catalogue, config: FramesConfig, out
         log.warning("%s: %s", finding.item, finding.measured)
     work = partial / _fingerprint(folder, config)
     jobs = [_Job(file, config, work) for file in listing.files]
-    with _Pile(work, config.size) as pile:
-        done = pile.resume(jobs)
+    with _PixelFiles(work, config.size) as files:
+        done = files.resume(jobs)
         rest = jobs[len(done) :]
         for job, result in zip(rest, run_parallel(_work, rest, "videos", "video"), strict=True):
             if isinstance(result, Finding):
                 raise_errors(folder, [result])
             else:
-                pile.add(job, result)
+                files.add(job, result)
                 done.append(result)
                 _warn(job.file, result.probe)
         used = [d for d in done if d.places]
@@ -110,14 +110,14 @@ def extract_frames(folder: Path, catalogue: Catalogue, config: FramesConfig, out
         for d in used:
             for index, score in d.places:
                 frames.append(Frame(video_id=d.video.video_id, frame_index=index, score=score, row=len(frames)))
-        pile.finish(out, frames=len(frames), references=len(used))
+        files.finish(out, frames=len(frames), references=len(used))
     write_table(out / TABLE_FILE, Frame, frames)
     write_table(out / PROBES_FILE, Probe, [d.probe for d in done])
     shutil.rmtree(work)
     return Extraction(tuple(d.video for d in used), tuple(d.probe for d in done), tuple(frames))
 
 
-class _Pile:
+class _PixelFiles:
     """The pixels of finished videos, one behind the other, and the list of what they are.
 
     The list is written after the pixels: what a kill left over behind the last line is cut off when it is resumed.
@@ -167,7 +167,7 @@ class _Pile:
         return done
 
     def add(self, job: _Job, done: _Done) -> None:
-        """Put a video on top, and remove the file that it came in."""
+        """Append a video, and remove the file that it came in."""
         with job.pixels.open("rb") as pixels:
             reference = pixels.read(self.size * self.size * 3)
             if done.places:

@@ -37,7 +37,7 @@ def thumbnail(frame: av.VideoFrame) -> Image:
     return small
 
 
-def glance(frame: av.VideoFrame) -> Image:
+def brightness_thumbnail(frame: av.VideoFrame) -> Image:
     """The brightness of `thumbnail` alone, for a third of its cost: uint8, height x width."""
     shown = brightness(frame)
     small: Image = cv2.resize(shown, _size(shown), interpolation=cv2.INTER_LINEAR)
@@ -51,8 +51,8 @@ def _size(plane: Image) -> tuple[int, int]:
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
-def strength(thumb: Image, reference: Image) -> float:
-    """How much is touched: mean |thumb - reference| less |mean(thumb - reference)|, in 8-bit steps over all channels.
+def contact_strength(thumb: Image, reference: Image) -> float:
+    """The contact strength: mean |thumb - reference| less |mean(thumb - reference)|, in 8-bit steps over all channels.
 
     Contact makes some parts brighter and others darker; a change of the light shifts all alike and cancels out. Never
     negative (triangle inequality), 0 for equal pictures and for a uniform shift that does not saturate.

@@ -13,9 +13,9 @@ from pipeline.config import FramesConfig
 from pipeline.records import Finding, Probe, Severity, Video
 from pipeline.videos.decoding import Image
 from pipeline.videos.files import VideoFile
-from pipeline.videos.frames.probing import Course, reference_from_end, run_pass
-from pipeline.videos.frames.reference import detail, starts_touching, strength
+from pipeline.videos.frames.reference import contact_strength, detail, starts_touching
 from pipeline.videos.frames.selection import Kept
+from pipeline.videos.frames.video_pass import VideoPass, reference_from_end, run_pass
 
 THUMBNAIL_SIZE = (8, 6)
 SIGNATURE_SIZE = (24, 18)
@@ -45,64 +45,64 @@ def scan(file: VideoFile, config: FramesConfig) -> Scan | Finding:
         return _wrong(file, f"unreadable ({problem.strerror}); mend its access, or copy it again")
     if size == 0:
         return _wrong(file, "empty (0 bytes); copy it again, or remove it")
-    course = run_pass(file.path, config)
-    if course.frames == 0:
+    found = run_pass(file.path, config)
+    if found.frames == 0:
         return _wrong(file, "no frame decodes; copy it again, convert it, or remove it")
-    if len(course.sizes) > 1:
-        return _wrong(file, f"frames of {len(course.sizes)} sizes; convert it to one size, or remove it")
+    if len(found.sizes) > 1:
+        return _wrong(file, f"frames of {len(found.sizes)} sizes; convert it to one size, or remove it")
     # The published rule believes the header; all others go by what really decodes.
-    count = course.header.frames if config.selection == "release" else course.frames
-    if count != course.header.frames:
-        course = run_pass(file.path, config, count)
-    assert course.first is not None, "set where there are frames"
-    assert course.last is not None, "set where there are frames"
-    touching = starts_touching(course.first, course.last)
+    count = found.header.frames if config.selection == "release" else found.frames
+    if count != found.header.frames:
+        found = run_pass(file.path, config, count)
+    assert found.first is not None, "set where there are frames"
+    assert found.last is not None, "set where there are frames"
+    touching = starts_touching(found.first, found.last)
     if touching:
-        course = run_pass(file.path, config, count, reference_from_end(file.path, course.frames, config))
-    assert course.reference is not None, "set where there are frames"
+        found = run_pass(file.path, config, count, reference_from_end(file.path, found.frames, config))
+    assert found.reference is not None, "set where there are frames"
     video = Video(
         video_id=file.video_id,
         object_id=file.object_id,
         path=file.relative,
         sha256=sha256,
-        frames=course.frames,
-        fps=course.header.fps,
-        height=next(iter(course.sizes))[0],
-        width=next(iter(course.sizes))[1],
+        frames=found.frames,
+        fps=found.header.fps,
+        height=next(iter(found.sizes))[0],
+        width=next(iter(found.sizes))[1],
     )
-    return Scan(video, _probe(file, video, course, touching), tuple(course.kept), course.reference.picture)
+    return Scan(video, _probe(file, video, found, touching), tuple(found.kept), found.reference.picture)
 
 
-def _probe(file: VideoFile, video: Video, course: Course, touching: bool) -> Probe:
-    assert course.reference is not None, "set where there are frames"
-    assert course.first is not None, "set where there are frames"
-    assert course.last is not None, "set where there are frames"
-    shown = course.last if course.strongest is None else course.strongest
-    still = course.reference.thumb
+def _probe(file: VideoFile, video: Video, found: VideoPass, touching: bool) -> Probe:
+    assert found.reference is not None, "set where there are frames"
+    assert found.first is not None, "set where there are frames"
+    assert found.last is not None, "set where there are frames"
+    shown = found.last if found.strongest is None else found.strongest
+    untouched = found.reference.thumb
     return Probe(
         video_id=file.video_id,
         object_id=file.object_id,
         path=file.relative,
         session=file.session,
-        header_frames=course.header.frames,
-        frames=course.frames,
+        header_frames=found.header.frames,
+        frames=found.frames,
         fps=video.fps,
         width=video.width,
         height=video.height,
-        rotation=course.rotation,
-        irregular=_irregular(course.times),
-        kept=len(course.kept),
-        brightness=float(still[:, :, 0].mean()),
-        brightness_step=max((abs(b - a) for a, b in itertools.pairwise(course.brightness)), default=0.0),
+        rotation=found.rotation,
+        irregular=_irregular(found.times),
+        kept=len(found.kept),
+        brightness=float(untouched[:, :, 0].mean()),
+        brightness_step=max((abs(b - a) for a, b in itertools.pairwise(found.brightness)), default=0.0),
         saturated=float(np.mean((shown[:, :, 0] == 0) | (shown[:, :, 0] == 255))),
-        contact=course.contact,
-        quiet=min(course.strengths, default=0.0),
-        contact_end=strength(course.last, still),
+        contact=found.contact,
+        quiet=min(found.strengths, default=0.0),
+        contact_end=contact_strength(found.last, untouched),
         starts_touching=touching,
-        texture_start=detail(course.first),
-        texture_end=detail(course.last),
-        thumbnail=_flat(cv2.resize(still, THUMBNAIL_SIZE, interpolation=cv2.INTER_AREA)),
-        signature=_signature(course.glances, still),
+        texture_start=detail(found.first),
+        texture_end=detail(found.last),
+        thumbnail=_flat(cv2.resize(untouched, THUMBNAIL_SIZE, interpolation=cv2.INTER_AREA)),
+        signature=_signature(found.brightness_thumbnails, untouched),
     )
 
 
@@ -112,15 +112,15 @@ def _irregular(times: list[tuple[int, float]]) -> float:
     return max(steps) / min(steps) if steps and min(steps) > 0 else 0.0
 
 
-def _signature(glances: list[Image], reference: Image) -> tuple[float, ...]:
+def _signature(pictures: list[Image], reference: Image) -> tuple[float, ...]:
     """What the contact looks like, for finding copies: the mean of the quarter of the pictures that show most of it.
 
     A mean of several survives a copy that is shortened or encoded anew, which moves the one strongest picture.
     """
-    still = np.ascontiguousarray(reference[:, :, 0])
-    ranked = sorted(glances, key=lambda g: strength(g, still), reverse=True)
-    strongest = ranked[: max(1, len(ranked) // 4)] or [still]
-    change = np.mean(strongest, axis=0, dtype=np.float32) - still.astype(np.float32)
+    untouched = np.ascontiguousarray(reference[:, :, 0])
+    ranked = sorted(pictures, key=lambda p: contact_strength(p, untouched), reverse=True)
+    strongest = ranked[: max(1, len(ranked) // 4)] or [untouched]
+    change = np.mean(strongest, axis=0, dtype=np.float32) - untouched.astype(np.float32)
     small = cv2.resize(change, SIGNATURE_SIZE, interpolation=cv2.INTER_AREA)
     small -= small.mean()
     norm = float(np.linalg.norm(small))

@@ -23,7 +23,7 @@ import numpy as np
 from pipeline.config import FramesConfig
 from pipeline.videos.decoding import Image
 from pipeline.videos.frames.fit import fit
-from pipeline.videos.frames.reference import strength
+from pipeline.videos.frames.reference import contact_strength
 
 RELEASE_FEWEST = 5
 HELD_BYTES = 64 * 2**20
@@ -73,7 +73,7 @@ def changed_pixels(grey: Image, before: Image) -> float:
     return float(cv2.countNonZero(cv2.absdiff(grey, before)))
 
 
-class Pool:
+class BestFrames:
     """The best frames so far: those with the largest scores, equal scores in favour of the earlier frame.
 
     Frames are held as the codec left them and fitted at the end, since most that come are pushed out again; only where
@@ -118,10 +118,10 @@ def thin(kept: Sequence[Kept], tolerance: float, noise: float) -> list[Kept]:
     Starts from the strongest contact and adds, one at a time, the frame that differs most from all that were taken
     (farthest point first, Gonzalez 1985), until that difference, less what noise alone makes between two frames, is
     below `tolerance` times the strongest contact over noise: what is left looks like something that is there already.
-    Where nothing touches, a single frame is left.
+    Where nothing touches, a single frame remains.
 
     Args:
-        kept: frames with their thumbnails and strengths of contact as scores.
+        kept: frames with their thumbnails and contact strengths as scores.
         noise: the strength of a frame that nothing touches. Two such frames differ by sqrt(2) times that.
     """
     strongest = max(kept, key=lambda k: (k.score, -k.index))
@@ -140,4 +140,4 @@ def thin(kept: Sequence[Kept], tolerance: float, noise: float) -> list[Kept]:
 def _gap(one: Kept, other: Kept) -> float:
     assert one.thumb is not None, "adaptive looks at thumbnails"
     assert other.thumb is not None, "adaptive looks at thumbnails"
-    return strength(one.thumb, other.thumb)
+    return contact_strength(one.thumb, other.thumb)

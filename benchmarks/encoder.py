@@ -1,0 +1,229 @@
+"""Encoders on one core: whole candidates, then number and side of frames, number formats and visual prompts.
+
+A candidate's cost is a video's from the file to the decided classes; weights are random where cost depends on no
+training, and errors are those of the report with most candidates in its cross-validation. The other encoders are
+frozen, have seen no label and are timed alone; each is judged by a grouped cross-validation of its heads. Prompts
+are trained for a few epochs and judged on the development split's validation videos, which also choose the epoch.
+
+`int8` is torch's dynamic quantisation of linear layers, of which the pretrained encoder has none.
+"""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Literal, cast
+
+import cv2
+import numpy as np
+import torch
+from torch import nn
+
+from benchmarks.encoder_models import ALONE, FRAMES, SIDE, features, prompts, whole
+from benchmarks.errors import WRONG, Error, cross_validated
+from benchmarks.frames import bench_videos
+from benchmarks.table import Row, make_rows
+from benchmarks.timing import flops_of, interleaved, machine, megabytes, one_thread
+from pipeline.config import EncoderConfig, FramesConfig
+from pipeline.encoder.baseline.predictor import Labels
+from pipeline.encoder.baseline.validation import Fold
+from pipeline.encoder.clips import ClipDataset, LabelledVideo
+from pipeline.encoder.frame_heads import choose_strength, fit_votes
+from pipeline.encoder.model import FrameEncoder
+from pipeline.encoder.recipes import base_encoder
+from pipeline.encoder.scene_encoder import SceneEncoder
+from pipeline.errors import UserError
+from pipeline.params import load_params
+from pipeline.records import Video
+from pipeline.runtime import derive_seed
+from pipeline.trainable import load_trainable
+from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.files import list_videos
+from pipeline.videos.frames.extract import extract_frames
+from pipeline.videos.frames.store import FrameStore
+
+PRETRAINED = Path("data") / "pretrained" / "encoder.safetensors"
+
+Clip = Mapping[str, torch.Tensor]
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is measured."""
+
+    videos: int = 25
+    """That are timed, spread over the objects."""
+    repeats: int = 5
+    folds: int = 5
+    deals: int = 3
+    epochs: int = 8
+    prompts: tuple[tuple[int, int], ...] = ((8, 0), (1, 0), (32, 0), (8, 1))
+    """Prompts a layer, and layers from the first (0: all); the first is the baseline, the paper's."""
+
+
+@dataclass(frozen=True)
+class Bed:
+    """What all encoders of a run share."""
+
+    folder: Path
+    frames: Path
+    videos: Sequence[Video]
+    catalogue: Catalogue
+    config: EncoderConfig
+    pretrained: Path
+    size: Size
+
+    @property
+    def objects(self) -> list[str]:
+        """Of each video."""
+        return [video.object_id for video in self.videos]
+
+    @property
+    def labels(self) -> Labels:
+        """Videos x properties."""
+        return np.array([self.catalogue.labels(o) for o in self.objects], dtype=np.int64)
+
+    @property
+    def classes(self) -> list[int]:
+        """How many each property has."""
+        return [len(p.levels) for p in self.catalogue.properties]
+
+    def timed(self) -> list[Video]:
+        """At equal distances in the order of the videos, which is by object."""
+        count = min(self.size.videos, len(self.videos))
+        return [self.videos[i * len(self.videos) // count] for i in range(count)]
+
+
+def measure(root: Path, size: Size | None = None) -> list[Row]:
+    """All questions, over the videos that `frames.bench_videos` finds.
+
+    Raises:
+        UserError: without pretrained weights, or where there are too few objects for folds.
+    """
+    size = size or Size()
+    folder, catalogue = bench_videos(root)
+    pretrained = root / PRETRAINED
+    if not pretrained.is_file():
+        raise UserError(
+            f"{pretrained}: no such file; `octopi scale small encoder.recipe=pretrained`, `dvc repro pretrain` make it"
+        )
+    if len({f.object_id for f in list_videos(folder, catalogue).files}) < 2 * size.folds:
+        raise UserError(f"{folder}: bench encoder needs videos of {2 * size.folds} objects or more")
+    params = load_params(root / "params.yaml").encoder
+    changed = {"recipe": "paper", "reference": "none", "weights": str(root / params.weights)}
+    with one_thread(), TemporaryDirectory() as made:
+        frames = Path(made) / "frames"
+        config = FramesConfig(selection="salient", size=SIDE)
+        videos = extract_frames(folder, catalogue, config, frames, Path(made) / "partial").videos
+        bed = Bed(folder, frames, videos, catalogue, params.model_copy(update=changed), pretrained, size)
+        return [*whole(bed, root / "reports"), *frozen(bed), *prompts(bed)]
+
+
+# --- Frozen encoders
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A frozen encoder and what it is shown."""
+
+    encoder: Literal["pretrained", "clip"] = "pretrained"
+    side: int = SIDE
+    """Pixels; frames, or their differences to the reference, are resized by area."""
+    frames: int = FRAMES
+    form: Literal["float32", "bfloat16", "int8"] = "float32"
+
+
+USUAL, CLIP = Setting(), Setting("clip")
+QUESTIONS: dict[str, dict[str, Setting]] = {
+    "encoder frames": {
+        "5 frames": USUAL,
+        "1 frame": replace(USUAL, frames=1),
+        **{f"{n} frames": replace(USUAL, frames=n) for n in (2, 3, 10)},
+    },
+    "frame size": {f"{side} pixels": replace(USUAL, side=side) for side in (SIDE, 90, 60, 30)},
+    "number format, pretrained encoder": {"float32": USUAL, "bfloat16": replace(USUAL, form="bfloat16")},
+    "number format, CLIP": {
+        "float32": CLIP,
+        "bfloat16": replace(CLIP, form="bfloat16"),
+        "int8": replace(CLIP, form="int8"),
+    },
+}
+"""Settings by name; the first of each question is its baseline."""
+
+
+def frozen(bed: Bed) -> list[Row]:
+    """Cost and error of all settings of `QUESTIONS`, each measured once, all in turns."""
+    distinct = {str(s): s for settings in QUESTIONS.values() for s in settings.values()}
+    encoders = {name: _encoder(setting, bed) for name, setting in distinct.items()}
+    shown = {name: [_clip(s, bed, video) for video in bed.timed()] for name, s in distinct.items()}
+    timed: dict[str, Callable[[int], object]] = {
+        name: lambda i, name=name: features(encoders[name], shown[name][i])  # type: ignore[misc]
+        for name in distinct
+    }
+    costs = interleaved(timed, range(len(bed.timed())), bed.size.repeats)
+    errors = {name: _error(encoders[name], setting, bed) for name, setting in distinct.items()}
+    counts = {}
+    for name, setting in distinct.items():
+        counts[name] = {"frames": float(setting.frames), "megabytes": megabytes(encoders[name])}
+        if setting.form != "int8":
+            clip = shown[name][0]
+            counts[name]["flops"] = flops_of(partial(encoders[name].describe, clip["frames"], clip["moments"]))
+    rows = []
+    for question, settings in QUESTIONS.items():
+        rows += make_rows(
+            question,
+            {name: costs[str(setting)] for name, setting in settings.items()},
+            unit=ALONE,
+            baseline=next(iter(settings)),
+            errors={name: errors[str(setting)] for name, setting in settings.items()},
+            error_of=WRONG,
+            counts={name: counts[str(setting)] for name, setting in settings.items()},
+            machine=machine("1 thread"),
+        )
+    return rows
+
+
+def _encoder(setting: Setting, bed: Bed) -> FrameEncoder:
+    encoder: FrameEncoder = SceneEncoder() if setting.encoder == "pretrained" else base_encoder(bed.config)
+    if setting.encoder == "pretrained":
+        load_trainable(encoder, bed.pretrained)
+    return formatted(encoder.eval(), setting.form)
+
+
+def formatted(encoder: FrameEncoder, form: str) -> FrameEncoder:
+    """A copy that computes in another number format."""
+    changed = copy.deepcopy(encoder)
+    if form == "int8":
+        with warnings.catch_warnings():  # Its successor is a package of its own, which is not needed for this.
+            warnings.simplefilter("ignore")
+            return cast(FrameEncoder, torch.ao.quantization.quantize_dynamic(changed, {nn.Linear}, torch.qint8))
+    return changed.to(torch.bfloat16) if form == "bfloat16" else changed
+
+
+def _clip(setting: Setting, bed: Bed, video: Video) -> Clip:
+    """A video's evaluation clip as the setting shows it: `frames` and `moments`, as `ClipDataset` has them."""
+    store = FrameStore(bed.frames, "subtract" if setting.encoder == "pretrained" else "none")
+    item = ClipDataset(store, [LabelledVideo(video.video_id, ())], per_video=setting.frames)[0]
+    if setting.side == SIDE:
+        return item
+    size = (setting.side, setting.side)
+    smaller = [cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in item["frames"].numpy()]
+    return {**item, "frames": torch.from_numpy(np.stack(smaller))}
+
+
+def _error(encoder: FrameEncoder, setting: Setting, bed: Bed) -> Error:
+    """Of the frozen encoder's heads, whose settings are chosen inside the training folds."""
+    clips = np.stack([features(encoder, _clip(setting, bed, video)).numpy() for video in bed.videos])
+    labels, owners, classes = bed.labels, np.array(bed.objects), bed.classes
+
+    def predict(fold: Fold) -> Labels:
+        learnt, wanted, inner = clips[fold.trained], labels[fold.trained], owners[fold.trained].tolist()
+        strength, _ = choose_strength(learnt, wanted, inner, classes, derive_seed("votes", fold.repeat, fold.number))
+        return fit_votes(learnt, wanted, inner, classes, strength).predict(clips[fold.tested])
+
+    return cross_validated(predict, labels, bed.objects, classes, folds=bed.size.folds, repeats=bed.size.deals)

@@ -1,0 +1,158 @@
+"""Encoders whole, from a video's file to its classes, and CLIP under visual prompts trained for a few epochs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from benchmarks.errors import WRONG, Error, error_of, reported, share_of
+from benchmarks.table import Row, make_rows
+from benchmarks.timing import flops_of, interleaved, machine, megabytes
+from pipeline.config import EncoderConfig, FramesConfig, RuntimeConfig, SplitConfig
+from pipeline.encoder.baseline.features import VIDEO_FEATURE_NAMES
+from pipeline.encoder.baseline.predictor import PropertyPredictor
+from pipeline.encoder.baseline.recordings import FRAMES as TREE_FRAMES
+from pipeline.encoder.baseline.recordings import Recording, describe
+from pipeline.encoder.candidates import CANDIDATES, Candidate
+from pipeline.encoder.clips import ClipDataset, LabelledVideo
+from pipeline.encoder.finetune import EncoderData, classify, train_classifier
+from pipeline.encoder.frame_classifier import FrameVotes
+from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
+from pipeline.encoder.recipes import base_encoder, property_classifier
+from pipeline.encoder.scene_encoder import SceneEncoder
+from pipeline.records import Part
+from pipeline.runtime import seed_everything
+from pipeline.sampling import sample_evaluation
+from pipeline.videos.files import VideoFile
+from pipeline.videos.frames.scan import Scan, scan
+from pipeline.videos.frames.store import FrameStore
+from pipeline.videos.frames.subtraction import subtract
+from pipeline.videos.split import assign
+
+if TYPE_CHECKING:
+    from benchmarks.encoder import Bed
+
+SIDE, FRAMES = 120, 5
+"""Pixels and frames a video, where these are not what differs."""
+WHOLE = ("trees", "probe", "paper", "scratch", "pretrained", "pretrained-one-frame", "pretrained-ten-frames")
+ALONE = "ms a video, encoder alone"
+
+
+@torch.inference_mode()
+def features(encoder: FrameEncoder, clip: Mapping[str, torch.Tensor]) -> torch.Tensor:
+    """What the heads are given of a clip: float32, frames x features."""
+    return encoder.describe(clip["frames"], clip["moments"]).float()
+
+
+def whole(bed: Bed, reports: Path) -> list[Row]:
+    """From the file to the classes."""
+    settings: dict[str, Callable[[VideoFile], object]] = {}
+    counts: dict[str, dict[str, float]] = {}
+    for name in WHOLE:
+        candidate = CANDIDATES[name]
+        if candidate.kind == "trees":
+            settings[name], counts[name] = _trees(bed), {"frames": TREE_FRAMES}
+            continue
+        model, frames = _classifier(candidate, bed).eval(), candidate.frames or FRAMES
+        settings[name] = partial(_decide, model, candidate.reference == "own", frames)
+        clip = torch.zeros(1, frames, SIDE, SIDE, 3, dtype=torch.uint8), torch.zeros(1, frames, dtype=torch.int64)
+        flops = flops_of(partial(model, *clip))
+        counts[name] = {"frames": frames, "megabytes": megabytes(model), "flops": flops}
+    files = [VideoFile(bed.folder / v.path, v.path, v.object_id, v.video_id) for v in bed.timed()]
+    judged = reported(reports, task="cross_validation", measure="combined").values()
+    # The report that compares most of them, and of such the one over most videos.
+    scores = max(judged, key=lambda rows: (len(rows), rows[0].n), default=[])
+    return make_rows(
+        "encoder",
+        interleaved(settings, files, bed.size.repeats),
+        unit="ms a video",
+        baseline="pretrained",
+        errors={row.encoder: error_of(row) for row in scores if row.encoder in WHOLE},
+        error_of=WRONG,
+        counts=counts,
+        machine=machine("1 thread"),
+    )
+
+
+def _classifier(candidate: Candidate, bed: Bed) -> PropertyClassifier:
+    """A candidate with heads that have learnt nothing."""
+    seed_everything(0)
+    if candidate.kind == "votes":
+        return FrameVotes(SceneEncoder() if candidate.pretrained else base_encoder(bed.config), bed.classes)
+    if candidate.recipe == "scratch":
+        encoder = SceneEncoder()
+        return PropertyClassifier(encoder, Heads(encoder.dim, bed.classes), bed.classes)
+    return property_classifier(bed.config, bed.classes)
+
+
+def _scan(file: VideoFile) -> Scan:
+    found = scan(file, FramesConfig(selection="salient", size=SIDE))
+    assert isinstance(found, Scan), "all videos were extracted before"
+    return found
+
+
+@torch.inference_mode()
+def _decide(model: PropertyClassifier, differences: bool, frames: int, file: VideoFile) -> torch.Tensor:
+    found = _scan(file)
+    chosen = [found.kept[p] for p in sample_evaluation(len(found.kept), frames)]
+    pictures = np.stack([kept.image for kept in chosen])
+    if differences:
+        pictures = subtract(pictures, found.reference)
+    places = torch.tensor([[kept.index for kept in chosen]])
+    return model.decide(model(torch.from_numpy(pictures)[None], places)["logits"])
+
+
+def _trees(bed: Bed) -> Callable[[VideoFile], object]:
+    """Trees that have grown on random features of as many videos; they decode a second time, whole frames."""
+    shape = len(bed.videos), len(VIDEO_FEATURE_NAMES)
+    features = np.random.default_rng(0).standard_normal(shape, dtype=np.float32)
+    predictor = PropertyPredictor(bed.classes, jobs=1).fit(features, bed.labels, bed.objects)
+    return lambda file: predictor.predict(describe(Recording(file.path, _scan(file).probe.starts_touching))[None])
+
+
+def prompts(bed: Bed) -> list[Row]:
+    """The paper's recipe with other prompts."""
+    split = assign(bed.catalogue, bed.videos, SplitConfig(name="development"))
+    data = EncoderData(FrameStore(bed.frames), bed.catalogue, split.assignments, FRAMES)
+    shown = ClipDataset(data.store, [LabelledVideo(v.video_id, ()) for v in bed.timed()], per_video=FRAMES)
+    clips = [shown[i] for i in range(len(shown))]
+    timed: dict[str, Callable[[Mapping[str, torch.Tensor]], object]] = {}
+    errors, counts = {}, {}
+    for count, layers in bed.size.prompts:
+        name = f"{count} at {'the first layer' if layers == 1 else f'{layers} layers' if layers else 'all layers'}"
+        changed = {"prompts": count, "prompt_layers": layers, "epochs": bed.size.epochs}
+        config = bed.config.model_copy(update=changed)
+        seed_everything(0)
+        model = property_classifier(config, bed.classes)
+        runtime = RuntimeConfig(device="cpu", threads=1)
+        inputs = ["bench", *(f"{a.video_id} {a.part}" for a in data.assignments)]
+        train_classifier(model, data, config, runtime, seed=0, inputs=inputs)
+        errors[name] = _validation_error(model.eval(), data, config)
+        timed[name] = partial(features, model.encoder)
+        # Not in inference mode: the counter fails there at parameters that are put into a layer, as prompts are.
+        flops = flops_of(partial(model.encoder.describe, clips[0]["frames"], clips[0]["moments"]))
+        counts[name] = {"frames": float(FRAMES), "megabytes": megabytes(model), "flops": flops}
+    return make_rows(
+        "prompts",
+        interleaved(timed, clips, bed.size.repeats),
+        unit=ALONE,
+        baseline=next(iter(timed)),
+        errors=errors,
+        error_of="share of validation videos, which also chose the epoch, of which not every property is right",
+        counts=counts,
+        machine=machine("1 thread"),
+    )
+
+
+def _validation_error(model: PropertyClassifier, data: EncoderData, config: EncoderConfig) -> Error:
+    wrong: dict[str, bool] = {}
+    objects: dict[str, tuple[str, ...]] = {}
+    for found in classify(model, data, [Part.VALIDATION], config.batch_size, torch.device("cpu")):
+        wrong[found.video_id] = wrong.get(found.video_id, False) or found.predicted != found.expected
+        objects[found.video_id] = (found.object_id,)
+    return share_of([float(w) for w in wrong.values()], list(objects.values()))

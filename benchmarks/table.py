@@ -1,0 +1,145 @@
+"""The rows of reports/speed_error.csv: ratios, the Pareto front, and the merge of a section's rows into the file."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from statistics import median
+
+from pydantic import Field, model_validator
+
+from benchmarks.errors import Error
+from pipeline.errors import UserError
+from pipeline.io import write_csv
+from pipeline.records import Record
+
+CSV = Path("reports") / "speed_error.csv"
+
+
+class Row(Record):
+    """One setting of a question."""
+
+    question: str
+    setting: str
+    cost: float = Field(ge=0)
+    """Median over the repeats, in `unit`."""
+    unit: str
+    cost_ratio: float = Field(ge=0)
+    """Median over the repeats of the cost over that of the question's baseline, whose ratio is 1."""
+    frames: float | None = None
+    """A video. This and the next four count what the unit is about, and are the same on every machine."""
+    tokens: float | None = None
+    """Generated for an answer, or useful ones (no padding) of a conversation that is trained on."""
+    flops: float | None = None
+    """Floating-point operations of matrix products, convolutions and attention."""
+    ffts: float | None = None
+    """Fourier transforms of one grid."""
+    megabytes: float | None = None
+    """Weights and buffers, in 10^6 bytes."""
+    error: float | None = None
+    """What `error_of` says; None where all settings compute the same."""
+    error_of: str = ""
+    low: float | None = None
+    """Ends of the error's 95 % interval over objects."""
+    high: float | None = None
+    n: int | None = None
+    """Videos, answers or scenes that the error is over."""
+    front: bool | None = None
+    """Whether no other setting of the question costs as little with as little error and less of one of them."""
+    machine: str = ""
+
+    @model_validator(mode="after")
+    def _interval_holds_error(self) -> Row:
+        if self.low is not None and self.high is not None:
+            assert self.error is not None, "an interval without an error"
+            assert self.low <= self.error + 1e-6, f"{self.low} above {self.error}"
+            assert self.error <= self.high + 1e-6, f"{self.error} above {self.high}"
+        return self
+
+
+def front(costs: Sequence[float], errors: Sequence[float]) -> list[bool]:
+    """Which points are on the Pareto front: no other is at least as good in both and better in one."""
+    points = list(zip(costs, errors, strict=True))
+    return [not any(c <= cost and e <= error and (c, e) != (cost, error) for c, e in points) for cost, error in points]
+
+
+def cost_ratios(costs: Mapping[str, Sequence[float]], baseline: str) -> dict[str, float]:
+    """Median over the repeats of each setting's cost over the baseline's in the same repeat.
+
+    Raises:
+        KeyError: where the baseline was not measured.
+    """
+    base = costs[baseline]
+    return {name: median(c / b for c, b in zip(own, base, strict=True)) for name, own in costs.items()}
+
+
+def make_rows(
+    question: str,
+    costs: Mapping[str, Sequence[float]],
+    *,
+    unit: str,
+    baseline: str,
+    errors: Mapping[str, Error] | None = None,
+    error_of: str = "",
+    counts: Mapping[str, Mapping[str, float]] | None = None,
+    machine: str = "",
+) -> list[Row]:
+    """The rows of a question.
+
+    Args:
+        costs: Of each setting in turn one figure a repeat, in `unit`; the n-th figures of all settings belong together.
+        baseline: The setting whose ratio is 1.
+        errors: Of settings; those without have none, and are not on the front.
+        counts: Of settings, by the names of the counting columns.
+    """
+    ratios, errors, counts = cost_ratios(costs, baseline), errors or {}, counts or {}
+    rows = []
+    for name, own in costs.items():
+        error = errors.get(name)
+        values = {"cost": median(own), "cost_ratio": ratios[name], **counts.get(name, {})}
+        if error is not None:
+            values |= error.columns
+        rounded = {column: float(f"{value:.4g}") for column, value in values.items()}
+        named = {"question": question, "setting": name, "unit": unit, "machine": machine}
+        rows.append(Row.model_validate({**named, "error_of": error_of if errors else "", **rounded}))
+    return with_front(rows)
+
+
+def with_front(rows: Sequence[Row]) -> list[Row]:
+    """The rows of one question, each told whether it is on the front; None where it has no error."""
+    judged = [row for row in rows if row.error is not None]
+    ahead = front([row.cost_ratio for row in judged], [row.error or 0.0 for row in judged])
+    known = {row.setting: on for row, on in zip(judged, ahead, strict=True)}
+    return [row.model_copy(update={"front": known.get(row.setting)}) for row in rows]
+
+
+def read_rows(path: Path) -> list[Row]:
+    """All rows of a table; none where there is no file.
+
+    Raises:
+        UserError: for a file that is no such table.
+    """
+    if not path.is_file():
+        return []
+    try:
+        with path.open(encoding="utf-8", newline="") as stream:
+            return [Row.model_validate({k: v for k, v in line.items() if v}) for line in csv.DictReader(stream)]
+    except ValueError as error:
+        raise UserError(f"{path}: not a table of costs and errors ({error}); restore it from Git") from None
+
+
+def merge(path: Path, rows: Sequence[Row]) -> list[Row]:
+    """Put the rows of some questions into the table, in place of what it had of them; returns the whole table.
+
+    Other questions keep their rows and their place; new ones come last.
+    """
+    fresh: dict[str, list[Row]] = {}
+    for row in [*read_rows(path), *rows]:
+        fresh.setdefault(row.question, [])
+    answered = {row.question for row in rows}
+    for row in [*(r for r in read_rows(path) if r.question not in answered), *rows]:
+        fresh[row.question].append(row)
+    table = [row for question in fresh.values() for row in question]
+    write_csv(path, Row, table)
+    return table

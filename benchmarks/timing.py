@@ -1,0 +1,134 @@
+"""Times of settings that take turns, and counts that no machine changes."""
+
+from __future__ import annotations
+
+import gc
+import platform
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from math import prod
+from pathlib import Path
+from statistics import median
+from time import perf_counter
+from typing import TYPE_CHECKING, Any, TypeVar
+from unittest import mock
+
+from pipeline.runtime import cores
+
+if TYPE_CHECKING:
+    from torch import nn
+
+T = TypeVar("T")
+
+
+def milliseconds(run: Callable[[], object]) -> float:
+    """What one call takes."""
+    started = perf_counter()
+    run()
+    return 1000 * (perf_counter() - started)
+
+
+def interleaved(
+    settings: Mapping[str, Callable[[T], object]], items: Sequence[T], repeats: int, warm: bool = True
+) -> dict[str, list[float]]:
+    """Milliseconds an item: of each setting one figure a repeat, the median over the items.
+
+    All settings have their turn at an item before the next item, so that a busy machine slows all alike.
+
+    Args:
+        warm: Run every setting once before, uncounted.
+    """
+    for run in settings.values() if warm else ():
+        run(items[0])
+    found: dict[str, list[float]] = {name: [] for name in settings}
+    for _ in range(repeats):
+        gc.collect()
+        spent: dict[str, list[float]] = {name: [] for name in settings}
+        for item in items:
+            for name, run in settings.items():
+                spent[name].append(milliseconds(lambda run=run, item=item: run(item)))  # type: ignore[misc]
+        for name, own in spent.items():
+            found[name].append(median(own))
+    return found
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Keep torch to one thread."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def machine(threads: str) -> str:
+    """The processor, how many cores there are and how many were used."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.is_file() else []
+    name = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
+    return f"{name}, {cores()} cores, {threads}"
+
+
+def flops_of(run: Callable[[], object]) -> float:
+    """Operations of matrix products, convolutions and attention in a call, two for a multiplication and an addition.
+
+    torch counts them. Fused kernels of attention, which the counter does not see into, are off meanwhile; quantised
+    layers it does not see at all.
+    """
+    import torch
+    from torch.utils.flop_counter import FlopCounterMode
+
+    fused = torch.backends.mha.get_fastpath_enabled()
+    torch.backends.mha.set_fastpath_enabled(False)
+    try:
+        with FlopCounterMode(display=False) as counter:
+            run()
+    finally:
+        torch.backends.mha.set_fastpath_enabled(fused)
+    return float(counter.get_total_flops())
+
+
+@dataclass
+class Count:
+    """How many there were."""
+
+    value: int = 0
+
+
+@contextmanager
+def counting_ffts() -> Iterator[Count]:
+    """Count scipy's real Fourier transforms, forth and back, of two-dimensional grids; a stack of n counts as n."""
+    import scipy.fft
+
+    count = Count()
+
+    def counted(transform: Callable[..., Any]) -> Callable[..., Any]:
+        def run(field: Any, *args: Any, **options: Any) -> Any:
+            count.value += prod(field.shape[:-2])
+            return transform(field, *args, **options)
+
+        return run
+
+    with (
+        mock.patch.object(scipy.fft, "rfft2", counted(scipy.fft.rfft2)),
+        mock.patch.object(scipy.fft, "irfft2", counted(scipy.fft.irfft2)),
+    ):
+        yield count
+
+
+def megabytes(module: nn.Module) -> float:
+    """Parameters and buffers as they lie in memory, 8-bit ones included, in 10^6 bytes."""
+    import torch
+
+    def size(value: object) -> int:
+        if isinstance(value, torch.Tensor):
+            return value.numel() * value.element_size()
+        # Quantised layers keep tuples in the tensors' place.
+        return sum(map(size, value)) if isinstance(value, tuple) else 0
+
+    return sum(map(size, module.state_dict().values())) / 1e6

@@ -1,0 +1,138 @@
+"""What differs between two commits, or a commit and what lies on disk: `octopi compare`.
+
+DVC reads both states: Git's files and, by the hashes in dvc.lock, what its cache holds. Nothing is checked out or run.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pyarrow.parquet as pq
+
+from pipeline.evaluation.scores import difference, effect_row, grouped, with_holm
+from pipeline.records import Graded
+from pipeline.revisions import State, find_state
+from pipeline.tasks import TASKS
+
+GRADED, QUESTIONS = "data/graded.parquet", "data/questions/evaluation.jsonl"
+KEY = ("task", "measure", "encoder", "lora", "opd", "touch", "seed")
+SHOWN = 40
+Rows = list[dict[str, Any]]
+
+
+def compare(root: Path, old: str, new: str = "") -> dict[str, Any]:
+    """Compare two Git revisions of the project in `root`; an empty `new` is the working tree.
+
+    Returns:
+        `old` and `new`, the names of both; `differs`; rows of what differs in `parameters`, `stages` (by dvc.lock),
+        `metrics` and `scores`; `tested`, as in effects.csv; `notes`, why something could not be compared.
+
+    Raises:
+        UserError: for an unknown revision, a folder outside Git and DVC, or a broken file.
+    """
+    one, two = find_state(root, old), find_state(root, new or None)
+    tested, notes = _tested(one, two)
+    found: dict[str, Rows] = {
+        "parameters": _changes(_flat(one.mapping("params.yaml")), _flat(two.mapping("params.yaml"))),
+        "stages": _stages(one.mapping("dvc.lock").get("stages") or {}, two.mapping("dvc.lock").get("stages") or {}),
+        "metrics": _changes(_metrics(one), _metrics(two)),
+        "scores": _changes(_scores(one), _scores(two)),
+        "tested": tested,
+    }
+    return {"old": one.name, "new": two.name, "differs": any(found.values()), **found, "notes": notes}
+
+
+def describe(found: dict[str, Any]) -> str:
+    """A comparison for a terminal; long lists are cut."""
+    parts = [f"{found['old']} -> {found['new']}" if found["differs"] else "Nothing differs"]
+    for title, rows in found.items():
+        if isinstance(rows, list) and rows and title != "notes":
+            table = pd.DataFrame(rows[:SHOWN]).fillna("").to_string(index=False, max_colwidth=72)
+            rest = f"\n... and {len(rows) - SHOWN} more; --json FILE has them all" if len(rows) > SHOWN else ""
+            parts.append(f"{title.capitalize()}\n{table}{rest}")
+    return "\n\n".join([*parts, *found["notes"]])
+
+
+def _stages(old: dict[str, Any], new: dict[str, Any]) -> Rows:
+    rows: Rows = []
+    for name in [name for name in dict.fromkeys([*new, *old]) if old.get(name) != new.get(name)]:
+        one, two = old.get(name, {}), new.get(name, {})
+        deps, outs = (
+            [c["name"] for c in _changes(*({d["path"]: d.get("md5") for d in e.get(kind, ())} for e in (one, two)))]
+            for kind in ("deps", "outs")
+        )
+        why = [*deps, *(kind for kind in ("params", "cmd") if one.get(kind) != two.get(kind))]
+        because = ", ".join(why) if one and two else f"only in the {'new' if two else 'old'}"
+        rows.append({"stage": name, "because of": because, "made": ", ".join(outs)})
+    return rows
+
+
+def _tested(one: State, two: State) -> tuple[Rows, list[str]]:
+    """Each system against itself on the questions that both asked, pooled over the seeds that both have."""
+    try:
+        answers = [_answers(state) for state in (one, two)]
+    except ValueError as error:
+        return [], [
+            f"No paired test: {GRADED} is not as grading writes it today ({' '.join(str(error).split())[:200]})."
+        ]
+    if lacking := " and ".join(state.name for state, found in zip((one, two), answers, strict=True) if found is None):
+        return [], [f"No paired test: {GRADED} of {lacking} is not at hand; `dvc pull` or `dvc repro` there brings it."]
+    asked = [_questions(state) for state in (one, two)]
+    if not all(asked):  # Then objects alone must tell whether a question is the same.
+        asked = [{}, {}]
+    meant = [
+        {g.question_id: (videos.get(g.question_id), g.objects) for g in found or ()}
+        for found, videos in zip(answers, asked, strict=True)
+    ]
+    same = {question for question, meaning in meant[0].items() if meaning == meant[1].get(question)}
+    before, after = (grouped(g for g in found or () if g.question_id in same) for found in answers)
+    rows = []
+    for (task, measure), settings in after.items():
+        for setting, runs in settings.items() if task in TASKS and measure == TASKS[task].measure else ():
+            earlier = before.get((task, measure), {}).get(setting, {})
+            if runs != earlier and (gap := difference(runs, earlier)):
+                rows.append(effect_row(gap, part=" ".join(setting), change="new - old", task=task, measure=measure))
+    other = len(meant[0].keys() | meant[1].keys()) - len(same)
+    notes = [f"{len(same)} questions are compared; {other} were asked by one side only, or differ."] if other else []
+    return [row.model_dump(mode="json") for row in with_holm(rows)], notes
+
+
+def _metrics(state: State) -> dict[str, str]:
+    return _flat({Path(folder).name: state.mapping(f"{folder}/metrics.json") for folder in state.folders("reports")})
+
+
+def _scores(state: State) -> dict[str, str]:
+    """By key: the accuracy and its interval."""
+    found = {}
+    for folder in state.folders("reports"):
+        table = pd.read_csv(io.BytesIO(state.read(f"{folder}/scores.csv") or b"task"), dtype=str).fillna("")
+        for row in table.to_dict("records"):
+            name = " ".join([Path(folder).name, *filter(None, map(row.get, KEY))])
+            found[name] = f"{row.get('accuracy')} [{row.get('low')}, {row.get('high')}]"
+    return found
+
+
+def _answers(state: State) -> list[Graded] | None:
+    content = state.read(GRADED)
+    rows = None if content is None else pq.read_table(io.BytesIO(content)).to_pylist()
+    return None if rows is None else [Graded.model_validate(row) for row in rows]
+
+
+def _questions(state: State) -> dict[str, object]:
+    """By id, what makes a question this one: its videos and its right answer."""
+    rows = map(json.loads, (state.read(QUESTIONS) or b"").splitlines())
+    return {row["question_id"]: (row["videos"], row["gold"]) for row in rows}
+
+
+def _changes(old: dict[str, Any], new: dict[str, Any]) -> Rows:
+    names = [name for name in dict.fromkeys([*new, *old]) if old.get(name) != new.get(name)]
+    return [{"name": name, "old": old.get(name), "new": new.get(name)} for name in names]
+
+
+def _flat(nested: dict[str, Any]) -> dict[str, str]:
+    """Dotted key to value, as text."""
+    return {str(k): str(v) for row in pd.json_normalize(nested).to_dict("records") for k, v in row.items()}

@@ -1,0 +1,287 @@
+"""Everything measured, as the rows of two tidy tables: accuracies (scores.csv) and differences (effects.csv).
+
+This is the one place where an accuracy is computed. A task appears here by itself once it is registered: its chance,
+and with it its measures, come from its own module.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import groupby
+from statistics import fmean
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from pydantic import AfterValidator, BeforeValidator
+
+from pipeline.evaluation.intervals import Objects, accuracy_interval
+from pipeline.evaluation.paired import Difference, holm, paired
+from pipeline.records import Classification, Encoder, Graded, Lora, Opd, OutOfFold, Part, Record, Touch
+from pipeline.tasks import TASKS
+from pipeline.videos.catalogue import Catalogue
+
+ALL_SEEDS = "all"
+"""In place of a seed: the mean over seeds, or over the repeats of a cross-validation."""
+HEADS, VALIDATION_HEADS, CROSS_VALIDATION = "heads", "heads_validation", "cross_validation"
+"""What stands as the task where no language model answered: the fine-tuned encoder's property heads on test videos and
+on validation videos, and encoders on objects that they were not trained on."""
+
+DIGITS = 6
+Share = Annotated[float, AfterValidator(lambda value: round(value, DIGITS))]
+Optional = Annotated[Share | None, BeforeValidator(lambda value: None if value == "" else value)]
+"""Empty in a CSV where it is None."""
+
+
+class ScoreRow(Record):
+    """One accuracy; all shares from 0 to 1."""
+
+    task: str
+    measure: str
+    encoder: str
+    """Of a cross-validation, the candidate's name."""
+    lora: str = ""
+    opd: str = ""
+    touch: str = ""
+    seed: str
+    """A number or `all`."""
+    n: int
+    """Questions, or videos; not multiplied by seeds."""
+    right: Share
+    """Right answers; over seeds their mean, which need not be whole."""
+    unread: Share
+    """Answers that could not be read, which count as wrong; over seeds their mean."""
+    accuracy: Share
+    low: Optional = None
+    """Of the 95 % interval over objects; None where the questions cannot show that objects differ."""
+    high: Optional = None
+    chance: Share
+
+
+class EffectRow(Record):
+    """What changing one part does on the same questions, all else as in the full system; shares from -1 to 1."""
+
+    part: str
+    """`encoder`, `lora`, `opd` or `touch`."""
+    change: str
+    """Such as `with - without`."""
+    task: str
+    measure: str
+    difference: Share
+    low: Optional = None
+    """Of the 95 % interval for new objects and, with several seeds, new seeds; None as in scores."""
+    high: Optional = None
+    p: Optional = None
+    """Of the sign-flip test over objects."""
+    p_holm: Optional = None
+    """Holm's adjustment over all rows of the report."""
+    smallest_effect: Optional = None
+    """The smallest true difference that this design finds in four of five repetitions; above 1 there is none."""
+    n: int
+    objects: int
+    seeds: int
+
+
+class Setting(NamedTuple):
+    """What was asked, apart from the seed."""
+
+    encoder: Encoder
+    lora: Lora
+    opd: Opd
+    touch: Touch
+
+
+FULL = Setting(Encoder.FINETUNED, Lora.WITH, Opd.ALL, Touch.REAL)
+CHANGES: tuple[tuple[str, Setting, Setting], ...] = (
+    ("encoder", FULL, FULL._replace(encoder=Encoder.BASE)),
+    ("lora", FULL, FULL._replace(lora=Lora.WITHOUT)),
+    ("opd", FULL, FULL._replace(opd=Opd.NONE)),
+    ("opd", FULL, FULL._replace(opd=Opd.NEEDED)),
+    *(("touch", FULL, FULL._replace(touch=touch)) for touch in Touch if touch is not Touch.REAL),
+)
+"""The part, the full system, and what it is compared with."""
+
+
+class Answer(NamedTuple):
+    """What an accuracy needs to know of an answer to one question, or of what was said of one video."""
+
+    correct: bool
+    objects: Objects
+    parsed: bool = True
+
+
+Runs = Mapping[int, Mapping[str, Answer]]
+"""By seed and question."""
+Table = Mapping[tuple[str, str], Mapping[Setting, Runs]]
+"""By measure, setting, seed and question."""
+
+
+def score_rows(
+    graded: Iterable[Graded],
+    catalogue: Catalogue,
+    classifications: Mapping[int, Sequence[Classification]] | None = None,
+    out_of_fold: Mapping[str, Sequence[OutOfFold]] | None = None,
+) -> list[ScoreRow]:
+    """The rows of scores.csv: one a seed and one over all of them, for each measure and setting that has answers.
+
+    Args:
+        graded: All graded answers of a run; some variants or tasks may be absent.
+        catalogue: What chance follows from.
+        classifications: Of the property heads, by the encoder's seed; videos of other parts are passed over.
+        out_of_fold: By candidate.
+    """
+    rows: list[ScoreRow] = []
+    for (task, measure), settings in _table(graded, catalogue).items():
+        chance = TASKS[task].chance(catalogue)[measure]
+        for setting, runs in settings.items():
+            rows += _rows(runs, task=task, measure=measure, chance=chance, **setting._asdict())
+    chances = {p.name: 1 / len(p.levels) for p in catalogue.properties}
+    chances["combined"] = math.prod(chances.values())
+    for task_name, part in ((HEADS, Part.TEST), (VALIDATION_HEADS, Part.VALIDATION)):
+        found = {seed: _videos(records, part) for seed, records in (classifications or {}).items()}
+        for measure, chance in chances.items():
+            by_seed = {seed: videos[measure] for seed, videos in found.items() if measure in videos}
+            rows += _rows(
+                by_seed, task=task_name, measure=measure, chance=chance, encoder=Encoder.FINETUNED, touch=Touch.REAL
+            )
+    for name, records in (out_of_fold or {}).items():
+        for place, measure in enumerate(chances):
+            runs = repeats(records, place if place < len(catalogue.properties) else None)
+            rows += _rows(runs, task=CROSS_VALIDATION, measure=measure, chance=chances[measure], encoder=name)[-1:]
+    return rows
+
+
+def effect_rows(graded: Iterable[Graded], catalogue: Catalogue) -> list[EffectRow]:
+    """The rows of effects.csv: what each part of the full system brings, task by task, pooled over seeds.
+
+    Only each task's measure of a whole answer, on questions and seeds that both settings have. Holm's family is all
+    rows.
+    """
+    rows = []
+    table = _table(graded, catalogue)
+    for part, full, less in CHANGES:
+        for (task, measure), settings in table.items():
+            if measure == TASKS[task].measure and (gap := difference(settings.get(full, {}), settings.get(less, {}))):
+                change = f"{getattr(full, part)} - {getattr(less, part)}"
+                rows.append(effect_row(gap, part=part, change=change, task=task, measure=measure))
+    return with_holm(rows)
+
+
+def candidate_rows(out_of_fold: Mapping[str, Iterable[OutOfFold]], reference: str) -> list[EffectRow]:
+    """Each other encoder less the reference in a cross-validation, every property of a video right at once.
+
+    As effects, with the repeats in place of seeds; a family of its own. Empty where the reference was not run.
+    """
+    runs = {name: repeats(records) for name, records in out_of_fold.items()}
+    rows = [
+        effect_row(gap, part="encoder", change=f"{name} - {reference}", task=CROSS_VALIDATION, measure="combined")
+        for name, videos in runs.items()
+        if name != reference and (gap := difference(videos, runs.get(reference, {})))
+    ]
+    return with_holm(rows)
+
+
+def effect_row(gap: Difference, *, part: str, change: str, task: str, measure: str) -> EffectRow:
+    """A row from what `paired` found, not yet adjusted."""
+    return EffectRow(
+        part=part,
+        change=change,
+        task=task,
+        measure=measure,
+        difference=gap.value,
+        low=gap.low,
+        high=gap.high,
+        p=gap.p,
+        smallest_effect=gap.smallest_effect,
+        n=gap.questions,
+        objects=gap.objects,
+        seeds=gap.seeds,
+    )
+
+
+def with_holm(rows: Sequence[EffectRow]) -> list[EffectRow]:
+    """The rows with p adjusted over all of them."""
+    adjusted = holm([row.p for row in rows])
+    return [row.model_copy(update={"p_holm": p}) for row, p in zip(rows, adjusted, strict=True)]
+
+
+def difference(one: Runs, other: Runs) -> Difference | None:
+    """How much more often the first is right, on the questions and seeds that both have; None where there are none."""
+    seeds = sorted(one.keys() & other.keys())
+    asked = _shared([runs[seed] for runs in (one, other) for seed in seeds])
+    if not asked:
+        return None
+    gains = [[float(one[s][q].correct) - float(other[s][q].correct) for q in asked] for s in seeds]
+    return paired(np.array(gains), [one[seeds[0]][q].objects for q in asked])
+
+
+def repeats(records: Iterable[OutOfFold], place: int | None = None) -> dict[int, dict[str, Answer]]:
+    """Whether one property, or with None every property, was told; by repeat and video."""
+    part = slice(None) if place is None else slice(place, place + 1)
+    runs: dict[int, dict[str, Answer]] = defaultdict(dict)
+    for r in records:
+        runs[r.repeat][r.video_id] = Answer(r.expected[part] == r.predicted[part], (r.object_id,))
+    return runs
+
+
+def _rows(runs: Runs, **named: object) -> list[ScoreRow]:
+    """A row a seed, and the last over all seeds, on the questions that all of them have answered."""
+    asked = _shared(runs.values())
+    found = [_row([[a] for a in answers.values()], seed=str(seed), **named) for seed, answers in sorted(runs.items())]
+    if asked:
+        found.append(_row([[answers[q] for answers in runs.values()] for q in asked], seed=ALL_SEEDS, **named))
+    return found
+
+
+def _row(questions: Sequence[Sequence[Answer]], **named: object) -> ScoreRow:
+    """One accuracy from the answers to each question, one a seed."""
+    right = [fmean(a.correct for a in answers) for answers in questions]
+    interval = accuracy_interval(np.array(right), [answers[0].objects for answers in questions])
+    return ScoreRow.model_validate(
+        {
+            **{name: str(value) if name != "chance" else value for name, value in named.items()},
+            "n": len(right),
+            "right": sum(right),
+            "unread": sum(fmean(not a.parsed for a in answers) for answers in questions),
+            "accuracy": fmean(right),
+            "low": interval and interval.low,
+            "high": interval and interval.high,
+        }
+    )
+
+
+def grouped(graded: Iterable[Graded]) -> Table:
+    """Answers by task and measure, then by setting."""
+    found: dict[tuple[str, str], dict[Setting, dict[int, dict[str, Answer]]]] = defaultdict(
+        lambda: defaultdict(lambda: defaultdict(dict))
+    )
+    for g in graded:
+        setting = Setting(g.encoder, g.lora, g.opd, g.touch)
+        found[g.task, g.measure][setting][g.seed][g.question_id] = Answer(g.correct, g.objects, g.parsed)
+    return found
+
+
+def _table(graded: Iterable[Graded], catalogue: Catalogue) -> Table:
+    """In the order of the registered tasks and of what each calls its measures."""
+    found = grouped(graded)
+    keys = [(task, measure) for task, definition in TASKS.items() for measure in definition.chance(catalogue)]
+    return {key: found[key] for key in keys if key in found}
+
+
+def _videos(records: Iterable[Classification], part: Part) -> dict[str, dict[str, Answer]]:
+    """By property and `combined`, whether the heads were right about each video of a part."""
+    found: dict[str, dict[str, Answer]] = defaultdict(dict)
+    kept = sorted((r for r in records if r.part == part), key=lambda r: r.video_id)
+    for video, group in groupby(kept, key=lambda r: r.video_id):
+        said = {r.property: Answer(r.expected == r.predicted, (r.object_id,)) for r in group}
+        for name, one in said.items():
+            found[name][video] = one
+        found["combined"][video] = Answer(all(s.correct for s in said.values()), next(iter(said.values())).objects)
+    return found
+
+
+def _shared(answered: Iterable[Mapping[str, Answer]]) -> list[str]:
+    """The questions that all have answered, sorted."""
+    asked = [set(answers) for answers in answered]
+    return sorted(set.intersection(*asked)) if asked else []

@@ -1,0 +1,153 @@
+"""Everything that a report is made of, from the results of a run to the files in reports/<scale>-<source>/."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import pandas as pd
+
+from pipeline.config import Params
+from pipeline.evaluation.ordinal import ErrorRow, error_rows
+from pipeline.evaluation.scores import EffectRow, ScoreRow, candidate_rows, effect_rows, score_rows
+from pipeline.io import read_csv, read_jsonl, read_table, write_csv, write_json, write_text
+from pipeline.params import PARAMS_FILE
+from pipeline.records import (
+    Assignment,
+    Classification,
+    Finding,
+    Graded,
+    Measurement,
+    OutOfFold,
+    Part,
+    Prediction,
+    Question,
+    Touch,
+    Video,
+)
+from pipeline.report.dataset import dataset_frame
+from pipeline.report.figures import draw_figures
+from pipeline.report.load import HEADS, load_report
+from pipeline.report.provenance import provenance
+from pipeline.report.readme import render_readme
+from pipeline.report.samples import choose_samples
+from pipeline.report.tables import headline
+from pipeline.videos.catalogue import Catalogue, load_catalogue
+
+MOST_METRICS = 12
+"""Columns of `dvc metrics show` that a person still reads."""
+BASELINE = "trees"
+"""The cross-validated model that all others are compared with in encoder_effects.csv."""
+CONFUSION = ("seed", "video_id", "property", "rated", "predicted")
+CURVES = ("stage", "name", "step", "value")
+LOGGED = ("loss", "validation_loss", "validation_combined")
+"""Curves that a report keeps; the others are in data/ and in MLflow."""
+
+
+def write_report(params: Params, root: Path) -> dict[str, float]:
+    """Write reports/<scale>-<source>/ below `root`. The same input gives the same bytes.
+
+    Args:
+        params: those in params.yaml of `root`.
+        root: holds data/, the weights and reports/.
+
+    Returns:
+        What metrics.json holds: accuracies from 0 to 1.
+
+    Raises:
+        UserError: where videos, split or graded answers are missing, or a file is broken. What a run may lack
+            (an encoder, a cross-validation, curves, samples) is not in its report.
+    """
+    data, folder = root / "data", root / "reports" / params.report_name
+    catalogue = load_catalogue(root / params.data.catalogue)
+    videos, assignments = read_table(data / "videos.parquet", Video), read_table(data / "splits.parquet", Assignment)
+    graded = read_table(data / "graded.parquet", Graded)
+    said = {
+        int(file.parent.name): read_table(file, Classification)
+        for file in sorted((data / "encoder").glob("*/classifications.parquet"))
+    }
+    out_of_fold = {
+        name: read_table(data / "cross_validation" / name / "out_of_fold.parquet", OutOfFold)
+        for name in params.cross_validation.models
+        if (data / "cross_validation" / name / "out_of_fold.parquet").is_file()
+    }
+    origin = provenance(params, catalogue, videos, assignments, [g.objects for g in graded], root)
+    write_csv(folder / "scores.csv", ScoreRow, score_rows(graded, catalogue, said, out_of_fold))
+    write_csv(folder / "effects.csv", EffectRow, effect_rows(graded, catalogue))
+    write_csv(folder / "encoder_effects.csv", EffectRow, candidate_rows(out_of_fold, BASELINE))
+    write_csv(folder / "encoder_errors.csv", ErrorRow, error_rows(out_of_fold, catalogue))
+    write_json(folder / "samples.json", _samples(params, data, graded))
+    audit = data / "audit" / "audit.csv"
+    write_csv(folder / "audit.csv", Finding, read_csv(audit, Finding) if audit.is_file() else [])
+    _write(folder / "dataset.csv", dataset_frame(catalogue, videos, assignments))
+    _write(folder / "confusion.csv", confusion_frame(said, catalogue))
+    _write(folder / "curves.csv", curves_frame(data))
+    write_text(folder / "params.yaml", (root / PARAMS_FILE).read_text(encoding="utf-8"))
+    write_json(folder / "provenance.json", origin)
+    return finish_report(folder)
+
+
+def finish_report(folder: Path) -> dict[str, float]:
+    """Write metrics.json, figures/ and README.md from the other files of a report; return the metrics."""
+    report = load_report(folder)
+    metrics = summary(report.scores)
+    confusion, curves = (pd.read_csv(folder / name) for name in ("confusion.csv", "curves.csv"))
+    tasks, properties = headline(report.scores), report.provenance["properties"]
+    figures = draw_figures(folder / "figures", tasks, report.effects, confusion, curves, report.published, properties)
+    write_json(folder / "metrics.json", metrics)
+    write_text(folder / "README.md", render_readme(report, figures))
+    return metrics
+
+
+def summary(scores: pd.DataFrame) -> dict[str, float]:
+    """At most `MOST_METRICS` accuracies by name: the full system's tasks, then the encoder's heads on test videos."""
+    tasks = {row["task"]: row["accuracy"] for row in headline(scores).to_dict("records")}
+    heads = scores[(scores["task"] == HEADS) & (scores["seed"] == "all")]
+    encoder = {f"encoder_{row['measure']}": row["accuracy"] for row in heads.to_dict("records")}
+    order = sorted(encoder, key=lambda name: name != "encoder_combined")
+    found = {**tasks, **{name: encoder[name] for name in order}}
+    return {name: round(float(value), 6) for name, value in list(found.items())[:MOST_METRICS]}
+
+
+def confusion_frame(said: dict[int, list[Classification]], catalogue: Catalogue) -> pd.DataFrame:
+    """What the heads say of test videos, with `CONFUSION`: one row a seed, video and property."""
+    levels = {p.name: p.levels for p in catalogue.properties}
+    rows = [
+        (seed, c.video_id, name, words[c.expected], words[c.predicted])
+        for seed, found in sorted(said.items())
+        for name, words in levels.items()
+        for c in found
+        if c.part is Part.TEST and c.property == name
+    ]
+    return pd.DataFrame(rows, columns=list(CONFUSION))
+
+
+def curves_frame(data: Path) -> pd.DataFrame:
+    """The histories of all trainings below data/, with `CURVES`; a stage is named as DVC names it."""
+    places: list[tuple[str, Iterable[Path]]] = [
+        ("pretrain", sorted(data.glob("pretrained/history.parquet"))),
+        ("finetune_encoder", sorted(data.glob("encoder/*/history.parquet"))),
+        ("align", sorted(data.glob("models/without/*/history.parquet"))),
+        ("lora", sorted(data.glob("models/with/*/history.parquet"))),
+    ]
+    rows = [
+        (stage if stage == "pretrain" else f"{stage}@{file.parent.name}", m.name, m.step, m.value)
+        for stage, files in places
+        for file in files
+        for m in sorted(read_table(file, Measurement), key=lambda m: (m.name, m.step))
+        if m.name in LOGGED
+    ]
+    return pd.DataFrame(rows, columns=list(CURVES))
+
+
+def _samples(params: Params, data: Path, graded: list[Graded]) -> dict[str, object]:
+    full = next(variant for variant in params.ablation.variants() if variant.full)
+    asked, answered = data / "questions" / "evaluation.jsonl", data / "answers" / full.key / f"{Touch.REAL}.jsonl"
+    if not asked.is_file() or not answered.is_file():
+        return choose_samples([], [], [])
+    scores = [g for g in graded if g.variant == full and g.touch is Touch.REAL]
+    return choose_samples(read_jsonl(asked, Question), read_jsonl(answered, Prediction), scores)
+
+
+def _write(path: Path, frame: pd.DataFrame) -> None:
+    write_text(path, frame.to_csv(index=False, lineterminator="\n"))

@@ -1,0 +1,109 @@
+"""The paper's tables about its data set: what objects are like, how long videos are, whether annotators agree."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from statistics import fmean, median
+from typing import Any
+
+import pandas as pd
+
+from pipeline.records import Assignment, Part, Video
+from pipeline.report.load import published
+from pipeline.videos.catalogue import Catalogue
+
+COLUMNS = ("table", "row", "objects", "with_videos", "train", "validation", "test", "frames", "published")
+AGREEMENT = "agreement, ICC(3,k)"
+"""What the audit calls its check of the annotators."""
+TITLES = {
+    "property_counts": "Property categories: objects a class",
+    "property_combinations": "Property combinations: objects each",
+    "video_lengths": "Video lengths, in frames that decode",
+    "annotator_agreement": "Annotator agreement, ICC(3,k) with its 95 % interval",
+}
+HEADINGS = {"row": "", "with_videos": "With videos"}
+
+
+def dataset_frame(catalogue: Catalogue, videos: Sequence[Video], assignments: Sequence[Assignment]) -> pd.DataFrame:
+    """The content of dataset.csv, with `COLUMNS`: a row a class, a combination of classes, and a figure of lengths.
+
+    Published figures stand beside where the catalogue is the paper's, joined by (table, row).
+    """
+    printed = published(catalogue.language.dataset)
+    values = {(row["task"], row["measure"]): row["value"] for row in printed.to_dict("records") if not row["model"]}
+    rows = [
+        _counted("property_counts", f"{p.name}: {level}", members, videos, assignments)
+        | {"published": values.get(("property_counts", level))}
+        for index, p in enumerate(catalogue.properties)
+        for number, level in enumerate(p.levels)
+        for members in [{o for o in catalogue.objects if catalogue.labels(o)[index] == number}]
+    ]
+    combined = Counter(map(catalogue.labels, catalogue.objects))
+    for labels in sorted(combined):
+        words = ", ".join(p.levels[level] for p, level in zip(catalogue.properties, labels, strict=True))
+        members = {o for o in catalogue.objects if catalogue.labels(o) == labels}
+        rows.append(
+            _counted("property_combinations", words, members, videos, assignments)
+            | {"published": values.get(("property_combinations", words))}
+        )
+    lengths = [v.frames for v in videos]
+    figures: dict[str, Callable[[list[int]], float]] = {
+        "average": fmean,
+        "median": median,
+        "minimum": min,
+        "maximum": max,
+    }
+    rows += [
+        {
+            "table": "video_lengths",
+            "row": row,
+            "frames": figure(lengths),
+            "published": values.get(("video_lengths", row)),
+        }
+        for row, figure in figures.items()
+        if lengths
+    ]
+    frame = pd.DataFrame(rows, columns=list(COLUMNS))
+    whole = list(COLUMNS[2:7])
+    return frame.astype(dict.fromkeys(whole, "Int64"))
+
+
+def dataset_tables(folder: Path, dataset: str) -> dict[str, pd.DataFrame]:
+    """The tables of a written report as they are shown, by title: text in every cell.
+
+    Args:
+        folder: of the report, with dataset.csv and audit.csv; what is missing there is no table.
+        dataset: name of the data set.
+    """
+    tables = {}
+    if (folder / "dataset.csv").is_file():
+        frame = pd.read_csv(folder / "dataset.csv", dtype=str).fillna("")
+        for key, rows in frame.groupby("table", sort=False):
+            shown = rows.drop(columns="table").loc[:, lambda f: (f != "").any()]
+            tables[TITLES[str(key)]] = shown.rename(columns=lambda c: HEADINGS.get(c, c.capitalize()))
+    if (folder / "audit.csv").is_file():
+        found = pd.read_csv(folder / "audit.csv", dtype=str).fillna("")
+        rows = found[found["check"] == AGREEMENT]
+        printed = published(dataset)
+        values = printed[printed["task"] == "annotator_agreement"].set_index("measure")["value"].to_dict()
+        if len(rows):
+            columns = {"": rows["item"], "Measured": rows["measured"]}
+            if values:
+                columns["Published"] = rows["item"].map(values).map("{:.3f}".format)
+            tables[TITLES["annotator_agreement"]] = pd.DataFrame(columns)
+    return tables
+
+
+def _counted(
+    table: str, row: str, members: set[str], videos: Sequence[Video], assignments: Sequence[Assignment]
+) -> dict[str, Any]:
+    parts = Counter({a.object_id: a.part for a in assignments if a.object_id in members}.values())
+    return {
+        "table": table,
+        "row": row,
+        "objects": len(members),
+        "with_videos": len(members & {v.object_id for v in videos}),
+        **{str(part): parts[part] for part in (Part.TRAIN, Part.VALIDATION, Part.TEST)},
+    }

@@ -1,0 +1,216 @@
+"""The figures of a report, as PNG: five tasks, effects, confusion of the heads, training curves.
+
+Drawn without pyplot (no global state, no window) and saved without dates, so that equal input gives equal files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+
+from pipeline.io import atomic
+from pipeline.report.load import KEYS, cells
+from pipeline.report.tables import task_title
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+MEASURED, PUBLISHED, QUIET, LINE = "#0a5fb4", "#8a4a00", "#555b66", "#c9ced6"
+SERIES = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#000000")
+"""Okabe and Ito's colours, safe for the colour-blind."""
+PARTS = {"lora": "LoRA", "opd": "OPD"}
+DPI = 150
+
+
+def draw_figures(
+    folder: Path,
+    headline: pd.DataFrame,
+    effects: pd.DataFrame,
+    confusion: pd.DataFrame,
+    curves: pd.DataFrame,
+    published: pd.DataFrame,
+    properties: Mapping[str, Sequence[str]],
+) -> list[str]:
+    """Draw what there is figures for and remove figures of an earlier run.
+
+    Args:
+        folder: Of the PNG files.
+        headline: rows of scores.csv, one a task: the full system.
+        effects: effects.csv.
+        confusion: property, rated, predicted; one row a video.
+        curves: stage, name, step, value.
+        published: as `load_report` gives it.
+        properties: the classes of each, in rising order.
+
+    Returns:
+        The names of the files, in reading order.
+    """
+    wanted: list[tuple[str, pd.DataFrame, Callable[[], Figure]]] = [
+        ("tasks.png", headline, lambda: draw_tasks(headline, published)),
+        ("effects.png", effects, lambda: draw_effects(effects)),
+        ("confusion.png", confusion, lambda: draw_confusion(confusion, properties)),
+        ("curves.png", curves[curves["name"] == "loss"], lambda: draw_curves(curves)),
+    ]
+    folder.mkdir(parents=True, exist_ok=True)
+    drawn = [name for name, rows, _ in wanted if len(rows)]
+    for old in folder.glob("*.png"):
+        if old.name not in drawn:
+            old.unlink()
+    for name, rows, draw in wanted:
+        if len(rows):
+            save(draw(), folder / name)
+    return drawn
+
+
+def draw_tasks(headline: pd.DataFrame, published: pd.DataFrame) -> Figure:
+    """A line from 0 to 100 % a task: the interval, the measured value, chance, and what the paper printed."""
+    figure, (axes,) = panels(1, 7.2, 0.75 + 0.5 * len(headline), across=1)
+    printed = cells(published)
+    for place, row in enumerate(headline.to_dict("records")):
+        axes.plot([0, 100], [-place, -place], color=LINE, linewidth=1.2, zorder=1)
+        if pd.notna(row["low"]):
+            ends = [100 * row["low"], 100 * row["high"]]
+            axes.plot(ends, [-place, -place], color=MEASURED, alpha=0.45, linewidth=5, solid_capstyle="round", zorder=2)
+        chance = 100 * row["chance"]
+        axes.plot([chance, chance], [-place - 0.25, -place + 0.25], color=QUIET, linestyle=(0, (2.5, 2)), linewidth=1.2)
+        for model, face in (("7b", "white"), ("13b", PUBLISHED)):
+            cell = printed.get((*(row[k] for k in KEYS), model))
+            if cell:
+                axes.plot(cell[0], -place, "D", color=PUBLISHED, markerfacecolor=face, markersize=6.5, zorder=3)
+        axes.plot(100 * row["accuracy"], -place, "o", color=MEASURED, markeredgecolor="white", markersize=8, zorder=4)
+        axes.text(104, -place, f"{100 * row['accuracy']:.1f}", color=MEASURED, weight="bold", va="center", fontsize=11)
+    axes.set_yticks([-i for i in range(len(headline))], [task_title(task) for task in headline["task"]])
+    axes.set_ylim(-len(headline) + 0.4, 0.6)
+    axes.set_xlim(-2, 114)
+    axes.set_xticks(range(0, 101, 25), [f"{x} %" for x in range(0, 101, 25)])
+    _quiet(axes)
+    axes.spines["left"].set_visible(False)
+    axes.tick_params(length=0)
+    _legend_of_tasks(figure, bool(printed))
+    return figure
+
+
+def draw_effects(effects: pd.DataFrame) -> Figure:
+    """A panel a part of the system: differences with intervals, by task; solid where Holm's p is below .05."""
+    from matplotlib.ticker import MaxNLocator
+
+    parts = list(dict.fromkeys(zip(effects["part"], effects["change"], strict=True)))
+    labels = list(dict.fromkeys(zip(effects["task"], effects["measure"], strict=True)))
+    figure, places = panels(len(parts), 2.7, 1.1 + 0.3 * len(labels), across=4, left=1.3)
+    reach = 100 * max(1e-3, float(effects[["difference", "low", "high"]].abs().max().max()))
+    for number, (axes, (part, change)) in enumerate(zip(places, parts, strict=True)):
+        rows = effects[(effects["part"] == part) & (effects["change"] == change)]
+        for row in rows.to_dict("records"):
+            height = -labels.index((row["task"], row["measure"]))
+            if pd.notna(row["low"]):
+                ends = [100 * row["low"], 100 * row["high"]]
+                axes.plot(ends, [height] * 2, color=MEASURED, alpha=0.45, linewidth=4, solid_capstyle="round")
+            face = MEASURED if row["p_holm"] < 0.05 else "white"
+            axes.plot(100 * row["difference"], height, "o", color=MEASURED, markerfacecolor=face, markersize=6)
+        axes.axvline(0, color=QUIET, linewidth=0.9)
+        axes.set_title(f"{PARTS.get(part, part)}\n{change}", fontsize=10)
+        axes.xaxis.set_major_locator(MaxNLocator(4, prune="both"))
+        axes.set_xlim(-1.06 * reach, 1.06 * reach)
+        axes.set_ylim(-len(labels) + 0.4, 0.6)
+        names = [task if measure in ("choice", "combined") else f"{task} {measure}" for task, measure in labels]
+        axes.set_yticks([-i for i in range(len(labels))], names if number % 4 == 0 else [""] * len(labels))
+        axes.set_xlabel("points", fontsize=9)
+        axes.grid(axis="x", alpha=0.25)
+        _quiet(axes)
+    return figure
+
+
+def draw_confusion(confusion: pd.DataFrame, properties: Mapping[str, Sequence[str]]) -> Figure:
+    """One matrix a property, with all its classes: rated down, predicted across, in videos."""
+    from sklearn.metrics import ConfusionMatrixDisplay
+
+    names = list(dict.fromkeys(confusion["property"]))
+    figure, places = panels(len(names), 3.6, 3.4)
+    for axes, name in zip(places, names, strict=True):
+        rows = confusion[confusion["property"] == name]
+        levels = properties[name]
+        ConfusionMatrixDisplay.from_predictions(
+            rows["rated"], rows["predicted"], labels=levels, ax=axes, cmap="Blues", colorbar=False
+        )
+        words = [level.replace(" ", "\n") for level in levels]
+        axes.set_xticklabels(words, fontsize=9)
+        axes.set_yticklabels(words, fontsize=9)
+        axes.set_xlabel("predicted")
+        axes.set_ylabel("rated" if name == names[0] else "")
+        axes.set_title(f"{name}: {(rows['rated'] == rows['predicted']).sum()} of {len(rows)} right", fontsize=10)
+        axes.tick_params(length=0)
+    return figure
+
+
+def draw_curves(curves: pd.DataFrame) -> Figure:
+    """The loss of each training over its optimiser steps: a panel a stage, a colour a variant, a line a seed."""
+    from matplotlib.lines import Line2D
+
+    losses = curves[curves["name"].isin(["loss", "validation_loss"])]
+    stages = losses["stage"].str.split("@").str[0]
+    names = list(dict.fromkeys(stages))
+    figure, places = panels(len(names), 3.4, 3.1)
+    for axes, name in zip(places, names, strict=True):
+        lines = list(losses[stages == name].groupby(["stage", "name"], sort=False))
+        labels: dict[str, int] = {}
+        for (stage, measure), points in lines:
+            variant = str(stage).partition("@")[2].rpartition("-")[0]
+            label = variant or {"loss": "training", "validation_loss": "validation"}[measure]
+            number = labels.setdefault(label, len(labels))
+            few = "o" if len(points) == 1 else ""
+            axes.plot(points["step"], points["value"], marker=few, color=SERIES[number % len(SERIES)], linewidth=1.3)
+        axes.set_title(name.replace("_", " "), fontsize=10)
+        axes.set_xlabel("optimiser step", fontsize=9)
+        axes.set_ylabel("loss" if name == names[0] else "", fontsize=9)
+        axes.grid(alpha=0.25)
+        _quiet(axes)
+        if len(labels) <= len(SERIES):
+            named = [Line2D([], [], color=SERIES[number], label=label) for label, number in labels.items()]
+            axes.legend(handles=named, frameon=False, fontsize=7.5)
+    return figure
+
+
+def panels(count: int, width: float, height: float, across: int = 4, left: float = 0.0) -> tuple[Figure, list[Axes]]:
+    """A figure of so many panels, each of this width and height in inches, with room for labels at the left."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    across = min(count, across)
+    down = -(-count // across)
+    figure = Figure(figsize=(width * across + left, height * down), layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = list(figure.subplots(down, across, squeeze=False).flat)
+    for unused in grid[count:]:
+        unused.remove()
+    return figure, grid[:count]
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure; equal bytes for equal figures."""
+    with atomic(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=DPI, metadata={"Software": None})
+
+
+def _quiet(axes: Axes) -> None:
+    axes.spines[["top", "right"]].set_visible(False)
+    for spine in axes.spines.values():
+        spine.set_color(LINE)
+    axes.tick_params(colors=QUIET, labelcolor="#1a1d23", labelsize=9)
+
+
+def _legend_of_tasks(figure: Figure, printed: bool) -> None:
+    from matplotlib.lines import Line2D
+
+    shown: dict[str, dict[str, Any]] = {
+        "measured, 95 % interval over objects": {"color": MEASURED, "marker": "o", "linewidth": 3, "alpha": 0.7},
+        "chance": {"color": QUIET, "linestyle": (0, (2.5, 2))},
+    }
+    if printed:
+        mark = {"color": PUBLISHED, "marker": "D", "linestyle": ""}
+        shown |= {"published, 7b": {**mark, "markerfacecolor": "white"}, "published, 13b": mark}
+    handles = [Line2D([], [], label=label, **style) for label, style in shown.items()]
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=8.5)

@@ -1,0 +1,107 @@
+"""A written report, read back: what tables, the page and tracking build on."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from pipeline.errors import UserError
+
+KEYS = ("task", "measure", "encoder", "lora", "opd")
+"""What a published cell and a measured row share; "" stands for "does not apply"."""
+SCORE_COLUMNS = (*KEYS, "touch", "seed", "n", "right", "unread", "accuracy", "low", "high", "chance")
+EFFECT_COLUMNS = (
+    *("part", "change", "task", "measure", "difference", "low", "high", "p", "p_holm", "smallest_effect"),
+    *("n", "objects", "seeds"),
+)
+TEXT = frozenset((*KEYS, "touch", "seed", "part", "change", "model"))
+ALL_SEEDS = "all"
+HEADS, VALIDATION_HEADS, CROSS_VALIDATION = "heads", "heads_validation", "cross_validation"
+"""As in `pipeline.evaluation.scores`, which takes seconds to import; a test holds them equal."""
+DATASET = "PhysiCLeAR"
+"""The data set of the paper's figures, as properties.yaml names it: beside another's they would mislead."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """The files of one folder in reports/. A file that a report lacks is an empty frame, dictionary or list."""
+
+    folder: Path
+    scores: pd.DataFrame
+    """`SCORE_COLUMNS`; accuracies are fractions."""
+    effects: pd.DataFrame
+    """`EFFECT_COLUMNS`; differences are fractions."""
+    published: pd.DataFrame
+    """The paper's figures; empty where the report is about other data."""
+    provenance: dict[str, Any]
+    samples: dict[str, Any]
+
+    @property
+    def name(self) -> str:
+        """Its folder's name, such as `smoke-scenes`."""
+        return self.folder.name
+
+
+def load_report(folder: Path) -> Report:
+    """Read a report that `write_report` wrote; raise UserError where its scores.csv or provenance.json is missing."""
+    if not (folder / "scores.csv").is_file() or not (folder / "provenance.json").is_file():
+        raise UserError(f"{folder}: no report (scores.csv, provenance.json); `dvc repro report` writes one")
+    provenance = _json(folder / "provenance.json")
+    scores, effects = (
+        read_frame(folder / name, columns)
+        for name, columns in (("scores.csv", SCORE_COLUMNS), ("effects.csv", EFFECT_COLUMNS))
+    )
+    return Report(
+        folder=folder,
+        scores=scores,
+        effects=effects,
+        published=published(str(provenance.get("dataset", ""))),
+        provenance=provenance,
+        samples=_json(folder / "samples.json"),
+    )
+
+
+def read_frame(file: Path, columns: tuple[str, ...]) -> pd.DataFrame:
+    """Read a CSV whose keys are text and whose other columns are numbers; an empty frame where there is none.
+
+    Raises:
+        UserError: the file lacks a column.
+    """
+    if not file.is_file():
+        return pd.DataFrame({name: pd.Series(dtype=object if name in TEXT else float) for name in columns})
+    frame = pd.read_csv(file, dtype=dict.fromkeys(TEXT, str))
+    missing = [name for name in columns if name not in frame]
+    if missing:
+        raise UserError(f"{file}: lacks {', '.join(missing)}; `dvc repro report` writes it anew")
+    text = [name for name in frame if name in TEXT]
+    frame[text] = frame[text].fillna("")
+    return frame
+
+
+@cache
+def _published() -> pd.DataFrame:
+    return read_frame(Path(__file__).with_name("published.csv"), (*KEYS, "model", "value", "n"))
+
+
+def published(dataset: str = DATASET) -> pd.DataFrame:
+    """The paper's figures: `KEYS`, model, value and n; no row where `dataset` is not the paper's.
+
+    `value` is as printed: percent, a count, frames or an ICC. `model` is 7b, 13b, CLIP (the heads, without a language
+    model) or `chance`. The paper gives no numbers of questions: n are the ones that its percentages fit.
+    """
+    return _published() if dataset == DATASET else _published().iloc[:0]
+
+
+def cells(published: pd.DataFrame) -> dict[tuple[str, ...], tuple[float, float]]:
+    """Published value and n by (task, measure, encoder, lora, opd, model)."""
+    keys = zip(*(published[k] for k in (*KEYS, "model")), strict=True)
+    return dict(zip(keys, zip(published["value"], published["n"], strict=True), strict=True))
+
+
+def _json(file: Path) -> dict[str, Any]:
+    return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}

@@ -1,0 +1,298 @@
+"""One page over all reports: reports/index.html, drawn from the files in reports/ and from nothing else.
+
+It needs no network, runs no script and opens from disk. Its tables are those of the registry
+(`pipeline.report.tables`); this module adds what stands around them: the tasks and effects as lines, speed against
+error, numerical stability, and what is missing.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pandas as pd
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup, escape
+
+from pipeline.errors import UserError
+from pipeline.io import write_text
+from pipeline.report.dataset import dataset_tables
+from pipeline.report.drawing import SIZE, draw_table, place_points, share, span
+from pipeline.report.load import KEYS, Report, load_report, read_frame
+from pipeline.report.readme import OTHER_MODELS, SMOKE, finding, origin, stands_on
+from pipeline.report.tables import TABLES, difference, headline, measured, number, task_title, whole
+from pipeline.tasks import TASKS
+
+PAGE = Path("reports/index.html")
+LARGEST = 1_500_000
+"""Bytes of the page at most, so that it opens at once on a phone."""
+SPEED = ("question", "setting", "cost", "unit", "cost_ratio", "error", "error_of", "low", "high", "front")
+STABILITY = ("part", "case", "format", "finite", "error", "bound", "verdict")
+MODELS = ("7b", "13b")
+AUDIT = ("check", "item", "measured", "expected", "severity")
+OLDER = "the report is older than this file: `dvc repro report` at its scale writes it"
+EXPECTED = {
+    "effects.csv": f"no two of its variants differ in one part alone, or {OLDER}",
+    "audit.csv": OLDER,
+    "samples.json": OLDER,
+    "curves.csv": f"its trainings kept no histories, or {OLDER}",
+    "confusion.csv": OLDER,
+}
+"""Files of a report, and why it may lack one."""
+PARTS = {"encoder": "Encoder", "lora": "LoRA", "opd": "OPD", "touch": "Touch"}
+RANK = {"error": 0, "warning": 1, "info": 2}
+Gap = tuple[str, str, str]
+"""Where something is missing, what, and why."""
+
+
+class Line(NamedTuple):
+    """A figure with its interval, drawn on a line; places are percent of that line's width."""
+
+    task: str
+    title: str
+    source: str = ""
+    """File and line that it comes from; empty where nothing was measured."""
+    said: str = ""
+    note: str = ""
+    value: float | None = None
+    low: float | None = None
+    high: float | None = None
+    chance: float | None = None
+    published: dict[str, tuple[str, str, float]] = {}  # noqa: RUF012
+    """By size of its model what the paper printed, of how many questions, and its place."""
+
+
+class Block(NamedTuple):
+    """A table under its heading."""
+
+    key: str
+    title: str
+    caption: str
+    html: Markup
+    file: str
+    open: bool = False
+
+
+def write_page(root: Path) -> Path:
+    """Write the page over all reports below `root`; equal files give an equal page.
+
+    Raises:
+        UserError: there is no report, or the page would be larger than `LARGEST`.
+    """
+    folder, gaps = root / PAGE.parent, list[Gap]()
+    chapters = _chapters(folder, gaps)
+    if not chapters:
+        raise UserError(f"{folder}: no whole report yet; `make repro` writes one")
+    environment = Environment(
+        loader=PackageLoader("pipeline.report"), autoescape=True, trim_blocks=True, undefined=StrictUndefined
+    )
+    environment.filters["inline"] = inline
+    style = " ".join(environment.get_template("style.css").render().split())
+    text = environment.get_template("page.html").render(
+        style=Markup(style),
+        digest=base64.b64encode(hashlib.sha256(style.encode()).digest()).decode(),
+        chapters=chapters,
+        other_models=OTHER_MODELS,
+        speed=list(_speed(folder, gaps)),
+        stability=_stability(folder, gaps),
+        gaps=gaps,
+        size=SIZE,
+    )
+    text = re.sub(r"\n\s*", "\n", text)
+    if len(text.encode()) > LARGEST:
+        raise UserError(f"{root / PAGE}: would have {len(text.encode())} bytes, over {LARGEST}; remove an old report")
+    write_text(root / PAGE, text)
+    return root / PAGE
+
+
+def inline(text: str, folder: str = "") -> Markup:
+    """A sentence of a README: its bold words, code and links as HTML, all else as it is.
+
+    Args:
+        text: Markdown.
+        folder: what its links are relative to.
+    """
+    html = re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", str(escape(text)))
+    html = re.sub(r"`(.+?)`", r"<code>\1</code>", html)
+    return Markup(re.sub(r"\[([^]]+)\]\(([\w./-]+)\)", rf'<a href="{escape(folder)}\2">\1</a>', html))
+
+
+def _chapters(folder: Path, gaps: list[Gap]) -> list[dict[str, Any]]:
+    """The reports: real videos first, then scenes, smoke last; a folder that holds no whole report is a gap."""
+    found = []
+    for place in sorted({file.parent for name in ("scores.csv", "README.md") for file in folder.glob(f"*/{name}")}):
+        try:
+            found.append(_chapter(load_report(place), gaps))
+        except (UserError, ValueError) as error:
+            gaps.append((place.name, "the whole report", str(error).replace(f"{folder}/", "")))
+        except KeyError as error:
+            gaps.append((place.name, "the whole report", f"its provenance.json lacks {error}: {OLDER}"))
+    return sorted(found, key=lambda c: (c["scale"] == "smoke", c["source"] != "videos", c["name"]))
+
+
+def _chapter(report: Report, gaps: list[Gap]) -> dict[str, Any]:
+    """What the template shows of one report."""
+    name, scale, source = report.name, report.provenance["scale"], report.provenance["source"]
+    tasks, (effects, points) = list(_tasks(report)), _effects(report)
+    gaps += [(name, line.title, "the full system was not asked") for line in tasks if not line.source]
+    gaps += [(name, file, why) for file, why in EXPECTED.items() if not (report.folder / file).is_file()]
+    files = sorted(p.relative_to(report.folder.parent).as_posix() for p in report.folder.rglob("*.*") if p.is_file())
+    return {
+        "name": name,
+        "scale": scale,
+        "source": source,
+        "finding": [*([SMOKE.strip("> \n")] if scale == "smoke" else []), *finding(report)],
+        "tasks": tasks,
+        "effects": effects,
+        "points": points,
+        "stands_on": stands_on(report.provenance),
+        "origin": origin(report.provenance),
+        "blocks": [*_tables(report, scale != "smoke", gaps), *_dataset(report), *_audit(report)],
+        "samples": report.samples,
+        "files": files,
+    }
+
+
+def _tasks(report: Report) -> Iterator[Line]:
+    """Every task with the full system's accuracy on real touch over all seeds."""
+    printed = {(*(c[k] for k in KEYS), c["model"]): c for c in report.published.to_dict("records")}
+    rows = headline(report.scores)
+    lines = {row["task"]: (index, row) for index, row in zip(rows.index, rows.to_dict("records"), strict=True)}
+    for task in dict.fromkeys([*TASKS, *lines]):
+        title = task_title(task).removesuffix(f" ({task})")
+        if task not in lines:
+            yield Line(task, title)
+            continue
+        index, row = lines[task]
+        cells = {model: printed.get((*(row[k] for k in KEYS), model)) for model in MODELS}
+        yield Line(
+            task,
+            title,
+            f"{report.name}/scores.csv:{index + 2}",
+            measured(row),
+            f"{row['right']:g} of {row['n']:g} right",
+            share(row["accuracy"]),
+            share(row["low"]),
+            share(row["high"]),
+            share(row["chance"]),
+            {m: (f"{c['value']:.1f}", f"n {c['n']:.0f}", c["value"]) for m, c in cells.items() if c},
+        )
+
+
+def _effects(report: Report) -> tuple[dict[str, list[Line]], float]:
+    """The effects on whole answers by part, and half the width of their line in points."""
+    rows = report.effects[whole(report.effects)]
+    points = span(100 * rows[["difference", "low", "high"]].abs().max(axis=None)) if len(rows) else 0.0
+    groups: dict[str, list[Line]] = {}
+    for index, row in zip(rows.index, rows.to_dict("records"), strict=True):
+        value, low, high = (share(0.5 + 50 * row[name] / points) for name in ("difference", "low", "high"))
+        source = f"{report.name}/effects.csv:{index + 2}"
+        p = number(row["p_holm"], 3)
+        line = Line(row["task"], task_title(row["task"]), source, difference(row), p, value, low, high)
+        groups.setdefault(f"{PARTS.get(row['part'], row['part'])}: {row['change']}", []).append(line)
+    return groups, points
+
+
+def _tables(report: Report, unfold: bool, gaps: list[Gap]) -> Iterator[Block]:
+    """The registry's tables; one without a row is a gap."""
+    for table in TABLES:
+        frame = table.build(report.scores, report.effects, report.published)
+        if frame.empty:
+            gaps.append(
+                (report.name, table.title, f"no row of its {table.source}.csv belongs there: nothing such was run")
+            )
+            continue
+        file = f"{report.name}/{table.source}.csv"
+        html = draw_table(frame, table.title, file)
+        yield Block(f"{report.name}-{table.key}", table.title, table.caption, html, file, unfold and not table.folded)
+
+
+def _dataset(report: Report) -> Iterator[Block]:
+    """The paper's tables about its data set."""
+    for title, frame in dataset_tables(report.folder, report.provenance["dataset"]).items():
+        file = f"{report.name}/{'audit' if 'Measured' in frame else 'dataset'}.csv"
+        yield Block(
+            f"{report.name}-{title.partition(':')[0].partition(',')[0].replace(' ', '-')}",
+            title,
+            "",
+            draw_table(frame, title, file),
+            file,
+        )
+
+
+def _audit(report: Report) -> Iterator[Block]:
+    """The audit's findings, counted by check; what needs attention first."""
+    audit = read_frame(report.folder / "audit.csv", AUDIT)
+    if len(audit):
+        file, counts = f"{report.name}/audit.csv", audit["severity"].value_counts()
+        groups = [
+            (RANK.get(severity, 3), -len(rows), check, severity, rows.iloc[0])
+            for (severity, check), rows in audit.groupby(["severity", "check"])
+        ]
+        shown = pd.DataFrame(
+            {
+                "Severity": severity,
+                "Check": check,
+                "Findings": str(-n),
+                "The first of them": f"{first['item']}: {first['measured']}",
+            }
+            for _, n, check, severity, first in sorted(groups, key=lambda g: g[:3])
+        )
+        caption = ", ".join(f"{counts[name]} {name}" for name in sorted(counts.index, key=lambda s: RANK.get(s, 3)))
+        yield Block(
+            f"{report.name}-audit",
+            "Data audit",
+            f"{caption}; counted by check.",
+            draw_table(shown, "Data audit", file, at_lines=False),
+            file,
+        )
+
+
+def _speed(folder: Path, gaps: list[Gap]) -> Iterator[dict[str, Any]]:
+    """Each question of speed_error.csv: its points, its front in words, its table."""
+    rows = read_frame(folder / "speed_error.csv", SPEED)
+    if rows.empty:
+        gaps.append(("speed", "speed_error.csv", "nothing was measured yet: `make bench` measures it"))
+    rows["front"] = rows["front"].astype(str).eq("True")
+    for question, group in rows.groupby("question", sort=False):
+        shown = group.drop(columns="question").dropna(axis="columns", how="all").map(_said)
+        shown.columns = [name.replace("_", " ").capitalize() for name in shown]
+        yield {
+            "question": question,
+            "costs": "; ".join(group["unit"].dropna().unique()),
+            "errors": "; ".join(group["error_of"].dropna().unique()),
+            "points": place_points(group),
+            "front": group[group["front"]].sort_values("cost_ratio").map(_said).to_dict("records"),
+            "html": draw_table(shown, str(question), "speed_error.csv"),
+        }
+
+
+def _stability(folder: Path, gaps: list[Gap]) -> dict[str, Any]:
+    """How many cases passed by part and number format, and the cases that failed."""
+    rows = read_frame(folder / "stability.csv", STABILITY)
+    if rows.empty:
+        gaps.append(("stability", "stability.csv", "nothing was measured yet: `make stability` measures it"))
+        return {"cases": 0}
+    failed = rows[rows["verdict"].ne("pass")]
+    groups = rows.assign(passed=rows["verdict"].eq("pass")).groupby(["part", "format"])["passed"]
+    cells = (groups.sum().astype(str) + " of " + groups.size().astype(str)).unstack(fill_value="")
+    cells.insert(0, "Part", cells.index)
+    return {
+        "cases": len(rows),
+        "failed": len(failed),
+        "failures": draw_table(failed.map(_said), "Cases that failed", "stability.csv") if len(failed) else "",
+        "table": draw_table(cells, "Cases that passed, by part and number format", "stability.csv", at_lines=False),
+    }
+
+
+def _said(value: Any) -> str:
+    """A cell of a CSV in words: four digits of a fraction, nothing for what is missing."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return "" if pd.isna(value) else f"{value:,.4g}"
+    return str(value)

@@ -1,0 +1,165 @@
+"""Where a report comes from and what its figures stand on: facts that files say, and nothing that changes by itself."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+import struct
+import subprocess
+from collections.abc import Sequence
+from importlib import metadata
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from pipeline.config import EncoderConfig, Params
+from pipeline.errors import UserError
+from pipeline.evaluation.intervals import coverage_note
+from pipeline.params import PARAMS_FILE
+from pipeline.records import Assignment, Part, Video
+from pipeline.videos.catalogue import Catalogue
+
+CODE = ("pipeline", "stages", "conf", "dvc.yaml")
+"""What a result can depend on. A commit of a report alone does not change its revision."""
+PACKAGES = ("torch", "transformers", "peft", "open_clip_torch", "scipy", "scikit-learn", "dvc")
+UNKNOWN = "unknown"
+ABOUT = "about.yaml"
+"""Beside the folders of weights, where people wrote down what the models were taught."""
+NOTES = Path(__file__).with_name("notes.yaml")
+"""What only people know about a report: whether its settings were chosen on its test objects before."""
+ARCHITECTURES = {"llama": "Llama", "mistral": "Mistral", "qwen2": "Qwen2", "gpt_neox": "GPT-NeoX"}
+
+
+def provenance(
+    params: Params,
+    catalogue: Catalogue,
+    videos: Sequence[Video],
+    assignments: Sequence[Assignment],
+    asked: Sequence[tuple[str, ...]],
+    root: Path,
+) -> dict[str, Any]:
+    """The content of provenance.json, for the report of `root` as it stands.
+
+    Args:
+        catalogue: for the data set's name and its properties.
+        videos: all that decode; their hashes are hashed.
+        assignments: for the test objects.
+        asked: the objects of each question, for what is known of the intervals.
+    """
+    rows = "\n".join(video.model_dump_json() for video in videos)
+    test = [a for a in assignments if a.part is Part.TEST]
+    commit = _git(root, "log", "-1", "--format=%H", "--", *CODE) or UNKNOWN
+    return {
+        "report": params.report_name,
+        "scale": params.scale,
+        "source": params.data.source,
+        "dataset": catalogue.language.dataset,
+        "properties": {p.name: list(p.levels) for p in catalogue.properties},
+        "split": params.split.name,
+        "test_objects": sorted({a.object_id for a in test}),
+        "test_videos": len(test),
+        "videos": len(videos),
+        "seeds": list(params.ablation.seeds),
+        "settings": notes().get(params.report_name, ""),
+        "intervals": coverage_note(asked),
+        "facts_told": params.questions.facts,
+        "command": "dvc repro",
+        "commit": commit,
+        "changed": bool(_git(root, "status", "--porcelain", "--", *CODE)),
+        "params_sha256": hashlib.sha256((root / PARAMS_FILE).read_bytes()).hexdigest(),
+        "data_sha256": hashlib.sha256(rows.encode()).hexdigest(),
+        "encoder": encoder_words(params.encoder),
+        "base_models": {
+            "encoder": base_model(root, params.encoder.weights),
+            "language": base_model(root, params.language.weights),
+        },
+        "python": platform.python_version(),
+        "packages": {name: _version(name) for name in PACKAGES},
+    }
+
+
+def encoder_words(config: EncoderConfig) -> str:
+    """What the fine-tuned tactile encoder is, in words."""
+    words = {
+        "paper": "the base CLIP with visual prompt tuning",
+        "release": "the base CLIP with visual prompt tuning as the published code has it",
+        "pretrained": "a convolutional network with synthetic pretraining (not CLIP)",
+    }[config.recipe]
+    return words + (" on pictures of the difference to the untouched gel" if config.reference == "subtract" else "")
+
+
+def base_model(root: Path, folder: str) -> dict[str, Any]:
+    """Folder, kind, size in parameters, hash of a base model, and what people wrote about what it was taught.
+
+    `parameters` are counted from the headers of its safetensors files. Where files are missing, they are 0 and the
+    hash is "unknown". `known_templates` says that it was taught in the wording of this pipeline's own questions.
+    """
+    where = root / folder
+    about = where.parent / ABOUT
+    said = (yaml.safe_load(about.read_text(encoding="utf-8")) or {}).get(where.name, {}) if about.is_file() else {}
+    return {
+        "folder": folder,
+        "kind": _kind(where),
+        "parameters": sum(parameters(file) for file in sorted(where.glob("*.safetensors"))),
+        "sha256": digest(where),
+        "taught": said.get("taught", ""),
+        "known_templates": bool(said.get("known_templates", False)),
+    }
+
+
+def parameters(file: Path) -> int:
+    """Numbers in a safetensors file, counted from its header.
+
+    Format: eight bytes with the header's length (little endian), then JSON with a shape a tensor
+    (https://huggingface.co/docs/safetensors).
+    """
+    with file.open("rb") as stream:
+        try:
+            (length,) = struct.unpack("<Q", stream.read(8))
+            header = json.loads(stream.read(length))
+        except (struct.error, ValueError, OverflowError, MemoryError):
+            raise UserError(f"{file}: not a safetensors file; get it again") from None
+    return sum(prod(tensor["shape"]) for name, tensor in header.items() if name != "__metadata__")
+
+
+def digest(folder: Path) -> str:
+    """SHA-256 over the names and hashes of a folder's files, hidden ones (downloads leave them) left out."""
+    found = {path.relative_to(folder): path for path in folder.rglob("*") if path.is_file()}
+    files = sorted(name for name in found if not any(part.startswith(".") for part in name.parts))
+    total = hashlib.sha256()
+    for name in files:
+        with found[name].open("rb") as stream:
+            total.update(f"{name.as_posix()} {hashlib.file_digest(stream, 'sha256').hexdigest()}\n".encode())
+    return total.hexdigest() if files else UNKNOWN
+
+
+def notes() -> dict[str, str]:
+    """What people wrote about reports in notes.yaml, by the report's name."""
+    return yaml.safe_load(NOTES.read_text(encoding="utf-8")) or {}
+
+
+def _kind(folder: Path) -> str:
+    if (folder / "open_clip_config.json").is_file():
+        return "CLIP"
+    if not (folder / "config.json").is_file():
+        return "model"
+    kind = str(json.loads((folder / "config.json").read_text(encoding="utf-8")).get("model_type", "model"))
+    return ARCHITECTURES.get(kind, kind)
+
+
+def _git(root: Path, *arguments: str) -> str:
+    try:
+        done = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=True, timeout=30)
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return done.stdout.strip()
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return UNKNOWN

@@ -1,0 +1,233 @@
+"""README.md of a report: the finding first, then what it stands on, then the paper's tables, in at most 150 lines.
+
+Every sentence is put together by rule from the report's own files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import pandas as pd
+
+from pipeline.report.load import KEYS, Report, cells
+from pipeline.report.tables import TABLES, headline, measured, number, task_title
+
+MOST_LINES = 150
+SMOKE = "> **Scale `smoke`: its figures prove only that the chain runs.**\n"
+ALPHA = 0.05
+VICUNA = 5e9
+"""Parameters below which a language model is no Vicuna 7b."""
+OTHER_MODELS = (
+    "Published figures are the paper's, of Octopi with Vicuna 7b and 13b (and of CLIP ViT-L/14 where no language model "
+    "answers): other models on other questions about other objects. They are no target that was met or missed."
+)
+NEAR_NULL = (
+    "It knows the wording of the tasks before it is trained here, so LoRA and OPD are near-null by construction: their "
+    "effects say nothing about a language model that does not."
+)
+
+
+def render_readme(report: Report, figures: Sequence[str]) -> str:
+    """The text of README.md.
+
+    Args:
+        report: with scores, effects and provenance.
+        figures: names of the files in figures/ that were drawn.
+    """
+    said = report.provenance
+    sections = [
+        f"# {report.name}: what was measured\n",
+        *([SMOKE] if said["scale"] == "smoke" else []),
+        "\n\n".join(finding(report)) + "\n",
+        five_tasks(report),
+        *([f"{OTHER_MODELS}\n"] if len(report.published) else []),
+        *_pictures(figures),
+        "## What the figures stand on\n\n" + "".join(f"- {fact}\n" for fact in stands_on(said)),
+        "## Where it comes from\n\n" + "".join(f"- {fact}\n" for fact in origin(said)),
+    ]
+    lines = "\n".join(sections).count("\n") + 1
+    elsewhere = []
+    for table in TABLES:
+        shown = table.build(report.scores, report.effects, report.published)
+        text = f"## {table.title}\n\n{table.caption}\n\n{markdown(shown)}"
+        if not table.folded and len(shown) and lines + text.count("\n") + 6 <= MOST_LINES:
+            sections.append(text)
+            lines += text.count("\n") + 1
+        elif len(shown):
+            elsewhere.append(table.title)
+    more = f"On the page [index.html](../index.html): {'; '.join(elsewhere)}.\n" if elsewhere else ""
+    files = (path.name for pattern in ("*.csv", "samples.json") for path in sorted(report.folder.glob(pattern)))
+    links = ", ".join(f"[{name}]({name})" for name in files)
+    return "\n".join([*sections, f"## More\n\n{more}All figures: {links}."]) + "\n"
+
+
+def finding(report: Report) -> list[str]:
+    """Three paragraphs: what made the figures; how far from chance; whether touch is used and what parts bring."""
+    chance, rest = _against_chance(headline(report.scores)), [*_touch(report.effects), *_parts(report.effects)]
+    return [" ".join(sentences) for sentences in (_who(report), chance, rest)]
+
+
+def five_tasks(report: Report) -> str:
+    """The table of the first screen: a row a task, the full system."""
+    rows = headline(report.scores)
+    models = [m for m in ("7b", "13b") if len(report.published)]
+    printed = cells(report.published)
+    size = report.provenance["base_models"]["language"]["parameters"]
+    shown: dict[str, list[str]] = {
+        "Task": [task_title(task) for task in rows["task"]],
+        f"Measured here ({size_words(size)} model) % [95 %]": [
+            f"**{measured(row)}**" for row in rows.to_dict("records")
+        ],
+        "n": [number(n, 0) for n in rows["n"]],
+        "Unread %": [number(row["unread"] / row["n"], scale=100) for row in rows.to_dict("records")],
+        "Chance %": [number(chance, scale=100) for chance in rows["chance"]],
+    }
+    for model in models:
+        found = [printed.get((*(row[k] for k in KEYS), model)) for row in rows.to_dict("records")]
+        shown[f"Published (Vicuna {model}) % (n)"] = [
+            f"{cell[0]:.2f} ({cell[1]:.0f})" if cell else "" for cell in found
+        ]
+    return markdown(pd.DataFrame(shown)) if len(rows) else "No answer of the full system was graded.\n"
+
+
+def stands_on(said: dict[str, Any]) -> list[str]:
+    """What a figure is worth: models with their size, test objects, seeds, whether they were looked at before."""
+    language, encoder = said["base_models"]["language"], said["base_models"]["encoder"]
+    objects = said["test_objects"]
+    named = f" ({', '.join(objects)})" if objects else ""
+    facts = [
+        f"**Language model:** {model_words(language)}." + (f" {NEAR_NULL}" if language["known_templates"] else ""),
+        f"**Tactile encoder:** {said['encoder']}. Base encoder of the ablation: {model_words(encoder)}.",
+        f"**Test objects:** {len(objects)}{named}, {said['test_videos']} videos, split `{said['split']}`.",
+        f"**Seeds:** {len(said['seeds'])} ({', '.join(map(str, said['seeds']))}).",
+        f"**Chosen on these objects before?** {said['settings'] or 'Nothing is noted in pipeline/report/notes.yaml.'}",
+        "**Intervals** are Wilson's with the effective number of questions, since questions share objects. "
+        + said["intervals"],
+    ]
+    if said["facts_told"]:
+        facts.append(
+            "**Matching questions** say what the named objects are like: they ask for touch, not for knowledge."
+        )
+    return facts
+
+
+def origin(said: dict[str, Any]) -> list[str]:
+    """Command, commit, data, base models by hash, packages."""
+    models = said["base_models"].values()
+    changed = " with uncommitted changes" if said["changed"] else ""
+    return [
+        f"`{said['command']}` with [params.yaml](params.yaml) at commit `{said['commit'][:12]}`{changed}",
+        f"data: {said['videos']} videos ({said['source']}, {said['dataset'] or 'unnamed catalogue'}), sha256 "
+        f"`{said['data_sha256'][:16]}` over their hashes",
+        "base models: " + ", ".join(f"`{m['folder']}` sha256 `{m['sha256'][:16]}`" for m in models),
+        f"Python {said['python']}; " + ", ".join(f"{name} {version}" for name, version in said["packages"].items()),
+        "in full: [provenance.json](provenance.json)",
+    ]
+
+
+def model_words(model: dict[str, Any]) -> str:
+    """A base model as a person would name it, such as "a 2.1 M-parameter Llama, trained on ..."."""
+    taught = model["taught"] or "what it was taught is not noted here"
+    return f"`{model['folder']}`, a {size_words(model['parameters'])} {model['kind']}, {taught}"
+
+
+def size_words(parameters: int) -> str:
+    """A number of parameters in words, such as "2.1 M-parameter"."""
+    if not parameters:
+        return "model of unknown size:"
+    value, unit = next(
+        (parameters / u, name) for u, name in ((1e9, "B"), (1e6, "M"), (1e3, "k"), (1, "")) if parameters >= u
+    )
+    return f"{value:.1f} {unit}-parameter"
+
+
+def markdown(frame: pd.DataFrame) -> str:
+    """A table in Markdown, of cells that are text; bars in cells are escaped."""
+    rows = [list(frame.columns), ["---"] * len(frame.columns), *frame.to_numpy().tolist()]
+    return "".join("| " + " | ".join(str(cell).replace("|", "\\|") for cell in row) + " |\n" for row in rows)
+
+
+def _who(report: Report) -> list[str]:
+    said = report.provenance
+    language = said["base_models"]["language"]
+    maker = f"A {size_words(language['parameters'])} {language['kind']}"
+    maker += f", {language['taught']}," if language["taught"] else ""
+    maker += " made these figures"
+    maker += " in place of the paper's Vicuna" if language["parameters"] < VICUNA else ""
+    maker += ": LoRA and OPD are near-null by construction" if language["known_templates"] else ""
+    clip = said["base_models"]["encoder"]
+    encoder = said["encoder"].replace("the base CLIP", f"a {size_words(clip['parameters'])} {clip['kind']}")
+    source = {"scenes": "synthetic", "videos": "real"}.get(said["source"], "")
+    objects, seeds = _count(len(said["test_objects"]), "test object"), _count(len(said["seeds"]), "seed")
+    about = f"Its tactile encoder was {encoder}; it answered about {source} videos of {objects}, under {seeds}."
+    return [f"{maker}.", about, *([said["settings"]] if said["settings"] else [])]
+
+
+def _against_chance(rows: pd.DataFrame) -> list[str]:
+    if not len(rows):
+        return ["No answer of the full system was graded."]
+    over = rows["accuracy"] - rows["chance"]
+    best, worst = rows.loc[over.idxmax()], rows.loc[over.idxmin()]
+    above = rows[rows["low"] > rows["chance"]]
+    below = rows[rows["high"] < rows["chance"]]
+    named = f" ({', '.join(above['task'])})" if len(above) else ""
+    extremes = " and ".join(
+        f"{kind} {row['task']} with {measured(row.to_dict())} % (chance {number(row['chance'], scale=100)})"
+        for kind, row in (("best in", best), ("worst in", worst))
+    )
+    tasks = f"{len(above)} of {_count(len(rows), 'task')}{named}"
+    text = f"The full system's interval lies above chance in {tasks}"
+    text += f" and below it in {', '.join(below['task'])}" if len(below) else ""
+    return [f"{text}: it is {extremes}." if len(rows) > 1 else f"{text}."]
+
+
+def _touch(effects: pd.DataFrame) -> list[str]:
+    rows = effects[effects["part"] == "touch"]
+    if not len(rows):
+        return ["Whether answers depend on touch was not tested."]
+    others = [change.partition(" - ")[2] for change in dict.fromkeys(rows["change"])]
+    span = f"{100 * rows['difference'].min():+.1f} to {100 * rows['difference'].max():+.1f} points"
+    fact = f"real minus {' or '.join(others)} touch is {span} by task"
+    sure, likely = rows[(rows["p_holm"] < ALPHA) & (rows["difference"] > 0)], rows[rows["low"] > 0]
+    if len(sure):
+        return [f"Answers use touch in {', '.join(dict.fromkeys(sure['task']))}: {fact}."]
+    if len(likely):
+        some = f"the interval lies above 0 in {len(likely)} of {len(rows)} comparisons, significant (Holm) is none"
+        return [f"Answers seem to use touch: {fact}; {some}{_impossible(effects)}."]
+    return [f"That answers use touch is not shown: {fact}, nowhere significant (Holm){_impossible(effects)}."]
+
+
+def _impossible(effects: pd.DataFrame) -> str:
+    """Whether so few objects could show anything at all: a sign flip's p is at least 2 / 2**objects."""
+    objects = int(effects["objects"].max())
+    return f", as {objects} objects never can be" if len(effects) * 2.0 ** (1 - objects) >= ALPHA else ""
+
+
+def _parts(effects: pd.DataFrame) -> list[str]:
+    rows = effects[effects["part"] != "touch"]
+    if not len(rows):
+        return []
+    shown = rows[rows["p_holm"] < ALPHA]
+    if len(shown):
+        words = ", ".join(f"{r['part']} in {r['task']} {100 * r['difference']:+.1f}" for r in shown.to_dict("records"))
+        return [f"Of {len(rows)} effects of encoder, LoRA and OPD these hold up (Holm): {words} points."]
+    smallest = rows["smallest_effect"].min()
+    found = f"; the smallest that this design could have found is {100 * smallest:.0f} points" if smallest <= 1 else ""
+    return [
+        f"None of {len(rows)} effects of encoder, LoRA and OPD is significant (Holm){_impossible(effects) or found}."
+    ]
+
+
+def _pictures(figures: Sequence[str]) -> list[str]:
+    shown = {
+        "effects.png": "What encoder, LoRA, OPD and touch bring: differences in points with intervals; full dots are "
+        "significant after Holm's adjustment"
+    }
+    rest = [f"[{name.removesuffix('.png')}](figures/{name})" for name in figures if name not in shown]
+    drawn = [f"![{alt}](figures/{name})\n" for name, alt in shown.items() if name in figures]
+    return [*drawn, f"Further figures: {', '.join(rest)}.\n"] if rest else drawn
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

@@ -1,0 +1,296 @@
+"""The tables of a report: each an entry here, a selection of scores.csv or effects.csv.
+
+To add one, add an entry to `TABLES`. A newly registered task is in all that its kind belongs to, without a change here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import pandas as pd
+
+from pipeline.report.load import ALL_SEEDS, CROSS_VALIDATION, HEADS, KEYS, VALIDATION_HEADS, cells
+from pipeline.tasks import TASKS
+
+Select = Callable[[pd.DataFrame], "pd.Series[bool]"]
+FULL = {"encoder": "finetuned", "lora": "with", "opd": "all"}
+CHOICE, COMBINED = "choice", "combined"
+NOT_ANSWERED = (HEADS, VALIDATION_HEADS, CROSS_VALIDATION)
+"""Tasks of scores.csv without a language model."""
+PUBLISHED_MODELS = ("7b", "13b", "CLIP")
+SYSTEM_WORDS = {"base": "base encoder", "without": "without LoRA", "none": "without OPD", "needed": "OPD as needed"}
+ENCODERS = {"finetuned": "fine-tuned", "base": "base"}
+
+
+@dataclass(frozen=True)
+class Table:
+    """One table: a selection of rows and the columns that are shown of them."""
+
+    key: str
+    title: str
+    caption: str
+    """Plain sentences: what the rows are, and what to mind."""
+    rows: Select
+    columns: tuple[str, ...]
+    """Names of `COLUMNS`; "published" stands for a column a published model."""
+    source: str = "scores"
+    """`scores` or `effects`."""
+    folded: bool = True
+    """Whether the page shows it only when asked."""
+
+    def select(self, scores: pd.DataFrame, effects: pd.DataFrame) -> pd.DataFrame:
+        """The rows of the table as the CSV has them, in the order of tasks, measures and systems."""
+        frame = effects if self.source == "effects" else scores
+        return _ordered(frame[self.rows(frame).astype(bool)]) if len(frame) else frame
+
+    def build(self, scores: pd.DataFrame, effects: pd.DataFrame, published: pd.DataFrame) -> pd.DataFrame:
+        """The table as it is shown: text in every cell, headings as column names; no row where nothing was measured.
+
+        Args:
+            scores: as `load_report` gives them.
+            effects: likewise.
+            published: likewise; joined by (task, measure, encoder, lora, opd), in columns of their own.
+        """
+        rows = self.select(scores, effects)
+        records = rows.to_dict("records")
+        shown: dict[str, list[str]] = {}
+        for name in self.columns:
+            if name == "published":
+                shown |= _beside(rows, published)
+            else:
+                heading, cell = COLUMNS[name]
+                shown[heading] = [cell(row) for row in records]
+        return pd.DataFrame(shown, index=rows.index, dtype=object)
+
+
+def headline(scores: pd.DataFrame) -> pd.DataFrame:
+    """One row a task that was asked: whole answers of the full system to real touch, over all seeds."""
+    return _ordered(scores[answers(scores) & whole(scores) & _differs(scores)])
+
+
+def number(value: float, digits: int = 1, scale: float = 1.0) -> str:
+    """A number with fixed digits; nothing for NaN."""
+    return "" if pd.isna(value) else f"{value * scale:.{digits}f}"
+
+
+def measured(row: dict[str, Any]) -> str:
+    """Percent with the 95 % interval, such as "60.6 [39.7, 78.3]"."""
+    span = "" if pd.isna(row["low"]) else f" [{number(row['low'], scale=100)}, {number(row['high'], scale=100)}]"
+    return number(row["accuracy"], scale=100) + span
+
+
+def difference(row: dict[str, Any]) -> str:
+    """Percentage points with a sign and the 95 % interval."""
+    span = "" if pd.isna(row["low"]) else f" [{100 * row['low']:+.1f}, {100 * row['high']:+.1f}]"
+    return f"{100 * row['difference']:+.1f}{span}"
+
+
+def task_title(task: str) -> str:
+    """What a task is called in words, such as "Property comparison (PC)"."""
+    titles = {
+        HEADS: "Property heads",
+        VALIDATION_HEADS: "Property heads, validation videos",
+        CROSS_VALIDATION: "Cross-validation",
+        **{name: task.title for name, task in TASKS.items()},
+    }
+    return f"{titles[task]} ({task})" if task in TASKS else titles.get(task, task)
+
+
+def system(row: dict[str, Any]) -> str:
+    """A variant by what it leaves out of the full system."""
+    if row["task"] in (HEADS, VALIDATION_HEADS):
+        return "property heads, no language model"
+    if row["task"] == CROSS_VALIDATION:
+        return str(row["encoder"])
+    words = [SYSTEM_WORDS[row[axis]] for axis in FULL if row[axis] in SYSTEM_WORDS]
+    return ", ".join(words) or "Octopi (full system)"
+
+
+def _count(name: str, digits: int = 0) -> Callable[[dict[str, Any]], str]:
+    return lambda row: number(row[name], digits)
+
+
+def _text(name: str) -> Callable[[dict[str, Any]], str]:
+    return lambda row: str(row[name])
+
+
+COLUMNS: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
+    "task": ("Task", lambda row: task_title(row["task"])),
+    "measure": ("Measure", lambda row: "all properties right" if row["measure"] == COMBINED else row["measure"]),
+    "system": ("System", system),
+    "encoder": ("Encoder", lambda row: ENCODERS.get(row["encoder"], row["encoder"])),
+    "lora": ("LoRA", _text("lora")),
+    "opd": ("OPD", _text("opd")),
+    "touch": ("Touch", _text("touch")),
+    "measured": ("Measured % [95 %]", measured),
+    "n": ("n", _count("n")),
+    "chance": ("Chance %", lambda row: number(row["chance"], scale=100)),
+    "unread": ("Unread %", lambda row: number(row["unread"] / row["n"] if row["n"] else float("nan"), scale=100)),
+    "part": ("Part", _text("part")),
+    "change": ("Change", _text("change")),
+    "difference": ("Difference, points [95 %]", difference),
+    "p": ("p", _count("p", 3)),
+    "p_holm": ("p, Holm", _count("p_holm", 3)),
+    "smallest": ("Smallest that could be found", lambda row: number(row["smallest_effect"], scale=100)),
+    "objects": ("Objects", _count("objects")),
+    "seeds": ("Seeds", _count("seeds")),
+}
+"""Heading of a column, and how its cell is written."""
+
+
+def _ordered(frame: pd.DataFrame) -> pd.DataFrame:
+    """Tasks in the registry's order, whole answers before parts, the full system before what lacks something."""
+    tasks = [*TASKS, *NOT_ANSWERED]
+    rank = pd.DataFrame(index=frame.index)
+    rank["task"] = frame["task"].map(lambda task: tasks.index(task) if task in tasks else len(tasks))
+    rank["measure"] = frame["measure"].map(lambda measure: measure != COMBINED).astype(int)
+    rank["named"] = pd.factorize(frame["measure"])[0]
+    for axis in (axis for axis in FULL if axis in frame):
+        rank[axis] = (frame[axis] != FULL[axis]).astype(int)
+    return frame.loc[rank.sort_values(list(rank.columns), kind="stable").index]
+
+
+def _beside(rows: pd.DataFrame, published: pd.DataFrame) -> dict[str, list[str]]:
+    """The published cells of these rows, a column a model that has any."""
+    printed, columns = cells(published), {}
+    for model in PUBLISHED_MODELS:
+        found = [printed.get((*key, model)) for key in zip(*(rows[k] for k in KEYS), strict=True)]
+        if any(found):
+            columns[f"Published {model} % (n)"] = [f"{cell[0]:.2f} ({cell[1]:.0f})" if cell else "" for cell in found]
+    return columns
+
+
+def answers(frame: pd.DataFrame) -> pd.Series[bool]:
+    """Answers of the language model to real touch, over all seeds."""
+    over = ~frame["task"].isin(NOT_ANSWERED) & (frame["seed"] == ALL_SEEDS)
+    return over & (frame["touch"] == "real")
+
+
+def whole(frame: pd.DataFrame) -> pd.Series[bool]:
+    """Measures that say that an answer is right, not only a part of it."""
+    return frame["measure"].isin({CHOICE, COMBINED, *(task.measure for task in TASKS.values())})
+
+
+def _differs(frame: pd.DataFrame, *axes: str) -> pd.Series[bool]:
+    """Variants that are the full system but for these axes; OPD as needed is in none of the paper's tables."""
+    same = frame["opd"] != "needed"
+    for axis, value in FULL.items():
+        same &= (frame[axis] == value) | (axis in axes)
+    return same
+
+
+def _variants(*axes: str, described: bool | None = None, trained: bool | None = None) -> Select:
+    """Answers of variants that differ in these axes; only descriptions, or only tasks that were trained, or not."""
+
+    def select(frame: pd.DataFrame) -> pd.Series[bool]:
+        rows = answers(frame) & _differs(frame, *axes)
+        if described is not None:
+            rows &= (frame["measure"] != CHOICE) == described
+        if trained is not None:
+            never = [name for name, task in TASKS.items() if not task.trained]
+            rows &= ~frame["task"].isin(never) == trained
+        return rows
+
+    return select
+
+
+def _over_seeds(*tasks: str) -> Select:
+    return lambda frame: frame["task"].isin(tasks) & (frame["seed"] == ALL_SEEDS)
+
+
+PAPER = ("task", "system", "measured", "n", "chance", "unread", "published")
+PROPERTIES = ("measure", "system", "measured", "n", "chance", "unread", "published")
+
+TABLES: tuple[Table, ...] = (
+    Table(
+        "understanding",
+        "Physical understanding",
+        "Questions about what was touched, with descriptions before the conclusion (OPD) and without.",
+        _variants("opd", described=False, trained=True),
+        PAPER,
+        folded=False,
+    ),
+    Table(
+        "reasoning",
+        "Scenario reasoning",
+        "Which of two objects fits a scenario: asked of every system, never trained.",
+        _variants("opd", described=False, trained=False),
+        PAPER,
+        folded=False,
+    ),
+    Table(
+        "description",
+        "Object property description",
+        "Describing one object, as a language model's answer and by the encoder's property heads on the same videos.",
+        lambda f: _variants(described=True)(f) | _over_seeds(HEADS)(f),
+        PROPERTIES,
+        folded=False,
+    ),
+    *(
+        Table(
+            f"{axis}_{kind}",
+            f"Ablation of {name}: {title}",
+            caption,
+            _variants(axis, described=kind == "properties"),
+            columns,
+            folded=False,
+        )
+        for axis, name, caption in (
+            ("encoder", "the encoder", "The tactile encoder fine-tuned on properties, or as it was before."),
+            ("lora", "LoRA", "With end-to-end fine-tuning of the language model, or after alignment alone."),
+        )
+        for kind, title, columns in (
+            ("properties", "property description", PROPERTIES),
+            ("understanding", "understanding and reasoning", PAPER),
+        )
+    ),
+    Table(
+        "effects",
+        "What each part brings",
+        "The full system minus the system that lacks one part, on the same questions. p is of a test by sign flips "
+        "over objects; Holm's counts all comparisons of the report.",
+        lambda f: f["part"] != "touch",
+        ("part", "change", "task", "measure", "difference", "p", "p_holm", "smallest", "n", "objects", "seeds"),
+        source="effects",
+        folded=False,
+    ),
+    Table(
+        "touch_effects",
+        "Is touch used?",
+        "What the full system loses where its touch is replaced. No loss means that answers do not depend on touch.",
+        lambda f: f["part"] == "touch",
+        ("change", "task", "measure", "difference", "p", "p_holm", "smallest", "n", "objects", "seeds"),
+        source="effects",
+    ),
+    Table(
+        "touch",
+        "Input ablations",
+        "The full system with its touch, and with another object's (swapped), none (removed) or noise.",
+        lambda f: ~f["task"].isin(NOT_ANSWERED) & (f["seed"] == ALL_SEEDS) & whole(f) & _differs(f),
+        ("task", "touch", "measured", "n", "chance", "unread"),
+    ),
+    Table(
+        "variants",
+        "All variants",
+        "Every combination of encoder, LoRA and OPD that was trained.",
+        lambda f: answers(f) & whole(f),
+        ("task", "encoder", "lora", "opd", "measured", "n", "chance", "unread", "published"),
+    ),
+    Table(
+        "heads",
+        "Property heads of the tactile encoder",
+        "What the encoder's heads say of test and validation videos, without a language model.",
+        _over_seeds(HEADS, VALIDATION_HEADS),
+        ("task", "measure", "encoder", "measured", "n", "chance", "published"),
+    ),
+    Table(
+        "cross_validation",
+        "Encoders and baselines over all objects",
+        "Grouped cross-validation: a model judges only videos of objects that it never saw. With few test objects this "
+        "is the main evidence about encoders.",
+        _over_seeds(CROSS_VALIDATION),
+        ("measure", "system", "measured", "n", "chance"),
+    ),
+)

@@ -1,0 +1,50 @@
+"""`octopi repro`: says how many stages will run, lets DVC run them, and writes the page where a report changed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pipeline.params import load_params
+
+CHAIN = "dvc.yaml"
+
+
+def outdated(root: Path) -> tuple[int, int]:
+    """How many stages will run at the most, and how many there are.
+
+    A stage runs where its inputs changed, and every stage after it unless its own inputs come out the same.
+    """
+    import networkx as nx
+    from dvc.repo import Repo
+
+    with Repo(str(root)) as repo:
+        changed = set(repo.status(targets=[CHAIN]))
+        graph = repo.index.graph
+        waiting = {stage for stage in graph if stage.addressing in changed}
+        for stage in tuple(waiting):
+            waiting |= nx.ancestors(graph, stage)
+        return len(waiting), sum(stage.path_in_repo == CHAIN for stage in graph)
+
+
+def reproduce(root: Path, arguments: list[str]) -> int:
+    """Run `dvc repro` with these arguments where anything changed; return its exit status."""
+    from dvc.cli import main as dvc
+
+    name = load_params(root / "params.yaml").report_name
+    waiting, total = outdated(root)
+    if waiting:
+        print(f"{name}: up to {waiting} of {total} stages will run", flush=True)
+    if waiting or arguments:
+        status = int(dvc(["repro", *arguments]))
+        if status:
+            return status
+    else:
+        print(f"{name}: all {total} stages are up to date")
+    page = root / "reports" / "index.html"
+    if waiting or not page.is_file():
+        from pipeline.report.page import write_page
+
+        write_page(root)
+    print(f"Report: reports/{name}/README.md; all reports on one page: reports/index.html")
+    print("Dashboard: make dashboard, then open http://127.0.0.1:5000")
+    return 0

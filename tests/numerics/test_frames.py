@@ -1,0 +1,109 @@
+"""Pictures and videos at their edges: black, white, even, flashing, a single frame, sums beyond 32 bits.
+
+All of it is arithmetic on bytes. Sums and differences are whole numbers below 2^53 and thus exact in a double, so that
+nearly every bound is 0; what they are held against is written down here in float64.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.config import FramesConfig
+from pipeline.scenes.film import write_film
+from pipeline.videos.decoding import Decoder, brightness
+from pipeline.videos.frames.reference import contact_strength
+from pipeline.videos.frames.selection import difference
+from pipeline.videos.frames.subtraction import GAIN, MIDDLE, RING, subtract
+from pipeline.videos.frames.video_pass import run_pass
+from tests.numerics.bounds import summing
+from tests.numerics.harness import FLOAT64, UINT8, Check, Floats
+
+PART = "frames"
+HEIGHT, WIDTH = 30, 40
+Image = np.ndarray
+
+
+def even(value: int, *shape: int) -> Image:
+    """A picture of one value."""
+    return np.full(shape or (HEIGHT, WIDTH, 3), value, np.uint8)
+
+
+def noise(seed: int) -> Image:
+    """A picture of values from 0 to 255."""
+    return np.random.default_rng(seed).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+
+
+PAIRS = {
+    "black and black": (even(0), even(0)),
+    "white and white": (even(255), even(255)),
+    "white and black": (even(255), even(0)),
+    "black and white": (even(0), even(255)),
+    "saturated by halves": (np.repeat([even(0, WIDTH, 3), even(255, WIDTH, 3)], 15, axis=0), even(128)),
+    "noise and noise": (noise(0), noise(1)),
+    "one pixel": (even(255, 1, 1, 3), even(0, 1, 1, 3)),
+}
+"""Two pictures each that are hard to compare: bytes that wrap around, saturate, or do not differ at all."""
+VIDEOS = {
+    "black": [even(0)] * 12,
+    "even": [even(77)] * 12,
+    "white": [even(255)] * 12,
+    "a single frame": [even(77)],
+    "two frames": [even(77), even(90)],
+    "black and white by turns": [even(255 * (i % 2)) for i in range(12)],
+    "noise": [noise(i) for i in range(12)],
+}
+"""Without contact, too short, or as restless as can be."""
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_pictures_are_compared_without_wrapping_around(check: Check, name: str) -> None:
+    """Salience and subtraction are exact.
+
+    The contact strength: roundings of means of whole numbers in a double, differences of numbers up to 255; where
+    these are 0, the error is absolute.
+    """
+    one, other = PAIRS[name]
+    change = one.astype(np.float64) - other
+    check(f"salience: {name}", UINT8, lambda _: difference(one[..., 0], other[..., 0]), 0, abs(change[..., 0]).sum())
+    check(
+        f"contact strength: {name}",
+        UINT8,
+        lambda _: contact_strength(one, other),
+        255 * summing(HEIGHT * WIDTH * 3, FLOAT64),
+        abs(change).mean() - abs(change.mean(axis=(0, 1))).mean(),
+    )
+    check(f"subtraction: {name}", UINT8, lambda _: subtract(one[None], other)[0], 0, subtracted(change))
+
+
+def subtracted(change: Floats) -> Floats:
+    """128 and twice the difference, less the outer ring's median; halves of it go up."""
+    rows, columns = (np.arange(n) for n in change.shape[:2])
+    top, left = (max(1, n // RING) for n in change.shape[:2])
+    outer = (np.minimum(rows, rows[::-1]) < top)[:, None] | (np.minimum(columns, columns[::-1]) < left)[None, :]
+    light = np.floor(np.median(change[outer], axis=0) + 0.5)
+    return np.clip(MIDDLE + GAIN * (change - light), 0, 255)
+
+
+def test_a_difference_beyond_32_bits_is_exact(check: Check) -> None:
+    shape = 4320, 7680
+    check(
+        "salience: a sum beyond 32 bits", UINT8, lambda _: difference(even(255, *shape), even(0, *shape)), 0,
+        255.0 * shape[0] * shape[1],
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", VIDEOS)
+def test_kept_frames_are_those_with_the_largest_differences(check: Check, tmp_path: Path, name: str) -> None:
+    """By sorting: 30 % of them, of equal ones the earlier; index and score of each."""
+    path = tmp_path / "video.mp4"
+    write_film(path, VIDEOS[name], 25.0)
+    with Decoder(path) as decoder:
+        planes = np.stack([brightness(frame).astype(np.float64) for frame in decoder.frames()])
+    scores = np.abs(np.diff(planes, axis=0)).sum(axis=(1, 2))
+    best = np.sort(np.argsort(-scores, kind="stable")[: -(-3 * len(scores) // 10)])
+    expected = np.stack([best + 1, scores[best]], axis=1) if len(scores) else np.zeros((1, 2))
+    kept = run_pass(path, FramesConfig(size=16, fraction=0.3)).kept
+    check(f"salient frames of a video: {name}", UINT8, lambda _: [(k.index, k.score) for k in kept], 0, expected)

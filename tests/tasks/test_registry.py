@@ -1,0 +1,105 @@
+"""The registry: a task that is named there once is built, counted, graded and checked like the others."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import pytest
+
+from pipeline.config import QuestionsConfig
+from pipeline.errors import UserError
+from pipeline.evaluation.grading import grade
+from pipeline.io import read_jsonl, write_jsonl
+from pipeline.records import Opd, Part, Prediction, Question, Score
+from pipeline.tasks import TASKS
+from pipeline.tasks.base import Draft, Pool, TaskDefinition, choice_score, draft_single_turn
+from pipeline.tasks.questions import build_questions, counts_by_task
+from pipeline.videos.catalogue import Catalogue, load_catalogue
+from tests.conftest import ROOT
+
+CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")
+POOL = Pool(Part.TEST, CATALOGUE, {o: [f"{o}_0"] for o in CATALOGUE.objects})
+
+
+class Hardest(TaskDefinition):
+    """A whole task as somebody would add it: is this object hard?"""
+
+    name = "HARD"
+    title = "Hard or not"
+
+    def strata(self, catalogue: Catalogue) -> int:
+        return 2
+
+    def draft(self, pool: Pool, stratum: int, rng: random.Random) -> Draft | None:
+        object_id = rng.choice(pool.objects)
+        choice = "yes" if pool.catalogue.labels(object_id)[0] == 2 else "no"
+        if choice != ("no", "yes")[stratum]:
+            return None
+        user = {Opd.NONE: "Is {tactile} hard?"}
+        answer = {Opd.NONE: choice}
+        return draft_single_turn(
+            pool, [object_id], rng, user=user, answer=answer, choice=choice, properties=["hardness"]
+        )
+
+    def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
+        said = prediction.outputs[0]
+        return choice_score(question, prediction, said if said in ("yes", "no") else None)
+
+    def chance(self, catalogue: Catalogue) -> dict[str, float]:
+        return {"choice": 1 / 2}
+
+
+def config(train: dict[str, int], evaluation: dict[str, int]) -> QuestionsConfig:
+    return QuestionsConfig(train=train, evaluation=evaluation)
+
+
+def test_the_papers_tasks_are_registered_in_its_order() -> None:
+    assert {name: task.title for name, task in TASKS.items()} == {
+        "OPD": "Object Property Description",
+        "PC": "Property Comparison",
+        "PSS": "Property Superlative Selection",
+        "POM": "Property-object Matching",
+        "PSR": "Property Scenario Reasoning",
+    }
+    assert [name for name, task in TASKS.items() if not task.trained] == ["PSR"]
+    assert all(task.measure in task.chance(CATALOGUE) for task in TASKS.values())
+
+
+def test_a_registered_task_is_counted_built_stored_and_graded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(TASKS, "HARD", Hardest())
+    counts = counts_by_task(config({}, {"hard": 6, "pc": 2}), "evaluation")
+    assert counts == {"OPD": 0, "PC": 2, "PSS": 0, "POM": 0, "PSR": 0, "HARD": 6}
+    built = build_questions(POOL, counts, seed=0, distinct=True, facts=True)
+    write_jsonl(tmp_path / "q.jsonl", built)
+    questions = [q for q in read_jsonl(tmp_path / "q.jsonl", Question) if q.task == "HARD"]
+    assert sorted(q.question_id for q in questions) == [f"HARD-test-{i:05d}" for i in range(6)]
+    answers = [
+        Prediction(question_id=q.question_id, task="HARD", outputs=("yes",), truncated=False, tokens=1)
+        for q in questions
+    ]
+    scores = grade(questions, answers, CATALOGUE)
+    assert [s.correct for s in scores] == [CATALOGUE.labels(s.objects[0])[0] == 2 for s in scores]
+    assert sum(s.correct for s in scores) == 3
+
+
+def test_another_task_changes_no_question_of_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    wanted = config({}, dict.fromkeys(("opd", "pc", "pss", "pom", "psr"), 4))
+    before = build_questions(POOL, counts_by_task(wanted, "evaluation"), seed=0, distinct=True)
+    monkeypatch.setitem(TASKS, "HARD", Hardest())
+    assert build_questions(POOL, counts_by_task(wanted, "evaluation"), seed=0, distinct=True) == before
+
+
+@pytest.mark.parametrize(
+    ("train", "message"),
+    [
+        ({"pcc": 3}, "questions.train.pcc is not a task; did you mean pc. allowed here: opd, pc, pss, pom, psr"),
+        ({"zzz": 3}, "questions.train.zzz is not a task; allowed here: opd"),
+        ({"psr": 3}, "questions.train.psr must be 0: PSR is for evaluation only"),
+    ],
+)
+def test_wrong_counts_are_one_line(train: dict[str, int], message: str) -> None:
+    with pytest.raises(UserError, match=message) as caught:
+        counts_by_task(config(train, {}), "train")
+    assert "\n" not in str(caught.value)
+    assert counts_by_task(config({"psr": 0}, {"psr": 3}), "train")["PSR"] == 0
