@@ -132,8 +132,8 @@ def cross_validate_candidate(
             expected=data.catalogue.labels(video.object_id),
             predicted=tuple(classes),
         )
-        for video, repeated in zip(data.videos, predicted.tolist(), strict=True)
-        for repeat, classes in enumerate(repeated)
+        for video, repeats in zip(data.videos, predicted.tolist(), strict=True)
+        for repeat, classes in enumerate(repeats)
     ]
 
 
