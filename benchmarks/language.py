@@ -26,13 +26,11 @@ from benchmarks.table import Row, make_rows
 from benchmarks.timing import flops_of, interleaved, machine, one_thread
 from pipeline.config import EncoderConfig
 from pipeline.embeddings import FLIPS, INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
-from pipeline.encoder.model import FrameEncoder
-from pipeline.encoder.recipes import base_encoder
+from pipeline.encoder.model import FrameEncoder, base_encoder
 from pipeline.io import read_table, save_tensors, write_table
-from pipeline.language.buckets import LengthBuckets
 from pipeline.language.chat import IGNORE_INDEX
-from pipeline.language.conversations import ConversationCollator, ConversationDataset, Sample
-from pipeline.language.generate import Asking, answer
+from pipeline.language.conversations import ConversationCollator, ConversationDataset, LengthBuckets, Sample
+from pipeline.language.generate import GenerationSettings, answer
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.params import load_params
 from pipeline.records import Assignment, Embedding, Graded, Opd, Part, Prediction, Question
@@ -279,8 +277,8 @@ def _asked(
 
 def ask(bed: Bed, model: OctopiForCausalLM, limit: int, batch: int) -> list[Prediction]:
     """The pipeline's own way."""
-    asking = Asking(system_prompt="", per_video=FRAMES, max_new_tokens=limit, batch_size=batch)
-    return answer(model, bed.store, bed.asked, Opd.ALL, asking)
+    settings = GenerationSettings(system_prompt="", per_video=FRAMES, max_new_tokens=limit, batch_size=batch)
+    return answer(model, bed.store, bed.asked, Opd.ALL, settings)
 
 
 def _texts(bed: Bed, model: OctopiForCausalLM, limit: int, batch: int, _: object) -> list[str]:

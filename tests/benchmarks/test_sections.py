@@ -13,7 +13,7 @@ import yaml
 from benchmarks import contact, encoder, frames, language
 from benchmarks.table import Row, merge, read_rows
 from benchmarks.timing import counting_ffts, flops_of
-from pipeline.encoder import frame_heads
+from pipeline.encoder import frame_classifier
 from pipeline.encoder.baseline import validation
 from pipeline.encoder.baseline.predictor import PropertyPredictor
 from pipeline.encoder.scene_encoder import SceneEncoder
@@ -109,7 +109,7 @@ def test_encoder(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     with pytest.raises(UserError, match="repro pretrain"):
         encoder.measure(project, size)
     for name, value in (("STRENGTHS", (1e-3, 1e-2)), ("FOLDS", 2), ("ROUNDS", 5)):
-        monkeypatch.setattr(frame_heads, name, value)
+        monkeypatch.setattr(frame_classifier, name, value)
     torch.manual_seed(0)
     save_trainable(SceneEncoder(), project / encoder.PRETRAINED)
     report = project / "reports" / "any"
