@@ -14,10 +14,10 @@ import pytest
 from pipeline.config import FramesConfig
 from pipeline.scenes.film import write_film
 from pipeline.videos.decoding import Decoder, brightness
-from pipeline.videos.frames.probing import run_pass
-from pipeline.videos.frames.reference import strength
+from pipeline.videos.frames.reference import contact_strength
 from pipeline.videos.frames.selection import difference
 from pipeline.videos.frames.subtraction import GAIN, MIDDLE, RING, subtract
+from pipeline.videos.frames.video_pass import run_pass
 from tests.numerics.bounds import summing
 from tests.numerics.harness import FLOAT64, UINT8, Check, Floats
 
@@ -71,7 +71,7 @@ def test_pictures_are_compared_without_wrapping_around(check: Check, name: str) 
     check(
         f"strength of contact: {name}",
         UINT8,
-        lambda _: strength(one, other),
+        lambda _: contact_strength(one, other),
         255 * summing(HEIGHT * WIDTH * 3, FLOAT64),
         abs(change).mean() - abs(change.mean(axis=(0, 1))).mean(),
     )
