@@ -66,13 +66,13 @@ def whole(bed: Bed, reports: Path) -> list[Row]:
     files = [VideoFile(bed.folder / v.path, v.path, v.object_id, v.video_id) for v in bed.timed()]
     judged = reported(reports, task="cross_validation", measure="combined").values()
     # The report that compares most of them, and of such the one over most videos.
-    scores = max(judged, key=lambda rows: (len(rows), float(rows[0]["n"])), default=[])
+    scores = max(judged, key=lambda rows: (len(rows), rows[0].n), default=[])
     return make_rows(
         "encoder",
         interleaved(settings, files, bed.size.repeats),
         unit="ms a video",
         baseline="pretrained",
-        errors={row["encoder"]: error_of(row) for row in scores if row["encoder"] in WHOLE},
+        errors={row.encoder: error_of(row) for row in scores if row.encoder in WHOLE},
         error_of=WRONG,
         counts=counts,
         machine=machine("1 thread"),

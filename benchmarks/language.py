@@ -209,7 +209,7 @@ def loss(bed: Bed, way: Way, questions: Sequence[Question], samples: Sequence[Sa
     embeddings, labels = bed.model.embed(batch["input_ids"], batch["features"]), batch["labels"]
     mask = torch.ones_like(labels)
     if way.padded:
-        rest = CUTOFF - embeddings.shape[1]
+        rest = max(0, CUTOFF - embeddings.shape[1])
         embeddings = F.pad(embeddings, (0, 0, 0, rest))
         labels, mask = F.pad(labels, (0, rest), value=IGNORE_INDEX), F.pad(mask, (0, rest))
     logits = bed.model.llm(inputs_embeds=embeddings, attention_mask=mask).logits.float()
@@ -226,7 +226,7 @@ def answering(bed: Bed, size: Size) -> list[Row]:
     def one_by_one(**options: bool) -> Callable[[object], list[str]]:
         return lambda _: [_answer(bed, size.limit, place, **options) for place in range(len(bed.asked))]
 
-    ways = {
+    ways: dict[str, Callable[[object], list[str]]] = {
         PUBLISHED: one_by_one(reads=True),
         "without the published loop's forward pass": one_by_one(),
         "and without a cache of keys and values": one_by_one(cache=False),
@@ -241,7 +241,7 @@ def answering(bed: Bed, size: Size) -> list[Row]:
 
 def formats(bed: Bed, size: Size) -> list[Row]:
     """The frozen weights in fewer bits; the connector stays in float32."""
-    ways = {}
+    ways: dict[str, Callable[[object], list[str]]] = {}
     names: tuple[DtypeName, ...] = ("float32", "bfloat16")
     for name in names:
         base = bed.model.octopi_config
@@ -339,7 +339,7 @@ def describing(root: Path) -> list[Row]:
     costs: dict[str, list[float]] = {}
     errors = {}
     for opd in ("all", "needed", "none"):
-        own = [error_of(row) for row in scores if row["opd"] == opd and row["task"] in DESCRIBED]
+        own = [error_of(row) for row in scores if row.opd == opd and row.task in DESCRIBED]
         tokens = [a.tokens for a in answers if a.opd == opd and a.task in DESCRIBED]
         if len(own) == len(DESCRIBED) and tokens:
             lows, highs = ([e for e in ends if e is not None] for ends in ([x.low for x in own], [x.high for x in own]))

@@ -12,7 +12,7 @@ CHAIN = "dvc.yaml"
 def outdated(root: Path) -> tuple[int, int]:
     """How many stages will run at the most, and how many there are.
 
-    A stage runs where its inputs changed, and again every stage after it; DVC skips those whose inputs come out the same.
+    A stage runs where its inputs changed, and every stage after it unless its own inputs come out the same.
     """
     import networkx as nx
     from dvc.repo import Repo

@@ -125,11 +125,10 @@ def write_params(params: Params, path: Path = PARAMS_FILE) -> bool:
 class _Dumper(yaml.SafeDumper):
     """Writes lists in one line, so that params.yaml stays readable."""
 
-    def represent_list(self, data: list[object]) -> yaml.nodes.Node:
-        return self.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=True)
 
-
-_Dumper.add_representer(list, _Dumper.represent_list)
+_Dumper.add_representer(
+    list, lambda dumper, data: dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=True)
+)
 
 
 def prune(params: Params, data: Path) -> None:

@@ -18,10 +18,12 @@ import sqlite3
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
+from functools import reduce
 from pathlib import Path
 from threading import Event
 from typing import Any, ParamSpec, TypeVar
@@ -32,19 +34,17 @@ from pipeline.config import Params, TrackingConfig
 from pipeline.errors import UserError
 from pipeline.io import read_json, read_table
 from pipeline.params import PARAMS_FILE
-from pipeline.records import WHOLE, Assignment, Lora, Measurement, Part, Touch, Variant, Video
-from pipeline.records import Encoder as EncoderAxis
+from pipeline.records import WHOLE, Assignment, Encoder, Lora, Measurement, Part, Touch, Variant, Video
 from pipeline.stage import DATA, RUNS, Stage
 
 logger = logging.getLogger(__name__)
 P = ParamSpec("P")
 T = TypeVar("T")
 
-MLRUNS = Path("mlruns")
-DATABASE, ARTIFACTS, LOCK_FILE = MLRUNS / "mlflow.db", MLRUNS / "artifacts", MLRUNS / ".lock"
-REPORTS, CHAIN, CHAIN_LOCK = Path("reports"), Path("dvc.yaml"), Path("dvc.lock")
+MLRUNS, REPORTS, CHAIN, CHAIN_LOCK = Path("mlruns"), Path("reports"), Path("dvc.yaml"), Path("dvc.lock")
 KIND, STAGE, VARIANT, FOLDER = "octopi.kind", "octopi.stage", "octopi.variant", "octopi.folder"
-PROCESS, LOCK, CONTENT, STATE = "octopi.process", "octopi.lock", "octopi.content", "octopi.state"
+LOCK, CONTENT, STATE = "octopi.lock", "octopi.content", "octopi.state"
+"""Tags with what a finished stage, variant and reproduction were made from; written last."""
 NOTE, VIEW, PARENT = "mlflow.note.content", "mlflow.sharedViewState.variants", "mlflow.parentRunId"
 A_CALL, LONGEST_PARAM, LONGEST_TAG = 100, 6000, 8000
 """MLflow's limits: items a call, and the length of values."""
@@ -59,20 +59,15 @@ class TrackingError(UserError):
     """The tracking server or database is out of reach."""
 
 
-def _words(error: Exception) -> str:
-    return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-
-
 def _attempt(call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T | None:
     """Call, unless tracking is out of reach already. A failure is one warning: the training is worth more."""
-    if out_of_reach.is_set():
-        return None
-    try:
-        return call(*args, **kwargs)
-    except Exception as error:
-        out_of_reach.set()
-        logger.warning("tracking is off, `octopi publish` completes the run: %s", _words(error))
-        return None
+    if not out_of_reach.is_set():
+        try:
+            return call(*args, **kwargs)
+        except Exception as error:
+            out_of_reach.set()
+            logger.warning("tracking is off, `octopi publish` completes the run: %s", _words(error))
+    return None
 
 
 # ---- trainings ----
@@ -82,11 +77,9 @@ def _attempt(call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T | Non
 def live(run: Stage) -> Iterator[list[Any]]:
     """Log a training while the block runs: curves by transformers' MLflowCallback, and the machine's load.
 
-    Args:
-        run: The stage that trains. Where `tracking.live` is off, MLflow is not even imported.
-
     Yields:
-        The callbacks to give to the Trainer; none where there is nothing to log to, or in a second process.
+        Callbacks for the Trainer: none where `tracking.live` is off (MLflow is then not even imported), in all but the
+        first process of a distributed training, and where tracking is out of reach.
     """
     if not run.params.tracking.live or os.environ.get("RANK", "0") != "0":
         yield []
@@ -102,7 +95,7 @@ def live(run: Stage) -> Iterator[list[Any]]:
         if mlflow := sys.modules.get("mlflow"):
             _attempt(mlflow.end_run, status)
             with suppress(Exception):
-                # Forgets the run where it could not be ended, or MLflow would try again when the process ends.
+                # Forgets a run that could not be ended, or MLflow would try again when the process ends.
                 mlflow.end_run(status)
 
 
@@ -110,18 +103,19 @@ def _begin(run: Stage) -> list[Any]:
     store = _Store(run.params.tracking)
     import mlflow
 
+    stages, started = read_stages(run.params), _milliseconds(run.started)
     with store.lock:
-        store.end_abandoned(run.name)
-        stages = read_stages(run.params)
+        # A stage runs once at a time: what is still running was killed.
+        store.kill({STAGE: run.name})
         parent = store.open_parent(run.params)
         if parent is None:
-            fresh = [s.ran.started for s in stages if s.ran and not store.run_of(s)]
-            parent = store.create_parent(run.params, min([*fresh, _milliseconds(run.started)]))
-        axes = next((s.axes for s in stages if s.title == run.name), {})
-        child = store.create(run.name, "stage", _milliseconds(run.started), {STAGE: run.name}, parent)
-        store.log(child, params=settings(run.params) | axes)
+            fresh = [stage.ran[0] for stage in stages if stage.ran and not store.run_of(stage)]
+            parent = store.create(run.params.report_name, "reproduction", min([*fresh, started]))
+        child = store.create(run.name, "stage", started, {STAGE: run.name, PARENT: parent})
+        axes = next((stage.axes for stage in stages if stage.title == run.name), {})
+        store.log(child, params=settings(run.params, axes))
     mlflow.set_tracking_uri(store.uri)
-    # What becomes the active run here is the one that the Trainer's callback logs to.
+    # The callback logs to the active run.
     mlflow.start_run(run_id=child, log_system_metrics=True)
     return [_callback()]
 
@@ -132,12 +126,11 @@ def _callback() -> Any:
     from pipeline.training import measured
 
     class Callback(MLflowCallback):
-        """Logs the same names as history.parquet; at once, not behind a queue, so that a failure shows."""
+        """Logs the names of history.parquet; at once and not behind a queue, so that a failure shows."""
 
         def setup(self, args: Any, state: Any, model: Any) -> None:
             _attempt(super().setup, args, state, model)
-            self._async_log = False
-            self._initialized = True
+            self._async_log, self._initialized = False, True
 
         def on_log(self, args: Any, state: Any, control: Any, logs: Any, model: Any = None, **more: Any) -> None:
             if values := measured(logs):
@@ -150,19 +143,8 @@ def _callback() -> Any:
 
 
 @dataclass(frozen=True)
-class Ran:
-    """The last time that a stage really ran."""
-
-    started: int
-    """Milliseconds since 1970, as all times here."""
-    ended: int
-    metrics: Mapping[str, float]
-    """The stage's own, and `run/seconds`, `run/startup_seconds`, `run/peak_memory_mb`."""
-
-
-@dataclass(frozen=True)
 class ChainStage:
-    """A stage of dvc.yaml with one value a matrix axis."""
+    """A stage of dvc.yaml with one value a matrix axis, and the last time that it really ran here."""
 
     title: str
     """As DVC names it, e.g. `align@finetuned-all-0`."""
@@ -171,13 +153,10 @@ class ChainStage:
     """Hash of its entry in dvc.lock; empty where it did not run yet with these parameters."""
     outs: Mapping[str, str]
     """Path to hash of what it made."""
-    ran: Ran | None
-    """None where DVC restored it on a machine that it never ran on."""
-
-
-def settings(params: Params) -> dict[str, str]:
-    """Resolved parameters by dotted key; lists as JSON."""
-    return dict(_flatten(params.model_dump(mode="json")))
+    ran: tuple[int, int] | None
+    """Start and end in milliseconds since 1970, as all times here; None where DVC only ever restored it."""
+    metrics: Mapping[str, float]
+    """The stage's own, and what it cost: `system/seconds`, `system/startup_seconds`, `system/peak_memory_mb`."""
 
 
 def read_stages(params: Params) -> list[ChainStage]:
@@ -187,35 +166,40 @@ def read_stages(params: Params) -> list[ChainStage]:
         UserError: where one of the two files is missing or not YAML.
     """
     chain, entries = (_read_yaml(path).get("stages") or {} for path in (CHAIN, CHAIN_LOCK))
+    chain.pop("publish", None)
     today, values = settings(params), params.model_dump(mode="json")
+
+    def choices(axis: Any) -> list[Any]:
+        """A list, or the parameter that is named like `${ablation.seeds}`."""
+        return list(reduce(lambda v, key: v[key], axis[2:-1].split("."), values) if isinstance(axis, str) else axis)
+
     found = []
     for name, stage in chain.items():
-        matrix = {axis: _resolve(choices, values) for axis, choices in stage.get("matrix", {}).items()}
-        for choice in itertools.product(*matrix.values()) if name != "publish" else ():
+        matrix = {axis: choices(value) for axis, value in stage.get("matrix", {}).items()}
+        for choice in itertools.product(*matrix.values()):
             title = f"{name}@{'-'.join(map(str, choice))}" if matrix else name
             entry = entries.get(title) or {}
-            made_with = dict(_flatten((entry.get("params") or {}).get(str(PARAMS_FILE)) or {}))
-            if not made_with.items() <= today.items():
+            if not dict(_flatten((entry.get("params") or {}).get(str(PARAMS_FILE)) or {})).items() <= today.items():
                 entry = {}
-            found.append(
-                ChainStage(
-                    title,
-                    dict(zip(matrix, map(str, choice), strict=True)),
-                    _digest(entry) if entry else "",
-                    {out["path"]: str(out.get("md5")) for out in entry.get("outs") or ()},
-                    _read_run(RUNS / f"{title}.json"),
-                )
-            )
+            outs = {out["path"]: str(out.get("md5")) for out in entry.get("outs") or ()}
+            axes = dict(zip(matrix, map(str, choice), strict=True))
+            found.append(ChainStage(title, axes, _digest(entry) if entry else "", outs, *_last_run(title)))
     return found
 
 
-def _read_run(path: Path) -> Ran | None:
+def _last_run(title: str) -> tuple[tuple[int, int] | None, dict[str, float]]:
+    path = RUNS / f"{title}.json"
     if not path.is_file():
-        return None
+        return None, {}
     run = read_json(path)
-    costs = {f"run/{name}": run[name] for name in ("seconds", "startup_seconds", "peak_memory_mb")}
     started, ended = (_milliseconds(datetime.fromisoformat(run[end]).timestamp()) for end in ("started", "ended"))
-    return Ran(started, ended, {**run["metrics"], **costs})
+    costs = {f"system/{name}": run[name] for name in ("seconds", "startup_seconds", "peak_memory_mb")}
+    return (started, ended), {**run["metrics"], **costs}
+
+
+def settings(params: Params, axes: Mapping[str, str] | None = None) -> dict[str, str]:
+    """Resolved parameters by dotted key, lists as JSON; `axes` come first and in place of those of their name."""
+    return {**(axes or {}), **dict(_flatten(params.model_dump(mode="json"))), **(axes or {})}
 
 
 def accuracies(params: Params) -> dict[str, dict[str, float]]:
@@ -226,32 +210,54 @@ def accuracies(params: Params) -> dict[str, dict[str, float]]:
     """
     path = REPORTS / params.report_name / "scores.csv"
     found: dict[str, dict[str, float]] = {}
-    if not path.is_file():
-        return found
-    with path.open(encoding="utf-8", newline="") as stream:
-        for row in csv.DictReader(stream):
-            if not row["lora"] or not row["seed"].isdigit():
-                continue
+    for row in csv.DictReader(path.read_text(encoding="utf-8").splitlines()) if path.is_file() else ():
+        if row["lora"] and row["seed"].isdigit():
             task = row["task"] if row["measure"] in WHOLE else f"{row['task']}.{row['measure']}"
-            real = row["touch"] == Touch.REAL
-            cells = {f"accuracy/{task}" if real else f"{row['touch']}/{task}": row["accuracy"]}
-            if real:
-                cells |= {f"low/{task}": row["low"], f"high/{task}": row["high"]}
-            key = "-".join(row[axis] for axis in ("encoder", "lora", "opd", "seed"))
-            found.setdefault(key, {}).update({name: float(cell) for name, cell in cells.items() if cell})
+            cells = {f"accuracy/{task}": row["accuracy"], f"low/{task}": row["low"], f"high/{task}": row["high"]}
+            if row["touch"] != Touch.REAL:
+                cells = {f"{row['touch']}/{task}": row["accuracy"]}
+            key = "-".join(row[axis] for axis in Variant._fields)
+            found.setdefault(key, {}).update({name: round(float(cell), 4) for name, cell in cells.items() if cell})
     return found
 
 
-def _artifacts(variant: Variant) -> list[tuple[Path, str]]:
-    """What a variant is made of and what it said: files and folders, with their place among the artifacts."""
-    trained = DATA / "models"
+def _artifacts(variant: Variant) -> Iterator[tuple[Path, str]]:
+    """What a variant said and is made of: folders and files, with their place among the artifacts."""
     key = f"{variant.encoder}-{variant.opd}-{variant.seed}"
-    found = [(DATA / "answers" / variant.key, "predictions"), (trained / variant.lora / key, "model")]
+    yield DATA / "answers" / variant.key, "predictions"
+    yield DATA / "models" / variant.lora / key, "model"
     if variant.lora is Lora.WITH:
-        found.append((trained / Lora.WITHOUT / key, "alignment"))
-    if variant.encoder is EncoderAxis.FINETUNED:
-        found.append((DATA / "encoder" / str(variant.seed) / "encoder.safetensors", "encoder"))
-    return [(path, place) for path, place in found if path.exists()]
+        yield DATA / "models" / Lora.WITHOUT / key, "alignment"
+    if variant.encoder is Encoder.FINETUNED:
+        yield DATA / "encoder" / str(variant.seed), "encoder"
+
+
+def _datasets(params: Params) -> Iterator[tuple[str, Any]]:
+    """Training, validation and test videos as MLflow's datasets; their digest is over ids and contents of the files."""
+    import pandas as pd
+    from mlflow.data import from_pandas
+
+    splits, videos = DATA / "splits.parquet", DATA / "videos.parquet"
+    if splits.is_file() and videos.is_file():
+        contents = {video.video_id: video.sha256 for video in read_table(videos, Video)}
+        assignments = read_table(splits, Assignment)
+        for part in (Part.TRAIN, Part.VALIDATION, Part.TEST):
+            rows = sorted((a.video_id, a.object_id, contents[a.video_id]) for a in assignments if a.part == part)
+            frame = pd.DataFrame(rows, columns=["video_id", "object_id", "sha256"])
+            with warnings.catch_warnings():
+                # MLflow has two readers of local folders, both the same, and says so.
+                warnings.simplefilter("ignore")
+                yield part.value, from_pandas(frame, source=params.data.dir, name=part.value)
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        found = yaml.load(path.read_text(encoding="utf-8"), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file; `dvc repro` makes it") from None
+    except yaml.YAMLError as error:
+        raise UserError(f"{path}: not YAML ({' '.join(str(error).split())}); restore it from Git") from None
+    return found if isinstance(found, dict) else {}
 
 
 def _flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
@@ -262,30 +268,16 @@ def _flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
             yield f"{prefix}{key}", value if isinstance(value, str) else json.dumps(value)
 
 
-def _resolve(choices: Any, values: Any) -> list[Any]:
-    """The list that a matrix axis names, like `${ablation.seeds}`."""
-    if isinstance(choices, str):
-        for key in choices.removeprefix("${").removesuffix("}").split("."):
-            values = values[key]
-        return list(values)
-    return list(choices)
-
-
-def _read_yaml(path: Path) -> dict[str, Any]:
-    try:
-        return yaml.load(path.read_text(encoding="utf-8"), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)) or {}
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such file; `dvc repro` makes it") from None
-    except yaml.YAMLError as error:
-        raise UserError(f"{path}: not YAML ({' '.join(str(error).split())}); restore it from Git") from None
-
-
 def _digest(value: object) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()[:16]
 
 
 def _milliseconds(seconds: float) -> int:
     return int(seconds * 1000)
+
+
+def _words(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
 
 
 def _git(*arguments: str) -> str:
@@ -295,34 +287,24 @@ def _git(*arguments: str) -> str:
     return "unknown"
 
 
-def this_process(pid: int | None = None) -> str:
-    """Names a process of this machine so that no later one is taken for it; empty where it runs no more."""
-    import psutil
-
-    with suppress(psutil.NoSuchProcess):
-        process = psutil.Process(pid)
-        return f"{socket.gethostname()}:{process.pid}:{process.create_time():.0f}"
-    return ""
-
-
 # ---- the experiment ----
 
 
 class _Store:
-    """One experiment of a server or of the local database."""
+    """One experiment of a server, or of the local database."""
 
     def __init__(self, tracking: TrackingConfig) -> None:
         """Connect, and make the experiment where it is new."""
         # When a server dies, one call of a training, one of the system monitor and one that ends the run may wait.
-        seconds = max(1, tracking.timeout_seconds // 3)
+        seconds = str(max(1, tracking.timeout_seconds // 3))
         os.environ.update(
             MLFLOW_HTTP_REQUEST_MAX_RETRIES="0",
-            MLFLOW_HTTP_REQUEST_TIMEOUT=str(seconds),
-            PGCONNECT_TIMEOUT=str(seconds),
+            MLFLOW_HTTP_REQUEST_TIMEOUT=seconds,
+            PGCONNECT_TIMEOUT=seconds,
             MLFLOW_DISABLE_TELEMETRY="true",
             MLFLOW_LOGGING_LEVEL="ERROR",
             MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT="true",
-            # The Trainer's hundred arguments hide the parameters that a person sets.
+            # The Trainer's hundred arguments would hide the parameters that a person sets.
             MLFLOW_MAX_LOG_PARAMS="0",
         )
         logging.getLogger("alembic").setLevel(logging.ERROR)
@@ -333,28 +315,29 @@ class _Store:
 
         # Ten attempts to open a broken database take 107 s.
         mlflow.store.db.utils.MAX_RETRY_COUNT = 1
-        local = not tracking.uri
-        self.uri = f"sqlite:///{DATABASE.resolve()}" if local else tracking.uri
-        self.folder = "" if local else f"{socket.gethostname()}:{Path.cwd()}"
-        if local and not event.contains(Engine, "connect", _do_not_wait_for_the_disk):
+        if not event.contains(Engine, "connect", _do_not_wait_for_the_disk):
             event.listen(Engine, "connect", _do_not_wait_for_the_disk)
+        database = MLRUNS.resolve() / "mlflow.db"
+        self.uri = tracking.uri or f"sqlite:///{database}"
+        # Several folders may share a server; the local database moves with its folder.
+        self.mine = {FOLDER: f"{socket.gethostname()}:{Path.cwd()}"} if tracking.uri else {}
         MLRUNS.mkdir(exist_ok=True)
-        self.lock = FileLock(LOCK_FILE, timeout=LOCK_SECONDS)
+        self.lock = FileLock(MLRUNS / ".lock", timeout=LOCK_SECONDS)
+        # Several first starts at once on a new database break it.
         with self.lock:
             self.client = mlflow.MlflowClient(self.uri)
             found = self.client.get_experiment_by_name(tracking.experiment)
-            self.experiment = found.experiment_id if found else self._create(tracking.experiment, local)
-
-    def _create(self, name: str, local: bool) -> str:
-        # Without the kind, the dashboard takes the experiment for a chat application's and hides the training views.
-        kind = {"mlflow.experimentKind": "custom_model_development"}
-        experiment = str(self.client.create_experiment(name, tags=kind | _front_page()))
-        if local:
-            # MLflow's own calls make the path absolute.
-            with closing(sqlite3.connect(DATABASE)) as database, database:
-                change = "UPDATE experiments SET artifact_location = ? WHERE experiment_id = ?"
-                database.execute(change, (ARTIFACTS.as_posix(), int(experiment)))
-        return experiment
+            if found:
+                self.experiment = str(found.experiment_id)
+                return
+            # Without the kind, the dashboard takes the experiment for a chat application's.
+            kind = {"mlflow.experimentKind": "custom_model_development"}
+            self.experiment = str(self.client.create_experiment(tracking.experiment, tags=kind))
+            if not tracking.uri:
+                # MLflow's own call would make the path absolute.
+                with closing(sqlite3.connect(database)) as connection, connection:
+                    change = "UPDATE experiments SET artifact_location = ? WHERE experiment_id = ?"
+                    connection.execute(change, ((MLRUNS / "artifacts").as_posix(), int(self.experiment)))
 
     def find(self, tags: Mapping[str, str], *conditions: str) -> list[Any]:
         """Runs with all these tags, the youngest first."""
@@ -365,31 +348,28 @@ class _Store:
         """The run that was made, live or by publishing, when the stage last really ran."""
         if stage.ran is None:
             return None
-        times = (f"attributes.start_time >= {stage.ran.started}", f"attributes.start_time <= {stage.ran.ended}")
+        times = (f"attributes.start_time {sign} {time}" for sign, time in zip((">=", "<="), stage.ran, strict=True))
         return next(iter(self.find({STAGE: stage.title}, *times)), None)
 
     def open_parent(self, params: Params) -> str | None:
-        """The reproduction of this folder that a training began and nobody published yet. Those of other scales end."""
-        mine = None
-        for run in self.find({KIND: "reproduction", FOLDER: self.folder}, "attributes.status = 'RUNNING'"):
-            if run.info.run_name == params.report_name and mine is None:
-                mine = str(run.info.run_id)
-            else:
-                self.client.set_terminated(run.info.run_id, "KILLED")
+        """The reproduction of this folder that a training began and nobody published yet; those of other scales end."""
+        name = f"attributes.run_name = '{params.report_name}'"
+        running = {KIND: "reproduction", **self.mine}, "attributes.status = 'RUNNING'"
+        mine = next((str(run.info.run_id) for run in self.find(*running, name)), None)
+        self.kill({KIND: "reproduction"}, but=mine)
         return mine
 
-    def create_parent(self, params: Params, start: int) -> str:
-        """Begin a reproduction."""
-        return self.create(params.report_name, "reproduction", start, {FOLDER: self.folder})
+    def kill(self, tags: Mapping[str, str], but: str | None = None) -> None:
+        """Mark runs of this folder that nobody will end any more."""
+        for run in self.find({**self.mine, **tags}, "attributes.status = 'RUNNING'"):
+            if run.info.run_id != but:
+                self.client.set_terminated(run.info.run_id, "KILLED")
 
-    def create(self, name: str, kind: str, start: int, tags: Mapping[str, str], parent: str = "") -> str:
-        """Begin a run, below `parent` where that is given."""
-        tags = {KIND: kind, PROCESS: this_process(), "mlflow.user": "octopi", **tags}
-        tags["mlflow.source.git.commit"] = _git("rev-parse", "HEAD")
-        if parent:
-            tags[PARENT] = parent
-        run = self.client.create_run(self.experiment, start_time=start, tags=tags, run_name=name)
-        return str(run.info.run_id)
+    def create(self, name: str, kind: str, start: int, tags: Mapping[str, str] | None = None) -> str:
+        """Begin a run."""
+        own = {KIND: kind, **self.mine, "mlflow.user": "octopi", **(tags or {})}
+        own["mlflow.source.git.commit"] = _git("rev-parse", "HEAD")
+        return str(self.client.create_run(self.experiment, start, own, name).info.run_id)
 
     def log(
         self,
@@ -404,26 +384,12 @@ class _Store:
         points = [Metric(*metric) for metric in metrics]
         own = [Param(name, value[:LONGEST_PARAM]) for name, value in (params or {}).items()]
         marks = [RunTag(name, value[:LONGEST_TAG]) for name, value in (tags or {}).items()]
-        for i in range(0, max(len(points), len(own), len(marks)), A_CALL):
-            self.client.log_batch(run, points[i : i + A_CALL], own[i : i + A_CALL], marks[i : i + A_CALL])
-
-    def add_file(self, run: str, path: Path, place: str) -> None:
-        """Copy a file or folder to the run's artifacts."""
-        (self.client.log_artifacts if path.is_dir() else self.client.log_artifact)(run, str(path), place)
-
-    def end_abandoned(self, stage: str = "") -> None:
-        """Mark runs of this machine's dead processes as KILLED: of one stage, or all but reproductions."""
-        for run in self.find({STAGE: stage} if stage else {}, "attributes.status = 'RUNNING'"):
-            name = run.data.tags.get(PROCESS, "")
-            host, _, rest = name.partition(":")
-            if run.data.tags[KIND] == "reproduction" or host != socket.gethostname():
-                continue
-            if this_process(int(rest.split(":")[0])) != name:
-                self.client.set_terminated(run.info.run_id, "KILLED")
+        for i in range(0, max(map(len, (points, own, marks))), A_CALL):
+            self.client.log_batch(run, *(items[i : i + A_CALL] for items in (points, own, marks)))
 
 
 def _do_not_wait_for_the_disk(connection: Any, _: object) -> None:
-    """Waiting for each of a thousand small commits makes most of publishing. A power failure may cost the database, and
+    """Waiting for each of a thousand small commits makes most of publishing; a power failure may cost the database, and
     `octopi publish` makes it again."""
     if isinstance(connection, sqlite3.Connection):
         connection.execute("PRAGMA synchronous=OFF")
@@ -442,11 +408,11 @@ def publish(params: Params) -> str:
         TrackingError: where the server or database is out of reach.
         UserError: where a file of the reproduction is missing or broken.
     """
-    stages = read_stages(params)
+    stages = [stage for stage in read_stages(params) if stage.lock]
     try:
         store = _Store(params.tracking)
         with store.lock:
-            return _Publication(store, params, [stage for stage in stages if stage.lock]).publish()
+            return _Publication(store, params, stages).publish()
     except UserError:
         raise
     except Exception as error:
@@ -461,140 +427,139 @@ class _Publication:
     stages: list[ChainStage]
 
     def publish(self) -> str:
-        store = self.store
-        runs = {stage.title: store.run_of(stage) for stage in self.stages}
-        fresh = [s for s in self.stages if s.ran and not (runs[s.title] and LOCK in runs[s.title].data.tags)]
+        store, now = self.store, _milliseconds(time.time())
+        runs = {stage.title: run for stage in self.stages if (run := store.run_of(stage))}
+        fresh = [s for s in self.stages if s.ran and not (s.title in runs and LOCK in runs[s.title].data.tags)]
         state = _digest([self.params.report_name, *(stage.lock for stage in self.stages)])
         parent = store.open_parent(self.params)
         if parent is None:
             if not fresh and (same := store.find({KIND: "reproduction", STATE: state})):
                 return f"nothing new since run {same[0].info.run_id}"
-            begin = min((s.ran.started for s in fresh if s.ran), default=_milliseconds(time.time()))
-            parent = store.create_parent(self.params, begin)
+            begin = min((s.ran[0] for s in fresh if s.ran), default=now)
+            parent = store.create(self.params.report_name, "reproduction", begin)
         for stage in fresh:
-            self._complete(stage, parent, runs[stage.title])
-        links = self._links(parent, runs)
+            self._complete(stage, parent, runs.get(stage.title))
+        links = self._cached(parent, runs, fresh)
+        ended = [s.ran[1] for s in self.stages if s.ran and _cached_tag(s) not in links]
         new = self._variants(parent, links)
-        self._complete_parent(parent, links | {STATE: state})
-        store.end_abandoned()
-        ended = [s.ran.ended for s in self.stages if s.ran and f"cached.{_tag(s.title)}" not in links]
-        store.client.set_terminated(parent, "FINISHED", max(ended, default=None))
-        return f"run {parent} in {store.uri}: {len(fresh)} stages ran, {new} new variants"
+        self._complete_parent(parent, {**links, STATE: state})
+        store.client.set_terminated(parent, "FINISHED", max(ended, default=now))
+        return f"run {parent} in {store.uri}: {len(ended)} stages ran, {new} variants are new"
 
     def _complete(self, stage: ChainStage, parent: str, run: Any | None) -> None:
         """A run of a stage that ran; one that was logged live gets what it lacks."""
-        assert stage.ran
-        began, ended = stage.ran.started, stage.ran.ended
-        run_id = (
-            run.info.run_id if run else self.store.create(stage.title, "stage", began, {STAGE: stage.title}, parent)
-        )
+        began, ended = stage.ran or (0, 0)
+        tags = {STAGE: stage.title, PARENT: parent}
+        run_id = run.info.run_id if run else self.store.create(stage.title, "stage", began, tags)
         history = next((path for out in stage.outs if (path := Path(out) / "history.parquet").is_file()), None)
         curve = read_table(history, Measurement) if history else []
-        last = max((m.step for m in curve), default=0) or 1
-        logged = set(run.data.metrics) if run else set()
+        steps = max((m.step for m in curve), default=0) or 1
+        logged = set(run.data.metrics if run else ())
         there = {(name, m.step) for name in logged for m in self.store.client.get_metric_history(run_id, name)}
         points = [
-            (m.name, m.value, began + (ended - began) * m.step // last, m.step)
+            (m.name, m.value, began + (ended - began) * m.step // steps, m.step)
             for m in curve
             if (m.name, m.step) not in there
         ]
         # The end of a curve is no point at its step 0.
-        names = {m.name for m in curve} | logged
-        points += [(name, float(value), ended, 0) for name, value in stage.ran.metrics.items() if name not in names]
-        self.store.log(run_id, points, settings(self.params) | stage.axes)
+        logged |= {m.name for m in curve}
+        points += [(name, float(value), ended, 0) for name, value in stage.metrics.items() if name not in logged]
+        self.store.log(run_id, points, settings(self.params, stage.axes))
         self.store.log(run_id, tags={LOCK: stage.lock})
         self.store.client.set_terminated(run_id, "FINISHED", ended)
 
-    def _links(self, parent: str, runs: Mapping[str, Any]) -> dict[str, str]:
-        """`cached.<stage>` for each stage that did not run: the hash of its entry in dvc.lock, and its earlier run."""
+    def _cached(self, parent: str, runs: Mapping[str, Any], fresh: Sequence[ChainStage]) -> dict[str, str]:
+        """For each stage that did not run: the hash of its entry in dvc.lock, and the run that made it."""
         links = {}
         for stage in self.stages:
-            run = runs[stage.title]
-            if (stage.ran and run is None) or (run and run.data.tags.get(PARENT) == parent):
+            run = runs.get(stage.title)
+            if stage in fresh or (run and run.data.tags.get(PARENT) == parent):
                 continue
             if run is None or run.data.tags.get(LOCK) != stage.lock:
                 run = next(iter(self.store.find({LOCK: stage.lock})), None)
-            links[f"cached.{_tag(stage.title)}"] = f"{stage.lock} {run.info.run_id if run else ''}".strip()
+            links[_cached_tag(stage)] = f"{stage.lock} {run.info.run_id if run else ''}".strip()
         return links
 
     def _variants(self, parent: str, links: dict[str, str]) -> int:
         """Runs of variants whose results are new, and links to those of the others; return how many are new."""
-        scores, new = accuracies(self.params), 0
+        store, scores, new = self.store, accuracies(self.params), 0
         answers = {stage.title: stage for stage in self.stages}
+        store.kill({KIND: "variant"})
         for variant in self.params.ablation.variants():
             stage = answers.get(f"answer@{variant.key}")
             if stage is None:
                 continue
             metrics = scores.get(variant.key, {})
             content = _digest([metrics, stage.outs])
-            if old := self.store.find({VARIANT: variant.key, CONTENT: content}):
+            if old := store.find({VARIANT: variant.key, CONTENT: content}):
                 if old[0].data.tags.get(PARENT) != parent:
                     links[f"variant.{variant.key}"] = old[0].info.run_id
                 continue
-            now = _milliseconds(time.time())
-            begin, end = (stage.ran.started, stage.ran.ended) if stage.ran else (now, now)
-            run = self.store.create(variant.key, "variant", begin, {VARIANT: variant.key}, parent)
-            axes = {axis: str(value) for axis, value in variant._asdict().items()}
-            points = [(name, value, end, 0) for name, value in metrics.items()]
-            self.store.log(run, points, settings(self.params) | axes)
+            begin, end = stage.ran or (_milliseconds(time.time()),) * 2
+            run = store.create(variant.key, "variant", begin, {VARIANT: variant.key, PARENT: parent})
+            # Whole tasks before their parts, as the dashboard keeps the order.
+            ordered = sorted(metrics.items(), key=lambda metric: ("." in metric[0], metric[0]))
+            points = [(name, value, end, 0) for name, value in ordered]
+            store.log(run, points, settings(self.params, stage.axes))
             for path, place in _artifacts(variant):
-                self.store.add_file(run, path, place)
-            self.store.log(run, tags={CONTENT: content})
-            self.store.client.set_terminated(run, "FINISHED", end)
+                if path.is_dir():
+                    store.client.log_artifacts(run, str(path), place)
+            store.log(run, tags={CONTENT: content})
+            store.client.set_terminated(run, "FINISHED", end)
             new += 1
+        every = {name for metrics in scores.values() for name in metrics}
+        tasks = [name for name in every if name.startswith("accuracy/") and "." not in name]
+        for name, value in _front_page(store.experiment, sorted(tasks)).items():
+            store.client.set_experiment_tag(store.experiment, name, value)
         return new
 
     def _complete_parent(self, parent: str, tags: Mapping[str, str]) -> None:
         """Parameters, the report with its metrics, the data, and what the run stands for."""
         from mlflow.entities import DatasetInput, InputTag
 
-        report = REPORTS / self.params.report_name
+        report, now = REPORTS / self.params.report_name, _milliseconds(time.time())
         summary = read_json(report / "metrics.json") if (report / "metrics.json").is_file() else {}
-        now = _milliseconds(time.time())
-        metrics = [(name, float(value), now, 0) for name, value in _flatten(summary)]
         if report.is_dir():
-            self.store.add_file(parent, report, "report")
-        inputs = [
-            DatasetInput(data._to_mlflow_entity(), [InputTag("mlflow.data.context", name)])
-            for name, data in _datasets(self.params).items()
-        ]
-        if inputs:
-            self.store.client.log_inputs(parent, inputs)
+            self.store.client.log_artifacts(parent, str(report), "report")
+        for name, data in _datasets(self.params):
+            context = InputTag("mlflow.data.context", name)
+            self.store.client.log_inputs(parent, [DatasetInput(data._to_mlflow_entity(), [context])])
         cached = sum(name.startswith("cached.") for name in tags)
         own = {
-            "octopi.dvc_lock": _digest(CHAIN_LOCK.read_text(encoding="utf-8")),
+            "octopi.dvc_lock": _digest([CHAIN_LOCK.read_text(encoding="utf-8")]),
             "octopi.uncommitted": _git("status", "--porcelain", "--", "pipeline", "stages", "dvc.yaml", "params.yaml"),
             NOTE: f"{len(self.stages) - cached} stages ran, {cached} came from DVC's cache (tags `cached.*`). "
             "Tables and figures: Artifacts, `report/README.md`.",
         }
-        self.store.log(parent, metrics, settings(self.params), own | tags)
+        metrics = [(name, float(value), now, 0) for name, value in _flatten(summary)]
+        self.store.log(parent, metrics, settings(self.params), {**own, **tags})
 
 
-def _datasets(params: Params) -> dict[str, Any]:
-    """Training, validation and test videos as MLflow's datasets; the digest is over names and contents of the files."""
-    import pandas as pd
-    from mlflow.data import from_pandas
-
-    splits, videos = DATA / "splits.parquet", DATA / "videos.parquet"
-    if not (splits.is_file() and videos.is_file()):
-        return {}
-    contents = {video.video_id: video.sha256 for video in read_table(videos, Video)}
-    found = {}
-    for part in (Part.TRAIN, Part.VALIDATION, Part.TEST):
-        rows = [
-            (a.video_id, a.object_id, contents[a.video_id]) for a in read_table(splits, Assignment) if a.part == part
-        ]
-        frame = pd.DataFrame(sorted(rows), columns=["video_id", "object_id", "sha256"])
-        found[part.value] = from_pandas(frame, source=params.data.dir, name=part.value)
-    return found
+def _cached_tag(stage: ChainStage) -> str:
+    # MLflow allows no @ in names.
+    return f"cached.{stage.title.replace('@', ':')}"
 
 
-def _tag(title: str) -> str:
-    """MLflow allows no @ in names."""
-    return title.replace("@", ":")
-
-
-def _front_page() -> dict[str, str]:
-    """The experiment's description, and the table of variants that it leads to, as MLflow's button for sharing a view
-    writes it."""
-    return {}
+def _front_page(experiment: str, accuracy: Sequence[str]) -> dict[str, str]:
+    """The experiment's description, and the table of variants that it leads to, written as MLflow's *Share view* does:
+    only so do parameters and metrics become columns without a click each."""
+    columns = [*(f"params.`{axis}`" for axis in Variant._fields), *(f"metrics.`{name}`" for name in accuracy)]
+    name = "attributes.`Run Name`"
+    view: dict[str, object] = {
+        "columnOrder": [name, *columns],
+        "columnWidths": {name: 240, **dict.fromkeys(columns, 105)},
+        "selectedColumns": columns,
+        "searchFilter": f"tags.`{KIND}` = 'variant'",
+        # Sorted by time, the table would fold variants below their reproductions.
+        "orderByKey": columns[0],
+        "orderByAsc": False,
+        "startTime": "ALL",
+        "lifecycleFilter": "Active",
+        "modelVersionFilter": "All Runs",
+        "runsExpanded": {},
+        "datasetsFilter": [],
+        "runsPinned": [],
+        "runsHidden": [],
+    }
+    link = f"#/experiments/{experiment}/runs?viewStateShareKey=variants"
+    return {NOTE: f"[All variants with their accuracies]({link}) · docs/dashboard.md", VIEW: json.dumps(view)}

@@ -13,7 +13,7 @@ CORE = (
     *("embeddings", "trainable", "weights", "training", "stage"),
 )
 ROOMS = ("videos", "scenes", "tasks", "encoder", "language", "evaluation", "report", "tracking")
-TOP = ("scales", "compare", "reproduce", "cli")
+TOP = ("scales", "revisions", "compare", "reproduce", "cli")
 ORDER = (*CORE, *ROOMS, *TOP)
 MODULES = sorted((ROOT / "pipeline").rglob("*.py"))
 

@@ -62,14 +62,14 @@ VIDEOS = {
 def test_pictures_are_compared_without_wrapping_around(check: Check, name: str) -> None:
     """Salience and subtraction are exact.
 
-    The strength of contact: roundings of means of whole numbers in a double, differences of numbers up to 255; where
+    The contact strength: roundings of means of whole numbers in a double, differences of numbers up to 255; where
     these are 0, the error is absolute.
     """
     one, other = PAIRS[name]
     change = one.astype(np.float64) - other
     check(f"salience: {name}", UINT8, lambda _: difference(one[..., 0], other[..., 0]), 0, abs(change[..., 0]).sum())
     check(
-        f"strength of contact: {name}",
+        f"contact strength: {name}",
         UINT8,
         lambda _: contact_strength(one, other),
         255 * summing(HEIGHT * WIDTH * 3, FLOAT64),
