@@ -22,10 +22,7 @@ from pipeline.language.generate import answer
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import assemble
 from pipeline.records import Embedding, Opd, Question
-from tests.language.shared import DIM, generation, language, material, model, questions, store
-
-__all__ = ["language", "model", "questions", "store"]
-"""Fixtures."""
+from tests.language.shared import DIM, generation, material
 
 
 def plainly(model: OctopiForCausalLM, ids: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
