@@ -28,7 +28,7 @@ def code(name: str) -> list[str]:
     return [d for d in stages()[name]["deps"] if d.startswith(("pipeline/", "stages/"))]
 
 
-@pytest.mark.parametrize("name", sorted(stages()))
+@pytest.mark.parametrize("name", sorted(stages().keys() - {"publish"}))
 def test_dependencies_cover_what_a_stage_can_import(name: str) -> None:
     reached = closure(ROOT / "stages" / f"{name}.py")
     covered = (*TOLD, *code(name))

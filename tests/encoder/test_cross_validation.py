@@ -31,7 +31,7 @@ from pipeline.errors import UserError
 from pipeline.io import write_table
 from pipeline.records import Measurement, Part, Probe
 from pipeline.runtime import derive_seed, seed_everything
-from pipeline.trainable import save_trainable, trainable_state
+from pipeline.training.trainable import save_trainable, trainable_state
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.decoding import decode
 from pipeline.videos.frames.reference import reference_indices

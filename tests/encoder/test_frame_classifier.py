@@ -27,7 +27,7 @@ from pipeline.encoder.frame_classifier import (
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.records import Part
 from pipeline.runtime import seed_everything
-from pipeline.trainable import save_trainable, trainable_state
+from pipeline.training.trainable import save_trainable, trainable_state
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
 from tests.encoders import CPU, OBJECTS, Floats, config, encoder_data, float64, random_heads

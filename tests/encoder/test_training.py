@@ -28,8 +28,8 @@ from pipeline.errors import UserError
 from pipeline.io import save_tensors, write_table
 from pipeline.records import Embedding, Part
 from pipeline.runtime import seed_everything
-from pipeline.trainable import load_trainable, save_trainable, trainable_state
-from pipeline.training import TrainableTrainer
+from pipeline.training.trainable import load_trainable, save_trainable, trainable_state
+from pipeline.training.trainer import TrainableTrainer
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
 from pipeline.weights import check_encoder, check_language

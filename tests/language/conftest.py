@@ -54,5 +54,5 @@ def model(language: LanguageConfig) -> OctopiForCausalLM:
 @pytest.fixture
 def checkpoints(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Where trainings keep theirs."""
-    monkeypatch.setattr("pipeline.training.CHECKPOINTS", tmp_path)
+    monkeypatch.setattr("pipeline.training.trainer.CHECKPOINTS", tmp_path)
     return tmp_path

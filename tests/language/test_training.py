@@ -15,7 +15,6 @@ from torch.optim.optimizer import register_optimizer_step_pre_hook
 from torch.utils.data import SequentialSampler
 from transformers import TrainerCallback, TrainerState
 
-from pipeline import training as shared
 from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig
 from pipeline.embeddings import EmbeddingStore
 from pipeline.errors import UserError
@@ -32,7 +31,8 @@ from pipeline.language.training import (
     write_model_card,
 )
 from pipeline.records import Question
-from pipeline.training import Trained
+from pipeline.training import trainer as shared
+from pipeline.training.trainer import Trained
 from tests.closure import ROOT
 from tests.language.shared import SMALL, call, material
 
