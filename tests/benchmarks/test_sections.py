@@ -10,10 +10,10 @@ import pytest
 import torch
 import yaml
 
-from benchmarks import contact, encoder, frames, language
+from benchmarks import contact, describing, encoder, encoder_models, frames, language
 from benchmarks.table import Row, merge, read_rows
 from benchmarks.timing import counting_ffts, flops_of
-from pipeline.encoder import frame_heads
+from pipeline.encoder import frame_classifier
 from pipeline.encoder.baseline import validation
 from pipeline.encoder.baseline.predictor import PropertyPredictor
 from pipeline.encoder.scene_encoder import SceneEncoder
@@ -25,7 +25,7 @@ from pipeline.scenes.elastic.kernels import half_space_table, make_kernel
 from pipeline.scenes.elastic.solver import solve
 from pipeline.scenes.film import write_film
 from pipeline.scenes.light import make_sensor, shade
-from pipeline.trainable import save_trainable
+from pipeline.training.trainable import save_trainable
 from pipeline.videos.catalogue import Catalogue
 from tests.checkpoints import write_clip, write_llama
 from tests.conftest import ROOT
@@ -109,7 +109,8 @@ def test_encoder(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     with pytest.raises(UserError, match="repro pretrain"):
         encoder.measure(project, size)
     for name, value in (("STRENGTHS", (1e-3, 1e-2)), ("FOLDS", 2), ("ROUNDS", 5)):
-        monkeypatch.setattr(frame_heads, name, value)
+        monkeypatch.setattr(frame_classifier, name, value)
+    monkeypatch.setattr(encoder_models, "WHOLE", ("trees", "probe", "paper", "pretrained"))
     torch.manual_seed(0)
     save_trainable(SceneEncoder(), project / encoder.PRETRAINED)
     report = project / "reports" / "any"
@@ -184,10 +185,10 @@ def test_describing_takes_tokens_from_answers_and_errors_from_the_report(project
     root = tmp_path / "root"
     (root / "reports" / "smoke-videos").mkdir(parents=True)
     (root / "params.yaml").symlink_to(project / "params.yaml")
-    assert language.describing(root) == []
+    assert describing.describing(root) == []
     scores, graded = [], []
     for opd, tokens, accuracy in ((Opd.ALL, 100, 0.5), (Opd.NONE, 10, 0.25)):
-        for task in language.DESCRIBED:
+        for task in describing.DESCRIBED:
             own = {"lora": "with", "opd": opd, "touch": "real", "n": 8}
             scores.append(score(task, "choice", "finetuned", accuracy, accuracy - 0.1, accuracy + 0.2, **own))
             answer = {"question_id": task, "task": task, "measure": "choice", "correct": True, "parsed": True}
@@ -196,10 +197,10 @@ def test_describing_takes_tokens_from_answers_and_errors_from_the_report(project
             graded.append(Graded.model_validate({**answer, **kind, **said}))
     write_csv(root / "reports" / "smoke-videos" / "scores.csv", ScoreRow, scores)
     write_table(root / "data" / "graded.parquet", Graded, graded)
-    described, concluded = language.describing(root)
-    assert (described.setting, described.cost, described.error, described.n) == ("all", 100, 0.5, 24)
+    whole, concluded = describing.describing(root)
+    assert (whole.setting, whole.cost, whole.error, whole.n) == ("all", 100, 0.5, 24)
     assert (concluded.cost_ratio, concluded.error, concluded.low, concluded.high) == (0.1, 0.75, 0.55, 0.85)
-    assert (described.front, concluded.front) == (True, True)
+    assert (whole.front, concluded.front) == (True, True)
 
 
 def test_contact(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
