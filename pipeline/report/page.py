@@ -209,7 +209,9 @@ def _tables(report: Report, unfold: bool, gaps: list[Gap]) -> Iterator[Block]:
             gaps.append((report.name, table.title, f"no row of its {file} belongs there: nothing such was run"))
     errors = report.folder / "encoder_errors.csv"
     if errors.is_file() and len(frame := _shown(pd.read_csv(errors))):
-        caption = "Classes are ordinal: classes that an answer is off on average, and Cohen's quadratically weighted kappa."
+        caption = (
+            "Classes are ordinal: classes that an answer is off on average, and Cohen's quadratically weighted kappa."
+        )
         yield _block(report, "errors", "How far encoders are off", caption, frame, errors.name)
     for title, frame in dataset_tables(report.folder, report.provenance["dataset"]).items():
         file = "audit.csv" if "Measured" in frame else "dataset.csv"
