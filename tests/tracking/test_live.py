@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import shutil
 import signal
@@ -110,17 +111,19 @@ def test_how_a_training_ended(chain: FakeChain, error: type[BaseException], stat
 def test_four_killed_cold_starts_and_the_next_attempt(chain: FakeChain) -> None:
     """Four trainings start at once without a database and are killed; one is tried again."""
     shutil.rmtree("mlruns")
-    code = (
-        "import os, sys; from pipeline.params import load_params; from pipeline.stage import Stage\n"
-        "from pipeline.tracking import live\n"
-        "params = load_params(); params = params.model_copy(update={'tracking': params.tracking.model_copy("
-        "update={'live': True})})\n"
-        "with live(Stage(sys.argv[1], params)) as callbacks: os._exit(9 if callbacks else 1)"
-    )
     names = [f"{stage}@{key}" for stage in ("align", "lora") for key in ("finetuned-all-0", "base-all-0")]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    started = [subprocess.Popen([sys.executable, "-c", code, name], env=environment) for name in names]
-    assert [process.wait(240) for process in started] == [9] * 4
+
+    def killed_at_once(name: str) -> None:
+        with live(Stage(name, watched(chain.params))) as callbacks:
+            os._exit(9 if callbacks else 1)
+
+    # Forked, so that MLflow is imported already and they really meet.
+    started = [multiprocessing.get_context("fork").Process(target=killed_at_once, args=(name,)) for name in names]
+    for process in started:
+        process.start()
+    for process in started:
+        process.join(240)
+    assert [process.exitcode for process in started] == [9] * 4
     killed = by_name("stage")
     assert {name: run.info.status for name, run in killed.items()} == dict.fromkeys(names, "RUNNING")
     assert len(runs("reproduction")) == 1
