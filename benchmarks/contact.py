@@ -54,13 +54,17 @@ def models() -> dict[str, ScenesConfig]:
     return {name: base.model_copy(update=changed) for name, changed in changes.items()}
 
 
-def measure(root: Path, objects: int | None = None, videos: int = 3, repeats: int = 5) -> list[Row]:
+def measure(
+    root: Path, objects: int | None = None, videos: int = 3, repeats: int = 5, folds: int = 5, deals: int = 3
+) -> list[Row]:
     """All questions, on objects of the catalogue of params.yaml.
 
     Args:
         objects: How many, at equal distances in the catalogue; all by default.
         videos: Scenes an object.
         repeats: Of the ball's contacts.
+        folds: Of the classifier's cross-validation.
+        deals: How often they are dealt.
     """
     data = load_params(root / "params.yaml").data
     catalogue = load_catalogue(root / data.catalogue)
@@ -68,7 +72,7 @@ def measure(root: Path, objects: int | None = None, videos: int = 3, repeats: in
     names = sorted(recipes)[:: -(-len(recipes) // objects) if objects else 1]
     jobs = [_Job(name, number, recipes[name]) for name in names for number in range(videos)]
     seen = list(run_parallel(_look, jobs, "models of contact", "scene"))
-    return [*hertz(repeats), *_against_finest(seen), *_for_a_classifier(seen, catalogue)]
+    return [*hertz(repeats), *_against_finest(seen), *_for_a_classifier(seen, catalogue, folds, deals)]
 
 
 # --- Hertz
@@ -212,7 +216,7 @@ def _against_finest(seen: Sequence[_Seen]) -> list[Row]:
     ]
 
 
-def _for_a_classifier(seen: Sequence[_Seen], catalogue: Catalogue) -> list[Row]:
+def _for_a_classifier(seen: Sequence[_Seen], catalogue: Catalogue, folds: int, deals: int) -> list[Row]:
     """Hand-made features with trees learn from the scenes of each model and are tested on those of the finest."""
     objects = [s.object_id for s in seen]
     labels = np.array([catalogue.labels(o) for o in objects])
@@ -229,5 +233,8 @@ def _for_a_classifier(seen: Sequence[_Seen], catalogue: Catalogue) -> list[Row]:
 
         return predict
 
-    errors = [cross_validated(learning_from(i), labels, objects, classes) for i in range(len(models()))]
+    errors = [
+        cross_validated(learning_from(i), labels, objects, classes, folds=folds, repeats=deals)
+        for i in range(len(models()))
+    ]
     return _question("contact, for a classifier", seen, "layer, every pixel", errors, WRONG)

@@ -33,15 +33,14 @@ from pipeline.config import EncoderConfig, FramesConfig
 from pipeline.encoder.baseline.predictor import Labels
 from pipeline.encoder.baseline.validation import Fold
 from pipeline.encoder.clips import ClipDataset, LabelledVideo
-from pipeline.encoder.frame_heads import choose_strength, fit_votes
-from pipeline.encoder.model import FrameEncoder
-from pipeline.encoder.recipes import base_encoder
+from pipeline.encoder.frame_classifier import choose_strength, fit_frame_heads
+from pipeline.encoder.model import FrameEncoder, base_encoder
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.errors import UserError
 from pipeline.params import load_params
 from pipeline.records import Video
 from pipeline.runtime import derive_seed
-from pipeline.trainable import load_trainable
+from pipeline.training.trainable import load_trainable
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import list_videos
 from pipeline.videos.frames.extract import extract_frames
@@ -172,7 +171,7 @@ def frozen(bed: Bed) -> list[Row]:
         counts[name] = {"frames": float(setting.frames), "megabytes": megabytes(encoders[name])}
         if setting.form != "int8":
             clip = shown[name][0]
-            counts[name]["flops"] = flops_of(partial(encoders[name].describe, clip["frames"], clip["moments"]))
+            counts[name]["flops"] = flops_of(partial(encoders[name].describe, clip["frames"], clip["frame_indices"]))
     rows = []
     for question, settings in QUESTIONS.items():
         rows += make_rows(
@@ -206,7 +205,7 @@ def formatted(encoder: FrameEncoder, form: str) -> FrameEncoder:
 
 
 def _clip(setting: Setting, bed: Bed, video: Video) -> Clip:
-    """A video's evaluation clip as the setting shows it: `frames` and `moments`, as `ClipDataset` has them."""
+    """A video's evaluation clip as the setting shows it: `frames` and `frame_indices`, as `ClipDataset` has them."""
     store = FrameStore(bed.frames, "subtract" if setting.encoder == "pretrained" else "none")
     item = ClipDataset(store, [LabelledVideo(video.video_id, ())], per_video=setting.frames)[0]
     if setting.side == SIDE:
@@ -224,6 +223,6 @@ def _error(encoder: FrameEncoder, setting: Setting, bed: Bed) -> Error:
     def predict(fold: Fold) -> Labels:
         learnt, wanted, inner = clips[fold.trained], labels[fold.trained], owners[fold.trained].tolist()
         strength, _ = choose_strength(learnt, wanted, inner, classes, derive_seed("votes", fold.repeat, fold.number))
-        return fit_votes(learnt, wanted, inner, classes, strength).predict(clips[fold.tested])
+        return fit_frame_heads(learnt, wanted, inner, classes, strength).predict(clips[fold.tested])
 
     return cross_validated(predict, labels, bed.objects, classes, folds=bed.size.folds, repeats=bed.size.deals)

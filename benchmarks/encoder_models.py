@@ -19,15 +19,15 @@ from pipeline.encoder.baseline.predictor import PropertyPredictor
 from pipeline.encoder.baseline.recordings import FRAMES as TREE_FRAMES
 from pipeline.encoder.baseline.recordings import Recording, describe
 from pipeline.encoder.candidates import CANDIDATES, Candidate
-from pipeline.encoder.clips import ClipDataset, LabelledVideo
-from pipeline.encoder.finetune import EncoderData, classify, train_classifier
-from pipeline.encoder.frame_classifier import FrameVotes
-from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
-from pipeline.encoder.recipes import base_encoder, property_classifier
+from pipeline.encoder.clips import ClipDataset, EncoderData, LabelledVideo, classify
+from pipeline.encoder.finetune import train_classifier
+from pipeline.encoder.frame_classifier import JointFrameClassifier
+from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier, base_encoder
+from pipeline.encoder.recipes import property_classifier
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.records import Part
 from pipeline.runtime import seed_everything
-from pipeline.sampling import sample_evaluation
+from pipeline.training.sampling import sample_evaluation
 from pipeline.videos.files import VideoFile
 from pipeline.videos.frames.scan import Scan, scan
 from pipeline.videos.frames.store import FrameStore
@@ -46,7 +46,7 @@ ALONE = "ms a video, encoder alone"
 @torch.inference_mode()
 def features(encoder: FrameEncoder, clip: Mapping[str, torch.Tensor]) -> torch.Tensor:
     """What the heads are given of a clip: float32, frames x features."""
-    return encoder.describe(clip["frames"], clip["moments"]).float()
+    return encoder.describe(clip["frames"], clip["frame_indices"]).float()
 
 
 def whole(bed: Bed, reports: Path) -> list[Row]:
@@ -66,13 +66,13 @@ def whole(bed: Bed, reports: Path) -> list[Row]:
     files = [VideoFile(bed.folder / v.path, v.path, v.object_id, v.video_id) for v in bed.timed()]
     judged = reported(reports, task="cross_validation", measure="combined").values()
     # The report that compares most of them, and of such the one over most videos.
-    scores = max(judged, key=lambda rows: (len(rows), float(rows[0]["n"])), default=[])
+    scores = max(judged, key=lambda rows: (len(rows), rows[0].n), default=[])
     return make_rows(
         "encoder",
         interleaved(settings, files, bed.size.repeats),
         unit="ms a video",
         baseline="pretrained",
-        errors={row["encoder"]: error_of(row) for row in scores if row["encoder"] in WHOLE},
+        errors={row.encoder: error_of(row) for row in scores if row.encoder in WHOLE},
         error_of=WRONG,
         counts=counts,
         machine=machine("1 thread"),
@@ -82,8 +82,8 @@ def whole(bed: Bed, reports: Path) -> list[Row]:
 def _classifier(candidate: Candidate, bed: Bed) -> PropertyClassifier:
     """A candidate with heads that have learnt nothing."""
     seed_everything(0)
-    if candidate.kind == "votes":
-        return FrameVotes(SceneEncoder() if candidate.pretrained else base_encoder(bed.config), bed.classes)
+    if candidate.kind == "frame_heads":
+        return JointFrameClassifier(SceneEncoder() if candidate.pretrained else base_encoder(bed.config), bed.classes)
     if candidate.recipe == "scratch":
         encoder = SceneEncoder()
         return PropertyClassifier(encoder, Heads(encoder.dim, bed.classes), bed.classes)
@@ -135,7 +135,7 @@ def prompts(bed: Bed) -> list[Row]:
         errors[name] = _validation_error(model.eval(), data, config)
         timed[name] = partial(features, model.encoder)
         # Not in inference mode: the counter fails there at parameters that are put into a layer, as prompts are.
-        flops = flops_of(partial(model.encoder.describe, clips[0]["frames"], clips[0]["moments"]))
+        flops = flops_of(partial(model.encoder.describe, clips[0]["frames"], clips[0]["frame_indices"]))
         counts[name] = {"frames": float(FRAMES), "megabytes": megabytes(model), "flops": flops}
     return make_rows(
         "prompts",

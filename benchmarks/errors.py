@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean, stdev
 
+import numpy as np
+
 from pipeline.encoder.baseline.predictor import Labels
 from pipeline.encoder.baseline.validation import Predict, cross_validate
-from pipeline.statistics import Outcome, clustered
+from pipeline.evaluation.intervals import accuracy_interval
+from pipeline.evaluation.scores import ScoreRow
+from pipeline.io import read_csv
 
 WRONG = "share of videos of unseen objects of which not every property is right"
 
@@ -39,7 +42,7 @@ def share_of(wrong: Sequence[float], objects: Sequence[tuple[str, ...]]) -> Erro
         wrong: From 0 (right) to 1, of each question or video.
         objects: What each is about.
     """
-    interval = clustered([Outcome(w, o) for w, o in zip(wrong, objects, strict=True)])
+    interval = accuracy_interval(np.array(wrong, dtype=np.float64), objects)
     if interval is None:
         return Error(fmean(wrong), n=len(wrong))
     return Error(fmean(wrong), interval.low, interval.high, len(wrong))
@@ -73,22 +76,23 @@ def cross_validated(
         objects: Each video's object.
         classes: How many classes each property has.
     """
-    judged = cross_validate(predict, labels, objects, classes, folds=folds, repeats=repeats)
-    return share_of([1 - video.correct(None) for video in judged], [(o,) for o in objects])
+    predicted = cross_validate(predict, labels, objects, classes, folds=folds, repeats=repeats)
+    wrong = (predicted != labels[:, None]).any(axis=2).mean(axis=1)
+    return share_of(wrong.tolist(), [(o,) for o in objects])
 
 
-def reported(reports: Path, **keys: str) -> dict[Path, list[dict[str, str]]]:
+def reported(reports: Path, **keys: str) -> dict[Path, list[ScoreRow]]:
     """Rows of every report's scores.csv that have these values, by report, reports without any left out."""
-    found = {}
-    for path in sorted(reports.glob("*/scores.csv")):
-        with path.open(encoding="utf-8", newline="") as stream:
-            rows = [r for r in csv.DictReader(stream) if all(r.get(key) == value for key, value in keys.items())]
-        if rows:
-            found[path.parent] = rows
-    return found
+    tables = {path.parent: read_csv(path, ScoreRow) for path in sorted(reports.glob("*/scores.csv"))}
+    chosen = {
+        report: [row for row in rows if all(getattr(row, key) == value for key, value in keys.items())]
+        for report, rows in tables.items()
+    }
+    return {report: rows for report, rows in chosen.items() if rows}
 
 
-def error_of(score: dict[str, str]) -> Error:
+def error_of(score: ScoreRow) -> Error:
     """One less the accuracy of a row of scores.csv."""
-    low, high = (1 - float(score[end]) if score.get(end) else None for end in ("high", "low"))
-    return Error(1 - float(score["accuracy"]), low, high, int(float(score["n"])))
+    if score.low is None or score.high is None:
+        return Error(1 - score.accuracy, n=score.n)
+    return Error(1 - score.accuracy, 1 - score.high, 1 - score.low, score.n)

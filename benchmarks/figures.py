@@ -60,7 +60,8 @@ def _bars(axes: Axes, rows: Sequence[Row]) -> None:
 
 
 def _trade(axes: Axes, rows: Sequence[Row], canvas: Any) -> None:
-    axes.set_xscale("log")
+    from matplotlib.ticker import FuncFormatter, LogLocator
+
     axes.set_ylabel("error")
     axes.text(0.5, 1.005, f"error: {rows[0].error_of}", transform=axes.transAxes, ha="center", fontsize=8)
     errors = [row.error or 0.0 for row in rows]
@@ -79,19 +80,13 @@ def _trade(axes: Axes, rows: Sequence[Row], canvas: Any) -> None:
     axes.legend(loc="best", fontsize=8)
     axes.margins(0.12)
     axes.grid(alpha=0.3)
-    _ticks(axes)
+    ratios = [row.cost_ratio for row in rows]
+    if max(ratios) > 4 * min(ratios):
+        axes.set_xscale("log", subs=[])
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if max(ratios) < 100 * min(ratios) else (1,)))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda ratio, _: f"{ratio:g}"))
     canvas.draw()
     _names(axes, rows)
-
-
-def _ticks(axes: Axes) -> None:
-    """Plain numbers where a logarithmic axis shows less than two decades."""
-    from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
-
-    low, high = axes.get_xlim()
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high / low > 6 else (1, 1.2, 1.5, 2, 3, 5, 7)))
-    axes.xaxis.set_major_formatter(ScalarFormatter())
-    axes.xaxis.set_minor_formatter(NullFormatter())
 
 
 def _names(axes: Axes, rows: Sequence[Row]) -> None:

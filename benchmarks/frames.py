@@ -28,7 +28,7 @@ from pipeline.encoder.baseline.validation import forest
 from pipeline.errors import UserError
 from pipeline.parallel import run_parallel
 from pipeline.params import load_params
-from pipeline.sampling import sample_evaluation
+from pipeline.training.sampling import sample_evaluation
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.decoding import Image, decode
 from pipeline.videos.files import VideoFile, list_videos
@@ -59,6 +59,8 @@ def measure(root: Path, repeats: int = 3, folds: int = 5, deals: int = 10) -> li
         UserError: where there are no videos, or too few objects for folds.
     """
     folder, catalogue = bench_videos(root)
+    if len({f.object_id for f in list_videos(folder, catalogue).files}) < 2 * folds:
+        raise UserError(f"{folder}: bench frames needs videos of {2 * folds} objects or more")
     return [*extraction(folder, catalogue, repeats), *selection(folder, catalogue, folds, deals)]
 
 
@@ -152,8 +154,6 @@ class Sample:
 def selection(folder: Path, catalogue: Catalogue, folds: int, deals: int) -> list[Row]:
     """Frames against error: every setting on the same videos by the same folds, drawn as for evaluation."""
     files = list_videos(folder, catalogue).files
-    if len({f.object_id for f in files}) < 2 * folds:
-        raise UserError(f"{folder}: bench frames needs videos of {2 * folds} objects or more")
     samples = [s for s in run_parallel(_sample, files, "frame selection", "video") if s is not None]
     objects = [s.object_id for s in samples]
     labels = np.array([catalogue.labels(o) for o in objects])

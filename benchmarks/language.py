@@ -21,21 +21,20 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
-from benchmarks.errors import Error, error_of, reported, share_of
+from benchmarks.describing import describing
+from benchmarks.errors import share_of
 from benchmarks.table import Row, make_rows
 from benchmarks.timing import flops_of, interleaved, machine, one_thread
 from pipeline.config import EncoderConfig
 from pipeline.embeddings import FLIPS, INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
-from pipeline.encoder.model import FrameEncoder
-from pipeline.encoder.recipes import base_encoder
-from pipeline.io import read_table, save_tensors, write_table
-from pipeline.language.buckets import LengthBuckets
+from pipeline.encoder.model import FrameEncoder, base_encoder
+from pipeline.io import save_tensors, write_table
 from pipeline.language.chat import IGNORE_INDEX
-from pipeline.language.conversations import ConversationCollator, ConversationDataset, Sample
-from pipeline.language.generate import Asking, answer
+from pipeline.language.conversations import ConversationCollator, ConversationDataset, LengthBuckets, Sample
+from pipeline.language.generate import GenerationSettings, answer
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.params import load_params
-from pipeline.records import Assignment, Embedding, Graded, Opd, Part, Prediction, Question
+from pipeline.records import Assignment, Embedding, Opd, Part, Prediction, Question
 from pipeline.runtime import DtypeName, seed_everything
 from pipeline.tasks.questions import build_questions, pool_of
 from pipeline.videos.catalogue import load_catalogue
@@ -43,8 +42,6 @@ from pipeline.videos.catalogue import load_catalogue
 FRAMES, UPDATE, CUTOFF = 5, 16, 512
 """A video's frames, conversations an update, and the tokens that the published code pads to."""
 ASKED: tuple[Any, ...] = ("OPD", "PC", "PSS", "POM")
-DESCRIBED = ("PC", "PSS", "POM")
-"""Tasks that can be answered without describing, over which errors are averaged."""
 PUBLISHED = "published way"
 DIFFERS = "share of answers that differ from {}'s"
 
@@ -209,7 +206,7 @@ def loss(bed: Bed, way: Way, questions: Sequence[Question], samples: Sequence[Sa
     embeddings, labels = bed.model.embed(batch["input_ids"], batch["features"]), batch["labels"]
     mask = torch.ones_like(labels)
     if way.padded:
-        rest = CUTOFF - embeddings.shape[1]
+        rest = max(0, CUTOFF - embeddings.shape[1])
         embeddings = F.pad(embeddings, (0, 0, 0, rest))
         labels, mask = F.pad(labels, (0, rest), value=IGNORE_INDEX), F.pad(mask, (0, rest))
     logits = bed.model.llm(inputs_embeds=embeddings, attention_mask=mask).logits.float()
@@ -226,7 +223,7 @@ def answering(bed: Bed, size: Size) -> list[Row]:
     def one_by_one(**options: bool) -> Callable[[object], list[str]]:
         return lambda _: [_answer(bed, size.limit, place, **options) for place in range(len(bed.asked))]
 
-    ways = {
+    ways: dict[str, Callable[[object], list[str]]] = {
         PUBLISHED: one_by_one(reads=True),
         "without the published loop's forward pass": one_by_one(),
         "and without a cache of keys and values": one_by_one(cache=False),
@@ -241,7 +238,7 @@ def answering(bed: Bed, size: Size) -> list[Row]:
 
 def formats(bed: Bed, size: Size) -> list[Row]:
     """The frozen weights in fewer bits; the connector stays in float32."""
-    ways = {}
+    ways: dict[str, Callable[[object], list[str]]] = {}
     names: tuple[DtypeName, ...] = ("float32", "bfloat16")
     for name in names:
         base = bed.model.octopi_config
@@ -279,8 +276,8 @@ def _asked(
 
 def ask(bed: Bed, model: OctopiForCausalLM, limit: int, batch: int) -> list[Prediction]:
     """The pipeline's own way."""
-    asking = Asking(system_prompt="", per_video=FRAMES, max_new_tokens=limit, batch_size=batch)
-    return answer(model, bed.store, bed.asked, Opd.ALL, asking)
+    settings = GenerationSettings(system_prompt="", per_video=FRAMES, max_new_tokens=limit, batch_size=batch)
+    return answer(model, bed.store, bed.asked, Opd.ALL, settings)
 
 
 def _texts(bed: Bed, model: OctopiForCausalLM, limit: int, batch: int, _: object) -> list[str]:
@@ -319,42 +316,3 @@ def _without_cache(model: OctopiForCausalLM, embeddings: torch.Tensor, limit: in
         said.append(logits[:, -1].argmax(-1, keepdim=True))
         embeddings = torch.cat([embeddings, model.llm.get_input_embeddings()(said[-1])], dim=1)
     return torch.cat(said, dim=1)
-
-
-# --- How much to describe
-
-
-def describing(root: Path) -> list[Row]:
-    """Tokens that the full system generates against its errors, means over `DESCRIBED`, under each OPD.
-
-    Errors are the report's, tokens those of the answers that it is made of. The interval's ends are means of the tasks'
-    ends: as wide as if all tasks erred together.
-    """
-    graded, report = root / "data" / "graded.parquet", root / "reports" / load_params(root / "params.yaml").report_name
-    full = {"encoder": "finetuned", "lora": "with", "touch": "real"}
-    scores = reported(root / "reports", **full, measure="choice", seed="all").get(report, [])
-    if not graded.is_file():
-        return []
-    answers = [a for a in read_table(graded, Graded) if (a.encoder, a.lora, a.touch) == tuple(full.values())]
-    costs: dict[str, list[float]] = {}
-    errors = {}
-    for opd in ("all", "needed", "none"):
-        own = [error_of(row) for row in scores if row["opd"] == opd and row["task"] in DESCRIBED]
-        tokens = [a.tokens for a in answers if a.opd == opd and a.task in DESCRIBED]
-        if len(own) == len(DESCRIBED) and tokens:
-            lows, highs = ([e for e in ends if e is not None] for ends in ([x.low for x in own], [x.high for x in own]))
-            whole = len(lows) == len(highs) == len(own)
-            low, high = (fmean(lows), fmean(highs)) if whole else (None, None)
-            errors[opd] = Error(fmean(e.value for e in own), low, high, sum(e.n or 0 for e in own))
-            costs[opd] = [fmean(tokens)]
-    if len(costs) < 2 or "all" not in costs:
-        return []
-    return make_rows(
-        "describing",
-        costs,
-        unit="tokens an answer",
-        baseline="all",
-        errors=errors,
-        error_of=f"error of the full system, mean over {', '.join(DESCRIBED)}",
-        counts={opd: {"tokens": own[0]} for opd, own in costs.items()},
-    )

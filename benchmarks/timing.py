@@ -43,10 +43,10 @@ def interleaved(
         run(items[0])
     found: dict[str, list[float]] = {name: [] for name in settings}
     for _ in range(repeats):
+        gc.collect()
         spent: dict[str, list[float]] = {name: [] for name in settings}
         for item in items:
             for name, run in settings.items():
-                gc.collect()
                 spent[name].append(milliseconds(lambda run=run, item=item: run(item)))  # type: ignore[misc]
         for name, own in spent.items():
             found[name].append(median(own))

@@ -39,6 +39,15 @@ def scale(
 
 
 @app.command()
+def page() -> None:
+    """Write reports/index.html, one page over all reports that opens from disk."""
+    from pipeline.report.page import write_page
+
+    file = write_page(Path())
+    typer.echo(f"{file}: {file.stat().st_size / 1000:.0f} kB")
+
+
+@app.command()
 def publish() -> None:
     """Show what lies in data/ and reports/ in MLflow, as `dvc repro` does at its end; a second call adds nothing."""
     from pipeline import tracking
@@ -98,6 +107,8 @@ def repro(context: typer.Context) -> None:
     from pipeline.reproduce import reproduce
 
     raise typer.Exit(reproduce(Path(), context.args))
+
+
 @app.command()
 def compare(
     old: Annotated[str, typer.Argument(help="A Git revision: a hash, a tag, a branch, HEAD~1.")],

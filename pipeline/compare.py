@@ -82,6 +82,8 @@ def _tested(one: State, two: State) -> tuple[Rows, list[str]]:
     if lacking := " and ".join(state.name for state, found in zip((one, two), answers, strict=True) if found is None):
         return [], [f"No paired test: {GRADED} of {lacking} is not at hand; `dvc pull` or `dvc repro` there brings it."]
     asked = [_questions(state) for state in (one, two)]
+    if not all(asked):  # Then objects alone must tell whether a question is the same.
+        asked = [{}, {}]
     meant = [
         {g.question_id: (videos.get(g.question_id), g.objects) for g in found or ()}
         for found, videos in zip(answers, asked, strict=True)

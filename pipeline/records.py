@@ -127,7 +127,7 @@ class Probe(Record):
     contact: float
     """Largest contact strength in a probed frame (`pipeline.videos.frames.reference.contact_strength`)."""
     quiet: float
-    """Smallest contact strength in a probed frame after the reference: what noise alone gives in a quiet part of a video."""
+    """Smallest contact strength in a probed frame after the reference: what noise alone gives in a quiet part."""
     contact_end: float
     """Contact strength in the last frame."""
     starts_touching: bool

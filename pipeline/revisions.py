@@ -55,12 +55,13 @@ def find_state(root: Path, revision: str | None) -> State:
     Raises:
         UserError: where there is no such commit, or `root` is in no Git repository or no DVC project.
     """
-    git = ["git", "rev-parse", "--verify", "--quiet", "--end-of-options", f"{revision or 'HEAD'}^{{commit}}"]
-    commit = subprocess.run(git, cwd=root, capture_output=True, text=True).stdout.strip()
-    if not commit:
-        raise UserError(f"{revision}: no commit of a Git repository in {root.resolve()}; `git log` lists them")
+    name = "HEAD" if revision is None else revision
+    git = ["git", "rev-parse", "--verify", "--quiet", "--end-of-options", f"{name}^{{commit}}"]
+    commit = subprocess.run(git, cwd=root, capture_output=True, text=True).stdout.split()
+    if len(commit) != 1:  # None, or those of a range.
+        raise UserError(f"{name}: no commit of a Git repository in {root.resolve()}; `git log` lists them")
     try:
-        files = DVCFileSystem(repo=Repo(str(root), rev=commit if revision else None))
+        files = DVCFileSystem(repo=Repo(str(root), rev=None if revision is None else commit[0]))
     except DvcException as error:
         raise UserError(f"{root.resolve()}: {error}") from None
-    return State(f"{revision} ({commit[:8]})" if revision else "working tree", files)
+    return State("working tree" if revision is None else f"{revision} ({commit[0][:8]})", files)

@@ -116,6 +116,9 @@ def sign_flip(values: Values, design: Design) -> Values:
 
     If both settings are equally good, what an object adds to the difference is as likely to be d as -d. Up to 15
     objects all signs are gone through, beyond that 10 000 are drawn (Phipson and Smyth 2010 for their p).
+
+    Simulated at 5 %, two equally good settings are told apart in at most 3 %. Where a difference were fixed by three
+    objects at once and by nothing else, it would be 13 %: objects are taken to add up.
     """
     units = flip_units(design)
     parts = values @ units.T

@@ -8,7 +8,8 @@ from pathlib import Path
 import pandas as pd
 
 from pipeline.config import Params
-from pipeline.evaluation.scores import EffectRow, ScoreRow, effect_rows, score_rows
+from pipeline.evaluation.ordinal import ErrorRow, error_rows
+from pipeline.evaluation.scores import EffectRow, ScoreRow, candidate_rows, effect_rows, score_rows
 from pipeline.io import read_csv, read_jsonl, read_table, write_csv, write_json, write_text
 from pipeline.params import PARAMS_FILE
 from pipeline.records import (
@@ -35,6 +36,8 @@ from pipeline.videos.catalogue import Catalogue, load_catalogue
 
 MOST_METRICS = 12
 """Columns of `dvc metrics show` that a person still reads."""
+BASELINE = "trees"
+"""The cross-validated model that all others are compared with in encoder_effects.csv."""
 CONFUSION = ("seed", "video_id", "property", "rated", "predicted")
 CURVES = ("stage", "name", "step", "value")
 LOGGED = ("loss", "validation_loss", "validation_combined")
@@ -68,8 +71,11 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
         for name in params.cross_validation.models
         if (data / "cross_validation" / name / "out_of_fold.parquet").is_file()
     }
+    origin = provenance(params, catalogue, videos, assignments, [g.objects for g in graded], root)
     write_csv(folder / "scores.csv", ScoreRow, score_rows(graded, catalogue, said, out_of_fold))
     write_csv(folder / "effects.csv", EffectRow, effect_rows(graded, catalogue))
+    write_csv(folder / "encoder_effects.csv", EffectRow, candidate_rows(out_of_fold, BASELINE))
+    write_csv(folder / "encoder_errors.csv", ErrorRow, error_rows(out_of_fold, catalogue))
     write_json(folder / "samples.json", _samples(params, data, graded))
     audit = data / "audit" / "audit.csv"
     write_csv(folder / "audit.csv", Finding, read_csv(audit, Finding) if audit.is_file() else [])
@@ -77,7 +83,7 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     _write(folder / "confusion.csv", confusion_frame(said, catalogue))
     _write(folder / "curves.csv", curves_frame(data))
     write_text(folder / "params.yaml", (root / PARAMS_FILE).read_text(encoding="utf-8"))
-    write_json(folder / "provenance.json", provenance(params, catalogue, videos, assignments, root))
+    write_json(folder / "provenance.json", origin)
     return finish_report(folder)
 
 

@@ -49,7 +49,7 @@ def place_points(rows: pd.DataFrame) -> Scatter | None:
     x, ratios = _axis([math.log10(ratio) for ratio in rows["cost_ratio"]], SIZE["left"], SIZE["width"] - SIZE["right"])
     y, errors = _axis(rows[["error", "low", "high"]].stack().tolist(), SIZE["bottom"], SIZE["top"])
     powers = range(math.floor(ratios[0]), math.ceil(ratios[1]) + 1)
-    ticks = [(math.log10(step) + power, f"{step * 10.0**power:g}×") for power in powers for step in (1, 2, 5)]
+    ticks = [(math.log10(step) + power, f"{step * 10.0**power:g}") for power in powers for step in (1, 2, 5)]
     ticks = [tick for tick in ticks if ratios[0] <= tick[0] <= ratios[1]]
     step = 10.0 ** math.floor(math.log10(errors[1] - errors[0]))
     step = next(s for s in (step, step / 2, step / 5) if (errors[1] - errors[0]) / s >= 3)
@@ -60,7 +60,7 @@ def place_points(rows: pd.DataFrame) -> Scatter | None:
         title = f"{row['setting']}: {row['cost_ratio']:.3g} times the cost, error {row['error']:.3g}"
         place = {"x": x(math.log10(row["cost_ratio"])), "y": y(row["error"]), "low": y(low), "high": y(high)}
         dots.append({**place, "title": title, "number": next(count) if row["front"] else None})
-    across = [(x(at), label) for at, label in ticks if len(ticks) <= 6 or label.strip("0.×") == "1"]
+    across = [(x(at), label) for at, label in ticks if len(ticks) <= 6 or label.strip("0.") == "1"]
     return Scatter(dots, across, [(y(level), f"{level:.3g}") for level in levels])
 
 
@@ -71,29 +71,33 @@ def _axis(values: Sequence[float], start: float, end: float) -> tuple[Any, tuple
     return lambda value: round(start + (value - low) / (high - low) * (end - start), 1), (low, high)
 
 
-def draw_table(frame: pd.DataFrame, caption: str, sources: Sequence[str]) -> Markup:
+def draw_table(frame: pd.DataFrame, caption: str, file: str, at_lines: bool = True) -> Markup:
     """A table as HTML by great_tables, in the page's style: its own would weigh 9 kB a table and know no dark screen.
 
     Args:
-        frame: text in every cell; rows that share a task, measure or severity stand together.
+        frame: text in every cell; rows of one task, measure or severity are brought together.
         caption: what the table is called.
-        sources: the file and line that each row comes from.
+        file: the CSV that it comes from.
+        at_lines: whether the frame's index is that of the CSV, so that each row can name its line.
     """
     import pyarrow as pa
     from great_tables import GT
 
+    frame = frame.rename(columns={"": " "})
     kinds = {str(name): _kind(str(name), frame[name]) for name in frame}
     words = [name for name, kind in kinds.items() if kind == "words"]
     group = next((name for name in HEADS if name in words and len(words) > 1), None)
     head = next((name for name in words if name != group), None)
+    if group:
+        frame = frame.iloc[pd.factorize(frame[group])[0].argsort(kind="stable")]
     with warnings.catch_warnings():
         # great_tables calls Arrow tables experimental; it is four times as slow with those of pandas.
         warnings.simplefilter("ignore", UserWarning)
         table = GT(pa.Table.from_pandas(frame, preserve_index=False), rowname_col=head, groupname_col=group, id="t")
-        html = table.as_raw_html()
+        html = (table.tab_stubhead(head) if head else table).as_raw_html()
     shown = [kind for name, kind in kinds.items() if name not in (group, head)]
     heads = iter([*(["words"] if head else []), *shown])
-    cells, rows = itertools.cycle(shown), iter(sources)
+    cells, rows = itertools.cycle(shown), (f"{file}:{index + 2}" if at_lines else file for index in frame.index)
 
     def attributes(match: re.Match[str]) -> str:
         tag, given = match.groups()
@@ -114,4 +118,4 @@ def _kind(name: str, cells: pd.Series[Any]) -> str:
     kind = name.partition(" ")[0].lower()
     if kind in ("measured", "published"):
         return kind
-    return "number" if all(re.match(r"[-+]?\d|$", cell) for cell in cells) else "words"
+    return "number" if all(re.fullmatch(r"[-+\d.,e/ \[\]()]*", cell) for cell in cells) else "words"

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from pipeline.io import atomic
-from pipeline.report.load import KEYS
+from pipeline.report.load import KEYS, cells
 from pipeline.report.tables import task_title
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def draw_figures(
 def draw_tasks(headline: pd.DataFrame, published: pd.DataFrame) -> Figure:
     """A line from 0 to 100 % a task: the interval, the measured value, chance, and what the paper printed."""
     figure, (axes,) = panels(1, 7.2, 0.75 + 0.5 * len(headline), across=1)
-    printed = {(*(cell[k] for k in KEYS), cell["model"]): cell["value"] for cell in published.to_dict("records")}
+    printed = cells(published)
     for place, row in enumerate(headline.to_dict("records")):
         axes.plot([0, 100], [-place, -place], color=LINE, linewidth=1.2, zorder=1)
         if pd.notna(row["low"]):
@@ -78,9 +78,9 @@ def draw_tasks(headline: pd.DataFrame, published: pd.DataFrame) -> Figure:
         chance = 100 * row["chance"]
         axes.plot([chance, chance], [-place - 0.25, -place + 0.25], color=QUIET, linestyle=(0, (2.5, 2)), linewidth=1.2)
         for model, face in (("7b", "white"), ("13b", PUBLISHED)):
-            value = printed.get((*(row[k] for k in KEYS), model))
-            if value is not None:
-                axes.plot(value, -place, "D", color=PUBLISHED, markerfacecolor=face, markersize=6.5, zorder=3)
+            cell = printed.get((*(row[k] for k in KEYS), model))
+            if cell:
+                axes.plot(cell[0], -place, "D", color=PUBLISHED, markerfacecolor=face, markersize=6.5, zorder=3)
         axes.plot(100 * row["accuracy"], -place, "o", color=MEASURED, markeredgecolor="white", markersize=8, zorder=4)
         axes.text(104, -place, f"{100 * row['accuracy']:.1f}", color=MEASURED, weight="bold", va="center", fontsize=11)
     axes.set_yticks([-i for i in range(len(headline))], [task_title(task) for task in headline["task"]])

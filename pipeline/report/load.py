@@ -97,5 +97,11 @@ def published(dataset: str = DATASET) -> pd.DataFrame:
     return _published() if dataset == DATASET else _published().iloc[:0]
 
 
+def cells(published: pd.DataFrame) -> dict[tuple[str, ...], tuple[float, float]]:
+    """Published value and n by (task, measure, encoder, lora, opd, model)."""
+    keys = zip(*(published[k] for k in (*KEYS, "model")), strict=True)
+    return dict(zip(keys, zip(published["value"], published["n"], strict=True), strict=True))
+
+
 def _json(file: Path) -> dict[str, Any]:
     return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}

@@ -1,8 +1,8 @@
 """One page over all reports: reports/index.html, drawn from the files in reports/ and from nothing else.
 
-It needs no network, runs no script and opens from disk. Its tables are those of the registry (`pipeline.report.tables`);
-this module adds what stands around them: the tasks and effects as lines, speed against error, numerical stability, and
-what is missing.
+It needs no network, runs no script and opens from disk. Its tables are those of the registry
+(`pipeline.report.tables`); this module adds what stands around them: the tasks and effects as lines, speed against
+error, numerical stability, and what is missing.
 """
 
 from __future__ import annotations
@@ -16,21 +16,23 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from pipeline.errors import UserError
 from pipeline.io import write_text
+from pipeline.report.dataset import dataset_tables
 from pipeline.report.drawing import SIZE, draw_table, place_points, share, span
-from pipeline.report.load import Report, load_report, read_frame
-from pipeline.report.readme import finding
-from pipeline.report.tables import FULL, TABLES, answers, difference, measured, number, task_title, whole
+from pipeline.report.load import KEYS, Report, load_report, read_frame
+from pipeline.report.readme import OTHER_MODELS, SMOKE, finding, origin, stands_on
+from pipeline.report.tables import TABLES, difference, headline, measured, number, task_title, whole
 from pipeline.tasks import TASKS
 
 PAGE = Path("reports/index.html")
 LARGEST = 1_500_000
 """Bytes of the page at most, so that it opens at once on a phone."""
-SPEED = ("question", "setting", "cost", "cost_ratio", "error", "low", "high", "front")
+SPEED = ("question", "setting", "cost", "unit", "cost_ratio", "error", "error_of", "low", "high", "front")
 STABILITY = ("part", "case", "format", "finite", "error", "bound", "verdict")
+MODELS = ("7b", "13b")
 AUDIT = ("check", "item", "measured", "expected", "severity")
 OLDER = "the report is older than this file: `dvc repro report` at its scale writes it"
 EXPECTED = {
@@ -41,6 +43,8 @@ EXPECTED = {
     "confusion.csv": OLDER,
 }
 """Files of a report, and why it may lack one."""
+PARTS = {"encoder": "Encoder", "lora": "LoRA", "opd": "OPD", "touch": "Touch"}
+RANK = {"error": 0, "warning": 1, "info": 2}
 Gap = tuple[str, str, str]
 """Where something is missing, what, and why."""
 
@@ -58,8 +62,8 @@ class Line(NamedTuple):
     low: float | None = None
     high: float | None = None
     chance: float | None = None
-    published: dict[str, tuple[str, float]] = {}  # noqa: RUF012
-    """What the paper printed for each size of its model, and its place."""
+    published: dict[str, tuple[str, str, float]] = {}  # noqa: RUF012
+    """By size of its model what the paper printed, of how many questions, and its place."""
 
 
 class Block(NamedTuple):
@@ -80,17 +84,19 @@ def write_page(root: Path) -> Path:
         UserError: there is no report, or the page would be larger than `LARGEST`.
     """
     folder, gaps = root / PAGE.parent, list[Gap]()
-    reports = _reports(folder, gaps)
-    if not reports:
-        raise UserError(f"{folder}: no report yet; `make repro` writes one")
+    chapters = _chapters(folder, gaps)
+    if not chapters:
+        raise UserError(f"{folder}: no whole report yet; `make repro` writes one")
     environment = Environment(
         loader=PackageLoader("pipeline.report"), autoescape=True, trim_blocks=True, undefined=StrictUndefined
     )
+    environment.filters["inline"] = inline
     style = " ".join(environment.get_template("style.css").render().split())
     text = environment.get_template("page.html").render(
         style=Markup(style),
         digest=base64.b64encode(hashlib.sha256(style.encode()).digest()).decode(),
-        chapters=[_chapter(report, gaps) for report in reports],
+        chapters=chapters,
+        other_models=OTHER_MODELS,
         speed=list(_speed(folder, gaps)),
         stability=_stability(folder, gaps),
         gaps=gaps,
@@ -103,71 +109,78 @@ def write_page(root: Path) -> Path:
     return root / PAGE
 
 
-def _reports(folder: Path, gaps: list[Gap]) -> list[Report]:
-    """Real videos first, then scenes, smoke last; a folder that holds no whole report is a gap."""
+def inline(text: str, folder: str = "") -> Markup:
+    """A sentence of a README: its bold words, code and links as HTML, all else as it is.
+
+    Args:
+        text: Markdown.
+        folder: what its links are relative to.
+    """
+    html = re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", str(escape(text)))
+    html = re.sub(r"`(.+?)`", r"<code>\1</code>", html)
+    return Markup(re.sub(r"\[([^]]+)\]\(([\w./-]+)\)", rf'<a href="{escape(folder)}\2">\1</a>', html))
+
+
+def _chapters(folder: Path, gaps: list[Gap]) -> list[dict[str, Any]]:
+    """The reports: real videos first, then scenes, smoke last; a folder that holds no whole report is a gap."""
     found = []
-    for name in sorted({file.parent for pattern in ("scores.csv", "provenance.json") for file in folder.glob(f"*/{pattern}")}):
+    for place in sorted({file.parent for name in ("scores.csv", "README.md") for file in folder.glob(f"*/{name}")}):
         try:
-            found.append(load_report(name))
+            found.append(_chapter(load_report(place), gaps))
         except (UserError, ValueError) as error:
-            gaps.append((name.name, "the whole report", str(error)))
-    return sorted(found, key=lambda r: (_kind(r)[0] == "smoke", _kind(r)[1] != "videos", r.name))
-
-
-def _kind(report: Report) -> tuple[str, str]:
-    """Scale and source."""
-    scale, _, source = report.name.partition("-")
-    return str(report.provenance.get("scale", scale)), str(report.provenance.get("source", source))
+            gaps.append((place.name, "the whole report", str(error).replace(f"{folder}/", "")))
+        except KeyError as error:
+            gaps.append((place.name, "the whole report", f"its provenance.json lacks {error}: {OLDER}"))
+    return sorted(found, key=lambda c: (c["scale"] == "smoke", c["source"] != "videos", c["name"]))
 
 
 def _chapter(report: Report, gaps: list[Gap]) -> dict[str, Any]:
     """What the template shows of one report."""
-    scale, source = _kind(report)
+    name, scale, source = report.name, report.provenance["scale"], report.provenance["source"]
     tasks, (effects, points) = list(_tasks(report)), _effects(report)
-    gaps += [(report.name, line.title, "the full system was not asked it") for line in tasks if not line.source]
-    gaps += [(report.name, name, why) for name, why in EXPECTED.items() if not (report.folder / name).is_file()]
+    gaps += [(name, line.title, "the full system was not asked") for line in tasks if not line.source]
+    gaps += [(name, file, why) for file, why in EXPECTED.items() if not (report.folder / file).is_file()]
     files = sorted(p.relative_to(report.folder.parent).as_posix() for p in report.folder.rglob("*.*") if p.is_file())
     return {
-        "report": report,
-        "kind": f"{'Real videos' if source == 'videos' else 'Synthetic scenes'}, scale {scale}",
-        "finding": finding(report),
+        "name": name,
+        "scale": scale,
+        "source": source,
+        "finding": [*([SMOKE.strip("> \n")] if scale == "smoke" else []), *finding(report)],
         "tasks": tasks,
         "effects": effects,
         "points": points,
-        "blocks": [*_tables(report, scale != "smoke", gaps), *_audit(report)],
-        "facts": list(_facts(report.provenance)),
+        "stands_on": stands_on(report.provenance),
+        "origin": origin(report.provenance),
+        "blocks": [*_tables(report, scale != "smoke", gaps), *_dataset(report), *_audit(report)],
+        "samples": report.samples,
         "files": files,
     }
 
 
 def _tasks(report: Report) -> Iterator[Line]:
     """Every task with the full system's accuracy on real touch over all seeds."""
-    rows = _full(report.scores[answers(report.scores) & whole(report.scores)])
-    printed = _full(report.published[whole(report.published)])
-    for task in dict.fromkeys([*TASKS, *rows["task"]]):
+    printed = {(*(c[k] for k in KEYS), c["model"]): c for c in report.published.to_dict("records")}
+    rows = headline(report.scores)
+    lines = {row["task"]: (index, row) for index, row in zip(rows.index, rows.to_dict("records"), strict=True)}
+    for task in dict.fromkeys([*TASKS, *lines]):
         title = task_title(task).removesuffix(f" ({task})")
-        for index, row in zip(rows.index, rows.to_dict("records"), strict=True):
-            if row["task"] == task:
-                models = printed[printed["task"].eq(task) & printed["measure"].eq(row["measure"])].to_dict("records")
-                yield Line(
-                    task,
-                    title,
-                    f"{report.name}/scores.csv:{index + 2}",
-                    measured(row),
-                    f"{row['right']:g} of {row['n']:g} right",
-                    *(share(row[name]) for name in ("accuracy", "low", "high", "chance")),
-                    {cell["model"]: (f"{cell['value']:.1f} (n {cell['n']:.0f})", cell["value"]) for cell in models},
-                )
-                break
-        else:
+        if task not in lines:
             yield Line(task, title)
-
-
-def _full(rows: pd.DataFrame) -> pd.DataFrame:
-    """Those of the full system."""
-    for axis, value in FULL.items():
-        rows = rows[rows[axis].eq(value)]
-    return rows
+            continue
+        index, row = lines[task]
+        cells = {model: printed.get((*(row[k] for k in KEYS), model)) for model in MODELS}
+        yield Line(
+            task,
+            title,
+            f"{report.name}/scores.csv:{index + 2}",
+            measured(row),
+            f"{row['right']:g} of {row['n']:g} right",
+            share(row["accuracy"]),
+            share(row["low"]),
+            share(row["high"]),
+            share(row["chance"]),
+            {m: (f"{c['value']:.1f}", f"n {c['n']:.0f}", c["value"]) for m, c in cells.items() if c},
+        )
 
 
 def _effects(report: Report) -> tuple[dict[str, list[Line]], float]:
@@ -176,10 +189,11 @@ def _effects(report: Report) -> tuple[dict[str, list[Line]], float]:
     points = span(100 * rows[["difference", "low", "high"]].abs().max(axis=None)) if len(rows) else 0.0
     groups: dict[str, list[Line]] = {}
     for index, row in zip(rows.index, rows.to_dict("records"), strict=True):
-        ends = (share(0.5 + 50 * row[name] / points) for name in ("difference", "low", "high"))
+        value, low, high = (share(0.5 + 50 * row[name] / points) for name in ("difference", "low", "high"))
         source = f"{report.name}/effects.csv:{index + 2}"
-        line = Line(row["task"], task_title(row["task"]), source, difference(row), number(row["p_holm"], 3), *ends)
-        groups.setdefault(f"{row['part']}: {row['change']}", []).append(line)
+        p = number(row["p_holm"], 3)
+        line = Line(row["task"], task_title(row["task"]), source, difference(row), p, value, low, high)
+        groups.setdefault(f"{PARTS.get(row['part'], row['part'])}: {row['change']}", []).append(line)
     return groups, points
 
 
@@ -188,32 +202,54 @@ def _tables(report: Report, unfold: bool, gaps: list[Gap]) -> Iterator[Block]:
     for table in TABLES:
         frame = table.build(report.scores, report.effects, report.published)
         if frame.empty:
-            gaps.append((report.name, table.title, f"no row of its {table.source}.csv belongs there: nothing such was run"))
+            gaps.append(
+                (report.name, table.title, f"no row of its {table.source}.csv belongs there: nothing such was run")
+            )
             continue
         file = f"{report.name}/{table.source}.csv"
-        lines = [f"{file}:{index + 2}" for index in table.select(report.scores, report.effects).index]
-        html = draw_table(frame, table.title, lines)
+        html = draw_table(frame, table.title, file)
         yield Block(f"{report.name}-{table.key}", table.title, table.caption, html, file, unfold and not table.folded)
+
+
+def _dataset(report: Report) -> Iterator[Block]:
+    """The paper's tables about its data set."""
+    for title, frame in dataset_tables(report.folder, report.provenance["dataset"]).items():
+        file = f"{report.name}/{'audit' if 'Measured' in frame else 'dataset'}.csv"
+        yield Block(
+            f"{report.name}-{title.partition(':')[0].partition(',')[0].replace(' ', '-')}",
+            title,
+            "",
+            draw_table(frame, title, file),
+            file,
+        )
 
 
 def _audit(report: Report) -> Iterator[Block]:
     """The audit's findings, counted by check; what needs attention first."""
     audit = read_frame(report.folder / "audit.csv", AUDIT)
     if len(audit):
-        file, counts = f"{report.name}/audit.csv", audit["severity"].value_counts().sort_index()
-        groups = audit.groupby(["severity", "check"]).agg(n=("item", "size"), item=("item", "first"), said=("measured", "first"))
-        groups = groups.reset_index().sort_values(["severity", "n"], ascending=[False, False], kind="stable")
-        groups = groups.sort_values("severity", key=lambda s: s.map({"error": 0, "warning": 1, "info": 2}), kind="stable")
+        file, counts = f"{report.name}/audit.csv", audit["severity"].value_counts()
+        groups = [
+            (RANK.get(severity, 3), -len(rows), check, severity, rows.iloc[0])
+            for (severity, check), rows in audit.groupby(["severity", "check"])
+        ]
         shown = pd.DataFrame(
             {
-                "Severity": groups["severity"],
-                "Check": groups["check"],
-                "Findings": groups["n"].astype(str),
-                "The first of them": groups["item"] + ": " + groups["said"].astype(str),
+                "Severity": severity,
+                "Check": check,
+                "Findings": str(-n),
+                "The first of them": f"{first['item']}: {first['measured']}",
             }
+            for _, n, check, severity, first in sorted(groups, key=lambda g: g[:3])
         )
-        caption = f"{', '.join(f'{count} {name}' for name, count in counts.items())}; counted by check."
-        yield Block(f"{report.name}-audit", "Data audit", caption, draw_table(shown, "Data audit", [file] * len(shown)), file)
+        caption = ", ".join(f"{counts[name]} {name}" for name in sorted(counts.index, key=lambda s: RANK.get(s, 3)))
+        yield Block(
+            f"{report.name}-audit",
+            "Data audit",
+            f"{caption}; counted by check.",
+            draw_table(shown, "Data audit", file, at_lines=False),
+            file,
+        )
 
 
 def _speed(folder: Path, gaps: list[Gap]) -> Iterator[dict[str, Any]]:
@@ -224,14 +260,14 @@ def _speed(folder: Path, gaps: list[Gap]) -> Iterator[dict[str, Any]]:
     rows["front"] = rows["front"].astype(str).eq("True")
     for question, group in rows.groupby("question", sort=False):
         shown = group.drop(columns="question").dropna(axis="columns", how="all").map(_said)
-        shown.columns = [_label(name) for name in shown]
-        lines = [f"speed_error.csv:{index + 2}" for index in group.index]
+        shown.columns = [name.replace("_", " ").capitalize() for name in shown]
         yield {
             "question": question,
-            "measures": sorted({*group.get("unit", pd.Series(dtype=str)).dropna(), *group.get("error_of", pd.Series(dtype=str)).dropna()}),
+            "costs": "; ".join(group["unit"].dropna().unique()),
+            "errors": "; ".join(group["error_of"].dropna().unique()),
             "points": place_points(group),
             "front": group[group["front"]].sort_values("cost_ratio").map(_said).to_dict("records"),
-            "html": draw_table(shown, str(question), lines),
+            "html": draw_table(shown, str(question), "speed_error.csv"),
         }
 
 
@@ -243,38 +279,20 @@ def _stability(folder: Path, gaps: list[Gap]) -> dict[str, Any]:
         return {"cases": 0}
     failed = rows[rows["verdict"].ne("pass")]
     groups = rows.assign(passed=rows["verdict"].eq("pass")).groupby(["part", "format"])["passed"]
-    cells = (groups.sum().astype(str) + " of " + groups.size().astype(str)).unstack(fill_value="")
+    cells = (groups.sum().astype(str) + "/" + groups.size().astype(str)).unstack(fill_value="")
     cells.insert(0, "Part", cells.index)
     return {
         "cases": len(rows),
         "failed": len(failed),
-        "failures": draw_table(failed.map(_said), "Failed", [f"stability.csv:{i + 2}" for i in failed.index]) if len(failed) else "",
-        "table": draw_table(cells, "Cases that passed, by part and number format", ["stability.csv"] * len(cells)),
+        "failures": draw_table(failed.map(_said), "Cases that failed", "stability.csv") if len(failed) else "",
+        "table": draw_table(cells, "Cases that passed, by part and number format", "stability.csv", at_lines=False),
     }
 
 
-def _facts(provenance: dict[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
-    """Names and values; of what holds further names, each its own."""
-    for name, value in provenance.items():
-        if isinstance(value, dict) and any(isinstance(inner, dict) for inner in value.values()):
-            yield from _facts(value, f"{_label(name)}, ")
-        elif value not in ("", [], {}):
-            yield f"{above}{_label(name) if not above else _label(name).lower()}", _said(value)
-
-
 def _said(value: Any) -> str:
-    """A value in words: four digits of a fraction, the beginning of a hash, nothing for what is missing."""
-    if isinstance(value, dict):
-        return ", ".join(f"{_label(k).lower()} {_said(v)}" for k, v in value.items() if v not in ("", False))
-    if isinstance(value, list):
-        return ", ".join(map(_said, value))
+    """A cell of a CSV in words: four digits of a fraction, nothing for what is missing."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
         return "" if pd.isna(value) else f"{value:,.4g}"
-    text = f"{value:,}" if isinstance(value, int) else str(value)
-    return f"{text[:12]}…" if re.fullmatch(r"[0-9a-f]{40,}", text) else text
-
-
-def _label(name: str) -> str:
-    return name.replace("_", " ").capitalize()
+    return str(value)

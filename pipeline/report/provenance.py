@@ -17,6 +17,7 @@ import yaml
 
 from pipeline.config import EncoderConfig, Params
 from pipeline.errors import UserError
+from pipeline.evaluation.intervals import coverage_note
 from pipeline.params import PARAMS_FILE
 from pipeline.records import Assignment, Part, Video
 from pipeline.videos.catalogue import Catalogue
@@ -27,13 +28,18 @@ PACKAGES = ("torch", "transformers", "peft", "open_clip_torch", "scipy", "scikit
 UNKNOWN = "unknown"
 ABOUT = "about.yaml"
 """Beside the folders of weights, where people wrote down what the models were taught."""
-NOTES = Path("reports/notes.yaml")
+NOTES = Path(__file__).with_name("notes.yaml")
 """What only people know about a report: whether its settings were chosen on its test objects before."""
 ARCHITECTURES = {"llama": "Llama", "mistral": "Mistral", "qwen2": "Qwen2", "gpt_neox": "GPT-NeoX"}
 
 
 def provenance(
-    params: Params, catalogue: Catalogue, videos: Sequence[Video], assignments: Sequence[Assignment], root: Path
+    params: Params,
+    catalogue: Catalogue,
+    videos: Sequence[Video],
+    assignments: Sequence[Assignment],
+    asked: Sequence[tuple[str, ...]],
+    root: Path,
 ) -> dict[str, Any]:
     """The content of provenance.json, for the report of `root` as it stands.
 
@@ -41,6 +47,7 @@ def provenance(
         catalogue: for the data set's name and its properties.
         videos: all that decode; their hashes are hashed.
         assignments: for the test objects.
+        asked: the objects of each question, for what is known of the intervals.
     """
     rows = "\n".join(video.model_dump_json() for video in videos)
     test = [a for a in assignments if a.part is Part.TEST]
@@ -56,7 +63,8 @@ def provenance(
         "test_videos": len(test),
         "videos": len(videos),
         "seeds": list(params.ablation.seeds),
-        "settings": notes(root).get(params.report_name, ""),
+        "settings": notes().get(params.report_name, ""),
+        "intervals": coverage_note(asked),
         "facts_told": params.questions.facts,
         "command": "dvc repro",
         "commit": commit,
@@ -128,9 +136,9 @@ def digest(folder: Path) -> str:
     return total.hexdigest() if files else UNKNOWN
 
 
-def notes(root: Path) -> dict[str, str]:
-    """What people wrote about reports, by the report's name."""
-    return (yaml.safe_load((root / NOTES).read_text(encoding="utf-8")) or {}) if (root / NOTES).is_file() else {}
+def notes() -> dict[str, str]:
+    """What people wrote about reports in notes.yaml, by the report's name."""
+    return yaml.safe_load(NOTES.read_text(encoding="utf-8")) or {}
 
 
 def _kind(folder: Path) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.report.load import KEYS, Report
+from pipeline.report.load import KEYS, Report, cells
 from pipeline.report.tables import TABLES, headline, measured, number, task_title
 
 MOST_LINES = 150
@@ -39,7 +39,7 @@ def render_readme(report: Report, figures: Sequence[str]) -> str:
     sections = [
         f"# {report.name}: what was measured\n",
         *([SMOKE] if said["scale"] == "smoke" else []),
-        " ".join(finding(report)) + "\n",
+        "\n\n".join(finding(report)) + "\n",
         five_tasks(report),
         *([f"{OTHER_MODELS}\n"] if len(report.published) else []),
         *_pictures(figures),
@@ -57,30 +57,37 @@ def render_readme(report: Report, figures: Sequence[str]) -> str:
         elif len(shown):
             elsewhere.append(table.title)
     more = f"On the page [index.html](../index.html): {'; '.join(elsewhere)}.\n" if elsewhere else ""
-    files = ("scores.csv", "effects.csv", "dataset.csv", "audit.csv", "samples.json")
+    files = (path.name for pattern in ("*.csv", "samples.json") for path in sorted(report.folder.glob(pattern)))
     links = ", ".join(f"[{name}]({name})" for name in files)
     return "\n".join([*sections, f"## More\n\n{more}All figures: {links}."]) + "\n"
 
 
 def finding(report: Report) -> list[str]:
-    """A few sentences: who answered about what, how far from chance, whether touch is used, what parts bring."""
-    return [*_who(report), *_against_chance(headline(report.scores)), *_touch(report.effects), *_parts(report.effects)]
+    """Three paragraphs: what made the figures; how far from chance; whether touch is used and what parts bring."""
+    chance, rest = _against_chance(headline(report.scores)), [*_touch(report.effects), *_parts(report.effects)]
+    return [" ".join(sentences) for sentences in (_who(report), chance, rest)]
 
 
 def five_tasks(report: Report) -> str:
     """The table of the first screen: a row a task, the full system."""
     rows = headline(report.scores)
     models = [m for m in ("7b", "13b") if len(report.published)]
-    cells = {(*(c[k] for k in KEYS), c["model"]): c for c in report.published.to_dict("records")}
+    printed = cells(report.published)
+    size = report.provenance["base_models"]["language"]["parameters"]
     shown: dict[str, list[str]] = {
         "Task": [task_title(task) for task in rows["task"]],
-        "Measured % [95 %]": [f"**{measured(row)}**" for row in rows.to_dict("records")],
+        f"Measured here ({size_words(size)} model) % [95 %]": [
+            f"**{measured(row)}**" for row in rows.to_dict("records")
+        ],
         "n": [number(n, 0) for n in rows["n"]],
+        "Unread %": [number(row["unread"] / row["n"], scale=100) for row in rows.to_dict("records")],
         "Chance %": [number(chance, scale=100) for chance in rows["chance"]],
     }
     for model in models:
-        found = [cells.get((*(row[k] for k in KEYS), model)) for row in rows.to_dict("records")]
-        shown[f"Published {model} % (n)"] = [f"{c['value']:.2f} ({c['n']:.0f})" if c else "" for c in found]
+        found = [printed.get((*(row[k] for k in KEYS), model)) for row in rows.to_dict("records")]
+        shown[f"Published (Vicuna {model}) % (n)"] = [
+            f"{cell[0]:.2f} ({cell[1]:.0f})" if cell else "" for cell in found
+        ]
     return markdown(pd.DataFrame(shown)) if len(rows) else "No answer of the full system was graded.\n"
 
 
@@ -94,9 +101,9 @@ def stands_on(said: dict[str, Any]) -> list[str]:
         f"**Tactile encoder:** {said['encoder']}. Base encoder of the ablation: {model_words(encoder)}.",
         f"**Test objects:** {len(objects)}{named}, {said['test_videos']} videos, split `{said['split']}`.",
         f"**Seeds:** {len(said['seeds'])} ({', '.join(map(str, said['seeds']))}).",
-        f"**Chosen on these objects before?** {said['settings'] or 'Nothing is noted in reports/notes.yaml.'}",
-        "**Intervals** are Wilson's with the effective number of questions, since questions share objects; they cover "
-        "about 90 %, not 95, for questions about three of seven objects.",
+        f"**Chosen on these objects before?** {said['settings'] or 'Nothing is noted in pipeline/report/notes.yaml.'}",
+        "**Intervals** are Wilson's with the effective number of questions, since questions share objects. "
+        + said["intervals"],
     ]
     if said["facts_told"]:
         facts.append(
@@ -128,7 +135,7 @@ def model_words(model: dict[str, Any]) -> str:
 def size_words(parameters: int) -> str:
     """A number of parameters in words, such as "2.1 M-parameter"."""
     if not parameters:
-        return "model of unknown size, a"
+        return "model of unknown size:"
     value, unit = next(
         (parameters / u, name) for u, name in ((1e9, "B"), (1e6, "M"), (1e3, "k"), (1, "")) if parameters >= u
     )
@@ -144,19 +151,17 @@ def markdown(frame: pd.DataFrame) -> str:
 def _who(report: Report) -> list[str]:
     said = report.provenance
     language = said["base_models"]["language"]
-    by = f"A {size_words(language['parameters'])} {language['kind']}"
-    by += f", {language['taught']}," if language["taught"] else ""
-    by += " and not the paper's Vicuna" if language["parameters"] < VICUNA else ""
-    by += ", so that LoRA and OPD are near-null by construction," if language["known_templates"] else ""
-    source = {"scenes": "synthetic videos", "videos": "real videos"}.get(said["source"], "videos")
-    about = f"about {source} of {_count(len(said['test_objects']), 'test object')}"
+    maker = f"A {size_words(language['parameters'])} {language['kind']}"
+    maker += f", {language['taught']}," if language["taught"] else ""
+    maker += " made these figures"
+    maker += " in place of the paper's Vicuna" if language["parameters"] < VICUNA else ""
+    maker += ": LoRA and OPD are near-null by construction" if language["known_templates"] else ""
     clip = said["base_models"]["encoder"]
     encoder = said["encoder"].replace("the base CLIP", f"a {size_words(clip['parameters'])} {clip['kind']}")
-    reused = [said["settings"]] if said["settings"] else []
-    return [
-        f"{by} answered {about} under {_count(len(said['seeds']), 'seed')}; its tactile encoder was {encoder}.",
-        *reused,
-    ]
+    source = {"scenes": "synthetic", "videos": "real"}.get(said["source"], "")
+    objects, seeds = _count(len(said["test_objects"]), "test object"), _count(len(said["seeds"]), "seed")
+    about = f"Its tactile encoder was {encoder}; it answered about {source} videos of {objects}, under {seeds}."
+    return [f"{maker}.", about, *([said["settings"]] if said["settings"] else [])]
 
 
 def _against_chance(rows: pd.DataFrame) -> list[str]:
@@ -171,7 +176,8 @@ def _against_chance(rows: pd.DataFrame) -> list[str]:
         f"{kind} {row['task']} with {measured(row.to_dict())} % (chance {number(row['chance'], scale=100)})"
         for kind, row in (("best in", best), ("worst in", worst))
     )
-    text = f"Its interval lies above chance in {len(above)} of {_count(len(rows), 'task')}{named}"
+    tasks = f"{len(above)} of {_count(len(rows), 'task')}{named}"
+    text = f"The full system's interval lies above chance in {tasks}"
     text += f" and below it in {', '.join(below['task'])}" if len(below) else ""
     return [f"{text}: it is {extremes}." if len(rows) > 1 else f"{text}."]
 
@@ -180,13 +186,22 @@ def _touch(effects: pd.DataFrame) -> list[str]:
     rows = effects[effects["part"] == "touch"]
     if not len(rows):
         return ["Whether answers depend on touch was not tested."]
-    shown = rows[(rows["p_holm"] < ALPHA) & (rows["difference"] > 0)]
+    others = [change.partition(" - ")[2] for change in dict.fromkeys(rows["change"])]
     span = f"{100 * rows['difference'].min():+.1f} to {100 * rows['difference'].max():+.1f} points"
-    changes = " or ".join(change.replace(" - ", " minus ") for change in dict.fromkeys(rows["change"]))
-    if not len(shown):
-        return [f"That answers use touch is not shown: {changes} touch is {span} by task, nowhere significant (Holm)."]
-    tasks = ", ".join(dict.fromkeys(shown["task"]))
-    return [f"Answers use touch in {tasks}: {changes} touch is {span} by task."]
+    fact = f"real minus {' or '.join(others)} touch is {span} by task"
+    sure, likely = rows[(rows["p_holm"] < ALPHA) & (rows["difference"] > 0)], rows[rows["low"] > 0]
+    if len(sure):
+        return [f"Answers use touch in {', '.join(dict.fromkeys(sure['task']))}: {fact}."]
+    if len(likely):
+        some = f"the interval lies above 0 in {len(likely)} of {len(rows)} comparisons, significant (Holm) is none"
+        return [f"Answers seem to use touch: {fact}; {some}{_impossible(effects)}."]
+    return [f"That answers use touch is not shown: {fact}, nowhere significant (Holm){_impossible(effects)}."]
+
+
+def _impossible(effects: pd.DataFrame) -> str:
+    """Whether so few objects could show anything at all: a sign flip's p is at least 2 / 2**objects."""
+    objects = int(effects["objects"].max())
+    return f", as {objects} objects never can be" if len(effects) * 2.0 ** (1 - objects) >= ALPHA else ""
 
 
 def _parts(effects: pd.DataFrame) -> list[str]:
@@ -199,7 +214,9 @@ def _parts(effects: pd.DataFrame) -> list[str]:
         return [f"Of {len(rows)} effects of encoder, LoRA and OPD these hold up (Holm): {words} points."]
     smallest = rows["smallest_effect"].min()
     found = f"; the smallest that this design could have found is {100 * smallest:.0f} points" if smallest <= 1 else ""
-    return [f"None of {len(rows)} effects of encoder, LoRA and OPD is significant (Holm){found}."]
+    return [
+        f"None of {len(rows)} effects of encoder, LoRA and OPD is significant (Holm){_impossible(effects) or found}."
+    ]
 
 
 def _pictures(figures: Sequence[str]) -> list[str]:

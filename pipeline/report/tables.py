@@ -11,7 +11,7 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.report.load import ALL_SEEDS, CROSS_VALIDATION, HEADS, KEYS, VALIDATION_HEADS
+from pipeline.report.load import ALL_SEEDS, CROSS_VALIDATION, HEADS, KEYS, VALIDATION_HEADS, cells
 from pipeline.tasks import TASKS
 
 Select = Callable[[pd.DataFrame], "pd.Series[bool]"]
@@ -54,13 +54,14 @@ class Table:
             published: likewise; joined by (task, measure, encoder, lora, opd), in columns of their own.
         """
         rows = self.select(scores, effects)
+        records = rows.to_dict("records")
         shown: dict[str, list[str]] = {}
         for name in self.columns:
             if name == "published":
                 shown |= _beside(rows, published)
             else:
                 heading, cell = COLUMNS[name]
-                shown[heading] = [cell(row) for row in rows.to_dict("records")]
+                shown[heading] = [cell(row) for row in records]
         return pd.DataFrame(shown, index=rows.index, dtype=object)
 
 
@@ -126,7 +127,7 @@ COLUMNS: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
     "measured": ("Measured % [95 %]", measured),
     "n": ("n", _count("n")),
     "chance": ("Chance %", lambda row: number(row["chance"], scale=100)),
-    "unread": ("Unread %", lambda row: number(row["unread"] / row["n"] if row["n"] else float("nan"), scale=100)),
+    "unread": ("Unread %", lambda row: number(row["unread"] / row["n"], scale=100)),
     "part": ("Part", _text("part")),
     "change": ("Change", _text("change")),
     "difference": ("Difference, points [95 %]", difference),
@@ -153,14 +154,11 @@ def _ordered(frame: pd.DataFrame) -> pd.DataFrame:
 
 def _beside(rows: pd.DataFrame, published: pd.DataFrame) -> dict[str, list[str]]:
     """The published cells of these rows, a column a model that has any."""
-    columns, keys = {}, list(zip(*(rows[k] for k in KEYS), strict=True))
+    printed, columns = cells(published), {}
     for model in PUBLISHED_MODELS:
-        cells = published[published["model"] == model]
-        printed = zip(zip(*(cells[k] for k in KEYS), strict=True), cells["value"], cells["n"], strict=True)
-        values = {key: f"{value:.2f} ({n:.0f})" for key, value, n in printed}
-        found = [values.get(key, "") for key in keys]
+        found = [printed.get((*key, model)) for key in zip(*(rows[k] for k in KEYS), strict=True)]
         if any(found):
-            columns[f"Published {model} % (n)"] = found
+            columns[f"Published {model} % (n)"] = [f"{cell[0]:.2f} ({cell[1]:.0f})" if cell else "" for cell in found]
     return columns
 
 
@@ -176,39 +174,30 @@ def whole(frame: pd.DataFrame) -> pd.Series[bool]:
 
 
 def _differs(frame: pd.DataFrame, *axes: str) -> pd.Series[bool]:
-    """Variants that are the full system but for these axes; on OPD only with or without."""
-    same = pd.Series(True, index=frame.index)
+    """Variants that are the full system but for these axes; OPD as needed is in none of the paper's tables."""
+    same = frame["opd"] != "needed"
     for axis, value in FULL.items():
-        same &= (
-            frame[axis].isin(["all", "none"] if axis == "opd" else [value, *SYSTEM_WORDS])
-            if axis in axes
-            else (frame[axis] == value)
-        )
+        same &= (frame[axis] == value) | (axis in axes)
     return same
 
 
-def _untrained(frame: pd.DataFrame) -> pd.Series[bool]:
-    return frame["task"].isin([name for name, task in TASKS.items() if not task.trained])
+def _variants(*axes: str, described: bool | None = None, trained: bool | None = None) -> Select:
+    """Answers of variants that differ in these axes; only descriptions, or only tasks that were trained, or not."""
+
+    def select(frame: pd.DataFrame) -> pd.Series[bool]:
+        rows = answers(frame) & _differs(frame, *axes)
+        if described is not None:
+            rows &= (frame["measure"] != CHOICE) == described
+        if trained is not None:
+            never = [name for name, task in TASKS.items() if not task.trained]
+            rows &= ~frame["task"].isin(never) == trained
+        return rows
+
+    return select
 
 
-def _understanding(*axes: str) -> Select:
-    return lambda f: answers(f) & (f["measure"] == CHOICE) & ~_untrained(f) & _differs(f, *axes)
-
-
-def _reasoning(*axes: str) -> Select:
-    return lambda f: answers(f) & (f["measure"] == CHOICE) & _untrained(f) & _differs(f, *axes)
-
-
-def _choices(*axes: str) -> Select:
-    return lambda f: answers(f) & (f["measure"] == CHOICE) & _differs(f, *axes)
-
-
-def _description(*axes: str) -> Select:
-    return lambda f: answers(f) & (f["measure"] != CHOICE) & _differs(f, *axes)
-
-
-def _over_seeds(f: pd.DataFrame, task: str) -> pd.Series[bool]:
-    return (f["task"] == task) & (f["seed"] == ALL_SEEDS)
+def _over_seeds(*tasks: str) -> Select:
+    return lambda frame: frame["task"].isin(tasks) & (frame["seed"] == ALL_SEEDS)
 
 
 PAPER = ("task", "system", "measured", "n", "chance", "unread", "published")
@@ -219,7 +208,7 @@ TABLES: tuple[Table, ...] = (
         "understanding",
         "Physical understanding",
         "Questions about what was touched, with descriptions before the conclusion (OPD) and without.",
-        _understanding("opd"),
+        _variants("opd", described=False, trained=True),
         PAPER,
         folded=False,
     ),
@@ -227,7 +216,7 @@ TABLES: tuple[Table, ...] = (
         "reasoning",
         "Scenario reasoning",
         "Which of two objects fits a scenario: asked of every system, never trained.",
-        _reasoning("opd"),
+        _variants("opd", described=False, trained=False),
         PAPER,
         folded=False,
     ),
@@ -235,41 +224,27 @@ TABLES: tuple[Table, ...] = (
         "description",
         "Object property description",
         "Describing one object, as a language model's answer and by the encoder's property heads on the same videos.",
-        lambda f: _description()(f) | _over_seeds(f, HEADS),
+        lambda f: _variants(described=True)(f) | _over_seeds(HEADS)(f),
         PROPERTIES,
         folded=False,
     ),
-    Table(
-        "encoder_properties",
-        "Ablation of the encoder: property description",
-        "The tactile encoder fine-tuned on properties, or as it was before.",
-        _description("encoder"),
-        PROPERTIES,
-        folded=False,
-    ),
-    Table(
-        "encoder_understanding",
-        "Ablation of the encoder: understanding and reasoning",
-        "The tactile encoder fine-tuned on properties, or as it was before.",
-        _choices("encoder"),
-        PAPER,
-        folded=False,
-    ),
-    Table(
-        "lora_properties",
-        "Ablation of LoRA: property description",
-        "With end-to-end fine-tuning of the language model, or after alignment alone.",
-        _description("lora"),
-        PROPERTIES,
-        folded=False,
-    ),
-    Table(
-        "lora_understanding",
-        "Ablation of LoRA: understanding and reasoning",
-        "With end-to-end fine-tuning of the language model, or after alignment alone.",
-        _choices("lora"),
-        PAPER,
-        folded=False,
+    *(
+        Table(
+            f"{axis}_{kind}",
+            f"Ablation of {name}: {title}",
+            caption,
+            _variants(axis, described=kind == "properties"),
+            columns,
+            folded=False,
+        )
+        for axis, name, caption in (
+            ("encoder", "the encoder", "The tactile encoder fine-tuned on properties, or as it was before."),
+            ("lora", "LoRA", "With end-to-end fine-tuning of the language model, or after alignment alone."),
+        )
+        for kind, title, columns in (
+            ("properties", "property description", PROPERTIES),
+            ("understanding", "understanding and reasoning", PAPER),
+        )
     ),
     Table(
         "effects",
@@ -293,12 +268,7 @@ TABLES: tuple[Table, ...] = (
         "touch",
         "Input ablations",
         "The full system with its touch, and with another object's (swapped), none (removed) or noise.",
-        lambda f: (
-            (f["seed"] == ALL_SEEDS)
-            & ~f["task"].isin(NOT_ANSWERED)
-            & f["measure"].isin([CHOICE, COMBINED])
-            & _differs(f)
-        ),
+        lambda f: ~f["task"].isin(NOT_ANSWERED) & (f["seed"] == ALL_SEEDS) & whole(f) & _differs(f),
         ("task", "touch", "measured", "n", "chance", "unread"),
     ),
     Table(
@@ -312,7 +282,7 @@ TABLES: tuple[Table, ...] = (
         "heads",
         "Property heads of the tactile encoder",
         "What the encoder's heads say of test and validation videos, without a language model.",
-        lambda f: _over_seeds(f, HEADS) | _over_seeds(f, VALIDATION_HEADS),
+        _over_seeds(HEADS, VALIDATION_HEADS),
         ("task", "measure", "encoder", "measured", "n", "chance", "published"),
     ),
     Table(
@@ -320,7 +290,7 @@ TABLES: tuple[Table, ...] = (
         "Encoders and baselines over all objects",
         "Grouped cross-validation: a model judges only videos of objects that it never saw. With few test objects this "
         "is the main evidence about encoders.",
-        lambda f: _over_seeds(f, CROSS_VALIDATION),
+        _over_seeds(CROSS_VALIDATION),
         ("measure", "system", "measured", "n", "chance"),
     ),
 )

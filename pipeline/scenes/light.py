@@ -79,12 +79,12 @@ class Sensor:
     """One sensor; planes are height x width in float32 and one a channel: blue, green, red."""
 
     glow: npt.NDArray[np.float32]
-    """Height x width x BGR: the background without marks, in 8-bit steps."""
+    """Height x width x BGR: the background without dust, in 8-bit steps."""
     direct: tuple[Plane, ...]
     """What the lights add to flat skin, in 8-bit steps."""
     gains: tuple[tuple[Plane, Plane], ...]
     """For slopes in x and y, in 8-bit steps."""
-    marks: npt.NDArray[np.float32]
+    dust: npt.NDArray[np.float32]
     """Height x width x 3 equal channels: the light that dust on the gel lets through, 0 to 1."""
     noise: npt.NDArray[np.float32]
     """A larger field of noise that frames are cut from, in 8-bit steps."""
@@ -92,7 +92,7 @@ class Sensor:
     @property
     def background(self) -> npt.NDArray[np.float32]:
         """Flat skin without noise: height x width x BGR, in 8-bit steps."""
-        return self.glow * self.marks
+        return self.glow * self.dust
 
 
 @lru_cache(maxsize=4)
@@ -126,7 +126,7 @@ def shade(skin: Heights, sensor: Sensor, pitch: float, seed: int, drift: Drift |
         sensor: Of the same size.
         pitch: In mm a pixel.
         seed: Which noise this frame has.
-        drift: Moves the marks on the gel; lights, camera and slopes stay where they are.
+        drift: Moves the dust on the gel; lights, camera and slopes stay where they are.
     """
     height, width = skin.shape
     slope_x = cv2.Sobel(skin, cv2.CV_32F, 1, 0, scale=1 / (8 * pitch), borderType=cv2.BORDER_REPLICATE)
@@ -144,7 +144,7 @@ def shade(skin: Heights, sensor: Sensor, pitch: float, seed: int, drift: Drift |
         changes.append(light)
     picture = cv2.merge(changes)
     picture += sensor.glow
-    picture *= sensor.marks if drift is None else _moved(sensor.marks, drift, pitch)
+    picture *= sensor.dust if drift is None else _moved(sensor.dust, drift, pitch)
     top, left = seed % (height // 2 + 1), (seed >> 20) % (width // 2 + 1)
     picture += sensor.noise[top : top + height, left : left + width]
     image: Image = cv2.convertScaleAbs(np.maximum(picture, 0, out=picture))
@@ -169,23 +169,23 @@ def _dust(
     x: npt.NDArray[np.float64], y: npt.NDArray[np.float64], width: int, rng: np.random.Generator
 ) -> npt.NDArray[np.float32]:
     """Small dark grains, round or longish, each with its own place, size, direction and darkness."""
-    marks = np.ones_like(x)
+    dust = np.ones_like(x)
     half = 9.3  # Half the view's width in mm; grains are small, so the other view's need not be told apart.
     for _ in range(SPECKS):
         u, v = (x - rng.uniform(-1, 1)) * half, (y - rng.uniform(-1, 1)) * half * 0.75
         turn, size, longer = rng.uniform(0, np.pi), rng.uniform(*SPECK_MM), rng.choice((1.0, 1.0, 3.0))
         along, across = u * np.cos(turn) + v * np.sin(turn), v * np.cos(turn) - u * np.sin(turn)
         size = max(size, 0.5 * 2 * half / width)  # No smaller than what the grid can carry.
-        marks *= 1 - rng.uniform(0.1, 0.35) * np.exp(-((along / longer) ** 2 + across**2) / (2 * size**2))
-    return np.repeat(marks[..., None].astype(np.float32), 3, axis=-1)
+        dust *= 1 - rng.uniform(0.1, 0.35) * np.exp(-((along / longer) ** 2 + across**2) / (2 * size**2))
+    return np.repeat(dust[..., None].astype(np.float32), 3, axis=-1)
 
 
-def _moved(marks: npt.NDArray[np.float32], drift: Drift, pitch: float) -> npt.NDArray[np.float32]:
-    """The marks where the paint has carried them; drift is smooth, so where it came from has moved about as far."""
-    height, width = marks.shape[:2]
+def _moved(dust: npt.NDArray[np.float32], drift: Drift, pitch: float) -> npt.NDArray[np.float32]:
+    """The dust where the paint has carried them; drift is smooth, so where it came from has moved about as far."""
+    height, width = dust.shape[:2]
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     from_x, from_y = x - drift[0] / np.float32(pitch), y - drift[1] / np.float32(pitch)
     moved: npt.NDArray[np.float32] = cv2.remap(
-        marks, from_x, from_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(1, 1, 1)
+        dust, from_x, from_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(1, 1, 1)
     )
     return moved

@@ -1,9 +1,9 @@
 """What the hand does: rest, press, twist under force, let go, as in the public videos.
 
-The figures below were measured on the videos of the development split's 53 training objects, from the course of each
-video's contact (`pipeline.videos.frames.reference.strength` against the first frames, over what is left once the object is
-gone). A video's contact grows about as the force does: for a ball the sum of |slope| over the contact goes as a^3 / R,
-which is F / E* by Hertz. So the course of the contact stands for the course of the force; its height in N is unknown.
+The figures below were measured on the videos of the development split's 53 training objects, from each video's contact
+strength over time (`pipeline.videos.frames.reference.contact_strength` against the first frames, over what remains
+once the object is gone). A video's contact strength grows about as the force does: for a ball the sum of |slope| over
+the contact goes as a^3 / R, which is F / E* by Hertz. So it stands for the force over time; the force in N is unknown.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ RELEASED = (0.554, 0.592, 0.648, 0.712, 0.760, 0.829, 0.856)
 FALL = (0.008, 0.008, 0.020, 0.032, 0.061, 0.100, 0.181)
 """From .45 of the peak to .12."""
 KEPT = (0.635, 0.660, 0.724, 0.783, 0.849, 0.920, 0.953)
-"""What is left of the peak in the last third before letting go: a twisting hand presses less."""
+"""What remains of the peak in the last third before letting go: a twisting hand presses less."""
 TWIST_DEGREES = (2.5, 9.5, 18.5, 53.6, 78.8, 95.2, 101.9)
-"""How far the object turns, from matching high-pass differences of neighbouring moments (Evangelidis and Psarakis 2008,
+"""How far the object turns, from matching high-pass differences of neighbouring frames (Evangelidis and Psarakis 2008,
 ECC); over the 34 of 106 strongly textured videos in which every step matched with a correlation over .8."""
 CLOCKWISE = 0.76
 """Share of these turns that go clockwise in the picture, where y points down."""
@@ -48,8 +48,8 @@ REACH_MM = 5.0
 """No object's centre ever lies further from the picture's centre, in x or in y."""
 LINGER = 0.03
 """Share of the videos that end in contact."""
-LEFT = (0.1, 0.6)
-"""What of the force is left in these. Seen in too few videos for quantiles."""
+REMAINING = (0.1, 0.6)
+"""Share of the force that remains in these. Seen in too few videos for quantiles."""
 TREMOR_MM = 0.15
 """Deviation of the random walk that the object's place has made by the end, at any frame rate. Not measured."""
 
@@ -76,18 +76,17 @@ def make_motion(frames: int, rng: np.random.Generator) -> Motion:
     """A hand's motion over a video of two frames or more, at any frame rate: times are shares of the video."""
     # Even a video of two frames has one in its very middle, while the object is held.
     time = np.arange(frames) / (2 * (frames // 2))
-    rise, fall = _draw(RISE, rng) / (_moment(0.9) - _moment(0.1)), _draw(FALL, rng)
-    touch = max(0.05, _draw(TOUCHED, rng) - _moment(0.1) * rise)
+    rise, fall = _draw(RISE, rng) / (_ramp_inverse(0.9) - _ramp_inverse(0.1)), _draw(FALL, rng)
+    touch = max(0.05, _draw(TOUCHED, rng) - _ramp_inverse(0.1) * rise)
     hold = min(touch + rise, 0.49)
     kept = _draw(KEPT, rng)
     # From .45 to .12 of the peak, and .3 of it, as shares of what was kept until then.
-    fall /= _moment(1 - 0.12 / kept) - _moment(1 - 0.45 / kept)
-    release = max(0.5, _draw(RELEASED, rng) - _moment(1 - 0.3 / kept) * fall)
-    left = rng.uniform(*LEFT) if rng.random() < LINGER else 0.0
+    fall /= _ramp_inverse(1 - 0.12 / kept) - _ramp_inverse(1 - 0.45 / kept)
+    release = max(0.5, _draw(RELEASED, rng) - _ramp_inverse(1 - 0.3 / kept) * fall)
+    remaining = rng.uniform(*REMAINING) if rng.random() < LINGER else 0.0
     twisted = np.clip((time - hold) / (release - hold), 0, 1)
-    course = (
-        _ramp(time, touch, hold) * (1 - (1 - kept) * twisted) * (1 - (1 - left) * _ramp(time, release, release + fall))
-    )
+    released = 1 - (1 - remaining) * _ramp(time, release, release + fall)
+    profile = _ramp(time, touch, hold) * (1 - (1 - kept) * twisted) * released
     force, start = rng.uniform(*FORCE_N), rng.uniform(0, 360)
     turn = _draw(TWIST_DEGREES, rng) * (-1 if rng.random() < CLOCKWISE else 1)
     heading, travel = rng.uniform(0, 2 * np.pi), _draw(TRAVEL_MM, rng)
@@ -97,7 +96,7 @@ def make_motion(frames: int, rng: np.random.Generator) -> Motion:
         places.append(
             np.clip(rng.normal(mean, deviation) + travel * part * (twisted - 0.5) + walk, -REACH_MM, REACH_MM)
         )
-    return Motion(force * course, start + turn * twisted, *places)
+    return Motion(force * profile, start + turn * twisted, *places)
 
 
 def _draw(quantiles: Sequence[float], rng: np.random.Generator) -> float:
@@ -111,6 +110,6 @@ def _ramp(time: Track, start: float, stop: float) -> Track:
     return s * s * (3 - 2 * s)
 
 
-def _moment(share: float) -> float:
+def _ramp_inverse(share: float) -> float:
     """The s from 0 to 1 at which a ramp reaches `share`: the inverse of 3 s^2 - 2 s^3."""
     return 0.5 - float(np.sin(np.arcsin(1 - 2 * share) / 3))

@@ -62,7 +62,7 @@ class Rough(Layer):
 
 
 class Creases(Layer):
-    """A crumpled sheet: facets between folds; a height below 0 makes the facets cushions.
+    """Crumpled paper: facets between folds; a height below 0 makes the facets cushions.
 
     height (1 - (sqrt(g^2 + fold^2) - fold) / 2), where g is a Gaussian field of one wavelength and variance 1.
 

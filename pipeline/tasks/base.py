@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from pipeline.records import Dialogue, Gold, Opd, Part, Prediction, Question, Score, Turn
 from pipeline.videos.catalogue import Catalogue, Property
-from pipeline.videos.wording import mentioned, plain
+from pipeline.videos.catalogue.wording import mentioned, plain
 
 LETTERS = "abc"
 ORDINALS = ("First", "Second")
@@ -79,6 +79,25 @@ def draw_videos(pool: Pool, objects: Sequence[str], rng: random.Random) -> tuple
     return tuple(rng.choice(list(pool.videos[o])) for o in objects)
 
 
+def draft_single_turn(
+    pool: Pool,
+    objects: Sequence[str],
+    rng: random.Random,
+    *,
+    user: Mapping[Opd, str],
+    answer: Mapping[Opd, str],
+    choice: str,
+    properties: Sequence[str],
+) -> Draft:
+    """A question of one turn about these objects, one dialogue for each OPD mode that `user` names."""
+    return Draft(
+        videos=draw_videos(pool, objects, rng),
+        objects=tuple(objects),
+        dialogues=tuple(Dialogue(opd=m, turns=(Turn(user=user[m], assistant=answer[m]),)) for m in Opd if m in user),
+        gold=gold(pool, objects, choice, properties),
+    )
+
+
 def gold(pool: Pool, objects: Sequence[str], choice: str, properties: Sequence[str]) -> Gold:
     """The structured answer about these objects."""
     return Gold(choice=choice, labels=tuple(map(pool.catalogue.labels, objects)), properties=tuple(properties))
@@ -99,9 +118,13 @@ def descriptions(
     return " ".join(texts)
 
 
-def single_turn(user: Mapping[Opd, str], assistant: Mapping[Opd, str]) -> tuple[Dialogue, ...]:
-    """One-turn dialogues, one for each OPD mode that both mappings name."""
-    return tuple(Dialogue(opd=m, turns=(Turn(user=user[m], assistant=assistant[m]),)) for m in Opd if m in user)
+def concluded(
+    catalogue: Catalogue, objects: Sequence[str], prefixes: Sequence[str], verdict: str, only: Sequence[str] = ()
+) -> dict[Opd, str]:
+    """The answer in every OPD mode: descriptions of all objects, then the verdict; `needed` describes `only` these."""
+    described = {Opd.NEEDED: descriptions(catalogue, objects, prefixes, only)}
+    described[Opd.ALL] = descriptions(catalogue, objects, prefixes)
+    return {Opd.NONE: verdict, **{mode: f"{text} Conclusion: {verdict}" for mode, text in described.items()}}
 
 
 def lettered(count: int) -> str:

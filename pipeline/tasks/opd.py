@@ -7,9 +7,9 @@ import random
 import re
 
 from pipeline.records import Opd, Prediction, Question, Score
-from pipeline.tasks.base import Draft, Pool, TaskDefinition, draw_videos, find_level, gold, single_turn
+from pipeline.tasks.base import Draft, Pool, TaskDefinition, draft_single_turn, find_level
 from pipeline.videos.catalogue import Catalogue
-from pipeline.videos.wording import OPENING
+from pipeline.videos.catalogue.wording import OPENING
 
 TEMPLATES = ("Describe the physical properties of {tactile}.", "How does this tactile video {tactile} feel?")
 
@@ -31,11 +31,14 @@ class ObjectPropertyDescription(TaskDefinition):
             return None
         user, answer = rng.choice(TEMPLATES), pool.catalogue.describe(object_id)
         modes = (Opd.NEEDED, Opd.ALL)
-        return Draft(
-            videos=draw_videos(pool, [object_id], rng),
-            objects=(object_id,),
-            dialogues=single_turn(dict.fromkeys(modes, user), dict.fromkeys(modes, answer)),
-            gold=gold(pool, [object_id], "", pool.catalogue.property_names),
+        return draft_single_turn(
+            pool,
+            [object_id],
+            rng,
+            user=dict.fromkeys(modes, user),
+            answer=dict.fromkeys(modes, answer),
+            choice="",
+            properties=pool.catalogue.property_names,
         )
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:

@@ -12,11 +12,9 @@ from pipeline.tasks.base import (
     Pool,
     TaskDefinition,
     choice_score,
+    concluded,
     conclusion,
-    descriptions,
-    draw_videos,
-    gold,
-    single_turn,
+    draft_single_turn,
 )
 from pipeline.videos.catalogue import Catalogue
 
@@ -60,17 +58,8 @@ class PropertyComparison(TaskDefinition):
             Opd.NEEDED: f"{ask} Describe the {prop.spoken} of both objects before answering.",
             Opd.ALL: f"{ask} Describe both objects before answering.",
         }
-        answer = {
-            Opd.NONE: verdict,
-            Opd.NEEDED: f"{descriptions(pool.catalogue, objects, prefixes, [prop.name])} Conclusion: {verdict}",
-            Opd.ALL: f"{descriptions(pool.catalogue, objects, prefixes)} Conclusion: {verdict}",
-        }
-        return Draft(
-            videos=draw_videos(pool, objects, rng),
-            objects=tuple(objects),
-            dialogues=single_turn(user, answer),
-            gold=gold(pool, objects, choice, [prop.name]),
-        )
+        answer = concluded(pool.catalogue, objects, prefixes, verdict, [prop.name])
+        return draft_single_turn(pool, objects, rng, user=user, answer=answer, choice=choice, properties=[prop.name])
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         """Read from how the conclusion begins: "Yes", "No" or "Both"; "yes and no" is none of them."""

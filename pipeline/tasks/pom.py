@@ -15,12 +15,10 @@ from pipeline.tasks.base import (
     Pool,
     TaskDefinition,
     choice_score,
+    concluded,
     conclusion,
-    descriptions,
-    draw_videos,
-    gold,
+    draft_single_turn,
     lettered,
-    single_turn,
 )
 from pipeline.videos.catalogue import Catalogue
 
@@ -66,20 +64,16 @@ class PropertyObjectMatching(TaskDefinition):
         request = REQUEST.format(options=listed)
         names = [f"{letter}) is {catalogue.objects[o].name}" for letter, o in zip(LETTERS, objects, strict=True)]
         verdict = f"{names[0]}, {names[1]} and {names[2]}."
-        described = f"{descriptions(catalogue, objects, [f'{x})' for x in LETTERS])} Conclusion: {verdict}"
         asked = f"{opening} Describe the object in each video, then m{request}"
         # Every property may tell the objects apart, so `needed` is `all`.
         user = {Opd.NONE: f"{opening} M{request}", Opd.NEEDED: asked, Opd.ALL: asked}
-        answer = {Opd.NONE: verdict, Opd.NEEDED: described, Opd.ALL: described}
-        return Draft(
-            videos=draw_videos(pool, objects, rng),
-            objects=tuple(objects),
-            dialogues=single_turn(user, answer),
-            gold=gold(pool, objects, order, catalogue.property_names),
+        answer = concluded(catalogue, objects, [f"{x})" for x in LETTERS], verdict)
+        return draft_single_turn(
+            pool, objects, rng, user=user, answer=answer, choice=order, properties=catalogue.property_names
         )
 
     def with_facts(self, draft: Draft, catalogue: Catalogue, rng: random.Random) -> Draft:
-        """The same question after the facts about its objects; what is left to find out is which video is of which."""
+        """The same question after the facts about its objects; touch and reasoning remain to be asked for."""
         told = facts(catalogue, draft.objects, rng)
 
         def begin(dialogue: Dialogue) -> Dialogue:

@@ -12,12 +12,10 @@ from pipeline.tasks.base import (
     Pool,
     TaskDefinition,
     choice_score,
+    concluded,
     conclusion,
-    descriptions,
-    draw_videos,
-    gold,
+    draft_single_turn,
     lettered,
-    single_turn,
 )
 from pipeline.videos.catalogue import Catalogue
 
@@ -59,16 +57,9 @@ class PropertySuperlativeSelection(TaskDefinition):
             Opd.NEEDED: f"{opening} Describe the {prop.spoken} of each object and then {request}",
             Opd.ALL: f"{opening} Describe each object and then {request}",
         }
-        answer = {
-            Opd.NONE: verdict,
-            Opd.NEEDED: f"{descriptions(pool.catalogue, objects, prefixes, [prop.name])} Conclusion: {verdict}",
-            Opd.ALL: f"{descriptions(pool.catalogue, objects, prefixes)} Conclusion: {verdict}",
-        }
-        return Draft(
-            videos=draw_videos(pool, objects, rng),
-            objects=tuple(objects),
-            dialogues=single_turn(user, answer),
-            gold=gold(pool, objects, LETTERS[position], [prop.name]),
+        answer = concluded(pool.catalogue, objects, prefixes, verdict, [prop.name])
+        return draft_single_turn(
+            pool, objects, rng, user=user, answer=answer, choice=LETTERS[position], properties=[prop.name]
         )
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:

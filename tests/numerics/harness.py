@@ -45,7 +45,7 @@ class Format(StrEnum):
 
     @property
     def device(self) -> str:
-        """Where it is tried: float16 on CUDA alone, since the CPU is slow in it and the pipeline never uses it there."""
+        """Where it is tried: float16 on CUDA alone, as the CPU is slow in it and the pipeline never uses it there."""
         return "cuda" if self is Format.FLOAT16 else "cpu"
 
 
@@ -69,10 +69,10 @@ class Row:
     case: str
     format: str
     finite: bool
-    error: float | None
+    error: str
     """Largest distance to the exact result over the largest exact number, or over 1 where all are 0; two digits."""
-    bound: float | None
-    """What the error may be; None where there is nothing to compare with, so that finiteness alone is judged."""
+    bound: str
+    """What the error may be; empty where there is nothing to compare with, so that finiteness alone is judged."""
     verdict: str
 
 
@@ -99,7 +99,7 @@ class Check:
             case: Its name, different from all others of the part.
             compute: The result in a format, of any shape.
             bound: How far the result may be off; see `Row`.
-            exact: The result from another computation, in float64 or better, of the same shape.
+            exact: The result from another computation, in float64 or better, of the same shape or a single number.
         """
         assert not any((r.part, r.case, r.format) == (self.part, case, fmt.value) for r in self.rows), f"{case}: twice"
         found, limit, error = self._floats(compute, fmt), None, None
@@ -109,13 +109,14 @@ class Check:
             limit = bound(fmt) if callable(bound) else bound
             if exact is None and case not in self.float64:
                 self.float64[case] = self._floats(compute, FLOAT64)
-            wanted = self.float64[case] if exact is None else np.atleast_1d(np.asarray(exact, np.float64))
+            wanted = self.float64[case] if exact is None else np.asarray(exact, np.float64)
+            wanted = wanted if wanted.ndim else np.full(found.shape, wanted)
             assert found.shape == wanted.shape, case
             if np.isfinite(found).all():
                 error = float(np.abs(found - wanted).max(initial=0)) / (float(np.abs(wanted).max(initial=0)) or 1)
         finite = bool(np.isfinite(found).all())
         right = finite and (error is None or limit is None or error <= limit)
-        digits = [None if x is None else float(f"{x:.1e}") for x in (error, limit)]
+        digits = ["" if x is None else f"{x:.1e}" if x else "0" for x in (error, limit)]
         self.rows.append(Row(self.part, case, fmt.value, finite, *digits, "pass" if right else "fail"))
         assert right, f"{case} in {fmt}: error {error}, at most {limit}" if finite else f"{case} in {fmt}: not finite"
 

@@ -14,10 +14,10 @@ import pytest
 from pipeline.config import FramesConfig
 from pipeline.scenes.film import write_film
 from pipeline.videos.decoding import Decoder, brightness
-from pipeline.videos.frames.probing import run_pass
-from pipeline.videos.frames.reference import strength
+from pipeline.videos.frames.reference import contact_strength
 from pipeline.videos.frames.selection import difference
 from pipeline.videos.frames.subtraction import GAIN, MIDDLE, RING, subtract
+from pipeline.videos.frames.video_pass import run_pass
 from tests.numerics.bounds import summing
 from tests.numerics.harness import FLOAT64, UINT8, Check, Floats
 
@@ -62,16 +62,16 @@ VIDEOS = {
 def test_pictures_are_compared_without_wrapping_around(check: Check, name: str) -> None:
     """Salience and subtraction are exact.
 
-    The strength of contact: roundings of means of whole numbers in a double, differences of numbers up to 255; where
+    The contact strength: roundings of means of whole numbers in a double, differences of numbers up to 255; where
     these are 0, the error is absolute.
     """
     one, other = PAIRS[name]
     change = one.astype(np.float64) - other
     check(f"salience: {name}", UINT8, lambda _: difference(one[..., 0], other[..., 0]), 0, abs(change[..., 0]).sum())
     check(
-        f"strength of contact: {name}",
+        f"contact strength: {name}",
         UINT8,
-        lambda _: strength(one, other),
+        lambda _: contact_strength(one, other),
         255 * summing(HEIGHT * WIDTH * 3, FLOAT64),
         abs(change).mean() - abs(change.mean(axis=(0, 1))).mean(),
     )

@@ -212,7 +212,7 @@ def lambert(size: float) -> Floats:
         for direct, (across, along) in zip(SENSOR.direct, SENSOR.gains, strict=True)
     ]
     noise = SENSOR.noise[: slopes.shape[0], : slopes.shape[1]]
-    return np.clip((np.stack(lit, axis=-1) + SENSOR.glow) * SENSOR.marks + noise, 0, 255)
+    return np.clip((np.stack(lit, axis=-1) + SENSOR.glow) * SENSOR.dust + noise, 0, 255)
 
 
 @pytest.mark.parametrize("size", STEEP)

@@ -80,5 +80,5 @@ def test_lengths_are_drawn_as_recorded() -> None:
 
 @given(st.floats(0, 1))
 def test_a_ramp_and_its_inverse(share: float) -> None:
-    moment = motion._moment(share)
-    assert motion._ramp(np.array([moment]), 0.0, 1.0)[0] == pytest.approx(share, abs=1e-9)
+    time = motion._ramp_inverse(share)
+    assert motion._ramp(np.array([time]), 0.0, 1.0)[0] == pytest.approx(share, abs=1e-9)

@@ -83,12 +83,12 @@ def test_refinement_is_about_second_order() -> None:
 
 def test_energies_agree() -> None:
     """Half of pressure times sink, plus nothing else, is the work of the force: the integral of F d(approach)."""
-    side, pitch = 64, 0.1
+    side, pitch = 48, 0.13
     x, y = grid(side, pitch)
     gap = ball(side, pitch) + 0.02 * (1 - np.cos(2 * np.pi * x / 1.3) * np.cos(2 * np.pi * y / 1.3))
     gap -= gap.min()
     kernel = make_kernel(layer_table((side, side), pitch, Gel(modulus=MODULUS, thickness=1.5)), gap)
-    forces = 2.0 * np.linspace(0, 1, 81)[1:] ** 2
+    forces = 2.0 * np.linspace(0, 1, 61)[1:] ** 2
     found = solve(gap, forces, kernel, pitch, tolerance=1e-9)
     stored = 0.5 * float((found.pressure[-1] * kernel.sink(found.pressure)[-1]).sum()) * pitch**2
     work = np.trapezoid(np.concatenate([[0], forces]), np.concatenate([[0], found.approach]))
@@ -153,27 +153,12 @@ def test_more_force_means_more_approach_and_area() -> None:
     assert all(a <= b for a, b in itertools.pairwise(areas))
 
 
-
-
 def test_flat_on_flat() -> None:
     """Even displacement: the pressure is least in the middle and highest at the edge, and carries the force."""
     side, pitch = 32, 0.2
     found = solve(np.zeros((side, side)), 2.0, half_space(side, pitch), pitch)
     p = found.pressure[0]
     assert p[0, 0] > p[0, side // 2] > p[side // 2, side // 2] > 0
-
-
-def test_a_needle_touches_in_one_pixel() -> None:
-    found = needle(Dtype.FLOAT64)
-    assert np.count_nonzero(found.pressure) == 1
-    assert found.converged.all()
-
-
-def test_contact_over_the_whole_field() -> None:
-    side, pitch = 32, 0.2
-    gap = ball(side, pitch, 500.0)
-    found = solve(gap, 1e3, half_space(side, pitch), pitch, tolerance=1e-8)
-    assert (found.pressure > 0).all()
 
 
 def test_torch_gives_what_numpy_gives() -> None:
@@ -195,17 +180,6 @@ def test_stopping_early_is_said_with_the_residual() -> None:
     assert found.converged.tolist() == [True, False]
     assert found.residual[1] > 1e-9
     assert back(found.pressure)[1].sum() * pitch**2 == pytest.approx(3.0)
-
-
-def test_a_good_start_saves_work() -> None:
-    side, pitch = 64, 0.1
-    gap = ball(side, pitch)
-    kernel = half_space(side, pitch)
-    cold = solve(gap, 1.0, kernel, pitch, tolerance=1e-8)
-    warm = solve(gap, 1.0, kernel, pitch, tolerance=1e-8, start=cold.pressure)
-    assert warm.iterations[0] < cold.iterations[0] / 2
-    nothing = solve(gap, 1.0, kernel, pitch, tolerance=1e-8, start=np.zeros_like(cold.pressure))
-    np.testing.assert_allclose(nothing.pressure, cold.pressure)
 
 
 @pytest.mark.parametrize("force", [-1.0, float("nan"), float("inf")])

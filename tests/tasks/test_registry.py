@@ -13,7 +13,7 @@ from pipeline.evaluation.grading import grade
 from pipeline.io import read_jsonl, write_jsonl
 from pipeline.records import Opd, Part, Prediction, Question, Score
 from pipeline.tasks import TASKS
-from pipeline.tasks.base import Draft, Pool, TaskDefinition, choice_score, draw_videos, gold, single_turn
+from pipeline.tasks.base import Draft, Pool, TaskDefinition, choice_score, draft_single_turn
 from pipeline.tasks.questions import build_questions, counts_by_task
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from tests.conftest import ROOT
@@ -37,11 +37,9 @@ class Hardest(TaskDefinition):
         if choice != ("no", "yes")[stratum]:
             return None
         user = {Opd.NONE: "Is {tactile} hard?"}
-        return Draft(
-            videos=draw_videos(pool, [object_id], rng),
-            objects=(object_id,),
-            dialogues=single_turn(user, {Opd.NONE: choice}),
-            gold=gold(pool, [object_id], choice, ["hardness"]),
+        answer = {Opd.NONE: choice}
+        return draft_single_turn(
+            pool, [object_id], rng, user=user, answer=answer, choice=choice, properties=["hardness"]
         )
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:

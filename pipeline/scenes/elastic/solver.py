@@ -3,7 +3,7 @@
 Polonsky & Keer 1999, Wear 231: minimise the elastic energy over all pressures that are nowhere negative and add up to
 the force. Directions are preconditioned by the kernel's periodic inverse, as short waves of the gap ask for much more
 pressure than long ones (Bugnicourt et al. 2018, Tribol. Int. 121). Many contacts are solved at once; those that are
-finished drop out. The residual is the share of the work that is left undone, sum p (g - min g) / sum p u with the gap
+finished drop out. The residual is the share of the work that is not done yet, sum p (g - min g) / sum p u with the gap
 g and the sink u: it bounds how far the energy is from its minimum (the duality gap of the quadratic programme), and is
 0 where p g = 0 and g >= 0 everywhere.
 """
@@ -36,7 +36,7 @@ class Solution:
     approach: Values
     """How far the bodies come together after first touch, in mm."""
     residual: Values
-    """Share of the work that is left undone."""
+    """Share of the work that is not done yet."""
     iterations: npt.NDArray[np.int64]
     converged: npt.NDArray[np.bool_]
 
@@ -49,7 +49,6 @@ def solve(
     *,
     tolerance: float = 1e-5,
     iterations: int = ITERATIONS,
-    start: Array | None = None,
 ) -> Solution:
     """Press bodies with forces; warns (`NotConverged`) where the residual stays above the tolerance.
 
@@ -60,7 +59,6 @@ def solve(
         pitch: In mm a pixel.
         tolerance: Of the residual, an energy: errors of pressures are about its root.
         iterations: At most.
-        start: Pressures to start from, of the solution's shape (their scale does not matter); even by default.
 
     Raises:
         ValueError: for a force that is negative or not finite, or a gap that is not finite.
@@ -80,19 +78,18 @@ def solve(
     steps = np.zeros(len(loads), dtype=np.int64)
 
     active = np.flatnonzero(loads > 0)
-    first = xp.ones_like(pressure) if start is None else xp.clip(start, 0, None)
-    work = _Contacts(_to_mean_one(first[active]), xp.broadcast_to(gap, shape)[active] / scale[active])
+    work = _Contacts(xp.ones_like(pressure[active]), xp.broadcast_to(gap, shape)[active] / scale[active])
     for step in range(1, iterations + 1):
         if not len(active):
             break
-        work.look(kernel)
-        left = back(work.residual)[:, 0, 0]
-        done = ~(left > tolerance) | (step == iterations)
+        work.measure(kernel)
+        undone = back(work.residual)[:, 0, 0]
+        done = ~(undone > tolerance) | (step == iterations)
         if done.any():
             out = active[done]
             pressure[out] = work.p[done] * scale[out]
             approach[out] = back(work.approach)[done, 0, 0] * mean[out]
-            residual[out], steps[out] = left[done], step
+            residual[out], steps[out] = undone[done], step
             active = active[~done]
             work.keep(np.flatnonzero(~done))
         if len(active):
@@ -120,7 +117,7 @@ class _Contacts:
         self.g_old = self.xp.ones_like(p[:, :1, :1])
         """Gap times direction before; infinite after the contact has grown, so that the direction starts afresh."""
 
-    def look(self, kernel: Kernel) -> None:
+    def measure(self, kernel: Kernel) -> None:
         """Gaps, approach and residual of the pressures as they are."""
         xp = self.xp
         u = kernel.sink(self.p)

@@ -32,7 +32,7 @@ LEARNT_FROM = (Part.TRAIN, Part.VALIDATION)
 
 @dataclass(frozen=True)
 class Evidence:
-    """What is known of the videos; `parts` is empty where no split was asked for."""
+    """What was measured of the videos; `parts` is empty where no split was asked for."""
 
     probes: Sequence[Probe]
     videos: Sequence[Video]
@@ -225,10 +225,10 @@ def _shares(name: str, place: int, objects: set[str], catalogue: Catalogue) -> s
 def _untouched_predictions(found: Evidence, names: Sequence[str], catalogue: Catalogue, seed: int) -> Iterator[Finding]:
     """Whether the untouched sensor, or the session alone, tells the property of an object never seen."""
     objects = [p.object_id for p in found.probes]
-    known = sorted(set(names))
+    distinct = sorted(set(names))
     inputs = {
         "no-contact reference": np.array([p.thumbnail for p in found.probes]),
-        "session": np.eye(len(known))[[known.index(n) for n in names]],
+        "session": np.eye(len(distinct))[[distinct.index(n) for n in names]],
     }
     for place, prop in enumerate(catalogue.properties):
         labels = [catalogue.labels(o)[place] for o in objects]

@@ -118,10 +118,10 @@ def thin(kept: Sequence[Kept], tolerance: float, noise: float) -> list[Kept]:
     Starts from the strongest contact and adds, one at a time, the frame that differs most from all that were taken
     (farthest point first, Gonzalez 1985), until that difference, less what noise alone makes between two frames, is
     below `tolerance` times the strongest contact over noise: what is left looks like something that is there already.
-    Where nothing touches, a single frame is left.
+    Where nothing touches, a single frame remains.
 
     Args:
-        kept: frames with their thumbnails and strengths of contact as scores.
+        kept: frames with their thumbnails and contact strengths as scores.
         noise: the strength of a frame that nothing touches. Two such frames differ by sqrt(2) times that.
     """
     strongest = max(kept, key=lambda k: (k.score, -k.index))

@@ -40,8 +40,8 @@ class FrameStore:
         if reference == "subtract":
             self.references = np.load(folder / REFERENCES_FILE, mmap_mode="r")
         self._place = {video_id: place for place, video_id in enumerate(self._rows)}
-        known = len(self._place) if self.references is None else len(self.references)
-        if len(self.index) != len(self.pixels) or len(self._place) != known:
+        expected = len(self._place) if self.references is None else len(self.references)
+        if len(self.index) != len(self.pixels) or len(self._place) != expected:
             raise UserError(f"{folder}: {TABLE_FILE} and its pictures differ in length; run `dvc repro extract_frames`")
 
     def share_reference(self, video_ids: Sequence[str]) -> None:

@@ -107,8 +107,8 @@ def run_pass(
     """Decode a video once.
 
     Args:
-        promised: how many frames it has, where that is known better than from its header.
-        given: its reference, where that is known already; otherwise it comes from the first frames.
+        promised: how many frames it has, where the header is not to be trusted.
+        given: its no-contact reference; None takes it from the first frames.
     """
     with Decoder(path) as decoder:
         found = VideoPass(decoder.header, reference=given)

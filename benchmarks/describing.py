@@ -1,0 +1,51 @@
+"""How much to describe before concluding: what the full system's answers cost, and what they got wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from statistics import fmean
+
+from benchmarks.errors import Error, error_of, reported
+from benchmarks.table import Row, make_rows
+from pipeline.io import read_table
+from pipeline.params import load_params
+from pipeline.records import Graded
+
+DESCRIBED = ("PC", "PSS", "POM")
+"""Tasks that can be answered without describing, over which errors are averaged."""
+
+
+def describing(root: Path) -> list[Row]:
+    """Tokens that the full system generates against its errors, means over `DESCRIBED`, under each OPD.
+
+    Errors are the report's, tokens those of the answers that it is made of. The interval's ends are means of the tasks'
+    ends: as wide as if all tasks erred together.
+    """
+    graded, report = root / "data" / "graded.parquet", root / "reports" / load_params(root / "params.yaml").report_name
+    full = {"encoder": "finetuned", "lora": "with", "touch": "real"}
+    scores = reported(root / "reports", **full, measure="choice", seed="all").get(report, [])
+    if not graded.is_file():
+        return []
+    answers = [a for a in read_table(graded, Graded) if (a.encoder, a.lora, a.touch) == tuple(full.values())]
+    costs: dict[str, list[float]] = {}
+    errors = {}
+    for opd in ("all", "needed", "none"):
+        own = [error_of(row) for row in scores if row.opd == opd and row.task in DESCRIBED]
+        tokens = [a.tokens for a in answers if a.opd == opd and a.task in DESCRIBED]
+        if len(own) == len(DESCRIBED) and tokens:
+            lows, highs = ([e for e in ends if e is not None] for ends in ([x.low for x in own], [x.high for x in own]))
+            whole = len(lows) == len(highs) == len(own)
+            low, high = (fmean(lows), fmean(highs)) if whole else (None, None)
+            errors[opd] = Error(fmean(e.value for e in own), low, high, sum(e.n or 0 for e in own))
+            costs[opd] = [fmean(tokens)]
+    if len(costs) < 2 or "all" not in costs:
+        return []
+    return make_rows(
+        "describing",
+        costs,
+        unit="tokens an answer",
+        baseline="all",
+        errors=errors,
+        error_of=f"error of the full system, mean over {', '.join(DESCRIBED)}",
+        counts={opd: {"tokens": own[0]} for opd, own in costs.items()},
+    )

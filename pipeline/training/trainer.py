@@ -1,0 +1,229 @@
+"""What both trainings share: the Trainer, its arguments, checkpoints that survive a kill, and the recorded curve."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from torch.utils.data import Sampler
+from transformers import PrinterCallback, Trainer, TrainerCallback, TrainerControl, TrainerState, TrainingArguments
+from transformers.trainer_utils import get_last_checkpoint
+
+from pipeline.config import RuntimeConfig
+from pipeline.errors import UserError
+from pipeline.records import Measurement
+from pipeline.runtime import CHECKPOINTS, LogLines
+from pipeline.training.sampling import EpochDataset
+from pipeline.training.trainable import trainable_state
+
+LOWEST = 0.01
+"""Share of the rate at the bottom of a wave."""
+
+
+class TrainableTrainer(Trainer):
+    """A Trainer whose checkpoints hold only what is trained, and whose parts may learn at rates of their own.
+
+    The frozen base would otherwise be written again with each checkpoint (13 GB for Vicuna-7b).
+
+    Args:
+        rates: Learning rate of the parameters under each name.
+        wave: Updates after which the rate has fallen to a hundredth, to rise again in as many, for ever: the published
+            code gives its cosine the length of one epoch. By default one cosine spans the training.
+        sampler: The order of the training set, where it is not simply random.
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        rates: Mapping[str, float] | None = None,
+        wave: int | None = None,
+        sampler: Sampler[int] | None = None,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(*args, **kwargs)
+        self.remove_callback(PrinterCallback)
+        self._rates = rates
+        self._wave = wave
+        self._sampler = sampler
+        if isinstance(self.train_dataset, EpochDataset):
+            # The state's epoch has a fraction for the steps within one.
+            self.train_dataset.follow(lambda: int(self.state.epoch or 0))
+        self.optimizer: torch.optim.Optimizer | None
+
+    def _get_train_sampler(self, train_dataset: Any = None) -> Sampler[int] | None:
+        return self._sampler or cast("Sampler[int] | None", super()._get_train_sampler(train_dataset))
+
+    def create_optimizer(self, model: torch.nn.Module | None = None) -> torch.optim.Optimizer:
+        """AdamW with one group a prefix of `rates`, or the Trainer's own without."""
+        if self._rates is None:
+            return cast(torch.optim.Optimizer, super().create_optimizer(model))
+        if self.optimizer is None:
+            # By name, not by identity: distributed wrappers replace the parameters and prefix their names.
+            trained = [(n, p) for n, p in (model or self.model).named_parameters() if p.requires_grad]
+            groups = [
+                {"params": [p for n, p in trained if f".{prefix}." in f".{n}"], "lr": rate}
+                for prefix, rate in self._rates.items()
+            ]
+            self.optimizer = torch.optim.AdamW(groups, weight_decay=self.args.weight_decay)
+        return self.optimizer
+
+    def create_scheduler(
+        self, num_training_steps: int, optimizer: torch.optim.Optimizer | None = None
+    ) -> torch.optim.lr_scheduler.LRScheduler:
+        """The Trainer's own, or the wave."""
+        wave, stepped = self._wave, optimizer or self.optimizer
+        if wave is None or stepped is None:
+            return cast(torch.optim.lr_scheduler.LRScheduler, super().create_scheduler(num_training_steps, optimizer))
+
+        def rate(step: int) -> float:
+            return LOWEST + (1 - LOWEST) * (1 + math.cos(math.pi * step / wave)) / 2
+
+        self.lr_scheduler = torch.optim.lr_scheduler.LambdaLR(stepped, rate)
+        return self.lr_scheduler
+
+    def _save(self, output_dir: str | None = None, state_dict: dict[str, Any] | None = None) -> None:
+        trained = trainable_state(self.accelerator.unwrap_model(self.model))
+        if state_dict is not None:
+            # Gathered by the distributed backend: take the gathered values.
+            trained = {name: state_dict[name] for name in trained}
+        check_finite(trained, self.state.global_step)
+        super()._save(output_dir, {name: value.contiguous() for name, value in trained.items()})
+
+    def _issue_warnings_after_load(self, load_result: Any) -> None:
+        # The frozen base is missing in each checkpoint by design; only what the model does not know is a mistake.
+        if load_result.unexpected_keys:
+            raise UserError(
+                f"{self.args.output_dir}: its checkpoint has {load_result.unexpected_keys[0]}, which the model lacks; "
+                "delete the folder and run again"
+            )
+
+
+def _diverged(what: str, step: int) -> UserError:
+    return UserError(
+        f"{what} at step {step}: the training diverged; lower the learning rate (earlier checkpoints are kept)"
+    )
+
+
+def check_finite(state: Mapping[str, torch.Tensor], step: int) -> None:
+    """Raise UserError where a trained parameter is not finite."""
+    broken = next((name for name, value in state.items() if not value.isfinite().all()), None)
+    if broken:
+        raise _diverged(f"{broken} is not finite", step)
+
+
+LOSSES = ("loss", "grad_norm", "validation_loss")
+
+
+class TrainingMonitor(TrainerCallback):
+    """Says in a log file how far a training is, and stops it where the loss is no number any more."""
+
+    def __init__(self) -> None:
+        self._lines: LogLines | None = None
+
+    def on_log(
+        self,
+        args: TrainingArguments,
+        state: TrainerState,
+        control: TrainerControl,
+        logs: dict[str, float] | None = None,
+        **_: Any,
+    ) -> None:
+        """Called by the Trainer after each logging step.
+
+        Raises:
+            UserError: where a loss or the gradient's norm is not finite.
+        """
+        values = measured(logs or {})
+        bad = [name for name in LOSSES if not math.isfinite(values.get(name, 0.0))]
+        if bad:
+            raise _diverged(f"{bad[0]} is {values[bad[0]]}", state.global_step)
+        # At a terminal the Trainer has a bar of its own.
+        if state.is_world_process_zero and args.disable_tqdm and "loss" in values:
+            self._lines = self._lines or LogLines("training", state.max_steps, "step", after=state.global_step)
+            self._lines.reached(state.global_step, f"loss {values['loss']:.3f}")
+
+
+def checkpoint_dir(stage: str, fingerprint: str) -> Path:
+    """Where a training keeps its checkpoints, outside DVC's reach (DVC deletes a killed stage's outputs)."""
+    return CHECKPOINTS / stage / fingerprint
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What a training leaves: its curve, and the trained parameters by name, whole even where they were sharded."""
+
+    history: list[Measurement]
+    state: dict[str, torch.Tensor]
+
+
+def training_arguments(folder: Path, runtime: RuntimeConfig, seed: int, **own: Any) -> TrainingArguments:
+    """What all trainings share: AdamW, a cosine, checkpoints every `runtime.save_steps`; `own` adds and overrides."""
+    shared: dict[str, Any] = {
+        "output_dir": str(folder),
+        "seed": seed,
+        "optim": "adamw_torch",
+        "lr_scheduler_type": "cosine",
+        "save_strategy": "steps" if runtime.save_steps else "no",
+        "save_steps": runtime.save_steps or 500,
+        "save_total_limit": 1,
+        "label_names": ["labels"],
+        "logging_nan_inf_filter": False,
+        "remove_unused_columns": False,
+        "dataloader_pin_memory": False,
+        "report_to": "none",
+        # A bar is for a person at a terminal; a log file gets a line now and then.
+        "disable_tqdm": not sys.stderr.isatty(),
+        "use_cpu": runtime.device == "cpu",
+    }
+    arguments = TrainingArguments(**shared | own)
+    if arguments.device.type == "cuda":
+        # One process must not spread over several GPUs; that is accelerate's task, one process a GPU.
+        arguments._n_gpu = 1
+    return arguments
+
+
+def train(trainer: Trainer) -> Trained:
+    """Train to the end, from the last checkpoint where there is one, and tidy up."""
+    folder = Path(str(trainer.args.output_dir))
+    _drop_unfinished(folder)
+    last = get_last_checkpoint(str(folder)) if folder.is_dir() else None
+    trainer.train(resume_from_checkpoint=last)
+    history = [
+        Measurement(step=entry["step"], name=name, value=value)
+        for entry in trainer.state.log_history
+        # A state that was read back has its names in order, one that was not has them as they were logged.
+        for name, value in sorted(measured(entry).items())
+    ]
+    whole = trainer.accelerator.get_state_dict(trainer.model_wrapped)
+    names = trainable_state(trainer.accelerator.unwrap_model(trainer.model))
+    state = {name: whole[name] for name in names if name in whole}
+    check_finite(state, trainer.state.global_step)
+    if trainer.is_world_process_zero():
+        shutil.rmtree(folder, ignore_errors=True)
+    return Trained(history, state)
+
+
+def _drop_unfinished(folder: Path) -> None:
+    """Remove checkpoints that were being written when their process died: the Trainer writes its state last."""
+    for checkpoint in folder.glob("checkpoint-*"):
+        if not (checkpoint / "trainer_state.json").is_file():
+            shutil.rmtree(checkpoint)
+
+
+def measured(entry: Mapping[str, object]) -> dict[str, float]:
+    """What of a log entry is a figure of the training: not its bookkeeping, nor wall-clock times."""
+    names = {name: "validation_loss" if name == "eval_loss" else name.removeprefix("eval_") for name in entry}
+    return {
+        names[name]: float(value)
+        for name, value in entry.items()
+        if isinstance(value, (int, float)) and name not in BOOKKEEPING and not name.endswith(("_runtime", "_second"))
+    }
+
+
+BOOKKEEPING = {"step", "epoch", "total_flos", "train_loss"}

@@ -1,0 +1,219 @@
+"""The catalogue of a data set: its properties, its objects, the annotators' ratings and the words for all of it.
+
+A catalogue is a folder with `objects.csv` and `properties.yaml`, and, where its publishers described the objects,
+`descriptions.csv` (docs/data.md explains every column and key). The one in pipeline/physiclear is PhysiCLeAR's, from
+the tables of the paper (names, ratings, materials, parts, splits).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+
+import yaml
+from pydantic import ValidationError
+
+from pipeline.errors import UserError
+from pipeline.records import Part
+from pipeline.runtime import derive_seed
+from pipeline.videos.catalogue.csv_reader import Row, read_rows
+from pipeline.videos.catalogue.wording import Entry, Language, Property, Scenario
+
+__all__ = ["RULED_SPLITS", "Catalogue", "Language", "Object", "Property", "Scenario", "load_catalogue"]
+
+OBJECTS, PROPERTIES, DESCRIPTIONS = "objects.csv", "properties.yaml", "descriptions.csv"
+RULED_SPLITS = ("development", "kfold")
+"""Splits that are made by rule; no column may bear their names."""
+
+
+class Object(Entry):
+    """One object (or part of one); tuples have one entry a property, in the catalogue's order."""
+
+    object_id: str
+    name: str
+    material: str = ""
+    part_of: str = ""
+    part: str = ""
+    splits: dict[str, Part]
+    """By the name of the split."""
+    ratings: tuple[tuple[int, ...], ...]
+    stated: tuple[int | None, ...] = ()
+    """The final labels that the publishers state; None where they state none. `labels` never depends on them."""
+    description: str = ""
+    """In the publishers' words; empty where there is none."""
+
+    @property
+    def labels(self) -> tuple[int, ...]:
+        """The class of each property: the annotators' mean, rounded (half upwards)."""
+        return tuple(math.floor(sum(r) / len(r) + 0.5) for r in self.ratings)
+
+
+class Catalogue(Entry):
+    """A data set's objects and the language for them."""
+
+    language: Language
+    objects: dict[str, Object]
+
+    @cached_property
+    def properties(self) -> tuple[Property, ...]:
+        """The properties in the order of every label tuple."""
+        return self.language.properties
+
+    @cached_property
+    def property_names(self) -> tuple[str, ...]:
+        """Their names, in the same order."""
+        return tuple(p.name for p in self.properties)
+
+    @property
+    def split_names(self) -> tuple[str, ...]:
+        """The splits that objects.csv has columns for, in the columns' order."""
+        return tuple(next(iter(self.objects.values())).splits)
+
+    def labels(self, object_id: str) -> tuple[int, ...]:
+        """The class of each property of one object."""
+        return self.objects[object_id].labels
+
+    def property_index(self, name: str) -> int:
+        """The position of a property in a label tuple."""
+        return self.property_names.index(name)
+
+    def structured(self, labels: tuple[int, ...]) -> str:
+        """The paper's closing sentence, e.g. "Overall, it presents a hard and smooth surface with no bumps."."""
+        words = {p.name: p.levels[level] for p, level in zip(self.properties, labels, strict=True)}
+        return self.language.structured.format(**words)
+
+    def unstructured(self, object_id: str) -> str:
+        """The object's own free description; each property's wording is fixed by the object's id."""
+        words = {}
+        for p, level in zip(self.properties, self.labels(object_id), strict=True):
+            choices = p.phrases[level]
+            words[p.name] = choices[derive_seed("phrase", object_id, p.name) % len(choices)]
+        return self.language.unstructured.format(**words)
+
+    def describe(self, object_id: str) -> str:
+        """The full description of an object: unstructured, then structured."""
+        return f"{self.unstructured(object_id)} {self.structured(self.labels(object_id))}"
+
+    def describe_one(self, object_id: str, name: str) -> str:
+        """The structured description of one property only (OPD mode `needed`)."""
+        index = self.property_index(name)
+        p = self.properties[index]
+        return p.alone.format(level=p.levels[self.labels(object_id)[index]])
+
+
+def load_catalogue(folder: Path) -> Catalogue:
+    """Read `properties.yaml`, `objects.csv` and, where it is there, `descriptions.csv` of a folder.
+
+    Raises:
+        UserError: naming the file, line and mend, for a missing file or column, an object listed twice, two objects
+            of one name, a rating or stated label outside the classes, an unknown part of a split, or a description of
+            an object that is not listed.
+    """
+    for name in (PROPERTIES, OBJECTS):
+        if not (folder / name).is_file():
+            raise UserError(
+                f"{folder / name}: no such file; data.catalogue must name a folder with {OBJECTS} and {PROPERTIES}"
+            )
+    language = _read_language(folder / PROPERTIES)
+    header, rows = read_rows(folder / OBJECTS, ["object_id", "name", *(p.name for p in language.properties)])
+    splits = _split_columns(folder / OBJECTS, header, language)
+    entries = [(where, _read_object(row, language, splits, where)) for where, row in rows]
+    if not entries:
+        raise UserError(f"{folder / OBJECTS}: lists no object; add one line an object")
+    objects: dict[str, Object] = {}
+    names: dict[str, str] = {}
+    for where, entry in entries:
+        if entry.object_id in objects:
+            raise UserError(
+                f"{where}: {entry.object_id} is listed twice, so it could stand in two splits; keep one line an object"
+            )
+        objects[entry.object_id] = entry
+        twin = names.setdefault(entry.name.lower(), entry.object_id)
+        if twin != entry.object_id:
+            raise UserError(
+                f"{where}: {entry.name!r} is also the name of {twin}; give each object a name of its own, since "
+                "matching questions tell objects apart by name"
+            )
+    for object_id, text in _read_descriptions(folder / DESCRIPTIONS, objects).items():
+        objects[object_id] = objects[object_id].model_copy(update={"description": text})
+    return Catalogue(language=language, objects=objects)
+
+
+def _read_language(file: Path) -> Language:
+    try:
+        return Language.model_validate(yaml.safe_load(file.read_text(encoding="utf-8")))
+    except ValidationError as error:
+        detail = error.errors(include_url=False)[0]
+        key = ".".join(str(part) for part in detail["loc"])
+        message = detail["msg"].removeprefix("Value error, ")
+        raise UserError(f"{file}: {f'{key}: ' if key else ''}{' '.join(message.split())}") from None
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        raise UserError(f"{file}: {' '.join(str(error).split())[:300]}") from None
+
+
+def _split_columns(file: Path, header: Sequence[str], language: Language) -> dict[str, str]:
+    """Column to split; `label_` columns are looked at too, so that no misspelt one is passed over in silence."""
+    names = [p.name for p in language.properties]
+    for column in header:
+        if column.startswith("label_") and column.removeprefix("label_") not in names:
+            raise UserError(f"{file}: column {column} names no property; allowed: label_ and {', '.join(names)}")
+    splits = {column: column.removeprefix("split_") for column in header if column.startswith("split_")}
+    for column, name in splits.items():
+        if name in RULED_SPLITS or not re.fullmatch(r"[a-z][a-z0-9_]*", name):
+            raise UserError(
+                f"{file}: column {column}: a split's name begins with a small letter, goes on with those, digits or _, "
+                f"and is neither {' nor '.join(RULED_SPLITS)}; rename it"
+            )
+    return splits
+
+
+def _read_object(row: Row, language: Language, splits: dict[str, str], where: str) -> Object:
+    if not row["object_id"] or not row["name"]:
+        raise UserError(f"{where}: object_id and name must not be empty")
+    ratings, stated = [], []
+    for p in language.properties:
+        most = len(p.levels) - 1
+        values = _classes(row[p.name], most)
+        if not values:
+            raise UserError(
+                f"{where}: {p.name} is {row[p.name]!r}; write the annotators' ratings as numbers from 0 to {most} "
+                "separated by spaces"
+            )
+        ratings.append(values)
+        label = row.get(f"label_{p.name}", "")
+        final = _classes(label, most)
+        if label and len(final) != 1:
+            raise UserError(f"{where}: label_{p.name} is {label!r}; write one number from 0 to {most}, or nothing")
+        stated.append(final[0] if final else None)
+    parts = {}
+    for column, name in splits.items():
+        value = row[column] or Part.UNUSED
+        if value not in set(Part):
+            raise UserError(f"{where}: {column} is {value!r}; allowed: {', '.join(Part)}")
+        parts[name] = Part(value)
+    fields = {key: row.get(key, "") for key in ("object_id", "name", "material", "part_of", "part")}
+    return Object(**fields, splits=parts, ratings=tuple(ratings), stated=tuple(stated))
+
+
+def _classes(text: str, most: int) -> tuple[int, ...]:
+    """The numbers of a cell; empty where one is none, or no class."""
+    words = text.split()
+    values = tuple(int(word) for word in words if re.fullmatch(r"[0-9]+", word))
+    return values if len(values) == len(words) and all(v <= most for v in values) else ()
+
+
+def _read_descriptions(file: Path, objects: dict[str, Object]) -> dict[str, str]:
+    """Object id to its publishers' description; nothing where there is no such file."""
+    described: dict[str, str] = {}
+    rows = read_rows(file, ["object_id", "description"])[1] if file.is_file() else []
+    for where, row in rows:
+        object_id = row["object_id"]
+        if object_id not in objects:
+            raise UserError(f"{where}: {object_id!r} is not in {file.with_name(OBJECTS)}; correct or remove the line")
+        if object_id in described:
+            raise UserError(f"{where}: {object_id} is described twice; keep one line an object")
+        described[object_id] = row["description"]
+    return described

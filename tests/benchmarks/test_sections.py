@@ -1,0 +1,244 @@
+"""Every section in a reduced form, whole: its rows are valid, and its counts and errors what they must be."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from benchmarks import contact, describing, encoder, encoder_models, frames, language
+from benchmarks.table import Row, merge, read_rows
+from benchmarks.timing import counting_ffts, flops_of
+from pipeline.encoder import frame_classifier
+from pipeline.encoder.baseline import validation
+from pipeline.encoder.baseline.predictor import PropertyPredictor
+from pipeline.encoder.scene_encoder import SceneEncoder
+from pipeline.errors import UserError
+from pipeline.evaluation.scores import ScoreRow
+from pipeline.io import write_csv, write_table
+from pipeline.records import Graded, Opd
+from pipeline.scenes.elastic.kernels import half_space_table, make_kernel
+from pipeline.scenes.elastic.solver import solve
+from pipeline.scenes.film import write_film
+from pipeline.scenes.light import make_sensor, shade
+from pipeline.training.trainable import save_trainable
+from pipeline.videos.catalogue import Catalogue
+from tests.checkpoints import write_clip, write_llama
+from tests.conftest import ROOT
+
+LENGTH = 20
+"""Frames of a video; the published rule leaves out videos of ten."""
+TINY = language.Size(repeats=1, trained=4, asked=4, aligned=4, limit=4, batches=(1, 3))
+
+
+@pytest.fixture(scope="module")
+def project(catalogue: Catalogue, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A project with tiny models, and two videos each of balls of twelve sizes."""
+    root = tmp_path_factory.mktemp("project")
+    values = yaml.safe_load((ROOT / "params.yaml").read_text())
+    values["encoder"]["weights"] = str(write_clip(root / "clip"))
+    values["language"]["weights"] = str(write_llama(root / "llama"))
+    values["data"] |= {"source": "videos", "dir": "films"}
+    (root / "params.yaml").write_text(yaml.safe_dump(values))
+    (root / "pipeline").symlink_to(ROOT / "pipeline")
+    (root / "films").mkdir()
+    sensor = make_sensor(96, 72, 0)
+    y, x = np.mgrid[:72, :96]
+    known = sorted(catalogue.objects.values(), key=lambda o: o.object_id)
+    parts = {part: [o.object_id for o in known if o.splits["paper"] == part] for part in ("train", "validation")}
+    for place, name in enumerate([*parts["train"][:10], *parts["validation"][:2]]):
+        for number in range(2):
+            ball = np.exp(-((x - 48 - 4 * number) ** 2 + (y - 36) ** 2) / (60 + 25 * place)).astype(np.float32)
+            skins = [np.float32(max(0, np.sin(t / 4 - 0.5))) * ball for t in range(LENGTH)]
+            pictures = [shade(skin, sensor, 0.3, seed * 977) for seed, skin in enumerate(skins)]
+            write_film(root / "films" / f"{name}_{number}.avi", pictures, 10.0)
+    return root
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The project's own videos, and three trees a property in place of two hundred."""
+    monkeypatch.delenv("OCTOPI_DATA_DIR", raising=False)
+    for module in (validation, contact):
+        monkeypatch.setattr(module, "PropertyPredictor", partial(PropertyPredictor, trees=3))
+
+
+def by_question(rows: list[Row], folder: Path) -> dict[str, dict[str, Row]]:
+    """Rows by question and setting, after a way through the file."""
+    merge(folder / "table.csv", rows)
+    found: dict[str, dict[str, Row]] = {}
+    for row in read_rows(folder / "table.csv"):
+        found.setdefault(row.question, {})[row.setting] = row
+    for own in found.values():
+        assert all(row.cost > 0 for row in own.values())
+        assert 1 in [row.cost_ratio for row in own.values()]
+        judged = [row for row in own.values() if row.error is not None]
+        assert any(row.front for row in judged) == bool(judged)
+    return found
+
+
+def score(task: str, measure: str, encoder: str, accuracy: float, low: float, high: float, **more: object) -> ScoreRow:
+    found = {"accuracy": accuracy, "low": low, "high": high, "chance": 0.1, "right": 9, "unread": 0, "n": 24}
+    named = {"task": task, "measure": measure, "encoder": encoder, "seed": "all"}
+    return ScoreRow.model_validate({**named, **found, **more})
+
+
+def test_frames(project: Path, tmp_path: Path) -> None:
+    found = by_question(frames.measure(project, repeats=1, folds=2, deals=1), tmp_path)
+    assert {"published way", "bare decoding", "salient, 64 pixels"} <= set(found["frame extraction"])
+    assert all(row.error is None for row in found["frame extraction"].values())
+    rules = found["frames"]
+    assert list(rules) == [str(s) for s in frames.SETTINGS]
+    # 30 % of the frames are fewer than ten.
+    assert [rules[f"uniform, {n} frame{'s' * (n > 1)}"].frames for n in (1, 3, 5, 10)] == [1, 3, 5, 6]
+    assert all(row.n == 24 and row.low is not None for row in rules.values())
+
+
+def test_frames_need_objects(project: Path) -> None:
+    with pytest.raises(UserError, match="videos of 40 objects"):
+        frames.measure(project, repeats=1, folds=20)
+
+
+def test_encoder(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)  # Trainings leave their checkpoints there.
+    size = encoder.Size(videos=1, repeats=1, folds=2, deals=1, epochs=1, prompts=((2, 0), (1, 1)))
+    with pytest.raises(UserError, match="repro pretrain"):
+        encoder.measure(project, size)
+    for name, value in (("STRENGTHS", (1e-3, 1e-2)), ("FOLDS", 2), ("ROUNDS", 5)):
+        monkeypatch.setattr(frame_classifier, name, value)
+    monkeypatch.setattr(encoder_models, "WHOLE", ("trees", "probe", "paper", "pretrained"))
+    torch.manual_seed(0)
+    save_trainable(SceneEncoder(), project / encoder.PRETRAINED)
+    report = project / "reports" / "any"
+    report.mkdir(parents=True)
+    scored = score("cross_validation", "combined", "pretrained", 0.4, 0.3, 0.5)
+    write_csv(report / "scores.csv", ScoreRow, [scored])
+    found = by_question(encoder.measure(project, size), tmp_path)
+    assert {*encoder.QUESTIONS, "encoder", "prompts"} == set(found)
+    whole = found["encoder"]
+    assert (whole["pretrained"].error, whole["pretrained"].front, whole["paper"].error) == (0.6, True, None)
+    assert list(found["prompts"]) == ["2 at all layers", "1 at the first layer"]
+    counted = found["encoder frames"]
+    single, ten = counted["1 frame"].flops, counted["10 frames"].flops
+    assert single is not None
+    assert ten == pytest.approx(10 * single, rel=1e-3)
+    sides = found["frame size"]
+    assert sides["60 pixels"].flops == pytest.approx((sides["120 pixels"].flops or 0) / 4, rel=0.05)
+    clip = found["number format, CLIP"]
+    assert clip["bfloat16"].megabytes == pytest.approx((clip["float32"].megabytes or 0) / 2, rel=0.01)
+    assert clip["int8"].flops is None
+
+
+@pytest.fixture(scope="module")
+def bed(project: Path, tmp_path_factory: pytest.TempPathFactory) -> language.Bed:
+    return language.make_bed(project, TINY, tmp_path_factory.mktemp("embeddings"))
+
+
+def test_language(project: Path, tmp_path: Path) -> None:
+    found = by_question(language.measure(project, TINY), tmp_path)
+    assert list(found["training"]) == list(language.WAYS)
+    assert all(row.error is None for row in found["training"].values())
+    ways = found["answering"]
+    assert all(row.error == 0 for row in ways.values()), "all ways say the same"
+    published, lean = ways["published way"].flops, ways["the pipeline's way, 1 at a time"].flops
+    assert published is not None
+    assert lean is not None
+    assert lean < ways["without the published loop's forward pass"].flops < published  # type: ignore[operator]
+    assert ways["and without a cache of keys and values"].flops > lean  # type: ignore[operator]
+    assert found["number format, language model"]["float32"].error == 0
+    assert "describing" not in found
+
+
+def test_all_ways_of_training_compute_one_loss(bed: language.Bed) -> None:
+    questions = bed.training[:4]
+    data = bed.conversations(questions)
+    losses = {}
+    for name, way in language.WAYS.items():
+        # Frames and mirrors are drawn; the embeddings of what was drawn are compared, so all take the cached ones.
+        cached = language.Way(way.batch, way.padded, False, way.all_logits, way.buckets)
+        parts = [list(range(i, min(i + way.batch, 4))) for i in range(0, 4, way.batch)]
+        losses[name] = sum(
+            float(language.loss(bed, cached, [questions[i] for i in p], [data[i] for i in p], 7)) for p in parts
+        )
+    expected = losses[language.PUBLISHED]
+    assert losses == pytest.approx(dict.fromkeys(losses, expected), rel=1e-5)
+
+
+def test_operations_of_a_pass_follow_from_the_shapes(bed: language.Bed) -> None:
+    llm, length = bed.model.llm, 40
+    shapes = llm.config
+    with torch.no_grad():
+        embeddings = torch.zeros(2, length, shapes.hidden_size)
+        found = flops_of(lambda: llm(inputs_embeds=embeddings, use_cache=False))
+    keys = shapes.num_key_value_heads * shapes.hidden_size // shapes.num_attention_heads
+    layer = shapes.hidden_size * (2 * shapes.hidden_size + 2 * keys + 3 * shapes.intermediate_size)
+    linear = 2 * length * (shapes.num_hidden_layers * layer + shapes.hidden_size * shapes.vocab_size)
+    attention = 4 * shapes.num_hidden_layers * shapes.hidden_size * length**2
+    assert found == pytest.approx(2 * (linear + attention), rel=0.01)
+
+
+def test_describing_takes_tokens_from_answers_and_errors_from_the_report(project: Path, tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    (root / "reports" / "smoke-videos").mkdir(parents=True)
+    (root / "params.yaml").symlink_to(project / "params.yaml")
+    assert describing.describing(root) == []
+    scores, graded = [], []
+    for opd, tokens, accuracy in ((Opd.ALL, 100, 0.5), (Opd.NONE, 10, 0.25)):
+        for task in describing.DESCRIBED:
+            own = {"lora": "with", "opd": opd, "touch": "real", "n": 8}
+            scores.append(score(task, "choice", "finetuned", accuracy, accuracy - 0.1, accuracy + 0.2, **own))
+            answer = {"question_id": task, "task": task, "measure": "choice", "correct": True, "parsed": True}
+            kind = {"encoder": "finetuned", "lora": "with", "opd": opd, "seed": 0, "touch": "real"}
+            said = {"truncated": False, "expected": "A", "predicted": "A", "objects": ("rug",), "tokens": tokens}
+            graded.append(Graded.model_validate({**answer, **kind, **said}))
+    write_csv(root / "reports" / "smoke-videos" / "scores.csv", ScoreRow, scores)
+    write_table(root / "data" / "graded.parquet", Graded, graded)
+    whole, concluded = describing.describing(root)
+    assert (whole.setting, whole.cost, whole.error, whole.n) == ("all", 100, 0.5, 24)
+    assert (concluded.cost_ratio, concluded.error, concluded.low, concluded.high) == (0.1, 0.75, 0.55, 0.85)
+    assert (whole.front, concluded.front) == (True, True)
+
+
+def test_contact(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    chosen = {name: contact.models()[name] for name in ("layer, every pixel", "winkler", "layer, 64 cells")}
+    small = {name: c.model_copy(update={"cells": 96}) if "every" in name else c for name, c in chosen.items()}
+    monkeypatch.setattr(contact, "models", lambda: small)
+    monkeypatch.setattr(contact, "FRAMES", 12)
+    monkeypatch.setattr(contact, "CELLS", (32, 64))
+    found = by_question(contact.measure(project, objects=6, videos=1, repeats=1, folds=2, deals=1), tmp_path)
+    for question in ("contact", "contact, slopes"):
+        finest, springs, _ = (found[question][name] for name in small)
+        assert finest.error == 0
+        assert finest.ffts is not None
+        assert springs.ffts is not None
+        # Springs need none; the surface's relief takes some.
+        assert 10 * springs.ffts < finest.ffts
+        assert springs.error is not None
+        assert springs.error > 0.1
+    assert all(row.n == 6 for row in found["contact, for a classifier"].values())
+    ball = found["contact, Hertz's ball"]
+    springs, rough, fine = (
+        ball[name].error
+        for name in (
+            "springs, 256 cells",
+            "half-space, 32 cells, tolerance 1e-02",
+            "half-space, 64 cells, tolerance 1e-04",
+        )
+    )
+    assert springs is not None
+    assert rough is not None
+    assert fine is not None
+    assert fine < rough < 0.01 * springs
+
+
+def test_transforms_of_the_solver_follow_from_its_iterations() -> None:
+    gap = np.add.outer(np.linspace(-1, 1, 32) ** 2, np.linspace(-1, 1, 32) ** 2)
+    kernel = make_kernel(half_space_table(gap.shape, 0.1, 1.0), gap)
+    with counting_ffts() as count:
+        solution = solve(gap, 0.5, kernel, 0.1, tolerance=1e-4)
+    # Forth and back for the surface; in all steps but the last also for the direction and what it moves.
+    assert count.value == 6 * int(solution.iterations[0]) - 4

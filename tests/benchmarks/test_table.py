@@ -1,0 +1,192 @@
+"""The table of costs and errors: its front, its ratios, how sections merge into it, and the figures drawn from it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from statistics import median
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from benchmarks import __main__ as command
+from benchmarks.errors import Error, error_of, mean_of, reported, share_of
+from benchmarks.figures import FOLDER, draw
+from benchmarks.table import CSV, Row, cost_ratios, front, make_rows, merge, read_rows
+from benchmarks.timing import counting_ffts, flops_of, interleaved, megabytes
+from pipeline.errors import UserError
+from pipeline.evaluation.scores import ScoreRow
+from pipeline.io import write_csv
+from tests.conftest import ROOT
+
+POINTS = st.lists(st.tuples(st.integers(1, 6), st.integers(0, 6)), min_size=1, max_size=12)
+
+
+@given(POINTS)
+def test_the_front_is_what_no_other_beats(points: list[tuple[int, int]]) -> None:
+    costs, errors = zip(*points, strict=True)
+    found = front(costs, errors)
+    ahead = [p for p, on in zip(points, found, strict=True) if on]
+    # A second way: in order of cost, then error, only what has less error than all before stays, and its equals.
+    lowest, expected = float("inf"), set()
+    for cost, error in sorted(points):
+        if error < lowest:
+            expected.add((cost, error))
+            lowest = error
+    assert set(ahead) == expected
+    assert all(on == (point in expected) for point, on in zip(points, found, strict=True))
+
+
+@given(st.lists(st.lists(st.floats(0.1, 1e3), min_size=3, max_size=3), min_size=2, max_size=4), st.floats(0.1, 10))
+def test_ratios_are_within_a_repeat_and_no_machine_s(costs: list[list[float]], speed: float) -> None:
+    named = {str(i): own for i, own in enumerate(costs)}
+    ratios = cost_ratios(named, "1")
+    assert ratios["1"] == 1
+    for name, own in named.items():
+        assert ratios[name] == pytest.approx(median(own[i] / named["1"][i] for i in range(3)))
+    slower = {name: [speed * c for c in own] for name, own in named.items()}
+    assert cost_ratios(slower, "1") == pytest.approx(ratios)
+    # A slow repeat slows all alike, and changes no ratio.
+    uneven = {name: [own[0], 100 * own[1], own[2]] for name, own in named.items()}
+    assert cost_ratios(uneven, "1") == pytest.approx(ratios)
+
+
+def rows(question: str, *points: tuple[str, float, float | None]) -> list[Row]:
+    return make_rows(
+        question,
+        {name: [cost] for name, cost, _ in points},
+        unit="ms",
+        baseline=points[0][0],
+        errors={name: Error(e, e / 2, min(1.0, 2 * e), 9) for name, _, e in points if e is not None},
+        error_of="share wrong",
+        counts={points[0][0]: {"frames": 5}},
+        machine="any",
+    )
+
+
+def test_rows_carry_ratio_front_and_counts() -> None:
+    first, second, third, unjudged = rows("q", ("a", 2, 0.3), ("b", 4, 0.2), ("c", 8, 0.25), ("d", 1, None))
+    assert [r.cost_ratio for r in (first, second, third, unjudged)] == [1, 2, 4, 0.5]
+    assert [r.front for r in (first, second, third, unjudged)] == [True, True, False, None]
+    assert (first.frames, second.frames, first.n) == (5, None, 9)
+    with pytest.raises(KeyError):
+        make_rows("q", {"a": [1.0]}, unit="ms", baseline="b")
+    with pytest.raises(ValidationError, match="above"):
+        Row(question="q", setting="s", cost=1, unit="ms", cost_ratio=1, error=0.5, low=0.6, high=0.7)
+
+
+def test_merging_keeps_other_questions_and_their_order(tmp_path: Path) -> None:
+    table = tmp_path / "speed_error.csv"
+    kept, old = rows("kept", ("a", 1, 0.1), ("b", 3, 0.12345)), rows("old", ("a", 1, 0.5), ("gone", 2, 0.4))
+    merge(table, [*old, *kept])
+    assert read_rows(table) == [*old, *kept]
+    fresh, new = rows("old", ("a", 7, None), ("b", 5, None)), rows("new", ("a", 1, 0.1))
+    assert merge(table, [*new, *fresh]) == [*fresh, *kept, *new] == read_rows(table)
+    before = table.read_bytes()
+    merge(table, fresh)
+    assert table.read_bytes() == before
+    table.write_text("question,setting\nq,s\n")
+    with pytest.raises(UserError, match="not a table"):
+        read_rows(table)
+
+
+def test_a_figure_a_question_and_stale_ones_go(tmp_path: Path) -> None:
+    (tmp_path / FOLDER).mkdir()
+    (tmp_path / FOLDER / "stale.png").write_bytes(b"")
+    table = [*rows("Which, where?", ("a, 1", 2, 0.3), ("b", 4, 0.0)), *rows("no error", ("a", 1, None), ("b", 9, None))]
+    drawn = draw(table, tmp_path)
+    assert [p.name for p in drawn] == ["which-where.png", "no-error.png"]
+    assert sorted(p.name for p in (tmp_path / FOLDER).iterdir()) == sorted(p.name for p in drawn)
+    first = [p.read_bytes() for p in drawn]
+    assert all(b.startswith(b"\x89PNG") and len(b) > 5000 for b in first)
+    assert [p.read_bytes() for p in draw(table, tmp_path)] == first
+
+
+def test_the_committed_table_is_consistent() -> None:
+    table = read_rows(ROOT / CSV)
+    for question in {row.question for row in table}:
+        own = [row for row in table if row.question == question]
+        assert len({row.setting for row in own}) == len(own)
+        assert 1 in [row.cost_ratio for row in own], question
+        judged = [row for row in own if row.error is not None]
+        expected = front([r.cost_ratio for r in judged], [r.error or 0.0 for r in judged])
+        assert [row.front for row in judged] == expected
+        assert all(row.error_of and row.n for row in judged)
+    pictures = {p.name for p in (ROOT / CSV.parent / FOLDER).glob("*.png")}
+    assert len(pictures) == len({row.question for row in table})
+
+
+def test_settings_take_turns_at_each_item() -> None:
+    seen: list[tuple[str, int]] = []
+    settings = {name: (lambda i, name=name: seen.append((name, i))) for name in "ab"}
+    costs = interleaved(settings, [1, 2], 2, warm=False)
+    assert seen == 2 * [("a", 1), ("b", 1), ("a", 2), ("b", 2)]
+    assert {name: len(own) for name, own in costs.items()} == {"a": 2, "b": 2}
+
+
+def test_operations_and_bytes_are_those_of_the_shapes() -> None:
+    attention = torch.nn.MultiheadAttention(8, 2, batch_first=True).eval()
+    x = torch.zeros(1, 5, 8)
+    # Four projections of 8 x 8, and scores and sums over 5 x 5, two operations each.
+    with torch.no_grad():
+        assert flops_of(lambda: attention(x, x, x, need_weights=False)) == 2 * 4 * 5 * 8 * 8 + 2 * 2 * 5 * 5 * 8
+    model = torch.nn.Sequential(torch.nn.Conv2d(3, 4, 3), torch.nn.Flatten(), torch.nn.Linear(4 * 36, 2))
+    assert flops_of(lambda: model(torch.zeros(2, 3, 8, 8))) == 2 * 2 * (4 * 36 * 27 + 144 * 2)
+    assert megabytes(model) == 4 * (4 * 27 + 4 + 144 * 2 + 2) / 1e6
+
+
+def test_transforms_are_counted_and_unchanged() -> None:
+    import numpy as np
+    import scipy.fft
+
+    field = np.random.default_rng(0).normal(size=(3, 4, 6))
+    with counting_ffts() as count:
+        spectrum = scipy.fft.rfft2(field)
+        back = scipy.fft.irfft2(spectrum[0], s=(4, 6))
+    scipy.fft.rfft2(field)
+    assert count.value == 4
+    np.testing.assert_allclose(back, field[0])
+
+
+def test_errors_have_intervals_over_objects() -> None:
+    one = mean_of([1.0, 3.0, 2.0, 2.0], ["a", "a", "b", "b"])
+    assert (one.value, one.low, one.high) == (2, 2, 2)
+    two = mean_of([1.0, 3.0], ["a", "b"])
+    # Student's t with one degree of freedom: 12.706, deviation sqrt 2 over sqrt 2.
+    assert two.high == pytest.approx(2 + 12.706, abs=1e-3)
+    assert two.low == 0
+    assert mean_of([1.0], ["a"]) == Error(1.0, n=1)
+    share = share_of([1, 0, 0, 1], [(o,) for o in "abcd"])
+    assert share.low is not None
+    assert share.high is not None
+    assert share.low < share.value == 0.5 < share.high
+
+
+def test_errors_come_from_the_reports_that_have_them(tmp_path: Path) -> None:
+    shared = {"measure": "m", "encoder": "e", "seed": "all", "right": 4, "unread": 0, "chance": 0.1, "n": 9}
+    for name, task in (("one", "heads"), ("two", "other")):
+        row = ScoreRow.model_validate({**shared, "task": task, "accuracy": 0.5, "low": 0.4, "high": 0.7})
+        write_csv(tmp_path / name / "scores.csv", ScoreRow, [row, row.model_copy(update={"low": None})])
+    found = reported(tmp_path, task="heads")
+    assert list(found) == [tmp_path / "one"]
+    whole, half = map(error_of, found[tmp_path / "one"])
+    assert whole.columns == pytest.approx({"error": 0.5, "low": 0.3, "high": 0.6, "n": 9})
+    assert half.columns == {"error": 0.5, "n": 9}
+
+
+def test_the_command_merges_and_names_what_is_allowed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from benchmarks import contact
+
+    monkeypatch.chdir(tmp_path)
+    merge(CSV, rows("other", ("a", 1, 0.2)))
+    monkeypatch.setattr(contact, "measure", lambda root: rows("contact", ("x", 1, 0.1), ("y", 2, 0.05)))
+    command.main(["contact"])
+    assert [row.question for row in read_rows(CSV)] == ["other", "contact", "contact"]
+    assert (CSV.parent / FOLDER / "contact.png").is_file()
+    assert "x 2  error 0.05 (front)" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="frames, encoder, language, contact"):
+        command.main(["startup"])

@@ -1,0 +1,239 @@
+"""The per-frame classifier: fitted heads against scikit-learn, decisions against all combinations."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.special import log_softmax, logsumexp
+from sklearn.linear_model import LogisticRegression
+
+from pipeline.encoder import frame_classifier
+from pipeline.encoder.clips import EncoderData
+from pipeline.encoder.finetune import finetune
+from pipeline.encoder.frame_classifier import (
+    STRENGTHS,
+    FittedHeads,
+    JointFrameClassifier,
+    choose_strength,
+    fit_frame_heads,
+)
+from pipeline.encoder.scene_encoder import SceneEncoder
+from pipeline.records import Part
+from pipeline.runtime import seed_everything
+from pipeline.training.trainable import save_trainable, trainable_state
+from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.frames.store import FrameStore
+from tests.encoders import CPU, OBJECTS, Floats, config, encoder_data, float64, random_heads
+
+pytestmark = pytest.mark.usefixtures("elsewhere")
+
+
+class Bare(SceneEncoder):
+    """An encoder of any length that nobody asks for a picture."""
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.dim = dim
+
+
+@settings(max_examples=30)
+@given(
+    st.integers(0, 10**6),
+    st.lists(st.integers(1, 4), min_size=1, max_size=3),
+    st.integers(1, 6),
+    st.sampled_from([0.0, 0.3, 3.0, 100.0]),
+    st.sampled_from([1.0, 1e6, 1e30]),
+)
+def test_evidence_is_the_log_of_mean_probabilities_and_decides_jointly(
+    seed: int, classes: list[int], frames: int, strength: float, scale: float
+) -> None:
+    """Strong weights make the frames so sure that the other classes' probabilities are 0 in float32."""
+    heads = random_heads(seed, 5, classes, strength)
+    model = JointFrameClassifier(Bare(5), classes)
+    heads.copy_into(model)
+    clips = (scale * np.random.default_rng(seed).normal(size=(3, frames, 5))).astype(np.float32)
+    with torch.no_grad():
+        found = model.classify(torch.from_numpy(clips))
+    scaled = (clips.astype(np.float64) - heads.centre) / heads.spread.astype(np.float64)
+    for z, weight, bias, evidence in zip(found, heads.weights, heads.biases, heads.evidence(clips), strict=True):
+        logs = log_softmax(np.clip(scaled, -5, 5) @ weight.T + bias, axis=-1)
+        expected = logsumexp(logs, axis=1, b=1 / frames)
+        np.testing.assert_allclose(z.numpy(), expected, rtol=2e-5, atol=2e-5)
+        np.testing.assert_allclose(evidence, expected, rtol=2e-5, atol=2e-5)
+    decided = model.decide(torch.cat(found, dim=1))
+    assert decided.dtype == torch.int64
+    tables = [log_softmax(float64(z), axis=1) for z in found]
+    dependence = float64(model.dependence)
+    for video in range(3):
+        scores = {
+            choice: sum(t[video, c] for t, c in zip(tables, choice, strict=True)) + dependence[choice]
+            for choice in itertools.product(*map(range, classes))
+        }
+        assert tuple(decided[video].tolist()) == max(scores, key=lambda choice: scores[choice])
+
+
+Clips = tuple[np.ndarray, np.ndarray, list[str]]
+
+
+def planted(seed: int, objects: int = 12, videos: int = 2, frames: int = 3, dim: int = 6) -> Clips:
+    """Clips whose first columns tell the labels through noise; the last is constant."""
+    rng = np.random.default_rng(seed)
+    truth = np.stack([np.arange(objects) % 3, np.arange(objects) // 3 % 2], axis=1)
+    labels = np.repeat(truth, videos, axis=0)
+    clips = rng.normal(size=(len(labels), frames, dim)).astype(np.float32)
+    clips[..., :2] += 2 * labels[:, None]
+    clips[..., -1] = 0.1
+    return clips, labels, [f"o{i}" for i in range(objects) for _ in range(videos)]
+
+
+def reference(clips: np.ndarray, wanted: np.ndarray, strength: float) -> tuple[Callable[[np.ndarray], Floats], Floats]:
+    """Another solver to convergence: probabilities of a frame, and the classes that they are of."""
+    frames = clips.reshape(-1, clips.shape[-1]).astype(np.float64)
+    mean, deviation = frames.mean(axis=0), frames.std(axis=0)
+    deviation[deviation < 1e-6] = 1
+
+    def scale(some: np.ndarray) -> Floats:
+        return np.clip((some.reshape(-1, some.shape[-1]) - mean) / deviation, -5, 5)
+
+    model = LogisticRegression(C=strength, solver="newton-cholesky", tol=1e-10)
+    model.fit(scale(clips), np.repeat(wanted, clips.shape[1]))
+    return lambda some: model.predict_proba(scale(some)).reshape(*some.shape[:2], -1), model.classes_
+
+
+@pytest.mark.parametrize("joint", [True, False])
+@pytest.mark.parametrize("strength", [STRENGTHS[0], STRENGTHS[-1]])
+def test_heads_are_scikit_learns_logistic_regression_in_the_model_too(strength: float, joint: bool) -> None:
+    """Of three and of two classes; the latter it fits with one row of weights, which the penalty treats otherwise."""
+    clips, labels, objects = planted(0)
+    unseen = planted(1)[0]
+    heads = fit_frame_heads(clips, labels, objects, [3, 2], strength, joint=joint)
+    assert bool(heads.dependence.any()) == joint
+    for position, logs in enumerate(heads.evidence(unseen)):
+        probabilities, _ = reference(clips, labels[:, position], strength)
+        np.testing.assert_allclose(np.exp(logs), probabilities(unseen).mean(axis=1), atol=2e-4)
+    says_the_same(heads, unseen, [3, 2])
+
+
+def says_the_same(heads: FittedHeads, clips: np.ndarray, classes: list[int]) -> None:
+    model = JointFrameClassifier(Bare(6), classes)
+    heads.copy_into(model)
+    with torch.no_grad():
+        logits = torch.cat(model.classify(torch.from_numpy(clips)), dim=1)
+    np.testing.assert_allclose(logits.numpy(), np.concatenate(heads.evidence(clips), axis=1), rtol=2e-5, atol=2e-5)
+    assert (model.decide(logits).numpy() == heads.predict(clips)).all()
+
+
+@pytest.mark.parametrize("kept", [(0, 2), (1, 2), (0,), (2,)])
+def test_a_class_that_training_lacks_is_all_but_impossible(kept: tuple[int, ...]) -> None:
+    clips, labels, objects = planted(0, objects=18)
+    some = np.isin(labels[:, 0], kept)
+    clips, labels, objects = clips[some], labels[some], [o for o, s in zip(objects, some, strict=True) if s]
+    heads = fit_frame_heads(clips, labels, objects, [4, 2], STRENGTHS[-1])
+    unseen = np.concatenate([planted(1)[0], 1e6 * planted(2)[0], -1e6 * planted(3)[0], np.zeros((1, 3, 6), np.float32)])
+    found = np.exp(heads.evidence(unseen)[0])
+    lacking = [c for c in range(4) if c not in kept]
+    assert np.isfinite(found).all()
+    assert found[:, lacking].max() < 1e-3
+    assert found.sum(axis=1) == pytest.approx(1)
+    assert set(heads.predict(unseen)[:, 0].tolist()) <= set(kept)
+    says_the_same(heads, unseen, [4, 2])
+    if len(kept) == 2:
+        probabilities, present = reference(clips, labels[:, 0], STRENGTHS[-1])
+        assert tuple(present) == kept
+        np.testing.assert_allclose(found[:, list(kept)], probabilities(unseen).mean(axis=1), atol=3e-4)
+
+
+class Scripted:
+    """Fitted heads that are right about the first so many of the objects, and that tell what they have seen."""
+
+    def __init__(self, seen: set[int], right: int) -> None:
+        self.seen, self.right = seen, right
+
+    def predict(self, clips: np.ndarray) -> np.ndarray:
+        owners = clips[:, 0, 0].astype(int)
+        assert not self.seen & set(owners.tolist()), "tested on an object that it learnt from"
+        return np.where(owners < self.right, 1, 0)[:, None]
+
+
+@pytest.mark.parametrize(("right", "chosen"), [((3, 5, 5, 2), 1), ((4, 4, 4, 4), 0), ((0, 0, 0, 1), 3)])
+@pytest.mark.parametrize("objects", [2, 7])
+def test_the_strength_is_chosen_inside_and_ties_go_to_the_first(
+    objects: int, right: tuple[int, ...], chosen: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first feature names the object. All labels are 1, so `right` objects are told right."""
+    owners = np.repeat(np.arange(objects), 2)
+    clips = np.zeros((len(owners), 3, 2), np.float32)
+    clips[..., 0] = owners[:, None]
+    folds: dict[float, list[frozenset[int]]] = {}
+
+    def fit(
+        clips: np.ndarray, labels: np.ndarray, names: Sequence[str], _: object, strength: float, **__: bool
+    ) -> Scripted:
+        seen = set(clips[:, 0, 0].astype(int).tolist())
+        assert [f"o{i}" for i in clips[:, 0, 0].astype(int)] == list(names)
+        assert (labels == 1).all()
+        folds.setdefault(strength, []).append(frozenset(seen))
+        return Scripted(seen, right[STRENGTHS.index(strength)])
+
+    monkeypatch.setattr(frame_classifier, "fit_frame_heads", fit)
+    labels = np.ones((len(owners), 1), np.int64)
+    strength, curve = choose_strength(clips, labels, [f"o{i}" for i in owners], [2], seed=4)
+    reached = [min(r, objects) / objects for r in right]
+    assert [m.value for m in curve] == pytest.approx(reached)
+    assert [m.step for m in curve] == [0, 1, 2, 3]
+    assert strength == STRENGTHS[reached.index(max(reached))]
+    if objects == 7:
+        assert strength == STRENGTHS[chosen]
+    assert list(folds) == list(STRENGTHS), "all in their order"
+    assert len(set(map(tuple, folds.values()))) == 1, "on the same folds"
+    for trained in folds.values():
+        assert sorted(o for seen in trained for o in set(range(objects)) - seen) == list(range(objects))
+
+
+def test_one_object_leaves_nothing_to_choose_by(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(frame_classifier, "fit_frame_heads", None)
+    clips, labels, _ = planted(0, objects=1)
+    assert choose_strength(clips, labels, ["o0"] * 2, [3, 2], seed=0) == (STRENGTHS[1], [])
+
+
+def test_finetuning_the_recipe_pretrained_fits_heads_to_evaluation_clips(
+    weights: Path, catalogue: Catalogue, tmp_path: Path
+) -> None:
+    """By hand: the pretrained network in evaluation mode on frames i n // k of each training video's difference."""
+    seed_everything(3)
+    pretrained = SceneEncoder()
+    pretrained(torch.randint(0, 256, (8, 32, 32, 3), dtype=torch.uint8), torch.zeros(8))
+    save_trainable(pretrained, tmp_path / "pretrained.safetensors")
+    parts = {o: Part.TEST if i > 4 else Part.TRAIN for i, o in enumerate(OBJECTS)}
+    plain = encoder_data(tmp_path, catalogue, parts)
+    data = EncoderData(FrameStore(tmp_path, "subtract"), catalogue, plain.assignments, 2)
+    model, curve = finetune(
+        data, config(weights, "pretrained"), CPU, seed=5, inputs=[], pretrained=tmp_path / "pretrained.safetensors"
+    )
+    assert isinstance(model, JointFrameClassifier)
+    pretrained.eval()
+    with torch.no_grad():
+        clips = np.stack(
+            [
+                pretrained(torch.from_numpy(data.store.pictures(f"{o}_0", [0, n // 2])), torch.zeros(2)).numpy()
+                for o, n in zip(OBJECTS[:5], (4, 1, 3, 4, 1), strict=True)
+            ]
+        )
+    labels = np.array([catalogue.labels(o) for o in OBJECTS[:5]])
+    strength, expected = choose_strength(clips, labels, OBJECTS[:5], [3, 3, 3], 5)
+    heads = fit_frame_heads(clips, labels, OBJECTS[:5], [3, 3, 3], strength)
+    assert curve == expected
+    for head, weight in zip(model.heads.children(), heads.weights, strict=True):
+        assert isinstance(head, torch.nn.Linear)
+        np.testing.assert_allclose(float64(head.weight), weight, atol=1e-5)
+    np.testing.assert_allclose(float64(model.centre), heads.centre, atol=1e-6)
+    np.testing.assert_array_equal(float64(model.dependence), heads.dependence)
+    own = trainable_state(model.encoder)
+    assert all(torch.equal(v, own[n]) for n, v in trainable_state(pretrained).items()), "the network itself stays"

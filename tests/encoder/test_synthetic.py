@@ -1,0 +1,411 @@
+"""Synthetic pictures: each follows from seed and number alone, says what is so of its object, and survives kills."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.special import expit
+
+import pipeline.parallel
+from pipeline.config import FramesConfig, PretrainConfig
+from pipeline.encoder import pretrain as pretraining
+from pipeline.encoder import synthetic as module
+from pipeline.encoder.pretrain import STRENGTH, PretrainingDataset, held_out, pretraining_model, vary
+from pipeline.encoder.scene_encoder import SceneEncoder
+from pipeline.encoder.synthetic import (
+    BODIES,
+    FORCES,
+    HEIGHT,
+    KINDS,
+    PITCH,
+    QUANTITIES,
+    SIDE,
+    WIDTH,
+    SyntheticPictures,
+    draw_object,
+    draw_pictures,
+    sensors,
+)
+from pipeline.errors import UserError
+from pipeline.runtime import seed_everything
+from pipeline.scenes.geometry import heights
+from pipeline.scenes.invent import LAYERS, MODULUS_MPA, invent
+from pipeline.scenes.light import Sensor
+from pipeline.scenes.measure import measure
+from pipeline.scenes.recipe import Recipe
+from pipeline.videos.frames.subtraction import subtract
+from tests.frame_rules import pillow
+
+CONFIG = PretrainConfig(objects=9, presses=2, seed=5)
+FRAMES = FramesConfig(size=32)
+ARRAYS = ("pictures", "quantities", "kinds")
+
+
+def equal(one: SyntheticPictures, other: SyntheticPictures) -> bool:
+    pairs = [(getattr(one, name), getattr(other, name)) for name in ARRAYS]
+    return all(a.dtype == b.dtype and np.array_equal(a, b) for a, b in pairs)
+
+
+def row(pictures: SyntheticPictures, number: int) -> SyntheticPictures:
+    return SyntheticPictures(*(getattr(pictures, name)[number : number + 1] for name in ARRAYS))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_sensors() -> Iterator[None]:
+    """Making all of them takes each process seconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "SENSORS", 3)
+        sensors.cache_clear()
+        yield
+    sensors.cache_clear()
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> SyntheticPictures:
+    """Drawn in three chunks, by as many processes as there are cores."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "CHUNK", 4)
+        return draw_pictures(CONFIG, FRAMES, tmp_path_factory.mktemp("pictures"))
+
+
+# Drawing
+
+
+@pytest.mark.parametrize("number", [0, 8])
+def test_an_object_alone_is_the_same_as_among_others(number: int, drawn: SyntheticPictures) -> None:
+    """Whatever else the settings say, and whatever was drawn before."""
+    np.random.seed(number)
+    other = PretrainConfig(objects=5000, presses=2, seed=5, steps=7, batch_size=1, augment=False)
+    assert equal(draw_object(number, other, FRAMES), row(drawn, number))
+
+
+def test_pictures_differ_by_number_and_by_seed(drawn: SyntheticPictures) -> None:
+    assert len({drawn.pictures[i].tobytes() for i in range(9)}) == 9
+    elsewhere = draw_object(0, CONFIG.model_copy(update={"seed": 6}), FRAMES)
+    assert not any(np.array_equal(elsewhere.pictures[0], p) for p in drawn.pictures)
+    assert (elsewhere.quantities[0, 0, 0] != drawn.quantities[:, 0, 0]).all()
+
+
+@pytest.mark.parametrize(("processes", "chunk"), [(3, 1)])
+def test_the_number_of_processes_and_chunks_changes_nothing(
+    processes: int, chunk: int, drawn: SyntheticPictures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pipeline.parallel, "cores", lambda: processes)
+    monkeypatch.setattr(module, "CHUNK", chunk)
+    assert equal(draw_pictures(CONFIG, FRAMES, tmp_path), drawn)
+
+
+def interrupt() -> None:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(
+    ("death", "error"),
+    [(interrupt, KeyboardInterrupt), (lambda: os._exit(9), UserError)],
+    ids=["interrupted", "killed"],
+)
+def test_a_killed_drawing_keeps_what_is_finished_and_ends_the_same(
+    death: Callable[[], None],
+    error: type[BaseException],
+    drawn: SyntheticPictures,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(pipeline.parallel, "cores", lambda: 1)
+    monkeypatch.setattr(module, "CHUNK", 4)
+    with monkeypatch.context() as patch:
+
+        def until(number: int, config: PretrainConfig, frames: FramesConfig) -> SyntheticPictures:
+            if number == 5:
+                death()
+            return draw_object(number, config, frames)
+
+        patch.setattr(module, "draw_object", until)
+        with pytest.raises(error):
+            draw_pictures(CONFIG, FRAMES, tmp_path)
+    finished = {int(f.stem) for f in tmp_path.glob("[0-9]*.npz")}
+    assert 0 in finished
+    assert 4 not in finished
+    assert finished <= {0, 8}
+
+    def only_others(number: int, config: PretrainConfig, frames: FramesConfig) -> SyntheticPictures:
+        assert number // 4 * 4 not in finished, "drawn again"
+        return draw_object(number, config, frames)
+
+    monkeypatch.setattr(module, "draw_object", only_others)
+    assert equal(draw_pictures(CONFIG, FRAMES, tmp_path), drawn)
+
+
+# What is told
+
+
+def test_pictures_have_their_shapes_and_ranges(drawn: SyntheticPictures) -> None:
+    assert (drawn.pictures.shape, drawn.pictures.dtype) == ((9, 2, 32, 32, 3), np.uint8)
+    assert (drawn.quantities.shape, drawn.quantities.dtype) == ((9, 2, len(QUANTITIES)), np.float32)
+    assert (drawn.kinds.shape, drawn.kinds.dtype) == ((9, len(KINDS)), np.uint8)
+    assert np.isfinite(drawn.quantities).all()
+    assert set(np.unique(drawn.kinds)) == {0, 1}
+    assert (drawn.kinds[:, -len(BODIES) :].sum(axis=1) == 1).all(), "one body each"
+    assert (drawn.kinds[:, : -len(BODIES)].sum(axis=1) <= 3).all(), "three layers at most"
+    told = {name: drawn.quantities[..., i] for i, name in enumerate(QUANTITIES)}
+    modulus, force, radius = (told[f"log10 {name}"] for name in ("modulus", "force", "contact radius"))
+    assert (modulus == modulus[:, :1]).all(), "the object's, whatever the press"
+    assert ((modulus >= np.log10(MODULUS_MPA[0])) & (modulus <= np.log10(MODULUS_MPA[1]))).all()
+    assert ((force >= np.log10(FORCES[0])) & (force <= np.log10(FORCES[1]))).all()
+    assert (np.diff(force, axis=1) > 0).all()
+    assert (np.diff(radius, axis=1) > -1e-6).all(), "pressed harder, nothing loses contact"
+    assert ((told["bump share"] >= 0) & (told["bump share"] <= 1)).all()
+
+
+@pytest.mark.parametrize("number", [12, 15, 18])
+def test_quantities_are_measured_where_they_are_shown(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Texture of the whole surface; bumps and depth of the skin in view, under each force."""
+    surfaces: list[np.ndarray] = []
+    skins: list[np.ndarray] = []
+    texture, share = module.texture, module.bump_share
+
+    def note_surface(surface: np.ndarray, pitch: float) -> float:
+        surfaces.append(surface)
+        assert pitch == PITCH
+        return texture(surface, pitch)
+
+    def note_skin(skin: np.ndarray, pitch: float) -> float:
+        skins.append(skin)
+        return share(skin, pitch)
+
+    monkeypatch.setattr(module, "texture", note_surface)
+    monkeypatch.setattr(module, "bump_share", note_skin)
+    told = draw_object(number, CONFIG, FRAMES).quantities[0].astype(np.float64)
+    (surface,) = surfaces
+    assert surface.shape == (SIDE, SIDE)
+    assert {skin.shape for skin in skins} == {(HEIGHT, WIDTH)}
+    for press, skin in zip(told, skins, strict=True):
+        found = measure(float(10 ** press[0]), surface, skin, PITCH)
+        assert 10 ** press[3] - 5e-4 == pytest.approx(found.texture, rel=1e-4, abs=1e-8)
+        assert press[4] == pytest.approx(found.bump, abs=1e-6)
+        assert press[5] == pytest.approx(math.log10(skin.max() + 1e-3), abs=1e-5)
+
+
+@pytest.mark.parametrize("length", [0.6, 2.4, 7.0])
+def test_bands_tell_a_wave_as_the_filters_transfer_says(length: float) -> None:
+    """A Gaussian filter of cutoff c passes 2^-(c / L)^2 of a sine of wavelength L (ISO 16610-21)."""
+    wave = np.tile(0.1 * np.sin(2 * np.pi * PITCH / length * np.arange(SIDE)), (SIDE, 1)).astype(np.float32)
+    inner = np.zeros((SIDE, SIDE), bool)
+    inner[:, 60:-60] = True  # Filters lack neighbours at the border.
+    left, expected = 0.1, []
+    for cutoff in (0.3, 0.6, 1.2, 2.4, 4.8):
+        passed = left * 2 ** -((cutoff / length) ** 2)
+        expected.append((left - passed) / math.sqrt(2))
+        left = passed
+    found = 10.0 ** np.array(module._bands(wave, inner)) - 1e-3
+    assert found[0] == pytest.approx(expected[0], rel=0.25), "half a pixel wide, a Gaussian is only nearly one"
+    np.testing.assert_allclose(found[1:], expected[1:], rtol=0.06, atol=3e-4)
+    assert module._bands(wave, ~(inner | ~inner)) == [-3.0] * 5, "nothing touches, nothing to tell"
+
+
+# Pictures
+
+
+def test_a_press_that_touches_nothing_shows_128(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the sensor; what is left is noise, doubled, and what coding makes of it."""
+    shade = module.shade
+    monkeypatch.setattr(module, "shade", lambda skin, *rest: shade(np.zeros_like(skin), *rest))
+    for number in range(2):
+        pictures = draw_object(number, CONFIG, FRAMES).pictures.astype(float)
+        assert np.abs(pictures.mean(axis=(2, 3)) - 128).max() < 1
+        assert pictures.std(axis=(2, 3)).max() < 4
+        assert np.abs(pictures - 128).max() < 25
+
+
+@pytest.mark.parametrize(("fit", "size"), [("crop", 16), ("squash", 48), ("crop", 128), ("squash", 150)])
+def test_frames_are_fitted_as_those_of_videos(fit: str, size: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Against PIL, and in RGB; a press's frame and reference are of one sensor."""
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH] / 12
+    waves = np.stack([120 + 60 * np.sin(x + c) * np.cos(y) + 20 * np.sin(y) for c in range(3)], axis=2).astype(np.uint8)
+    seen: list[Sensor] = []
+    taken: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def light(_: np.ndarray, sensor: Sensor, pitch: float, seed: int) -> np.ndarray:
+        seen.append(sensor)
+        return waves
+
+    def note(frames: np.ndarray, reference: np.ndarray) -> np.ndarray:
+        taken.append((frames[0], reference))
+        return subtract(frames, reference)
+
+    monkeypatch.setattr(module, "shade", light)
+    monkeypatch.setattr(module, "subtract", note)
+    found = draw_object(2, CONFIG, FramesConfig(size=size, fit=fit))
+    assert found.pictures.shape == (1, 2, size, size, 3)
+    for sensor, (frame, reference), shown in zip(seen, taken, found.pictures[0], strict=True):
+        for found, whole in ((frame, waves), (reference, cv2.convertScaleAbs(sensor.background))):
+            expected = pillow(np.ascontiguousarray(whole[..., ::-1]), size, fit).astype(float)
+            assert np.abs(found - expected).mean() < 2.5, "coding included"
+        np.testing.assert_array_equal(shown, subtract(frame[None], reference)[0])
+
+
+def test_sensors_are_made_once_and_differ() -> None:
+    assert sensors() is sensors()
+    assert len({s.background.tobytes() for s in sensors()}) == len(sensors()) == 3
+    assert all(s.background.shape == (HEIGHT, WIDTH, 3) for s in sensors())
+
+
+# Varying
+
+
+ramp = np.arange(256, dtype=np.uint8).reshape(16, 16)
+RAMPS = np.repeat(np.stack([ramp, ramp, ramp])[..., None], 3, axis=3)
+"""Three presses that show every value once in every channel."""
+
+
+def mirrored(pictures: np.ndarray) -> list[np.ndarray]:
+    return [np.flip(pictures, axes) for axes in ((), (1,), (2,), (1, 2))]
+
+
+def upright(pictures: np.ndarray) -> np.ndarray:
+    """The ramps turned back: on average they rise to the right and downwards."""
+    across, down = pictures[:, :, -1].mean() - pictures[:, :, 0].mean(), pictures[:, -1].mean() - pictures[:, 0].mean()
+    return np.flip(pictures, tuple(axis for axis, rise in ((1, down), (2, across)) if rise < 0))
+
+
+def test_presses_are_mirrored_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pretraining, "STRENGTH", (1.0, 1.0))
+    pictures = np.random.default_rng(0).integers(0, 256, (3, 8, 8, 3), dtype=np.uint8)
+    before = pictures.copy()
+    ways = []
+    for seed in range(60):
+        found = vary(pictures, np.random.default_rng(seed))
+        ways += [i for i, way in enumerate(mirrored(pictures)) if np.array_equal(way, found)]
+    assert len(ways) == 60, "all presses alike, in one of four ways"
+    assert min(ways.count(i) for i in range(4)) > 5
+    assert np.array_equal(pictures, before), "what was given stays"
+
+
+@given(st.integers(0, 10**6))
+def test_strengths_turn_about_the_middle(seed: int) -> None:
+    """128 + g (v - 128), rounded and cut at the ends: one factor a press."""
+    found = upright(vary(RAMPS, np.random.default_rng(seed)).astype(int))
+    assert np.array_equal(found, upright(vary(RAMPS, np.random.default_rng(seed)).astype(int))), "repeatable"
+    gains = []
+    for press in found:
+        values = press[..., 0].ravel()
+        assert (press == press[..., :1]).all(), "all channels alike"
+        inside = (values > 0) & (values < 255)
+        given_ = np.arange(256)[inside] - 128.0
+        gain = float(given_ @ (values[inside] - 128.0) / (given_ @ given_))
+        assert np.abs(values - np.clip(128 + gain * (np.arange(256) - 128), 0, 255)).max() < 1.6
+        assert values[128] == 128
+        gains.append(gain)
+    assert STRENGTH[0] - 0.01 < min(gains) <= max(gains) < STRENGTH[1] + 0.01
+    assert len(set(gains)) == 3, "each press has its own"
+
+
+def test_an_item_of_a_training_depends_on_seed_epoch_and_number_alone(drawn: SyntheticPictures) -> None:
+    data = PretrainingDataset(drawn, augment=True, seed=1)
+    first = data[3]["frames"]
+    assert torch.equal(first, PretrainingDataset(drawn, augment=True, seed=1)[3]["frames"])
+    assert not torch.equal(first, PretrainingDataset(drawn, augment=True, seed=2)[3]["frames"])
+    data.follow(lambda: 1)
+    assert not torch.equal(first, data[3]["frames"])
+    data.follow(lambda: 0)
+    assert torch.equal(first, data[3]["frames"])
+    plain = PretrainingDataset(drawn, augment=False, seed=1)
+    assert len(plain) == 9
+    for name, kind in (("frames", torch.uint8), ("quantities", torch.float32), ("kinds", torch.float32)):
+        assert plain[3][name].dtype == kind
+        source = drawn.pictures if name == "frames" else getattr(drawn, name)
+        np.testing.assert_array_equal(plain[3][name].numpy(), source[3])
+
+
+# Inventing
+
+
+@given(st.integers(0, 2**62))
+@settings(max_examples=40)
+def test_what_is_invented_can_be_made(seed: int) -> None:
+    recipe = invent(np.random.default_rng(seed))
+    assert Recipe.model_validate_json(recipe.model_dump_json()) == recipe
+    assert recipe == invent(np.random.default_rng(seed))
+    assert MODULUS_MPA[0] <= recipe.modulus <= MODULUS_MPA[1]
+    kinds = [layer.kind for layer in recipe.relief]
+    assert len(kinds) == len(set(kinds)) <= 3
+    assert {*kinds, recipe.body.kind} <= set(KINDS)
+    surface = heights(recipe.surface, 65, 0.25, np.random.default_rng(seed))
+    assert (surface.shape, surface.dtype) == ((65, 65), np.float32)
+    assert np.isfinite(surface).all()
+    assert surface.max() < 20, "in mm: nothing stands out farther than the sensor is wide"
+
+
+def test_bodies_and_layers_come_as_often_as_said() -> None:
+    """Within five standard deviations of 2000 draws; of more than three layers some are left out."""
+    recipes = [invent(np.random.default_rng(seed)) for seed in range(2000)]
+    bodies = [r.body.kind for r in recipes]
+    for kind, share in {"flat": 0.25, "round": 0.5, "bar": 0.13, "wedge": 0.12}.items():
+        assert bodies.count(kind) / 2000 == pytest.approx(share, abs=5 * math.sqrt(share * (1 - share) / 2000))
+    for kind, (share, _) in LAYERS.items():
+        found = sum(kind in [layer.kind for layer in r.relief] for r in recipes) / 2000
+        slack = 5 * math.sqrt(share * (1 - share) / 2000)
+        assert 0.9 * share - slack <= found <= share + slack
+    orders = {tuple(layer.kind for layer in r.relief) for r in recipes}
+    assert ("rough", "domes") in orders
+    assert ("domes", "rough") in orders
+
+
+# The model
+
+
+@pytest.mark.parametrize("constant", [False, True])
+def test_the_loss_by_hand(constant: bool) -> None:
+    """In float64; `constant`: a quantity that never changes."""
+    rng = np.random.default_rng(1)
+    pictures = SyntheticPictures(
+        pictures=rng.integers(0, 256, (6, 2, 32, 32, 3), dtype=np.uint8),
+        quantities=rng.normal(3, 5, size=(6, 2, 4)).astype(np.float32),
+        kinds=rng.integers(0, 2, (6, 3)).astype(np.uint8),
+    )
+    if constant:
+        pictures.quantities[..., 0] = 7
+    seed_everything(0)
+    model = pretraining_model(SceneEncoder(), pictures).eval()
+    batch = slice(1, 5)
+    arrays = (pictures.pictures[batch], pictures.quantities[batch], pictures.kinds[batch].astype(np.float32))
+    with torch.no_grad():
+        found = {n: v.item() for n, v in model(*map(torch.from_numpy, arrays)).items()}
+        flat = torch.from_numpy(pictures.pictures[batch].reshape(-1, 32, 32, 3))
+        features = model.encoder(flat, torch.zeros(8)).double().numpy()
+    weights = {n: p.detach().double().numpy() for n, p in model.named_parameters()}
+    hidden = np.maximum(features @ weights["head.1.weight"].T + weights["head.1.bias"], 0)
+    told = (hidden @ weights["head.3.weight"].T + weights["head.3.bias"]).reshape(4, 2, 7)
+    exact = pictures.quantities.astype(np.float64)
+    wanted = (exact[batch] - exact.mean(axis=(0, 1))) / (exact.std(axis=(0, 1)) + 1e-6)
+    off = np.abs(told[..., :4] - wanted)
+    quantities = np.where(off < 1, off**2 / 2, off - 0.5).mean()
+    chances = expit(told[..., 4:])
+    present = np.repeat(pictures.kinds[batch, None].astype(float), 2, axis=1)
+    flags = -(present * np.log(chances) + (1 - present) * np.log(1 - chances)).mean()
+    assert found["quantities"] == pytest.approx(quantities, rel=1e-5)
+    assert found["kinds"] == pytest.approx(flags, rel=1e-5)
+    assert found["loss"] == pytest.approx(2 * quantities + 0.6 * flags, rel=1e-5)
+
+
+def test_held_out_parts_are_means_over_pictures(drawn: SyntheticPictures) -> None:
+    seed_everything(0)
+    model = pretraining_model(SceneEncoder(), drawn)
+    data = PretrainingDataset(drawn, augment=False, seed=0)
+    found = held_out(model, data)
+    assert not model.training
+    with torch.no_grad():
+        single = [model(**{n: v[None] for n, v in data[i].items()}) for i in range(9)]
+    assert found == pytest.approx(
+        {f"held_out_{n}": np.mean([s[n].item() for s in single]) for n in ("loss", "quantities", "kinds")}
+    )
+    assert found == held_out(model, data), "nothing is dropped at random"

@@ -1,0 +1,374 @@
+"""Trainings of encoders that go wrong: classes that lack, NaN, rates that are too high, kills, too few objects."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+from torch.optim.optimizer import register_optimizer_step_pre_hook
+
+from pipeline.config import CrossValidationConfig, EncoderConfig, FramesConfig, PretrainConfig, RuntimeConfig
+from pipeline.encoder import pretrain as pretraining
+from pipeline.encoder.candidates import CANDIDATES
+from pipeline.encoder.clips import EncoderData, classify
+from pipeline.encoder.cross_validation import CrossValidationData, cross_validate_candidate
+from pipeline.encoder.embed import embed_videos
+from pipeline.encoder.finetune import fit_heads, train_classifier
+from pipeline.encoder.frame_classifier import STRENGTHS, JointFrameClassifier, fit_frame_heads
+from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
+from pipeline.encoder.pretrain import WEIGHTS, PretrainingModel, pretrain
+from pipeline.encoder.recipes import property_classifier
+from pipeline.encoder.scene_encoder import CHANNELS, SceneEncoder
+from pipeline.encoder.synthetic import SyntheticPictures
+from pipeline.errors import UserError
+from pipeline.records import Measurement, Part
+from pipeline.runtime import seed_everything
+from pipeline.training.trainable import trainable_state
+from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.frames.store import FrameStore
+from tests.conftest import fake_videos
+from tests.encoders import CPU, OBJECTS, PARTS, config, encoder_data, write_frames
+
+CLASSES = [3, 3, 3]
+DEVICE = torch.device("cpu")
+GRADIENTS = ("paper", "release", "scratch")
+"""Classifiers that are trained by gradients; `scratch` is the network of difference pictures with the paper's heads."""
+TOO_HIGH = "lower the learning rate"
+pytestmark = pytest.mark.usefixtures("elsewhere")
+
+
+def settings(kind: str, weights: Path, **changes: object) -> EncoderConfig:
+    return config(weights, "release" if kind == "release" else "paper", **changes)
+
+
+def classifier(kind: str, weights: Path) -> PropertyClassifier:
+    """Equal at every call."""
+    seed_everything(0)
+    if kind == "scratch":
+        return PropertyClassifier(SceneEncoder(), Heads(256, CLASSES), CLASSES)
+    return property_classifier(settings(kind, weights), CLASSES)
+
+
+Run = Callable[..., tuple[list[Measurement], dict[str, torch.Tensor]]]
+
+
+def training(kind: str, weights: Path, data: EncoderData, **changes: object) -> Run:
+    """A training that may be run again and again: its history and end state."""
+
+    def run(
+        factor: float = 1.0, model: PropertyClassifier | None = None
+    ) -> tuple[list[Measurement], dict[str, torch.Tensor]]:
+        """With the learning rate times `factor`."""
+        setting = settings(kind, weights, **changes)
+        setting = setting.model_copy(update={"learning_rate": factor * setting.learning_rate})
+        model = model or classifier(kind, weights)
+        history = train_classifier(model, data, setting, CPU, seed=0, inputs=[])
+        return history, trainable_state(model)
+
+    return run
+
+
+def same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> None:
+    torch.testing.assert_close(one, other, rtol=0, atol=0)
+
+
+Hook = Callable[[Callable[[int], None]], None]
+
+
+@pytest.fixture
+def before_updates() -> Iterator[Hook]:
+    """Has something called before each update of any optimiser, with the number of updates made."""
+    handles = []
+
+    def register(call: Callable[[int], None]) -> None:
+        made = iter(range(10**6))
+        handles.append(register_optimizer_step_pre_hook(lambda *_: call(next(made))))
+
+    yield register
+    for handle in handles:
+        handle.remove()
+
+
+def killed_at(*updates: int, begun: list[int]) -> Callable[[int], None]:
+    """Dies at these updates; keeps all that were begun."""
+
+    def kill(number: int) -> None:
+        begun.append(number)
+        if number in updates:
+            raise KeyboardInterrupt
+
+    return kill
+
+
+# Lacking classes
+
+HARD = dict.fromkeys(("baseball", "controller_base", "potato", "ice_block"), Part.TRAIN)
+"""All of the highest hardness; none of the highest bumpiness."""
+
+
+@pytest.mark.parametrize("kind", [*GRADIENTS, "pretrained"])
+def test_a_class_that_training_lacks_does_not_stop_it(
+    kind: str, weights: Path, catalogue: Catalogue, tmp_path: Path
+) -> None:
+    assert {catalogue.labels(o)[0] for o in HARD} == {2}
+    data = encoder_data(tmp_path, catalogue, {**HARD, "pillow": Part.VALIDATION, "rug": Part.TEST})
+    if kind == "pretrained":
+        model: PropertyClassifier = JointFrameClassifier(SceneEncoder(), CLASSES)
+        history = fit_heads(model, data, config(weights, "pretrained"), CPU, 0)
+        assert [m.name for m in history] == ["inner_combined"] * len(STRENGTHS)
+    else:
+        model = classifier(kind, weights)
+        history, _ = training(kind, weights, data, epochs=2)(model=model)
+    assert all(np.isfinite(m.value) for m in history)
+    judged = classify(model, data, [Part.TEST], 4, DEVICE)
+    assert [r.expected for r in judged] == list(catalogue.labels("rug"))
+    assert all(np.isfinite(r.probabilities).all() and min(r.probabilities) > 0 for r in judged)
+    if kind == "pretrained":
+        assert judged[0].predicted == 2
+        assert judged[0].probabilities[:2] == pytest.approx((0, 0), abs=1e-3)
+
+
+def test_a_single_video_fits() -> None:
+    clips = np.random.default_rng(0).normal(size=(1, 3, 4)).astype(np.float32)
+    heads = fit_frame_heads(clips, np.array([[2, 0]]), ["a"], [3, 2], STRENGTHS[0])
+    assert heads.predict(clips).tolist() == heads.predict(-1e6 * clips).tolist() == [[2, 0]]
+
+
+# NaN
+
+
+class Sick(FrameEncoder):
+    """Says nothing finite of what is bright all over."""
+
+    def __init__(self, value: float) -> None:
+        super().__init__(256)
+        self.value = value
+
+    def forward(self, frames: torch.Tensor, frame_indices: torch.Tensor) -> torch.Tensor:
+        embedded = frames.flatten(1)[:, :256].float()
+        embedded[frames.flatten(1).amin(1) == 255, 3] = self.value
+        return embedded
+
+
+def with_a_bright_video(folder: Path, catalogue: Catalogue, parts: dict[str, Part], bright: str) -> EncoderData:
+    data = encoder_data(folder, catalogue, parts)
+    pixels = np.array(data.store.pixels)
+    pixels[data.store.rows(bright)[-1]] = 255
+    np.save(folder / "frames.npy", pixels)
+    return EncoderData(FrameStore(folder), catalogue, data.assignments, 4)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_what_is_not_finite_is_named_by_its_video(
+    value: float, weights: Path, catalogue: Catalogue, tmp_path: Path
+) -> None:
+    """Embeddings, logits in batches of any size, and features that heads are fitted to."""
+    data = with_a_bright_video(tmp_path, catalogue, PARTS, "pillow_0")
+    with pytest.raises(UserError, match=r"^pillow_0: .*not finite"):
+        embed_videos(Sick(value), data.store, data.assignments, batch_size=3, device=DEVICE)
+    unused = [a.model_copy(update={"part": Part.UNUSED}) if a.object_id == "pillow" else a for a in data.assignments]
+    tensor, index = embed_videos(Sick(value), data.store, unused, batch_size=3, device=DEVICE)
+    assert tensor.isfinite().all()
+    assert len(tensor) == len(index)
+
+    for batch in (2, 64):
+        model = PropertyClassifier(Sick(value), Heads(256, CLASSES), CLASSES)
+        with pytest.raises(UserError, match=r"^pillow_0: .*not finite"):
+            classify(model, data, list(Part), batch, DEVICE)
+        with pytest.raises(UserError, match=r"^pillow_0: .*not finite"):
+            classify(JointFrameClassifier(Sick(value), CLASSES), data, list(Part), batch, DEVICE)
+    with pytest.raises(UserError, match="pillow_0"):
+        fit_heads(JointFrameClassifier(Sick(value), CLASSES), data, config(weights, "pretrained"), CPU, 0)
+
+
+# Rates that are too high
+
+
+@pytest.mark.parametrize("kind", GRADIENTS)
+def test_a_rate_too_high_ends_finite_or_in_one_line(
+    kind: str, weights: Path, catalogue: Catalogue, tmp_path: Path
+) -> None:
+    """Params allow no rate from 10 on; a model may be as badly scaled all the same.
+
+    A batch of eight makes the first update the last: what diverges in it is told too.
+    """
+    data = encoder_data(tmp_path, catalogue, PARTS)
+    run = training(kind, weights, data, epochs=1, batch_size=1)
+    for factor in (100, 1e6):
+        history, state = run(factor)
+        assert all(np.isfinite(m.value) for m in history)
+        assert all(v.isfinite().all() for v in state.values())
+    with pytest.raises(UserError, match=rf"^loss is .* at step 5: .*{TOO_HIGH}.*$"):
+        run(1e20)
+    with pytest.raises(UserError, match=TOO_HIGH):
+        training(kind, weights, data, epochs=1, batch_size=8)(1e23)
+
+
+def test_a_loss_that_is_no_number_stops_the_training_and_leaves_the_last_checkpoint(
+    weights: Path, catalogue: Catalogue, tmp_path: Path, before_updates: Hook
+) -> None:
+    run = training("paper", weights, encoder_data(tmp_path, catalogue, PARTS), epochs=4, batch_size=2)
+    _, smooth = run()
+    model = classifier("paper", weights)
+
+    def poison(update: int) -> None:
+        if update == 7:  # The second of the third epoch's three.
+            torch.nn.init.constant_(next(iter(model.heads.parameters())), float("inf"))
+
+    before_updates(poison)
+    with pytest.raises(UserError, match=f"loss is nan at step 9: .*{TOO_HIGH}") as caught:
+        run(model=model)
+    assert "\n" not in str(caught.value)
+    assert "checkpoint-6" in {f.name for f in tmp_path.glob("checkpoints/*/*/*")}
+    same(run()[1], smooth)
+
+
+# Kills
+
+
+def in_order(history: list[Measurement]) -> list[tuple[int, str, float]]:
+    return sorted((m.step, m.name, m.value) for m in history)
+
+
+@pytest.mark.parametrize(("kind", "validated"), [("paper", True), ("release", True), ("scratch", False)])
+def test_a_killed_training_ends_as_if_it_had_not_been(
+    kind: str, validated: bool, weights: Path, catalogue: Catalogue, tmp_path: Path, before_updates: Hook
+) -> None:
+    """Killed in the second epoch, and again in the third; release drops units at random."""
+    parts = PARTS if validated else dict.fromkeys(PARTS, Part.TRAIN)
+    run = training(kind, weights, encoder_data(tmp_path, catalogue, parts), epochs=3, batch_size=2)
+    epoch = 3 if validated else 4
+    history, state = run()
+    begun: list[int] = []
+    before_updates(killed_at(epoch + 1, 2 * epoch + 2, begun=begun))
+    for number in (1, 2):
+        with pytest.raises(KeyboardInterrupt):
+            run()
+        assert f"checkpoint-{number * epoch}" in {f.name for f in tmp_path.glob("checkpoints/*/*/*")}
+    resumed, end = run()
+    assert len(begun) == (epoch + 2) + (epoch + 1) + epoch, "only what the last checkpoint lacked was done again"
+    assert in_order(resumed) == in_order(history)
+    same(state, end)
+    assert not any(tmp_path.glob("checkpoints/*/*"))
+
+
+WRITTEN = ["model.safetensors", "training_args.bin", "optimizer.pt", "scheduler.pt", "rng_state.pth"]
+WRITTEN += ["trainer_state.json"]
+"""Files of a checkpoint in the order that the Trainer writes them."""
+
+
+def test_a_checkpoint_that_was_being_written_is_passed_over(
+    weights: Path, catalogue: Catalogue, tmp_path: Path, before_updates: Hook
+) -> None:
+    """However far it had come: some of it, all but the last file."""
+    run = training("release", weights, encoder_data(tmp_path, catalogue, PARTS), epochs=3, batch_size=2)
+    history, whole = run()
+    for first_lacking in ("trainer_state.json", "optimizer.pt", "model.safetensors"):
+        before_updates(killed_at(7, begun=[]))
+        with pytest.raises(KeyboardInterrupt):
+            run()
+        (last,) = tmp_path.glob("checkpoints/*/*/checkpoint-6")
+        for name in WRITTEN[WRITTEN.index(first_lacking) :]:
+            (last / name).unlink(missing_ok=True)
+        resumed, again = run()
+        assert resumed == history, "in the same order, too"
+        same(whole, again)
+
+
+# Synthetic pretraining
+
+
+@pytest.fixture
+def noise(monkeypatch: pytest.MonkeyPatch) -> SyntheticPictures:
+    """Noise in place of scenes, with something to tell of it."""
+    rng = np.random.default_rng(0)
+    made = SyntheticPictures(
+        pictures=rng.integers(0, 256, (16, 2, 16, 16, 3), dtype=np.uint8),
+        quantities=rng.normal(size=(16, 2, 5)).astype(np.float32),
+        kinds=rng.integers(0, 2, (16, 4)).astype(np.uint8),
+    )
+    monkeypatch.setattr(pretraining, "draw_pictures", lambda *_: made)
+    return made
+
+
+def pretrained(steps: int, saved: int, objects: int = 16, side: int = 16) -> tuple[SceneEncoder, list[Measurement]]:
+    setting = PretrainConfig(objects=objects, presses=2, steps=steps, batch_size=4)
+    return pretrain(setting, FramesConfig(size=side), RuntimeConfig(device="cpu", save_steps=saved))
+
+
+@pytest.mark.usefixtures("noise")
+@pytest.mark.parametrize("killed", [3, 7])
+def test_a_killed_pretraining_ends_as_if_it_had_not_been(killed: int, tmp_path: Path, before_updates: Hook) -> None:
+    """15 objects make four updates an epoch: the checkpoint after 2 is within the first, after 6 within the second."""
+    encoder, history = pretrained(8, 2)
+    begun: list[int] = []
+    before_updates(killed_at(killed, begun=begun))
+    with pytest.raises(KeyboardInterrupt):
+        pretrained(8, 2)
+    assert [f.name for f in tmp_path.glob("checkpoints/pretrain/*/*")] == [f"checkpoint-{killed - 1}"]
+    again, resumed = pretrained(8, 2)
+    assert len(begun) == (killed + 1) + 8 - (killed - 1)
+    same(trainable_state(encoder), trainable_state(again))
+    assert in_order(resumed) == in_order(history)
+    assert not any(tmp_path.glob("checkpoints/*/*"))
+
+
+@pytest.mark.usefixtures("noise")
+def test_what_diverges_between_two_reports_replaces_no_good_checkpoint(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, before_updates: Hook
+) -> None:
+    made: list[PretrainingModel] = []
+    original: Callable[[SceneEncoder, SyntheticPictures], PretrainingModel] = pretraining.pretraining_model
+    monkeypatch.setattr(pretraining, "pretraining_model", lambda *given: made.append(original(*given)) or made[-1])
+
+    def poison(update: int) -> None:
+        if update == 41:
+            torch.nn.init.constant_(made[-1].head[1].weight, float("inf"))
+
+    before_updates(poison)
+    with pytest.raises(UserError, match="earlier checkpoints are kept"):
+        pretrained(240, 4)
+    kept = list(tmp_path.glob("checkpoints/pretrain/*/*/model.safetensors"))
+    assert kept
+    assert all(value.isfinite().all() for file in kept for value in load_file(file).values())
+
+
+def test_a_tiny_pretraining_draws_trains_and_tells_what_it_left_aside(tmp_path: Path) -> None:
+    encoder, history = pretrained(4, 2, objects=8, side=32)
+    assert all(np.isfinite(m.value) for m in history)
+    last = {m.name: m.value for m in history if m.step == 4}
+    parts = {name: last[f"held_out_{name}"] for name in WEIGHTS}
+    assert last["held_out_loss"] == pytest.approx(sum(WEIGHTS[name] * value for name, value in parts.items()), rel=1e-5)
+    assert [m.step for m in history if m.name == "loss"] == [1, 2, 3, 4]
+    assert all(v.isfinite().all() for v in trainable_state(encoder).values())
+    counts = [int(b) for n, b in encoder.named_buffers() if n.endswith("num_batches_tracked")]
+    assert counts == [4] * len(CHANNELS), "the object left aside has touched no statistics"
+    assert not any(tmp_path.glob("checkpoints/*/*"))
+
+
+# Too few objects
+
+
+def test_two_objects_are_too_few_for_five_folds_and_enough_for_two(
+    weights: Path, catalogue: Catalogue, tmp_path: Path
+) -> None:
+    """With one object to train on none is left to validate by."""
+    videos = fake_videos(OBJECTS[1:3], 2)
+    frames = write_frames(tmp_path / "frames", {v.video_id: 1 for v in videos})
+    data = CrossValidationData(
+        videos=videos,
+        catalogue=catalogue,
+        frames=frames,
+        recordings=frames,
+        per_video=1,
+        encoder=EncoderConfig(weights=str(weights), epochs=1),
+        runtime=CPU,
+        pretrained=tmp_path / "none",
+    )
+    with pytest.raises(UserError, match=r"cross_validation.folds is 5 but only 2 objects"):
+        cross_validate_candidate(CANDIDATES["constant"], data, CrossValidationConfig(folds=5))
+    assert len(cross_validate_candidate(CANDIDATES["paper"], data, CrossValidationConfig(folds=2, repeats=1))) == 4

@@ -1,0 +1,218 @@
+"""`octopi compare` in a small Git and DVC repository: what it names, what it leaves out, and its paired test."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+import shutil
+import subprocess
+from contextlib import chdir
+from pathlib import Path
+
+import pytest
+import yaml
+from dvc.repo import Repo
+from typer.testing import CliRunner
+
+from pipeline.cli import app
+from pipeline.compare import compare
+from pipeline.errors import UserError
+from pipeline.evaluation.scores import ScoreRow, score_rows
+from pipeline.io import write_csv, write_table
+from pipeline.records import Graded
+from tests.evaluation.test_scores import CATALOGUE, graded
+
+REPORT = "reports/smoke-scenes"
+CHAIN = {
+    "stages": {
+        "questions": {
+            "cmd": "mkdir -p data/questions && cp made/evaluation.jsonl data/questions/",
+            "deps": ["made/evaluation.jsonl"],
+            "outs": ["data/questions/evaluation.jsonl"],
+        },
+        "grade": {
+            "cmd": "cp made/graded.parquet data/",
+            "deps": ["made/graded.parquet", "data/questions/evaluation.jsonl"],
+            "params": ["epochs"],
+            "outs": ["data/graded.parquet"],
+        },
+        "report": {
+            "cmd": f"mkdir -p {REPORT} && cp made/metrics.json made/scores.csv {REPORT}/",
+            "deps": ["made/metrics.json", "made/scores.csv", "data/graded.parquet"],
+            "outs": [{f"{REPORT}/{name}": {"cache": False}} for name in ("metrics.json", "scores.csv")],
+        },
+    }
+}
+BEFORE = [i % 3 == 0 for i in range(18)]
+AFTER = [i % 3 == 0 or i % 6 in (1, 2, 4) for i in range(18)]
+
+
+class History:
+    """The repository; every `commit` reproduces before it commits."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def git(self, *arguments: str) -> str:
+        identity = ("-c", "user.name=a", "-c", "user.email=a@b.c")
+        command = ["git", *identity, *arguments]
+        return subprocess.run(command, cwd=self.folder, capture_output=True, text=True, check=True).stdout.strip()
+
+    def write(self, name: str, text: str) -> None:
+        (self.folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (self.folder / name).write_text(text)
+
+    def answers(self, right: list[bool], videos: str = "0", metric: float = 0.25) -> None:
+        """The full system's and the base encoder's descriptions; the latter never change."""
+        answers = graded("OPD", right, measure="combined") + graded("OPD", BEFORE, measure="combined", encoder="base")
+        write_table(self.folder / "made" / "graded.parquet", Graded, answers)
+        write_csv(self.folder / "made" / "scores.csv", ScoreRow, score_rows(answers, CATALOGUE))
+        rows = [
+            {"question_id": f"OPD-{i:03}", "videos": [f"o_{videos if i < 3 else 0}"], "gold": "x"} for i in range(18)
+        ]
+        self.write("made/evaluation.jsonl", "".join(json.dumps(row) + "\n" for row in rows))
+        self.write("made/metrics.json", json.dumps({"OPD": metric}))
+
+    def commit(self, tag: str) -> None:
+        with chdir(self.folder), Repo() as repo:
+            repo.reproduce()
+        self.git("add", "--all")
+        self.git("commit", "--quiet", "--allow-empty", "--message", tag)
+        self.git("tag", tag)
+
+
+@pytest.fixture(scope="module")
+def history(tmp_path_factory: pytest.TempPathFactory) -> History:
+    """Tags: `first`; `again`, the same reproduced; `longer`, one parameter and the answers changed; `asked`, three
+    questions about other videos.
+    """
+    found = History(tmp_path_factory.mktemp("history") / "a clone")
+    (found.folder / "made").mkdir(parents=True)
+    found.git("init", "--quiet")
+    Repo.init(str(found.folder)).close()
+    found.write(".dvc/config", "[core]\n    analytics = false\n")
+    found.write("dvc.yaml", yaml.safe_dump(CHAIN))
+    found.write(".gitignore", "/data/\n")
+    found.write("params.yaml", "epochs: 4\nencoder: {sizes: [1, 2]}\n")
+    found.answers(BEFORE)
+    found.commit("first")
+    shutil.rmtree(found.folder / "data")
+    found.commit("again")
+    found.write("params.yaml", "epochs: 5\nencoder: {sizes: [1, 2]}\n")
+    found.answers(AFTER, metric=0.75)
+    found.commit("longer")
+    found.answers(BEFORE, videos="1", metric=0.75)
+    found.commit("asked")
+    return found
+
+
+@pytest.fixture
+def copy(history: History, tmp_path: Path) -> History:
+    """One to change."""
+    shutil.copytree(history.folder, tmp_path / "copy", symlinks=True)
+    return History(tmp_path / "copy")
+
+
+def test_a_reproduction_done_twice_differs_in_nothing(history: History) -> None:
+    found = compare(history.folder, "first", "again")
+    assert not found["differs"]
+    assert found["tested"] == found["notes"] == []
+    assert not compare(history.folder, "asked")["differs"], "the working tree is as committed"
+
+
+def test_what_changed_is_named_with_what_it_moved(history: History) -> None:
+    found = compare(history.folder, "again", "longer")
+    assert found["parameters"] == [{"name": "epochs", "old": "4", "new": "5"}]
+    assert found["stages"] == [
+        {"stage": "grade", "because of": "made/graded.parquet, params", "made": "data/graded.parquet"},
+        {
+            "stage": "report",
+            "because of": "data/graded.parquet, made/metrics.json, made/scores.csv",
+            "made": f"{REPORT}/metrics.json, {REPORT}/scores.csv",
+        },
+    ]
+    assert found["metrics"] == [{"name": "smoke-scenes.OPD", "old": "0.25", "new": "0.75"}]
+    assert [row["name"] for row in found["scores"]] == [
+        f"smoke-scenes OPD combined finetuned with all real {seed}" for seed in ("0", "all")
+    ]
+    assert found["scores"][0]["old"].startswith(f"{sum(BEFORE) / 18:.6f} [")
+    assert found["scores"][0]["new"].startswith(f"{sum(AFTER) / 18:.6f} [")
+    back = compare(history.folder, "longer", "again")
+    assert [row["difference"] for row in back["tested"]] == [-row["difference"] for row in found["tested"]]
+
+
+def test_the_paired_test_is_on_the_same_questions_and_over_objects(history: History) -> None:
+    """The base encoder answered as before, so that one system is tested; p by going through all signs."""
+    (row,) = compare(history.folder, "again", "longer")["tested"]
+    assert (row["part"], row["task"], row["n"], row["objects"]) == ("finetuned with all real", "OPD", 18, 6)
+    assert row["difference"] == pytest.approx((sum(AFTER) - sum(BEFORE)) / 18, abs=1e-6)
+    sums = [sum(AFTER[i] - BEFORE[i] for i in range(o, 18, 6)) for o in range(6)]
+    ways = [abs(sum(s * v for s, v in zip(signs, sums, strict=True))) for signs in itertools.product((1, -1), repeat=6)]
+    assert row["p"] == row["p_holm"] == pytest.approx(sum(way >= abs(sum(sums)) for way in ways) / 64, abs=1e-6)
+    assert row["low"] <= row["difference"] <= row["high"]
+
+
+def test_other_questions_are_left_out_and_counted(history: History) -> None:
+    found = compare(history.folder, "longer", "asked")
+    (row,) = found["tested"]
+    assert row["n"] == 15
+    assert row["difference"] == pytest.approx((sum(BEFORE[3:]) - sum(AFTER[3:])) / 15, abs=1e-6)
+    assert found["notes"] == ["15 questions are compared; 3 were asked by one side only, or differ."]
+
+
+def test_without_a_cache_all_but_the_paired_test_is_there(history: History, tmp_path: Path) -> None:
+    clone = tmp_path / "clone"
+    subprocess.run(["git", "clone", "--quiet", str(history.folder), str(clone)], check=True)
+    found = compare(clone, "again", "longer")
+    assert (len(found["parameters"]), len(found["metrics"]), len(found["scores"])) == (1, 1, 2)
+    assert found["tested"] == []
+    (note,) = found["notes"]
+    assert re.search(r"graded.parquet of again \(\w+\) and longer \(\w+\) is not at hand; `dvc pull`", note)
+
+
+def test_the_working_tree_is_what_lies_on_disk(copy: History) -> None:
+    copy.write("params.yaml", "epochs: 6\nencoder: {sizes: [1, 2]}\n")
+    copy.write(f"{REPORT}/metrics.json", '{"OPD": 0.75, "PC": 1.0}')
+    found = compare(copy.folder, "HEAD")
+    assert found["new"] == "working tree"
+    assert found["parameters"] == [{"name": "epochs", "old": "5", "new": "6"}]
+    assert found["metrics"] == [{"name": "smoke-scenes.PC", "old": None, "new": "1.0"}]
+    assert found["stages"] == found["scores"] == found["tested"] == []
+
+
+@pytest.mark.parametrize(
+    ("file", "text"),
+    [("params.yaml", "{"), ("params.yaml", "- 1\n"), ("dvc.lock", "{"), (f"{REPORT}/metrics.json", "{")],
+)
+def test_a_broken_file_is_named(copy: History, file: str, text: str) -> None:
+    copy.write(file, text)
+    with pytest.raises(UserError, match=re.escape(f"{Path(file).name} of working tree: not a mapping")):
+        compare(copy.folder, "HEAD")
+
+
+@pytest.mark.parametrize("revision", ["nowhere", "--all", "HEAD:params.yaml", "first..again", ""])
+def test_an_unknown_revision_is_refused(history: History, revision: str) -> None:
+    with pytest.raises(UserError, match="no commit of a Git repository"):
+        compare(history.folder, revision)
+
+
+def test_outside_of_git_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
+    with pytest.raises(UserError, match="no commit of a Git repository"):
+        compare(tmp_path, "HEAD")
+
+
+def test_what_a_person_sees(history: History, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(history.folder)
+    same = CliRunner().invoke(app, ["compare", "first", "again"])
+    assert (same.exit_code, same.output.strip()) == (0, "Nothing differs")
+    file = tmp_path / "out" / "compared.json"
+    other = CliRunner().invoke(app, ["compare", "again", "longer", "--json", str(file)])
+    assert other.exit_code == 0, other.output
+    for words in (r"epochs +4 +5", r"smoke-scenes\.OPD +0\.25 +0\.75", r"finetuned with all real +new - old +OPD"):
+        assert re.search(words, other.output), words
+    written = json.loads(file.read_text())
+    assert written["differs"] is True
+    assert written["tested"][0]["task"] == "OPD"
+    assert history.git("status", "--porcelain") == "", "nothing is checked out"

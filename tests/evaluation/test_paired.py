@@ -1,0 +1,228 @@
+"""Comparisons on the same questions, against brute force, scipy, quadrature and simulated seeds."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import random
+from statistics import fmean
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+from scipy.integrate import quad
+
+from pipeline.evaluation.intervals import design_of
+from pipeline.evaluation.paired import DRAWS, flip_units, holm, paired, sign_flip, smallest_effect
+from tests.evaluation.test_intervals import About, designs, single
+
+GAINS = st.lists(st.integers(-1, 1), min_size=24, max_size=24)
+
+
+def test_by_hand() -> None:
+    """Four objects of three questions: Bonett and Price's interval with the effective number of questions and t."""
+    rows = np.array([(1, 1, 0), (1, 0, 0), (0, 0, -1), (1, 1, 1)], dtype=float)
+    gap = paired(rows.reshape(1, 12), single(4, 3))
+    d, square = 5 / 12, 7 / 12
+    n = (square - d * d) * 12 / 11 / (4 / 3 * sum((sum(x) - 3 * d) ** 2 for x in rows) / 144)
+    assert n < 12
+    centre = n * d / (n + 2)
+    half = 3.1824463053 * math.sqrt(((n * square + 2) / (n + 2) - centre**2) / (n + 2))
+    assert (gap.value, gap.low, gap.high) == pytest.approx((d, centre - half, min(1, centre + half)), abs=1e-9)
+    ways = [abs(sum(s * x for s, x in zip(signs, (2, 1, -1, 3), strict=True))) for signs in signs_of(4)]
+    assert gap.p == fmean(way >= 5 for way in ways)
+    assert (gap.questions, gap.objects, gap.seeds) == (12, 4, 1)
+
+
+def signs_of(count: int) -> list[tuple[int, ...]]:
+    return list(itertools.product((1, -1), repeat=count))
+
+
+@given(better=st.integers(0, 12), worse=st.integers(0, 12), same=st.integers(0, 12))
+@settings(deadline=None, max_examples=40)
+def test_independent_questions_have_bonett_and_prices_interval(better: int, worse: int, same: int) -> None:
+    """One question an object: both kinds of discordant questions get one more, and t stands in place of z."""
+    n = better + worse + same
+    if n < 2 or max(better, worse, same) == n:
+        return
+    gap = paired(np.array([[1.0] * better + [-1.0] * worse + [0.0] * same]), single(n, 1))
+    one, other = (better + 1) / (n + 2), (worse + 1) / (n + 2)
+    half = stats.t.ppf(0.975, n - 1) * math.sqrt((one + other - (one - other) ** 2) / (n + 2))
+    # It must hold the difference itself, which the two more questions pull towards nothing.
+    low, high = min(one - other - half, gap.value), max(one - other + half, gap.value)
+    assert (gap.low, gap.high) == pytest.approx((max(-1.0, low), min(1.0, high)), abs=1e-12)
+
+
+def test_without_difference_with_one_object_and_with_none() -> None:
+    gap = paired(np.zeros((1, 3)), single(3, 1))
+    assert (gap.value, gap.p) == (0, 1)
+    assert gap.low is not None
+    assert gap.low == -gap.high < 0, "that nothing was seen is no proof that nothing is there"  # type: ignore[operator]
+    alone = paired(np.array([[1.0, 0.0]]), (("a",), ("a",)))
+    assert (alone.value, alone.low, alone.high, alone.p, alone.smallest_effect) == (0.5, None, None, None, None)
+    every = paired(np.ones((1, 35)), single(7, 5))
+    assert (every.value, every.high, every.p) == (1, 1, 2 / 128)
+    with pytest.raises(ValueError, match="there must be questions"):
+        paired(np.ones((1, 0)), ())
+
+
+@given(about=designs(), gains=GAINS, more=GAINS, seed=st.integers(0, 9))
+@settings(deadline=None, max_examples=60)
+def test_properties(about: About, gains: list[int], more: list[int], seed: int) -> None:
+    values = np.array([gains[: len(about)], more[: len(about)]], dtype=float)
+    gap, mirrored = paired(values, about), paired(-values, about)
+    order = random.Random(seed).sample(range(len(about)), len(about))
+    assert paired(values[:, order], [about[i] for i in order]) == gap
+    assert mirrored.value == pytest.approx(-gap.value)
+    if gap.low is not None and gap.high is not None and gap.p is not None and gap.smallest_effect is not None:
+        assert -1 <= gap.low <= gap.value <= gap.high <= 1
+        assert (-mirrored.high, -mirrored.low) == pytest.approx((gap.low, gap.high))  # type: ignore[operator]
+        assert mirrored.p == gap.p
+        assert gap.smallest_effect > 0
+        units = flip_units(design_of(about))
+        assert 2 / 2 ** len(units) <= gap.p <= 1
+        # What is flipped adds up to what is tested.
+
+        assert float((units @ values[0]).sum()) == pytest.approx(values[0].sum(), abs=1e-9)
+
+
+# Sign flips
+
+
+def test_sign_flip_of_darwins_maize() -> None:
+    """Fisher 1935, section 21: of 32768 ways to sign the 15 differences, 1726 are as far from 0."""
+    differences = np.array([49, -67, 8, 16, 6, 23, 28, 41, 14, 29, 56, 24, 75, 60, -48], dtype=float)
+    assert float(sign_flip(differences, design_of(single(15, 1)))) == 1726 / 32768
+    # A sixteenth object that brings nothing changes no sum, but there are too many now to go through.
+    drawn = float(sign_flip(np.append(differences, 0.0), design_of(single(16, 1))))
+    assert drawn == pytest.approx(1726 / 32768, abs=0.007)
+    assert float(sign_flip(np.ones(40), design_of(single(40, 1)))) == 1 / (DRAWS + 1)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_sign_flip_against_scipy(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    values = rng.integers(-1, 2, size=35) + 0.1 * rng.integers(-3, 4, size=35)
+    theirs = stats.permutation_test(
+        (values.reshape(7, 5).sum(axis=1),),
+        lambda x, axis: x.sum(axis=axis),
+        permutation_type="samples",
+        n_resamples=np.inf,
+        vectorized=True,
+    )
+    assert float(sign_flip(values, design_of(single(7, 5)))) == pytest.approx(theirs.pvalue, abs=1e-12)
+
+
+def test_pairs_are_split_by_least_squares_and_all_signs_gone_through() -> None:
+    """Each difference as the mean of its objects' effects; their shares of the sum are flipped, one by one."""
+    about = tuple(itertools.combinations("abcde", 2))
+    values = np.random.default_rng(2).integers(-1, 2, len(about)).astype(float)
+    shares = np.array([[0.5 * (name in row) for name in "abcde"] for row in about])
+    parts = np.linalg.lstsq(shares, values, rcond=None)[0] * shares.sum(axis=0)
+    assert parts.sum() == pytest.approx(values.sum())
+    far = [abs(float(np.dot(signs, parts))) >= abs(values.sum()) - 1e-9 for signs in signs_of(5)]
+    assert float(sign_flip(values, design_of(about))) == pytest.approx(fmean(far), abs=1e-12)
+
+
+@pytest.mark.parametrize("about", [1, 2, 3])
+def test_flips_have_at_least_the_variance_that_chance_has(about: int) -> None:
+    """Objects' own effects exactly; questions' own chance at least as often as they have objects."""
+    rows = tuple(itertools.combinations("abcdefg", about)) * 2
+    design = design_of(rows)
+    units = flip_units(design)
+    assert units @ design.membership / about == pytest.approx(np.diag(design.membership.sum(axis=0) / about), abs=1e-9)
+    assert (units**2).sum() >= about * len(rows) - 1e-9
+
+
+def test_equal_settings_are_told_apart_no_more_often_than_said() -> None:
+    """Triples of seven objects, two settings that share half of what makes a question right; 2 % are usual."""
+    rng = np.random.default_rng(3)
+    rows = tuple(tuple(f"{o}" for o in rng.choice(7, 3, replace=False)) for _ in range(70))
+    design = design_of(rows)
+    both, one, other = (
+        math.sqrt(0.7 / 3) * rng.standard_normal((2000, 7)) @ design.membership.T
+        + math.sqrt(0.3) * rng.standard_normal((2000, 70))
+        for _ in range(3)
+    )
+    values = (both + one < 0).astype(float) - (both + other < 0)
+    assert (sign_flip(values, design) <= 0.05).mean() <= 0.06
+
+
+def test_what_questions_cannot_tell_apart_is_flipped_together() -> None:
+    pairs = design_of((("a", "b"), ("c", "d"), ("c", "d"), ("e", "f")))
+    assert flip_units(pairs).tolist() == [[1, 0, 0, 0], [0, 1, 1, 0], [0, 0, 0, 1]]
+    assert float(sign_flip(np.ones(4), pairs)) == 2 / 8
+    chain = design_of((("a", "b"), ("b", "c"), ("c", "d")))
+    assert float(sign_flip(np.ones(3), chain)) == 1, "one part has one sign"
+
+
+# Seeds
+
+
+def test_several_seeds_are_one_comparison_of_their_means() -> None:
+    rng = np.random.default_rng(5)
+    table, about = rng.integers(-1, 2, (4, 35)).astype(float), single(7, 5)
+    several, means = paired(table, about), paired(table.mean(axis=0, keepdims=True), about)
+    assert (several.value, several.p) == (pytest.approx(table.mean()), means.p)
+    again = paired(np.tile(table[:1], (3, 1)), about)
+    one = paired(table[:1], about)
+    assert (again.low, again.high, again.p) == pytest.approx((one.low, one.high, one.p)), "the same answers add nothing"
+
+
+def test_the_interval_covers_new_seeds() -> None:
+    """Two equally good settings whose runs deviate by ten points: what leaves the seeds out covers less."""
+    rng, objects, seeds, covered, without = np.random.default_rng(2), 20, 5, 0, 0
+    sets = [rng.choice(objects, 2, replace=False) for _ in range(100)]
+    names = [tuple(f"{o:02}" for o in sorted(s)) for s in sets]
+    for _ in range(150):
+        rates = 0.5 + rng.normal(0, 0.1, (2, seeds, 1)) + rng.normal(0, 0.05, (2, 1, objects))[:, :, sets].mean(axis=-1)
+        one, other = rng.random((2, seeds, 100)) < rates
+        table = one.astype(float) - other
+        gap, alone = paired(table, names), paired(table.mean(axis=0, keepdims=True), names)
+        covered += gap.low <= 0 <= gap.high  # type: ignore[operator]
+        without += alone.low <= 0 <= alone.high  # type: ignore[operator]
+    assert covered / 150 >= 0.93
+    assert without / 150 <= 0.88
+
+
+# What a design can find, and families
+
+
+def test_smallest_effect_of_known_designs() -> None:
+    """Bloom 1995: 2.8 standard errors; Cohen 1988: 34 pairs for a medium effect, 15 for a large one."""
+    assert smallest_effect(1, 100_000) == pytest.approx(1.959964 + 0.841621, abs=1e-3)
+    for effect, pairs in ((0.5, 34), (0.8, 15)):
+        enough, less = (smallest_effect(1 / math.sqrt(n), n - 1) for n in (pairs, pairs - 1))
+        assert enough <= effect < less
+
+
+@pytest.mark.parametrize(
+    ("freedom", "power", "size"), [(1, 0.8, 0.05), (2.5, 0.8, 0.05), (6, 0.95, 0.05), (59, 0.9, 0.01)]
+)
+def test_the_smallest_effect_has_its_power_by_quadrature(freedom: float, power: float, size: float) -> None:
+    """Over the deviation's distribution, the normal mean beyond the critical value on either side."""
+    shift, critical = smallest_effect(1, freedom, power, size), stats.t.ppf(1 - size / 2, freedom)
+
+    def found(s: float) -> float:
+        beyond = stats.norm.sf(critical * s - shift) + stats.norm.cdf(-critical * s - shift)
+        return float(beyond * stats.chi.pdf(s * math.sqrt(freedom), freedom) * math.sqrt(freedom))
+
+    assert quad(found, 0, 10, limit=200, points=[1])[0] == pytest.approx(power, abs=1e-7)
+
+
+def test_holm_of_some_that_have_no_p() -> None:
+    assert holm([0.01, None, 0.04, 0.03, 0.005]) == pytest.approx([0.03, None, 0.06, 0.06, 0.02])
+    assert holm([None]) == [None]
+    assert holm([]) == []
+
+
+@given(st.lists(st.floats(0.001, 1), min_size=1, max_size=5))
+@settings(max_examples=15, deadline=None)
+def test_holm_is_the_closure_of_bonferroni(ps: list[float]) -> None:
+    """Marcus, Peritz, Gabriel 1976: a p is worth the largest that any family with it gives by Bonferroni."""
+    places = range(len(ps))
+    families = [f for size in range(1, len(ps) + 1) for f in itertools.combinations(places, size)]
+    worth = {f: min(1.0, len(f) * min(ps[i] for i in f)) for f in families}
+    assert holm(ps) == pytest.approx([max(w for f, w in worth.items() if i in f) for i in places], abs=1e-12)

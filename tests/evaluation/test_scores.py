@@ -1,0 +1,262 @@
+"""The rows of scores.csv and effects.csv, from made-up answers that are counted by hand."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+from statistics import fmean
+
+import numpy as np
+import pytest
+from sklearn.metrics import cohen_kappa_score
+
+from pipeline.evaluation.intervals import accuracy_interval
+from pipeline.evaluation.ordinal import error_rows, quadratic_kappa
+from pipeline.evaluation.paired import paired
+from pipeline.evaluation.scores import EffectRow, ScoreRow, candidate_rows, effect_rows, score_rows
+from pipeline.io import read_csv, write_csv
+from pipeline.records import Classification, Encoder, Graded, Lora, Opd, OutOfFold, Part, Touch
+from pipeline.tasks import TASKS
+from pipeline.videos.catalogue import load_catalogue
+from tests.closure import ROOT
+
+CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")
+OBJECTS = [f"object{i}" for i in range(6)]
+PAIRS = list(itertools.combinations(OBJECTS, 2))
+RNG = np.random.default_rng(1)
+
+
+def graded(
+    task: str,
+    right: list[bool],
+    *,
+    encoder: str = "finetuned",
+    lora: str = "with",
+    opd: str = "all",
+    seed: int = 0,
+    touch: str = "real",
+    measure: str = "choice",
+    unread: int = 0,
+    objects: list[tuple[str, ...]] | None = None,
+) -> list[Graded]:
+    """One answer a question; the last `unread` could not be read."""
+    about = objects or (PAIRS if measure == "choice" else [(o,) for o in OBJECTS] * 3)
+    return [
+        Graded(
+            question_id=f"{task}-{i:03}",
+            task=task,
+            measure=measure,
+            correct=correct,
+            parsed=i < len(right) - unread,
+            truncated=False,
+            expected="a",
+            predicted="",
+            objects=about[i],
+            encoder=Encoder(encoder),
+            lora=Lora(lora),
+            opd=Opd(opd),
+            seed=seed,
+            touch=Touch(touch),
+        )
+        for i, correct in enumerate(right)
+    ]
+
+
+def drawn(count: int = 15) -> list[bool]:
+    return [bool(x) for x in RNG.random(count) < 0.5]
+
+
+def row(rows: list[ScoreRow], **named: object) -> ScoreRow:
+    (found,) = [r for r in rows if all(getattr(r, k) == v for k, v in named.items())]
+    return found
+
+
+def test_one_seed_and_all_of_them() -> None:
+    first, second = drawn(), [True, False, *drawn(13)]
+    rows = score_rows(graded("PC", first, unread=2) + graded("PC", second, seed=3, unread=1), CATALOGUE)
+    assert [r.seed for r in rows] == ["0", "3", "all"]
+    for r, right, unread in zip(rows, (first, second), (2, 1), strict=False):
+        assert (r.n, r.right, r.unread) == (15, sum(right), unread)
+        assert r.accuracy == pytest.approx(sum(right) / 15, abs=1e-6)
+        interval = accuracy_interval(np.array(right, dtype=float), PAIRS)
+        assert (r.low, r.high) == pytest.approx(interval, abs=1e-6)
+        assert r.chance == pytest.approx(1 / 3, abs=1e-6)
+    pooled, means = rows[-1], np.mean([first, second], axis=0)
+    assert (pooled.n, pooled.unread) == (15, 1.5)
+    assert (pooled.right, pooled.accuracy) == pytest.approx((means.sum(), means.mean()), abs=1e-6)
+    assert (pooled.low, pooled.high) == pytest.approx(accuracy_interval(means, PAIRS), abs=1e-6)
+
+
+def test_over_seeds_only_what_all_of_them_answered() -> None:
+    rows = score_rows(graded("PC", [True] * 15) + graded("PC", [False] * 10, seed=1), CATALOGUE)
+    assert [(r.seed, r.n, r.accuracy) for r in rows] == [("0", 15, 1), ("1", 10, 0), ("all", 10, 0.5)]
+    assert score_rows([], CATALOGUE) == []
+
+
+def test_tasks_and_measures_come_from_the_registry(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their order, their chance; a task that is registered later appears by itself."""
+
+    class Later(type(TASKS["PC"])):  # type: ignore[misc]
+        name, measure = "LATER", "shape"
+
+        def chance(self, catalogue: object) -> dict[str, float]:
+            return {"shape": 0.125}
+
+    monkeypatch.setitem(TASKS, "LATER", Later())
+    answers = graded("LATER", drawn(), measure="shape", objects=PAIRS) + graded("PSR", drawn()) + graded("PC", drawn())
+    for measure in ("combined", "hardness"):
+        answers += graded("OPD", drawn(18), measure=measure)
+    rows = [r for r in score_rows(answers, CATALOGUE) if r.seed == "all"]
+    assert [(r.task, r.measure, round(r.chance, 4)) for r in rows] == [
+        ("OPD", "hardness", 0.3333),
+        ("OPD", "combined", 0.037),
+        ("PC", "choice", 0.3333),
+        ("PSR", "choice", 0.5),
+        ("LATER", "shape", 0.125),
+    ]
+    less = graded("LATER", drawn(), measure="shape", objects=PAIRS, lora="without")
+    assert [(r.part, r.task, r.measure) for r in effect_rows(answers + less, CATALOGUE)] == [("lora", "LATER", "shape")]
+
+
+def test_one_object_has_an_accuracy_but_no_interval(tmp_path: Path) -> None:
+    alone = [("object0",)] * 4
+    answers = graded("OPD", [True, False, True, True], measure="combined", objects=alone)
+    answers += graded("OPD", [True, False, False, True], measure="combined", objects=alone, lora="without")
+    rows, effects = score_rows(answers, CATALOGUE), effect_rows(answers, CATALOGUE)
+    assert {(r.lora, r.accuracy, r.low, r.high) for r in rows} == {
+        ("with", 0.75, None, None),
+        ("without", 0.5, None, None),
+    }
+    assert [(e.difference, e.low, e.p, e.p_holm, e.smallest_effect) for e in effects] == [
+        (0.25, None, None, None, None)
+    ]
+    write_csv(tmp_path / "scores.csv", ScoreRow, rows)
+    write_csv(tmp_path / "effects.csv", EffectRow, effects)
+    assert (tmp_path / "scores.csv").read_text().splitlines()[:2] == [
+        "task,measure,encoder,lora,opd,touch,seed,n,right,unread,accuracy,low,high,chance",
+        "OPD,combined,finetuned,with,all,real,0,4,3.0,0.0,0.75,,,0.037037",
+    ]
+    assert read_csv(tmp_path / "scores.csv", ScoreRow) == rows
+    assert read_csv(tmp_path / "effects.csv", EffectRow) == effects
+
+
+def test_effects_are_the_full_system_less_one_part() -> None:
+    full = {0: drawn(), 1: drawn()}
+    changes = {
+        ("encoder", "finetuned - base"): {"encoder": "base"},
+        ("lora", "with - without"): {"lora": "without"},
+        ("opd", "all - none"): {"opd": "none"},
+        ("opd", "all - needed"): {"opd": "needed"},
+        ("touch", "real - removed"): {"touch": "removed"},
+        ("touch", "real - swapped"): {"touch": "swapped"},
+    }
+    less = {change: {seed: drawn() for seed in full} for change in changes}
+    answers = [a for seed, right in full.items() for a in graded("PC", right, seed=seed)]
+    for change, named in changes.items():
+        answers += [a for s, right in less[change].items() for a in graded("PC", right, seed=s, **named)]  # type: ignore[arg-type]
+    # Neither a system that lacks two parts nor a seed that one side lacks is compared.
+    answers += graded("PC", drawn(), lora="without", encoder="base") + graded("PC", drawn(), seed=9)
+    rows = effect_rows(answers[::-1], CATALOGUE)
+    assert [(r.part, r.change) for r in rows] == list(changes)
+    for r in rows:
+        gains = np.array([np.subtract(full[s], less[r.part, r.change][s], dtype=float) for s in full])
+        gap = paired(gains, PAIRS)
+        assert (r.n, r.objects, r.seeds, r.task, r.measure) == (15, 6, 2, "PC", "choice")
+        expected = (gap.value, gap.low, gap.high, gap.p, gap.smallest_effect)
+        assert (r.difference, r.low, r.high, r.p, r.smallest_effect) == pytest.approx(expected, abs=1e-6)
+    least = min(r.p for r in rows if r.p is not None)
+    assert min(r.p_holm for r in rows if r.p_holm is not None) == pytest.approx(min(1, 6 * least), abs=1e-5)
+    assert effect_rows(graded("PC", full[0]), CATALOGUE) == [], "nothing to compare with"
+
+
+def heads(
+    part: Part, predicted: dict[str, tuple[int, int, int]], expected: tuple[int, int, int]
+) -> list[Classification]:
+    return [
+        Classification(
+            video_id=video,
+            object_id=video[:-2],
+            part=part,
+            property=name,
+            expected=e,
+            predicted=p,
+            probabilities=(1.0,),
+        )
+        for video, classes in predicted.items()
+        for name, e, p in zip(CATALOGUE.property_names, expected, classes, strict=True)
+    ]
+
+
+def test_property_heads_on_test_and_on_validation_videos() -> None:
+    said = heads(Part.TEST, {"a_0": (0, 1, 2), "a_1": (0, 0, 2), "b_0": (1, 0, 2), "c_0": (0, 1, 2)}, (0, 1, 2))
+    said += heads(Part.VALIDATION, {"d_0": (0, 1, 2)}, (0, 1, 2)) + heads(Part.TRAIN, {"e_0": (1, 1, 1)}, (0, 1, 2))
+    rows = score_rows([], CATALOGUE, {0: said})
+    names = (*CATALOGUE.property_names, "combined")
+    found = {name: row(rows, task="heads", measure=name, seed="0") for name in names}
+    assert [found[name].accuracy for name in names] == [0.75, 0.5, 1, 0.5]
+    assert {(r.n, r.encoder, r.lora, r.opd, r.touch) for r in found.values()} == {(4, "finetuned", "", "", "real")}
+    assert found["combined"].chance == pytest.approx(1 / 27, abs=1e-6)
+    interval = accuracy_interval(np.array([1.0, 0, 0, 1]), [("a",), ("a",), ("b",), ("c",)])
+    assert (found["combined"].low, found["combined"].high) == pytest.approx(interval, abs=1e-6)
+    assert row(rows, task="heads_validation", measure="combined", seed="all").n == 1
+
+
+def out_of_fold(predicted: list[tuple[tuple[int, ...], ...]]) -> list[OutOfFold]:
+    """Repeats x videos x properties of four videos of three objects, in which nothing but zeros is right."""
+    videos = ("a_0", "a_1", "b_0", "c_0")
+    return [
+        OutOfFold(video_id=v, object_id=v[0], repeat=r, expected=(0, 0, 0), predicted=p)
+        for r, repeat in enumerate(predicted)
+        for v, p in zip(videos, repeat, strict=True)
+    ]
+
+
+RIGHT, WRONG, HALF = (0, 0, 0), (2, 1, 1), (0, 0, 1)
+TREES = out_of_fold([(RIGHT, HALF, WRONG, RIGHT), (HALF, RIGHT, RIGHT, RIGHT)])
+PROBE = out_of_fold([(WRONG, HALF, WRONG, RIGHT), (HALF, HALF, WRONG, RIGHT)])
+
+
+def test_cross_validation_is_the_mean_over_repeats() -> None:
+    rows = score_rows([], CATALOGUE, None, {"trees": TREES})
+    assert {(r.task, r.encoder, r.lora, r.opd, r.touch, r.seed, r.n) for r in rows} == {
+        ("cross_validation", "trees", "", "", "", "all", 4)
+    }
+    combined = row(rows, measure="combined")
+    shares = np.array([0.5, 0.5, 0.5, 1])
+    assert (combined.accuracy, combined.right) == (shares.mean(), shares.sum())
+    about = [("a",), ("a",), ("b",), ("c",)]
+    assert (combined.low, combined.high) == pytest.approx(accuracy_interval(shares, about), abs=1e-6)
+    assert row(rows, measure="hardness").accuracy == pytest.approx(7 / 8)
+
+
+def test_encoders_are_compared_video_by_video() -> None:
+    (found,) = candidate_rows({"trees": TREES, "probe": PROBE}, "trees")
+    assert (found.part, found.change, found.n, found.objects, found.seeds) == ("encoder", "probe - trees", 4, 3, 2)
+    gains = np.array([[-1, 0, 0, 0], [0, -1, -1, 0]], dtype=float)
+    gap = paired(gains, [("a",), ("a",), ("b",), ("c",)])
+    assert (found.difference, found.low, found.high, found.p) == pytest.approx(
+        (gap.value, gap.low, gap.high, gap.p), abs=1e-6
+    )
+    assert found.p_holm == found.p
+    assert candidate_rows({"probe": PROBE}, "trees") == []
+
+
+def test_errors_know_the_order_of_classes() -> None:
+    rows = error_rows({"trees": TREES}, CATALOGUE)
+    assert [(r.property, r.n) for r in rows] == [(name, 4) for name in CATALOGUE.property_names]
+    assert [r.absolute_error for r in rows] == [2 / 8, 1 / 8, 3 / 8]
+    assert rows[0].kappa == 0, "constant truth: no better than chance"
+
+
+def test_kappa_of_cohens_example() -> None:
+    """Counts after Cohen 1968 with quadratic weights, by hand."""
+    table = [[88, 14, 18], [10, 40, 10], [2, 6, 12]]
+    pairs = [(r, c) for r, line in enumerate(table) for c, count in enumerate(line) for _ in range(count)]
+    apart = fmean((r - c) ** 2 for r, c in pairs)
+    by_chance = fmean((r - c) ** 2 for r, _ in pairs for _, c in pairs)
+    expected, predicted = [r for r, _ in pairs], [c for _, c in pairs]
+    kappa = quadratic_kappa(expected, predicted, 3)
+    assert kappa == pytest.approx(1 - apart / by_chance, abs=1e-12)
+    assert kappa == pytest.approx(cohen_kappa_score(expected, predicted, weights="quadratic"), abs=1e-12)
+    assert quadratic_kappa([1, 1], [1, 1], 3) is None
+    assert quadratic_kappa([0, 0], [1, 1], 3) == 0, "constant answers that are wrong agree by chance alone"

@@ -1,0 +1,128 @@
+"""What the stages before the report leave on disk, made up: real formats, small, a second of work."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+from pathlib import Path
+
+import yaml
+
+from pipeline.config import Params
+from pipeline.evaluation.grading import grade
+from pipeline.io import write_csv, write_jsonl, write_table
+from pipeline.records import (
+    Assignment,
+    Classification,
+    Finding,
+    Graded,
+    Measurement,
+    OutOfFold,
+    Part,
+    Prediction,
+    Question,
+    Severity,
+    Touch,
+    Video,
+)
+from pipeline.scales import compose
+from pipeline.tasks.questions import build_questions, counts_by_task, pool_of
+from pipeline.videos.catalogue import Catalogue, load_catalogue
+from tests.closure import ROOT
+
+VIDEOS_AN_OBJECT = 2
+
+
+def fake_params(*overrides: str) -> Params:
+    """The smoke scale with overrides; catalogue and weights are this repository's."""
+    here = {
+        "data.catalogue": "pipeline/physiclear",
+        "language.weights": "standins/llama",
+        "encoder.weights": "standins/clip",
+    }
+    return compose("smoke", [*(f"{key}='{ROOT / path}'" for key, path in here.items()), *overrides], conf=ROOT / "conf")
+
+
+def write_run(root: Path, params: Params, *, objects: Sequence[str] = (), skill: float = 0.6) -> Params:
+    """Write params.yaml and data/ of a finished run below `root`; returns the parameters.
+
+    Args:
+        objects: those that have videos; all of `scenes.objects` by default.
+        skill: the share of right answers and classifications.
+    """
+    rng = random.Random(1)
+    catalogue = load_catalogue(Path(params.data.catalogue))
+    root.mkdir(parents=True, exist_ok=True)
+    (root / "params.yaml").write_text(yaml.safe_dump(params.model_dump(mode="json"), sort_keys=False))
+    data, parts = root / "data", {o.object_id: o.splits["paper"] for o in catalogue.objects.values()}
+    videos = [_video(o, i, rng) for o in sorted(objects or params.scenes.objects) for i in range(VIDEOS_AN_OBJECT)]
+    assignments = [Assignment(video_id=v.video_id, object_id=v.object_id, part=parts[v.object_id]) for v in videos]
+    write_table(data / "videos.parquet", Video, videos)
+    write_table(data / "splits.parquet", Assignment, assignments)
+    found = [("agreement, ICC(3,k)", name, "0.893 (0.843 to 0.929)") for name in catalogue.property_names]
+    audit = [Finding(check=c, item=i, measured=m, severity=Severity.INFO) for c, i, m in found]
+    write_csv(data / "audit" / "audit.csv", Finding, audit)
+    counts = counts_by_task(params.questions, "evaluation")
+    questions = build_questions(pool_of(Part.TEST, assignments, catalogue), counts, seed=0, distinct=True)
+    write_jsonl(data / "questions" / "evaluation.jsonl", questions)
+    for seed in params.ablation.seeds:
+        said = [c for a in assignments for c in _classify(a, catalogue, skill, rng)]
+        write_table(data / "encoder" / str(seed) / "classifications.parquet", Classification, said)
+        write_table(data / "encoder" / str(seed) / "history.parquet", Measurement, _history("loss", "validation_loss"))
+    graded = []
+    for variant in params.ablation.variants():
+        model = f"{variant.encoder}-{variant.opd}-{variant.seed}"
+        write_table(data / "models" / variant.lora / model / "history.parquet", Measurement, _history("loss"))
+        for touch in (Touch.REAL, *(params.ablation.touch if variant.full else ())):
+            answers = [p for q in questions if (p := _say(q, variant.opd, skill, rng))]
+            write_jsonl(data / "answers" / variant.key / f"{touch}.jsonl", answers)
+            whose = {**variant._asdict(), "touch": touch}
+            graded += [Graded(**s.model_dump(), **whose) for s in grade(questions, answers, catalogue)]
+    write_table(data / "graded.parquet", Graded, graded)
+    for name in params.cross_validation.models:
+        records = [_out_of_fold(a, catalogue, skill, rng) for a in assignments]
+        write_table(data / "cross_validation" / name / "out_of_fold.parquet", OutOfFold, records)
+    return params
+
+
+def _video(object_id: str, number: int, rng: random.Random) -> Video:
+    name = f"{object_id}_{number}"
+    shape = {"frames": rng.randint(20, 30), "fps": 25.0, "width": 160, "height": 120}
+    return Video(video_id=name, object_id=object_id, path=f"{name}.avi", sha256=f"{rng.getrandbits(256):064x}", **shape)
+
+
+def _classify(a: Assignment, catalogue: Catalogue, skill: float, rng: random.Random) -> list[Classification]:
+    if a.part not in (Part.VALIDATION, Part.TEST):
+        return []
+    return [
+        Classification(
+            video_id=a.video_id,
+            object_id=a.object_id,
+            part=a.part,
+            property=p.name,
+            expected=label,
+            predicted=label if rng.random() < skill else rng.randrange(len(p.levels)),
+            probabilities=(0.2, 0.3, 0.5),
+        )
+        for p, label in zip(catalogue.properties, catalogue.labels(a.object_id), strict=True)
+    ]
+
+
+def _out_of_fold(a: Assignment, catalogue: Catalogue, skill: float, rng: random.Random) -> OutOfFold:
+    labels = catalogue.labels(a.object_id)
+    guess = labels if rng.random() < skill else tuple(rng.randrange(len(p.levels)) for p in catalogue.properties)
+    return OutOfFold(video_id=a.video_id, object_id=a.object_id, repeat=0, expected=labels, predicted=guess)
+
+
+def _say(q: Question, opd: str, skill: float, rng: random.Random) -> Prediction | None:
+    """The right answer, or one that cannot be read."""
+    dialogue = next((d for d in q.dialogues if d.opd == opd), None)
+    if dialogue is None:
+        return None
+    right = rng.random() < skill
+    outputs = tuple(turn.assistant if right else "I cannot tell." for turn in dialogue.turns)
+    return Prediction(question_id=q.question_id, task=q.task, outputs=outputs, truncated=not right, tokens=9)
+
+
+def _history(*names: str) -> list[Measurement]:
+    return [Measurement(step=s, name=name, value=4 / (1 + s / 9)) for s in range(1, 9) for name in names]

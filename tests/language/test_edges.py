@@ -1,0 +1,117 @@
+"""The language side at its edges: embeddings in any places, embeddings that lack or are not finite, no answer.
+
+What rounding does to it is in tests/numerics.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch.nn import functional as F
+
+from pipeline.config import LanguageConfig
+from pipeline.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
+from pipeline.errors import UserError
+from pipeline.io import read_table, save_tensors
+from pipeline.language.chat import IGNORE_INDEX, Encoded, encode
+from pipeline.language.generate import answer
+from pipeline.language.octopi import OctopiForCausalLM
+from pipeline.language.training import assemble
+from pipeline.records import Embedding, Opd, Question
+from tests.language.shared import DIM, generation, material
+
+
+def plainly(model: OctopiForCausalLM, ids: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
+    """`embed` by the letter: token for token, with a counter of frames."""
+    words, connector = model.llm.get_input_embeddings().weight, model.connector
+    first, last = connector.projection[0], connector.projection[2]
+    rows = []
+    for row, given_features in zip(ids.tolist(), features, strict=True):
+        frames, found = iter(given_features), []
+        for token in row:
+            if token == model.frame_id:
+                found.append(last.weight @ F.gelu(first.weight @ next(frames) + first.bias) + last.bias)
+            elif token in (model.start_id, model.end_id):
+                found.append(connector.delimiters[int(token == model.end_id)])
+            else:
+                found.append(words[token])
+        rows.append(torch.stack(found))
+    return torch.stack(rows)
+
+
+@pytest.fixture(scope="module")
+def steady(language: LanguageConfig) -> OctopiForCausalLM:
+    """One model for all examples of a property."""
+    torch.manual_seed(5)
+    made = OctopiForCausalLM.from_base(language.weights, DIM).eval()
+    torch.nn.init.normal_(made.connector.delimiters)
+    return made
+
+
+TOKENS = st.integers(0, 259) | st.sampled_from(["start", "frame", "frame", "frame", "end"])
+ROWS = st.integers(1, 12).flatmap(
+    lambda length: st.lists(st.lists(TOKENS, min_size=length, max_size=length), min_size=1, max_size=4)
+)
+
+
+@given(rows=ROWS, spare=st.integers(0, 2))
+def test_embedding_equals_a_plain_one(steady: OctopiForCausalLM, rows: list[list[int | str]], spare: int) -> None:
+    """Rows without any tactile token, all frames in one row, frames at the very ends, rows of nothing else."""
+    special = {"start": steady.start_id, "frame": steady.frame_id, "end": steady.end_id}
+    ids = torch.tensor([[special[t] if isinstance(t, str) else t for t in row] for row in rows])
+    counts = (ids == steady.frame_id).sum(1)
+    features = torch.full((len(rows), int(counts.max()) + spare, DIM), float("nan"))
+    for row, count in enumerate(counts.tolist()):
+        features[row, :count] = torch.randn(count, DIM, generator=torch.manual_seed(row))
+    with torch.no_grad():
+        torch.testing.assert_close(steady.embed(ids, features), plainly(steady, ids, features), atol=2e-6, rtol=0)
+
+
+def test_frames_of_one_row_give_gradients_to_no_other(model: OctopiForCausalLM) -> None:
+    ids = torch.tensor([[model.frame_id] * 7, [5] * 7])
+    features = torch.randn(2, 7, DIM, requires_grad=True)
+    model.embed(ids, features).square().sum().backward()
+    assert features.grad is not None
+    assert (features.grad[0].abs().sum(1) > 0).all()
+    assert (features.grad[1] == 0).all()
+
+
+def test_a_conversation_without_an_answer_is_named(
+    questions: list[Question], store: EmbeddingStore, language: LanguageConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "pipeline.language.conversations.encode",
+        lambda rendered, tokenizer: Encoded((ids := encode(rendered, tokenizer).input_ids), (IGNORE_INDEX,) * len(ids)),
+    )
+    with pytest.raises(UserError, match=r"^[A-Z]+-train-\d+: has no answer to learn from"):
+        assemble(material(language, questions, store), 3, "test")
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_an_embedding_that_is_not_finite_is_named_by_its_video(
+    value: float, store: EmbeddingStore, tmp_path: Path
+) -> None:
+    """Training and answering read embeddings through the store alone."""
+    (tmp_path / INDEX_FILE).write_bytes((store.folder / INDEX_FILE).read_bytes())
+    entry = read_table(store.folder / INDEX_FILE, Embedding)[-1]
+    tensor = store.tensor.clone()
+    tensor[entry.row, 2] = value
+    save_tensors(tmp_path / TENSOR_FILE, {TENSOR: tensor})
+    wanted = f"safetensors: {entry.video_id} has an embedding that is not finite.*dvc repro"
+    with pytest.raises(UserError, match=wanted):
+        EmbeddingStore(tmp_path)
+
+
+def test_a_video_without_embeddings_is_named(
+    questions: list[Question], store: EmbeddingStore, language: LanguageConfig, model: OctopiForCausalLM
+) -> None:
+    question = questions[0].model_copy(update={"videos": ("nowhere_3",) * len(questions[0].videos)})
+    with pytest.raises(UserError, match="nowhere_3 has no embedding; run `dvc repro`"):
+        answer(model, store, [question], Opd.ALL, generation(1))
+    _, data = assemble(material(language, [question], store), 1, "test")
+    with pytest.raises(UserError, match="nowhere_3"):
+        data[0]

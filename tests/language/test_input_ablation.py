@@ -1,0 +1,113 @@
+"""Input ablations: no touch, another object's, noise; the same for every variant and batch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
+from pipeline.errors import UserError
+from pipeline.io import save_tensors, write_table
+from pipeline.language.conversations import evaluation_features
+from pipeline.language.input_ablation import NoisyTouch, SwappedTouch, _ring, ablate_input
+from pipeline.records import Dialogue, Embedding, Gold, Opd, Part, Question, Touch, Turn
+
+DIM = 6
+
+
+def question(number: int, objects: Sequence[str], video: int = 0) -> Question:
+    said = Turn(user="{tactile}" * len(objects), assistant="x")
+    return Question(
+        question_id=f"q{number}",
+        task="PC",
+        part=Part.TEST,
+        videos=tuple(f"{o}_{video}" for o in objects),
+        objects=tuple(objects),
+        dialogues=(Dialogue(opd=Opd.ALL, turns=(said,)),),
+        gold=Gold(choice="yes", labels=((0,),) * len(objects), properties=("hardness",)),
+    )
+
+
+def store_of(folder: Path, videos: dict[str, int]) -> EmbeddingStore:
+    """An embedding of video v's frame f begins with v's number and f."""
+    index, rows = [], []
+    generator = torch.Generator().manual_seed(0)
+    for number, (video, frames) in enumerate(videos.items()):
+        for frame in range(frames):
+            index.append(Embedding(video_id=video, frame_index=frame, flip="none", row=len(rows)))
+            rows.append(torch.cat([torch.tensor([number, frame]).float(), torch.randn(DIM - 2, generator=generator)]))
+    save_tensors(folder / TENSOR_FILE, {TENSOR: torch.stack(rows)})
+    write_table(folder / INDEX_FILE, Embedding, index)
+    return EmbeddingStore(folder)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> EmbeddingStore:
+    return store_of(tmp_path, {f"{o}_{v}": 2 + 3 * v for o in "abcd" for v in range(2)})
+
+
+QUESTIONS = [question(0, "ab"), question(1, "cd"), question(2, "ad", video=1)]
+
+
+def test_swapped_is_always_another_object(store: EmbeddingStore) -> None:
+    names = sorted({v for v, _ in store._rows})
+    for seed in range(20):
+        ablated = SwappedTouch(store, QUESTIONS, seed)
+        for asked in QUESTIONS:
+            for video, own in zip(asked.videos, asked.objects, strict=True):
+                first = ablated.features(video, range(ablated.count(video)))
+                other = names[int(first[0, 0])]
+                assert other.split("_")[0] != own
+                assert torch.equal(first, store.features(other, range(store.count(other))))
+        assert ablated.dim == DIM
+
+
+@given(st.integers(min_value=2, max_value=9), st.integers(min_value=0, max_value=10_000))
+def test_no_object_keeps_its_touch_and_none_is_given_twice(count: int, seed: int) -> None:
+    videos = {f"o{i}": [f"o{i}_0"] for i in range(count)}
+    ring = _ring(videos, seed)
+    assert sorted(ring.values()) == sorted(ring)
+    assert all(own != other for own, other in ring.items())
+
+
+def test_swapping_needs_two_objects(store: EmbeddingStore) -> None:
+    with pytest.raises(UserError, match=r"ablation.counterfactuals: swapped needs questions about two objects"):
+        SwappedTouch(store, [question(0, "a")], 0)
+
+
+def test_noise_has_the_embeddings_moments_and_is_no_ones_touch(tmp_path: Path) -> None:
+    store = store_of(tmp_path, {"a_0": 4000, "b_0": 4000})
+    ablated = NoisyTouch(store, seed=3)
+    drawn = torch.cat([ablated.features(v, range(4000)) for v in ("a_0", "b_0")])
+    mean, deviation = store.tensor.mean(0), store.tensor.std(0)
+    # Five standard errors of a mean and of a deviation over 8000 draws.
+    assert ((drawn.mean(0) - mean).abs() < 5 * deviation / 8000**0.5).all()
+    assert ((drawn.std(0) / deviation - 1).abs() < 5 / (2 * 8000) ** 0.5).all()
+    assert abs(torch.corrcoef(torch.stack([drawn[:, 0], store.tensor[:, 0]]))[0, 1]) < 5 / 8000**0.5
+
+
+def test_noise_is_the_same_at_each_call_and_differs_between_frames_videos_and_seeds(store: EmbeddingStore) -> None:
+    ablated = NoisyTouch(store, seed=3)
+    first = ablated.features("a_1", [0, 1, 4])
+    assert torch.equal(first[[2, 0]], ablated.features("a_1", [4, 0]))
+    assert not torch.equal(first[0], first[1])
+    assert not torch.equal(first[0], ablated.features("b_1", [0])[0])
+    assert not torch.equal(first[0], NoisyTouch(store, seed=4).features("a_1", [0])[0])
+    assert ablated.features("a_1", []).shape == (0, DIM)
+
+
+def test_real_touch_is_the_store_and_removed_asks_for_nothing(store: EmbeddingStore) -> None:
+    for touch in (Touch.REAL, Touch.REMOVED):
+        assert ablate_input(store, touch, QUESTIONS, 0) is store
+    assert evaluation_features(QUESTIONS[0], store, per_video=0).shape == (0, DIM)
+    swapped, noise = (ablate_input(store, touch, QUESTIONS, 0) for touch in (Touch.SWAPPED, Touch.NOISE))
+    real = evaluation_features(QUESTIONS[0], store, 3)
+    for ablated in (swapped, noise):
+        given = evaluation_features(QUESTIONS[0], ablated, 3)
+        assert given.shape == real.shape
+        assert not torch.equal(given, real)

@@ -1,0 +1,221 @@
+"""Encoders at their edges: frames without signal and with too much of it, late frames, batches of one.
+
+The towers and the pretrained network run in float64, float32 and bfloat16, and in float16 where a CUDA device is. CLIP
+is the committed stand-in; prompts and the network of difference pictures are random.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import pytest
+import torch
+from torch.nn import functional as F
+
+from pipeline.config import EncoderConfig
+from pipeline.encoder.clips import ClipDataset, LabelledVideo, classify
+from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
+from pipeline.encoder.recipes import RECIPES, base_encoder, property_classifier
+from pipeline.encoder.release import sinusoid
+from pipeline.encoder.scene_encoder import CHANNELS, SceneEncoder
+from pipeline.records import Part
+from pipeline.runtime import seed_everything
+from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.frames.store import FrameStore
+from tests.closure import ROOT
+from tests.encoders import PARTS, encoder_data, write_frames
+from tests.numerics.bounds import longest_sum, magnification, rounded
+from tests.numerics.harness import FLOAT32, FLOAT64, NETWORKS, Check, Format, formats
+
+PART = "encoder"
+CLASSES = (3, 3, 3)
+SIDE = 64
+TIMES = torch.tensor([0, 1, 40_000, 10**6])
+"""Numbers of the frames in their videos: float32 no longer holds the sinusoid of the last."""
+BASES = {"base": "paper", "base of release": "release"}
+"""Encoders without prompts, and the recipe that they are read by."""
+CLASSIFIERS = (*RECIPES, "scratch")
+
+
+def classifier(kind: str) -> PropertyClassifier:
+    """Of a recipe, equal at every call; `scratch` is the network of difference pictures with the paper's heads."""
+    seed_everything(0)
+    if kind == "scratch":
+        model = PropertyClassifier(SceneEncoder(), Heads(256, CLASSES), CLASSES)
+    else:
+        model = property_classifier(settings(kind), CLASSES)
+    if isinstance(model.encoder, SceneEncoder):
+        # With running statistics of some pictures: a fresh network's are 0 and 1.
+        draw = torch.Generator().manual_seed(7)
+        for _ in range(20):
+            shown = torch.randint(0, 256, (8, 32, 32, 3), dtype=torch.uint8, generator=draw)
+            model.encoder.train()(shown, torch.zeros(8))
+    return model
+
+
+def settings(kind: str) -> EncoderConfig:
+    reference = "subtract" if kind == "pretrained" else "none"
+    return EncoderConfig(recipe=kind, weights=str(ROOT / "standins" / "clip"), reference=reference)
+
+
+@cache
+def encoder(kind: str, fmt: Format) -> FrameEncoder:
+    seed_everything(0)
+    made = base_encoder(settings(BASES[kind])) if kind in BASES else classifier(kind).encoder
+    return made.eval().to(fmt.device, fmt.torch)
+
+
+def both(model: FrameEncoder, frames: torch.Tensor, times: torch.Tensor = TIMES) -> torch.Tensor:
+    """What the language model and, where that is something else, the classifier are given, side by side."""
+    given: torch.Tensor = model(frames, times)
+    same = type(model).describe is FrameEncoder.describe
+    return given if same else torch.cat([given, model.describe(frames, times)], dim=1)
+
+
+def hard_frames() -> dict[str, torch.Tensor]:
+    """uint8, 4 x side x side x RGB."""
+    noise = torch.from_numpy(np.random.default_rng(0).integers(0, 256, (4, SIDE, SIDE, 3), dtype=np.uint8))
+    shown = {"noise": noise}
+    for name, value in (("black", 0), ("grey", 128), ("white", 255)):
+        shown[f"{name}, one half the opposite"] = torch.full_like(noise, value)
+        shown[f"{name}, one half the opposite"][1, : SIDE // 2] = 255 - value
+    return shown
+
+
+FRAMES = hard_frames()
+
+
+@cache
+def magnified(kind: str, name: str) -> float:
+    model = encoder(kind, FLOAT64)
+    return magnification(model, lambda: both(model, FRAMES[name]))
+
+
+def network(kind: str, name: str, fmt: Format) -> float:
+    """condition: the encoder's magnification of rounded weights on these frames, times roundings a layer."""
+    return rounded(magnified(kind, name), longest_sum(encoder(kind, FLOAT64)), fmt)
+
+
+@formats(*NETWORKS)
+@pytest.mark.parametrize("name", FRAMES)
+@pytest.mark.parametrize("kind", [*BASES, *RECIPES])
+def test_hard_frames_are_embedded(check: Check, kind: str, name: str, fmt: Format) -> None:
+    @torch.no_grad()
+    def embedded(f: Format) -> torch.Tensor:
+        return both(encoder(kind, f), FRAMES[name].to(f.device), TIMES.to(f.device))
+
+    check(f"{kind}: {name}", fmt, embedded, lambda f: network(kind, name, f))
+
+
+def test_positions_of_late_frames_are_told_apart(check: Check) -> None:
+    """roundings: that to float32, and of angles up to 10^9 in float64; against long doubles."""
+    late = 10**9
+    angles = late * np.longdouble(10_000) ** (-np.arange(0, 64, 2, dtype=np.longdouble) / 64)
+    exact = np.stack([np.sin(angles), np.cos(angles)], axis=-1).ravel()
+    bound = FLOAT32.roundoff + 8 * late * FLOAT64.roundoff
+    check("positions: frame 10^9", FLOAT32, lambda _: sinusoid(torch.tensor([late]), 64)[0], bound, exact)
+    assert not torch.equal(*sinusoid(torch.tensor([late, late + 1]), 64))
+
+
+@pytest.mark.parametrize("kind", [*BASES, *RECIPES])
+def test_a_batch_of_one_equals_a_batch_of_many(check: Check, kind: str) -> None:
+    """condition: twice that of the network, as two ways are compared."""
+
+    @torch.no_grad()
+    def alone(f: Format) -> torch.Tensor:
+        whole = both(encoder(kind, f), FRAMES["noise"])
+        single = [both(encoder(kind, f), x[None], n[None]) for x, n in zip(FRAMES["noise"], TIMES, strict=True)]
+        assert not torch.allclose(whole[0], whole[1]), "the frames differ"
+        return (torch.cat(single) - whole) / whole.abs().max()
+
+    check(f"{kind}: frames one by one, against a batch", FLOAT32, alone, 2 * network(kind, "noise", FLOAT32), 0.0)
+
+
+@pytest.mark.parametrize("name", FRAMES)
+@pytest.mark.parametrize("kind", CLASSIFIERS)
+def test_hard_frames_train_and_are_decided_on(check: Check, kind: str, name: str) -> None:
+    frames = torch.stack([FRAMES[name][:3], FRAMES[name][1:]])
+    numbers = torch.tensor([[0, 1, 2], [10**6, 10**6, 10**6]])
+    model = classifier(kind).train()
+
+    def trained(_: Format) -> torch.Tensor:
+        loss = model(frames, numbers, torch.tensor([[0, 1, 2], [2, 1, 0]]))["loss"]
+        loss.backward()
+        return torch.cat([loss[None], *(p.grad.flatten() for p in model.parameters() if p.grad is not None)])
+
+    check(f"{kind}: {name}: loss and gradients", FLOAT32, trained)
+    with torch.no_grad():
+        logits = model.eval()(frames, numbers)["logits"]
+    assert logits.isfinite().all()
+    assert set(model.decide(logits).flatten().tolist()) <= {0, 1, 2}
+
+
+def test_the_network_is_seven_convolutions_of_what_differs_from_128(check: Check) -> None:
+    """By BN(w * x) = (g w / s) * x + b - g m / s in float64; 24 steps, which pictures show doubled, count as 1.
+
+    condition: twice that of the network, as two ways are compared.
+    """
+    model = encoder("pretrained", FLOAT64)
+    state = model.state_dict()
+    shown = FRAMES["noise"].clone()
+    shown[0] = 128
+    maps = (shown.double().permute(0, 3, 1, 2) - 128) / 24
+    for number, (_, stride) in enumerate(CHANNELS):
+        kernel, norm = state[f"layers.{3 * number}.weight"], f"layers.{3 * number + 1}"
+        scale = state[f"{norm}.weight"] / (state[f"{norm}.running_var"] + 1e-5).sqrt()
+        shift = state[f"{norm}.bias"] - state[f"{norm}.running_mean"] * scale
+        maps = F.conv2d(maps, kernel * scale[:, None, None, None], shift, stride, kernel.shape[-1] // 2).relu()
+    assert maps.shape[1:] == (128, 4, 4)
+    exact = torch.cat([maps.mean((2, 3)), maps.amax((2, 3))], dim=1).detach()
+
+    @torch.no_grad()
+    def found(f: Format) -> torch.Tensor:
+        return cast(torch.Tensor, encoder("pretrained", f)(shown, TIMES))
+
+    check(
+        "pretrained: against folded convolutions",
+        FLOAT32,
+        found,
+        2 * network("pretrained", "noise", FLOAT32),
+        exact.numpy(),
+    )
+
+
+@pytest.mark.parametrize("kind", CLASSIFIERS)
+def test_classifications_do_not_depend_on_the_batch(
+    check: Check, kind: str, catalogue: Catalogue, tmp_path: Path
+) -> None:
+    """use: probabilities are written and compared to six digits."""
+    data, model = encoder_data(tmp_path, catalogue, PARTS), classifier(kind)
+    alone, together = (
+        classify(model, data, [Part.TRAIN, Part.VALIDATION], size, torch.device("cpu")) for size in (1, 64)
+    )
+    assert [(r.video_id, r.predicted) for r in alone] == [(r.video_id, r.predicted) for r in together]
+    exact = np.array([r.probabilities for r in together])
+    np.testing.assert_allclose(exact.sum(1), 1)
+    check(
+        f"{kind}: probabilities one by one, against a batch",
+        FLOAT32,
+        lambda _: [r.probabilities for r in alone],
+        1e-6,
+        exact,
+    )
+
+
+@pytest.mark.parametrize("kind", CLASSIFIERS)
+def test_a_video_of_one_frame_is_that_frame_repeated(check: Check, kind: str, tmp_path: Path) -> None:
+    """The mean of equal features is off by what a sum of five rounds."""
+    store = FrameStore(write_frames(tmp_path, {"long_0": 4, "short_0": 1}))
+    video, model = LabelledVideo("short_0", (0, 1, 2)), classifier(kind).eval()
+    item = ClipDataset(store, [video], per_video=5)[0]
+    drawn = ClipDataset(store, [video], per_video=5, seed=3, flip_probability=0.5)[0]
+    assert item["frames"].shape == drawn["frames"].shape == (5, 32, 32, 3)
+    assert (item["frames"] == torch.from_numpy(store.pictures("short_0"))[0]).all()
+    assert (drawn["frames"] == drawn["frames"][:1]).all()
+    with torch.no_grad():
+        once = model(item["frames"][None, :1], item["frame_indices"][None, :1])["logits"]
+        repeated = model(item["frames"][None], item["frame_indices"][None])["logits"]
+    torch.testing.assert_close(repeated, once, atol=2e-6, rtol=2e-6)

@@ -1,0 +1,308 @@
+"""The language model at its edges: tactile embeddings of any size, padding, adapters that do nothing or are merged,
+labels that are all ignored, losses of huge logits, answers beyond the cache's room.
+
+The model is the committed stand-in; the connector is random and stays float32 as in the pipeline, whatever the model's
+format is, which is that of the rows. transformers normalises in float32 even in a float64 model: what the other
+formats are held against is right to some 1e-7, and a float64 model gets float32's bound.
+"""
+
+from __future__ import annotations
+
+import copy
+from functools import cache
+from typing import cast
+
+import pytest
+import torch
+from torch import nn
+from torch.nn import functional as F
+from transformers.modeling_outputs import CausalLMOutput
+
+from pipeline.config import LoraTrainConfig
+from pipeline.language.cache import AHEAD, roomy_cache
+from pipeline.language.chat import IGNORE_INDEX
+from pipeline.language.octopi import OctopiForCausalLM
+from pipeline.language.training import add_lora
+from pipeline.runtime import seed_everything
+from tests.closure import ROOT
+from tests.numerics.bounds import longest_sum, magnification, rounded, summing
+from tests.numerics.cross_entropy import TARGETS, logits, mean_loss, rounded_loss
+from tests.numerics.harness import BFLOAT16, FLOAT16, FLOAT32, FLOAT64, NETWORKS, SOLVED, Check, Format, formats
+
+PART = "language"
+DIM, FRAMES, LENGTH = 64, 4, 40
+SIZES = (0.0, 1e-30, 1.0, 1e4)
+"""Of tactile embeddings; at 1e4 a random connector's output is near the largest number of float16."""
+PAPER = LoraTrainConfig(samples=1, rank=128, alpha=256, dropout=0)
+
+
+def octopi() -> OctopiForCausalLM:
+    """A model with a random connector, in float32; equal at every call."""
+    seed_everything(5)
+    made = OctopiForCausalLM.from_base(ROOT / "standins" / "llama", DIM).eval()
+    nn.init.normal_(made.connector.delimiters, std=0.02)
+    return made
+
+
+@cache
+def made(fmt: Format) -> OctopiForCausalLM:
+    """`octopi` with its language model in a format, on that format's device; kept, so leave it as it is."""
+    model = octopi()
+    model.llm.to(fmt.torch)
+    if fmt is FLOAT64:
+        model.connector.double()
+    return model.to(fmt.device)
+
+
+def conversation(model: OctopiForCausalLM) -> tuple[torch.Tensor, torch.Tensor]:
+    """Token numbers with frames among them, 3 x `LENGTH`, and embeddings of noise, 3 x frames x `DIM`."""
+    draw = torch.Generator().manual_seed(0)
+    ids = torch.randint(4, 200, (3, LENGTH), generator=draw)
+    ids[:, 3], ids[:, 4 : 4 + FRAMES], ids[:, 4 + FRAMES] = model.start_id, model.frame_id, model.end_id
+    delimiters = model.connector.delimiters
+    features = torch.randn(3, FRAMES, DIM, generator=draw).to(delimiters.device, delimiters.dtype)
+    return ids.to(delimiters.device), features
+
+
+@torch.no_grad()
+def answered(model: OctopiForCausalLM, size: float = 1.0) -> torch.Tensor:
+    """Logits of the `conversation`, its embeddings multiplied by `size`: rows x length x vocabulary."""
+    ids, features = conversation(model)
+    return cast(torch.Tensor, model(ids, size * features).logits)
+
+
+@cache
+def magnified(size: float, adapted: bool = False) -> float:
+    model = with_adapter(octopi(), 0.02).double() if adapted else made(FLOAT64)
+    return magnification(model, lambda: answered(model, size))
+
+
+def network(fmt: Format, size: float = 1.0, adapted: bool = False) -> float:
+    """condition: the model's magnification of rounded weights times roundings a layer, relative to the largest logit.
+
+    Where two ways through the model are compared it counts twice.
+    """
+    return rounded(magnified(size, adapted), longest_sum(made(FLOAT64)), FLOAT32 if fmt is FLOAT64 else fmt)
+
+
+def over(difference: torch.Tensor, whole: torch.Tensor) -> torch.Tensor:
+    """Relative to the largest; NaN where any of the whole is not finite."""
+    return torch.where(whole.isfinite().all(), difference / whole.abs().max(), torch.nan)
+
+
+# Embeddings
+
+
+@formats(*NETWORKS)
+@pytest.mark.parametrize("size", SIZES)
+def test_embeddings_of_any_size_are_projected_and_answered(check: Check, fmt: Format, size: float) -> None:
+    """The connector: roundings of two layers in float32, by the sizes of their terms (GELU's slope is at most 1.13),
+    and the cast to the model's format."""
+
+    @torch.no_grad()
+    def projected(f: Format) -> torch.Tensor:
+        ids, features = conversation(made(f))
+        return made(f).embed(ids, size * features)[:, 4 : 4 + FRAMES]
+
+    first, _, last = (cast(nn.Linear, layer) for layer in made(FLOAT64).connector.projection)
+    features = (size * conversation(made(FLOAT64))[1]).flatten(0, 1)
+    with torch.no_grad():
+        hidden = F.gelu(first(features)).abs()
+        off = summing(DIM + 1, FLOAT32) * (features.abs() @ first.weight.abs().T + first.bias.abs())
+        off = 1.13 * off + 4 * FLOAT32.roundoff * hidden
+        sizes = (hidden + off) @ last.weight.abs().T + last.bias.abs()
+        off = off @ last.weight.abs().T + summing(len(last.weight) + 1, FLOAT32) * sizes
+        largest = made(FLOAT64).connector.projection(features).abs().max()
+    check(f"connector: embeddings of {size:g}", fmt, projected, float(off.max() / largest) + fmt.roundoff)
+    name = f"logits after embeddings of {size:g}"
+    check(name, fmt, lambda f: answered(made(f), size), lambda f: network(f, size))
+
+
+# Padding and the cache
+
+
+@formats(*NETWORKS)
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_row_of_nothing_but_padding_spoils_no_other(check: Check, fmt: Format, side: str) -> None:
+    """What the first row's logits lose by its neighbours; and a loss over such rows has finite gradients."""
+    model = made(fmt)
+    ids = conversation(model)[0].clamp(max=199)
+    mask, none = torch.ones_like(ids), torch.zeros(3, 0, DIM, device=fmt.device)
+    mask[1] = 0
+    mask[2, slice(None, 4) if side == "left" else slice(5, None)] = 0
+
+    @torch.no_grad()
+    def lost(_: Format) -> torch.Tensor:
+        beside, alone = model(ids, none, mask).logits, model(ids[:1], none[:1]).logits
+        return over(beside[:1] - alone, beside)
+
+    name = f"a row of nothing but padding, padded on the {side}, beside others"
+    check(name, fmt, lost, 2 * network(fmt), 0.0)
+
+    if fmt is FLOAT32:
+        labels = ids.masked_fill(mask == 0, IGNORE_INDEX)
+        words = model.embed(ids, none).detach().requires_grad_()
+        loss = F.cross_entropy(model.llm(inputs_embeds=words, attention_mask=mask).logits.mT, labels)
+        check(f"{name}: gradients", fmt, lambda _: torch.autograd.grad(loss, words)[0])
+
+
+@formats(*NETWORKS)
+def test_token_by_token_is_all_at_once(check: Check, fmt: Format) -> None:
+    """The prompt leaves `AHEAD` places free, and more tokens follow."""
+    model = made(fmt)
+    ids = torch.randint(4, 200, (2, 5 + AHEAD + 4), generator=torch.Generator().manual_seed(0)).to(fmt.device)
+    parts = [ids[:, :5], ids[:, 5 : 5 + AHEAD - 2], *ids[:, 5 + AHEAD - 2 :].split(1, dim=1)]
+    kept = roomy_cache(model.llm.config)
+
+    @torch.no_grad()
+    def stepwise(_: Format) -> torch.Tensor:
+        whole = model.llm(ids, use_cache=False).logits
+        steps = [model.llm(part, past_key_values=kept, use_cache=True).logits for part in parts]
+        return over(torch.cat(steps, dim=1) - whole, whole)
+
+    check("token by token beyond the cache's room, against all at once", fmt, stepwise, 2 * network(fmt), 0.0)
+
+
+# Adapters
+
+
+def with_adapter(model: OctopiForCausalLM, deviation: float) -> OctopiForCausalLM:
+    """With LoRA of the paper's size; B normal of that deviation, 0 as fresh ones."""
+    seed_everything(1)
+    add_lora(model, PAPER)
+    for name, parameter in model.named_parameters():
+        if "lora_B" in name:
+            nn.init.normal_(parameter, std=deviation)
+    return model.eval()
+
+
+@formats(*NETWORKS)
+def test_a_fresh_adapter_is_the_identity_and_a_merged_one_is_the_same(check: Check, fmt: Format) -> None:
+    """use: B = 0 is the identity to the bit, whatever alpha and rank are."""
+    model = octopi()
+    model.llm.to(fmt.torch)
+    before = answered(with_adapter(model, 0.0).to(fmt.device))
+    adapter = f"adapter, alpha {PAPER.alpha:g}, rank {PAPER.rank}"
+    plain = octopi()
+    plain.llm.to(fmt.torch)
+    check(f"fresh {adapter}, against none", fmt, lambda _: before - answered(plain.to(fmt.device)), 0, 0.0)
+
+    for name, parameter in model.named_parameters():
+        if "lora_B" in name:
+            nn.init.normal_(parameter, std=0.02)
+    apart = answered(model)
+    assert not torch.allclose(apart, before, atol=1e-3), "it does something"
+    model.llm = copy.deepcopy(model.llm).merge_and_unload()
+    bound = 2 * network(fmt, adapted=True)
+    check(f"{adapter}, merged against apart", fmt, lambda _: over(answered(model) - apart, apart), bound, 0.0)
+
+
+@formats(*SOLVED)
+def test_a_merged_adapter_is_the_sum_of_both_weights(check: Check, fmt: Format) -> None:
+    """W + alpha / rank B A; roundings: the sum over ranks, by the sizes of its terms."""
+    model = with_adapter(octopi(), 0.02).to(fmt.torch)
+    layer = model.llm.get_base_model().model.layers[1].self_attn.q_proj
+    scale = PAPER.alpha / PAPER.rank
+    base, low, high = (
+        w.weight.detach().double() for w in (layer.base_layer, layer.lora_A["default"], layer.lora_B["default"])
+    )
+    exact = base + scale * high @ low
+    sizes = base.abs() + scale * high.abs() @ low.abs()
+    bound = float(sizes.max() / exact.abs().max()) * summing(PAPER.rank + 2, fmt)
+    merged = model.llm.merge_and_unload().model.layers[1].self_attn.q_proj.weight
+    check("adapter: merged weights", fmt, lambda _: merged, bound, exact.numpy())
+
+
+@formats(FLOAT32, BFLOAT16, FLOAT16)
+def test_what_is_trained_is_float32_and_moves_as_adam_says(check: Check, fmt: Format) -> None:
+    """The first step is rate x g / (|g| + eps), however small gradients g are: a half format would lose both the step
+    beside the weight and an eps of 1e-8, whose loss makes 0 / 0 of a gradient of 0.
+
+    roundings: some 8 operations on a step, and that of the weight.
+    """
+    model, rate = octopi(), 1e-5
+    model.llm.to(fmt.torch)
+    trained = [p for p in with_adapter(model, 0.0).to(fmt.device).train().parameters() if p.requires_grad]
+    assert {p.dtype for p in trained} == {torch.float32}
+    ids, features = conversation(model)
+    model(ids, features, labels=ids.masked_fill(ids > 199, IGNORE_INDEX)).loss.backward()
+    for parameter in trained:
+        cast(torch.Tensor, parameter.grad).mul_(1e-6)
+    before = torch.cat([p.detach().flatten().double() for p in trained])
+    slope = torch.cat([cast(torch.Tensor, p.grad).flatten().double() for p in trained])
+    torch.optim.AdamW(trained, lr=rate, weight_decay=0).step()
+    after = torch.cat([p.detach().flatten().double() for p in trained])
+    exact = -rate * slope / (slope.abs() + 1e-8)
+    bound = (8 + float(before.abs().max()) / float(exact.abs().max())) * FLOAT32.roundoff
+    check("first step of Adam, gradients times 1e-6", fmt, lambda _: after - before, bound, exact.cpu().numpy())
+
+
+# Losses
+
+
+@formats(*NETWORKS)
+def test_labels_that_are_all_ignored_weigh_nothing(check: Check, fmt: Format) -> None:
+    """use: exactly nothing is learnt, however many tokens the update counts."""
+    model = made(fmt)
+    ids, features = (x[:1] for x in conversation(model))
+    labels = torch.full_like(ids, IGNORE_INDEX)
+    losses = [model(ids, features, labels=labels, num_items_in_batch=n).loss for n in (None, torch.tensor(0), 12)]
+    labels[:, 0] = 5  # Nothing foretells the first token.
+    losses.append(model(ids, features, labels=labels).loss)
+    check("labels that are all ignored: loss", fmt, lambda _: torch.stack(losses), 0, 0.0)
+    gradients = torch.autograd.grad(torch.stack(losses).sum(), list(model.connector.parameters()))
+    assert all((gradient == 0).all() for gradient in gradients)
+
+
+@formats(*NETWORKS)
+def test_answers_of_one_token_are_learnt(check: Check, fmt: Format) -> None:
+    """The end token alone, at both ends of what an answer can be in; against a softmax of float64's logits.
+
+    condition: that of the logits; a cross-entropy moves by no more than twice what its logits do.
+    """
+    columns, end = (1, LENGTH // 2, LENGTH - 1), made(fmt).tokenizer.eos_token_id
+
+    def asked(f: Format) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        ids, features = conversation(made(f))
+        labels = torch.full_like(ids, IGNORE_INDEX)
+        for row, column in enumerate(columns):
+            ids[row, column] = labels[row, column] = end
+        return ids, features, labels
+
+    ids, features, _ = asked(FLOAT64)
+    with torch.no_grad():
+        said = made(FLOAT64)(ids, features).logits.double()
+    exact = sum(-said[row, c - 1].log_softmax(0)[end].item() for row, c in enumerate(columns)) / len(columns)
+
+    @torch.no_grad()
+    def loss(f: Format) -> torch.Tensor:
+        ids, features, labels = asked(f)
+        return cast(torch.Tensor, made(f)(ids, features, labels=labels).loss)
+
+    check("answers of one token: loss", fmt, loss, 2 * network(fmt) * said.abs().max().item() / exact, exact)
+
+
+@formats(*NETWORKS)
+@pytest.mark.parametrize("power", [0, 5, 12, 60, 120])
+def test_losses_of_answers_are_cross_entropies(
+    check: Check, monkeypatch: pytest.MonkeyPatch, fmt: Format, power: int
+) -> None:
+    """Of a language model that says the same whatever it reads, its first column foretelling the second.
+
+    2^120 is a three hundredth of the largest number of float32; 7 x 2^12 is near that of float16.
+    """
+    if fmt is Format.FLOAT16 and power > 12:
+        pytest.skip("beyond float16")
+    said = torch.from_numpy(logits(power))[:, None].expand(-1, 2, -1).to(fmt.device, fmt.torch)
+    model = made(fmt)
+    monkeypatch.setattr(
+        model.llm, "forward", lambda logits_to_keep, **_: CausalLMOutput(logits=said[:, logits_to_keep])
+    )
+    ids = torch.tensor([[1, target] for target in TARGETS], device=fmt.device)
+    labels = ids.clone()
+    labels[:, 0] = IGNORE_INDEX
+
+    def loss(_: Format) -> torch.Tensor:
+        return cast(torch.Tensor, model(ids, torch.zeros(len(ids), 0, DIM, device=fmt.device), labels=labels).loss)
+
+    check(f"loss of answers, logits of 2^{power}", fmt, loss, rounded_loss(power, fmt), mean_loss(power))

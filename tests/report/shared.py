@@ -1,0 +1,70 @@
+"""Reports for tests of the page, made of those in Git, and the page as tests read it."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+from tests.closure import ROOT
+
+STABILITY = """part,case,format,finite,error,bound,verdict
+loss,large,float64,True,1e-15,1e-14,pass
+loss,large,bfloat16,False,0.5,0.25,fail
+"""
+
+
+def write_reports(root: Path, *names: str) -> Path:
+    """reports/ with what the page shows: the report `small-videos` under each of these names, speed and stability."""
+    reports = root / "reports"
+    for name in names:
+        shutil.copytree(ROOT / "reports" / "small-videos", reports / name)
+        scale, source = name.split("-")
+        edit(reports / name / "provenance.json", report=name, scale=scale, source=source)
+    shutil.copy(ROOT / "reports" / "speed_error.csv", reports)
+    (reports / "stability.csv").write_text(STABILITY)
+    return root
+
+
+def edit(file: Path, **changed: Any) -> None:
+    """Change values of a JSON file."""
+    file.write_text(json.dumps({**json.loads(file.read_text()), **changed}))
+
+
+def rows_of(file: Path) -> list[dict[str, Any]]:
+    with file.open(encoding="utf-8", newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def write_rows(file: Path, rows: list[dict[str, Any]]) -> None:
+    with file.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+class Page:
+    """The elements of a page, which is well-formed as XML too."""
+
+    def __init__(self, file: Path) -> None:
+        self.root = ElementTree.fromstring(file.read_text(encoding="utf-8"))
+        self.parents = {child: parent for parent in self.root.iter() for child in parent}
+
+    def all(self, *tags: str, kind: str = "") -> list[ElementTree.Element]:
+        """Elements by tag, or by class."""
+        return [e for e in self.root.iter() if e.tag in tags or kind in e.get("class", "").split()]
+
+    def named(self, name: str) -> ElementTree.Element:
+        (found,) = [e for e in self.root.iter() if e.get("id") == name]
+        return found
+
+    def above(self, element: ElementTree.Element | None) -> list[ElementTree.Element]:
+        """An element and everything that it stands in."""
+        return [] if element is None else [element, *self.above(self.parents.get(element))]
+
+
+def words(element: ElementTree.Element) -> str:
+    return " ".join(" ".join(element.itertext()).split())
