@@ -464,7 +464,9 @@ class _Publication:
         # The end of a curve is no point at its step 0.
         logged |= {m.name for m in curve}
         points += [(name, float(value), ended, 0) for name, value in stage.metrics.items() if name not in logged]
-        self.store.log(run_id, points, settings(self.params, stage.axes))
+        # What it ran with stays, where settings of no result changed since.
+        own = {} if run else settings(self.params, stage.axes)
+        self.store.log(run_id, points, own)
         self.store.log(run_id, tags={LOCK: stage.lock})
         self.store.client.set_terminated(run_id, "FINISHED", ended)
 
@@ -532,7 +534,9 @@ class _Publication:
             "Tables and figures: Artifacts, `report/README.md`.",
         }
         metrics = [(name, float(value), now, 0) for name, value in _flatten(summary)]
-        self.store.log(parent, metrics, settings(self.params), {**own, **tags})
+        known = self.store.client.get_run(parent).data.params
+        values = {name: value for name, value in settings(self.params).items() if name not in known}
+        self.store.log(parent, metrics, values, {**own, **tags})
 
 
 def _cached_tag(stage: ChainStage) -> str:

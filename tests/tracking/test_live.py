@@ -1,0 +1,311 @@
+"""Trainings that log while they run: their curves, their ends, and that nothing which tracking does reaches them."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+from urllib.request import urlopen
+
+import mlflow
+import pytest
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from pipeline import tracking
+from pipeline.config import Params
+from pipeline.io import read_table, write_table
+from pipeline.records import Measurement
+from pipeline.stage import Stage
+from pipeline.tracking import TrackingError, live, publish
+from pipeline.training import TrainableTrainer, Trained, TrainingMonitor, train, training_arguments
+from tests.closure import ROOT
+from tests.tracking.conftest import FIRST, FULL, FakeChain, by_name, client, runs
+
+ALIGN = "align@finetuned-all-0"
+STEPS = 6
+
+
+def watched(params: Params, **values: object) -> Params:
+    return params.model_copy(update={"tracking": params.tracking.model_copy(update={"live": True, **values})})
+
+
+class Line(nn.Module):
+    """The smallest thing that a Trainer trains."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layer = nn.Linear(2, 1)
+
+    def forward(self, inputs: torch.Tensor, labels: torch.Tensor) -> dict[str, torch.Tensor]:
+        return {"loss": F.mse_loss(self.layer(inputs)[:, 0], labels)}
+
+
+def fit(params: Params, callbacks: Sequence[Any]) -> Trained:
+    """Some steps on made-up points; the same whenever it is called."""
+    torch.manual_seed(0)
+    data = [{"inputs": torch.tensor([i, 1.0]), "labels": torch.tensor(2.0 * i)} for i in range(8)]
+    arguments = training_arguments(Path("fit"), params.runtime, 0, max_steps=STEPS, logging_steps=1)
+    callbacks = [TrainingMonitor(), *callbacks]
+    return train(TrainableTrainer(model=Line(), args=arguments, train_dataset=data, callbacks=callbacks))
+
+
+def test_a_training_and_publishing_share_one_run(chain: FakeChain, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MLFLOW_SYSTEM_METRICS_SAMPLING_INTERVAL", "0.05")
+    stage = Stage(ALIGN, watched(chain.params))
+    with live(stage) as callbacks:
+        assert by_name("stage")[ALIGN].info.status == "RUNNING"
+        trained = fit(chain.params, callbacks)
+        deadline = time.monotonic() + 30
+        while not any(m.startswith("system/") for m in by_name("stage")[ALIGN].data.metrics):
+            assert time.monotonic() < deadline, "no system metrics"
+            time.sleep(0.1)
+    run, (parent,) = by_name("stage")[ALIGN], runs("reproduction")
+    assert (run.info.status, parent.info.status) == ("FINISHED", "RUNNING")
+    assert run.info.start_time == int(stage.started * 1000)
+    logged = {name for name in run.data.metrics if not name.startswith("system/")}
+    assert logged == {m.name for m in trained.history}
+    history = client().get_metric_history(run.info.run_id, "loss")
+    assert {(m.step, m.value) for m in history} == {(m.step, m.value) for m in trained.history if m.name == "loss"}
+    assert run.data.params.keys() == by_params(chain.params)
+
+    chain.ran([ALIGN], minutes=minutes_of(stage))
+    write_table(Path("data/models/without/finetuned-all-0/history.parquet"), Measurement, trained.history)
+    publish(chain.params)
+    complete = by_name("stage")[ALIGN]
+    assert complete.info.run_id == run.info.run_id
+    assert complete.data.metrics["system/peak_memory_mb"] == 100
+    assert len(client().get_metric_history(run.info.run_id, "loss")) == STEPS
+    assert [r.info.run_id for r in runs("reproduction")] == [parent.info.run_id]
+    assert runs("reproduction")[0].info.status == "FINISHED"
+
+
+def minutes_of(stage: Stage) -> float:
+    """When the stage began, a second early: its run is the one that began within."""
+    return (stage.started - 1 - FIRST.timestamp()) / 60
+
+
+def by_params(params: Params) -> set[str]:
+    """What a person sets and the stage's axes: not the Trainer's hundred arguments."""
+    return {*tracking.settings(params), "encoder", "opd", "seed"}
+
+
+@pytest.mark.parametrize(("error", "status"), [(RuntimeError, "FAILED"), (KeyboardInterrupt, "KILLED")])
+def test_how_a_training_ended(chain: FakeChain, error: type[BaseException], status: str) -> None:
+    with pytest.raises(error), live(Stage(ALIGN, watched(chain.params))):
+        raise error
+    assert by_name("stage")[ALIGN].info.status == status
+    assert mlflow.active_run() is None
+
+
+def test_four_killed_cold_starts_and_the_next_attempt(chain: FakeChain) -> None:
+    """Four trainings start at once without a database and are killed; one is tried again."""
+    shutil.rmtree("mlruns")
+    names = [f"{stage}@{key}" for stage in ("align", "lora") for key in ("finetuned-all-0", "base-all-0")]
+
+    def killed_at_once(name: str) -> None:
+        with live(Stage(name, watched(chain.params))) as callbacks:
+            os._exit(9 if callbacks else 1)
+
+    # Forked, so that MLflow is imported already and they really meet.
+    started = [multiprocessing.get_context("fork").Process(target=killed_at_once, args=(name,)) for name in names]
+    for process in started:
+        process.start()
+    for process in started:
+        process.join(240)
+    assert [process.exitcode for process in started] == [9] * 4
+    killed = by_name("stage")
+    assert {name: run.info.status for name, run in killed.items()} == dict.fromkeys(names, "RUNNING")
+    assert len(runs("reproduction")) == 1
+    with live(Stage(ALIGN, watched(chain.params))):
+        pass
+    assert client().get_run(killed[ALIGN].info.run_id).info.status == "KILLED"
+    assert sorted(run.info.status for run in runs("stage")) == ["FINISHED", "KILLED", *["RUNNING"] * 3]
+    assert len(runs("reproduction")) == 1
+
+
+def test_an_unfinished_reproduction_of_another_scale_ends(chain: FakeChain) -> None:
+    with live(Stage(ALIGN, watched(chain.params).model_copy(update={"scale": "other"}))):
+        pass
+    publish(chain.params)
+    assert {r.info.run_name: r.info.status for r in runs("reproduction")} == {
+        "other-scenes": "KILLED",
+        chain.params.report_name: "FINISHED",
+    }
+
+
+def test_without_live_logging_mlflow_is_not_imported(chain: FakeChain) -> None:
+    shutil.rmtree("mlruns")
+    code = (
+        "import sys; from pipeline.params import load_params; from pipeline.stage import Stage\n"
+        f"from pipeline.tracking import live\nwith live(Stage('{ALIGN}', load_params())) as callbacks: pass\n"
+        "assert callbacks == [] and 'mlflow' not in sys.modules"
+    )
+    assert chain.params.tracking.live is False
+    subprocess.run([sys.executable, "-c", code], check=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    assert not Path("mlruns").exists()
+
+
+def test_only_the_first_process_of_a_distributed_training_logs(
+    chain: FakeChain, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RANK", "1")
+    with live(Stage(ALIGN, watched(chain.params))) as callbacks:
+        assert callbacks == []
+    assert runs() == []
+
+
+@contextmanager
+def silent_server() -> Iterator[str]:
+    """Accepts connections and never answers."""
+    with closing(socket.socket()) as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen(16)
+        yield f"http://127.0.0.1:{listener.getsockname()[1]}"
+
+
+@contextmanager
+def closed_port() -> Iterator[str]:
+    with silent_server() as uri:
+        pass
+    yield uri
+
+
+@contextmanager
+def garbage() -> Iterator[str]:
+    """The local database is no database."""
+    Path("mlruns/mlflow.db").write_bytes(b"garbage " * 1000)
+    yield ""
+
+
+@contextmanager
+def nonsense() -> Iterator[str]:
+    yield "htp:/nowhere"
+
+
+@contextmanager
+def no_such_folder() -> Iterator[str]:
+    Path("file").write_text("")
+    yield "sqlite:///file/mlflow.db"
+
+
+@pytest.mark.parametrize("dead", [silent_server, closed_port, garbage, nonsense, no_such_folder])
+def test_out_of_reach_costs_one_warning_and_one_call(
+    chain: FakeChain, dead: Any, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    untracked = fit(chain.params, [])
+    monkeypatch.setattr("mlflow.store.db.utils.time.sleep", lambda _: pytest.fail("opens the database again"))
+    with dead() as uri:
+        params = watched(chain.params, uri=uri)
+        with live(Stage(ALIGN, params)) as callbacks:
+            trained = fit(params, callbacks)
+        monkeypatch.setattr(tracking, "_Store", lambda _: pytest.fail("calls again"))
+        with live(Stage("lora@finetuned-all-0", params)) as callbacks:
+            assert callbacks == []
+        monkeypatch.undo()
+        monkeypatch.chdir(chain.folder)
+        with pytest.raises(TrackingError, match="octopi publish` tries again"):
+            publish(params)
+    assert (os.environ["MLFLOW_HTTP_REQUEST_MAX_RETRIES"], os.environ["MLFLOW_HTTP_REQUEST_TIMEOUT"]) == ("0", "1")
+    assert trained.history == untracked.history
+    assert all(torch.equal(trained.state[name], value) for name, value in untracked.state.items())
+    (warning,) = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
+    assert warning.startswith("tracking is off")
+    assert len(warning.splitlines()) == 1
+
+
+def test_a_server_that_dies_while_a_training_goes_on(
+    chain: FakeChain, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with closed_port() as uri:
+        port = uri.rsplit(":", 1)[1]
+    Path("mlruns").rename(tmp_path / "server")
+    store = ["--backend-store-uri", f"sqlite:///{tmp_path / 'server' / 'mlflow.db'}"]
+    command = [
+        sys.executable,
+        "-m",
+        "mlflow",
+        "server",
+        "--host",
+        "127.0.0.1",
+        "--port",
+        port,
+        *store,
+        "--workers",
+        "1",
+    ]
+    environment = {**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false", "MLFLOW_DISABLE_TELEMETRY": "true"}
+    with (tmp_path / "server.log").open("w") as log:
+        server = subprocess.Popen(
+            [*command, "--artifacts-destination", str(tmp_path / "artifacts")],
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
+            env=environment,
+        )
+    try:
+        wait_for(f"{uri}/health")
+        params = watched(chain.params, uri=uri, experiment="remote", timeout_seconds=60)
+        publish(params)
+        assert "nothing new" in publish(params)
+        there = client(uri)
+        experiment = there.get_experiment_by_name("remote").experiment_id
+        (variant,) = there.search_runs([experiment], f"tags.`octopi.variant` = '{FULL}'")
+        assert {a.path for a in there.list_artifacts(variant.info.run_id, "encoder")} == {"encoder/encoder.safetensors"}
+        with live(Stage(ALIGN, watched(params, timeout_seconds=3))) as callbacks:
+            assert len(callbacks) == 1
+            os.killpg(server.pid, signal.SIGKILL)
+            server.wait()
+            trained = fit(params, callbacks)
+    finally:
+        if server.poll() is None:
+            os.killpg(server.pid, signal.SIGKILL)
+            server.wait()
+    assert trained.history == fit(params, []).history
+    assert [r.levelname for r in caplog.records].count("WARNING") == 1
+    assert mlflow.active_run() is None
+
+
+def wait_for(url: str) -> None:
+    deadline = time.monotonic() + 120
+    while True:
+        try:
+            with urlopen(url, timeout=2):
+                return
+        except OSError:
+            assert time.monotonic() < deadline, "the server did not start"
+            time.sleep(0.3)
+
+
+def test_a_curve_that_broke_off_is_completed(chain: FakeChain, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = iter(range(100))
+
+    def log_metrics(*args: Any, real: Any = mlflow.log_metrics, **kwargs: Any) -> None:
+        if next(calls) >= 3:
+            raise OSError("gone")
+        real(*args, **kwargs)
+
+    monkeypatch.setattr(mlflow, "log_metrics", log_metrics)
+    stage = Stage(ALIGN, watched(chain.params))
+    with live(stage) as callbacks:
+        trained = fit(chain.params, callbacks)
+    chain.ran([ALIGN], minutes=minutes_of(stage))
+    path = Path("data/models/without/finetuned-all-0/history.parquet")
+    write_table(path, Measurement, trained.history)
+    tracking.out_of_reach.clear()
+    publish(chain.params)
+    run = by_name("stage")[ALIGN]
+    history = client().get_metric_history(run.info.run_id, "loss")
+    expected = [(m.step, m.value) for m in read_table(path, Measurement) if m.name == "loss"]
+    assert sorted((m.step, m.value) for m in history) == expected
+    assert run.info.status == "FINISHED"
