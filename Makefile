@@ -12,7 +12,7 @@ export PATH := $(BIN):$(PATH)
 export PYTHONUNBUFFERED := 1
 export HF_HUB_OFFLINE := 1
 
-.PHONY: install repro test lint dashboard bench standins clean
+.PHONY: install repro test stability lint dashboard bench standins clean
 
 install: $(DONE)
 
@@ -28,6 +28,9 @@ repro: install
 
 test: install
 	python -m pytest
+
+stability: install
+	python -m pytest tests/numerics --stability-csv reports/stability.csv
 
 lint: install
 	ruff check .

@@ -40,7 +40,7 @@ from pipeline.errors import UserError
 from pipeline.params import load_params
 from pipeline.records import Video
 from pipeline.runtime import derive_seed
-from pipeline.trainable import load_trainable
+from pipeline.training.trainable import load_trainable
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import list_videos
 from pipeline.videos.frames.extract import extract_frames

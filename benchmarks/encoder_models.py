@@ -27,7 +27,7 @@ from pipeline.encoder.recipes import property_classifier
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.records import Part
 from pipeline.runtime import seed_everything
-from pipeline.sampling import sample_evaluation
+from pipeline.training.sampling import sample_evaluation
 from pipeline.videos.files import VideoFile
 from pipeline.videos.frames.scan import Scan, scan
 from pipeline.videos.frames.store import FrameStore

@@ -28,7 +28,7 @@ from pipeline.encoder.baseline.validation import forest
 from pipeline.errors import UserError
 from pipeline.parallel import run_parallel
 from pipeline.params import load_params
-from pipeline.sampling import sample_evaluation
+from pipeline.training.sampling import sample_evaluation
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.decoding import Image, decode
 from pipeline.videos.files import VideoFile, list_videos

@@ -82,7 +82,7 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-QUICK = 2.0
+QUICK = 5.0
 """Seconds between two lines of progress in a log file at least: what is quick says nothing."""
 
 

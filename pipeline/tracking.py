@@ -123,7 +123,7 @@ def _begin(run: Stage) -> list[Any]:
 def _callback() -> Any:
     from transformers.integrations import MLflowCallback
 
-    from pipeline.training import measured
+    from pipeline.training.trainer import measured
 
     class Callback(MLflowCallback):
         """Logs the names of history.parquet; at once and not behind a queue, so that a failure shows."""

@@ -12,7 +12,7 @@ from pipeline.io import read_table, save_tensors, write_table
 from pipeline.records import Assignment, Embedding, Encoder, Part
 from pipeline.runtime import resolve_device
 from pipeline.stage import DATA, stage
-from pipeline.trainable import load_trainable
+from pipeline.training.trainable import load_trainable
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.frames.store import FrameStore
 from pipeline.weights import check_encoder

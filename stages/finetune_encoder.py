@@ -10,7 +10,7 @@ from pipeline.records import Assignment, Classification, Measurement, Part
 from pipeline.runtime import resolve_device
 from pipeline.stage import DATA, stage
 from pipeline.tracking import live
-from pipeline.trainable import save_trainable
+from pipeline.training.trainable import save_trainable
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.frames.store import REFERENCES_FILE, TABLE_FILE, FrameStore
 from pipeline.weights import check_encoder, clip_file

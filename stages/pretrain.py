@@ -16,7 +16,7 @@ def main() -> None:
             return
         # Imported here, since most runs end above and need no torch.
         from pipeline.encoder.pretrain import pretrain
-        from pipeline.trainable import save_trainable
+        from pipeline.training.trainable import save_trainable
 
         with live(run) as callbacks:
             encoder, history = pretrain(params.pretrain, params.frames, params.runtime, callbacks)

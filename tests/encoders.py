@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from pipeline.encoder.frame_heads import FittedHeads
 from safetensors.torch import load_file, save_file
 
 from pipeline.config import EncoderConfig, Recipe, RuntimeConfig
-from pipeline.encoder.finetune import EncoderData
+from pipeline.encoder.clips import EncoderData
+from pipeline.encoder.frame_classifier import FittedHeads
 from pipeline.io import write_table
 from pipeline.records import Assignment, Frame, Part
 from pipeline.videos.catalogue import Catalogue

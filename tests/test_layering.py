@@ -9,8 +9,8 @@ import pytest
 from tests.closure import ROOT, imported
 
 CORE = (
-    *("__init__", "errors", "records", "runtime", "io", "config", "params", "progress", "parallel", "card", "sampling"),
-    *("embeddings", "trainable", "weights", "training", "stage"),
+    *("__init__", "errors", "records", "runtime", "io", "config", "params", "progress", "parallel", "card"),
+    *("embeddings", "weights", "training", "stage"),
 )
 ROOMS = ("videos", "scenes", "tasks", "encoder", "language", "evaluation", "report", "tracking")
 TOP = ("scales", "revisions", "compare", "reproduce", "cli")

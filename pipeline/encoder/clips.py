@@ -16,7 +16,7 @@ from pipeline.encoder.model import FrameEncoder, PropertyClassifier
 from pipeline.errors import UserError
 from pipeline.records import Assignment, Classification, Part
 from pipeline.runtime import derive_seed
-from pipeline.sampling import EpochDataset, sample_evaluation, sample_training
+from pipeline.training.sampling import EpochDataset, sample_evaluation, sample_training
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
 

@@ -132,8 +132,8 @@ def cross_validate_candidate(
             expected=data.catalogue.labels(video.object_id),
             predicted=tuple(classes),
         )
-        for video, repeated in zip(data.videos, predicted.tolist(), strict=True)
-        for repeat, classes in enumerate(repeated)
+        for video, repeats in zip(data.videos, predicted.tolist(), strict=True)
+        for repeat, classes in enumerate(repeats)
     ]
 
 
@@ -200,7 +200,7 @@ def frozen_encoder(candidate: Candidate, data: CrossValidationData) -> FrameEnco
     """The encoder that gives a `frame_heads` candidate its features."""
     from pipeline.encoder.recipes import base_encoder
     from pipeline.encoder.scene_encoder import SceneEncoder
-    from pipeline.trainable import load_trainable
+    from pipeline.training.trainable import load_trainable
 
     if candidate.encoder == "clip":
         # As CLIP reads it, whatever the recipe of the chain.

@@ -22,7 +22,7 @@ from pipeline.encoder.recipes import property_classifier
 from pipeline.io import fingerprint
 from pipeline.records import Measurement, Part
 from pipeline.runtime import resolve_device, seed_everything
-from pipeline.trainable import load_trainable
+from pipeline.training.trainable import load_trainable
 from pipeline.videos.catalogue import Catalogue
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def train_classifier(
     Without validation videos there is nothing to choose by, and the last epoch is kept.
     """
     # Imported here, since fitted heads need no Trainer, and importing it takes seconds.
-    from pipeline.training import TrainableTrainer, TrainingMonitor, checkpoint_dir, train, training_arguments
+    from pipeline.training.trainer import TrainableTrainer, TrainingMonitor, checkpoint_dir, train, training_arguments
 
     train_set = ClipDataset(
         data.store,

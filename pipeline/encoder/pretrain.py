@@ -22,9 +22,9 @@ from pipeline.encoder.synthetic import SyntheticPictures, draw_pictures
 from pipeline.io import fingerprint
 from pipeline.records import Measurement
 from pipeline.runtime import CHECKPOINTS, derive_seed, seed_everything
-from pipeline.sampling import EpochDataset
 from pipeline.scenes import invent
-from pipeline.training import TrainableTrainer, TrainingMonitor, checkpoint_dir, train, training_arguments
+from pipeline.training.sampling import EpochDataset
+from pipeline.training.trainer import TrainableTrainer, TrainingMonitor, checkpoint_dir, train, training_arguments
 from pipeline.videos.frames import subtraction
 from pipeline.videos.frames.subtraction import MIDDLE
 

@@ -15,7 +15,7 @@ from pipeline.errors import UserError
 from pipeline.language.chat import IGNORE_INDEX, Encoded, encode, render
 from pipeline.records import Opd, Question
 from pipeline.runtime import derive_seed
-from pipeline.sampling import EpochDataset, sample_evaluation, sample_training
+from pipeline.training.sampling import EpochDataset, sample_evaluation, sample_training
 
 POOL = 16
 """Batches that are drawn together and dealt by length: more of them pad less, fewer mix lengths more freely."""

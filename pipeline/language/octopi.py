@@ -19,7 +19,7 @@ from pipeline.language.cache import roomy_cache
 from pipeline.language.chat import IGNORE_INDEX, TACTILE_TOKENS
 from pipeline.language.connector import CONFIG_FILE, Connector, OctopiConfig, read_config
 from pipeline.runtime import DtypeName, Quantization, resolve_dtype
-from pipeline.trainable import load_trainable
+from pipeline.training.trainable import load_trainable
 
 CONNECTOR_FILE = "connector.safetensors"
 ADAPTER_DIR = "adapter"

@@ -22,7 +22,14 @@ from pipeline.language.conversations import ConversationCollator, ConversationDa
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.records import Encoder, Opd, Question
 from pipeline.runtime import derive_seed, seed_everything
-from pipeline.training import TrainableTrainer, Trained, TrainingMonitor, checkpoint_dir, train, training_arguments
+from pipeline.training.trainer import (
+    TrainableTrainer,
+    Trained,
+    TrainingMonitor,
+    checkpoint_dir,
+    train,
+    training_arguments,
+)
 
 logger = logging.getLogger(__name__)
 

@@ -75,7 +75,7 @@ def draw_table(frame: pd.DataFrame, caption: str, file: str, at_lines: bool = Tr
     """A table as HTML by great_tables, in the page's style: its own would weigh 9 kB a table and know no dark screen.
 
     Args:
-        frame: text in every cell; rows that share a task, measure or severity stand together.
+        frame: text in every cell; rows of one task, measure or severity are brought together.
         caption: what the table is called.
         file: the CSV that it comes from.
         at_lines: whether the frame's index is that of the CSV, so that each row can name its line.
@@ -88,6 +88,8 @@ def draw_table(frame: pd.DataFrame, caption: str, file: str, at_lines: bool = Tr
     words = [name for name, kind in kinds.items() if kind == "words"]
     group = next((name for name in HEADS if name in words and len(words) > 1), None)
     head = next((name for name in words if name != group), None)
+    if group:
+        frame = frame.iloc[pd.factorize(frame[group])[0].argsort(kind="stable")]
     with warnings.catch_warnings():
         # great_tables calls Arrow tables experimental; it is four times as slow with those of pandas.
         warnings.simplefilter("ignore", UserWarning)
@@ -116,4 +118,4 @@ def _kind(name: str, cells: pd.Series[Any]) -> str:
     kind = name.partition(" ")[0].lower()
     if kind in ("measured", "published"):
         return kind
-    return "number" if all(re.match(r"[-+]?\d|$", cell) for cell in cells) else "words"
+    return "number" if all(re.fullmatch(r"[-+\d.,e/ \[\]()]*", cell) for cell in cells) else "words"

@@ -279,7 +279,7 @@ def _stability(folder: Path, gaps: list[Gap]) -> dict[str, Any]:
         return {"cases": 0}
     failed = rows[rows["verdict"].ne("pass")]
     groups = rows.assign(passed=rows["verdict"].eq("pass")).groupby(["part", "format"])["passed"]
-    cells = (groups.sum().astype(str) + " of " + groups.size().astype(str)).unstack(fill_value="")
+    cells = (groups.sum().astype(str) + "/" + groups.size().astype(str)).unstack(fill_value="")
     cells.insert(0, "Part", cells.index)
     return {
         "cases": len(rows),

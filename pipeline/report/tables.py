@@ -127,7 +127,7 @@ COLUMNS: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
     "measured": ("Measured % [95 %]", measured),
     "n": ("n", _count("n")),
     "chance": ("Chance %", lambda row: number(row["chance"], scale=100)),
-    "unread": ("Unread %", lambda row: number(row["unread"] / row["n"] if row["n"] else float("nan"), scale=100)),
+    "unread": ("Unread %", lambda row: number(row["unread"] / row["n"], scale=100)),
     "part": ("Part", _text("part")),
     "change": ("Change", _text("change")),
     "difference": ("Difference, points [95 %]", difference),

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from pipeline.records import Dialogue, Gold, Opd, Part, Prediction, Question, Score, Turn
 from pipeline.videos.catalogue import Catalogue, Property
-from pipeline.videos.wording import mentioned, plain
+from pipeline.videos.catalogue.wording import mentioned, plain
 
 LETTERS = "abc"
 ORDINALS = ("First", "Second")

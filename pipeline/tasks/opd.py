@@ -9,7 +9,7 @@ import re
 from pipeline.records import Opd, Prediction, Question, Score
 from pipeline.tasks.base import Draft, Pool, TaskDefinition, draft_single_turn, find_level
 from pipeline.videos.catalogue import Catalogue
-from pipeline.videos.wording import OPENING
+from pipeline.videos.catalogue.wording import OPENING
 
 TEMPLATES = ("Describe the physical properties of {tactile}.", "How does this tactile video {tactile} feel?")
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from pipeline.errors import UserError
 from pipeline.records import Finding, Severity
 from pipeline.videos.catalogue import Catalogue
-from pipeline.videos.csv_reader import read_rows
+from pipeline.videos.catalogue.csv_reader import read_rows
 
 SUFFIXES = (".avi", ".mjpg", ".mkv", ".mov", ".mp4")
 LIST_FILE = "videos.csv"

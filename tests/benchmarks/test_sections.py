@@ -25,7 +25,7 @@ from pipeline.scenes.elastic.kernels import half_space_table, make_kernel
 from pipeline.scenes.elastic.solver import solve
 from pipeline.scenes.film import write_film
 from pipeline.scenes.light import make_sensor, shade
-from pipeline.trainable import save_trainable
+from pipeline.training.trainable import save_trainable
 from pipeline.videos.catalogue import Catalogue
 from tests.checkpoints import write_clip, write_llama
 from tests.conftest import ROOT

@@ -23,9 +23,9 @@ from pipeline.scenes.recipe import recipe_of
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool
 from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.videos.catalogue.wording import levels_named
 from pipeline.videos.files import list_videos
 from pipeline.videos.split import check_split
-from pipeline.videos.wording import levels_named
 from tests.closure import ROOT
 from tests.fake_chain import fake_params, write_chain
 from tests.project import OBJECTS, REDUCED, Project, copy_project

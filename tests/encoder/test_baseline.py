@@ -6,11 +6,12 @@ import itertools
 import math
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.encoder.baseline.features import (
@@ -28,7 +29,6 @@ from pipeline.encoder.baseline.features import (
 )
 from pipeline.encoder.baseline.predictor import SMOOTHING, PropertyPredictor, decode_jointly, log_dependence
 from pipeline.encoder.baseline.validation import cross_validate, deal, forest
-from pipeline.evaluation.intervals import accuracy_interval
 
 GREY = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
 
@@ -66,18 +66,17 @@ def slow_patterns(grey: np.ndarray) -> list[float]:
     return [seen[code] / seen.total() for code in range(10)]
 
 
-@given(st.integers(0, 10**6), st.integers(3, 12), st.integers(3, 12), st.integers(2, 6))
+@settings(max_examples=25)
+@given(st.integers(0, 10**6), st.integers(3, 9), st.integers(3, 9), st.integers(2, 6))
 def test_uniform_patterns_against_a_slow_version(seed: int, height: int, width: int, levels: int) -> None:
     grey = np.random.default_rng(seed).integers(-levels, levels, (height, width)).astype(np.float32)
     assert uniform_patterns(grey) == pytest.approx(slow_patterns(grey), abs=1e-12)
-
-
-def test_patterns_ignore_rounding_errors() -> None:
+    # Rounding errors on an even surface make no pattern.
     flat = np.float32(37.4) + np.random.default_rng(0).normal(0, 1e-5, (20, 20)).astype(np.float32)
     assert uniform_patterns(flat)[8] == 1
 
 
-@pytest.mark.parametrize("period", [4, 8, 16, 32, 64])
+@pytest.mark.parametrize("period", [4, 16, 64])
 def test_stripes_have_their_energy_in_the_right_band_and_ring(period: int) -> None:
     features = named(wave(1 / period))
     omega = 2 * math.pi / period
@@ -148,21 +147,15 @@ def test_an_untouched_gel_shows_nothing() -> None:
     assert frame_features(picture, picture) == pytest.approx(frame_features(GREY, GREY))
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 7), (2, 3), (17, 31), (241, 319), (480, 640), (224, 224)])
-@pytest.mark.parametrize("kind", ["black", "white", "noise", "checkered"])
-def test_hard_pictures_have_finite_features(size: tuple[int, int], kind: str) -> None:
-    frame = np.zeros((*size, 3), np.uint8)
-    if kind == "white":
-        frame[:] = 255
-    elif kind == "noise":
-        frame = noise(4, *size)
-    elif kind == "checkered":
-        frame[::2, ::2] = 255
-    for reference in (GREY, frame, 255 - frame, np.zeros((5, 9, 3), np.float32)):
-        features = frame_features(frame, reference)
-        assert features.shape == (len(FEATURE_NAMES),)
-        assert features.dtype == np.float32
-        assert np.isfinite(features).all()
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (17, 31), (480, 640)])
+def test_hard_pictures_have_finite_features(size: tuple[int, int]) -> None:
+    checkered = np.zeros((*size, 3), np.uint8)
+    checkered[::2, ::2] = 255
+    for frame in (np.zeros_like(checkered), checkered, np.full_like(checkered, 255), noise(4, *size)):
+        for reference in (GREY, frame, np.zeros((5, 9, 3), np.float32)):
+            features = frame_features(frame, reference)
+            assert (features.shape, features.dtype) == ((len(FEATURE_NAMES),), np.float32)
+            assert np.isfinite(features).all()
 
 
 def test_a_video_is_its_frames_mean_and_maximum() -> None:
@@ -178,17 +171,20 @@ def test_a_video_is_its_frames_mean_and_maximum() -> None:
     assert (features == video_features(frames, GREY.astype(np.float32))).all()
 
 
-def test_pictures_that_are_none_are_refused() -> None:
+@pytest.mark.parametrize(
+    ("frame", "reference", "message"),
+    [
+        (GREY[..., 0], GREY, "height x width x 3"),
+        (GREY[:0], GREY, "height x width x 3"),
+        (GREY.astype(np.float32), GREY, "uint8"),
+        (GREY, np.full((9, 9, 3), np.nan, np.float32), "finite"),
+    ],
+)
+def test_pictures_that_are_none_are_refused(frame: np.ndarray, reference: np.ndarray, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        frame_features(frame, reference)
     with pytest.raises(ValueError, match="at least one frame"):
         video_features([], GREY)
-    with pytest.raises(ValueError, match="height x width x 3"):
-        frame_features(GREY[..., 0], GREY)
-    with pytest.raises(ValueError, match="height x width x 3"):
-        frame_features(GREY[:0], GREY)
-    with pytest.raises(ValueError, match="uint8"):
-        frame_features(GREY.astype(np.float32), GREY)
-    with pytest.raises(ValueError, match="finite"):
-        frame_features(GREY, np.full((9, 9, 3), np.nan, np.float32))
 
 
 # Predictor
@@ -245,14 +241,14 @@ def planted(seed: int, objects: int = 24, videos: int = 3, strength: float = 4) 
 
 def test_a_planted_signal_is_found_and_seeds_decide() -> None:
     features, labels, objects = planted(0)
-    model = PropertyPredictor((3, 2), seed=1, trees=40, jobs=1).fit(features, labels, objects)
+    model = PropertyPredictor((3, 2), seed=1, trees=20, jobs=1).fit(features, labels, objects)
     unseen, answers, _ = planted(1)
     assert (model.predict(unseen) == answers).all(axis=1).mean() > 0.8
     tables = model.probabilities(unseen)
     assert [t.shape for t in tables] == [(72, 3), (72, 2)]
     assert all(t.sum(axis=1) == pytest.approx(1) and (t > 0).all() for t in tables)
-    again = PropertyPredictor((3, 2), seed=1, trees=40, jobs=2).fit(features, labels, objects)
-    other = PropertyPredictor((3, 2), seed=2, trees=40, jobs=1).fit(features, labels, objects)
+    again = PropertyPredictor((3, 2), seed=1, trees=20, jobs=2).fit(features, labels, objects)
+    other = PropertyPredictor((3, 2), seed=2, trees=20, jobs=1).fit(features, labels, objects)
     assert all((a == b).all() for a, b in zip(tables, again.probabilities(unseen), strict=True))
     assert any((a != b).any() for a, b in zip(tables, other.probabilities(unseen), strict=True))
 
@@ -268,12 +264,8 @@ def test_a_class_that_training_lacks_stays_possible() -> None:
     assert second[:, 0] == pytest.approx(1 / 2 / 11)
     assert third == pytest.approx(1)
     assert set(model.predict(features)[:, 0].tolist()) <= {0, 2}
-
-
-def test_a_single_video_trains() -> None:
-    one = np.zeros((1, 3), np.float32)
-    model = PropertyPredictor((3, 3), trees=5, jobs=1).fit(one, np.array([[2, 1]]), ["a"])
-    assert model.predict(one).tolist() == [[2, 1]]
+    one = PropertyPredictor((3, 3), trees=5, jobs=1).fit(features[:1], np.array([[2, 1]]), ["a"])
+    assert one.predict(features[:1]).tolist() == [[2, 1]], "a single video trains"
 
 
 def test_what_does_not_fit_is_refused() -> None:
@@ -338,46 +330,27 @@ def test_no_video_is_predicted_from_its_object(monkeypatch: pytest.MonkeyPatch) 
     assert set(predicted.values()) == {3 * 2}  # Videos an object, repeats.
 
 
-def test_cross_validation_finds_a_signal_and_is_repeatable() -> None:
-    features, labels, objects = planted(5, objects=30, strength=8)
-    predicted = cross_validate(
-        forest(features, labels, objects, (3, 2), seed=7, jobs=1), labels, objects, (3, 2), folds=3, repeats=2, seed=7
-    )
-    assert predicted.shape == (90, 2, 2)
-    assert (predicted == labels[:, None]).all(axis=-1).mean() > 0.8
-    alike = [
-        cross_validate(
-            forest(features, labels, objects, (3, 2), seed=7, jobs=j),
-            labels,
-            objects,
-            (3, 2),
-            folds=2,
-            repeats=1,
-            seed=7,
-        )
-        for j in (1, 2)
-    ]
-    assert alike[0].tolist() == alike[1].tolist()
+def test_cross_validation_finds_a_signal_is_repeatable_and_tells_noise_at_chance(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    few = partial(PropertyPredictor, trees=12)
+    monkeypatch.setattr("pipeline.encoder.baseline.validation.PropertyPredictor", few)
 
+    def right(features: np.ndarray, labels: np.ndarray, objects: list[str], seed: int, jobs: int) -> np.ndarray:
+        classes = (3, 2)[: labels.shape[1]]
+        predict = forest(features, labels, objects, classes, seed=seed, jobs=jobs)
+        predicted = cross_validate(predict, labels, objects, classes, folds=3, repeats=1, seed=seed)
+        assert predicted.shape == (len(labels), 1, labels.shape[1])
+        return (predicted[:, 0] == labels).all(axis=1)
 
-def test_noise_is_told_at_chance() -> None:
-    """Classes are drawn, not balanced: of balanced ones a fold that has more leaves fewer to train on."""
-    held = 0
-    for seed in range(6):
+    signal = planted(5, objects=30, strength=8)
+    assert (right(*signal, 7, 1) == right(*signal, 7, 2)).all(), "on any number of cores"
+    assert right(*signal, 7, 1).mean() > 0.8
+    # Classes are drawn, not balanced: of balanced ones a fold that has more leaves fewer to train on.
+    noise_right = []
+    for seed in range(4):
         rng = np.random.default_rng(seed)
-        labels = np.repeat(rng.integers(0, 2, (24, 1)), 2, axis=0)
-        features = rng.normal(size=(48, 5)).astype(np.float32)
-        objects = [f"o{i // 2}" for i in range(48)]
-        predicted = cross_validate(
-            forest(features, labels, objects, (2,), seed=seed, jobs=1),
-            labels,
-            objects,
-            (2,),
-            folds=3,
-            repeats=1,
-            seed=seed,
-        )
-        interval = accuracy_interval((predicted[:, 0, 0] == labels[:, 0]).astype(float), [(o,) for o in objects])
-        assert interval is not None
-        held += interval.low <= 0.5 <= interval.high
-    assert held >= 5
+        labels, objects = rng.integers(0, 2, (40, 1)), [f"o{i}" for i in range(40)]
+        noise_right.append(right(rng.normal(size=(40, 5)).astype(np.float32), labels, objects, seed, 1))
+    # Four standard errors of 160 coin flips.
+    assert np.mean(noise_right) == pytest.approx(0.5, abs=4 * 0.5 / math.sqrt(160))

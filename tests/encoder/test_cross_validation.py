@@ -11,61 +11,56 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from pipeline.encoder.frame_heads import Clips, FittedHeads, fit_frame_heads
 from pydantic import ValidationError
 from torch.optim.optimizer import register_optimizer_step_pre_hook
 
 from pipeline.config import CrossValidationConfig, EncoderConfig, RuntimeConfig
 from pipeline.encoder import cross_validation as module
-from pipeline.encoder import frame_heads as voting
+from pipeline.encoder import finetune, frame_classifier
 from pipeline.encoder.baseline.features import video_features
 from pipeline.encoder.baseline.predictor import PropertyPredictor
 from pipeline.encoder.baseline.recordings import Recording, describe, recording_features
-from pipeline.encoder.baseline.validation import Fold, Predict, deal
-from pipeline.encoder.baseline.validation import cross_validate as fold_by_fold
-from pipeline.encoder.candidates import CANDIDATES, LEARNING_CURVE, Candidate
+from pipeline.encoder.baseline.validation import Fold, Predict, cross_validate, deal
+from pipeline.encoder.candidates import CANDIDATES, LEARNING_CURVE, Candidate, check_candidates
+from pipeline.encoder.clips import EncoderData
 from pipeline.encoder.cross_validation import CrossValidationData, cross_validate_candidate, frozen_encoder
-from pipeline.encoder.finetune import EncoderData
+from pipeline.encoder.frame_classifier import Clips, FittedHeads, fit_frame_heads
 from pipeline.encoder.model import FrameEncoder, PropertyClassifier
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.errors import UserError
 from pipeline.io import write_table
 from pipeline.records import Measurement, Part, Probe
 from pipeline.runtime import derive_seed, seed_everything
-from pipeline.scales import compose
-from pipeline.scenes.film import write_film
-from pipeline.trainable import save_trainable, trainable_state
+from pipeline.training.trainable import save_trainable, trainable_state
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.decoding import decode
 from pipeline.videos.frames.reference import reference_indices
 from pipeline.videos.frames.store import FrameStore
 from pipeline.videos.frames.subtraction import subtract
 from tests.audit_records import probe
-from tests.closure import ROOT
 from tests.conftest import encode, fake_videos, moving_square
 from tests.encoders import write_frames
 
 OBJECTS = ("baseball", "controller_base", "cotton_ball", "ice_block", "millet", "pillow", "rug")
 CONFIG = CrossValidationConfig(folds=3, repeats=2, seed=4)
+SMALL = CrossValidationConfig(folds=2, repeats=1, seed=4)
+CONSTANT = module.KINDS["constant"]
 
 
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Checkpoints go to a folder of the working directory; fewer fits, since they are not what is tested."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(voting, "STRENGTHS", (1e-3, 1e-2))
-    monkeypatch.setattr(voting, "FOLDS", 2)
+    monkeypatch.setattr(frame_classifier, "STRENGTHS", (1e-3, 1e-2))
+    monkeypatch.setattr(frame_classifier, "FOLDS", 2)
 
 
 @pytest.fixture
-def arena(weights: Path, catalogue: Catalogue, tmp_path: Path) -> CrossValidationData:
+def data(weights: Path, catalogue: Catalogue, tmp_path: Path) -> CrossValidationData:
     """Two videos an object and one more of the first; the pictures of an object are all of one grey of its own."""
     videos = [v for v in fake_videos(OBJECTS, 3) if v.video_id.endswith(("_0", "_1")) or v.object_id == "baseball"]
     folder = write_frames(tmp_path / "frames", {v.video_id: 3 for v in videos})
-    pixels = np.load(folder / "frames.npy")
-    for position, video in enumerate(videos):
-        pixels[3 * position : 3 * position + 3] = grey(video.object_id)
-    np.save(folder / "frames.npy", pixels)
+    paint(folder, [grey(v.object_id) for v in videos])
     return CrossValidationData(
         videos=videos,
         catalogue=catalogue,
@@ -78,6 +73,13 @@ def arena(weights: Path, catalogue: Catalogue, tmp_path: Path) -> CrossValidatio
     )
 
 
+def paint(folder: Path, greys: Sequence[int]) -> None:
+    """Give the three frames of each video one grey."""
+    pixels = np.load(folder / "frames.npy")
+    pixels[:] = np.repeat(greys, 3)[:, None, None, None]
+    np.save(folder / "frames.npy", pixels)
+
+
 def grey(object_id: str) -> int:
     return 20 + 30 * OBJECTS.index(object_id)
 
@@ -85,39 +87,30 @@ def grey(object_id: str) -> int:
 class Telling(FrameEncoder):
     """Says of a picture what its first pixel is, and little else."""
 
-    def __init__(self) -> None:
+    def __init__(self, *_: object) -> None:
         super().__init__(3)
 
     def forward(self, frames: torch.Tensor, frame_indices: torch.Tensor) -> torch.Tensor:
-        return torch.stack([frames[:, 0, 0, 0].float(), frame_indices.float(), frame_indices.float() ** 2], dim=1)
+        numbers = frame_indices.float()
+        return torch.stack([frames[:, 0, 0, 0].float(), numbers, numbers**2], dim=1)
 
 
-def owners(clips: Clips) -> list[str]:
+def shown(clips: Clips) -> list[str]:
     """Whose pictures `Telling` was shown."""
-    named = {grey(o): o for o in OBJECTS}
-    return [named[int(value)] for value in clips[:, 0, 0]]
+    return [{grey(o): o for o in OBJECTS}[int(value)] for value in clips[:, 0, 0]]
 
 
-class Folds(list[Fold]):
-    """The folds as they are asked for; the last is the one being predicted."""
-
-    def tested(self, arena: CrossValidationData) -> set[str]:
-        return {o for o, tested in zip(arena.objects, self[-1].tested, strict=True) if tested}
-
-    def known(self, arena: CrossValidationData) -> set[str]:
-        return {o for o, known in zip(arena.objects, self[-1].trained, strict=True) if known}
+def objects_of(data: CrossValidationData, chosen: np.ndarray) -> set[str]:
+    return {o for o, c in zip(data.objects, chosen, strict=True) if c}
 
 
 @pytest.fixture
-def folds(monkeypatch: pytest.MonkeyPatch) -> Folds:
-    seen = Folds()
+def folds(monkeypatch: pytest.MonkeyPatch) -> list[Fold]:
+    """The folds as they are asked for; the last is the one being predicted."""
+    seen: list[Fold] = []
 
     def spying(predict: Predict, *args: object, **settings: int) -> np.ndarray:
-        def noting(fold: Fold) -> np.ndarray:
-            seen.append(fold)
-            return predict(fold)
-
-        return fold_by_fold(noting, *args, **settings)  # type: ignore[arg-type]
+        return cross_validate(lambda fold: (seen.append(fold), predict(fold))[1], *args, **settings)  # type: ignore
 
     monkeypatch.setattr(module, "cross_validate", spying)
     return seen
@@ -126,267 +119,215 @@ def folds(monkeypatch: pytest.MonkeyPatch) -> Folds:
 # Who learns from what
 
 
-@pytest.mark.parametrize("name", ["probe", "pretrained-independent", "pretrained-10-objects", "pretrained-3"])
-def test_votes_learn_from_no_object_that_they_are_tested_on(
-    name: str, arena: CrossValidationData, folds: Folds, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("joint", "limit"), [(True, None), (False, None), (True, 3)])
+def test_frame_heads_learn_from_no_object_that_they_are_tested_on(
+    joint: bool, limit: int | None, data: CrossValidationData, folds: list[Fold], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Told by the objects' names and by the pictures themselves, in the final fits and in those that choose."""
-    limit = {"pretrained-10-objects": 10, "pretrained-3": 3}.get(name)
-    candidate = replace(CANDIDATES["probe"], objects=limit, joint=name != "pretrained-independent")
-    monkeypatch.setattr(module, "frozen_encoder", lambda *_: Telling())
+    """By the objects' names and by the pictures themselves, in the final fits and in those that choose."""
+    monkeypatch.setattr(module, "frozen_encoder", Telling)
     fits: list[int] = []
 
-    def spy(
-        clips: Clips,
-        labels: np.ndarray,
-        objects: Sequence[str],
-        classes: Sequence[int],
-        strength: float,
-        *,
-        joint: bool,
-    ) -> FittedHeads:
-        assert owners(clips) == list(objects)
-        assert labels.tolist() == [list(arena.catalogue.labels(o)) for o in objects]
-        assert not set(objects) & folds.tested(arena)
-        assert set(objects) <= folds.known(arena)
+    def spy(clips: Clips, labels: np.ndarray, objects: Sequence[str], *rest: object, joint: bool) -> FittedHeads:
+        assert shown(clips) == list(objects)
+        assert labels.tolist() == [list(data.catalogue.labels(o)) for o in objects]
+        assert set(objects) <= objects_of(data, folds[-1].trained) - objects_of(data, folds[-1].tested)
         assert joint == candidate.joint
         fits.append(len(set(objects)))
-        votes = fit_frame_heads(clips, labels, objects, classes, strength, joint=joint)
+        fitted = fit_frame_heads(clips, labels, objects, *rest, joint=joint)  # type: ignore[arg-type]
 
         class Spied(FittedHeads):
             def predict(self, clips: Clips) -> np.ndarray:
-                assert not set(owners(clips)) & set(objects)
+                assert not set(shown(clips)) & set(objects)
                 return super().predict(clips)
 
-        return Spied(**vars(votes))
+        return Spied(**vars(fitted))
 
-    monkeypatch.setattr(module, "fit_frame_heads", spy)
-    monkeypatch.setattr(voting, "fit_frame_heads", spy)
-    judged = cross_validate_candidate(candidate, arena, CONFIG)
-    assert len(judged) == 2 * 15
-    assert len(folds) == 6
+    monkeypatch.setattr(frame_classifier, "fit_frame_heads", spy)
+    candidate = replace(CANDIDATES["probe"], objects=limit, joint=joint)
+    found = cross_validate_candidate(candidate, data, CONFIG)
+    assert [(r.video_id, r.repeat) for r in found] == [(v.video_id, n) for v in data.videos for n in (0, 1)]
+    assert all(r.expected == data.catalogue.labels(r.object_id) for r in found)
     assert len(fits) == 6 * (2 * 2 + 1), "two strengths on two inner folds, and the fit itself"
-    known = [len({o for o, t in zip(arena.objects, f.trained, strict=True) if t}) for f in folds]
-    assert fits[4::5] == [min(limit or 99, k) for k in known]
+    assert fits[4::5] == [min(limit or 99, len(objects_of(data, f.trained))) for f in folds]
 
 
 @pytest.mark.parametrize("name", ["paper", "paper-difference", "release", "scratch"])
 def test_gradients_learn_from_no_object_that_they_are_tested_on(
-    name: str, arena: CrossValidationData, folds: Folds, monkeypatch: pytest.MonkeyPatch
+    name: str, data: CrossValidationData, folds: list[Fold], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    candidate = CANDIDATES[name]
     chosen: list[frozenset[str]] = []
 
     def spy(
-        model: PropertyClassifier, data: EncoderData, config: EncoderConfig, runtime: RuntimeConfig, **_: object
+        model: PropertyClassifier, clips: EncoderData, config: EncoderConfig, *_: object, **__: object
     ) -> list[Measurement]:
-        parts: dict[Part, set[str]] = {part: set() for part in Part}
-        for assignment in data.assignments:
-            parts[assignment.part].add(assignment.object_id)
-        assert parts[Part.TEST] == folds.tested(arena)
-        assert parts[Part.TRAIN] | parts[Part.VALIDATION] == folds.known(arena)
-        assert parts[Part.VALIDATION]
+        parts = {part: {a.object_id for a in clips.assignments if a.part == part} for part in Part}
+        assert parts[Part.TEST] == objects_of(data, folds[-1].tested)
+        assert parts[Part.TRAIN] | parts[Part.VALIDATION] == objects_of(data, folds[-1].trained)
         assert not parts[Part.VALIDATION] & parts[Part.TRAIN]
         assert not parts[Part.UNUSED]
         chosen.append(frozenset(parts[Part.VALIDATION]))
         assert config.recipe == ("release" if name == "release" else "paper")
-        assert (data.store.references is None) == (name in ("paper", "release"))
+        assert model.cosine_per_epoch == (name == "release")
+        assert (clips.store.references is None) == (name in ("paper", "release"))
         assert isinstance(model.encoder, SceneEncoder) == (name == "scratch")
-        for key, value in candidate.settings.items():
-            assert getattr(config, key) == value
+        assert CANDIDATES[name].settings.items() <= config.model_dump().items()
         return []
 
-    monkeypatch.setattr(module, "train_classifier", spy)
-    judged = cross_validate_candidate(candidate, arena, CONFIG)
+    monkeypatch.setattr(finetune, "train_classifier", spy)
+    found = cross_validate_candidate(CANDIDATES[name], data, CONFIG)
     assert len(chosen) == len(folds) == 6
     assert len(set(chosen)) > 1, "drawn anew in each fold"
-    assert all(0 <= p < 3 for j in judged for p in j.predicted)
+    assert all(chosen)
+    assert all(0 <= p < 3 for r in found for p in r.predicted)
 
 
-def test_a_limited_contestant_draws_anew_in_each_fold_and_nests(arena: CrossValidationData, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_limited_candidate_draws_anew_in_each_fold_and_nests(
+    data: CrossValidationData, monkeypatch: pytest.MonkeyPatch
+) -> None:
     drawn: dict[int, list[frozenset[str]]] = {}
 
-    def fake(candidate: Candidate, arena: CrossValidationData) -> Predict:
+    def fake(candidate: Candidate, data: CrossValidationData) -> Predict:
         def predict(fold: Fold) -> np.ndarray:
-            used = frozenset(o for o, t in zip(arena.objects, fold.trained, strict=True) if t)
-            drawn.setdefault(candidate.objects or 99, []).append(used)
-            held = {o for o, t in zip(arena.objects, fold.tested, strict=True) if t}
-            assert not used & held
-            assert all(t == (o in used) for o, t in zip(arena.objects, fold.trained, strict=True)), "all their videos"
+            used = objects_of(data, fold.trained)
+            drawn.setdefault(candidate.objects or 99, []).append(frozenset(used))
+            assert not used & objects_of(data, fold.tested)
+            assert all(t == (o in used) for o, t in zip(data.objects, fold.trained, strict=True)), "all their videos"
             return np.zeros((int(fold.tested.sum()), 3), np.int64)
 
         return predict
 
-    monkeypatch.setitem(module.KINDS, "votes", fake)
+    monkeypatch.setitem(module.KINDS, "frame_heads", fake)
     for count in (2, 3, None):
-        cross_validate_candidate(replace(CANDIDATES["pretrained"], objects=count), arena, CONFIG)
-    assert {len(s) for s in drawn[2]} == {2}
-    assert {len(s) for s in drawn[3]} == {3}
-    places = {
-        tuple(sorted(known).index(o) for o in sorted(kept)) for kept, known in zip(drawn[3], drawn[99], strict=True)
-    }
+        cross_validate_candidate(replace(CANDIDATES["pretrained"], objects=count), data, CONFIG)
+    assert [{len(s) for s in drawn[n]} for n in (2, 3)] == [{2}, {3}]
+    places = {tuple(sorted(a).index(o) for o in sorted(k)) for k, a in zip(drawn[3], drawn[99], strict=True)}
     assert len(places) > 3, "folds do not draw alike"
     assert all(a <= b <= c for a, b, c in zip(drawn[2], drawn[3], drawn[99], strict=True)), "fewer are some of more"
 
 
-def test_all_contestants_share_their_folds(arena: CrossValidationData, folds: Folds, monkeypatch: pytest.MonkeyPatch) -> None:
-    def none(*_: object) -> Predict:
-        return lambda fold: np.zeros((int(fold.tested.sum()), 3), np.int64)
-
-    for kind in ("trees", "votes", "gradient"):
-        monkeypatch.setitem(module.KINDS, kind, none)
-    seen = []
+def test_all_candidates_share_their_folds(
+    data: CrossValidationData, folds: list[Fold], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for kind in module.KINDS:
+        monkeypatch.setitem(module.KINDS, kind, CONSTANT)
+    seen = set()
     for candidate in CANDIDATES.values():
         folds.clear()
-        cross_validate_candidate(candidate, arena, CONFIG)
-        seen.append([(f.repeat, f.number, f.tested.tobytes(), f.trained.tobytes()) for f in folds])
-    assert all(one == seen[0] for one in seen)
+        cross_validate_candidate(candidate, data, CONFIG)
+        seen.add(tuple((f.repeat, f.number, f.tested.tobytes(), f.trained.tobytes()) for f in folds))
+    assert len(seen) == 1
     dealt = [deal(OBJECTS, 3, derive_seed(4, "folds", repeat)) for repeat in range(2)]
-    held = [{o for o, t in zip(arena.objects, f.tested, strict=True) if t} for f in folds]
-    assert held == [set(part) for parts in dealt for part in parts]
+    assert [objects_of(data, f.tested) for f in folds] == [set(part) for parts in dealt for part in parts]
     assert all((f.trained != f.tested).all() for f in folds)
-
-
-def test_each_video_is_judged_once_a_repeat(arena: CrossValidationData) -> None:
-    judged = cross_validate_candidate(CANDIDATES["constant"], arena, CONFIG)
-    assert [(j.video_id, j.repeat) for j in judged] == [(v.video_id, r) for v in arena.videos for r in (0, 1)]
-    assert all(j.expected == arena.catalogue.labels(j.object_id) for j in judged)
 
 
 # What they say
 
 
-def test_constant_by_hand(arena: CrossValidationData) -> None:
+def test_constant_by_hand(data: CrossValidationData) -> None:
     """Each object counts once, however many videos it has; of equals the lowest classes."""
-    judged = cross_validate_candidate(CANDIDATES["constant"], arena, CONFIG)
+    found = cross_validate_candidate(CANDIDATES["constant"], data, CONFIG)
     for repeat in range(2):
         for held in deal(OBJECTS, 3, derive_seed(4, "folds", repeat)):
-            counts = Counter(arena.catalogue.labels(o) for o in OBJECTS if o not in held)
-            most = max(counts.values())
-            expected = min(c for c, n in counts.items() if n == most)
-            assert {j.predicted for j in judged if j.repeat == repeat and j.object_id in held} == {expected}
-    assert len({j.predicted for j in judged}) > 1, "folds differ here"
+            counts = Counter(data.catalogue.labels(o) for o in OBJECTS if o not in held)
+            expected = min(c for c, n in counts.items() if n == max(counts.values()))
+            assert {r.predicted for r in found if r.repeat == repeat and r.object_id in held} == {expected}
+    assert len({r.predicted for r in found}) > 1, "folds differ here"
 
 
-def test_what_the_pictures_tell_is_found(arena: CrossValidationData, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures that show the class itself, by frozen features of the same; and by those that show nothing."""
-    folder = arena.frames
-    pixels = np.load(folder / "frames.npy")
-    for position, video in enumerate(arena.videos):
-        pixels[3 * position : 3 * position + 3] = 100 * arena.catalogue.labels(video.object_id)[0]
-    np.save(folder / "frames.npy", pixels)
-    monkeypatch.setattr(module, "frozen_encoder", lambda *_: Telling())
+def test_what_the_pictures_show_is_found(data: CrossValidationData, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures that show the class itself."""
+    paint(data.frames, [100 * data.catalogue.labels(o)[0] for o in data.objects])
+    monkeypatch.setattr(module, "frozen_encoder", Telling)
+    monkeypatch.setattr(frame_classifier, "STRENGTHS", (10.0,))
     candidate = replace(CANDIDATES["probe"], joint=False)
-    monkeypatch.setattr(voting, "STRENGTHS", (10.0,))
-    seen = cross_validate_candidate(candidate, arena, CrossValidationConfig(folds=7, repeats=1))
-    shared = [j for j in seen if sum(arena.catalogue.labels(o)[0] == j.expected[0] for o in OBJECTS) > 1]
+    found = cross_validate_candidate(candidate, data, CrossValidationConfig(folds=7, repeats=1))
+    shared = [r for r in found if sum(data.catalogue.labels(o)[0] == r.expected[0] for o in OBJECTS) > 1]
     assert len(shared) > 8
-    assert all(j.predicted[0] == j.expected[0] for j in shared), "classes that another object has, too"
+    assert all(r.predicted[0] == r.expected[0] for r in shared), "classes that another object has, too"
 
 
-@pytest.mark.parametrize(
-    "name", ["probe", "probe-difference", "pretrained-untrained", "pretrained-pooled", "pretrained-raw"]
-)
-def test_a_verdict_is_repeatable_and_independent_of_the_order(name: str, arena: CrossValidationData) -> None:
+@pytest.mark.parametrize("name", ["probe-difference", "pretrained-untrained", "pretrained-raw"])
+def test_results_are_repeatable_and_independent_of_the_order(name: str, data: CrossValidationData) -> None:
     candidate = CANDIDATES[name]
-    if candidate.pretrained:
-        candidate = replace(candidate, encoder="untrained")
-    setting = CrossValidationConfig(folds=2, repeats=1)
-    pixels = np.load(arena.frames / "frames.npy")
+    candidate = replace(candidate, encoder="untrained") if candidate.pretrained else candidate
+    pixels = np.load(data.frames / "frames.npy")
     pixels += np.random.default_rng(0).integers(0, 20, pixels.shape, dtype=np.uint8)
-    np.save(arena.frames / "frames.npy", pixels)
-    first = cross_validate_candidate(candidate, arena, setting)
+    np.save(data.frames / "frames.npy", pixels)
+    first = cross_validate_candidate(candidate, data, SMALL)
     torch.rand(7)
-    assert cross_validate_candidate(candidate, arena, setting) == first
-    turned = cross_validate_candidate(candidate, replace(arena, videos=arena.videos[::-1]), setting)
-    assert sorted(turned, key=lambda j: j.video_id) == sorted(first, key=lambda j: j.video_id)
+    assert cross_validate_candidate(candidate, data, SMALL) == first
+    turned = cross_validate_candidate(candidate, replace(data, videos=data.videos[::-1]), SMALL)
+    assert sorted(turned, key=lambda r: r.video_id) == sorted(first, key=lambda r: r.video_id)
 
 
-def test_the_untrained_network_is_always_the_same_and_the_pretrained_one_is_loaded(arena: CrossValidationData) -> None:
-    def state(candidate: str, arena: CrossValidationData) -> dict[str, torch.Tensor]:
+def test_the_untrained_network_is_always_the_same_and_the_pretrained_one_is_loaded(data: CrossValidationData) -> None:
+    def state(name: str, data: CrossValidationData) -> dict[str, torch.Tensor]:
         seed_everything(int(torch.randint(100, (1,))))
-        return trainable_state(frozen_encoder(CANDIDATES[candidate], arena))
+        return trainable_state(frozen_encoder(CANDIDATES[name], data))
 
-    one, other = state("pretrained-untrained", arena), state("pretrained-untrained", arena)
+    one, other = state("pretrained-untrained", data), state("pretrained-untrained", data)
     assert all(torch.equal(one[n], other[n]) for n in one)
     with pytest.raises(UserError, match="encoder.safetensors: no such file"):
-        state("pretrained", arena)
+        state("pretrained", data)
     seed_everything(77)
     pretrained = SceneEncoder()
-    file = arena.frames / "encoder.safetensors"
-    save_trainable(pretrained, file)
-    loaded = state("pretrained", replace(arena, pretrained=file))
+    save_trainable(pretrained, data.pretrained)
+    loaded = state("pretrained", data)
     assert all(torch.equal(v, loaded[n]) for n, v in trainable_state(pretrained).items())
     assert not torch.equal(loaded["layers.0.weight"], one["layers.0.weight"])
 
 
-def test_frames_and_pooling_are_what_their_names_say(arena: CrossValidationData, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "frozen_encoder", lambda *_: Telling())
-    shapes: dict[str, set[tuple[int, ...]]] = {}
-
-    def spy(clips: Clips, *args: object, **settings: bool) -> FittedHeads:
-        shapes.setdefault(name, set()).add(clips.shape[1:])
-        if name == "pretrained-pooled":
-            np.testing.assert_allclose(clips[:, 0, 1], 1.5)
-        return fit_frame_heads(clips, *args, **settings)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(module, "fit_frame_heads", spy)
-    for name in ("pretrained", "pretrained-one-frame", "pretrained-ten-frames", "pretrained-pooled"):
-        cross_validate_candidate(CANDIDATES[name], arena, CrossValidationConfig(folds=2, repeats=1))
-    assert shapes == {
-        "pretrained": {(2, 3)},
-        "pretrained-one-frame": {(1, 3)},
-        "pretrained-ten-frames": {(10, 3)},
-        "pretrained-pooled": {(1, 3)},
-    }
+def test_frames_and_pooling_are_what_their_names_say(
+    data: CrossValidationData, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "frozen_encoder", Telling)
+    expected = {"": 2, "-one-frame": 1, "-ten-frames": 10, "-pooled": 1}
+    for name, frames in expected.items():
+        candidate = CANDIDATES[f"pretrained{name}"]
+        clips = module._features(Telling(), candidate, data, data.store(candidate))
+        assert clips.shape == (15, frames, 3)
+    np.testing.assert_allclose(clips[:, 0, 1], 1.5, err_msg="the mean of frames 0 and 3")
 
 
 def test_the_mean_reference_is_of_training_videos_alone(
-    arena: CrossValidationData, folds: Folds, monkeypatch: pytest.MonkeyPatch
+    data: CrossValidationData, folds: list[Fold], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    share, used = FrameStore.share_reference, []
+    used = []
 
     def spy(store: FrameStore, video_ids: Sequence[str]) -> None:
-        known = [v.video_id for v, t in zip(arena.videos, folds[-1].trained, strict=True) if t]
-        assert list(video_ids) == known
-        used.append(known)
-        share(store, video_ids)
+        assert list(video_ids) == [v.video_id for v, t in zip(data.videos, folds[-1].trained, strict=True) if t]
+        used.append(video_ids)
 
     monkeypatch.setattr(FrameStore, "share_reference", spy)
-    cross_validate_candidate(replace(CANDIDATES["pretrained-raw"], encoder="untrained"), arena, CrossValidationConfig(folds=3, repeats=1))
-    assert len(used) == 3
+    cross_validate_candidate(replace(CANDIDATES["pretrained-raw"], encoder="untrained"), data, SMALL)
+    assert len(used) == 2
 
 
-def test_a_shared_reference_by_hand(arena: CrossValidationData) -> None:
-    store, plain = FrameStore(arena.frames, "subtract"), FrameStore(arena.frames)
-    references = np.load(arena.frames / "references.npy").astype(float)
-    chosen = [arena.videos[i].video_id for i in (1, 4, 7)]
-    store.share_reference(chosen)
+def test_a_shared_reference_by_hand(data: CrossValidationData) -> None:
+    store, plain = FrameStore(data.frames, "subtract"), FrameStore(data.frames)
+    references = np.load(data.frames / "references.npy").astype(float)
+    store.share_reference([data.videos[i].video_id for i in (1, 4, 7)])
     mean = np.floor(references[[1, 4, 7]].sum(axis=0) / 3 + 0.5).astype(np.uint8)  # Of three values none ends in .5.
-    for video in arena.videos:
+    for video in data.videos:
         expected = subtract(plain.pictures(video.video_id), mean)
         np.testing.assert_array_equal(store.pictures(video.video_id), expected)
-    assert (np.load(arena.frames / "references.npy") == references).all(), "the file stays"
+    assert (np.load(data.frames / "references.npy") == references).all(), "the file stays"
 
 
 # Kills
-
-
-CONSTANT = module.KINDS["constant"]
 
 
 def kill_after(count: int, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
     """Make all candidates constant and interrupt them when asked for one more fold; returns the folds begun."""
     begun: list[tuple[int, int]] = []
 
-    def until(candidate: Candidate, arena: CrossValidationData) -> Predict:
-        predict = CONSTANT(candidate, arena)
-
+    def until(candidate: Candidate, data: CrossValidationData) -> Predict:
         def counting(fold: Fold) -> np.ndarray:
             if len(begun) == count:
                 raise KeyboardInterrupt
             begun.append((fold.repeat, fold.number))
-            return predict(fold)
+            return CONSTANT(candidate, data)(fold)
 
         return counting
 
@@ -395,114 +336,97 @@ def kill_after(count: int, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, i
     return begun
 
 
-@pytest.mark.parametrize("count", [0, 1, 4, 5])
-def test_finished_folds_survive_a_kill(
-    count: int, arena: CrossValidationData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    whole = cross_validate_candidate(CANDIDATES["constant"], arena, CONFIG)
-    assert not any(tmp_path.glob("checkpoints/cross_validation/*"))
+def killed(count: int, candidate: Candidate, data: CrossValidationData, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         kill_after(count, patch)
         with pytest.raises(KeyboardInterrupt):
-            cross_validate_candidate(CANDIDATES["constant"], arena, CONFIG)
+            cross_validate_candidate(candidate, data, CONFIG)
+
+
+@pytest.mark.parametrize("count", [0, 4, 5])
+def test_finished_folds_survive_a_kill(
+    count: int, data: CrossValidationData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = cross_validate_candidate(CANDIDATES["constant"], data, CONFIG)
+    killed(count, CANDIDATES["constant"], data, monkeypatch)
     begun = kill_after(99, monkeypatch)
-    assert cross_validate_candidate(CANDIDATES["constant"], arena, CONFIG) == whole
+    assert cross_validate_candidate(CANDIDATES["constant"], data, CONFIG) == whole
     assert begun == [(r, n) for r in range(2) for n in range(3)][count:]
     assert not any(tmp_path.glob("checkpoints/cross_validation/*")), "kept no longer than needed"
 
 
-def test_folds_of_other_settings_are_not_taken_for_these(arena: CrossValidationData, monkeypatch: pytest.MonkeyPatch) -> None:
-    with monkeypatch.context() as patch:
-        kill_after(2, patch)
-        with pytest.raises(KeyboardInterrupt):
-            cross_validate_candidate(CANDIDATES["constant"], arena, CONFIG)
-    begun = kill_after(99, monkeypatch)
-    other = CONFIG.model_copy(update={"seed": 5})
-    cross_validate_candidate(CANDIDATES["constant"], arena, other)
-    assert len(begun) == 6
-    cross_validate_candidate(replace(CANDIDATES["constant"], joint=False), arena, CONFIG)
-    assert len(begun) == 12
-
-
-def relabelled(arena: CrossValidationData) -> CrossValidationData:
+def relabelled(data: CrossValidationData) -> CrossValidationData:
     """Another rating of one object, as a corrected objects.csv has it."""
-    rug = arena.catalogue.objects["rug"]
-    other = rug.model_copy(update={"ratings": ((0, 0, 0), *rug.ratings[1:])})
-    objects = {**arena.catalogue.objects, "rug": other}
-    return replace(arena, catalogue=Catalogue(language=arena.catalogue.language, objects=objects))
+    rug = data.catalogue.objects["rug"]
+    objects = {**data.catalogue.objects, "rug": rug.model_copy(update={"ratings": ((0, 0, 0), *rug.ratings[1:])})}
+    return replace(data, catalogue=Catalogue(language=data.catalogue.language, objects=objects))
 
 
-def pretrained_anew(arena: CrossValidationData) -> CrossValidationData:
+def pretrained_anew(data: CrossValidationData) -> CrossValidationData:
     seed_everything(1)
-    save_trainable(SceneEncoder(), arena.pretrained)
-    return arena
+    save_trainable(SceneEncoder(), data.pretrained)
+    return data
 
 
-@pytest.mark.parametrize("change", [relabelled, pretrained_anew])
-def test_folds_of_other_inputs_are_not_taken_for_these(
-    change: Callable[[CrossValidationData], CrossValidationData], arena: CrossValidationData, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("change", "candidate", "config"),
+    [
+        (relabelled, CANDIDATES["pretrained"], CONFIG),
+        (pretrained_anew, CANDIDATES["pretrained"], CONFIG),
+        (lambda data: data, replace(CANDIDATES["pretrained"], joint=False), CONFIG),
+        (lambda data: data, CANDIDATES["pretrained"], CONFIG.model_copy(update={"seed": 5})),
+    ],
+)
+def test_folds_of_other_inputs_or_settings_are_not_taken_for_these(
+    change: Callable[[CrossValidationData], CrossValidationData],
+    candidate: Candidate,
+    config: CrossValidationConfig,
+    data: CrossValidationData,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A stage that was killed begins anew where its inputs have changed since."""
-    save_trainable(SceneEncoder(), arena.pretrained)
-    with monkeypatch.context() as patch:
-        kill_after(2, patch)
-        with pytest.raises(KeyboardInterrupt):
-            cross_validate_candidate(CANDIDATES["pretrained"], arena, CONFIG)
+    save_trainable(SceneEncoder(), data.pretrained)
+    killed(2, CANDIDATES["pretrained"], data, monkeypatch)
     begun = kill_after(99, monkeypatch)
-    cross_validate_candidate(CANDIDATES["pretrained"], change(arena), CONFIG)
+    cross_validate_candidate(candidate, change(data), config)
     assert len(begun) == 6
-
-
-class Updates:
-    """Counts the updates of all optimisers; interrupts the one numbered `stop`."""
-
-    def __init__(self) -> None:
-        self.made = 0
-        self.stop = -1
-
-    def __call__(self, *_: object) -> None:
-        self.made += 1
-        if self.made == self.stop:
-            raise KeyboardInterrupt
 
 
 @pytest.fixture
-def updates() -> Iterator[Updates]:
-    counter = Updates()
-    handle = register_optimizer_step_pre_hook(counter)
+def updates() -> Iterator[dict[str, int]]:
+    """Counts the updates of all optimisers; interrupts the one numbered `stop`."""
+    counter = {"made": 0, "stop": -1}
+
+    def count(*_: object) -> None:
+        counter["made"] += 1
+        if counter["made"] == counter["stop"]:
+            raise KeyboardInterrupt
+
+    handle = register_optimizer_step_pre_hook(count)
     yield counter
     handle.remove()
 
 
-@pytest.mark.parametrize(
-    ("change", "left"),
-    [
-        ({}, 1),
-        ({"seed": 5}, 2),
-    ],
-    ids=["the same", "other folds"],
-)
+@pytest.mark.parametrize(("seed", "left"), [(4, 1), (5, 2)], ids=["the same", "other folds"])
 def test_a_killed_training_goes_on_only_with_its_own_objects(
-    change: dict[str, int], left: int, arena: CrossValidationData, updates: Updates, monkeypatch: pytest.MonkeyPatch
+    seed: int, left: int, data: CrossValidationData, updates: dict[str, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Killed in the second epoch of two. Else a model would be judged on objects that it learnt from."""
-    original, epochs = module.train_classifier, []
+    """Killed in the second epoch of two. Else a model would be tested on objects that it learnt from."""
+    original, epochs = finetune.train_classifier, []
 
     def counting(
-        model: PropertyClassifier, data: EncoderData, config: EncoderConfig, runtime: RuntimeConfig, **rest: object
+        model: PropertyClassifier, clips: EncoderData, config: EncoderConfig, *rest: object, **others: object
     ) -> list[Measurement]:
-        before, epoch = updates.made, math.ceil(len(data.videos(Part.TRAIN)) / config.batch_size)
-        if updates.stop < 0:
-            updates.stop = epoch + 1
-        history = original(model, data, config, runtime, **rest)  # type: ignore[arg-type]
-        epochs.append((updates.made - before) / epoch)
+        before, epoch = updates["made"], math.ceil(len(clips.videos(Part.TRAIN)) / config.batch_size)
+        if updates["stop"] < 0:
+            updates["stop"] = epoch + 1
+        history = original(model, clips, config, *rest, **others)  # type: ignore[arg-type]
+        epochs.append((updates["made"] - before) / epoch)
         return history
 
-    monkeypatch.setattr(module, "train_classifier", counting)
-    setting = CrossValidationConfig(folds=2, repeats=1, seed=4)
+    monkeypatch.setattr(finetune, "train_classifier", counting)
     with pytest.raises(KeyboardInterrupt):
-        cross_validate_candidate(CANDIDATES["paper"], arena, setting)
-    cross_validate_candidate(CANDIDATES["paper"], arena, setting.model_copy(update=change))
+        cross_validate_candidate(CANDIDATES["paper"], data, SMALL)
+    cross_validate_candidate(CANDIDATES["paper"], data, SMALL.model_copy(update={"seed": seed}))
     assert epochs == [left, 2]
 
 
@@ -510,92 +434,74 @@ def test_a_killed_training_goes_on_only_with_its_own_objects(
 
 
 def test_features_of_a_recording_are_those_of_five_frames_at_equal_distances(tmp_path: Path) -> None:
-    for count in (1, 2, 4, 13, 25):
+    for count in (1, 4, 13):
         path = encode(tmp_path / f"{count}.mkv", moving_square(count, count))
         frames = list(decode(path))
         reference = np.mean([frames[i] for i in reference_indices(count)], axis=0, dtype=np.float64)
         inner = [frames[round(k * (count - 1) / 6)] for k in range(1, 6)]
-        np.testing.assert_allclose(
-            describe(Recording(path, False)), video_features(inner, reference.astype(np.float32)), rtol=1e-4, atol=1e-5
-        )
+        expected = video_features(inner, reference.astype(np.float32))
+        np.testing.assert_allclose(describe(Recording(path, False)), expected, rtol=1e-4, atol=1e-5)
+    back = encode(tmp_path / "back.mkv", moving_square(13, 13)[::-1])
+    turned = describe(Recording(back, True))
+    np.testing.assert_allclose(turned, expected, rtol=1e-4, atol=1e-5, err_msg="one that starts touching, from its end")
+    assert not np.allclose(describe(Recording(back, False)), turned)
 
 
-def test_a_recording_that_starts_touching_is_read_from_its_end(tmp_path: Path) -> None:
-    frames = moving_square(25, 1)
-    ahead = encode(tmp_path / "a.mkv", frames)
-    back = encode(tmp_path / "b.mkv", frames[::-1])
-    np.testing.assert_allclose(describe(Recording(ahead, True)), describe(Recording(back, False)), rtol=1e-4, atol=1e-5)
-    assert not np.allclose(describe(Recording(ahead, True)), describe(Recording(ahead, False)))
-
-
-def test_trees_are_the_baseline_on_whole_recordings(catalogue: Catalogue, weights: Path, tmp_path: Path) -> None:
-    objects = ("baseball", "pillow", "rug", "ice_block")
-    videos = [v.model_copy(update={"path": f"{v.video_id}.avi"}) for v in fake_videos(objects, 2)]
+def test_trees_are_the_baseline_on_whole_recordings(
+    data: CrossValidationData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few = lambda *args, **settings: PropertyPredictor(*args, **{**settings, "trees": 10, "jobs": 1})  # noqa: E731
+    monkeypatch.setattr("pipeline.encoder.baseline.validation.PropertyPredictor", few)
+    videos = [v.model_copy(update={"path": f"{v.video_id}.mkv"}) for v in data.videos[:8]]
     for seed, video in enumerate(videos):
-        write_film(tmp_path / video.path, moving_square(8, seed), 25.0)
-    write_frames(tmp_path / "frames", {v.video_id: 1 for v in videos})
-    touching = {"rug_1", "pillow_0"}
-    write_table(
-        tmp_path / "frames" / "probes.parquet",
-        Probe,
-        [probe(v.video_id, starts_touching=v.video_id in touching) for v in videos],
-    )
-    arena = CrossValidationData(
-        videos=videos,
-        catalogue=catalogue,
-        frames=tmp_path / "frames",
-        recordings=tmp_path,
-        per_video=2,
-        encoder=EncoderConfig(weights=str(weights)),
-        runtime=RuntimeConfig(device="cpu"),
-        pretrained=tmp_path / "none",
-    )
-    judged = cross_validate_candidate(CANDIDATES["trees"], arena, CrossValidationConfig(folds=2, repeats=1, seed=3))
-    features = np.stack([describe(Recording(tmp_path / v.path, v.video_id in touching)) for v in videos])
+        encode(tmp_path / video.path, moving_square(6, seed))
+    touching = {videos[1].video_id, videos[4].video_id}
+    probes = [probe(v.video_id, starts_touching=v.video_id in touching) for v in videos]
+    write_table(data.frames / "probes.parquet", Probe, probes)
+    found = {
+        r.video_id: r.predicted
+        for r in cross_validate_candidate(CANDIDATES["trees"], replace(data, videos=videos), SMALL)
+    }
     recordings = [Recording(tmp_path / v.path, v.video_id in touching) for v in videos]
+    features = np.stack([describe(recording) for recording in recordings])
     np.testing.assert_array_equal(recording_features(recordings), features)
-    found = {j.video_id: j.predicted for j in judged}
-    for number, held in enumerate(deal(objects, 2, derive_seed(3, "folds", 0))):
-        known = [i for i, v in enumerate(videos) if v.object_id not in held]
-        model = PropertyPredictor((3, 3, 3), seed=derive_seed(0, "trees", 0, number), jobs=1)
-        labels = np.array([catalogue.labels(v.object_id) for v in videos])
-        model.fit(features[known], labels[known], [videos[i].object_id for i in known])
+    labels = np.array([data.catalogue.labels(v.object_id) for v in videos])
+    for number, held in enumerate(deal([v.object_id for v in videos], 2, derive_seed(4, "folds", 0))):
+        trained = [i for i, v in enumerate(videos) if v.object_id not in held]
+        model = few((3, 3, 3), seed=derive_seed(0, "trees", 0, number))
+        model.fit(features[trained], labels[trained], [videos[i].object_id for i in trained])
         tested = [i for i, v in enumerate(videos) if v.object_id in held]
-        assert [found[videos[i].video_id] for i in tested] == [
-            tuple(p) for p in model.predict(features[tested]).tolist()
-        ]
+        assert [found[videos[i].video_id] for i in tested] == list(map(tuple, model.predict(features[tested]).tolist()))
 
 
-# Contestants
+# Candidates
 
 
 def test_each_variation_changes_one_thing_of_its_parent() -> None:
     for name, candidate in CANDIDATES.items():
-        if not candidate.parent:
-            continue
-        parent = CANDIDATES[candidate.parent]
-        assert not parent.parent, name
-        changed = [k for k, v in asdict(candidate).items() if v != asdict(parent)[k] and k not in ("title", "parent")]
-        assert len(changed) == 1, name
-    titles = [c.title for c in CANDIDATES.values()]
-    assert len(set(titles)) == len(titles)
+        if candidate.parent:
+            parent = CANDIDATES[candidate.parent]
+            assert not parent.parent, name
+            changed = {k for k, v in asdict(candidate).items() if v != asdict(parent)[k]} - {"title", "parent"}
+            assert len(changed) == 1, name
+    assert len({c.title for c in CANDIDATES.values()}) == len(CANDIDATES)
     assert {CANDIDATES[f"pretrained-{n}-objects"].objects for n in LEARNING_CURVE} == set(LEARNING_CURVE)
-    assert "trees" in CANDIDATES
 
 
-def test_an_unknown_model_is_one_clear_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ValidationError, match="strnog is no model"):
-        CrossValidationConfig(models=("paper", "strnog"))
-    with pytest.raises(UserError, match=r"strnog is no model; known: constant, trees, .*strong") as caught:
-        compose("smoke", ["cross_validation.models=[paper,strnog]"], conf=ROOT / "conf")
-    assert "cross_validation.models" in str(caught.value)
-    assert "\n" not in str(caught.value)
-    with pytest.raises(UserError, match=r"cross_validation.models: names no model.*\[constant\] is the cheapest"):
-        compose("smoke", ["cross_validation.models=[]"], conf=ROOT / "conf")
-    assert CrossValidationConfig(models=tuple(CANDIDATES)).models == tuple(CANDIDATES)
+def test_an_unknown_candidate_is_one_clear_line() -> None:
+    check_candidates(tuple(CANDIDATES), "paper")
+    with pytest.raises(UserError, match=r"^cross_validation.models: pretraind is no model; did you mean pretrained\?"):
+        check_candidates(("paper", "pretraind"), "paper")
+    with pytest.raises(UserError, match=r"paper would be trained with the settings of encoder.recipe=release"):
+        check_candidates(("constant", "paper"), "release")
 
 
-@pytest.mark.parametrize(("key", "value"), [("folds", 1), ("folds", 51), ("repeats", 0), ("seed", -1)])
-def test_numbers_out_of_range_are_refused(key: str, value: int) -> None:
+@pytest.mark.parametrize(("key", "value"), [("folds", 1), ("folds", 51), ("repeats", 0), ("seed", -1), ("models", ())])
+def test_values_out_of_range_are_refused(key: str, value: object) -> None:
     with pytest.raises(ValidationError, match=key):
         CrossValidationConfig.model_validate({key: value})
+
+
+def test_more_folds_than_objects_are_refused(data: CrossValidationData) -> None:
+    with pytest.raises(UserError, match=r"cross_validation.folds is 8 but only 7 objects have videos"):
+        cross_validate_candidate(CANDIDATES["constant"], data, CrossValidationConfig(folds=8))

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import UserError
-from pipeline.sampling import sample_evaluation, sample_training
+from pipeline.training.sampling import sample_evaluation, sample_training
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.extract import extract_frames
 from pipeline.videos.frames.store import FrameStore

@@ -27,7 +27,7 @@ from pipeline.encoder.synthetic import SyntheticPictures
 from pipeline.errors import UserError
 from pipeline.records import Measurement, Part
 from pipeline.runtime import seed_everything
-from pipeline.trainable import trainable_state
+from pipeline.training.trainable import trainable_state
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
 from tests.conftest import fake_videos

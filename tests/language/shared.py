@@ -1,51 +1,18 @@
-"""What the tests of the language side share: a tiny Llama, questions in real wording, embeddings of noise."""
+"""What the tests of the language side share: training material, generation settings, prompts."""
 
 from __future__ import annotations
 
-import pytest
 import torch
 
 from pipeline.config import LanguageConfig, TrainConfig
-from pipeline.embeddings import FLIPS, INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
-from pipeline.io import save_tensors, write_table
+from pipeline.embeddings import EmbeddingStore
+from pipeline.language.chat import encode, render
 from pipeline.language.generate import GenerationSettings
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import Material
-from pipeline.records import Assignment, Embedding, Opd, Part, Question
-from pipeline.runtime import seed_everything
-from pipeline.tasks.questions import build_questions, pool_of
-from pipeline.videos.catalogue import load_catalogue
-from tests.checkpoints import write_llama
-from tests.closure import ROOT
+from pipeline.records import Opd, Question
 
-__all__ = ["language", "model", "questions", "store"]
-"""Fixtures."""
 FRAMES, DIM = 2, 6
-
-
-@pytest.fixture(scope="module")
-def language(tmp_path_factory: pytest.TempPathFactory) -> LanguageConfig:
-    folder = write_llama(tmp_path_factory.mktemp("llama"))
-    return LanguageConfig(weights=str(folder), max_new_tokens=12, generation_batch_size=4)
-
-
-@pytest.fixture(scope="module")
-def questions() -> list[Question]:
-    catalogue = load_catalogue(ROOT / "pipeline" / "physiclear")
-    videos = [Assignment(video_id=f"{o}_0", object_id=o, part=Part.TRAIN) for o in list(catalogue.objects)[::4]]
-    counts = {"OPD": 4, "PC": 4, "PSS": 3, "PSR": 3}
-    return build_questions(pool_of(Part.TRAIN, videos, catalogue), counts, seed=0, distinct=False)
-
-
-@pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory, questions: list[Question]) -> EmbeddingStore:
-    folder = tmp_path_factory.mktemp("embeddings")
-    videos = sorted({v for q in questions for v in q.videos})
-    index = [Embedding(video_id=v, frame_index=f, flip=flip, row=0) for v in videos for flip in FLIPS for f in range(3)]
-    index = [entry.model_copy(update={"row": row}) for row, entry in enumerate(index)]
-    write_table(folder / INDEX_FILE, Embedding, index)
-    save_tensors(folder / TENSOR_FILE, {TENSOR: torch.randn(len(index), DIM, generator=torch.manual_seed(0))})
-    return EmbeddingStore(folder)
 
 
 def material(language: LanguageConfig, questions: list[Question], store: EmbeddingStore) -> Material:
@@ -53,14 +20,22 @@ def material(language: LanguageConfig, questions: list[Question], store: Embeddi
     return Material(trained, store, Opd.ALL, language, per_video=FRAMES, flip_probability=0.5, seed=3)
 
 
-@pytest.fixture
-def model(language: LanguageConfig) -> OctopiForCausalLM:
-    seed_everything(1)
-    return OctopiForCausalLM.from_base(language.weights, DIM).eval()
-
-
 def generation(batch_size: int, tokens: int = 12) -> GenerationSettings:
     return GenerationSettings(system_prompt="", per_video=FRAMES, max_new_tokens=tokens, batch_size=batch_size)
 
 
 SMALL = TrainConfig(samples=8, epochs=2, batch_size=4, micro_batch_size=2, projection_learning_rate=1e-3)
+
+
+def prompt(question: Question, opd: Opd, model: OctopiForCausalLM) -> list[int]:
+    """Token ids of a question's first turn."""
+    dialogue = question.dialogue(opd)
+    assert dialogue is not None
+    text = render(dialogue.turns, system_prompt="", frames=FRAMES, eos="</s>", complete=False)
+    return list(encode(text, model.tokenizer).input_ids)
+
+
+def call(model: OctopiForCausalLM) -> dict[str, torch.Tensor]:
+    """A question about two frames."""
+    ids = torch.tensor([[5, model.start_id, model.frame_id, model.frame_id, model.end_id, 7, 9]])
+    return {"input_ids": ids, "features": torch.randn(1, 2, DIM, generator=torch.manual_seed(3))}

@@ -1,32 +1,29 @@
-"""The language side: embeddings in their places, masks, adapters, checkpoints, answers."""
+"""The model: embeddings in their places, the loss, and what is saved, loaded and refused."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import save_file
-from torch.optim.optimizer import register_optimizer_step_pre_hook
-from torch.utils.data import SequentialSampler
+from safetensors.torch import load_file, save_file
 
-from pipeline import training as shared
-from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig
+from pipeline.config import LanguageConfig, LoraTrainConfig
 from pipeline.embeddings import EmbeddingStore
 from pipeline.errors import UserError
-from pipeline.language.base import load_llm
-from pipeline.language.chat import IGNORE_INDEX, TACT_FRAME
+from pipeline.language.base import load_llm, load_tokenizer
+from pipeline.language.chat import IGNORE_INDEX
 from pipeline.language.conversations import ConversationCollator
 from pipeline.language.generate import answer
 from pipeline.language.octopi import OctopiForCausalLM
-from pipeline.language.training import Job, add_lora, align, assemble, finetune_lora
+from pipeline.language.training import add_lora, assemble
 from pipeline.records import Opd, Question
-from pipeline.trainable import trainable_state
 from tests.checkpoints import write_llama
-from tests.language.shared import DIM, FRAMES, SMALL, generation, language, material, model, questions, store
+from tests.language.shared import DIM, call, generation, material
 
-__all__ = ["language", "model", "questions", "store"]
-"""Fixtures."""
+LORA = LoraTrainConfig(samples=1, rank=4, alpha=8, dropout=0.0)
 
 
 def test_tactile_embeddings_stand_where_the_frames_are(model: OctopiForCausalLM) -> None:
@@ -34,6 +31,9 @@ def test_tactile_embeddings_stand_where_the_frames_are(model: OctopiForCausalLM)
     ids = torch.tensor([[5, model.start_id, model.frame_id, model.frame_id, model.end_id, 7], [8, 9, 10, 11, 12, 13]])
     features = torch.randn(2, 2, DIM)
     features[1] = float("nan")  # padding of a row without frames: must never be read
+    trained = {name for name, p in model.named_parameters() if p.requires_grad}
+    assert all(name.startswith("connector.") for name in trained)
+    assert model.connector.delimiters.shape == (2, 32)
     output = model.embed(ids, features)
     expected = torch.stack(
         [
@@ -47,12 +47,6 @@ def test_tactile_embeddings_stand_where_the_frames_are(model: OctopiForCausalLM)
     )
     torch.testing.assert_close(output[0], expected)
     assert torch.equal(output[1], words[ids[1]])
-
-
-def test_only_connector_is_trained_and_only_two_words_are_new(model: OctopiForCausalLM) -> None:
-    trained = {name for name, p in model.named_parameters() if p.requires_grad}
-    assert all(name.startswith("connector.") for name in trained)
-    assert model.connector.delimiters.shape == (2, 32)
 
 
 def test_loss_is_over_answers_only(
@@ -88,215 +82,206 @@ def test_padding_changes_no_logit(
         torch.testing.assert_close(together[row, : len(alone)], alone, atol=2e-5, rtol=0)
 
 
-def test_same_draws_for_same_epoch_and_others_for_another(
-    language: LanguageConfig, questions: list[Question], store: EmbeddingStore
-) -> None:
-    _, data = assemble(material(language, questions, store), 6, "test")
-    first = [data[i]["features"] for i in range(len(data))]
-    assert all(torch.equal(a, data[i]["features"]) for i, a in enumerate(first))
-    data.follow(lambda: 1)
-    assert not all(torch.equal(a, data[i]["features"]) for i, a in enumerate(first))
-
-
-def test_fresh_adapter_changes_nothing_and_reloads_exactly(
-    model: OctopiForCausalLM, language: LanguageConfig, tmp_path: Path
-) -> None:
-    ids = torch.tensor([[5, model.start_id, model.frame_id, model.end_id, 7]])
-    call = {"input_ids": ids, "features": torch.randn(1, 1, DIM)}
-    before = model(**call).logits
-    add_lora(model, LoraTrainConfig(samples=1, rank=128, alpha=256))
-    model.eval()
-    torch.testing.assert_close(model(**call).logits, before, atol=0, rtol=0)
-    for name, parameter in model.named_parameters():
-        if "lora_B" in name:
-            torch.nn.init.normal_(parameter, std=0.05)
-    changed = model(**call).logits
-    assert not torch.allclose(changed, before)
-    model.save_pretrained(tmp_path, trainable_state(model))
-    other = OctopiForCausalLM.from_pretrained(tmp_path)
-    assert torch.equal(other(**call).logits, changed)
-    merged = other.llm.merge_and_unload()
-    torch.testing.assert_close(
-        merged(inputs_embeds=other.embed(ids, call["features"])).logits, changed, atol=1e-4, rtol=0
-    )
-
-
 def test_unknown_target_module_is_named(model: OctopiForCausalLM) -> None:
     with pytest.raises(UserError, match="no layer q_projection"):
         add_lora(model, LoraTrainConfig(samples=1, target_modules=("q_projection",)))
 
 
-@pytest.mark.parametrize("opd", list(Opd))
-def test_batch_size_changes_no_answer(
-    model: OctopiForCausalLM, questions: list[Question], store: EmbeddingStore, opd: Opd
-) -> None:
-    one = answer(model, store, questions, opd, generation(1))
-    many = answer(model, store, questions, opd, generation(5))
-    assert one == many
-    mixed = answer(model, store, questions[::-1], opd, generation(len(questions)))
-    assert sorted(mixed, key=lambda p: p.question_id) == sorted(one, key=lambda p: p.question_id)
-    turns = {q.question_id: len(d.turns) for q in questions if (d := q.dialogue(opd))}
-    assert {p.question_id: len(p.outputs) for p in one} == turns
-    if opd is Opd.NONE:
-        assert not [p for p in one if p.task == "OPD"], "without descriptions there is nothing to ask"
+def trained(model: OctopiForCausalLM) -> OctopiForCausalLM:
+    """With an adapter that changes something, and a connector that no seed draws."""
+    if not hasattr(model.llm, "peft_config"):
+        add_lora(model, LORA)
+    for name, parameter in model.named_parameters():
+        if "lora_B" in name or name.startswith("connector."):
+            torch.nn.init.normal_(parameter, std=0.1)
+    return model.eval()
 
 
-def test_running_into_the_limit_is_said(
-    model: OctopiForCausalLM, questions: list[Question], store: EmbeddingStore
-) -> None:
-    predictions = answer(model, store, questions[:2], Opd.ALL, generation(2, tokens=1))
-    assert all(p.truncated for p in predictions)
-    assert all(p.tokens == len(p.outputs) for p in predictions)
+def digests(folder: Path) -> dict[str, str]:
+    files = sorted(f for f in folder.rglob("*") if f.is_file())
+    return {str(f.relative_to(folder)): hashlib.sha256(f.read_bytes()).hexdigest() for f in files}
 
 
-def test_answers_equal_generation_by_hand(
-    model: OctopiForCausalLM, questions: list[Question], store: EmbeddingStore
-) -> None:
-    from pipeline.language.chat import encode, render
-    from pipeline.language.conversations import evaluation_features
-
-    question = next(q for q in questions if q.task == "PC")
-    dialogue = question.dialogue(Opd.ALL)
-    assert dialogue is not None
-    ids = list(
-        encode(
-            render(dialogue.turns, system_prompt="", frames=FRAMES, eos="</s>", complete=False), model.tokenizer
-        ).input_ids
-    )
-    features = evaluation_features(question, store, FRAMES)[None]
-    said: list[int] = []
-    for _ in range(12):  # the whole sequence anew for each token, without cache or padding
-        x = torch.tensor([ids + said])
-        said.append(int(model(x, features).logits[0, -1].argmax()))
-        if said[-1] == model.tokenizer.eos_token_id:
-            break
-    expected = model.tokenizer.decode(said, skip_special_tokens=True).strip()
-    assert answer(model, store, [question], Opd.ALL, generation(1))[0].outputs == (expected,)
-
-
-class Killed(Exception):
-    """Stands in for a kill at some step."""
+def test_what_is_saved_comes_back_to_the_bit_and_in_the_same_bytes(model: OctopiForCausalLM, tmp_path: Path) -> None:
+    fresh = model(**call(model)).logits
+    add_lora(model, LORA)
+    assert torch.equal(model.eval()(**call(model)).logits, fresh), "a fresh adapter changes nothing"
+    model = trained(model)
+    expected = model(**call(model)).logits
+    assert not torch.allclose(expected, fresh)
+    model.save_pretrained(tmp_path / "a")
+    loaded = OctopiForCausalLM.from_pretrained(tmp_path / "a")
+    assert not loaded.training
+    assert torch.equal(loaded(**call(model)).logits, expected)
+    loaded.save_pretrained(tmp_path / "b")
+    model.save_pretrained(tmp_path / "c", {n: v.clone() for n, v in model.state_dict().items()})
+    assert digests(tmp_path / "a") == digests(tmp_path / "b") == digests(tmp_path / "c")
+    assert set(digests(tmp_path / "a")) == {
+        *("config.json", "connector.safetensors", "adapter/adapter_config.json", "adapter/adapter_model.safetensors")
+    }
+    told = json.loads((tmp_path / "a" / "config.json").read_text())
+    assert (told["architectures"], told["tactile_dim"], told["hidden_size"]) == (["OctopiForCausalLM"], DIM, 32)
+    size = sum(f.stat().st_size for f in (tmp_path / "a").rglob("*"))
+    assert size < 60_000, "the base stays where it is"
+    merged = loaded.llm.merge_and_unload()
+    again = merged(inputs_embeds=loaded.embed(**call(model))).logits
+    torch.testing.assert_close(again, expected, atol=1e-4, rtol=0)
 
 
-@pytest.mark.parametrize("kill_at", [None, 2, 3])
-def test_killed_training_ends_like_an_uninterrupted_one(
-    kill_at: int | None,
-    language: LanguageConfig,
-    questions: list[Question],
-    store: EmbeddingStore,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(shared, "CHECKPOINTS", tmp_path)
-    config = LoraTrainConfig(**SMALL.model_dump(), rank=4, alpha=8, learning_rate=1e-3, dropout=0.1)
-    runtime = RuntimeConfig(device="cpu", save_steps=1)
+def test_plain_peft_loads_the_adapter(model: OctopiForCausalLM, language: LanguageConfig, tmp_path: Path) -> None:
+    from peft import PeftModel
+    from transformers import AutoModelForCausalLM
 
-    def run(mark: str, stop: int | None) -> tuple[dict[str, torch.Tensor], list[float]]:
-        def log(step: int, values: dict[str, float]) -> None:
-            if step == stop:
-                raise Killed
-
-        model, data = assemble(material(language, questions, store), 8, "test")
-        add_lora(model, config)
-        trained = finetune_lora(model, data, config, runtime, Job("lora", mark, 0, log))
-        return trained.state, [m.value for m in trained.history if m.name == "loss"]
-
-    reference, curve = run("reference", None)
-    if kill_at is not None:
-        with pytest.raises(Killed):
-            run("killed", kill_at)
-        assert list((tmp_path / "lora" / "killed").glob("checkpoint-*")), "there must be something to resume from"
-    state, again = run("killed", None)
-    assert again == curve
-    for name, value in reference.items():
-        assert torch.equal(value, state[name]), name
-    assert not (tmp_path / "lora" / "killed").exists(), "checkpoints go when the training is done"
+    model = trained(model)
+    model.save_pretrained(tmp_path)
+    plain = PeftModel.from_pretrained(AutoModelForCausalLM.from_pretrained(language.weights), tmp_path / "adapter")
+    embeddings = model.embed(**call(model))
+    assert torch.equal(plain(inputs_embeds=embeddings).logits, model.llm(inputs_embeds=embeddings).logits)
 
 
-def test_each_part_learns_at_its_own_rate(
-    language: LanguageConfig,
-    questions: list[Question],
-    store: EmbeddingStore,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(shared, "CHECKPOINTS", tmp_path)
-    config = LoraTrainConfig(
-        **{**SMALL.model_dump(), "projection_learning_rate": 1e-9}, rank=4, alpha=8, learning_rate=1e-2
-    )
-    model, data = assemble(material(language, questions, store), 8, "test")
-    add_lora(model, config)
-    before = {n: p.detach().clone() for n, p in model.named_parameters()}
-    finetune_lora(model, data, config, RuntimeConfig(device="cpu"), Job("lora", "x", 0))
-    moved = {n: float((p - before[n]).abs().max()) for n, p in model.named_parameters()}
-    assert max(v for n, v in moved.items() if n.startswith("connector.")) < 1e-6
-    assert min(v for n, v in moved.items() if "lora_B" in n) > 1e-3
-    assert max(v for n, v in moved.items() if "base_layer" in n or "embed_tokens" in n) == 0
+@pytest.mark.parametrize(("tied", "heads"), [(True, 4), (False, 1)])
+def test_tied_or_not_grouped_or_not(tied: bool, heads: int, tmp_path: Path) -> None:
+    folder = write_llama(tmp_path / "base", tie_word_embeddings=tied, num_key_value_heads=heads)
+    model = trained(OctopiForCausalLM.from_base(folder, DIM))
+    words = model.llm.get_base_model()
+    assert (words.get_input_embeddings().weight is words.get_output_embeddings().weight) == tied
+    model.save_pretrained(tmp_path / "saved")
+    again = OctopiForCausalLM.from_pretrained(tmp_path / "saved")
+    assert torch.equal(again(**call(model)).logits, model(**call(model)).logits)
 
 
-def test_diverging_training_stops_with_the_mend(
-    language: LanguageConfig,
-    questions: list[Question],
-    store: EmbeddingStore,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(shared, "CHECKPOINTS", tmp_path)
-    model, data = assemble(material(language, questions, store), 8, "test")
-    with torch.no_grad():
-        model.connector.delimiters.fill_(float("inf"))
-    with pytest.raises(UserError, match="lower the learning rate"):
-        align(model, data, SMALL, RuntimeConfig(device="cpu"), Job("align", "x", 0))
-
-
-def test_checkpoint_of_another_model_is_refused(language: LanguageConfig, tmp_path: Path) -> None:
-    folder = write_llama(tmp_path)
-    config = folder / "config.json"
-    config.write_text(config.read_text().replace('"num_hidden_layers": 2', '"num_hidden_layers": 3'))
-    with pytest.raises(UserError, match="does not fit its config.json"):
+def test_sharded_weights_are_read_and_a_missing_shard_is_named(language: LanguageConfig, tmp_path: Path) -> None:
+    folder = write_llama(tmp_path, shard="20KB")
+    shards = sorted(folder.glob("model-*.safetensors"))
+    assert len(shards) > 2
+    whole, parts = (load_llm(Path(f), torch.float32).state_dict() for f in (language.weights, folder))
+    assert all(torch.equal(value, parts[name]) for name, value in whole.items())
+    shards[1].unlink()
+    with pytest.raises(UserError, match=r"language.weights: .*model-00002-of"):
+        load_llm(folder, torch.float32)
+    write_llama(tmp_path, shard="20KB")
+    shards[0].write_bytes(shards[0].read_bytes()[:-100])
+    with pytest.raises(UserError, match=r"language.weights: .* cannot be loaded"):
         load_llm(folder, torch.float32)
 
 
-def test_pickle_in_place_of_safetensors_is_refused(model: OctopiForCausalLM, tmp_path: Path) -> None:
-    model.save_pretrained(tmp_path)
-    torch.save(model.connector.state_dict(), tmp_path / "connector.safetensors")
-    with pytest.raises(UserError, match="not a safetensors file"):
-        OctopiForCausalLM.from_pretrained(tmp_path)
-    save_file({"projection.0.weight": torch.zeros(1)}, tmp_path / "connector.safetensors")
-    with pytest.raises(UserError, match="does not fit the model"):
-        OctopiForCausalLM.from_pretrained(tmp_path)
-
-
-def test_frame_token_never_comes_out_as_text(model: OctopiForCausalLM) -> None:
-    assert model.frame_id >= model.llm.get_input_embeddings().num_embeddings
-    assert TACT_FRAME not in model.tokenizer.decode(range(model.llm.config.vocab_size))
-
-
-def test_accumulated_batches_weigh_every_token_alike(
-    language: LanguageConfig,
-    questions: list[Question],
-    store: EmbeddingStore,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize(("pad", "bos"), [("<pad>", True), ("</s>", False), ("<unk>", True), (None, False)])
+def test_any_padding_token_leaves_the_end_to_be_learnt(
+    pad: str | None, bos: bool, questions: list[Question], store: EmbeddingStore, tmp_path: Path
 ) -> None:
-    """By the gradient of the first update: rounding aside, four batches of one must give that of one of four."""
-    monkeypatch.setattr(shared, "CHECKPOINTS", tmp_path)
-    # Buckets depend on how many questions a batch has.
-    monkeypatch.setattr("pipeline.language.training.LengthBuckets", lambda lengths, *_: SequentialSampler(lengths))
-    gradients: list[torch.Tensor] = []
-    for micro in (4, 2, 1):
-        model, data = assemble(material(language, questions, store), 4, "test")
-        counts = [sum(label != IGNORE_INDEX for label in e.labels) for e in data.encoded]
-        assert max(counts) > 1.5 * min(counts), "or equal weights would do"
-        config = SMALL.model_copy(update={"micro_batch_size": micro, "epochs": 1, "max_grad_norm": 1e9})
-        kept = register_optimizer_step_pre_hook(
-            lambda optimizer, *_: gradients.append(
-                torch.cat([p.grad.flatten() for group in optimizer.param_groups for p in group["params"]])
-            )
-        )
-        align(model.double(), data, config, RuntimeConfig(device="cpu"), Job("align", f"x{micro}", 0))
-        kept.remove()
-    assert len(gradients) == 3
-    for other in gradients[1:]:
-        # transformers' normalisation computes in float32 whatever it is given.
-        torch.testing.assert_close(gradients[0], other, atol=1e-6 * float(gradients[0].abs().max()), rtol=0)
+    folder = write_llama(tmp_path, bos=bos, pad=pad)
+    setting = LanguageConfig(weights=str(folder))
+    model, data = assemble(material(setting, questions, store), 6, "test")
+    assert model.tokenizer.pad_token == (pad or "<unk>")
+    samples = [data[i] for i in range(len(data))]
+    batch = ConversationCollator(int(model.tokenizer.pad_token_id))(samples)
+    end = model.tokenizer.eos_token_id
+    for row, sample in zip(batch["labels"], samples, strict=True):
+        kept = row[row != IGNORE_INDEX]
+        assert kept[-1] == end
+        assert torch.equal(kept, sample["labels"][sample["labels"] != IGNORE_INDEX])
+        opening = model.tokenizer.convert_ids_to_tokens(sample["input_ids"][:1].tolist())
+        assert (opening[0] == "<s>") == bos
+    one, many = (answer(model, store, questions, Opd.NEEDED, generation(size, 6)) for size in (1, 7))
+    assert one == many
+    assert all(p.tokens <= 6 * len(p.outputs) for p in one)
+
+
+def test_without_unknown_token_the_end_pads(tmp_path: Path) -> None:
+    folder = write_llama(tmp_path, pad=None)
+    file = folder / "tokenizer_config.json"
+    told = json.loads(file.read_text())
+    told.pop("unk_token")
+    file.write_text(json.dumps(told))
+    assert load_tokenizer(folder).pad_token == "</s>"
+    told.pop("eos_token")
+    file.write_text(json.dumps(told))
+    with pytest.raises(UserError, match=r"language.weights: .*names no eos_token"):
+        load_tokenizer(folder)
+
+
+def test_a_token_without_an_embedding_and_a_checkpoint_of_another_model_are_named(tmp_path: Path) -> None:
+    folder = write_llama(tmp_path, vocab_size=255)
+    with pytest.raises(UserError, match="the tokenizer .* has .*, of which the model has no embedding"):
+        OctopiForCausalLM.from_base(folder, DIM)
+    form = write_llama(tmp_path / "other") / "config.json"
+    form.write_text(form.read_text().replace('"num_hidden_layers": 2', '"num_hidden_layers": 3'))
+    with pytest.raises(UserError, match="does not fit its config.json"):
+        load_llm(form.parent, torch.float32)
+
+
+def test_rows_that_no_token_has_are_no_matter(tmp_path: Path) -> None:
+    """Many checkpoints round their matrix up: the tactile tokens' ids are then rows of it, which are never read."""
+    folder = write_llama(tmp_path, vocab_size=320)
+    model = OctopiForCausalLM.from_base(folder, DIM)
+    assert model.frame_id < 320
+    before = model.embed(**call(model))
+    with torch.no_grad():
+        model.llm.get_input_embeddings().weight[260:] = float("nan")
+    assert torch.equal(model.embed(**call(model)), before)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="here four bits may well be had")
+def test_four_bits_without_a_card_are_one_line(language: LanguageConfig) -> None:
+    with pytest.raises(UserError, match=r"^language.quantization: nf4 needs .*CUDA device.*quantization=none$"):
+        OctopiForCausalLM.from_base(language.weights, DIM, quantization="nf4")
+
+
+def broken(folder: Path, what: str) -> str:
+    """Break a saved model; what the message must say."""
+    adapter, config = folder / "adapter", folder / "config.json"
+    if what == "no config":
+        config.unlink()
+        return "config.json: no such file"
+    if what == "foreign config":
+        config.write_text('{"model_type": "llama"}')
+        return r"config.json: base_model: Field required"
+    if what == "pickled adapter":
+        (adapter / "adapter_model.safetensors").unlink()
+        torch.save({}, adapter / "adapter_model.bin")
+        return r"adapter_model.safetensors: no such file \(pickled adapters are refused\)"
+    if what == "cut adapter":
+        file = adapter / "adapter_model.safetensors"
+        file.write_bytes(file.read_bytes()[:300])
+        return "adapter: its adapter is broken or of another language model"
+    if what == "pickled connector":
+        torch.save({}, folder / "connector.safetensors")
+        return "not a safetensors file"
+    if what == "foreign connector":
+        save_file({"projection.0.weight": torch.zeros(1)}, folder / "connector.safetensors")
+        return "does not fit the model"
+    tensors = load_file(folder / "connector.safetensors")
+    tensors["delimiters"][0, 0] = float("nan")
+    save_file(tensors, folder / "connector.safetensors")
+    return "connector.delimiters is not finite"
+
+
+BROKEN = (
+    "no config",
+    "foreign config",
+    "pickled adapter",
+    "cut adapter",
+    "pickled connector",
+    "foreign connector",
+    "NaN",
+)
+
+
+@pytest.mark.parametrize("what", BROKEN)
+def test_a_broken_model_is_one_line(what: str, model: OctopiForCausalLM, tmp_path: Path) -> None:
+    trained(model).save_pretrained(tmp_path)
+    message = broken(tmp_path, what)
+    with pytest.raises(UserError, match=message) as caught:
+        OctopiForCausalLM.from_pretrained(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_another_base_is_refused(model: OctopiForCausalLM, tmp_path: Path) -> None:
+    model = trained(model)
+    model.save_pretrained(tmp_path / "saved")
+    wide = write_llama(tmp_path / "wide", hidden_size=64)
+    with pytest.raises(UserError, match=r"made for word embeddings of 32, but .*wide has 64"):
+        OctopiForCausalLM.from_pretrained(tmp_path / "saved", base=wide)
+    heads = write_llama(tmp_path / "heads", num_key_value_heads=4)
+    with pytest.raises(UserError, match="adapter is broken or of another language model .*size mismatch"):
+        OctopiForCausalLM.from_pretrained(tmp_path / "saved", base=heads)

@@ -51,7 +51,7 @@ def test_answers_that_are_all_alike_have_wilsons_interval_of_objects(check: Chec
     exact = np.array([0, square / (7 + square)])
     answers = np.full((seeds, 21), value).mean(axis=0)
     check(
-        f"seven objects, all answers {value:g} under {seeds} seeds: interval",
+        f"seven objects, all answers {value:g}, {seeds} seed(s): interval",
         FLOAT64,
         lambda _: numbers(*(accuracy_interval(answers, by_turns(21, 7)) or [None])),
         AGREED,
@@ -105,7 +105,7 @@ def test_differences_that_are_all_alike_have_an_interval_with_a_width(check: Che
     assert -1 <= ends[0] <= value <= ends[1] <= 1
     assert ends[0] < ends[1]
     ends = numbers(*ends, found.p, found.smallest_effect)
-    check(f"differences that are all {value:g} under {seeds} seeds: interval, p", FLOAT64, lambda _: ends)
+    check(f"differences that are all {value:g}, {seeds} seed(s): interval, p", FLOAT64, lambda _: ends)
 
 
 @pytest.mark.parametrize("freedom", [1.0, 6.0, 1e6])

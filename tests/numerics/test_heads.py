@@ -22,8 +22,8 @@ from torch.nn import functional as F
 from pipeline.encoder.baseline.predictor import decode_jointly, log_dependence
 from pipeline.encoder.frame_classifier import JointFrameClassifier
 from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
-from pipeline.encoder.release import SHORTEST_FEATURE, PublishedHeads
 from pipeline.encoder.pretrain import PretrainingModel
+from pipeline.encoder.release import SHORTEST_FEATURE, PublishedHeads
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.runtime import seed_everything
 from tests.numerics.bounds import summing
@@ -104,7 +104,11 @@ def huge_classifier(kind: type[PropertyClassifier], weight: float) -> PropertyCl
     """Heads whose weights are `weight` times as large as fresh ones."""
     seed_everything(0)
     network = SceneEncoder()
-    model = JointFrameClassifier(network, CLASSES) if kind is JointFrameClassifier else kind(network, Heads(256, CLASSES), CLASSES)
+    model = (
+        JointFrameClassifier(network, CLASSES)
+        if kind is JointFrameClassifier
+        else kind(network, Heads(256, CLASSES), CLASSES)
+    )
     with torch.no_grad():
         for parameter in model.heads.parameters():
             parameter.mul_(weight)
@@ -130,7 +134,9 @@ def test_huge_logits_are_finite_and_decided_on(
 
     exact, double = said(FLOAT64), huge_classifier(kind, weight).double()
     wild = features.double()
-    terms = double.standardise(wild).abs().flatten(0, 1) if isinstance(double, JointFrameClassifier) else wild.abs().mean(1)
+    terms = (
+        double.standardise(wild).abs().flatten(0, 1) if isinstance(double, JointFrameClassifier) else wild.abs().mean(1)
+    )
     heads = [cast(nn.Linear, head) for head in double.heads.children()]
     sizes = max((terms @ head.weight.abs().T + head.bias.abs()).max().item() for head in heads)
     bound = (2 if kind is JointFrameClassifier else 1) * summing(256 + 4, fmt) * sizes / float(exact.abs().max())

@@ -225,14 +225,16 @@ def test_what_is_trained_is_float32_and_moves_as_adam_says(check: Check, fmt: Fo
     trained = [p for p in with_adapter(model, 0.0).to(fmt.device).train().parameters() if p.requires_grad]
     assert {p.dtype for p in trained} == {torch.float32}
     ids, features = conversation(model)
-    (1e-6 * model(ids, features, labels=ids.masked_fill(ids > 199, IGNORE_INDEX)).loss).backward()
+    model(ids, features, labels=ids.masked_fill(ids > 199, IGNORE_INDEX)).loss.backward()
+    for parameter in trained:
+        cast(torch.Tensor, parameter.grad).mul_(1e-6)
     before = torch.cat([p.detach().flatten().double() for p in trained])
     slope = torch.cat([cast(torch.Tensor, p.grad).flatten().double() for p in trained])
     torch.optim.AdamW(trained, lr=rate, weight_decay=0).step()
     after = torch.cat([p.detach().flatten().double() for p in trained])
     exact = -rate * slope / (slope.abs() + 1e-8)
     bound = (8 + float(before.abs().max()) / float(exact.abs().max())) * FLOAT32.roundoff
-    check("first step of Adam, gradients of a loss of 1e-6", fmt, lambda _: after - before, bound, exact.cpu().numpy())
+    check("first step of Adam, gradients times 1e-6", fmt, lambda _: after - before, bound, exact.cpu().numpy())
 
 
 # Losses

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from pipeline.errors import UserError
 from pipeline.records import Part
 from pipeline.videos.catalogue import Catalogue, load_catalogue
-from pipeline.videos.wording import contradiction, levels_named, mentioned, plain
+from pipeline.videos.catalogue.wording import contradiction, levels_named, mentioned, plain
 from tests.conftest import ROOT
 
 PHYSICLEAR = ROOT / "pipeline" / "physiclear"

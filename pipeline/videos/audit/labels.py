@@ -9,7 +9,7 @@ from statistics import fmean
 
 from pipeline.records import Finding, Part, Severity
 from pipeline.videos.catalogue import Catalogue
-from pipeline.videos.wording import contradiction
+from pipeline.videos.catalogue.wording import contradiction
 
 TINY = 1e-12
 """Variances up to it are rounding."""

@@ -1,8 +1,8 @@
 """The catalogue of a data set: its properties, its objects, the annotators' ratings and the words for all of it.
 
 A catalogue is a folder with `objects.csv` and `properties.yaml`, and, where its publishers described the objects,
-`descriptions.csv` (docs/data.md explains every column and key). The one beside this module is PhysiCLeAR's, from the
-tables of the paper (names, ratings, materials, parts, splits).
+`descriptions.csv` (docs/data.md explains every column and key). The one in pipeline/physiclear is PhysiCLeAR's, from
+the tables of the paper (names, ratings, materials, parts, splits).
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from pydantic import ValidationError
 from pipeline.errors import UserError
 from pipeline.records import Part
 from pipeline.runtime import derive_seed
-from pipeline.videos.csv_reader import Row, read_rows
-from pipeline.videos.wording import Entry, Language, Property, Scenario
+from pipeline.videos.catalogue.csv_reader import Row, read_rows
+from pipeline.videos.catalogue.wording import Entry, Language, Property, Scenario
 
 __all__ = ["RULED_SPLITS", "Catalogue", "Language", "Object", "Property", "Scenario", "load_catalogue"]
 

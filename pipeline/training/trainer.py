@@ -19,8 +19,8 @@ from pipeline.config import RuntimeConfig
 from pipeline.errors import UserError
 from pipeline.records import Measurement
 from pipeline.runtime import CHECKPOINTS, LogLines
-from pipeline.sampling import EpochDataset
-from pipeline.trainable import trainable_state
+from pipeline.training.sampling import EpochDataset
+from pipeline.training.trainable import trainable_state
 
 LOWEST = 0.01
 """Share of the rate at the bottom of a wave."""

@@ -1,10 +1,10 @@
-"""SyntheticPictures: each follows from seed and number alone, says what is so of its object, and survives kills and bad light."""
+"""Synthetic pictures: each follows from seed and number alone, says what is so of its object, and survives kills."""
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -20,7 +20,7 @@ from pipeline.config import FramesConfig, PretrainConfig
 from pipeline.encoder import pretrain as pretraining
 from pipeline.encoder import synthetic as module
 from pipeline.encoder.pretrain import STRENGTH, PretrainingDataset, held_out, pretraining_model, vary
-from pipeline.encoder.scene_encoder import PretrainingModel, SceneEncoder
+from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.encoder.synthetic import (
     BODIES,
     FORCES,
@@ -45,7 +45,7 @@ from pipeline.scenes.recipe import Recipe
 from pipeline.videos.frames.subtraction import subtract
 from tests.frame_rules import pillow
 
-CONFIG = PretrainConfig(objects=9, presses=3, seed=5)
+CONFIG = PretrainConfig(objects=9, presses=2, seed=5)
 FRAMES = FramesConfig(size=32)
 ARRAYS = ("pictures", "quantities", "kinds")
 
@@ -55,8 +55,18 @@ def equal(one: SyntheticPictures, other: SyntheticPictures) -> bool:
     return all(a.dtype == b.dtype and np.array_equal(a, b) for a, b in pairs)
 
 
-def row(lessons: SyntheticPictures, number: int) -> SyntheticPictures:
-    return SyntheticPictures(*(getattr(lessons, name)[number : number + 1] for name in ARRAYS))
+def row(pictures: SyntheticPictures, number: int) -> SyntheticPictures:
+    return SyntheticPictures(*(getattr(pictures, name)[number : number + 1] for name in ARRAYS))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_sensors() -> Iterator[None]:
+    """Making all of them takes each process seconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "SENSORS", 3)
+        sensors.cache_clear()
+        yield
+    sensors.cache_clear()
 
 
 @pytest.fixture(scope="module")
@@ -64,28 +74,28 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> SyntheticPictures:
     """Drawn in three chunks, by as many processes as there are cores."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "CHUNK", 4)
-        return draw_pictures(CONFIG, FRAMES, tmp_path_factory.mktemp("lessons"))
+        return draw_pictures(CONFIG, FRAMES, tmp_path_factory.mktemp("pictures"))
 
 
 # Drawing
 
 
-@pytest.mark.parametrize("number", [0, 3, 4, 8])
-def test_a_lesson_alone_is_the_same_as_among_others(number: int, drawn: SyntheticPictures) -> None:
+@pytest.mark.parametrize("number", [0, 8])
+def test_an_object_alone_is_the_same_as_among_others(number: int, drawn: SyntheticPictures) -> None:
     """Whatever else the settings say, and whatever was drawn before."""
     np.random.seed(number)
-    other = PretrainConfig(objects=5000, presses=3, seed=5, steps=7, batch_size=1, augment=False)
+    other = PretrainConfig(objects=5000, presses=2, seed=5, steps=7, batch_size=1, augment=False)
     assert equal(draw_object(number, other, FRAMES), row(drawn, number))
 
 
-def test_lessons_differ_by_number_and_by_seed(drawn: SyntheticPictures) -> None:
+def test_pictures_differ_by_number_and_by_seed(drawn: SyntheticPictures) -> None:
     assert len({drawn.pictures[i].tobytes() for i in range(9)}) == 9
     elsewhere = draw_object(0, CONFIG.model_copy(update={"seed": 6}), FRAMES)
     assert not any(np.array_equal(elsewhere.pictures[0], p) for p in drawn.pictures)
     assert (elsewhere.quantities[0, 0, 0] != drawn.quantities[:, 0, 0]).all()
 
 
-@pytest.mark.parametrize(("processes", "chunk"), [(1, 50), (3, 1)])
+@pytest.mark.parametrize(("processes", "chunk"), [(3, 1)])
 def test_the_number_of_processes_and_chunks_changes_nothing(
     processes: int, chunk: int, drawn: SyntheticPictures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -138,9 +148,9 @@ def test_a_killed_drawing_keeps_what_is_finished_and_ends_the_same(
 # What is told
 
 
-def test_lessons_have_their_shapes_and_ranges(drawn: SyntheticPictures) -> None:
-    assert (drawn.pictures.shape, drawn.pictures.dtype) == ((9, 3, 32, 32, 3), np.uint8)
-    assert (drawn.quantities.shape, drawn.quantities.dtype) == ((9, 3, len(QUANTITIES)), np.float32)
+def test_pictures_have_their_shapes_and_ranges(drawn: SyntheticPictures) -> None:
+    assert (drawn.pictures.shape, drawn.pictures.dtype) == ((9, 2, 32, 32, 3), np.uint8)
+    assert (drawn.quantities.shape, drawn.quantities.dtype) == ((9, 2, len(QUANTITIES)), np.float32)
     assert (drawn.kinds.shape, drawn.kinds.dtype) == ((9, len(KINDS)), np.uint8)
     assert np.isfinite(drawn.quantities).all()
     assert set(np.unique(drawn.kinds)) == {0, 1}
@@ -156,7 +166,7 @@ def test_lessons_have_their_shapes_and_ranges(drawn: SyntheticPictures) -> None:
     assert ((told["bump share"] >= 0) & (told["bump share"] <= 1)).all()
 
 
-@pytest.mark.parametrize("number", range(12, 20))
+@pytest.mark.parametrize("number", [12, 15, 18])
 def test_quantities_are_measured_where_they_are_shown(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Texture of the whole surface; bumps and depth of the skin in view, under each force."""
     surfaces: list[np.ndarray] = []
@@ -185,7 +195,7 @@ def test_quantities_are_measured_where_they_are_shown(number: int, monkeypatch: 
         assert press[5] == pytest.approx(math.log10(skin.max() + 1e-3), abs=1e-5)
 
 
-@pytest.mark.parametrize("length", [0.6, 1.2, 2.4, 4.8, 7.0])
+@pytest.mark.parametrize("length", [0.6, 2.4, 7.0])
 def test_bands_tell_a_wave_as_the_filters_transfer_says(length: float) -> None:
     """A Gaussian filter of cutoff c passes 2^-(c / L)^2 of a sine of wavelength L (ISO 16610-21)."""
     wave = np.tile(0.1 * np.sin(2 * np.pi * PITCH / length * np.arange(SIDE)), (SIDE, 1)).astype(np.float32)
@@ -205,28 +215,18 @@ def test_bands_tell_a_wave_as_the_filters_transfer_says(length: float) -> None:
 # Pictures
 
 
-def test_pictures_are_differences_to_the_untouched_gel(drawn: SyntheticPictures) -> None:
-    """Where it touches least, at the border, every channel lies about 128."""
-    ring = np.ones((32, 32), bool)
-    ring[4:-4, 4:-4] = False
-    border = drawn.pictures[:, :, ring].astype(float)
-    assert np.abs(np.median(border, axis=2) - 128).max() <= 1
-    assert np.abs(border.mean() - 128) < 2
-    assert drawn.pictures[:, :, 10:22, 10:22].std(axis=(2, 3)).mean() > 2 * border.std(axis=2).min()
-
-
 def test_a_press_that_touches_nothing_shows_128(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the sensor; what is left is noise, doubled, and what coding makes of it."""
     shade = module.shade
     monkeypatch.setattr(module, "shade", lambda skin, *rest: shade(np.zeros_like(skin), *rest))
-    for number in range(4):
+    for number in range(2):
         pictures = draw_object(number, CONFIG, FRAMES).pictures.astype(float)
         assert np.abs(pictures.mean(axis=(2, 3)) - 128).max() < 1
         assert pictures.std(axis=(2, 3)).max() < 4
         assert np.abs(pictures - 128).max() < 25
 
 
-@pytest.mark.parametrize(("fit", "size"), [("crop", 16), ("crop", 60), ("squash", 48), ("crop", 128), ("squash", 150)])
+@pytest.mark.parametrize(("fit", "size"), [("crop", 16), ("squash", 48), ("crop", 128), ("squash", 150)])
 def test_frames_are_fitted_as_those_of_videos(fit: str, size: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Against PIL, and in RGB; a press's frame and reference are of one sensor."""
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH] / 12
@@ -244,9 +244,9 @@ def test_frames_are_fitted_as_those_of_videos(fit: str, size: int, monkeypatch: 
 
     monkeypatch.setattr(module, "shade", light)
     monkeypatch.setattr(module, "subtract", note)
-    lesson = draw_object(2, CONFIG, FramesConfig(size=size, fit=fit))
-    assert lesson.pictures.shape == (1, 3, size, size, 3)
-    for sensor, (frame, reference), shown in zip(seen, taken, lesson.pictures[0], strict=True):
+    found = draw_object(2, CONFIG, FramesConfig(size=size, fit=fit))
+    assert found.pictures.shape == (1, 2, size, size, 3)
+    for sensor, (frame, reference), shown in zip(seen, taken, found.pictures[0], strict=True):
         for found, whole in ((frame, waves), (reference, cv2.convertScaleAbs(sensor.background))):
             expected = pillow(np.ascontiguousarray(whole[..., ::-1]), size, fit).astype(float)
             assert np.abs(found - expected).mean() < 2.5, "coding included"
@@ -255,7 +255,7 @@ def test_frames_are_fitted_as_those_of_videos(fit: str, size: int, monkeypatch: 
 
 def test_sensors_are_made_once_and_differ() -> None:
     assert sensors() is sensors()
-    assert len({s.background.tobytes() for s in sensors()}) == len(sensors()) == 24
+    assert len({s.background.tobytes() for s in sensors()}) == len(sensors()) == 3
     assert all(s.background.shape == (HEIGHT, WIDTH, 3) for s in sensors())
 
 
@@ -309,16 +309,7 @@ def test_strengths_turn_about_the_middle(seed: int) -> None:
     assert len(set(gains)) == 3, "each press has its own"
 
 
-@pytest.mark.parametrize("value", [0, 1, 127, 128, 254, 255])
-def test_varied_pictures_stay_pictures(value: int) -> None:
-    pictures = np.full((2, 6, 5, 3), value, np.uint8)
-    for seed in range(20):
-        found = vary(pictures, np.random.default_rng(seed))
-        assert (found.shape, found.dtype) == (pictures.shape, np.uint8)
-        assert (found.astype(int) - 128).min() * (value - 128) >= 0, "nothing wraps around"
-
-
-def test_a_lesson_of_a_training_depends_on_seed_epoch_and_number_alone(drawn: SyntheticPictures) -> None:
+def test_an_item_of_a_training_depends_on_seed_epoch_and_number_alone(drawn: SyntheticPictures) -> None:
     data = PretrainingDataset(drawn, augment=True, seed=1)
     first = data[3]["frames"]
     assert torch.equal(first, PretrainingDataset(drawn, augment=True, seed=1)[3]["frames"])
@@ -339,7 +330,7 @@ def test_a_lesson_of_a_training_depends_on_seed_epoch_and_number_alone(drawn: Sy
 
 
 @given(st.integers(0, 2**62))
-@settings(max_examples=150)
+@settings(max_examples=40)
 def test_what_is_invented_can_be_made(seed: int) -> None:
     recipe = invent(np.random.default_rng(seed))
     assert Recipe.model_validate_json(recipe.model_dump_json()) == recipe
@@ -376,42 +367,41 @@ def test_bodies_and_layers_come_as_often_as_said() -> None:
 def test_the_loss_by_hand(constant: bool) -> None:
     """In float64; `constant`: a quantity that never changes."""
     rng = np.random.default_rng(1)
-    lessons = SyntheticPictures(
+    pictures = SyntheticPictures(
         pictures=rng.integers(0, 256, (6, 2, 32, 32, 3), dtype=np.uint8),
         quantities=rng.normal(3, 5, size=(6, 2, 4)).astype(np.float32),
         kinds=rng.integers(0, 2, (6, 3)).astype(np.uint8),
     )
     if constant:
-        lessons.quantities[..., 0] = 7
+        pictures.quantities[..., 0] = 7
     seed_everything(0)
-    model = pretraining_model(SceneEncoder(), lessons).eval()
+    model = pretraining_model(SceneEncoder(), pictures).eval()
     batch = slice(1, 5)
-    arrays = (lessons.pictures[batch], lessons.quantities[batch], lessons.kinds[batch].astype(np.float32))
+    arrays = (pictures.pictures[batch], pictures.quantities[batch], pictures.kinds[batch].astype(np.float32))
     with torch.no_grad():
         found = {n: v.item() for n, v in model(*map(torch.from_numpy, arrays)).items()}
-        pictures = torch.from_numpy(lessons.pictures[batch].reshape(-1, 32, 32, 3))
-        features = model.encoder(pictures, torch.zeros(8)).double().numpy()
+        flat = torch.from_numpy(pictures.pictures[batch].reshape(-1, 32, 32, 3))
+        features = model.encoder(flat, torch.zeros(8)).double().numpy()
     weights = {n: p.detach().double().numpy() for n, p in model.named_parameters()}
     hidden = np.maximum(features @ weights["head.1.weight"].T + weights["head.1.bias"], 0)
     told = (hidden @ weights["head.3.weight"].T + weights["head.3.bias"]).reshape(4, 2, 7)
-    exact = lessons.quantities.astype(np.float64)
+    exact = pictures.quantities.astype(np.float64)
     wanted = (exact[batch] - exact.mean(axis=(0, 1))) / (exact.std(axis=(0, 1)) + 1e-6)
     off = np.abs(told[..., :4] - wanted)
     quantities = np.where(off < 1, off**2 / 2, off - 0.5).mean()
     chances = expit(told[..., 4:])
-    present = np.repeat(lessons.kinds[batch, None].astype(float), 2, axis=1)
+    present = np.repeat(pictures.kinds[batch, None].astype(float), 2, axis=1)
     flags = -(present * np.log(chances) + (1 - present) * np.log(1 - chances)).mean()
     assert found["quantities"] == pytest.approx(quantities, rel=1e-5)
     assert found["kinds"] == pytest.approx(flags, rel=1e-5)
     assert found["loss"] == pytest.approx(2 * quantities + 0.6 * flags, rel=1e-5)
 
 
-def test_held_out_parts_are_means_over_lessons(drawn: SyntheticPictures) -> None:
+def test_held_out_parts_are_means_over_pictures(drawn: SyntheticPictures) -> None:
     seed_everything(0)
     model = pretraining_model(SceneEncoder(), drawn)
     data = PretrainingDataset(drawn, augment=False, seed=0)
     found = held_out(model, data)
-    assert isinstance(model, PretrainingModel)
     assert not model.training
     with torch.no_grad():
         single = [model(**{n: v[None] for n, v in data[i].items()}) for i in range(9)]

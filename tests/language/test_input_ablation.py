@@ -1,4 +1,4 @@
-"""What stands in for touch: nothing, another object's, noise; the same for every variant and batch."""
+"""Input ablations: no touch, another object's, noise; the same for every variant and batch."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pipeline.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
 from pipeline.errors import UserError
 from pipeline.io import save_tensors, write_table
 from pipeline.language.conversations import evaluation_features
-from pipeline.language.input_ablation import NoisyTouch, SwappedTouch, ablate_input
+from pipeline.language.input_ablation import NoisyTouch, SwappedTouch, _ring, ablate_input
 from pipeline.records import Dialogue, Embedding, Gold, Opd, Part, Question, Touch, Turn
 
 DIM = 6
@@ -57,20 +57,18 @@ QUESTIONS = [question(0, "ab"), question(1, "cd"), question(2, "ad", video=1)]
 def test_swapped_is_always_another_object(store: EmbeddingStore) -> None:
     names = sorted({v for v, _ in store._rows})
     for seed in range(20):
-        felt = SwappedTouch(store, QUESTIONS, seed)
+        ablated = SwappedTouch(store, QUESTIONS, seed)
         for asked in QUESTIONS:
             for video, own in zip(asked.videos, asked.objects, strict=True):
-                first = felt.features(video, range(felt.count(video)))
+                first = ablated.features(video, range(ablated.count(video)))
                 other = names[int(first[0, 0])]
                 assert other.split("_")[0] != own
                 assert torch.equal(first, store.features(other, range(store.count(other))))
-        assert felt.dim == DIM
+        assert ablated.dim == DIM
 
 
 @given(st.integers(min_value=2, max_value=9), st.integers(min_value=0, max_value=10_000))
 def test_no_object_keeps_its_touch_and_none_is_given_twice(count: int, seed: int) -> None:
-    from pipeline.language.input_ablation import _ring
-
     videos = {f"o{i}": [f"o{i}_0"] for i in range(count)}
     ring = _ring(videos, seed)
     assert sorted(ring.values()) == sorted(ring)
@@ -84,8 +82,8 @@ def test_swapping_needs_two_objects(store: EmbeddingStore) -> None:
 
 def test_noise_has_the_embeddings_moments_and_is_no_ones_touch(tmp_path: Path) -> None:
     store = store_of(tmp_path, {"a_0": 4000, "b_0": 4000})
-    felt = NoisyTouch(store, seed=3)
-    drawn = torch.cat([felt.features(v, range(4000)) for v in ("a_0", "b_0")])
+    ablated = NoisyTouch(store, seed=3)
+    drawn = torch.cat([ablated.features(v, range(4000)) for v in ("a_0", "b_0")])
     mean, deviation = store.tensor.mean(0), store.tensor.std(0)
     # Five standard errors of a mean and of a deviation over 8000 draws.
     assert ((drawn.mean(0) - mean).abs() < 5 * deviation / 8000**0.5).all()
@@ -94,13 +92,13 @@ def test_noise_has_the_embeddings_moments_and_is_no_ones_touch(tmp_path: Path) -
 
 
 def test_noise_is_the_same_at_each_call_and_differs_between_frames_videos_and_seeds(store: EmbeddingStore) -> None:
-    felt = NoisyTouch(store, seed=3)
-    first = felt.features("a_1", [0, 1, 4])
-    assert torch.equal(first[[2, 0]], felt.features("a_1", [4, 0]))
+    ablated = NoisyTouch(store, seed=3)
+    first = ablated.features("a_1", [0, 1, 4])
+    assert torch.equal(first[[2, 0]], ablated.features("a_1", [4, 0]))
     assert not torch.equal(first[0], first[1])
-    assert not torch.equal(first[0], felt.features("b_1", [0])[0])
+    assert not torch.equal(first[0], ablated.features("b_1", [0])[0])
     assert not torch.equal(first[0], NoisyTouch(store, seed=4).features("a_1", [0])[0])
-    assert felt.features("a_1", []).shape == (0, DIM)
+    assert ablated.features("a_1", []).shape == (0, DIM)
 
 
 def test_real_touch_is_the_store_and_removed_asks_for_nothing(store: EmbeddingStore) -> None:
@@ -109,7 +107,7 @@ def test_real_touch_is_the_store_and_removed_asks_for_nothing(store: EmbeddingSt
     assert evaluation_features(QUESTIONS[0], store, per_video=0).shape == (0, DIM)
     swapped, noise = (ablate_input(store, touch, QUESTIONS, 0) for touch in (Touch.SWAPPED, Touch.NOISE))
     real = evaluation_features(QUESTIONS[0], store, 3)
-    for felt in (swapped, noise):
-        felt_features = evaluation_features(QUESTIONS[0], felt, 3)
-        assert felt_features.shape == real.shape
-        assert not torch.equal(felt_features, real)
+    for ablated in (swapped, noise):
+        given = evaluation_features(QUESTIONS[0], ablated, 3)
+        assert given.shape == real.shape
+        assert not torch.equal(given, real)

@@ -1,0 +1,351 @@
+"""Training of encoders, what is saved of them, and the registry of recipes."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+import torch
+from torch.optim.optimizer import register_optimizer_step_pre_hook
+from transformers import EvalPrediction, TrainerCallback, TrainingArguments
+
+from pipeline.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
+from pipeline.encoder import finetune as training
+from pipeline.encoder.clip import load_visual_tower
+from pipeline.encoder.clips import ClipDataset, LabelledVideo
+from pipeline.encoder.embed import standardize
+from pipeline.encoder.finetune import accuracies, finetune, train_classifier, write_encoder_card
+from pipeline.encoder.frame_classifier import JointFrameClassifier
+from pipeline.encoder.model import Heads, PropertyClassifier
+from pipeline.encoder.recipes import RECIPES, base_encoder, check_recipe, property_classifier
+from pipeline.encoder.scene_encoder import SceneEncoder
+from pipeline.errors import UserError
+from pipeline.io import save_tensors, write_table
+from pipeline.records import Embedding, Part
+from pipeline.runtime import seed_everything
+from pipeline.training.trainable import load_trainable, save_trainable, trainable_state
+from pipeline.training.trainer import TrainableTrainer
+from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.frames.store import FrameStore
+from pipeline.weights import check_encoder, check_language
+from tests.checkpoints import write_clip, write_llama
+from tests.encoders import (
+    CPU,
+    FRAME_INDICES,
+    PARTS,
+    config,
+    encoder_data,
+    float64,
+    random_heads,
+    write_frames,
+)
+
+pytestmark = pytest.mark.usefixtures("elsewhere")
+
+
+# Training
+
+
+@pytest.mark.parametrize("wave", [1, 3])
+def test_the_wave_is_torchs_cosine_annealing_over_and_over(wave: int, tmp_path: Path) -> None:
+    def optimiser() -> torch.optim.Optimizer:
+        return torch.optim.AdamW([torch.nn.Parameter(torch.zeros(1))], lr=3e-3)
+
+    arguments = TrainingArguments(output_dir=str(tmp_path), use_cpu=True, report_to="none")
+    trainer = TrainableTrainer(model=torch.nn.Linear(1, 1), args=arguments, wave=wave)
+    mine, theirs = optimiser(), optimiser()
+    schedule = trainer.create_scheduler(1000, mine)
+    reference = torch.optim.lr_scheduler.CosineAnnealingLR(theirs, T_max=wave, eta_min=3e-5)
+    for _ in range(6 * wave + 1):
+        assert schedule.get_last_lr() == pytest.approx(reference.get_last_lr(), rel=1e-9)
+        for stepped in (mine, theirs, schedule, reference):
+            stepped.step()
+
+
+@pytest.fixture
+def rates() -> Iterator[list[float]]:
+    """The rate of each update of any optimiser."""
+    used: list[float] = []
+    handle = register_optimizer_step_pre_hook(lambda optimiser, *_: used.append(optimiser.param_groups[0]["lr"]))
+    yield used
+    handle.remove()
+
+
+@pytest.mark.parametrize("recipe", ["paper", "release"])
+def test_training_follows_its_recipe_and_leaves_the_backbone(
+    recipe: str,
+    weights: Path,
+    catalogue: Catalogue,
+    tmp_path: Path,
+    rates: list[float],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Batches of 2 of 5 videos make three updates an epoch; each epoch draws its own clips."""
+    drawn: list[tuple[int, str]] = []
+    draw = ClipDataset.__getitem__
+
+    def spy(self: ClipDataset, index: int) -> dict[str, torch.Tensor]:
+        if self.seed is not None:
+            drawn.append((self.epoch, self.videos[index].video_id))
+        return draw(self, index)
+
+    monkeypatch.setattr(ClipDataset, "__getitem__", spy)
+    data, setting = encoder_data(tmp_path, catalogue, PARTS), config(weights, recipe, epochs=4, batch_size=2)
+    seed_everything(0)
+    model = property_classifier(setting, data.classes)
+    backbone = {n: v.clone() for n, v in model.encoder.visual.state_dict().items()}
+    before = {n: v.clone() for n, v in trainable_state(model).items()}
+    assert not model.train().encoder.visual.training
+    train_classifier(model, data, setting, CPU, seed=1, inputs=[])
+    if recipe == "release":
+        expected = [1e-3 * (0.01 + 0.99 * (1 + math.cos(math.pi * s / 3)) / 2) for s in range(12)]
+    else:
+        expected = [1e-3 * (1 + math.cos(math.pi * s / 12)) / 2 for s in range(12)]
+    assert rates == pytest.approx(expected, rel=1e-9)
+    after = trainable_state(model)
+    moved = (after["encoder.prompts.prompts"] - before["encoder.prompts.prompts"]).flatten(1).abs().amax(dim=1)
+    assert (moved > 0).all(), "the prompts of every layer learn"
+    assert all(not torch.equal(before[n], after[n]) for n in before)
+    assert all(torch.equal(backbone[n], v) for n, v in model.encoder.visual.state_dict().items())
+    trained = [f"{o}_0" for o, part in PARTS.items() if part == Part.TRAIN]
+    assert sorted(drawn) == sorted((epoch, video) for epoch in range(4) for video in trained)
+    assert [epoch for epoch, _ in drawn] == sorted(epoch for epoch, _ in drawn)
+
+
+@pytest.mark.parametrize(
+    ("reached", "kept"), [((0.1, 0.5, 0.5), 1), ((0.0, 0.0, 0.0), 0), ((0.1, 0.2, 0.3), 2), ((), 2)]
+)
+def test_the_first_of_the_best_epochs_is_kept(
+    reached: tuple[float, ...],
+    kept: int,
+    weights: Path,
+    catalogue: Catalogue,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Without validation videos it is the last."""
+    parts = PARTS if reached else dict.fromkeys(PARTS, Part.TRAIN)
+    data, setting = encoder_data(tmp_path, catalogue, parts), config(weights, "paper", epochs=3)
+    model = property_classifier(setting, data.classes)
+    seen: list[dict[str, torch.Tensor]] = []
+
+    class Remember(TrainerCallback):
+        def on_log(self, *_: object, logs: dict[str, float], **__: object) -> None:
+            if "loss" in logs:
+                seen.append({n: v.clone() for n, v in trainable_state(model).items()})
+
+    script = iter(reached)
+    monkeypatch.setattr(training, "accuracies", lambda *_: {"validation_combined": next(script)})
+    history = train_classifier(model, data, setting, CPU, seed=1, inputs=[], callbacks=[Remember()])
+    found = trainable_state(model)
+    assert [all(torch.equal(v, found[n]) for n, v in epoch.items()) for epoch in seen] == [i == kept for i in range(3)]
+    assert [m.value for m in history if m.name == "validation_combined"] == list(reached)
+    assert not any(tmp_path.glob("checkpoints/*/*")), "a finished training leaves no checkpoint"
+
+
+def test_a_clip_depends_on_seed_epoch_and_video_alone(tmp_path: Path) -> None:
+    store = FrameStore(write_frames(tmp_path, {"a_0": 9, "b_0": 9}))
+    videos = [LabelledVideo("a_0", (0,)), LabelledVideo("b_0", (1,))]
+
+    def clip(seed: int, epoch: int, order: int = 1) -> tuple[list[int], bytes]:
+        data = ClipDataset(store, videos[::order], per_video=3, seed=seed, flip_probability=0.5)
+        data.follow(lambda: epoch)
+        item = data[0 if order > 0 else 1]
+        return item["frame_indices"].tolist(), item["frames"].numpy().tobytes()
+
+    assert clip(1, 4) == clip(1, 4) == clip(1, 4, -1)
+    assert len({clip(1, epoch)[1] for epoch in range(20)}) > 15
+    assert len({clip(seed, 0)[1] for seed in range(20)}) > 15
+
+
+def test_validation_counts_videos_that_are_right_in_everything(catalogue: Catalogue) -> None:
+    logits = np.array([[3, 1, 0, 0, 2, 1, 0, 0, 5], [0, 1, 0, 4, 0, 0, -1, -3, -2], [0, 0, 1, 0, 0, 1, 0, 1, 0]])
+    found = accuracies(EvalPrediction(logits, np.array([[0, 1, 2], [1, 0, 1], [1, 2, 1]])), catalogue)
+    expected = {"hardness": 2 / 3, "roughness": 1, "bumpiness": 2 / 3, "combined": 1 / 3}
+    assert found == pytest.approx({f"validation_{name}": value for name, value in expected.items()})
+
+
+# The registry
+
+
+def test_a_new_backbone_is_a_module_and_a_line(
+    weights: Path, catalogue: Catalogue, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It trains, is saved and loaded, and embeds, without another change."""
+    module = ModuleType("toy_recipe")
+    module.base_encoder = lambda _: SceneEncoder()  # type: ignore[attr-defined]
+    module.property_classifier = lambda _, classes: PropertyClassifier(  # type: ignore[attr-defined]
+        SceneEncoder(), Heads(256, classes), classes
+    )
+    monkeypatch.setitem(sys.modules, "toy_recipe", module)
+    monkeypatch.setitem(RECIPES, "toy", "toy_recipe")
+    check_recipe("toy")
+    data, setting = encoder_data(tmp_path, catalogue, PARTS), config(weights, "toy", epochs=1)
+    model, history = finetune(data, setting, CPU, seed=0, inputs=[], pretrained=tmp_path / "none")
+    assert "validation_combined" in {m.name for m in history}
+    save_trainable(model, tmp_path / "toy.safetensors")
+    load_trainable(property_classifier(setting, data.classes), tmp_path / "toy.safetensors")
+    assert base_encoder(setting).dim == 256
+
+
+def test_an_unknown_recipe_is_one_line() -> None:
+    with pytest.raises(UserError, match=r"^encoder.recipe: papr is no recipe; did you mean paper\? known: paper, "):
+        check_recipe("papr")
+
+
+def test_the_card_names_weights_by_hash_data_and_settings_and_is_the_same_again(
+    weights: Path, catalogue: Catalogue, tmp_path: Path
+) -> None:
+    import hashlib
+
+    import yaml
+
+    data, setting = encoder_data(tmp_path, catalogue, PARTS), config(weights, "paper")
+    (weights / "README.md").write_text("---\nlicense: mit\n---\n")
+    texts = []
+    for folder in (tmp_path / "a", tmp_path / "b"):
+        write_encoder_card(folder, data, setting, 3, tmp_path / "none", "scenes")
+        texts.append((folder / "README.md").read_text())
+    (weights / "README.md").unlink()
+    assert texts[0] == texts[1]
+    front = yaml.safe_load(texts[0].split("---\n")[1])
+    assert (front["license"], front["base_model"]) == ("mit", [weights.as_posix()])
+    digest = hashlib.sha256((weights / "open_clip_model.safetensors").read_bytes()).hexdigest()
+    lines = [digest, "| learning_rate | 0.001 |", "| seed | 3 |", "| training videos (scenes) | 5 |", "hardness"]
+    assert all(line in texts[0] for line in lines)
+
+
+# What is saved, and what is refused
+
+
+def test_a_network_reloads_exactly_with_its_running_statistics(tmp_path: Path) -> None:
+    seed_everything(0)
+    model = PropertyClassifier(SceneEncoder(), Heads(256, [3, 2]), [3, 2]).train()
+    frames = torch.randint(0, 256, (4, 2, 32, 32, 3), dtype=torch.uint8)
+    labels, indices = torch.tensor([[0, 1], [2, 0], [1, 1], [0, 0]]), torch.zeros(4, 2, dtype=torch.int64)
+    optimiser = torch.optim.AdamW(model.parameters(), lr=1e-2)
+    model(frames, indices, labels)["loss"].backward()
+    optimiser.step()
+    state = trainable_state(model)
+    assert state.keys() == model.state_dict().keys(), "nothing is frozen, so everything is there"
+    assert sum("running_" in name for name in state) == 2 * 7
+    save_trainable(model, tmp_path / "model.safetensors")
+    other = PropertyClassifier(SceneEncoder(), Heads(256, [3, 2]), [3, 2])
+    load_trainable(other, tmp_path / "model.safetensors")
+    assert torch.equal(model.eval()(frames, indices)["logits"], other.eval()(frames, indices)["logits"])
+    encoder = SceneEncoder().requires_grad_(False)
+    assert trainable_state(encoder) == {}, "statistics of frozen layers are not trained"
+    next(layer for layer in encoder.layers if isinstance(layer, torch.nn.BatchNorm2d)).requires_grad_(True)
+    names = {"bias", "num_batches_tracked", "running_mean", "running_var", "weight"}
+    assert {n.split(".")[-1] for n in trainable_state(encoder)} == names
+
+
+OWN = {
+    "paper": ("encoder.prompts.prompts", "encoder.prompts.shared", "heads.0", "heads.1"),
+    "release": ("encoder.prompts.prompts", "heads.shared", "heads.properties.0", "heads.properties.1"),
+    "pretrained": ("centre", "spread", "dependence", "encoder.layers", "heads.0", "heads.1"),
+}
+
+
+@pytest.mark.parametrize("recipe", OWN)
+def test_each_recipe_saves_what_is_its_own_and_reloads_exactly(
+    recipe: str, weights: Path, frames: torch.Tensor, tmp_path: Path
+) -> None:
+    model, other = (property_classifier(config(weights, recipe), [3, 2]).eval() for _ in range(2))
+    if isinstance(model, JointFrameClassifier):
+        random_heads(2, 256, [3, 2], 0.1).copy_into(model)
+    assert all(name.startswith(OWN[recipe]) for name in trainable_state(model))
+    assert {p for p in OWN[recipe] if any(n.startswith(p) for n in trainable_state(model))} == set(OWN[recipe])
+    save_trainable(model, tmp_path / "model.safetensors")
+    load_trainable(other, tmp_path / "model.safetensors")
+    with torch.no_grad():
+        first, second = (m(frames, FRAME_INDICES)["logits"] for m in (model, other))
+    assert torch.equal(first, second)
+    assert torch.equal(model.decide(first), other.decide(second))
+    for wrong in (
+        (config(weights, recipe), [3, 3]),
+        (config(weights, "release" if recipe == "paper" else "paper"), [3, 2]),
+    ):
+        with pytest.raises(UserError, match="does not fit the model"):
+            load_trainable(property_classifier(*wrong), tmp_path / "model.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("broken", "message"),
+    [
+        ("missing", "hf download timm"),
+        ("pickle", "pickles are refused"),
+        ("disguised pickle", "does not fit"),
+        ("small frames", r"frames\.size is 24 .* frames\.size=32$"),
+        ("another model", "does not fit its open_clip_config.json"),
+        ("language pickle", "only pickles"),
+    ],
+)
+def test_bad_weights_are_one_line(broken: str, message: str, tmp_path: Path) -> None:
+    folder = write_clip(tmp_path / "clip")
+    file, form = folder / "open_clip_model.safetensors", folder / "open_clip_config.json"
+    check_encoder(folder, 32)
+    match broken:
+        case "missing":
+            folder = tmp_path / "nothing"
+        case "pickle":
+            file.rename(folder / "open_clip_pytorch_model.bin")
+        case "disguised pickle":
+            torch.save({"a": torch.zeros(1)}, file)
+        case "another model":
+            form.write_text(form.read_text().replace('"layers": 2', '"layers": 3'))
+        case "language pickle":
+            folder = write_llama(tmp_path / "llama")
+            (folder / "model.safetensors").rename(folder / "pytorch_model.bin")
+
+    def load() -> None:
+        if broken == "language pickle":
+            check_language(folder)
+        else:
+            check_encoder(folder, 24 if broken == "small frames" else 32)
+            load_visual_tower(folder)
+
+    with pytest.raises(UserError, match=message) as caught:
+        load()
+    assert "\n" not in str(caught.value)
+
+
+# Embeddings
+
+
+def test_standardized_by_training_frames_alone() -> None:
+    videos = ("train_0", "train_1", "test_0")
+    keys = [(video, flip, f) for video in videos for flip in ("none", "both") for f in range(4)]
+    index = [Embedding(video_id=v, frame_index=f, flip=flip, row=row) for row, (v, flip, f) in enumerate(keys)]
+    raw = torch.randn(len(index), 3, generator=torch.manual_seed(0)) * torch.tensor([1e-3, 1.0, 0.0]) + 1e3
+    rows = [e.row for e in index if e.video_id.startswith("train") and e.flip == "none"]
+    done = standardize(raw, index, {"train_0", "train_1"})
+    exact = float64(raw)
+    deviation = np.array([*exact[rows].std(0)[:2], 1.0])
+    expected = (exact - exact[rows].mean(0)) / deviation
+    np.testing.assert_allclose(done.numpy(), expected, rtol=1e-6)
+    assert done.isfinite().all(), "a constant dimension is only shifted"
+    raw[[e.row for e in index if e.video_id == "test_0"]] += 5
+    assert torch.equal(standardize(raw, index, {"train_0", "train_1"})[rows], done[rows])
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_embeddings_are_served_by_a_memory_map(tmp_path: Path) -> None:
+    tensor = torch.randn(64, 8)
+    save_tensors(tmp_path / TENSOR_FILE, {TENSOR: tensor})
+    write_table(
+        tmp_path / INDEX_FILE,
+        Embedding,
+        [Embedding(video_id="a_0", frame_index=i, flip="none", row=i) for i in range(64)],
+    )
+    store = EmbeddingStore(tmp_path)
+    maps = Path("/proc/self/maps").read_text().splitlines()
+    mapped = [line.split()[0].split("-") for line in maps if line.endswith(TENSOR_FILE)]
+    place = store.tensor.data_ptr()
+    assert any(int(low, 16) <= place < int(high, 16) for low, high in mapped), "read from the file when it is asked for"
+    assert torch.equal(store.features("a_0", [5, 2]), tensor[[5, 2]])

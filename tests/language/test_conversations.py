@@ -1,0 +1,143 @@
+"""Conversations: training and evaluation see the same text, only answers carry labels, batches hold like lengths."""
+
+from __future__ import annotations
+
+import random
+from itertools import pairwise
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch.utils.data import BatchSampler
+from transformers import PreTrainedTokenizerBase
+
+from pipeline.config import LanguageConfig
+from pipeline.embeddings import EmbeddingStore
+from pipeline.language.base import load_tokenizer
+from pipeline.language.chat import IGNORE_INDEX, TACT_END, TACT_FRAME, TACT_START, TACTILE_TOKENS, encode, render
+from pipeline.language.conversations import POOL, LengthBuckets
+from pipeline.language.training import assemble
+from pipeline.records import Assignment, Part, Question, Turn
+from pipeline.tasks.questions import build_questions, pool_of
+from pipeline.videos.catalogue import load_catalogue
+from tests.checkpoints import write_llama
+from tests.closure import ROOT
+from tests.language.shared import material
+
+WORDS = st.text(
+    alphabet=st.characters(codec="utf-8", exclude_categories=("Cs",), exclude_characters="<>{}"), max_size=60
+)
+
+
+@pytest.fixture(scope="module", params=["random", "standin"])
+def tokenizer(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> PreTrainedTokenizerBase:
+    if request.param == "standin":
+        return load_tokenizer(ROOT / "standins" / "llama")
+    return load_tokenizer(write_llama(tmp_path_factory.mktemp("llama")))
+
+
+@pytest.fixture(scope="module")
+def all_questions() -> list[Question]:
+    catalogue = load_catalogue(ROOT / "pipeline" / "physiclear")
+    videos = [
+        Assignment(video_id=f"{o}_{n}", object_id=o, part=Part.TEST)
+        for o in list(catalogue.objects)[::3]
+        for n in (0, 1)
+    ]
+    return build_questions(
+        pool_of(Part.TEST, videos, catalogue),
+        dict.fromkeys(("OPD", "PC", "PSS", "POM", "PSR"), 6),
+        seed=1,
+        distinct=True,
+    )
+
+
+def test_vicuna_layout() -> None:
+    turns = [Turn(user="Feel {tactile}.", assistant="Soft."), Turn(user="Sure?", assistant="Yes.")]
+    rendered = render(turns, system_prompt="Be kind.", frames=2, eos="</s>", complete=True)
+    assert rendered.text == (
+        f"Be kind. USER: Feel {TACT_START}{TACT_FRAME}{TACT_FRAME}{TACT_END}. ASSISTANT: Soft.</s>"
+        "USER: Sure? ASSISTANT: Yes.</s>"
+    )
+    assert [rendered.text[a:b] for a, b in rendered.answers] == [" Soft.</s>", " Yes.</s>"]
+
+
+def test_every_question_is_prompted_as_it_was_trained(
+    tokenizer: PreTrainedTokenizerBase, all_questions: list[Question]
+) -> None:
+    eos, marks = str(tokenizer.eos_token), tokenizer.convert_tokens_to_ids(list(TACTILE_TOKENS))
+    for question in all_questions:
+        for dialogue in question.dialogues:
+            for last in range(1, len(dialogue.turns) + 1):
+                turns = dialogue.turns[:last]
+                full = encode(render(turns, system_prompt="", frames=5, eos=eos, complete=True), tokenizer)
+                asked = encode(render(turns, system_prompt="", frames=5, eos=eos, complete=False), tokenizer)
+                assert full.input_ids[: len(asked.input_ids)] == asked.input_ids
+                assert set(asked.labels[-3:]) == {IGNORE_INDEX}
+                answer = [i for i, y in zip(full.input_ids, full.labels, strict=True) if y != IGNORE_INDEX]
+                assert answer[-1] == tokenizer.eos_token_id, "the model must learn to stop"
+                said = " ".join(t.assistant for t in turns)
+                heard = tokenizer.decode(answer, skip_special_tokens=True)
+                assert heard.split() == said.split(), "labels are exactly the answers"
+                shown = sum(t.user.count("{tactile}") for t in turns)
+                assert [full.input_ids.count(t) for t in marks] == [shown, 5 * shown, shown]
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.tuples(WORDS, WORDS), min_size=1, max_size=3))
+def test_labels_cover_answers_for_any_text(tokenizer: PreTrainedTokenizerBase, talk: list[tuple[str, str]]) -> None:
+    turns = [Turn(user=u, assistant=a) for u, a in talk]
+    encoded = encode(render(turns, system_prompt="", frames=1, eos="</s>", complete=True), tokenizer)
+    labelled = [i for i, y in zip(encoded.input_ids, encoded.labels, strict=True) if y != IGNORE_INDEX]
+    assert labelled.count(tokenizer.eos_token_id) == len(turns)
+    assert len(encoded.input_ids) == len(encoded.labels)
+    assert encoded.labels[0] == IGNORE_INDEX
+
+
+def test_same_draws_for_same_epoch_and_others_for_another(
+    language: LanguageConfig, questions: list[Question], store: EmbeddingStore
+) -> None:
+    _, data = assemble(material(language, questions, store), 6, "test")
+    first = [data[i]["features"] for i in range(len(data))]
+    assert all(torch.equal(a, data[i]["features"]) for i, a in enumerate(first))
+    data.follow(lambda: 1)
+    assert not all(torch.equal(a, data[i]["features"]) for i, a in enumerate(first))
+
+
+LENGTHS = st.lists(st.integers(1, 500), max_size=300)
+
+
+@settings(max_examples=30)
+@given(LENGTHS, st.integers(1, 20), st.integers(0, 5), st.integers(0, 3))
+def test_each_epoch_has_every_conversation_once(lengths: list[int], size: int, seed: int, epoch: int) -> None:
+    sampler = LengthBuckets(lengths, size, seed, lambda: epoch)
+    order = list(sampler)
+    assert sorted(order) == list(range(len(lengths)))
+    assert len(sampler) == len(lengths)
+    assert list(sampler) == order, "asked again, as a resumed training does"
+    # Batches of sorted neighbours are disjoint in length, but for ties: no other cut of a pool pads less.
+    batches = [order[i * size : (i + 1) * size] for i in range(len(order) // size)]
+    for start in range(0, len(batches), POOL):
+        ranges = sorted((min(b), max(b)) for b in ([lengths[i] for i in x] for x in batches[start : start + POOL]))
+        assert all(low[1] <= high[0] for low, high in pairwise(ranges))
+
+
+def test_epochs_and_seeds_differ() -> None:
+    orders = [list(LengthBuckets([5] * 64, 4, s, lambda e=e: e)) for s in (0, 1) for e in (0, 1)]  # type: ignore[misc]
+    assert len({tuple(order) for order in orders}) == 4
+
+
+def test_padding_falls_and_batches_come_in_no_order_of_length() -> None:
+    rng = random.Random(0)
+    lengths = [rng.choice((50, 115, 158, 210)) + rng.randrange(10) for _ in range(800)]
+
+    def padding(order: list[int]) -> float:
+        batches = list(BatchSampler(order, 4, drop_last=False))
+        return 1 - sum(lengths) / sum(len(b) * max(lengths[i] for i in b) for b in batches)
+
+    order = list(LengthBuckets(lengths, 4, 0, lambda: 0))
+    assert padding(order) < 0.05
+    assert padding(list(range(800))) > 0.25
+    first = [lengths[i] for i in order[: 4 * POOL : 4]]
+    assert first not in (sorted(first), sorted(first, reverse=True))

@@ -1,0 +1,156 @@
+"""Answers against transformers' own generation and by hand, at the limits of tokens, positions and the cache."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+
+import pytest
+import torch
+from transformers import DynamicCache, MistralConfig, MistralForCausalLM
+
+from pipeline.config import LanguageConfig
+from pipeline.embeddings import EmbeddingStore
+from pipeline.errors import UserError
+from pipeline.language.cache import AHEAD, roomy_cache
+from pipeline.language.chat import TACT_FRAME
+from pipeline.language.conversations import evaluation_features
+from pipeline.language.generate import answer
+from pipeline.language.octopi import OctopiForCausalLM
+from pipeline.language.training import assemble
+from pipeline.records import Opd, Question
+from tests.checkpoints import write_llama
+from tests.language.shared import DIM, FRAMES, generation, material, prompt
+
+
+def by_hand(model: OctopiForCausalLM, question: Question, store: EmbeddingStore, opd: Opd, count: int) -> list[int]:
+    """The likeliest tokens, the whole sequence anew for each, without cache or padding."""
+    said, start = prompt(question, opd, model), len(prompt(question, opd, model))
+    features = evaluation_features(question, store, FRAMES)[None]
+    for _ in range(count):
+        said.append(int(model(torch.tensor([said]), features).logits[0, -1].argmax()))
+    return said[start:]
+
+
+def test_one_row_answers_as_transformers_own_generation_does(
+    model: OctopiForCausalLM, questions: list[Question], store: EmbeddingStore
+) -> None:
+    """By its own cache, without padding, over more tokens than room is made for at a time."""
+    limit, end = 2 * AHEAD + 20, model.tokenizer.eos_token_id
+    for question in [q for q in questions if q.task in ("PC", "PSS")][:2]:
+        ids = torch.tensor([prompt(question, Opd.NEEDED, model)])
+        new = model.llm.generate(
+            inputs_embeds=model.embed(ids, evaluation_features(question, store, FRAMES)[None]),
+            attention_mask=torch.ones_like(ids),
+            max_new_tokens=limit,
+            do_sample=False,
+            eos_token_id=end,
+            pad_token_id=0,
+        )[0].tolist()
+        (prediction,) = answer(model, store, [question], Opd.NEEDED, generation(1, limit))
+        assert prediction.outputs == (model.tokenizer.decode(new, skip_special_tokens=True).strip(),)
+        assert prediction.tokens == len(new)
+        first = by_hand(model, question, store, Opd.NEEDED, 12)
+        assert new[:12] == first[: first.index(end) + 1 if end in first else None]
+
+
+@pytest.mark.parametrize("window", [None, 8])
+def test_the_cache_gives_back_what_transformers_own_does(window: int | None) -> None:
+    torch.manual_seed(0)
+    shapes = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 4}
+    llm = MistralForCausalLM(
+        MistralConfig(vocab_size=50, num_key_value_heads=2, sliding_window=window, **shapes)
+    ).eval()
+    own, other = roomy_cache(llm.config), DynamicCache(config=llm.config)
+    for start, stop in ((0, 5), (5, 6), (6, 7), (7, 7 + AHEAD), (7 + AHEAD, 8 + AHEAD)):
+        ids = torch.randint(0, 50, (3, stop - start), generator=torch.manual_seed(stop))
+        with torch.no_grad():
+            found, expected = (llm(ids, past_key_values=cache, use_cache=True).logits for cache in (own, other))
+        torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
+        assert own.get_seq_length() == other.get_seq_length() == stop
+
+
+def test_an_answer_at_the_limit_is_whole_and_one_beyond_is_cut(
+    model: OctopiForCausalLM, questions: list[Question], store: EmbeddingStore
+) -> None:
+    """A token that the model says after some others is made the end token."""
+    asked = [q for q in questions if q.task == "OPD"][:3]
+    assert all(p.truncated and p.tokens == 8 for p in answer(model, store, asked, Opd.ALL, generation(4, 8)))
+    said = {q.question_id: by_hand(model, q, store, Opd.ALL, 8) for q in asked}
+    question = next(q for q in asked if len(set(said[q.question_id])) > 1)
+    new = said[question.question_id]
+    place = next(i for i in range(1, 8) if new[i] not in new[:i])
+    other = copy.copy(model)
+    other.tokenizer = copy.deepcopy(model.tokenizer)
+    other.tokenizer.eos_token = other.tokenizer.convert_ids_to_tokens(new[place])
+    whole, cut = (answer(other, store, [question], Opd.ALL, generation(1, n))[0] for n in (place + 1, place))
+    assert (whole.truncated, whole.tokens) == (False, place + 1)
+    assert (cut.truncated, cut.tokens) == (True, place)
+    assert whole.outputs == cut.outputs, "the end token says nothing"
+
+
+def test_an_answer_ends_where_the_positions_do_whatever_its_neighbours(
+    questions: list[Question], store: EmbeddingStore, tmp_path: Path
+) -> None:
+    """Each row has its own limit; with the end token as padding, the cut must still be seen."""
+    asked = [q for q in questions if q.task in ("OPD", "PC", "PSS")]
+    wide = OctopiForCausalLM.from_base(write_llama(tmp_path / "wide", pad="</s>"), DIM)
+    lengths = {q.question_id: len(prompt(q, Opd.ALL, wide)) for q in asked}
+    most = max(lengths.values()) + 5
+    torch.manual_seed(0)
+    folder = write_llama(tmp_path / "tight", pad="</s>", max_position_embeddings=most)
+    tight = OctopiForCausalLM.from_base(folder, DIM)
+    alone, together = (answer(tight, store, asked, Opd.ALL, generation(size, 40)) for size in (1, 50))
+    assert alone == together
+    room = {name: min(40, most - length) for name, length in lengths.items()}
+    assert len(set(room.values())) > 2
+    for prediction in together:
+        assert prediction.tokens <= room[prediction.question_id]
+        assert prediction.truncated == (prediction.tokens == room[prediction.question_id])
+    assert any(p.tokens == 5 for p in together)
+
+
+def test_a_question_longer_than_the_positions_is_named_with_the_key(
+    questions: list[Question], store: EmbeddingStore, tmp_path: Path
+) -> None:
+    setting = LanguageConfig(weights=str(write_llama(tmp_path, max_position_embeddings=60)))
+    with pytest.raises(UserError, match=r"^[A-Z]+-train-\d+: takes \d+ tokens, .* 60 at once; lower frames.per_video"):
+        assemble(material(setting, questions, store), 4, "test")
+    model = OctopiForCausalLM.from_base(setting.weights, DIM)
+    with pytest.raises(UserError, match=r"^[A-Z]+-train-\d+: .*language.system_prompt.*language.weights$"):
+        answer(model, store, questions, Opd.ALL, generation(2))
+
+
+@pytest.mark.parametrize("opd", [Opd.ALL, Opd.NONE])
+def test_batch_size_changes_no_answer(
+    model: OctopiForCausalLM, questions: list[Question], store: EmbeddingStore, opd: Opd
+) -> None:
+    one = answer(model, store, questions, opd, generation(1))
+    assert answer(model, store, questions, opd, generation(5)) == one
+    mixed = answer(model, store, questions[::-1], opd, generation(len(questions)))
+    assert sorted(mixed, key=lambda p: p.question_id) == sorted(one, key=lambda p: p.question_id)
+    turns = {q.question_id: len(d.turns) for q in questions if (d := q.dialogue(opd))}
+    assert {p.question_id: len(p.outputs) for p in one} == turns
+    if opd is Opd.NONE:
+        assert not [p for p in one if p.task == "OPD"], "without descriptions there is nothing to ask"
+
+
+def test_running_into_the_limit_is_said(
+    model: OctopiForCausalLM, questions: list[Question], store: EmbeddingStore
+) -> None:
+    predictions = answer(model, store, questions[:2], Opd.ALL, generation(2, tokens=1))
+    assert all(p.truncated for p in predictions)
+    assert all(p.tokens == len(p.outputs) for p in predictions)
+
+
+def test_frame_token_never_comes_out_as_text(model: OctopiForCausalLM) -> None:
+    assert model.frame_id >= model.llm.get_input_embeddings().num_embeddings
+    assert TACT_FRAME not in model.tokenizer.decode(range(model.llm.config.vocab_size))
+
+
+def test_embeddings_of_another_length_are_refused(
+    tmp_path: Path, language: LanguageConfig, store: EmbeddingStore
+) -> None:
+    model = OctopiForCausalLM.from_base(language.weights, DIM + 1)
+    with pytest.raises(UserError, match=f"embeddings of {DIM}, but the model reads {DIM + 1}"):
+        answer(model, store, [], Opd.ALL, generation(1))

@@ -1,0 +1,241 @@
+"""Language trainings: what learns how fast, kills from which they resume to the bit, and rates that are too high."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+from torch.optim.optimizer import register_optimizer_step_pre_hook
+from torch.utils.data import SequentialSampler
+from transformers import TrainerCallback, TrainerState
+
+from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig
+from pipeline.embeddings import EmbeddingStore
+from pipeline.errors import UserError
+from pipeline.io import write_jsonl
+from pipeline.language.chat import IGNORE_INDEX
+from pipeline.language.octopi import OctopiForCausalLM
+from pipeline.language.training import (
+    Job,
+    Material,
+    add_lora,
+    align,
+    assemble,
+    finetune_lora,
+    write_model_card,
+)
+from pipeline.records import Question
+from pipeline.training import trainer as shared
+from pipeline.training.trainer import Trained
+from tests.closure import ROOT
+from tests.language.shared import SMALL, call, material
+
+CPU = RuntimeConfig(device="cpu")
+RUNTIME = RuntimeConfig(device="cpu", save_steps=2)
+CONFIG = LoraTrainConfig(
+    **{**SMALL.model_dump(), "epochs": 2, "samples": 10}, rank=4, alpha=8, learning_rate=1e-3, dropout=0.1
+)
+"""Three updates an epoch, the last of them smaller; six in all."""
+CHILD = """
+import os, signal, sys
+from pathlib import Path
+import torch
+from torch.optim.optimizer import register_optimizer_step_pre_hook
+from pipeline.io import read_jsonl
+from pipeline.embeddings import EmbeddingStore
+from pipeline.records import Question
+from pipeline.config import LanguageConfig
+from tests.language.test_training import run
+folder, weights, embeddings, kind, when = sys.argv[1:]
+def die(*_):
+    os.kill(os.getpid(), signal.SIGKILL)
+if when.startswith("writing"):
+    save, saved = torch.save, []
+    def half(value, file, *rest, **others):
+        if str(file).endswith(when.split()[1]):
+            saved.append(file)
+            if len(saved) == 2:
+                Path(file).write_bytes(b"half a file")
+                die()
+        return save(value, file, *rest, **others)
+    torch.save = half
+else:
+    count = iter(range(1000))
+    register_optimizer_step_pre_hook(lambda *_: die() if next(count) == int(when) else None)
+questions = read_jsonl(Path(folder) / "questions.jsonl", Question)
+run(kind, LanguageConfig(weights=weights), questions, EmbeddingStore(Path(embeddings)), Path(folder) / "killed")
+"""
+
+
+class AtStep(TrainerCallback):
+    """Does something when a step is logged."""
+
+    def __init__(self, step: int, act: object) -> None:
+        self.step, self.act = step, act
+
+    def on_log(self, args: object, state: TrainerState, *_: object, **__: object) -> None:
+        if state.global_step == self.step:
+            self.act()  # type: ignore[operator]
+
+
+@pytest.fixture
+def held(language: LanguageConfig, questions: list[Question], store: EmbeddingStore) -> Material:
+    return material(language, questions, store)
+
+
+def run(
+    kind: str,
+    language: LanguageConfig,
+    questions: list[Question],
+    store: EmbeddingStore,
+    folder: Path,
+    *callbacks: TrainerCallback,
+) -> Trained:
+    """One training with its checkpoints below the folder."""
+    shared.CHECKPOINTS = folder
+    # Sums depend on the number of threads in their last bits, and each process would take its own.
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    job = Job(kind, "x", 0, callbacks)
+    try:
+        model, data = assemble(material(language, questions, store), 10, "test")
+        if kind == "align":
+            return align(model, data, CONFIG, RUNTIME, job)
+        add_lora(model, CONFIG)
+        return finetune_lora(model, data, CONFIG, RUNTIME, job)
+    finally:
+        torch.set_num_threads(threads)
+
+
+@pytest.mark.parametrize(
+    ("kind", "when", "left"), [("align", "logged 5", 4), ("lora", "5", 4), ("lora", "writing optimizer.pt", 2)]
+)
+def test_killed_and_resumed_ends_the_same(
+    kind: str,
+    when: str,
+    left: int,
+    language: LanguageConfig,
+    questions: list[Question],
+    store: EmbeddingStore,
+    checkpoints: Path,
+) -> None:
+    """Interrupted; by SIGKILL in a process of its own between two checkpoints, and while one is being written."""
+    if when == "logged 5":
+
+        def die() -> None:
+            raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            run(kind, language, questions, store, checkpoints / "killed", AtStep(5, die))
+    else:
+        write_jsonl(checkpoints / "questions.jsonl", questions)
+        done = subprocess.run(
+            [sys.executable, "-c", CHILD, str(checkpoints), language.weights, str(store.folder), kind, when],
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == -signal.SIGKILL, done.stderr[-2000:]
+    kept = {int(f.parent.name.split("-")[1]) for f in checkpoints.glob(f"killed/{kind}/x/*/trainer_state.json")}
+    assert kept == {left}
+    whole = run(kind, language, questions, store, checkpoints / "whole")
+    again = run(kind, language, questions, store, checkpoints / "killed")
+    assert again.history == whole.history
+    assert again.state.keys() == whole.state.keys()
+    assert all(torch.equal(again.state[name], value) for name, value in whole.state.items())
+    assert not (checkpoints / "killed" / kind / "x").exists(), "checkpoints go when the training is done"
+
+
+def test_another_language_model_under_the_same_name_begins_anew(held: Material, tmp_path: Path) -> None:
+    """A checkpoint holds only what is trained: gone on with on other weights, it would be neither's."""
+    marks = []
+    for content in (b"one", b"one", b"two"):
+        (tmp_path / "model.safetensors").write_bytes(content)
+        language = held.language.model_copy(update={"weights": str(tmp_path)})
+        marks.append(Material(**{**vars(held), "language": language}).fingerprint(SMALL))
+    assert marks[0] == marks[1] != marks[2]
+
+
+@pytest.mark.parametrize("factor", [100, 1e30])
+def test_a_rate_too_high_ends_finite_or_in_one_line(factor: float, held: Material, checkpoints: Path) -> None:
+    """Params allow no rate from 10 on; a model may be as badly scaled all the same."""
+    model, data = assemble(held, 10, "test")
+    rates = {"learning_rate": factor * 2e-4, "projection_learning_rate": factor * 2e-5}
+    config = CONFIG.model_copy(update=rates)
+    add_lora(model, config)
+    if factor == 100:
+        trained = finetune_lora(model, data, config, RUNTIME, Job("lora", "x", 0))
+        assert all(v.isfinite().all() for v in trained.state.values())
+    else:
+        with pytest.raises(UserError, match=r"^[a-z_]+ is .* at step \d: .*lower the learning rate.*kept\)$"):
+            finetune_lora(model, data, config, RUNTIME, Job("lora", "x", 0))
+
+
+def test_running_away_late_leaves_the_last_good_checkpoint(held: Material, checkpoints: Path) -> None:
+    model, data = assemble(held, 10, "test")
+
+    def spoil() -> None:
+        with torch.no_grad():
+            model.connector.delimiters.fill_(float("inf"))
+
+    with pytest.raises(UserError, match="lower the learning rate"):
+        align(model, data, CONFIG, RUNTIME, Job("align", "x", 0, [AtStep(5, spoil)]))
+    (kept,) = checkpoints.glob("align/x/checkpoint-*")
+    assert kept.name == "checkpoint-4"
+    assert all(value.isfinite().all() for value in load_file(kept / "model.safetensors").values())
+
+
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_each_part_learns_at_its_own_rate_and_in_float32(dtype: str, held: Material, checkpoints: Path) -> None:
+    rates = {"projection_learning_rate": 1e-9, "learning_rate": 1e-2}
+    config = CONFIG.model_copy(update={**rates, "epochs": 1})
+    language = held.language.model_copy(update={"dtype": dtype})
+    model, data = assemble(Material(**{**vars(held), "language": language}), 8, "test")
+    add_lora(model, config)
+    before = {n: p.detach().clone() for n, p in model.named_parameters()}
+    for name, parameter in model.named_parameters():
+        assert parameter.dtype == (torch.float32 if parameter.requires_grad else getattr(torch, dtype)), name
+    finetune_lora(model, data, config, CPU, Job("lora", "x", 0))
+    moved = {n: float((p.detach() - before[n]).abs().max()) for n, p in model.named_parameters()}
+    assert max(v for n, v in moved.items() if n.startswith("connector.")) < 1e-6
+    assert min(v for n, v in moved.items() if "lora_B" in n) > 1e-3
+    assert max(v for n, v in moved.items() if "base_layer" in n or "embed_tokens" in n) == 0
+    model.save_pretrained(checkpoints / "saved")
+    saved = load_file(checkpoints / "saved" / "adapter" / "adapter_model.safetensors")
+    assert {v.dtype for v in saved.values()} == {torch.float32}
+    again = OctopiForCausalLM.from_pretrained(checkpoints / "saved", dtype=dtype)  # type: ignore[arg-type]
+    assert torch.equal(again(**call(model)).logits, model.eval()(**call(model)).logits)
+    write_model_card(checkpoints / "saved", held, data, config)
+    card = (checkpoints / "saved" / "README.md").read_text()
+    assert all(line in card for line in ("fine-tuned with LoRA", "| rank | 4 |", f"base_model:\n- {language.weights}"))
+
+
+def test_accumulated_batches_weigh_every_token_alike(
+    held: Material, checkpoints: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the gradient of the first update: rounding aside, four batches of one must give that of one of four."""
+    # Buckets depend on how many questions a batch has.
+    monkeypatch.setattr("pipeline.language.training.LengthBuckets", lambda lengths, *_: SequentialSampler(lengths))
+    gradients: list[torch.Tensor] = []
+    for micro in (4, 2, 1):
+        model, data = assemble(held, 4, "test")
+        counts = [sum(label != IGNORE_INDEX for label in e.labels) for e in data.encoded]
+        assert max(counts) > 1.5 * min(counts), "or equal weights would do"
+        config = SMALL.model_copy(update={"micro_batch_size": micro, "epochs": 1, "max_grad_norm": 1e9})
+        kept = register_optimizer_step_pre_hook(
+            lambda optimizer, *_: gradients.append(
+                torch.cat([p.grad.flatten() for group in optimizer.param_groups for p in group["params"]])
+            )
+        )
+        align(model.double(), data, config, CPU, Job("align", f"x{micro}", 0))
+        kept.remove()
+    assert len(gradients) == 3
+    for other in gradients[1:]:
+        # transformers' normalisation computes in float32 whatever it is given.
+        torch.testing.assert_close(gradients[0], other, atol=1e-6 * float(gradients[0].abs().max()), rtol=0)

@@ -1,0 +1,263 @@
+"""A whole report from a made-up run: its files, its figures recomputed, runs that lack something, equal bytes."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from safetensors.numpy import save_file
+
+from pipeline.errors import UserError
+from pipeline.io import read_jsonl, read_table, write_table
+from pipeline.params import load_params
+from pipeline.records import Classification, Graded, Part, Prediction, Question
+from pipeline.report.build import MOST_METRICS, write_report
+from pipeline.report.dataset import dataset_tables
+from pipeline.report.load import DATASET, load_report
+from pipeline.report.provenance import base_model, digest, encoder_words, parameters
+from pipeline.report.readme import MOST_LINES
+from pipeline.report.samples import choose_samples
+from pipeline.report.tables import TABLES, headline
+from tests.closure import ROOT
+from tests.fake_run import fake_params, write_run
+
+FILES = {
+    *(
+        "README.md",
+        "scores.csv",
+        "effects.csv",
+        "metrics.json",
+        "curves.csv",
+        "confusion.csv",
+        "dataset.csv",
+        "audit.csv",
+    ),
+    *("samples.json", "params.yaml", "provenance.json", "encoder_effects.csv", "encoder_errors.csv"),
+    *(f"figures/{name}.png" for name in ("tasks", "effects", "confusion", "curves")),
+}
+FEW = ("questions.evaluation={opd:4,pc:4,pss:4,pom:4,psr:4}",)
+REAL_PICTURES = {".png", ".jpg", ".webp", ".npy", ".avi", ".mp4"}
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def test_everything_that_was_promised_is_there_and_dvc_knows_of_it(written: Path) -> None:
+    assert set(files_of(written)) == FILES
+    stage = yaml.safe_load((ROOT / "dvc.yaml").read_text())["stages"]["report"]
+    outs = [*stage["outs"], *stage["metrics"]]
+    promised = {path.removeprefix("reports/${scale}-${data.source}/") for out in outs for path in out}
+    assert {name.split("/")[0] for name in FILES} == promised
+    assert all(options == {"cache": False} for out in outs for options in out.values())
+
+
+def test_accuracies_are_those_of_the_graded_answers(written: Path) -> None:
+    graded = read_table(written.parents[1] / "data" / "graded.parquet", Graded)
+    rows = load_report(written).scores
+    answered = rows[~rows["task"].isin(["heads", "heads_validation", "cross_validation"])]
+    assert len(answered)
+    for row in answered.to_dict("records"):
+        mine = [
+            g
+            for g in graded
+            if (g.task, g.measure, g.encoder, g.lora, g.opd, g.touch)
+            == tuple(row[k] for k in ("task", "measure", "encoder", "lora", "opd", "touch"))
+            and row["seed"] in ("all", str(g.seed))
+        ]
+        assert row["accuracy"] == pytest.approx(np.mean([g.correct for g in mine]))
+        assert row["unread"] / row["n"] == pytest.approx(np.mean([not g.parsed for g in mine]))
+        assert row["n"] == len({g.question_id for g in mine})
+        assert not row["low"] > row["accuracy"]
+        assert not row["high"] < row["accuracy"]
+
+
+def test_confusion_and_metrics_are_the_heads_on_test_videos(written: Path) -> None:
+    run, frame = written.parents[1], pd.read_csv(written / "confusion.csv")
+    found = [
+        c
+        for seed in (0, 1)
+        for c in read_table(run / "data" / "encoder" / str(seed) / "classifications.parquet", Classification)
+        if c.part is Part.TEST
+    ]
+    assert len(frame) == len(found)
+    assert (frame["rated"] == frame["predicted"]).sum() == sum(c.expected == c.predicted for c in found)
+    metrics = json.loads((written / "metrics.json").read_text())
+    rough = [c.expected == c.predicted for c in found if c.property == "roughness"]
+    assert metrics["encoder_roughness"] == pytest.approx(np.mean(rough), abs=1e-6)
+    assert {"OPD", "PC", "PSS", "POM", "PSR", "encoder_combined"} <= set(metrics)
+    assert len(metrics) <= MOST_METRICS
+
+
+def test_curves_name_their_stages_as_dvc_does(written: Path) -> None:
+    curves = pd.read_csv(written / "curves.csv")
+    assert {"finetune_encoder@0", "align@base-none-1", "lora@finetuned-all-0"} <= set(curves["stage"])
+    assert set(curves["name"]) == {"loss", "validation_loss"}
+    assert curves[curves["stage"] == "align@base-none-1"]["value"].tolist() == [4 / (1 + s / 9) for s in range(1, 9)]
+
+
+def test_the_readme_is_short_and_holds_the_papers_tables(written: Path) -> None:
+    text = (written / "README.md").read_text()
+    assert text.count("\n") <= MOST_LINES
+    report = load_report(written)
+    for task in headline(report.scores)["task"]:
+        assert f"({task})" in text
+    for table in TABLES:
+        assert table.title in text
+    assert "![What encoder" in text
+    assert set(re.findall(r"\]\(([^)#]+)\)", text)) == {*FILES, "../index.html"} - {"README.md", "metrics.json"}
+
+
+def test_provenance_counts_and_hashes_the_models(written: Path, tmp_path: Path) -> None:
+    said = load_report(written).provenance
+    language = said["base_models"]["language"]
+    assert (language["kind"], language["known_templates"]) == ("Llama", True)
+    assert 2.0e6 < language["parameters"] < 2.4e6
+    assert language["sha256"] == digest(ROOT / "standins" / "llama")
+    assert said["test_objects"] == ["bath_towel", "hairbrush_bristles", "ice_block", "toilet_brush_bristles"]
+    assert said["seeds"] == [0, 1]
+    assert said["properties"]["roughness"][0] == "smooth"
+    (tmp_path / "m").mkdir()
+    save_file({"a": np.zeros((3, 4), np.float32), "b": np.zeros(5, np.float16)}, tmp_path / "m" / "x.safetensors")
+    assert parameters(tmp_path / "m" / "x.safetensors") == 3 * 4 + 5
+    before = digest(tmp_path / "m")
+    (tmp_path / "m" / ".when").write_text("downloaded now")
+    assert digest(tmp_path / "m") == before
+    (tmp_path / "m" / "y").write_text("more")
+    assert digest(tmp_path / "m") != before
+    absent = base_model(tmp_path, "nowhere")
+    assert (absent["parameters"], absent["sha256"], absent["taught"]) == (0, "unknown", "")
+    (tmp_path / "m" / "x.safetensors").write_bytes(b"no header")
+    with pytest.raises(UserError, match="not a safetensors file"):
+        parameters(tmp_path / "m" / "x.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("recipe", "words"),
+    [("paper", "CLIP with visual prompt tuning"), ("pretrained", "(not CLIP) on pictures of the difference")],
+)
+def test_the_encoder_is_called_what_it_is(recipe: str, words: str) -> None:
+    reference = "subtract" if recipe == "pretrained" else "none"
+    assert words in encoder_words(fake_params(f"encoder.recipe={recipe}", f"encoder.reference={reference}").encoder)
+
+
+def test_samples_are_the_first_right_and_wrong_answer_of_each_task(written: Path) -> None:
+    data, said = written.parents[1] / "data", load_report(written).samples
+    graded = [
+        g
+        for g in read_table(data / "graded.parquet", Graded)
+        if (g.variant.key, g.touch, g.measure)
+        == ("finetuned-with-all-0", "real", "combined" if g.task == "OPD" else "choice")
+    ]
+    for task in ("OPD", "PC", "PSS", "POM", "PSR"):
+        for right in (True, False):
+            wanted = sorted(g.question_id for g in graded if g.task == task and g.correct is right)[:1]
+            assert [s["question_id"] for s in said["samples"] if (s["task"], s["right"]) == (task, right)] == wanted
+    first = said["samples"][0]
+    assert first["videos"]
+    assert "[video A]" in " ".join(first["asked"])
+    assert "{tactile}" not in json.dumps(said)
+    questions = read_jsonl(data / "questions" / "evaluation.jsonl", Question)
+    answers = read_jsonl(data / "answers" / "finetuned-with-all-0" / "real.jsonl", Prediction)
+    assert choose_samples(questions, answers, graded)["samples"] == said["samples"]
+    assert choose_samples([], [], [])["samples"] == []
+
+
+def test_the_data_sets_tables_count_objects_and_set_the_papers_beside(written: Path) -> None:
+    tables = list(dataset_tables(written, DATASET).values())
+    counts = tables[0].set_index("")
+    soft = {"Objects": "11", "With videos": "6", "Train": "4", "Validation": "1", "Test": "1", "Published": "26.0"}
+    assert dict(counts.loc["hardness: soft"]) == soft
+    assert counts["With videos"].astype(int).sum() == 3 * 19
+    assert list(tables[2][""]) == ["average", "median", "minimum", "maximum"]
+    assert list(tables[3]["Published"]) == ["0.894", "0.979", "0.792"]
+    assert "Published" not in dataset_tables(written, "Other").popitem()[1]
+
+
+def test_two_writes_are_equal_to_the_byte_and_leave_no_figure_of_another_run(written: Path) -> None:
+    before, root = files_of(written), written.parents[1]
+    (written / "figures" / "of_last_year.png").write_bytes(b"")
+    write_report(load_params(root / "params.yaml"), root)
+    assert files_of(written) == before
+
+
+@pytest.fixture(scope="module")
+def lean(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The report of a run on real videos with one variant, no test object, and nothing that a run may lack."""
+    root = tmp_path_factory.mktemp("lean")
+    objects = "scenes.objects=[baseball,rug,pillow]"
+    one = ("ablation.encoders=[finetuned]", "ablation.lora=[with]", "ablation.opd=[all]", "ablation.touch=[]")
+    params = write_run(root, fake_params(objects, *one, "data.source=videos", "data.dir=elsewhere"))
+    for gone in ("audit/audit.csv", "encoder/0/classifications.parquet", "questions/evaluation.jsonl"):
+        (root / "data" / gone).unlink()
+    write_report(params, root)
+    return root / "reports" / params.report_name
+
+
+def test_a_run_that_measured_nothing_says_so(lean: Path) -> None:
+    report = load_report(lean)
+    assert set(report.scores["task"]) == {"cross_validation"}
+    assert report.effects.empty
+    text = (lean / "README.md").read_text()
+    assert "No answer of the full system was graded." in text
+    assert "Whether answers depend on touch was not tested." in text
+    assert "0, 0 videos" in text
+    assert json.loads((lean / "metrics.json").read_text()) == {}
+    assert {p.name for p in (lean / "figures").iterdir()} == {"curves.png"}
+
+
+def test_a_report_on_real_videos_has_no_picture_of_them(lean: Path, written: Path) -> None:
+    for folder in (lean, written):
+        pictures = [name for name in files_of(folder) if Path(name).suffix in REAL_PICTURES]
+        assert set(pictures) <= {f"figures/{name}.png" for name in ("tasks", "effects", "confusion", "curves")}
+
+
+def test_one_seed_of_one_variant_has_answers_but_no_effects(tmp_path: Path) -> None:
+    one = ("ablation.encoders=[finetuned]", "ablation.lora=[with]", "ablation.opd=[all]", "ablation.touch=[]")
+    no_pom = "questions.evaluation={opd:4,pc:4,pss:4,pom:0,psr:4}"
+    params = write_run(tmp_path, fake_params(*one, no_pom))
+    metrics = write_report(params, tmp_path)
+    assert set(metrics) >= {"OPD", "PC", "PSS", "PSR"}
+    assert "POM" not in metrics
+    text = (tmp_path / "reports" / params.report_name / "README.md").read_text()
+    assert "(POM)" not in text
+    assert "effects of encoder" not in text
+    assert "Published (Vicuna 7b)" in text
+
+
+def test_missing_and_broken_results_are_one_line(tmp_path: Path) -> None:
+    params = write_run(tmp_path, fake_params(*FEW))
+    (tmp_path / "data" / "graded.parquet").write_bytes(b"half a file")
+    with pytest.raises(UserError, match=r"graded.parquet: not a readable table"):
+        write_report(params, tmp_path)
+    write_table(tmp_path / "data" / "graded.parquet", Graded, [])
+    (tmp_path / "data" / "splits.parquet").unlink()
+    with pytest.raises(UserError, match=r"splits.parquet: no such file"):
+        write_report(params, tmp_path)
+
+
+def test_the_stage_does_not_load_a_network() -> None:
+    heavy = ("torch", "transformers", "mlflow", "cv2")
+    code = f"import sys, pipeline.report.build; print([m for m in {heavy} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, text=True, capture_output=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_the_committed_reports_are_whole_and_say_what_made_them() -> None:
+    for name in ("small-scenes", "small-videos"):
+        report = load_report(ROOT / "reports" / name)
+        text = (report.folder / "README.md").read_text()
+        assert text.count("\n") <= MOST_LINES
+        assert "a stand-in trained from scratch on the pipeline's own templates" in text
+        assert report.provenance["settings"] in text
+        for table in TABLES:
+            rows: Any = table.build(report.scores, report.effects, report.published)
+            assert len(rows), table.key

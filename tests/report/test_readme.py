@@ -1,0 +1,150 @@
+"""What a report's README says is put together by rule: each rule, and what it must not claim."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.report.load import Report, published
+from pipeline.report.readme import MOST_LINES, finding, render_readme, size_words, stands_on
+from tests.report.conftest import effect, effects_of, score, scores_of
+
+
+def model(**other: Any) -> dict[str, Any]:
+    facts = {
+        "folder": "weights/x",
+        "kind": "Llama",
+        "parameters": 2_200_000,
+        "sha256": "ab" * 32,
+        "taught": "taught by hand",
+    }
+    return {**facts, "known_templates": True, **other}
+
+
+def report(scores: list[dict[str, Any]], effects: list[dict[str, Any]] | None = None, **said: Any) -> Report:
+    language = said.pop("language", {})
+    facts = {
+        "scale": "small",
+        "source": "videos",
+        "dataset": "PhysiCLeAR",
+        "split": "paper",
+        "command": "dvc repro",
+        "test_objects": ["a", "b"],
+        "test_videos": 4,
+        "videos": 9,
+        "seeds": [0],
+        "settings": "",
+        "facts_told": False,
+        "commit": "c" * 40,
+        "changed": False,
+        "data_sha256": "d" * 64,
+        "python": "3",
+        "packages": {"torch": "2"},
+        "encoder": "the base CLIP with visual prompt tuning",
+        "intervals": "",
+        "properties": {},
+        "base_models": {"language": model(**language), "encoder": model(kind="CLIP", parameters=1_100_000)},
+    }
+    return Report(
+        Path("reports/small-videos"), scores_of(*scores), effects_of(*effects or []), published(), {**facts, **said}, {}
+    )
+
+
+def test_who_made_the_figures_comes_first_with_size_and_teaching() -> None:
+    text = render_readme(report([score()], settings="Looked at before."), ["effects.png"])
+    first = text.splitlines()[2]
+    assert first.startswith(
+        "A 2.2 M-parameter Llama, taught by hand, made these figures in place of the paper's Vicuna"
+    )
+    assert "LoRA and OPD are near-null by construction" in first
+    assert "a 1.1 M-parameter CLIP with visual prompt tuning" in first
+    assert "real videos of 2 test objects, under 1 seed" in first
+    assert first.endswith("Looked at before.")
+    head = next(line for line in text.splitlines() if line.startswith("| Task"))
+    assert "Measured here (2.2 M-parameter model)" in head
+    assert "Published (Vicuna 13b)" in head
+    assert "other models on other questions about other objects" in text
+
+
+def test_a_large_base_that_was_not_taught_the_templates_is_not_called_one_that_was() -> None:
+    large = report([score()], language={"parameters": 6_738_415_616, "known_templates": False, "taught": ""})
+    said = finding(large)[0]
+    assert said.startswith("A 6.7 B-parameter Llama made these figures.")
+    assert "not noted" in stands_on(large.provenance)[0]
+    assert "near-null" not in render_readme(large, [])
+
+
+@pytest.mark.parametrize(
+    ("count", "words"), [(0, "unknown size"), (900, "900.0 -p"), (2_150, "2.1 k-"), (3e9, "3.0 B-")]
+)
+def test_sizes_are_read_by_people(count: float, words: str) -> None:
+    assert words.split(" ")[0] in size_words(int(count))
+
+
+def test_above_and_below_chance_are_said_only_where_the_whole_interval_is() -> None:
+    rows = [
+        score("PC", accuracy=0.6, low=0.5, high=0.7, chance=0.3),
+        score("PSS", accuracy=0.5, low=0.2, high=0.8, chance=0.3),
+        score("POM", accuracy=0.1, low=0.05, high=0.15, chance=0.3),
+    ]
+    said = finding(report(rows))[1]
+    assert "lies above chance in 1 of 3 tasks (PC) and below it in POM" in said
+    assert "best in PC with 60.0 [50.0, 70.0] % (chance 30.0)" in said
+    assert "worst in POM with 10.0 [5.0, 15.0] %" in said
+    assert finding(report([rows[1]]))[1] == "The full system's interval lies above chance in 0 of 1 task."
+    assert finding(report([score("PC", low=None, high=None)]))[1].startswith(
+        "The full system's interval lies above chance in 0"
+    )
+    assert finding(report([]))[1] == "No answer of the full system was graded."
+
+
+TOUCH = {"part": "touch", "change": "real - swapped"}
+
+
+@pytest.mark.parametrize(
+    ("rows", "expected"),
+    [
+        ([], "Whether answers depend on touch was not tested."),
+        (
+            [effect(**TOUCH, p_holm=0.01, low=0.02)],
+            "Answers use touch in PC: real minus swapped touch is +10.0 to +10.0",
+        ),
+        ([effect(**TOUCH, low=0.02)], "Answers seem to use touch: real minus swapped touch"),
+        ([effect(**TOUCH)], "That answers use touch is not shown: real minus swapped touch"),
+        ([effect(**TOUCH, p_holm=0.01, difference=-0.1, low=-0.2)], "That answers use touch is not shown"),
+        ([effect(**TOUCH, low=0.02, objects=5)], "significant (Holm) is none, as 5 objects never can be."),
+    ],
+)
+def test_whether_touch_is_used(rows: list[dict[str, Any]], expected: str) -> None:
+    assert expected in finding(report([score()], rows))[2]
+
+
+def test_effects_that_hold_are_named_and_those_that_do_not_are_not() -> None:
+    none = finding(report([score()], [effect(), effect("opd", "all - none", smallest_effect=0.12)]))[2]
+    assert "None of 2 effects of encoder, LoRA and OPD is significant (Holm); the smallest" in none
+    assert "could have found is 12 points" in none
+    some = finding(report([score()], [effect(p_holm=0.001), effect("opd", "all - none")]))[2]
+    assert "Of 2 effects of encoder, LoRA and OPD these hold up (Holm): lora in PC +10.0 points." in some
+    assert "opd in PC" not in some
+
+
+def test_a_readme_stays_short_whatever_is_measured() -> None:
+    tasks = [score(f"T{i}", variant=v) for i in range(60) for v in ("finetuned with all", "finetuned with none")]
+    text = render_readme(report(tasks), ["tasks.png", "effects.png"])
+    assert text.count("\n") <= MOST_LINES
+    assert "T59" in text
+    assert "On the page" in text
+    assert "## Physical understanding" not in text
+
+
+def test_smoke_says_that_it_proves_nothing() -> None:
+    assert "prove only that the chain runs" in render_readme(report([score()], scale="smoke"), [])
+    assert "prove only" not in render_readme(report([score()]), [])
+
+
+def test_what_the_figures_stand_on_is_said_in_words() -> None:
+    facts = "\n".join(stands_on(report([], settings="", facts_told=True, intervals="Known to be narrow.").provenance))
+    for words in ("2 (a, b), 4 videos, split `paper`", "Nothing is noted", "Known to be narrow.", "ask for touch"):
+        assert words in facts

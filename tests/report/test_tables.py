@@ -1,0 +1,162 @@
+"""The registry of tables: what each selects, how cells are written, and published figures in columns of their own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.errors import UserError
+from pipeline.evaluation import scores as evaluation
+from pipeline.report import load
+from pipeline.report.load import KEYS, load_report, published, read_frame
+from pipeline.report.tables import TABLES, Table, headline, task_title
+from pipeline.tasks import TASKS
+from pipeline.videos.catalogue import Catalogue
+from tests.report.conftest import effect, effects_of, score, scores_of
+
+BY_KEY = {table.key: table for table in TABLES}
+NO_EFFECTS = effects_of()
+
+
+def build(key: str, *rows: dict[str, object], dataset: str = load.DATASET) -> pd.DataFrame:
+    return BY_KEY[key].build(scores_of(*rows), NO_EFFECTS, published(dataset))
+
+
+def test_a_row_is_written_as_by_hand_with_published_figures_in_their_own_columns() -> None:
+    (row,) = build("understanding", score("PC")).to_dict("records")
+    assert row == {
+        "Task": "Property Comparison (PC)",
+        "System": "Octopi (full system)",
+        "Measured % [95 %]": "50.0 [35.0, 65.0]",
+        "n": "40",
+        "Chance %": "33.3",
+        "Unread %": "10.0",
+        "Published 7b % (n)": "48.10 (158)",
+        "Published 13b % (n)": "55.06 (158)",
+    }
+
+
+def test_effects_are_written_in_points_and_what_is_unknown_is_empty() -> None:
+    rows = effects_of(
+        effect(difference=-0.125, low=-0.3, high=0.05), effect("opd", "all - none", low=None, high=None, p=None)
+    )
+    shown = BY_KEY["effects"].build(scores_of(), rows, published())
+    assert list(shown["Difference, points [95 %]"]) == ["-12.5 [-30.0, +5.0]", "+10.0"]
+    assert list(shown["p"]) == ["0.200", ""]
+    assert list(shown["Smallest that could be found"]) == ["25.0", "25.0"]
+    assert BY_KEY["touch_effects"].build(scores_of(), rows, published()).empty
+
+
+@pytest.mark.parametrize(
+    ("key", "systems"),
+    [
+        ("understanding", ["Octopi (full system)", "without OPD"]),
+        ("encoder_understanding", ["Octopi (full system)", "base encoder"]),
+        ("lora_understanding", ["Octopi (full system)", "without LoRA"]),
+    ],
+)
+def test_each_of_the_papers_tables_changes_one_part_only(key: str, systems: list[str]) -> None:
+    names = [
+        f"{e} {lora} {opd}"
+        for e in ("base", "finetuned")
+        for lora in ("without", "with")
+        for opd in ("none", "needed", "all")
+    ]
+    shown = build(key, *(score(variant=name) for name in names), score(seed="0"), score(touch="swapped"))
+    assert list(shown["System"]) == systems
+    assert all(shown["Published 7b % (n)"])
+
+
+def test_tasks_stand_where_they_belong_whole_answers_first() -> None:
+    heads = {"variant": "finetuned  ", "measure": "combined"}
+    rows = [score(task, variant="finetuned with all") for task in ("PSR", "POM", "PC")]
+    rows += [score("OPD", m) for m in ("hardness", "combined")]
+    rows += [
+        score("heads", **heads),
+        score("heads_validation", **heads),
+        score("cross_validation", "combined", variant="trees  "),
+    ]
+    tasks = {
+        key: list(dict.fromkeys(table.select(scores_of(*rows), NO_EFFECTS).get("task", [])))
+        for key, table in BY_KEY.items()
+    }
+    assert tasks["understanding"] == ["PC", "POM"]
+    assert tasks["reasoning"] == ["PSR"]
+    assert tasks["description"] == ["OPD", "heads"]
+    assert (
+        tasks["variants"] == tasks["touch"] == list(headline(scores_of(*rows))["task"]) == ["OPD", "PC", "POM", "PSR"]
+    )
+    assert (tasks["heads"], tasks["cross_validation"]) == (["heads", "heads_validation"], ["cross_validation"])
+    assert list(build("description", *rows)["Measure"])[:2] == ["all properties right", "hardness"]
+    assert list(build("description", *rows)["Published CLIP % (n)"]) == ["", "", "57.89 (38)"]
+
+
+def test_the_heads_have_no_unread_answers_where_it_was_not_counted() -> None:
+    assert list(build("touch", score(touch="removed", unread=None))["Unread %"]) == [""]
+
+
+def test_another_data_set_has_nothing_published_beside_it() -> None:
+    assert not [c for c in build("understanding", score("PC"), dataset="Other").columns if "Published" in c]
+
+
+@pytest.mark.parametrize("table", TABLES, ids=lambda t: t.key)
+def test_nothing_measured_is_an_empty_table_and_a_key_is_used_once(table: Table) -> None:
+    assert len(table.build(scores_of(), NO_EFFECTS, published())) == 0
+    assert table.caption.endswith(".")
+    assert len(BY_KEY) == len(TABLES)
+
+
+VARIANTS = st.tuples(
+    st.sampled_from([*TASKS, "a task of tomorrow"]),
+    st.sampled_from(["finetuned", "base"]),
+    st.sampled_from(["with", "without"]),
+    st.sampled_from(["all", "needed", "none"]),
+)
+
+
+@settings(max_examples=5)
+@given(st.lists(VARIANTS, unique=True, min_size=6, max_size=12))
+def test_every_variant_is_in_the_table_of_all_once_and_no_table_invents_one(
+    rows: list[tuple[str, str, str, str]],
+) -> None:
+    frame = scores_of(*(score(task, variant=f"{e} {lora} {opd}") for task, e, lora, opd in rows))
+    keys = ["task", "encoder", "lora", "opd"]
+    assert sorted(BY_KEY["variants"].select(frame, NO_EFFECTS)[keys].itertuples(index=False, name=None)) == sorted(rows)
+    for table in TABLES:
+        found = list(table.select(frame, NO_EFFECTS).get(keys, pd.DataFrame()).itertuples(index=False, name=None))
+        assert set(found) <= set(rows)
+        assert len(found) == len(set(found))
+
+
+def test_published_keys_are_unique_percentages_of_their_n_and_of_registered_tasks(catalogue: Catalogue) -> None:
+    cells = published()
+    assert not cells.duplicated([*KEYS, "model"]).any()
+    answered = cells[cells["model"].isin(["7b", "13b", "CLIP"])]
+    whole = answered["value"] * answered["n"] / 100
+    # Two printed digits of a percentage leave so much of a question open.
+    assert ((whole - whole.round()).abs() <= 0.005 * answered["n"] / 100 + 1e-9).all()
+    assert set(answered["task"]) == {*TASKS, "heads"}
+    for row in cells[cells["model"] == "chance"].to_dict("records"):
+        assert row["value"] == pytest.approx(100 * TASKS[row["task"]].chance(catalogue)[row["measure"]], abs=0.005)
+    assert published("Other").empty
+
+
+def test_words_of_the_csv_are_those_of_the_evaluation() -> None:
+    same = ("ALL_SEEDS", "HEADS", "VALIDATION_HEADS", "CROSS_VALIDATION")
+    assert [getattr(load, n) for n in same] == [getattr(evaluation, n) for n in same]
+    assert tuple(evaluation.ScoreRow.model_fields) == load.SCORE_COLUMNS
+    assert tuple(evaluation.EffectRow.model_fields) == load.EFFECT_COLUMNS
+    assert task_title("heads") == "Property heads"
+    assert task_title("unheard of") == "unheard of"
+
+
+def test_a_folder_that_is_no_report_or_lacks_a_column_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="no report"):
+        load_report(tmp_path)
+    (tmp_path / "scores.csv").write_text("task,measure\nPC,choice\n")
+    with pytest.raises(UserError, match=r"scores.csv: lacks encoder, lora"):
+        read_frame(tmp_path / "scores.csv", load.SCORE_COLUMNS)

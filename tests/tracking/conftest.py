@@ -1,0 +1,193 @@
+"""A finished chain, made up: two variants, the files that tracking reads, and a database that is there already."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+import yaml
+
+from pipeline.config import Params, TrackingConfig
+from pipeline.io import write_json, write_table
+from pipeline.records import Assignment, Measurement, Part, Video
+from pipeline.scales import compose, write_params
+from pipeline.tracking import _Store, out_of_reach, publish
+from tests.closure import ROOT
+
+if TYPE_CHECKING:
+    from mlflow import MlflowClient
+    from mlflow.entities import Run
+
+SYSTEM = "{encoder: '${ablation.encoders}', opd: '${ablation.opd}', seed: '${ablation.seeds}'}"
+CHAIN = f"""
+stages:
+  split: {{cmd: x}}
+  align: {{cmd: x, matrix: {SYSTEM}}}
+  lora: {{cmd: x, matrix: {SYSTEM}}}
+  answer: {{cmd: x, matrix: {{encoder: '${{ablation.encoders}}', lora: '${{ablation.lora}}',
+    opd: '${{ablation.opd}}', seed: '${{ablation.seeds}}'}}}}
+  grade: {{cmd: x}}
+  publish: {{cmd: x}}
+"""
+FULL, BASE = "finetuned-with-all-0", "base-with-all-0"
+TITLES = ["split", "align@finetuned-all-0", "align@base-all-0", "lora@finetuned-all-0", "lora@base-all-0"]
+TITLES += [f"answer@{FULL}", f"answer@{BASE}", "grade"]
+FIRST = datetime(2024, 5, 1, 10, tzinfo=UTC)
+SECONDS = 9
+HEADER = "task,measure,encoder,lora,opd,touch,seed,n,right,unread,accuracy,low,high,chance\n"
+SCORES = """\
+PC,choice,finetuned,with,all,real,0,12,6,0,0.5,0.25,0.75,0.3
+PC,choice,finetuned,with,all,real,all,12,7,0,0.6,0.3,0.8,0.3
+PC,choice,finetuned,with,all,swapped,0,12,4,0,0.333333,0.1,0.6,0.3
+PC,choice,base,with,all,real,0,12,3,0,0.25,0.1,0.5,0.3
+OPD,combined,finetuned,with,all,real,0,8,1,0,0.125,,,0.1
+OPD,hardness,finetuned,with,all,real,0,8,4,0,0.5,0.2,0.8,0.3
+TOY,choice,finetuned,with,all,real,0,4,3,0,0.75,0.5,1,0.5
+heads,combined,finetuned,,,real,0,12,6,0,0.9,0.8,1,0.1
+"""
+
+
+@dataclass
+class FakeChain:
+    """A reproduction in the working directory."""
+
+    params: Params
+    folder: Path
+
+    def copy(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeChain]:
+        """Copy it, and make that the working directory of a process that tracks."""
+        shutil.copytree(self.folder, folder)
+        monkeypatch.chdir(folder)
+        out_of_reach.clear()
+        yield FakeChain(self.params, folder)
+        out_of_reach.clear()
+
+    def write(self) -> None:
+        """Write it whole to the working directory."""
+        write_params(self.params)
+        Path("dvc.yaml").write_text(CHAIN)
+        parts = {"a_0": Part.TRAIN, "a_1": Part.TRAIN, "b_0": Part.VALIDATION, "c_0": Part.TEST}
+        assigned = [Assignment(video_id=v, object_id=v[0], part=p) for v, p in parts.items()]
+        write_table(Path("data/splits.parquet"), Assignment, assigned)
+        form = {"frames": 20, "fps": 25.0, "width": 160, "height": 120}
+        videos = [Video(video_id=v, object_id=v[0], path=f"{v}.avi", sha256=v, **form) for v in parts]
+        write_table(Path("data/videos.parquet"), Video, videos)
+        for title in TITLES:
+            if title.startswith(("align", "lora")):
+                curve = [Measurement(step=s, name="loss", value=1 / s) for s in range(1, 121)]
+                write_table(Path(out(title)) / "history.parquet", Measurement, curve)
+                (Path(out(title)) / "connector.safetensors").write_bytes(b"weights")
+            if title.startswith("answer"):
+                Path(out(title)).mkdir(parents=True)
+                (Path(out(title)) / "real.jsonl").write_text("{}\n")
+        Path("data/encoder/0").mkdir(parents=True)
+        Path("data/encoder/0/encoder.safetensors").write_bytes(b"prompts")
+        self.ran(TITLES, 0)
+        self.report()
+
+    def ran(self, titles: Sequence[str], minutes: float, mark: str = "1") -> None:
+        """Stages ran one after the other, `minutes` after the first; `mark` stands for the hash of what they made."""
+        path = Path("dvc.lock")
+        lock = yaml.safe_load(path.read_text()) if path.is_file() else {"schema": "2.0", "stages": {}}
+        for index, title in enumerate(titles):
+            begin = FIRST + timedelta(minutes=minutes, seconds=index * (SECONDS + 1))
+            times = {"started": begin.isoformat(), "ended": (begin + timedelta(seconds=SECONDS)).isoformat()}
+            cost = {"startup_seconds": 1.5, "seconds": float(SECONDS), "peak_memory_mb": 100.0}
+            write_json(Path("runs") / f"{title}.json", {**times, **cost, "metrics": {"loss": 1.0, "answers": 5}})
+            lock["stages"][title] = {
+                "cmd": f"python {title}",
+                "params": {"params.yaml": {"seed": 0, "frames": {"size": 64}}},
+                "outs": [{"path": out(title), "md5": mark * 32}],
+            }
+        path.write_text(yaml.safe_dump(lock))
+
+    def report(self, rows: str = SCORES) -> None:
+        """Write the report with these rows of scores.csv."""
+        folder = Path("reports") / self.params.report_name
+        write_json(folder / "metrics.json", {"full": {"PC": 0.5}, "encoder.combined": 0.25})
+        (folder / "scores.csv").write_text(HEADER + rows)
+        (folder / "README.md").write_text("# Report\n")
+
+
+def out(title: str) -> str:
+    name, _, key = title.partition("@")
+    folders = {"align": "data/models/without", "lora": "data/models/with", "answer": "data/answers"}
+    return f"{folders[name]}/{key}" if key else f"data/{name}"
+
+
+@pytest.fixture(scope="session")
+def fresh_database(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """mlruns/ with an empty experiment: making its tables takes seconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("database"))
+        _Store(TrackingConfig())
+        return Path("mlruns").resolve()
+
+
+@pytest.fixture(scope="session")
+def finished(tmp_path_factory: pytest.TempPathFactory, fresh_database: Path) -> FakeChain:
+    """The folder of a chain of which each stage ran once; it is copied, not used."""
+    folder = tmp_path_factory.mktemp("finished") / "a clone"
+    shutil.copytree(fresh_database, folder / "mlruns")
+    overrides = ("ablation.lora=[with]", "ablation.opd=[all]", "tracking.timeout_seconds=3")
+    fake = FakeChain(compose("smoke", overrides, conf=ROOT / "conf"), folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        fake.write()
+    return fake
+
+
+@pytest.fixture
+def chain(finished: FakeChain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeChain]:
+    """The finished chain as the working directory."""
+    yield from finished.copy(tmp_path / "a clone", monkeypatch)
+
+
+@pytest.fixture(scope="session")
+def published(finished: FakeChain, tmp_path_factory: pytest.TempPathFactory) -> FakeChain:
+    """The finished chain after publishing; it is copied, not used."""
+    folder = tmp_path_factory.mktemp("published") / "a clone"
+    with pytest.MonkeyPatch.context() as patch:
+        for chain in finished.copy(folder, patch):
+            commit = "git init -q && git -c user.name=a -c user.email=a@b commit -q --allow-empty -m a"
+            subprocess.run(commit, shell=True, check=True)
+            publish(chain.params)
+    return FakeChain(finished.params, folder)
+
+
+@pytest.fixture
+def again(published: FakeChain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeChain]:
+    """The published chain, moved, as the working directory."""
+    yield from published.copy(tmp_path / "moved", monkeypatch)
+
+
+def client(uri: str = "") -> MlflowClient:
+    """MLflow's own client."""
+    from mlflow import MlflowClient
+
+    return MlflowClient(uri or f"sqlite:///{Path('mlruns/mlflow.db').resolve()}")
+
+
+def runs(kind: str = "", uri: str = "") -> list[Run]:
+    """All runs of a kind, in the order they began."""
+    there = client(uri)
+    query = f"tags.`octopi.kind` = '{kind}'" if kind else ""
+    experiment = there.get_experiment_by_name("octopi").experiment_id
+    return list(there.search_runs([experiment], query, order_by=["attributes.start_time ASC"], max_results=500))
+
+
+def by_name(kind: str) -> dict[str, Any]:
+    """Runs of a kind by their names; fails where two have one name."""
+    found = runs(kind)
+    assert len({run.info.run_name for run in found}) == len(found)
+    return {run.info.run_name: run for run in found}
+
+
+def seconds(run: Run) -> float:
+    return (run.info.end_time - run.info.start_time) / 1000

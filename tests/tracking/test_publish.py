@@ -1,0 +1,252 @@
+"""Publishing: what stands in MLflow after a reproduction, and after a second one."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import mlflow
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from pipeline.errors import UserError
+from pipeline.scales import compose, write_params
+from pipeline.tracking import TrackingError, publish, read_stages
+from tests.closure import ROOT
+from tests.tracking.conftest import (
+    BASE,
+    FIRST,
+    FULL,
+    SCORES,
+    SECONDS,
+    TITLES,
+    FakeChain,
+    by_name,
+    client,
+    runs,
+    seconds,
+)
+
+
+def test_a_parent_and_a_child_a_stage_and_a_variant(again: FakeChain) -> None:
+    (parent,) = runs("reproduction")
+    stages, variants = by_name("stage"), by_name("variant")
+    assert (set(stages), set(variants)) == (set(TITLES), {FULL, BASE})
+    assert {run.info.status for run in runs()} == {"FINISHED"}
+    assert {r.data.tags["mlflow.parentRunId"] for r in (*stages.values(), *variants.values())} == {parent.info.run_id}
+
+
+def test_times_are_those_of_the_stages(again: FakeChain) -> None:
+    (parent,) = runs("reproduction")
+    assert parent.info.start_time == FIRST.timestamp() * 1000
+    assert seconds(parent) == len(TITLES) * (SECONDS + 1) - 1
+    assert {seconds(run) for run in by_name("stage").values()} == {SECONDS}
+
+
+def test_a_stage_has_its_axes_metrics_and_cost(again: FakeChain) -> None:
+    run = by_name("stage")["answer@base-with-all-0"]
+    cost = {"system/seconds": SECONDS, "system/startup_seconds": 1.5, "system/peak_memory_mb": 100}
+    assert run.data.metrics == {"loss": 1.0, "answers": 5} | cost
+    assert [run.data.params[a] for a in ("encoder", "lora", "opd", "seed")] == ["base", "with", "all", "0"]
+    assert run.data.params["encoder.epochs"] == "4"
+
+
+def test_a_training_has_its_curve_over_steps(again: FakeChain) -> None:
+    run = by_name("stage")["lora@finetuned-all-0"]
+    history = client().get_metric_history(run.info.run_id, "loss")
+    assert [(m.step, m.value) for m in sorted(history, key=lambda m: m.step)] == [(s, 1 / s) for s in range(1, 121)]
+    assert {run.info.start_time <= m.timestamp <= run.info.end_time for m in history} == {True}
+
+
+def test_a_variant_has_factors_accuracies_and_what_it_is_made_of(again: FakeChain) -> None:
+    run, base = by_name("variant")[FULL], by_name("variant")[BASE]
+    assert list(run.data.params)[:4] == ["encoder", "lora", "opd", "seed"]
+    assert run.data.params["lora.rank"] == "8"
+    assert run.data.metrics == {
+        key: value
+        for key, value in zip(
+            [
+                "accuracy/PC",
+                "low/PC",
+                "high/PC",
+                "swapped/PC",
+                "accuracy/OPD",
+                "accuracy/OPD.hardness",
+                "low/OPD.hardness",
+                "high/OPD.hardness",
+                "accuracy/TOY",
+                "low/TOY",
+                "high/TOY",
+            ],
+            (0.5, 0.25, 0.75, 0.3333, 0.125, 0.5, 0.2, 0.8, 0.75, 0.5, 1),
+            strict=True,
+        )
+    }
+    artifacts = {a.path for a in client().list_artifacts(run.info.run_id)}
+    assert artifacts == {"predictions", "model", "alignment", "encoder"}
+    assert "encoder" not in {a.path for a in client().list_artifacts(base.info.run_id)}
+    (weights,) = client().list_artifacts(run.info.run_id, "encoder")
+    copy = mlflow.artifacts.download_artifacts(f"{run.info.artifact_uri}/{weights.path}")
+    assert Path(copy).read_bytes() == b"prompts"
+
+
+def test_a_new_task_is_a_metric_and_a_column_by_itself(again: FakeChain) -> None:
+    assert by_name("variant")[FULL].data.metrics["accuracy/TOY"] == 0.75
+    experiment = client().get_experiment_by_name("octopi")
+    view = json.loads(experiment.tags["mlflow.sharedViewState.variants"])
+    tasks = ["metrics.`accuracy/OPD`", "metrics.`accuracy/PC`", "metrics.`accuracy/TOY`"]
+    assert view["selectedColumns"] == [*(f"params.`{a}`" for a in ("encoder", "lora", "opd", "seed")), *tasks]
+    found = client().search_runs([experiment.experiment_id], view["searchFilter"])
+    assert {run.info.run_name for run in found} == {FULL, BASE}
+    assert "viewStateShareKey=variants" in experiment.tags["mlflow.note.content"]
+
+
+def test_the_parent_has_parameters_report_and_data(again: FakeChain) -> None:
+    commit = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=True).stdout.strip()
+    (parent,) = runs("reproduction")
+    assert parent.data.metrics == {"full.PC": 0.5, "encoder.combined": 0.25}
+    values = yaml.safe_load(Path("params.yaml").read_text())
+    assert json.loads(parent.data.params["ablation.encoders"]) == values["ablation"]["encoders"]
+    assert parent.data.params["language.weights"] == values["language"]["weights"]
+    assert parent.data.tags["mlflow.source.git.commit"] == commit
+    assert {a.path for a in client().list_artifacts(parent.info.run_id, "report")} == {
+        f"report/{name}" for name in ("README.md", "metrics.json", "scores.csv")
+    }
+    data = {d.dataset.name: json.loads(d.dataset.profile)["num_rows"] for d in parent.inputs.dataset_inputs}
+    assert data == {"train": 2, "validation": 1, "test": 1}
+    assert len({d.dataset.digest for d in parent.inputs.dataset_inputs}) == 3
+
+
+def test_a_second_time_adds_nothing(again: FakeChain) -> None:
+    before = hashlib.sha256(Path("mlruns/mlflow.db").read_bytes()).hexdigest()
+    assert "nothing new" in publish(again.params)
+    assert hashlib.sha256(Path("mlruns/mlflow.db").read_bytes()).hexdigest() == before
+
+
+def test_only_what_ran_again_makes_runs(again: FakeChain) -> None:
+    first, stages, variants = runs("reproduction")[0], by_name("stage"), by_name("variant")
+    anew = ["lora@base-all-0", f"answer@{BASE}", "grade"]
+    again.ran(anew, minutes=60, mark="2")
+    publish(again.params)
+    parent = runs("reproduction")[1]
+    children = [run for run in runs() if run.data.tags.get("mlflow.parentRunId") == parent.info.run_id]
+    assert {run.info.run_name for run in children} == {*anew, BASE}
+    assert seconds(parent) == 3 * (SECONDS + 1) - 1
+    cached = {name.removeprefix("cached."): v for name, v in parent.data.tags.items() if name.startswith("cached.")}
+    assert set(cached) == {title.replace("@", ":") for title in TITLES if title not in anew}
+    for title, run in stages.items():
+        if title not in anew:
+            assert cached[title.replace("@", ":")] == f"{run.data.tags['octopi.lock']} {run.info.run_id}"
+    assert parent.data.tags[f"variant.{FULL}"] == variants[FULL].info.run_id
+    assert f"variant.{BASE}" not in parent.data.tags
+    assert client().get_run(first.info.run_id).data.tags == first.data.tags
+
+
+def test_scores_that_moved_make_a_new_variant(again: FakeChain) -> None:
+    again.report(SCORES.replace("0,12,6,0,0.5,", "0,12,7,0,0.5833,"))
+    again.ran(["grade"], minutes=60, mark="3")
+    publish(again.params)
+    assert [run.info.run_name for run in runs("variant")].count(FULL) == 2
+    assert [run.info.run_name for run in runs("variant")].count(BASE) == 1
+
+
+def test_going_back_to_results_that_stand_there_adds_nothing(again: FakeChain) -> None:
+    lock = Path("dvc.lock").read_bytes()
+    again.ran(TITLES, minutes=60, mark="2")
+    publish(again.params)
+    count = len(runs())
+    Path("dvc.lock").write_bytes(lock)
+    assert runs("reproduction")[0].info.run_id in publish(again.params)
+    again.ran(["grade"], minutes=120, mark="3")
+    publish(again.params)
+    assert len(runs()) == count + 2
+    stage = next(run for run in runs("stage") if run.info.run_name == "split")
+    assert runs("reproduction")[2].data.tags["cached.split"].endswith(stage.info.run_id)
+
+
+def test_a_clone_that_only_pulled_has_hashes_and_no_stage_runs(chain: FakeChain) -> None:
+    shutil.rmtree("runs")
+    publish(chain.params)
+    (parent,) = runs("reproduction")
+    assert runs("stage") == []
+    assert len(runs("variant")) == 2
+    assert len(parent.data.tags["cached.grade"].split()) == 1
+    assert "nothing new" in publish(chain.params)
+
+
+def test_entries_of_other_parameters_are_no_part(chain: FakeChain) -> None:
+    lock = yaml.safe_load(Path("dvc.lock").read_text())
+    lock["stages"]["lora@base-all-0"]["params"]["params.yaml"]["frames"]["size"] = 224
+    lock["stages"]["align@base-needed-7"] = lock["stages"]["split"]
+    Path("dvc.lock").write_text(yaml.safe_dump(lock))
+    publish(chain.params)
+    assert set(by_name("stage")) == set(TITLES) - {"lora@base-all-0"}
+
+
+def test_publishing_that_was_cut_off_goes_on(chain: FakeChain, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(mlflow.MlflowClient, "log_artifacts", lambda *_: (_ for _ in ()).throw(OSError("disk")))
+        with pytest.raises(TrackingError, match="disk"):
+            publish(chain.params)
+    publish(chain.params)
+    (parent,) = runs("reproduction")
+    assert not [name for name in parent.data.tags if name.startswith(("cached.", "variant."))]
+    assert set(by_name("stage")) == set(TITLES)
+    whole = [run for run in runs() if run.info.status == "FINISHED"]
+    assert len(whole) == 1 + len(TITLES) + 2
+    assert "nothing new" in publish(chain.params)
+    run = by_name("stage")["lora@base-all-0"]
+    assert len(client().get_metric_history(run.info.run_id, "loss")) == 120
+
+
+def test_a_moved_folder_keeps_its_artifacts(chain: FakeChain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    publish(chain.params)
+    monkeypatch.chdir(tmp_path)
+    shutil.move("a clone", "moved")
+    monkeypatch.chdir(tmp_path / "moved")
+    run = by_name("variant")[FULL]
+    assert not run.info.artifact_uri.startswith(("/", "file:"))
+    assert {a.path for a in client().list_artifacts(run.info.run_id, "model")} >= {"model/connector.safetensors"}
+    assert "nothing new" in publish(chain.params)
+
+
+@pytest.mark.parametrize(("content", "message"), [(None, "no such file"), ("{", "not YAML")])
+def test_a_broken_lock_is_one_line(chain: FakeChain, content: str | None, message: str) -> None:
+    Path("dvc.lock").unlink()
+    if content:
+        Path("dvc.lock").write_text(content)
+    with pytest.raises(UserError, match=rf"dvc\.lock: {message}"):
+        publish(chain.params)
+
+
+def test_the_command_says_in_one_line_why_it_could_not(chain: FakeChain, monkeypatch: pytest.MonkeyPatch) -> None:
+    from pipeline import cli
+
+    assert "2 variants are new" in CliRunner().invoke(cli.app, ["publish"]).stdout
+    Path("dvc.lock").unlink()
+    monkeypatch.setattr(sys, "argv", ["octopi", "publish"])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 1
+
+
+def test_stages_are_those_that_dvc_lists(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for part in ("pipeline", "stages", "standins", "conf", "reports"):
+        (tmp_path / part).symlink_to(ROOT / part)
+    shutil.copy(ROOT / "dvc.yaml", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    params = compose("smoke", ["ablation.seeds=[0,3]"], conf=ROOT / "conf")
+    write_params(params)
+    Path("dvc.lock").write_text("schema: '2.0'\n")
+    dvc = [sys.executable, "-m", "dvc"]
+    subprocess.run([*dvc, "init", "--no-scm", "-q"], check=True)
+    listed = subprocess.run(
+        [*dvc, "stage", "list", "--name-only"], capture_output=True, text=True, check=True, env=os.environ
+    )
+    assert [s.title for s in read_stages(params)] == [line for line in listed.stdout.split() if line != "publish"]
