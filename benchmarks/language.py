@@ -15,7 +15,6 @@ from functools import partial
 from pathlib import Path
 from statistics import fmean
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 import torch
@@ -34,28 +33,26 @@ from pipeline.language.conversations import ConversationCollator, ConversationDa
 from pipeline.language.generate import GenerationSettings, answer
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.params import load_params
-from pipeline.records import Assignment, Embedding, Opd, Part, Prediction, Question
+from pipeline.records import Assignment, Embedding, Opd, Part, Question
 from pipeline.runtime import DtypeName, seed_everything
 from pipeline.tasks.questions import build_questions, pool_of
 from pipeline.videos.catalogue import load_catalogue
 
 FRAMES, UPDATE, CUTOFF = 5, 16, 512
 """A video's frames, conversations an update, and the tokens that the published code pads to."""
-ASKED: tuple[Any, ...] = ("OPD", "PC", "PSS", "POM")
+ASKED = ("OPD", "PC", "PSS", "POM")
 PUBLISHED = "published way"
 DIFFERS = "share of answers that differ from {}'s"
 
 
 @dataclass(frozen=True)
 class Size:
-    """How much is measured."""
+    """How much is measured: conversations that are trained on and answered in a repeat, and aligned on before."""
 
     repeats: int = 5
     trained: int = 64
-    """Conversations that are trained on in a repeat."""
     asked: int = 64
     aligned: int = 192
-    """Conversations that the model is aligned on before."""
     limit: int = 160
     """New tokens of an answer."""
     batches: tuple[int, ...] = (1, 8, 32)
@@ -69,7 +66,7 @@ class Bed:
     encoder: FrameEncoder
     store: EmbeddingStore
     pictures: Mapping[str, torch.Tensor]
-    """Of each video its frames: uint8, frames x side x side x RGB."""
+    """uint8, frames x side x side x RGB."""
     training: Sequence[Question]
     asked: Sequence[Question]
 
@@ -95,9 +92,8 @@ class Bed:
 
 def measure(root: Path, size: Size | None = None) -> list[Row]:
     """All questions; how much to describe only where answers were graded and their report written."""
-    size = size or Size()
     with one_thread(), TemporaryDirectory() as folder:
-        bed = make_bed(root, size, Path(folder))
+        bed = make_bed(root, size := size or Size(), Path(folder))
         optimiser = torch.optim.AdamW(bed.model.connector.parameters(), lr=3e-3)
         train(bed, WAYS["4 at a time, of like length"], bed.training, optimiser)
         return [*training(bed, size), *answering(bed, size), *formats(bed, size), *describing(root)]
@@ -232,8 +228,7 @@ def answering(bed: Bed, size: Size) -> list[Row]:
             for batch in size.batches
         },
     }
-    tokens = fmean(p.tokens for p in ask(bed, bed.model, size.limit, size.batches[-1]))
-    return _asked("answering", ways, bed, size.repeats, {name: {"tokens": tokens} for name in ways})
+    return _asked("answering", ways, bed, size.repeats)
 
 
 def formats(bed: Bed, size: Size) -> list[Row]:
@@ -245,20 +240,14 @@ def formats(bed: Bed, size: Size) -> list[Row]:
         model = OctopiForCausalLM.from_base(base.base_model, base.tactile_dim, dtype=name)
         model.connector.load_state_dict(bed.model.connector.state_dict())
         ways[name] = partial(_texts, bed, model, size.limit, size.batches[-1])
-    return _asked("number format, language model", ways, bed, size.repeats, {name: {} for name in ways})
+    return _asked("number format, language model", ways, bed, size.repeats)
 
 
-def _asked(
-    question: str,
-    ways: Mapping[str, Callable[[object], list[str]]],
-    bed: Bed,
-    repeats: int,
-    counts: Mapping[str, Mapping[str, float]],
-) -> list[Row]:
+def _asked(question: str, ways: Mapping[str, Callable[[object], list[str]]], bed: Bed, repeats: int) -> list[Row]:
     said: dict[str, list[str]] = {}
     flops = {name: flops_of(lambda n=name, w=way: said.update({n: w(None)})) for name, way in ways.items()}  # type: ignore[misc]
     first, objects, count = next(iter(ways)), [q.objects for q in bed.asked], len(bed.asked)
-    costs = interleaved(ways, [None], repeats, warm=False)
+    costs, tokenizer = interleaved(ways, [None], repeats, warm=False), bed.model.tokenizer
     return make_rows(
         question,
         {name: [ms / count for ms in own] for name, own in costs.items()},
@@ -269,19 +258,18 @@ def _asked(
             for name, texts in said.items()
         },
         error_of=DIFFERS.format(first),
-        counts={name: {**own, "flops": flops[name] / count} for name, own in counts.items()},
+        counts={
+            name: {"flops": flops[name] / count, "tokens": fmean(len(tokenizer(t).input_ids) for t in texts)}
+            for name, texts in said.items()
+        },
         machine=machine("1 thread"),
     )
 
 
-def ask(bed: Bed, model: OctopiForCausalLM, limit: int, batch: int) -> list[Prediction]:
+def _texts(bed: Bed, model: OctopiForCausalLM, limit: int, batch: int, _: object) -> list[str]:
     """The pipeline's own way."""
     settings = GenerationSettings(system_prompt="", per_video=FRAMES, max_new_tokens=limit, batch_size=batch)
-    return answer(model, bed.store, bed.asked, Opd.ALL, settings)
-
-
-def _texts(bed: Bed, model: OctopiForCausalLM, limit: int, batch: int, _: object) -> list[str]:
-    return [prediction.outputs[0] for prediction in ask(bed, model, limit, batch)]
+    return [prediction.outputs[0] for prediction in answer(model, bed.store, bed.asked, Opd.ALL, settings)]
 
 
 @torch.no_grad()
@@ -294,18 +282,12 @@ def _answer(bed: Bed, limit: int, place: int, reads: bool = False, cache: bool =
     ids = sample["input_ids"][: int((sample["labels"] != IGNORE_INDEX).nonzero()[0])][None]
     embeddings = model.embed(ids, bed.encode(question)[None])
     if cache:
-        new = model.llm.generate(
-            inputs_embeds=embeddings,
-            attention_mask=torch.ones_like(ids),
-            max_new_tokens=limit,
-            do_sample=False,
-            eos_token_id=tokenizer.eos_token_id,
-            pad_token_id=tokenizer.pad_token_id,
-        )
+        ends = {"eos_token_id": tokenizer.eos_token_id, "pad_token_id": tokenizer.pad_token_id}
+        call = {"attention_mask": torch.ones_like(ids), "max_new_tokens": limit, "do_sample": False, **ends}
+        new = model.llm.generate(inputs_embeds=embeddings, **call)
     else:
         new = _without_cache(model, embeddings, limit)
-    said: str = tokenizer.decode(new[0], skip_special_tokens=True).strip()
-    return said
+    return str(tokenizer.decode(new[0], skip_special_tokens=True)).strip()
 
 
 def _without_cache(model: OctopiForCausalLM, embeddings: torch.Tensor, limit: int) -> torch.Tensor:

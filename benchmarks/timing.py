@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import platform
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -43,7 +42,6 @@ def interleaved(
         run(items[0])
     found: dict[str, list[float]] = {name: [] for name in settings}
     for _ in range(repeats):
-        gc.collect()
         spent: dict[str, list[float]] = {name: [] for name in settings}
         for item in items:
             for name, run in settings.items():
