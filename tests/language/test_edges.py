@@ -22,10 +22,7 @@ from pipeline.language.generate import answer
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import assemble
 from pipeline.records import Embedding, Opd, Question
-from tests.language.shared import DIM, asking, language, material, model, questions, store
-
-__all__ = ["language", "model", "questions", "store"]
-"""Fixtures."""
+from tests.language.shared import DIM, generation, material
 
 
 def plainly(model: OctopiForCausalLM, ids: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
@@ -114,7 +111,7 @@ def test_a_video_without_embeddings_is_named(
 ) -> None:
     question = questions[0].model_copy(update={"videos": ("nowhere_3",) * len(questions[0].videos)})
     with pytest.raises(UserError, match="nowhere_3 has no embedding; run `dvc repro`"):
-        answer(model, store, [question], Opd.ALL, asking(1))
+        answer(model, store, [question], Opd.ALL, generation(1))
     _, data = assemble(material(language, [question], store), 1, "test")
     with pytest.raises(UserError, match="nowhere_3"):
         data[0]
