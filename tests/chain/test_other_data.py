@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import random
 import re
 from collections import Counter
@@ -13,12 +12,11 @@ from textwrap import dedent
 
 import pytest
 import yaml
-from pipeline.reporting import write_report
 from safetensors.numpy import load_file
 
 from pipeline.errors import UserError
 from pipeline.io import read_jsonl, read_table
-from pipeline.records import Opd, Part, Prediction, Question, Score
+from pipeline.records import Graded, Opd, Part, Prediction, Question
 from pipeline.scenes.recipe import recipe_of
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool
@@ -27,7 +25,6 @@ from pipeline.videos.catalogue.wording import levels_named
 from pipeline.videos.files import list_videos
 from pipeline.videos.split import check_split
 from tests.closure import ROOT
-from tests.fake_chain import fake_params, write_chain
 from tests.project import OBJECTS, REDUCED, Project, copy_project
 
 PHYSICLEAR = ROOT / "pipeline" / "physiclear"
@@ -69,38 +66,32 @@ def write_catalogue(folder: Path, *, name: str = "stickiness", split: str = "min
     return folder
 
 
-def rows(folder: Path, table: str) -> list[dict[str, str]]:
-    with (folder / "tables" / f"{table}.csv").open(newline="") as stream:
+def rows(report: Path, table: str) -> list[dict[str, str]]:
+    with (report / f"{table}.csv").open(newline="") as stream:
         return list(csv.DictReader(stream))
 
 
-def check_tables(report: Path, name: str) -> None:
+def check_report(report: Path, name: str) -> None:
     """Rows for the fourth property wherever there are rows for properties, and nothing of the paper's."""
-    for table in ("property_description", "encoder_property", "lora_property", "all_variants"):
-        found = [r for r in rows(report, table) if r["row"] == name]
-        assert found, table
-        assert all(float(r["chance"]) == 25 for r in found)
-        assert all(
-            float(r["chance"]) == pytest.approx(100 / 108, abs=1e-3)
-            for r in rows(report, table)
-            if r["row"] == "combined"
-        )
-    heads = next(r for r in rows(report, "property_description") if (r["row"], r["system"]) == (name, "FT CLIP"))
-    assert heads["value"] != ""
-    confused = [r for r in rows(report, "confusion_matrices") if r["property"] == name]
-    assert [(r["expected"], r["predicted"]) for r in confused] == [(a, b) for a in LEVELS for b in LEVELS]
-    assert sum(int(r["videos"]) for r in confused) == int(heads["n"])
-    assert [r["level"] for r in rows(report, "property_counts") if r["property"] == name] == LEVELS
-    assert [int(r["objects"]) for r in rows(report, "property_counts") if r["property"] == name] == [3, 2, 2, 2]
-    assert len(rows(report, "property_combinations")) == 3 * 3 * 3 * 4
-    assert any(r["row"] == name for r in rows(report, "annotator_agreement"))
-    for file in (report / "tables").glob("*.csv"):
-        for row in rows(report, file.stem):
-            assert not any(value for column, value in row.items() if column.startswith("published")), file.name
-    page = (report / "README.md").read_text()
-    assert "ublished" not in page
-    assert "paper's" not in page
-    assert name in page
+    chances = {
+        row["measure"]: float(row["chance"]) for row in rows(report, "scores") if row["task"] in ("OPD", "heads")
+    }
+    assert chances == pytest.approx(
+        {"hardness": 1 / 3, "roughness": 1 / 3, "bumpiness": 1 / 3, name: 1 / 4, "combined": 1 / 108}
+    )
+    about = Counter(row["task"] for row in rows(report, "scores") if row["measure"] == name)
+    assert {"OPD", "heads", "cross_validation"} <= about.keys()
+    videos = {row["video_id"] for row in rows(report, "confusion") if row["property"] == name}
+    heads = next(row for row in rows(report, "scores") if (row["task"], row["measure"]) == ("heads", name))
+    assert len(videos) == float(heads["n"])
+    counts = [row for row in rows(report, "dataset") if row["row"].startswith(f"{name}: ")]
+    assert [row["row"] for row in counts] == [f"{name}: {level}" for level in LEVELS]
+    assert [int(row["objects"]) for row in counts] == [3, 2, 2, 2]
+    assert sum(row["table"] == "property_combinations" for row in rows(report, "dataset")) == 3 * 3 * 3 * 4
+    assert not any(row["published"] for row in rows(report, "dataset"))
+    readme = (report / "README.md").read_text()
+    assert "48.10" not in readme, "the paper's figures are about another data set"
+    assert name in readme
 
 
 @pytest.fixture(scope="module")
@@ -163,14 +154,6 @@ def narrowed(catalogue: Catalogue, kept: slice) -> Catalogue:
     return Catalogue.model_construct(language=language, objects=few)
 
 
-def test_the_report_has_its_rows(tmp_path: Path) -> None:
-    folder = write_catalogue(tmp_path / "catalogue", split="paper")
-    params = fake_params(f"data.catalogue='{folder}'", f"scenes.objects=[{','.join(OBJECTS)}]")
-    write_chain(tmp_path, params)
-    write_report(params, tmp_path)
-    check_tables(tmp_path / "reports" / params.report_name, "stickiness")
-
-
 @pytest.fixture(scope="module")
 def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
     project = copy_project(tmp_path_factory.mktemp("other") / "project")
@@ -193,18 +176,16 @@ def test_the_whole_chain_runs_on_it(project: Project) -> None:
     heads = load_file(data / "encoder" / "0" / "encoder.safetensors")
     assert [len(heads[f"heads.{i}.bias"]) for i in range(4)] == [3, 3, 3, 4]
     assert "heads.4.bias" not in heads
-    scores = read_table(data / "scores" / "finetuned-with-all-0" / "scores.parquet", Score)
-    measures = Counter(s.measure for s in scores if s.task == "OPD")
+    graded = read_table(data / "graded.parquet", Graded)
+    measures = Counter(g.measure for g in graded if g.task == "OPD")
     assert set(measures) == {"hardness", "roughness", "bumpiness", "stickiness", "combined"}
     assert len(set(measures.values())) == 1
     report = project.folder / "reports" / "smoke-scenes"
-    check_tables(report, "stickiness")
-    assert "ft-clip.stickiness" in json.loads((report / "metrics.json").read_text())
-    for figure in ("confusion_matrices", "embedding_map"):
-        assert (report / "figures" / f"{figure}.png").is_file()
-    assert "split mine" in (report / "README.md").read_text()
-    counts = [r for r in rows(report, "property_counts") if r["property"] == "stickiness"]
-    assert [sum(int(r[part]) for r in counts) for part in ("train", "validation", "test")] == [4, 1, 4]
+    check_report(report, "stickiness")
+    assert (report / "figures" / "confusion.png").is_file()
+    assert "split `mine`" in (report / "README.md").read_text()
+    counts = [row for row in rows(report, "dataset") if row["row"].startswith("stickiness: ")]
+    assert [sum(int(row[part]) for row in counts) for part in ("train", "validation", "test")] == [4, 1, 4]
 
 
 def blocks(page: str, language: str) -> list[str]:
