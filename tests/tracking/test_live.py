@@ -28,7 +28,7 @@ from pipeline.io import read_table, write_table
 from pipeline.records import Measurement
 from pipeline.stage import Stage
 from pipeline.tracking import TrackingError, live, publish
-from pipeline.training import TrainableTrainer, Trained, TrainingMonitor, train, training_arguments
+from pipeline.training.trainer import TrainableTrainer, Trained, TrainingMonitor, train, training_arguments
 from tests.closure import ROOT
 from tests.tracking.conftest import FIRST, FULL, FakeChain, by_name, client, runs
 
