@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import get_args
 
 import pytest
 
-from pipeline.config import Recipe
 from pipeline.encoder.candidates import RELEASE, needs_pretraining
+from pipeline.encoder.recipes import RECIPES
 from pipeline.errors import UserError
 from pipeline.params import load_params
 from pipeline.scales import check_inputs, compose, prune, shipped_scales, write_params
@@ -179,7 +178,7 @@ def test_prune_keeps_what_params_name_and_removes_the_rest(tmp_path: Path) -> No
 
 def test_a_recipe_brings_its_settings_and_gives_way_to_yours() -> None:
     smoke = compose("smoke", conf=CONF)
-    for recipe in get_args(Recipe):
+    for recipe in RECIPES:
         composed = compose("smoke", [f"encoder.recipe={recipe}"], conf=CONF)
         assert composed.encoder.recipe == recipe
         assert composed.language == smoke.language
