@@ -186,22 +186,25 @@ def _touch(effects: pd.DataFrame) -> list[str]:
     rows = effects[effects["part"] == "touch"]
     if not len(rows):
         return ["Whether answers depend on touch was not tested."]
-    others = [change.partition(" - ")[2] for change in dict.fromkeys(rows["change"])]
+    *others, last = [change.partition(" - ")[2] for change in dict.fromkeys(rows["change"])]
     span = f"{100 * rows['difference'].min():+.1f} to {100 * rows['difference'].max():+.1f} points"
-    fact = f"real minus {' or '.join(others)} touch is {span} by task"
+    instead = f"{', '.join(others)} or {last}" if others else last
+    fact = f"with real touch in place of {instead} accuracy differs by {span}, task by task"
     sure, likely = rows[(rows["p_holm"] < ALPHA) & (rows["difference"] > 0)], rows[rows["low"] > 0]
     if len(sure):
         return [f"Answers use touch in {', '.join(dict.fromkeys(sure['task']))}: {fact}."]
     if len(likely):
-        some = f"the interval lies above 0 in {len(likely)} of {len(rows)} comparisons, significant (Holm) is none"
+        some = f"{len(likely)} of {len(rows)} intervals lie above 0, none is significant after Holm's adjustment"
         return [f"Answers seem to use touch: {fact}; {some}{_impossible(effects)}."]
-    return [f"That answers use touch is not shown: {fact}, nowhere significant (Holm){_impossible(effects)}."]
+    return [
+        f"That answers use touch is not shown: {fact}, none significant after Holm's adjustment{_impossible(effects)}."
+    ]
 
 
 def _impossible(effects: pd.DataFrame) -> str:
     """Whether so few objects could show anything at all: a sign flip's p is at least 2 / 2**objects."""
     objects = int(effects["objects"].max())
-    return f", as {objects} objects never can be" if len(effects) * 2.0 ** (1 - objects) >= ALPHA else ""
+    return f" ({objects} objects are too few for that)" if len(effects) * 2.0 ** (1 - objects) >= ALPHA else ""
 
 
 def _parts(effects: pd.DataFrame) -> list[str]:
@@ -215,7 +218,8 @@ def _parts(effects: pd.DataFrame) -> list[str]:
     smallest = rows["smallest_effect"].min()
     found = f"; the smallest that this design could have found is {100 * smallest:.0f} points" if smallest <= 1 else ""
     return [
-        f"None of {len(rows)} effects of encoder, LoRA and OPD is significant (Holm){_impossible(effects) or found}."
+        f"None of {len(rows)} effects of encoder, LoRA and OPD is significant after Holm's adjustment"
+        f"{_impossible(effects) or found}."
     ]
 
 

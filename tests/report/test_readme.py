@@ -109,12 +109,15 @@ TOUCH = {"part": "touch", "change": "real - swapped"}
         ([], "Whether answers depend on touch was not tested."),
         (
             [effect(**TOUCH, p_holm=0.01, low=0.02)],
-            "Answers use touch in PC: real minus swapped touch is +10.0 to +10.0",
+            "Answers use touch in PC: with real touch in place of swapped accuracy differs by +10.0 to +10.0",
         ),
-        ([effect(**TOUCH, low=0.02)], "Answers seem to use touch: real minus swapped touch"),
-        ([effect(**TOUCH)], "That answers use touch is not shown: real minus swapped touch"),
+        ([effect(**TOUCH, low=0.02)], "Answers seem to use touch: with real touch in place of swapped"),
+        ([effect(**TOUCH)], "That answers use touch is not shown: with real touch in place of swapped"),
         ([effect(**TOUCH, p_holm=0.01, difference=-0.1, low=-0.2)], "That answers use touch is not shown"),
-        ([effect(**TOUCH, low=0.02, objects=5)], "significant (Holm) is none, as 5 objects never can be."),
+        (
+            [effect(**TOUCH, low=0.02, objects=5)],
+            "none is significant after Holm's adjustment (5 objects are too few for that).",
+        ),
     ],
 )
 def test_whether_touch_is_used(rows: list[dict[str, Any]], expected: str) -> None:
@@ -123,7 +126,7 @@ def test_whether_touch_is_used(rows: list[dict[str, Any]], expected: str) -> Non
 
 def test_effects_that_hold_are_named_and_those_that_do_not_are_not() -> None:
     none = finding(report([score()], [effect(), effect("opd", "all - none", smallest_effect=0.12)]))[2]
-    assert "None of 2 effects of encoder, LoRA and OPD is significant (Holm); the smallest" in none
+    assert "None of 2 effects of encoder, LoRA and OPD is significant after Holm's adjustment; the smallest" in none
     assert "could have found is 12 points" in none
     some = finding(report([score()], [effect(p_holm=0.001), effect("opd", "all - none")]))[2]
     assert "Of 2 effects of encoder, LoRA and OPD these hold up (Holm): lora in PC +10.0 points." in some
