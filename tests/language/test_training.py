@@ -32,7 +32,7 @@ from pipeline.language.training import (
 )
 from pipeline.records import Question
 from pipeline.training.trainer import Trained
-from pipeline.training.trainer import trainer as shared
+from pipeline.training import trainer as shared
 from tests.closure import ROOT
 from tests.language.shared import SMALL, call, material
 
