@@ -31,8 +31,8 @@ from pipeline.language.training import (
     write_model_card,
 )
 from pipeline.records import Question
+from pipeline.training import trainer as shared
 from pipeline.training.trainer import Trained
-from pipeline.training.trainer import trainer as shared
 from tests.closure import ROOT
 from tests.language.shared import SMALL, call, material
 
