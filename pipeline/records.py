@@ -9,7 +9,7 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Literal, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field
 
 
 class Record(BaseModel):
@@ -235,10 +235,6 @@ class Prediction(Record):
     """Tokens generated, over all turns."""
 
 
-WHOLE = ("choice", "combined")
-"""Measures that say that an answer is right, not only a part of it."""
-
-
 class Score(Record):
     """One graded measure of one answer; OPD has one a property and `combined`, other tasks `choice`."""
 
@@ -270,26 +266,6 @@ class Graded(Score):
     def variant(self) -> Variant:
         """The answering system."""
         return Variant(self.encoder, self.lora, self.opd, self.seed)
-
-
-class GateRow(Record):
-    """What a base language model can conclude from perfect descriptions in words, before it ever felt anything."""
-
-    task: str
-    """Begins with the task's name; what follows says under which circumstances."""
-    accuracy: float = Field(ge=0, le=1)
-    low: float
-    """Of Wilson's 95 % interval."""
-    high: float
-    n: int = Field(ge=1)
-    goal: float | None = None
-    """What has to be reached; None where the row is for information."""
-    passed: bool | None = None
-
-    @field_validator("goal", "passed", mode="before")
-    @classmethod
-    def _empty_is_none(cls, value: object) -> object:
-        return None if value == "" else value
 
 
 class Classification(Record):

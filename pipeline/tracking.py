@@ -34,8 +34,9 @@ from pipeline.config import Params, TrackingConfig
 from pipeline.errors import UserError
 from pipeline.io import read_json, read_table
 from pipeline.params import PARAMS_FILE
-from pipeline.records import WHOLE, Assignment, Encoder, Lora, Measurement, Part, Touch, Variant, Video
+from pipeline.records import Assignment, Encoder, Lora, Measurement, Part, Touch, Variant, Video
 from pipeline.stage import DATA, RUNS, Stage
+from pipeline.tasks import TASKS
 
 logger = logging.getLogger(__name__)
 P = ParamSpec("P")
@@ -212,7 +213,8 @@ def accuracies(params: Params) -> dict[str, dict[str, float]]:
     found: dict[str, dict[str, float]] = {}
     for row in csv.DictReader(path.read_text(encoding="utf-8").splitlines()) if path.is_file() else ():
         if row["lora"] and row["seed"].isdigit():
-            task = row["task"] if row["measure"] in WHOLE else f"{row['task']}.{row['measure']}"
+            whole = TASKS[row["task"]].measure if row["task"] in TASKS else "choice"
+            task = row["task"] if row["measure"] == whole else f"{row['task']}.{row['measure']}"
             cells = {f"accuracy/{task}": row["accuracy"], f"low/{task}": row["low"], f"high/{task}": row["high"]}
             if row["touch"] != Touch.REAL:
                 cells = {f"{row['touch']}/{task}": row["accuracy"]}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from collections.abc import Collection
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
@@ -31,8 +32,10 @@ def imported(file: Path) -> set[Path]:
     return files
 
 
-def closure(script: Path) -> list[str]:
+def closure(script: Path, unfollowed: Collection[str] = ()) -> list[str]:
     """Project files that running `script` can import, itself included, relative to the root and sorted.
+
+    What the files in `unfollowed` import does not count.
 
     Packages' empty __init__ files are left out: they cannot change a result.
     """
@@ -42,5 +45,6 @@ def closure(script: Path) -> list[str]:
         file = waiting.pop()
         if file not in seen:
             seen.add(file)
-            waiting += imported(file)
+            if file.relative_to(ROOT).as_posix() not in unfollowed:
+                waiting += imported(file)
     return sorted(f.relative_to(ROOT).as_posix() for f in seen if f.stat().st_size > 0)

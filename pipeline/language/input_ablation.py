@@ -67,7 +67,7 @@ class NoisyTouch:
 
 
 def ablate_input(store: EmbeddingStore, touch: Touch, questions: Sequence[Question], seed: int) -> TactileFeatures:
-    """What a variant feels of the questions' videos.
+    """What a variant is given of the questions' videos.
 
     `removed` is no matter of the embeddings but of the prompt, which then has no frame to put one at.
     """
@@ -90,9 +90,9 @@ def _videos(questions: Iterable[Question]) -> dict[str, list[str]]:
 
 def _ring(videos: Mapping[str, Sequence[str]], seed: int) -> dict[str, str]:
     objects = list(videos)
-    if len(objects) < 2:
+    if len(objects) == 1:
         raise UserError(
-            "ablation.counterfactuals: swapped needs questions about two objects at least; leave it out or add objects"
+            "ablation.touch: swapped needs questions about two objects at least; leave it out or add objects"
         )
     random.Random(derive_seed(seed, "swapped")).shuffle(objects)
     return {

@@ -30,7 +30,7 @@ def code(name: str) -> list[str]:
 
 @pytest.mark.parametrize("name", sorted(stages().keys() - {"publish"}))
 def test_dependencies_cover_what_a_stage_can_import(name: str) -> None:
-    reached = closure(ROOT / "stages" / f"{name}.py")
+    reached = closure(ROOT / "stages" / f"{name}.py", unfollowed=["pipeline/tracking.py"])
     covered = (*TOLD, *code(name))
     missing = [m for m in reached if not any(m == d or m.startswith(f"{d}/") for d in covered)]
     assert not missing, f"add to the dependencies of {name} in dvc.yaml"

@@ -76,8 +76,9 @@ def test_no_object_keeps_its_touch_and_none_is_given_twice(count: int, seed: int
 
 
 def test_swapping_needs_two_objects(store: EmbeddingStore) -> None:
-    with pytest.raises(UserError, match=r"ablation.counterfactuals: swapped needs questions about two objects"):
+    with pytest.raises(UserError, match=r"ablation.touch: swapped needs questions about two objects"):
         SwappedTouch(store, [question(0, "a")], 0)
+    assert SwappedTouch(store, [], 0).dim == store.dim, "no test object has videos: nothing is asked"
 
 
 def test_noise_has_the_embeddings_moments_and_is_no_ones_touch(tmp_path: Path) -> None:
