@@ -26,8 +26,9 @@ $(DONE): requirements.lock pyproject.toml
 repro: install
 	@octopi repro
 
+# Two at a time, a file to one process: torch needs a gigabyte in each.
 test: install
-	python -m pytest
+	python -m pytest --numprocesses 2 --dist loadfile
 
 stability: install
 	python -m pytest tests/numerics --stability-csv reports/stability.csv

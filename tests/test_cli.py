@@ -130,7 +130,7 @@ def test_data_audit_ends_with_status_1_where_parts_share_a_video(folder: Path) -
     assert status == 1
     assert [(row["check"], row["severity"]) for row in rows[:2]] == [
         ("same content", "error"),
-        ("agreement, ICC(3,k)", "warning"),
+        ("stated label", "warning"),
     ]
     assert len(lines(output, "error")) == 1
     assert audited()[0] == 0, "without a split it is a warning"

@@ -63,7 +63,7 @@ def provenance(
         "test_videos": len(test),
         "videos": len(videos),
         "seeds": list(params.ablation.seeds),
-        "settings": notes().get(params.report_name, ""),
+        "settings": notes().get(f"{params.report_name}/{params.split.name}", ""),
         "intervals": coverage_note(asked),
         "facts_told": params.questions.facts,
         "command": "dvc repro",
@@ -137,7 +137,7 @@ def digest(folder: Path) -> str:
 
 
 def notes() -> dict[str, str]:
-    """What people wrote about reports in notes.yaml, by the report's name."""
+    """What people wrote about reports in notes.yaml, by name and split, such as `small-videos/development`."""
     return yaml.safe_load(NOTES.read_text(encoding="utf-8")) or {}
 
 
