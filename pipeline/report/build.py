@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 
 import pandas as pd
 
-from pipeline.config import Params
+from pipeline.config import AblationConfig, Params
 from pipeline.evaluation.ordinal import ErrorRow, error_rows
 from pipeline.evaluation.scores import EffectRow, ScoreRow, candidate_rows, effect_rows, score_rows
 from pipeline.io import read_csv, read_jsonl, read_table, write_csv, write_json, write_text
@@ -62,9 +61,11 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     catalogue = load_catalogue(root / params.data.catalogue)
     videos, assignments = read_table(data / "videos.parquet", Video), read_table(data / "splits.parquet", Assignment)
     graded = read_table(data / "graded.parquet", Graded)
+    # By the lists in params.yaml and not by what lies there: a narrowed ablation leaves the others' files behind.
     said = {
-        int(file.parent.name): read_table(file, Classification)
-        for file in sorted((data / "encoder").glob("*/classifications.parquet"))
+        seed: read_table(file, Classification)
+        for seed in sorted(params.ablation.seeds)
+        if (file := data / "encoder" / str(seed) / "classifications.parquet").is_file()
     }
     out_of_fold = {
         name: read_table(data / "cross_validation" / name / "out_of_fold.parquet", OutOfFold)
@@ -81,7 +82,7 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     write_csv(folder / "audit.csv", Finding, read_csv(audit, Finding) if audit.is_file() else [])
     _write(folder / "dataset.csv", dataset_frame(catalogue, videos, assignments))
     _write(folder / "confusion.csv", confusion_frame(said, catalogue))
-    _write(folder / "curves.csv", curves_frame(data))
+    _write(folder / "curves.csv", curves_frame(data, params.ablation))
     write_text(folder / "params.yaml", (root / PARAMS_FILE).read_text(encoding="utf-8"))
     write_json(folder / "provenance.json", origin)
     return finish_report(folder)
@@ -122,18 +123,20 @@ def confusion_frame(said: dict[int, list[Classification]], catalogue: Catalogue)
     return pd.DataFrame(rows, columns=list(CONFUSION))
 
 
-def curves_frame(data: Path) -> pd.DataFrame:
-    """The histories of all trainings below data/, with `CURVES`; a stage is named as DVC names it."""
-    places: list[tuple[str, Iterable[Path]]] = [
-        ("pretrain", sorted(data.glob("pretrained/history.parquet"))),
-        ("finetune_encoder", sorted(data.glob("encoder/*/history.parquet"))),
-        ("align", sorted(data.glob("models/without/*/history.parquet"))),
-        ("lora", sorted(data.glob("models/with/*/history.parquet"))),
+def curves_frame(data: Path, ablation: AblationConfig) -> pd.DataFrame:
+    """The histories of this ablation's trainings below data/, with `CURVES`; a stage is named as DVC names it."""
+    trained = sorted({f"{v.encoder}-{v.opd}-{v.seed}" for v in ablation.variants()})
+    places = [
+        ("pretrain", [data / "pretrained"]),
+        ("finetune_encoder", [data / "encoder" / seed for seed in sorted(map(str, ablation.seeds))]),
+        ("align", [data / "models" / "without" / key for key in trained]),
+        ("lora", [data / "models" / "with" / key for key in trained]),
     ]
     rows = [
-        (stage if stage == "pretrain" else f"{stage}@{file.parent.name}", m.name, m.step, m.value)
-        for stage, files in places
-        for file in files
+        (stage if stage == "pretrain" else f"{stage}@{folder.name}", m.name, m.step, m.value)
+        for stage, folders in places
+        for folder in folders
+        if (file := folder / "history.parquet").is_file()
         for m in sorted(read_table(file, Measurement), key=lambda m: (m.name, m.step))
         if m.name in LOGGED
     ]

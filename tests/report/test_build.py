@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -187,6 +188,19 @@ def test_two_writes_are_equal_to_the_byte_and_leave_no_figure_of_another_run(wri
     (written / "figures" / "of_last_year.png").write_bytes(b"")
     write_report(load_params(root / "params.yaml"), root)
     assert files_of(written) == before
+
+
+def test_what_a_wider_ablation_left_in_data_is_in_no_report(written: Path) -> None:
+    """DVC removes no output of a seed that params.yaml names no more."""
+    before, root = files_of(written), written.parents[1]
+    for place in ("encoder/0", "models/with/finetuned-all-0", "models/without/finetuned-all-0"):
+        shutil.copytree(root / "data" / place, root / "data" / f"{place[:-1]}9")
+    try:
+        write_report(load_params(root / "params.yaml"), root)
+        assert files_of(written) == before
+    finally:
+        for place in ("encoder/9", "models/with/finetuned-all-9", "models/without/finetuned-all-9"):
+            shutil.rmtree(root / "data" / place)
 
 
 @pytest.fixture(scope="module")
