@@ -27,7 +27,10 @@ def scale(
 ) -> None:
     """Choose what `dvc repro` runs: write params.yaml from conf/NAME.yaml and the overrides."""
     from pipeline.scales import check_inputs, compose, prune, write_params
+    from pipeline.stage import running_stages
 
+    if running := running_stages():
+        raise UserError(f"{running[0]} is running, and would be recorded with other parameters; wait for it or stop it")
     params = compose(name, overrides or ())
     check_inputs(params)
     changed = write_params(params)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import re
+import shlex
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import yaml
+from pydantic import BaseModel
 
 from pipeline import weights
 from pipeline.config import Params
@@ -50,7 +54,7 @@ def compose(name: str, overrides: Sequence[str] = (), conf: Path = CONF) -> Para
         if "=" not in override:
             raise UserError(f"{override!r} is no override; write key=value, for example split.name=development")
     # Every key may be set here; whether it exists is the validation's matter, since that knows what is allowed.
-    forced = [o if o.startswith(("+", "~")) else f"++{o}" for o in overrides]
+    forced = [o if o.startswith(("+", "~")) else f"++{_literal(o)}" for o in overrides]
     # A recipe brings its own values; they give way to what is set beside it.
     asked = dict(o.lstrip("+").split("=", 1) for o in overrides).get(RECIPE)
     if asked is not None and (conf / "recipe" / f"{asked}.yaml").is_file():
@@ -64,6 +68,20 @@ def compose(name: str, overrides: Sequence[str] = (), conf: Path = CONF) -> Para
     return validate({str(k): v for k, v in values.items()}, f"scale {name}")
 
 
+def _literal(override: str) -> str:
+    """The override with a text as it stands: Hydra's grammar would read brackets, commas or blanks of a path."""
+    key, value = override.split("=", 1)
+    field: Any = Params
+    for part in key.split("."):
+        fields = field.model_fields if isinstance(field, type) and issubclass(field, BaseModel) else {}
+        field = fields[part].annotation if part in fields else None
+    if field is not str or (len(value) > 1 and value[0] == value[-1] and value[0] in "'\""):
+        return override
+    # Hydra halves backslashes only where a quotation mark follows.
+    escaped = re.sub(r"(\\*)('|$)", lambda found: found[1] * 2 + ("\\'" if found[2] else ""), value)
+    return f"{key}='{escaped}'"
+
+
 def check_inputs(params: Params) -> None:
     """Raise UserError where something that the scale needs is not there: videos, catalogue, objects, tasks, weights."""
     catalogue = load_catalogue(Path(params.data.catalogue))
@@ -71,7 +89,12 @@ def check_inputs(params: Params) -> None:
     check_candidates(params.cross_validation.models, params.encoder.recipe)
     counts_by_task(params.questions, "train")
     counts_by_task(params.questions, "evaluation")
+    launcher = shlex.split(params.runtime.launcher)
+    if not launcher or shutil.which(launcher[0]) is None:
+        raise UserError(f"runtime.launcher: no program {params.runtime.launcher!r}; set it to python, or install it")
     folder = Path(params.data.dir)
+    if params.data.source == "videos" and folder.exists() and not folder.is_dir():
+        raise UserError(f"data.dir: {folder} is a file; name the folder that the videos are in")
     if params.data.source == "videos" and not folder.is_dir():
         raise UserError(
             f"data.dir: {folder} does not exist; import the public data set (README, section Real videos) or name the "
@@ -116,7 +139,7 @@ def write_params(params: Params, path: Path = PARAMS_FILE) -> bool:
     """Write params.yaml if that changes it; return whether it did."""
     values = params.model_dump(mode="json")
     text = HEADER + yaml.dump(values, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)
-    if path.is_file() and path.read_text(encoding="utf-8") == text:
+    if path.is_file() and path.read_bytes() == text.encode():
         return False
     write_text(path, text)
     return True

@@ -70,6 +70,8 @@ def test_paper_scales_have_the_papers_hyper_parameters(scale: str) -> None:
         (["lora.target_modules=[]"], ["lora.target_modules"]),
         (["encoder.learning_rate=nan"], ["encoder.learning_rate"]),
         (["runtime.device=tpu"], ["runtime.device", "'cuda'"]),
+        (["lora.alpha=1e309"], ["lora.alpha", "finite"]),
+        (["encoder.epochs=true"], ["encoder", "epochs is true"]),
         (["justaword"], ["key=value"]),
         (["a b=[1"], ["a b"]),
     ],
@@ -90,20 +92,48 @@ def test_unknown_scale_names_the_known() -> None:
 
 @pytest.mark.parametrize(
     ("text", "word"),
-    [("", "octopi scale smoke"), ("scale: [", "not YAML"), ("scale: smoke\n", "missing"), (None, "no such file")],
+    [
+        (b"", "octopi scale smoke"),
+        (b"scale: [", "not YAML"),
+        (b"scale: smoke\n", "missing"),
+        (b"seed: 1\nseed: 2\n", "seed stands twice"),
+        (b"align: {epochs: 1, epochs: 2}\n", "epochs stands twice"),
+        ("scale: smoke\n".encode("utf-16"), "not UTF-8"),
+        (None, "no such file"),
+    ],
 )
-def test_broken_params_file(text: str | None, word: str, tmp_path: Path) -> None:
+def test_broken_params_file(text: bytes | None, word: str, tmp_path: Path) -> None:
     path = tmp_path / "params.yaml"
     if text is not None:
-        path.write_text(text)
+        path.write_bytes(text)
     with pytest.raises(UserError, match=word):
         load_params(path)
+    # Whatever stands there, the command that the line names writes it anew.
+    assert write_params(compose("smoke", conf=CONF), path)
+    assert load_params(path) == compose("smoke", conf=CONF)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["my data", "a[1]", "{x}", "a,b", "a=b", "a&b#c", "it's", '"said"', "Prüfling", "back\\slash", "end\\", "$x"],
+)
+def test_any_folder_may_hold_the_videos(name: str, tmp_path: Path) -> None:
+    folder = tmp_path / name
+    params = compose("small", ["data.source=videos", f"data.dir={folder}"], conf=CONF)
+    assert params.data.dir == str(folder)
+    write_params(params, tmp_path / "params.yaml")
+    assert load_params(tmp_path / "params.yaml").data.dir == str(folder)
 
 
 def test_missing_inputs_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     with pytest.raises(UserError, match="data.dir"):
         check_inputs(compose("small", ["data.source=videos", f"data.dir={tmp_path}/none"]))
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match="is a file"):
+        check_inputs(compose("small", ["data.source=videos", f"data.dir={tmp_path}/file"]))
+    with pytest.raises(UserError, match=r"runtime.launcher.*acelerate"):
+        check_inputs(compose("smoke", ["runtime.launcher=acelerate launch"]))
     with pytest.raises(UserError, match="hf download timm"):
         check_inputs(compose("smoke", [f"encoder.weights={tmp_path}/none"]))
     with pytest.raises(UserError, match="hf download lmsys"):
