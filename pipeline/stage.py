@@ -54,8 +54,8 @@ def stage(name: str, key: str | None = None) -> Iterator[Stage]:
     """Run the body as the DVC stage `name` (with `@key` in a matrix).
 
     A UserError, a disk that cannot be read or written, or want of memory ends it with one line and status 1. So does a
-    params.yaml that was changed meanwhile: DVC would record the new values for what the old ones made. Metrics, time and memory go
-    to runs/, which is nobody's input, so that results stay identical from run to run; tracking shows them.
+    params.yaml that was changed meanwhile: DVC would record the new values for what the old ones made. Metrics, time,
+    memory go to runs/, which is nobody's input, so that results stay identical from run to run; tracking shows them.
     """
     started = time.time()
     full = f"{name}@{key}" if key else name
