@@ -29,7 +29,13 @@ PACKAGES = ("torch", "transformers", "peft", "open_clip_torch", "scipy", "scikit
 UNKNOWN = "unknown"
 NOTES = Path(__file__).with_name("notes.yaml")
 """What only people know about a report: whether its settings were chosen on its test objects before."""
-ARCHITECTURES = {"llama": "Llama", "mistral": "Mistral", "qwen2": "Qwen2", "gpt_neox": "GPT-NeoX"}
+ARCHITECTURES = {
+    "llama": "Llama",
+    "mistral": "Mistral",
+    "qwen2": "Qwen2",
+    "gpt_neox": "GPT-NeoX",
+    "tf_efficientnet_lite0": "EfficientNet-Lite0",
+}
 
 
 def provenance(

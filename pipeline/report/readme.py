@@ -16,8 +16,8 @@ from pipeline.weights import is_tiny
 
 MOST_LINES = 150
 CHANCE = (
-    "The base models are tiny and random, drawn from a seed and taught nothing: these figures are chance and prove only "
-    "that the chain runs."
+    "The base models are tiny and random, drawn from a seed and taught nothing: these figures are chance and prove "
+    "only that the chain runs."
 )
 ALPHA = 0.05
 VICUNA = 5e9

