@@ -42,6 +42,21 @@ def scale(
 
 
 @app.command()
+def weights(
+    name: Annotated[str, typer.Argument(help="smollm2, efficientnet-lite0, tiny-clip or tiny-llama.")],
+    to: Annotated[Path | None, typer.Option(help="Folder; weights/NAME by default.")] = None,
+) -> None:
+    """Make a base model as a folder of safetensors, from an installed package or (tiny) at random."""
+    from pipeline.runtime import quiet_libraries
+    from pipeline.weights.make import make
+
+    quiet_libraries()
+    folder = to or Path("weights") / name
+    make(name, folder)
+    typer.echo(f"{folder}: made; name it as encoder.weights or language.weights of `octopi scale`")
+
+
+@app.command()
 def page() -> None:
     """Write reports/index.html, one page over all reports that opens from disk."""
     from pipeline.report.page import write_page

@@ -139,7 +139,7 @@ class EncoderConfig(Section):
     convolutional network pretrained on synthetic pictures (section `pretrain`), with a per-frame classifier."""
     weights: str
     """Folder of the CLIP in open_clip's format: open_clip_config.json and open_clip_model.safetensors. With
-    `pretrained` it is the ablation's base encoder only."""
+    `pretrained` it is the ablation's base encoder only. The chain makes what is named below data/weights/."""
     prompts: Annotated[int, Field(ge=1, le=256)] = 8
     """Learnable prompts at each layer."""
     prompt_layers: Annotated[int, Field(ge=0)] = 0
@@ -182,6 +182,13 @@ class PretrainConfig(Section):
     seed: Seed = 0
 
 
+class TeachConfig(Section):
+    """Text-only teaching of a small base."""
+
+    base: str = ""
+    """Folder of the language model that is taught; empty: none is."""
+
+
 class CrossValidationConfig(Section):
     """Grouped cross-validation of encoders and their rivals over all objects with videos."""
 
@@ -198,13 +205,14 @@ class LanguageConfig(Section):
     """The language model and its generation."""
 
     weights: str
-    """Folder in transformers' format with a Llama-like model (safetensors) and a fast tokenizer."""
+    """Folder in transformers' format with a Llama-like model (safetensors) and a fast tokenizer. The chain makes what
+    is named below data/weights/."""
     dtype: DtypeName = "float32"
     """Number format of the frozen weights; whatever is trained stays in float32."""
     quantization: Quantization = "none"
     """`nf4`: hold the frozen linear layers in four bits (needs bitsandbytes and a CUDA device)."""
     system_prompt: str = ""
-    """Put before each conversation (Vicuna has one; the stand-in was made without)."""
+    """Put before each conversation (Vicuna has one)."""
     max_new_tokens: Annotated[int, Field(ge=1, le=4096)] = 256
     """Of an answer; fewer where the language model has no more positions. Longer answers are cut and marked."""
     generation_batch_size: Positive = 32
@@ -321,6 +329,7 @@ class Params(Section):
     encoder: EncoderConfig
     pretrain: PretrainConfig
     cross_validation: CrossValidationConfig
+    teach: TeachConfig = TeachConfig()
     language: LanguageConfig
     align: TrainConfig
     lora: LoraTrainConfig

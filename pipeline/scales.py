@@ -26,6 +26,8 @@ from pipeline.videos.files import list_videos, raise_errors
 from pipeline.videos.split import FEWEST_TRAINING_OBJECTS, assign_objects
 
 CONF = Path("conf")
+TAUGHT = "data/taught"
+"""What the chain makes of `teach.base`."""
 RECIPE = "encoder.recipe"
 HEADER = "# Written by `octopi scale`; change it with that command, or edit conf/ and run it again.\n"
 
@@ -104,8 +106,11 @@ def check_inputs(params: Params) -> None:
     if unknown:
         raise UserError(f"scenes.objects: {unknown[0]} is not in {params.data.catalogue}/objects.csv")
     check_objects(params, catalogue)
-    weights.check_encoder(Path(params.encoder.weights), params.frames.size)
-    weights.check_language(Path(params.language.weights))
+    backbone = getattr(params.encoder, "backbone", ("clip",))
+    weights.check_encoder(Path(params.encoder.weights), params.frames.size, backbone)
+    for key, base in (("teach.base", params.teach.base), ("language.weights", params.language.weights)):
+        if base not in ("", TAUGHT):
+            weights.check_language(Path(base), key)
 
 
 def check_objects(params: Params, catalogue: Catalogue) -> None:

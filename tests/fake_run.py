@@ -28,19 +28,17 @@ from pipeline.records import (
 from pipeline.scales import compose
 from pipeline.tasks.questions import build_questions, counts_by_task, pool_of
 from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.weights import is_tiny
 from tests.closure import ROOT
+from tests.models import model_folder
 
 VIDEOS_AN_OBJECT = 2
 
 
 def fake_params(*overrides: str) -> Params:
-    """The smoke scale with overrides; catalogue and weights are this repository's."""
-    here = {
-        "data.catalogue": "pipeline/physiclear",
-        "language.weights": "standins/llama",
-        "encoder.weights": "standins/clip",
-    }
-    return compose("smoke", [*(f"{key}='{ROOT / path}'" for key, path in here.items()), *overrides], conf=ROOT / "conf")
+    """The smoke scale with overrides; the catalogue is this repository's."""
+    here = f"data.catalogue='{ROOT / 'pipeline' / 'physiclear'}'"
+    return compose("smoke", [here, *overrides], conf=ROOT / "conf")
 
 
 def write_run(root: Path, params: Params, *, objects: Sequence[str] = (), skill: float = 0.6) -> Params:
@@ -54,6 +52,10 @@ def write_run(root: Path, params: Params, *, objects: Sequence[str] = (), skill:
     catalogue = load_catalogue(Path(params.data.catalogue))
     root.mkdir(parents=True, exist_ok=True)
     (root / "params.yaml").write_text(yaml.safe_dump(params.model_dump(mode="json"), sort_keys=False))
+    for folder in (params.encoder.weights, params.language.weights):
+        if is_tiny(folder):
+            (root / folder).parent.mkdir(parents=True, exist_ok=True)
+            (root / folder).symlink_to(model_folder(Path(folder).name))
     data, parts = root / "data", {o.object_id: o.splits["paper"] for o in catalogue.objects.values()}
     videos = [_video(o, i, rng) for o in sorted(objects or params.scenes.objects) for i in range(VIDEOS_AN_OBJECT)]
     assignments = [Assignment(video_id=v.video_id, object_id=v.object_id, part=parts[v.object_id]) for v in videos]

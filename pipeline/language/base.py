@@ -40,7 +40,7 @@ def load_tokenizer(folder: Path) -> PreTrainedTokenizerBase:
     Raises:
         UserError: where there is no end token, which answers are stopped by.
     """
-    check_language(folder)
+    check_language(folder, exists=True)
     tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True, use_fast=True)
     if tokenizer.eos_token is None:
         raise UserError(
@@ -63,7 +63,7 @@ def load_llm(folder: Path, dtype: torch.dtype, quantization: Quantization = "non
         UserError: for a missing folder or file, a pickle, a checkpoint that does not fit its configuration, or
             four bits where they cannot be had.
     """
-    check_language(folder)
+    check_language(folder, exists=True)
     own = _four_bits(dtype) if quantization == "nf4" else {}
     try:
         model, info = AutoModelForCausalLM.from_pretrained(

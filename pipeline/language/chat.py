@@ -1,4 +1,4 @@
-"""The one renderer of a conversation: training, evaluation and the stand-ins' pretraining all speak through it.
+"""The one renderer of a conversation: training and evaluation speak through it.
 
 The chat format is Vicuna v1.5's: `SYSTEM USER: question ASSISTANT: answer</s>USER: ...`. A video in a question becomes
 `<tact_start>`, one `<tact_frame>` a frame and `<tact_end>`; the model puts tactile embeddings in the frames' places.

@@ -23,7 +23,7 @@ from pipeline.io import write_text
 from pipeline.report.dataset import dataset_tables
 from pipeline.report.drawing import SIZE, draw_table, place_points, share, span
 from pipeline.report.load import KEYS, Report, load_report, read_frame
-from pipeline.report.readme import OTHER_MODELS, SMOKE, finding, origin, stands_on
+from pipeline.report.readme import OTHER_MODELS, finding, origin, stands_on
 from pipeline.report.tables import TABLES, difference, headline, measured, number, task_title, whole
 from pipeline.tasks import TASKS
 
@@ -146,7 +146,7 @@ def _chapter(report: Report, gaps: list[Gap]) -> dict[str, Any]:
         "name": name,
         "scale": scale,
         "source": source,
-        "finding": [*([SMOKE.strip("> \n")] if scale == "smoke" else []), *finding(report)],
+        "finding": finding(report),
         "tasks": tasks,
         "effects": effects,
         "points": points,

@@ -15,6 +15,7 @@ from typing import Any
 
 import yaml
 
+from pipeline.card import front_matter
 from pipeline.config import EncoderConfig, Params
 from pipeline.errors import UserError
 from pipeline.evaluation.intervals import coverage_note
@@ -26,11 +27,15 @@ CODE = ("pipeline", "stages", "conf", "dvc.yaml")
 """What a result can depend on. A commit of a report alone does not change its revision."""
 PACKAGES = ("torch", "transformers", "peft", "open_clip_torch", "scipy", "scikit-learn", "dvc")
 UNKNOWN = "unknown"
-ABOUT = "about.yaml"
-"""Beside the folders of weights, where people wrote down what the models were taught."""
 NOTES = Path(__file__).with_name("notes.yaml")
 """What only people know about a report: whether its settings were chosen on its test objects before."""
-ARCHITECTURES = {"llama": "Llama", "mistral": "Mistral", "qwen2": "Qwen2", "gpt_neox": "GPT-NeoX"}
+ARCHITECTURES = {
+    "llama": "Llama",
+    "mistral": "Mistral",
+    "qwen2": "Qwen2",
+    "gpt_neox": "GPT-NeoX",
+    "tf_efficientnet_lite0": "EfficientNet-Lite0",
+}
 
 
 def provenance(
@@ -92,21 +97,18 @@ def encoder_words(config: EncoderConfig) -> str:
 
 
 def base_model(root: Path, folder: str) -> dict[str, Any]:
-    """Folder, kind, size in parameters, hash of a base model, and what people wrote about what it was taught.
+    """Folder, kind, size in parameters, hash of a base model, and what its card says that it was taught.
 
     `parameters` are counted from the headers of its safetensors files. Where files are missing, they are 0 and the
-    hash is "unknown". `known_templates` says that it was taught in the wording of this pipeline's own questions.
+    hash is "unknown".
     """
     where = root / folder
-    about = where.parent / ABOUT
-    said = (yaml.safe_load(about.read_text(encoding="utf-8")) or {}).get(where.name, {}) if about.is_file() else {}
     return {
         "folder": folder,
         "kind": _kind(where),
         "parameters": sum(parameters(file) for file in sorted(where.glob("*.safetensors"))),
         "sha256": digest(where),
-        "taught": said.get("taught", ""),
-        "known_templates": bool(said.get("known_templates", False)),
+        "taught": str(front_matter(where).get("taught", "")),
     }
 
 
@@ -146,7 +148,8 @@ def _kind(folder: Path) -> str:
         return "CLIP"
     if not (folder / "config.json").is_file():
         return "model"
-    kind = str(json.loads((folder / "config.json").read_text(encoding="utf-8")).get("model_type", "model"))
+    config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    kind = str(config.get("model_type") or config.get("architecture", "model"))
     return ARCHITECTURES.get(kind, kind)
 
 

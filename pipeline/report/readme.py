@@ -12,9 +12,13 @@ import pandas as pd
 
 from pipeline.report.load import KEYS, Report, cells
 from pipeline.report.tables import TABLES, headline, measured, number, task_title
+from pipeline.weights import is_tiny
 
 MOST_LINES = 150
-SMOKE = "> **Scale `smoke`: its figures prove only that the chain runs.**\n"
+CHANCE = (
+    "The base models are tiny and random, drawn from a seed and taught nothing: these figures are chance and prove "
+    "only that the chain runs."
+)
 ALPHA = 0.05
 VICUNA = 5e9
 """Parameters below which a language model is no Vicuna 7b."""
@@ -38,7 +42,6 @@ def render_readme(report: Report, figures: Sequence[str]) -> str:
     said = report.provenance
     sections = [
         f"# {report.name}: what was measured\n",
-        *([SMOKE] if said["scale"] == "smoke" else []),
         "\n\n".join(finding(report)) + "\n",
         five_tasks(report),
         *([f"{OTHER_MODELS}\n"] if len(report.published) else []),
@@ -63,7 +66,10 @@ def render_readme(report: Report, figures: Sequence[str]) -> str:
 
 
 def finding(report: Report) -> list[str]:
-    """Three paragraphs: what made the figures; how far from chance; whether touch is used and what parts bring."""
+    """Three paragraphs: what made the figures; how far from chance; whether touch is used and what parts bring.
+
+    Where a base model is a random one, the first sentence says so.
+    """
     chance, rest = _against_chance(headline(report.scores)), [*_touch(report.effects), *_parts(report.effects)]
     return [" ".join(sentences) for sentences in (_who(report), chance, rest)]
 
@@ -97,7 +103,7 @@ def stands_on(said: dict[str, Any]) -> list[str]:
     objects = said["test_objects"]
     named = f" ({', '.join(objects)})" if objects else ""
     facts = [
-        f"**Language model:** {model_words(language)}." + (f" {NEAR_NULL}" if language["known_templates"] else ""),
+        f"**Language model:** {model_words(language)}." + (f" {NEAR_NULL}" if language.get("known_templates") else ""),
         f"**Tactile encoder:** {said['encoder']}. Base encoder of the ablation: {model_words(encoder)}.",
         f"**Test objects:** {len(objects)}{named}, {said['test_videos']} videos, split `{said['split']}`.",
         f"**Seeds:** {len(said['seeds'])} ({', '.join(map(str, said['seeds']))}).",
@@ -155,13 +161,14 @@ def _who(report: Report) -> list[str]:
     maker += f", {language['taught']}," if language["taught"] else ""
     maker += " made these figures"
     maker += " in place of the paper's Vicuna" if language["parameters"] < VICUNA else ""
-    maker += ": LoRA and OPD are near-null by construction" if language["known_templates"] else ""
+    maker += ": LoRA and OPD are near-null by construction" if language.get("known_templates") else ""
     clip = said["base_models"]["encoder"]
     encoder = said["encoder"].replace("the base CLIP", f"a {size_words(clip['parameters'])} {clip['kind']}")
     source = {"scenes": "synthetic", "videos": "real"}.get(said["source"], "")
     objects, seeds = _count(len(said["test_objects"]), "test object"), _count(len(said["seeds"]), "seed")
     about = f"Its tactile encoder was {encoder}; it answered about {source} videos of {objects}, under {seeds}."
-    return [f"{maker}.", about, *([said["settings"]] if said["settings"] else [])]
+    chance = [CHANCE] if any(is_tiny(model["folder"]) for model in said["base_models"].values()) else []
+    return [*chance, f"{maker}.", about, *([said["settings"]] if said["settings"] else [])]
 
 
 def _against_chance(rows: pd.DataFrame) -> list[str]:

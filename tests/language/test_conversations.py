@@ -24,16 +24,17 @@ from pipeline.videos.catalogue import load_catalogue
 from tests.checkpoints import write_llama
 from tests.closure import ROOT
 from tests.language.shared import material
+from tests.models import model_folder
 
 WORDS = st.text(
     alphabet=st.characters(codec="utf-8", exclude_categories=("Cs",), exclude_characters="<>{}"), max_size=60
 )
 
 
-@pytest.fixture(scope="module", params=["random", "standin"])
+@pytest.fixture(scope="module", params=["random", "tiny"])
 def tokenizer(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> PreTrainedTokenizerBase:
-    if request.param == "standin":
-        return load_tokenizer(ROOT / "standins" / "llama")
+    if request.param == "tiny":
+        return load_tokenizer(model_folder("tiny-llama"))
     return load_tokenizer(write_llama(tmp_path_factory.mktemp("llama")))
 
 

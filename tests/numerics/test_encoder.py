@@ -1,7 +1,7 @@
 """Encoders at their edges: frames without signal and with too much of it, late frames, batches of one.
 
 The towers and the pretrained network run in float64, float32 and bfloat16, and in float16 where a CUDA device is. CLIP
-is the committed stand-in; prompts and the network of difference pictures are random.
+is the tiny CLIP that the pipeline makes; prompts and the network of difference pictures are random.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from pipeline.records import Part
 from pipeline.runtime import seed_everything
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
-from tests.closure import ROOT
 from tests.encoders import PARTS, encoder_data, write_frames
+from tests.models import model_folder
 from tests.numerics.bounds import longest_sum, magnification, rounded
 from tests.numerics.harness import FLOAT32, FLOAT64, NETWORKS, Check, Format, formats
 
@@ -58,7 +58,7 @@ def classifier(kind: str) -> PropertyClassifier:
 
 def settings(kind: str) -> EncoderConfig:
     reference = "subtract" if kind == "pretrained" else "none"
-    return EncoderConfig(recipe=kind, weights=str(ROOT / "standins" / "clip"), reference=reference)
+    return EncoderConfig(recipe=kind, weights=str(model_folder("tiny-clip")), reference=reference)
 
 
 @cache

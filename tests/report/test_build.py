@@ -29,6 +29,7 @@ from pipeline.report.samples import choose_samples
 from pipeline.report.tables import TABLES, headline
 from tests.closure import ROOT
 from tests.fake_run import fake_params, write_run
+from tests.models import model_folder
 
 FILES = {
     *(
@@ -120,9 +121,9 @@ def test_the_readme_is_short_and_holds_the_papers_tables(written: Path) -> None:
 def test_provenance_counts_and_hashes_the_models(written: Path, tmp_path: Path) -> None:
     said = load_report(written).provenance
     language = said["base_models"]["language"]
-    assert (language["kind"], language["known_templates"]) == ("Llama", True)
+    assert (language["kind"], language["taught"]) == ("Llama", "drawn at random and taught nothing")
     assert 2.0e6 < language["parameters"] < 2.4e6
-    assert language["sha256"] == digest(ROOT / "standins" / "llama")
+    assert language["sha256"] == digest(model_folder("tiny-llama"))
     assert said["test_objects"] == ["bath_towel", "hairbrush_bristles", "ice_block", "toilet_brush_bristles"]
     assert said["seeds"] == [0, 1]
     assert said["properties"]["roughness"][0] == "smooth"

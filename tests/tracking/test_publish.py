@@ -219,7 +219,7 @@ def test_the_command_says_in_one_line_why_it_could_not(chain: FakeChain, monkeyp
 
 
 def test_stages_are_those_that_dvc_lists(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for part in ("pipeline", "stages", "standins", "conf", "reports"):
+    for part in ("pipeline", "stages", "conf", "reports"):
         (tmp_path / part).symlink_to(ROOT / part)
     shutil.copy(ROOT / "dvc.yaml", tmp_path)
     monkeypatch.chdir(tmp_path)
