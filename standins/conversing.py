@@ -6,7 +6,7 @@ import random
 import re
 from dataclasses import dataclass, replace
 
-from pipeline.language.chat import TACTILE, render
+from pipeline.language.chat import TACTILE, vicuna
 from pipeline.records import Opd, Turn
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Draft
@@ -65,7 +65,7 @@ def converse(world: World, task: str, mode: Opd, rng: random.Random, manner: Man
         Turn(user=_mark(t.user), assistant=_restyle(t.assistant, world, felt, draft, manner.style)) for t in turns
     ]
     filled[0] = filled[0].model_copy(update={"user": told + filled[0].user})
-    rendered = render(filled, system_prompt="", frames=0, eos=EOS, complete=True)
+    rendered = vicuna(filled, "", EOS, complete=True)
     writer, position = _Writer(Builder(task), felt, world, draft, manner, rng), 0
     for start, stop in rendered.answers:
         writer.question(rendered.text[position:start])

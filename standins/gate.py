@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Literal
 
 import torch
 
-from pipeline.language.chat import TACTILE, render
+from pipeline.language.chat import TACTILE, vicuna
 from pipeline.records import Opd, Part, Prediction, Question, Turn
 from pipeline.runtime import derive_seed
 from pipeline.tasks import TASKS
@@ -164,7 +164,7 @@ def prompts(items: Sequence[Item], said: Sequence[Sequence[str]]) -> list[str]:
     texts = []
     for item, own in zip(items, said, strict=True):
         turns = [Turn(user=t.user, assistant=a) for t, a in zip(item.turns, [*own, ""], strict=False)]
-        prompt = render(turns, system_prompt="", frames=0, eos=EOS, complete=False).text
+        prompt = vicuna(turns, "", EOS, complete=False).text
         texts.append(prompt + (item.given if len(turns) == len(item.turns) else ""))
     return texts
 

@@ -60,7 +60,7 @@ def pipeline_texts() -> list[str]:
     pool = Pool(part=Part.TRAIN, catalogue=real, videos={o: [f"{o}_0"] for o in real.objects})
     drafts = [t.draft(pool, i, rng) for t in TASKS.values() for i in range(t.strata(real)) for _ in range(3)]
     dialogues = [d for draft in drafts if draft is not None for d in draft.dialogues]
-    return [render(d.turns, system_prompt="", frames=2, eos=EOS, complete=True).text for d in dialogues]
+    return [render(d.turns, llama_tokenizer(), system_prompt="", frames=2, complete=True).text for d in dialogues]
 
 
 def test_folder_is_small() -> None:
@@ -123,8 +123,8 @@ def test_any_text_comes_back_exactly_with_right_offsets(text: str) -> None:
 def test_prompt_tokens_begin_the_whole_conversation(question: str, answer: str) -> None:
     tokenizer = llama_tokenizer()
     turns = [Turn(user=question, assistant=answer)]
-    prompt = render(turns, system_prompt="", frames=2, eos=EOS, complete=False).text
-    whole = render(turns, system_prompt="", frames=2, eos=EOS, complete=True).text
+    prompt = render(turns, tokenizer, system_prompt="", frames=2, complete=False).text
+    whole = render(turns, tokenizer, system_prompt="", frames=2, complete=True).text
     ids = tokenizer(prompt)["input_ids"]
     assert tokenizer(whole)["input_ids"][: len(ids)] == ids
 
@@ -154,7 +154,7 @@ def test_tactile_tokens_can_be_added_and_answers_are_labelled() -> None:
     add_tactile_tokens(tokenizer)
     assert len(tokenizer) == size + 3
     turns = [Turn(user="How does {tactile} feel?", assistant="It is hard."), Turn(user="Really?", assistant="Yes.")]
-    encoded = encode(render(turns, system_prompt="", frames=2, eos=EOS, complete=True), tokenizer)
+    encoded = encode(render(turns, tokenizer, system_prompt="", frames=2, complete=True), tokenizer)
     assert tokenizer.decode([i for i in encoded.labels if i >= 0]) == f" It is hard.{EOS} Yes.{EOS}"
 
 

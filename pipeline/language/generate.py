@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from typing import Any, cast
 
 import torch
@@ -11,7 +12,7 @@ from transformers import PreTrainedTokenizerBase, StoppingCriteria, StoppingCrit
 
 from pipeline.embeddings import TactileFeatures
 from pipeline.errors import UserError
-from pipeline.language.chat import encode, render
+from pipeline.language.chat import encode, end_ids, render
 from pipeline.language.conversations import check_length, evaluation_features, pad_features
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.records import Opd, Prediction, Question, Turn
@@ -102,13 +103,7 @@ def answer(
 
 
 def _prompt(turns: Sequence[Turn], tokenizer: PreTrainedTokenizerBase, settings: GenerationSettings) -> tuple[int, ...]:
-    rendered = render(
-        turns,
-        system_prompt=settings.system_prompt,
-        frames=settings.per_video,
-        eos=str(tokenizer.eos_token),
-        complete=False,
-    )
+    rendered = render(turns, tokenizer, system_prompt=settings.system_prompt, frames=settings.per_video, complete=False)
     return encode(rendered, tokenizer).input_ids
 
 
@@ -134,16 +129,16 @@ def _generate(
         stopping_criteria=StoppingCriteriaList([_Limits(room)]),
         do_sample=False,
         num_beams=1,
-        eos_token_id=tokenizer.eos_token_id,
+        eos_token_id=list(end_ids(tokenizer)),
         pad_token_id=pad,
     )
     return [_read(row[:most], tokenizer) for row, most in zip(new.tolist(), room.tolist(), strict=True)]
 
 
 def _read(tokens: list[int], tokenizer: PreTrainedTokenizerBase) -> _Generated:
-    """What one row says, up to its end token; behind that is padding."""
-    end = tokenizer.eos_token_id
-    truncated = end not in tokens
-    kept = tokens if truncated else tokens[: tokens.index(end)]
+    """What one row says, up to its first end token; behind that is padding."""
+    ends = end_ids(tokenizer)
+    kept = list(takewhile(lambda token: token not in ends, tokens))
+    truncated = len(kept) == len(tokens)
     text = tokenizer.decode(kept, skip_special_tokens=True).strip()
     return _Generated(text=text, tokens=len(kept) + (not truncated), truncated=truncated)
