@@ -5,7 +5,6 @@ The reference is transformers' own: the same format written with its `generation
 
 from __future__ import annotations
 
-import copy
 from pathlib import Path
 
 import pytest
@@ -27,7 +26,8 @@ VICUNA = (
 )
 LLAMA3 = (
     "{{ bos_token }}{% for m in messages %}<|head|>{{ m.role }}<|/head|>\n\n"
-    "{% if m.role == 'assistant' %}{% generation %}{{ m.content | trim }}<|eot|>{% endgeneration %}{% else %}{{ m.content | trim }}<|eot|>{% endif %}{% endfor %}"
+    "{% if m.role == 'assistant' %}{% generation %}{{ m.content | trim }}<|eot|>{% endgeneration %}"
+    "{% else %}{{ m.content | trim }}<|eot|>{% endif %}{% endfor %}"
     "{% if add_generation_prompt %}<|head|>assistant<|/head|>\n\n{% endif %}"
 )
 """As Llama-3 writes it, with shorter names."""
@@ -181,5 +181,5 @@ def test_nothing_that_a_folder_brings_is_run(tmp_path: Path) -> None:
     file = folder / "tokenizer_config.json"
     text = file.read_text().rstrip().rstrip("}")
     file.write_text(text + ', "auto_map": {"AutoTokenizer": [null, "own.Own"]}}')
-    copy.deepcopy(load_tokenizer(folder))
+    load_tokenizer(folder)
     assert not ran.exists()
