@@ -208,7 +208,8 @@ class LanguageConfig(Section):
     """Folder in transformers' format with a Llama-like model (safetensors) and a fast tokenizer. The chain makes what
     is named below data/weights/."""
     dtype: DtypeName = "float32"
-    """Number format of the frozen weights; whatever is trained stays in float32."""
+    """Number format of the frozen weights; whatever is trained stays in float32. `auto`: bfloat16 where the device
+    computes it in hardware, else float32."""
     quantization: Quantization = "none"
     """`nf4`: hold the frozen linear layers in four bits (needs bitsandbytes and a CUDA device)."""
     system_prompt: str = ""
@@ -247,8 +248,9 @@ class LoraTrainConfig(TrainConfig):
     rank: Annotated[int, Field(ge=1, le=1024)] = 128
     alpha: Annotated[float, Field(gt=0)] = 256
     dropout: Annotated[float, Field(ge=0, lt=1)] = 0.05
-    target_modules: tuple[str, ...] = Field(default=("q_proj", "k_proj"), min_length=1)
-    """Linear layers that get an adapter (the paper does not say; the published code: q_proj and k_proj)."""
+    target_modules: Literal["all-linear"] | Annotated[tuple[str, ...], Field(min_length=1)] = ("q_proj", "k_proj")
+    """Linear layers that get an adapter (the paper does not say; the published code: q_proj and k_proj); `all-linear`:
+    all but the one that gives the logits."""
 
 
 class AblationConfig(Section):

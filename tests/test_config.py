@@ -68,6 +68,7 @@ def test_paper_scales_have_the_papers_hyper_parameters(scale: str) -> None:
         (["align.batch_size=10"], ["align", "does not divide"]),
         (["data.dir=elsewhere"], ["data.dir", "data/scenes/videos"]),
         (["lora.target_modules=[]"], ["lora.target_modules"]),
+        (["lora.target_modules=all"], ["lora.target_modules", "'all-linear'"]),
         (["encoder.learning_rate=nan"], ["encoder.learning_rate"]),
         (["runtime.device=tpu"], ["runtime.device", "'cuda'"]),
         (["lora.alpha=1e309"], ["lora.alpha", "finite"]),
