@@ -121,7 +121,7 @@ def draw(rng: random.Random, *, whole: bool, held: bool = False, follow_ups: int
             continue
         place: Place = "behind"
         if kind not in ("match", "sort"):
-            weights = (9, 4, 7, 3) if whole else (12, 5, 3, 0)
+            weights = (9, 4, 7, 3) if whole else (13, 5, 2, 0)
             place = rng.choices(("behind", "ahead", "told", "earlier"), weights)[0]
         turns, learnt = _place(*asked, _describe_all(things, whole, rng), place, rng)
         for _ in range(rng.randint(0, follow_ups)):
@@ -143,7 +143,7 @@ def _things(rng: random.Random, count: int, whole: bool, held: bool) -> Things:
     topics = list(dict.fromkeys(topics))
     rng.shuffle(topics)
     levels = tuple({topic: rng.randrange(3) for topic in topics} for _ in range(count))
-    scheme = rng.choice(("ordinals", "letters", "names"))
+    scheme = rng.choices(("ordinals", "letters", "names"), (2, 2, 1))[0]
     if scheme == "ordinals":
         plain, noun = ("first", "second", "third"), rng.choice(("", " one", " thing"))
         labels, names = tuple(f"{p.capitalize()}:" for p in plain), tuple(f"the {p}{noun}" for p in plain)
