@@ -219,6 +219,39 @@ class LanguageConfig(Section):
     generation_batch_size: Positive = 32
 
 
+class TeachConfig(Section):
+    """Teaching a small language model, in text, to reason about described things (LoRA on all linear layers, AdamW)."""
+
+    base: str = ""
+    """Folder of the language model that is taught, for language.weights=data/taught; empty: nothing is taught."""
+    rank: Annotated[int, Field(ge=1, le=1024)] = 64
+    alpha: Annotated[float, Field(gt=0)] = 128
+    learning_rate: Rate = 5e-4
+    warmup: Annotated[int, Field(ge=0)] = 10
+    """Updates until the rate is reached; it stays there."""
+    batch_size: Positive = 32
+    """Items an update."""
+    micro_batch_size: Positive = 8
+    """Items at a time, of like length."""
+    max_updates: Positive = 200
+    """Longest either phase may take: short items, then whole descriptions."""
+    check_every: Positive = 20
+    """Updates between two looks at items that are not trained on."""
+    check_items: Positive = 64
+    advance: Fraction = 0.93
+    """Share of short items right at which whole descriptions begin."""
+    finish: Fraction = 0.97
+    """Share of whole descriptions right at which teaching ends."""
+    gate_questions: Annotated[int, Field(ge=0)] = 100
+    """Questions of each task that the untaught and the taught model are asked in words."""
+
+    @model_validator(mode="after")
+    def _batches_divide(self) -> Self:
+        if self.batch_size % self.micro_batch_size:
+            raise ValueError(f"micro_batch_size {self.micro_batch_size} does not divide batch_size {self.batch_size}")
+        return self
+
+
 class TrainConfig(Section):
     """One stage of language training (AdamW, cosine)."""
 
@@ -333,6 +366,7 @@ class Params(Section):
     cross_validation: CrossValidationConfig
     teach: TeachConfig = TeachConfig()
     language: LanguageConfig
+    teach: TeachConfig = TeachConfig()
     align: TrainConfig
     lora: LoraTrainConfig
     ablation: AblationConfig

@@ -299,6 +299,18 @@ class Measurement(Record):
     value: float
 
 
+class GateScore(Record):
+    """How a language model answers one task's questions about objects that are described in words."""
+
+    model: str
+    """`untaught`, `taught`, or another name that a report gives it."""
+    task: str
+    n: int = Field(ge=0)
+    right: int = Field(ge=0)
+    unread: int = Field(ge=0)
+    """Answers that name no choice, or several; they count as wrong."""
+
+
 Flip = Literal["none", "horizontal", "vertical", "both"]
 """How a clip is mirrored in training."""
 
