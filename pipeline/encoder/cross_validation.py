@@ -29,7 +29,7 @@ from pipeline.weights import clip_file
 if TYPE_CHECKING:
     from pipeline.encoder.clips import EncoderData
     from pipeline.encoder.frame_classifier import Clips
-    from pipeline.encoder.model import FrameEncoder, PropertyClassifier
+    from pipeline.encoder.model import FrameEncoder
 
 VALIDATION = 8
 """One in so many training objects is set aside where a training chooses its best epoch."""
@@ -222,7 +222,9 @@ def _features(encoder: FrameEncoder, candidate: Candidate, data: CrossValidation
 def _gradient(candidate: Candidate, data: CrossValidationData) -> Predict:
     from pipeline.encoder import finetune
     from pipeline.encoder.clips import classify
+    from pipeline.encoder.model import Heads, PropertyClassifier
     from pipeline.encoder.recipes import property_classifier
+    from pipeline.encoder.scene_encoder import SceneEncoder
 
     limit_threads(data.runtime.threads)
     recipe = "release" if candidate.recipe == "release" else "paper"
@@ -231,8 +233,11 @@ def _gradient(candidate: Candidate, data: CrossValidationData) -> Predict:
 
     def predict(fold: Fold) -> Labels:
         clips, seed, inputs = _training(candidate, data, store, fold)
-        scratch = candidate.recipe == "scratch"
-        model = _from_scratch(data.classes) if scratch else property_classifier(config, data.classes)
+        if candidate.recipe == "scratch":
+            encoder = SceneEncoder()
+            model = PropertyClassifier(encoder, Heads(encoder.dim, data.classes), data.classes)
+        else:
+            model = property_classifier(config, data.classes)
         finetune.train_classifier(model, clips, config, data.runtime, seed=seed, inputs=inputs)
         found: dict[str, list[int]] = {}
         for record in classify(model, clips, [Part.TEST], config.batch_size, device):
@@ -246,7 +251,6 @@ def _gradient(candidate: Candidate, data: CrossValidationData) -> Predict:
 def _tuned(candidate: Candidate, data: CrossValidationData) -> Predict:
     """The trunks have seen no label and stay as they are, so they are run once for all folds."""
     from pipeline.encoder import finetune
-    from pipeline.encoder.clips import EncoderData
     from pipeline.encoder.tuned import FLIPS, AboveTrunks, Trunks, base_encoder, property_classifier, run_trunks
 
     limit_threads(data.runtime.threads)
@@ -271,10 +275,7 @@ def _tuned(candidate: Candidate, data: CrossValidationData) -> Predict:
 def _training(
     candidate: Candidate, data: CrossValidationData, store: FrameStore, fold: Fold
 ) -> tuple[EncoderData, int, list[Path | str]]:
-    """A fold's videos in parts, of which one is set aside to choose the epoch by; the seed; what its training depends on.
-
-    torch is seeded.
-    """
+    """A fold's videos in parts, some set aside to choose the epoch by; the seed; what its training depends on."""
     from pipeline.encoder.clips import EncoderData
 
     seed = derive_seed("gradient", fold.repeat, fold.number) % 2**31
@@ -288,14 +289,6 @@ def _training(
     }
     inputs: list[Path | str] = [repr(candidate), repr(data.labels.tolist()), repr(sorted(parts.items())), *data.files]
     return EncoderData(store, data.catalogue, data.assignments(parts), data.per_video), seed, inputs
-
-
-def _from_scratch(classes: Sequence[int]) -> PropertyClassifier:
-    from pipeline.encoder.model import Heads, PropertyClassifier
-    from pipeline.encoder.scene_encoder import SceneEncoder
-
-    encoder = SceneEncoder()
-    return PropertyClassifier(encoder, Heads(encoder.dim, classes), classes)
 
 
 KINDS: dict[str, Callable[[Candidate, CrossValidationData], Predict]] = {

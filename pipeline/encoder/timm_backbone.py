@@ -99,7 +99,7 @@ def load_backbone(config: EncoderConfig, *, tuned: bool) -> TimmBackbone:
     logging.getLogger("timm").setLevel(logging.WARNING)
     try:
         model = timm.create_model(f"local-dir:{folder}", pretrained=True)
-    except (RuntimeError, ValueError, KeyError, TypeError, OSError, SafetensorError) as error:
+    except (RuntimeError, ValueError, LookupError, TypeError, AttributeError, OSError, SafetensorError) as error:
         reason = " ".join(str(error).split())[:200]
         raise UserError(f"encoder.weights: {folder} does not fit its config.json ({reason})") from None
     stages = len(getattr(model, "feature_info", ()))
