@@ -57,7 +57,7 @@ class Trunks:
         return [output[self.rows[video_id]] for output in self.outputs[flip]]
 
 
-@torch.inference_mode()
+@torch.no_grad()
 def run_trunks(
     encoder: SideBySide,
     data: EncoderData,
