@@ -161,13 +161,13 @@ class EncoderConfig(Section):
         named = ",".join(self.backbone)
         if len(set(self.backbone)) < len(self.backbone):
             raise ValueError(f"encoder.backbone=[{named}] names one twice")
-        if "scenes" in self.backbone and self.reference != "subtract":
-            raise ValueError("encoder.backbone: scenes was pretrained on differences: set encoder.reference=subtract")
         if self.recipe in CLIP_RECIPES and self.backbone != ("clip",):
             raise ValueError(
                 f"encoder.recipe={self.recipe} is for CLIP alone, but encoder.backbone=[{named}]; set "
                 "encoder.backbone=[clip] and encoder.weights, or encoder.recipe=tuned"
             )
+        if "scenes" in self.backbone and self.reference != "subtract":
+            raise ValueError("encoder.backbone: scenes was pretrained on differences: set encoder.reference=subtract")
         return self
 
 

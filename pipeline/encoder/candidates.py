@@ -102,7 +102,8 @@ def check_candidates(names: Sequence[str], config: EncoderConfig) -> None:
             hint = f"did you mean {close[0]}? " if close else ""
             raise UserError(f"cross_validation.models: {name} is no model; {hint}known: {', '.join(CANDIDATES)}")
         candidate = CANDIDATES[name]
-        if "clip" in candidate.backbone and not (Path(config.weights) / CLIP_CONFIG).is_file():
+        clip = "clip" in config.backbone or (Path(config.weights) / CLIP_CONFIG).is_file()
+        if "clip" in candidate.backbone and not clip:
             raise UserError(
                 f"cross_validation.models: {name} needs a CLIP, but encoder.weights={config.weights} has no "
                 f"{CLIP_CONFIG}; leave it out, or name a CLIP's folder"

@@ -93,7 +93,7 @@ def encoder_words(config: EncoderConfig) -> str:
     words = {
         "paper": "the base CLIP with visual prompt tuning",
         "release": "the base CLIP with visual prompt tuning as the published code has it",
-        "tuned": f"{' beside '.join(BACKBONE_WORDS.get(name, name) for name in config.backbone)}, tuned on the properties",
+        "tuned": " beside ".join(BACKBONE_WORDS.get(n, n) for n in config.backbone) + ", tuned on the properties",
     }[config.recipe]
     return words + (" on pictures of the difference to the untouched gel" if config.reference == "subtract" else "")
 
