@@ -23,10 +23,14 @@ QuestionCounts = dict[str, Annotated[int, Field(ge=0)]]
 
 Recipe = Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]*$")]
 """A name in `pipeline.encoder.recipes.RECIPES`; `octopi scale` checks that it is one."""
+CLIP_RECIPES = ("paper", "release")
+"""Recipes that are for `encoder.backbone=[clip]` alone."""
 Selection = Literal["salient", "release", "uniform", "contact", "adaptive"]
 
 SCENES_DIR = Path("data/scenes/videos")
 """Where the chain puts the videos that it makes itself."""
+PRETRAINED = Path("data/pretrained/encoder.safetensors")
+"""Where the chain puts the network that it pretrains on synthetic pictures, the backbone `scenes`."""
 
 
 class Section(BaseModel):
@@ -135,11 +139,16 @@ class EncoderConfig(Section):
     """The tactile encoder and its training on property labels."""
 
     recipe: Recipe = "paper"
-    """`paper`: CLIP with visual prompts, three heads. `release`: the same as the published code has it. `pretrained`: a
-    convolutional network pretrained on synthetic pictures (section `pretrain`), with a per-frame classifier."""
+    """`paper`: CLIP with visual prompts, three heads. `release`: the same as the published code has it. `tuned`: a
+    frame classifier on the features of any backbones, then their last stage, or prompts, with it."""
+    backbone: tuple[str, ...] = Field(default=("clip",), min_length=1)
+    """Names in `pipeline.encoder.backbones.BACKBONES`; of several, features stand side by side. `clip`: a ViT of
+    open_clip's. `timm`: a network of timm's. `scenes`: the one that the chain pretrains (section `pretrain`)."""
     weights: str
-    """Folder of the CLIP in open_clip's format: open_clip_config.json and open_clip_model.safetensors. With
-    `pretrained` it is the ablation's base encoder only. The chain makes what is named below data/weights/."""
+    """Folder of `clip` in open_clip's format (open_clip_config.json and open_clip_model.safetensors), or of `timm` in
+    timm's (config.json and model.safetensors). The chain makes what is named below data/weights/."""
+    feature_stage: Annotated[int, Field(ge=0, le=200)] = 3
+    """`timm`: which of the network's stages (a transformer: blocks) is read, from 0 on; what follows is not used."""
     prompts: Annotated[int, Field(ge=1, le=256)] = 8
     """Learnable prompts at each layer."""
     prompt_layers: Annotated[int, Field(ge=0)] = 0
@@ -149,7 +158,7 @@ class EncoderConfig(Section):
     learning_rate: Rate = 1e-3
     weight_decay: Annotated[float, Field(ge=0, lt=1)] = 0.0
     flip_probability: Annotated[float, Field(ge=0, le=1)] = 0.5
-    """Chance of each of the two flips in training. None of these from `prompts` on concerns `pretrained`."""
+    """Chance of each of the two flips in training."""
     reference: Literal["none", "subtract"] = "none"
     """`subtract`: show each frame's difference to the video's no-contact reference in place of the frame."""
     standardize: bool = False
@@ -158,14 +167,22 @@ class EncoderConfig(Section):
     """Frames at a time when embeddings are computed."""
 
     @model_validator(mode="after")
-    def _pretrained_sees_differences(self) -> Self:
-        if self.recipe == "pretrained" and self.reference != "subtract":
-            raise ValueError("encoder.recipe=pretrained was pretrained on differences: set encoder.reference=subtract")
+    def _backbones_fit(self) -> Self:
+        named = ",".join(self.backbone)
+        if len(set(self.backbone)) < len(self.backbone):
+            raise ValueError(f"encoder.backbone=[{named}] names one twice")
+        if self.recipe in CLIP_RECIPES and self.backbone != ("clip",):
+            raise ValueError(
+                f"encoder.recipe={self.recipe} is for CLIP alone, but encoder.backbone=[{named}]; set "
+                "encoder.backbone=[clip] and encoder.weights, or encoder.recipe=tuned"
+            )
+        if "scenes" in self.backbone and self.reference != "subtract":
+            raise ValueError("encoder.backbone: scenes was pretrained on differences: set encoder.reference=subtract")
         return self
 
 
 class PretrainConfig(Section):
-    """Pretraining of the pretrained recipe's encoder on pictures of invented objects."""
+    """Pretraining of the backbone `scenes` on pictures of invented objects."""
 
     objects: Annotated[int, Field(ge=8, le=1_000_000)] = 4000
     """Objects that are invented; each is drawn once."""
@@ -180,13 +197,6 @@ class PretrainConfig(Section):
     augment: bool = True
     """Vary how strong each picture's light is, and mirror it."""
     seed: Seed = 0
-
-
-class TeachConfig(Section):
-    """Text-only teaching of a small base."""
-
-    base: str = ""
-    """Folder of the language model that is taught; empty: none is."""
 
 
 class CrossValidationConfig(Section):
@@ -364,9 +374,8 @@ class Params(Section):
     encoder: EncoderConfig
     pretrain: PretrainConfig
     cross_validation: CrossValidationConfig
-    teach: TeachConfig = TeachConfig()
+    teach: TeachConfig
     language: LanguageConfig
-    teach: TeachConfig = TeachConfig()
     align: TrainConfig
     lora: LoraTrainConfig
     ablation: AblationConfig

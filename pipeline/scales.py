@@ -14,6 +14,7 @@ from pydantic import BaseModel
 
 from pipeline import weights
 from pipeline.config import Params
+from pipeline.encoder.backbones import check_backbones
 from pipeline.encoder.candidates import check_candidates
 from pipeline.encoder.recipes import check_recipe
 from pipeline.errors import UserError
@@ -88,7 +89,8 @@ def check_inputs(params: Params) -> None:
     """Raise UserError where something that the scale needs is not there: videos, catalogue, objects, tasks, weights."""
     catalogue = load_catalogue(Path(params.data.catalogue))
     check_recipe(params.encoder.recipe)
-    check_candidates(params.cross_validation.models, params.encoder.recipe)
+    check_backbones(params.encoder.backbone)
+    check_candidates(params.cross_validation.models, params.encoder)
     counts_by_task(params.questions, "train")
     counts_by_task(params.questions, "evaluation")
     launcher = shlex.split(params.runtime.launcher)

@@ -3,6 +3,7 @@
 import sys
 from pathlib import Path
 
+from pipeline.config import PRETRAINED
 from pipeline.encoder.clips import EncoderData, classify
 from pipeline.encoder.finetune import finetune, write_encoder_card
 from pipeline.io import read_table, write_table
@@ -29,7 +30,8 @@ def main() -> None:
         )
         inputs = [DATA / "frames" / name for name in (TABLE_FILE, REFERENCES_FILE)] + [DATA / "splits.parquet"]
         inputs.append(clip_file(Path(params.encoder.weights)))
-        pretrained = DATA / "pretrained" / "encoder.safetensors"
+        if "scenes" in params.encoder.backbone:
+            inputs.append(PRETRAINED)
         with live(run) as callbacks:
             model, history = finetune(
                 data,
@@ -37,7 +39,6 @@ def main() -> None:
                 params.runtime,
                 seed=params.seed + seed,
                 inputs=inputs,
-                pretrained=pretrained,
                 callbacks=callbacks,
             )
         device = resolve_device(params.runtime.device)
@@ -46,7 +47,7 @@ def main() -> None:
         save_trainable(model, out / "encoder.safetensors")
         write_table(out / "history.parquet", Measurement, history)
         write_table(out / "classifications.parquet", Classification, classified)
-        write_encoder_card(out, data, params.encoder, params.seed + seed, pretrained, params.data.source)
+        write_encoder_card(out, data, params.encoder, params.seed + seed, params.data.source)
         run.finish_training(history)
         for part in (Part.VALIDATION, Part.TEST):
             chosen = [c for c in classified if c.part == part]

@@ -213,10 +213,19 @@ def test_a_recipe_brings_its_settings_and_gives_way_to_yours() -> None:
         composed = compose("smoke", [f"encoder.recipe={recipe}"], conf=CONF)
         assert composed.encoder.recipe == recipe
         assert composed.language == smoke.language
-        assert needs_pretraining(recipe, composed.cross_validation.models) == (recipe == "pretrained")
-    release = compose("small", ["encoder.recipe=release"], conf=CONF).encoder
+        assert composed.encoder.backbone == ("clip",)
+        assert not needs_pretraining(composed.encoder, composed.cross_validation.models)
+    scenes = compose("smoke", ["encoder.recipe=tuned", "encoder.backbone=[scenes]"], conf=CONF)
+    assert needs_pretraining(scenes.encoder, ())
+    assert needs_pretraining(smoke.encoder, ("trees", "pretrained-raw"))
+    clip = "encoder.backbone=[clip]"
+    release = compose("small", ["encoder.recipe=release", clip], conf=CONF).encoder
     assert {name: getattr(release, name) for name in RELEASE} == RELEASE, "the candidate is the recipe"
-    own = compose("small", ["encoder.recipe=release", "encoder.epochs=3"], conf=CONF).encoder
+    own = compose("small", ["encoder.recipe=release", clip, "encoder.epochs=3"], conf=CONF).encoder
     assert (own.epochs, own.batch_size) == (3, RELEASE["batch_size"])
-    with pytest.raises(UserError, match=r"encoder.recipe=pretrained .* set encoder.reference=subtract"):
-        compose("smoke", ["encoder.recipe=pretrained", "encoder.reference=none"], conf=CONF)
+    with pytest.raises(UserError, match=r"scenes was pretrained on differences: set encoder.reference=subtract"):
+        compose("smoke", ["encoder.recipe=tuned", "encoder.backbone=[scenes]", "encoder.reference=none"], conf=CONF)
+    with pytest.raises(
+        UserError, match=r"encoder.recipe=paper is for CLIP alone, but encoder.backbone=\[timm,scenes\]"
+    ):
+        compose("small", ["encoder.recipe=paper"], conf=CONF)

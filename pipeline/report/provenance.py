@@ -86,12 +86,19 @@ def provenance(
     }
 
 
+BACKBONE_WORDS = {
+    "clip": "the base CLIP with visual prompts",
+    "timm": "the network of encoder.weights",
+    "scenes": "a convolutional network with synthetic pretraining",
+}
+
+
 def encoder_words(config: EncoderConfig) -> str:
     """What the fine-tuned tactile encoder is, in words."""
     words = {
         "paper": "the base CLIP with visual prompt tuning",
         "release": "the base CLIP with visual prompt tuning as the published code has it",
-        "pretrained": "a convolutional network with synthetic pretraining (not CLIP)",
+        "tuned": " beside ".join(BACKBONE_WORDS.get(n, n) for n in config.backbone) + ", tuned on the properties",
     }[config.recipe]
     return words + (" on pictures of the difference to the untouched gel" if config.reference == "subtract" else "")
 

@@ -78,13 +78,13 @@ def test_two_processes_train_like_one(project: Project) -> None:
         torch.testing.assert_close(value, results[1][name], atol=1e-6, rtol=1e-5)
 
 
-@pytest.mark.parametrize("recipe", ["release", "pretrained"])
+@pytest.mark.parametrize("recipe", ["release", "tuned"])
 def test_other_recipes_go_through_to_the_embeddings(project: Project, recipe: str) -> None:
-    smaller = ("pretrain.objects=16", "pretrain.steps=3") if recipe == "pretrained" else ()
+    smaller = ("encoder.backbone=[clip,scenes]", "pretrain.objects=16", "pretrain.steps=3") if recipe == "tuned" else ()
     project.run("octopi", "scale", *REDUCED, f"encoder.recipe={recipe}", *smaller, "encoder.epochs=1")
     project.run("dvc", "repro", "embed")
     trained = load_file(project.folder / "data" / "encoder" / "0" / "encoder.safetensors")
-    assert ("dependence" in trained) == (recipe == "pretrained")
+    assert ("dependence" in trained) == (recipe == "tuned")
     embeddings = load_file(project.folder / "data" / "embeddings" / "finetuned-0" / "embeddings.safetensors")
     assert all(value.isfinite().all() for value in embeddings.values())
     project.run("octopi", "scale", *REDUCED)

@@ -144,11 +144,15 @@ def test_provenance_counts_and_hashes_the_models(written: Path, tmp_path: Path) 
 
 @pytest.mark.parametrize(
     ("recipe", "words"),
-    [("paper", "CLIP with visual prompt tuning"), ("pretrained", "(not CLIP) on pictures of the difference")],
+    [
+        ("paper", "CLIP with visual prompt tuning"),
+        ("tuned", "synthetic pretraining, tuned on the properties on pictures of the difference"),
+    ],
 )
 def test_the_encoder_is_called_what_it_is(recipe: str, words: str) -> None:
-    reference = "subtract" if recipe == "pretrained" else "none"
-    assert words in encoder_words(fake_params(f"encoder.recipe={recipe}", f"encoder.reference={reference}").encoder)
+    backbone, reference = ("scenes", "subtract") if recipe == "tuned" else ("clip", "none")
+    changes = [f"encoder.recipe={recipe}", f"encoder.backbone=[{backbone}]", f"encoder.reference={reference}"]
+    assert words in encoder_words(fake_params(*changes).encoder)
 
 
 def test_samples_are_the_first_right_and_wrong_answer_of_each_task(written: Path) -> None:
