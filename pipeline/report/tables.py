@@ -11,14 +11,14 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.report.load import ALL_SEEDS, CROSS_VALIDATION, HEADS, KEYS, VALIDATION_HEADS, cells
+from pipeline.report.load import ALL_SEEDS, CROSS_VALIDATION, DESCRIBED, HEADS, KEYS, VALIDATION_HEADS, cells
 from pipeline.tasks import TASKS
 
 Select = Callable[[pd.DataFrame], "pd.Series[bool]"]
 FULL = {"encoder": "finetuned", "lora": "with", "opd": "all"}
 CHOICE, COMBINED = "choice", "combined"
-NOT_ANSWERED = (HEADS, VALIDATION_HEADS, CROSS_VALIDATION)
-"""Tasks of scores.csv without a language model."""
+NOT_ANSWERED = (HEADS, VALIDATION_HEADS, CROSS_VALIDATION, DESCRIBED)
+"""Tasks of scores.csv that no language model with touch answered."""
 PUBLISHED_MODELS = ("7b", "13b", "CLIP")
 SYSTEM_WORDS = {"base": "base encoder", "without": "without LoRA", "none": "without OPD", "needed": "OPD as needed"}
 ENCODERS = {"finetuned": "fine-tuned", "base": "base"}
@@ -93,6 +93,7 @@ def task_title(task: str) -> str:
         HEADS: "Property heads",
         VALIDATION_HEADS: "Property heads, validation videos",
         CROSS_VALIDATION: "Cross-validation",
+        DESCRIBED: "Described objects",
         **{name: task.title for name, task in TASKS.items()},
     }
     return f"{titles[task]} ({task})" if task in TASKS else titles.get(task, task)
@@ -102,7 +103,7 @@ def system(row: dict[str, Any]) -> str:
     """A variant by what it leaves out of the full system."""
     if row["task"] in (HEADS, VALIDATION_HEADS):
         return "property heads, no language model"
-    if row["task"] == CROSS_VALIDATION:
+    if row["task"] in (CROSS_VALIDATION, DESCRIBED):
         return str(row["encoder"])
     words = [SYSTEM_WORDS[row[axis]] for axis in FULL if row[axis] in SYSTEM_WORDS]
     return ", ".join(words) or "Octopi (full system)"
@@ -121,21 +122,17 @@ COLUMNS: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
     "measure": ("Measure", lambda row: "all properties right" if row["measure"] == COMBINED else row["measure"]),
     "system": ("System", system),
     "encoder": ("Encoder", lambda row: ENCODERS.get(row["encoder"], row["encoder"])),
-    "lora": ("LoRA", _text("lora")),
-    "opd": ("OPD", _text("opd")),
-    "touch": ("Touch", _text("touch")),
+    **{name: (title, _text(name)) for name, title in (("lora", "LoRA"), ("opd", "OPD"), ("touch", "Touch"))},
     "measured": ("Measured % [95 %]", measured),
     "n": ("n", _count("n")),
     "chance": ("Chance %", lambda row: number(row["chance"], scale=100)),
     "unread": ("Unread %", lambda row: number(row["unread"] / row["n"], scale=100)),
-    "part": ("Part", _text("part")),
-    "change": ("Change", _text("change")),
+    **{name: (name.capitalize(), _text(name)) for name in ("part", "change")},
     "difference": ("Difference, points [95 %]", difference),
     "p": ("p", _count("p", 3)),
     "p_holm": ("p, Holm", _count("p_holm", 3)),
     "smallest": ("Smallest that could be found", lambda row: number(row["smallest_effect"], scale=100)),
-    "objects": ("Objects", _count("objects")),
-    "seeds": ("Seeds", _count("seeds")),
+    **{name: (name.capitalize(), _count(name)) for name in ("objects", "seeds")},
 }
 """Heading of a column, and how its cell is written."""
 
@@ -226,6 +223,15 @@ TABLES: tuple[Table, ...] = (
         "Describing one object, as a language model's answer and by the encoder's property heads on the same videos.",
         lambda f: _variants(described=True)(f) | _over_seeds(HEADS)(f),
         PROPERTIES,
+        folded=False,
+    ),
+    Table(
+        "described",
+        "Reasoning about described objects",
+        "The base language model untaught and taught, asked in plain words about made-up objects: no touch, and not the "
+        "tasks' own wording. Intervals are Wilson's over questions.",
+        _over_seeds(DESCRIBED),
+        ("measure", "system", "measured", "n", "chance", "unread"),
         folded=False,
     ),
     *(
