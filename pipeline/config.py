@@ -249,7 +249,7 @@ class AblationConfig(Section):
     opd: tuple[Opd, ...] = (Opd.ALL, Opd.NONE)
     """How much an answer describes before it concludes: `all`, what is `needed` for the question, or `none`."""
     seeds: tuple[Seed, ...] = Field(default=(0,), min_length=1)
-    """With split.name=kfold a seed is a fold too: [0, 1, 2] of three folds tests each object once, [0, ..., 5] twice."""
+    """With split.name=kfold seeds are folds: [0, 1, 2] of three folds tests each object once, [0, ..., 5] twice."""
     touch: tuple[Literal[Touch.REMOVED, Touch.SWAPPED, Touch.NOISE], ...] = ()
     """Input ablations: what the full system is also given in place of its videos, to see whether it feels them."""
 

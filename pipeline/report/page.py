@@ -123,7 +123,7 @@ def inline(text: str, folder: str = "") -> Markup:
 
 
 def _chapters(folder: Path, gaps: list[Gap]) -> list[dict[str, Any]]:
-    """The reports: real videos first, then scenes, test objects that were looked at, smoke; a broken one is a gap."""
+    """The reports: real videos, scenes, those on test objects that were looked at, smoke; a broken one is a gap."""
     found = []
     for place in sorted({file.parent for name in ("scores.csv", "README.md") for file in folder.glob(f"*/{name}")}):
         try:

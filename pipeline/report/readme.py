@@ -29,9 +29,9 @@ NEAR_NULL = (
 
 
 TAUGHT = (
-    "before it met touch, `{}` learnt from text alone to reason about described objects that were made up, never in the "
-    "tasks' own wording. What LoRA and OPD bring comes on top of that; the table *Reasoning about described objects* "
-    "has the untaught base."
+    "before it met touch, `{}` learnt from text alone to reason about described objects that were made up, never in "
+    "the tasks' own wording. What LoRA and OPD bring comes on top of that; the table *Reasoning about described "
+    "objects* has the untaught base."
 )
 
 

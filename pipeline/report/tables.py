@@ -15,6 +15,7 @@ from pipeline.report.load import ALL_SEEDS, CROSS_VALIDATION, DESCRIBED, HEADS, 
 from pipeline.tasks import TASKS
 
 Select = Callable[[pd.DataFrame], "pd.Series[bool]"]
+Cell = Callable[[dict[str, Any]], str]
 FULL = {"encoder": "finetuned", "lora": "with", "opd": "all"}
 CHOICE, COMBINED = "choice", "combined"
 NOT_ANSWERED = (HEADS, VALIDATION_HEADS, CROSS_VALIDATION, DESCRIBED)
@@ -109,30 +110,28 @@ def system(row: dict[str, Any]) -> str:
     return ", ".join(words) or "Octopi (full system)"
 
 
-def _count(name: str, digits: int = 0) -> Callable[[dict[str, Any]], str]:
+def _count(name: str, digits: int = 0) -> Cell:
     return lambda row: number(row[name], digits)
 
 
-def _text(name: str) -> Callable[[dict[str, Any]], str]:
+def _text(name: str) -> Cell:
     return lambda row: str(row[name])
 
 
-COLUMNS: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
+COLUMNS: dict[str, tuple[str, Cell]] = {
     "task": ("Task", lambda row: task_title(row["task"])),
     "measure": ("Measure", lambda row: "all properties right" if row["measure"] == COMBINED else row["measure"]),
     "system": ("System", system),
     "encoder": ("Encoder", lambda row: ENCODERS.get(row["encoder"], row["encoder"])),
     **{name: (title, _text(name)) for name, title in (("lora", "LoRA"), ("opd", "OPD"), ("touch", "Touch"))},
     "measured": ("Measured % [95 %]", measured),
-    "n": ("n", _count("n")),
     "chance": ("Chance %", lambda row: number(row["chance"], scale=100)),
     "unread": ("Unread %", lambda row: number(row["unread"] / row["n"], scale=100)),
     **{name: (name.capitalize(), _text(name)) for name in ("part", "change")},
     "difference": ("Difference, points [95 %]", difference),
-    "p": ("p", _count("p", 3)),
-    "p_holm": ("p, Holm", _count("p_holm", 3)),
+    **{name: (title, _count(name, 3)) for name, title in (("p", "p"), ("p_holm", "p, Holm"))},
     "smallest": ("Smallest that could be found", lambda row: number(row["smallest_effect"], scale=100)),
-    **{name: (name.capitalize(), _count(name)) for name in ("objects", "seeds")},
+    **{name: (title, _count(name)) for name, title in (("n", "n"), ("objects", "Objects"), ("seeds", "Seeds"))},
 }
 """Heading of a column, and how its cell is written."""
 
@@ -197,8 +196,8 @@ def _over_seeds(*tasks: str) -> Select:
     return lambda frame: frame["task"].isin(tasks) & (frame["seed"] == ALL_SEEDS)
 
 
-PAPER = ("task", "system", "measured", "n", "chance", "unread", "published")
-PROPERTIES = ("measure", "system", "measured", "n", "chance", "unread", "published")
+SHOWN = ("system", "measured", "n", "chance", "unread")
+PAPER, PROPERTIES = ("task", *SHOWN, "published"), ("measure", *SHOWN, "published")
 
 TABLES: tuple[Table, ...] = (
     Table(
@@ -228,10 +227,9 @@ TABLES: tuple[Table, ...] = (
     Table(
         "described",
         "Reasoning about described objects",
-        "The base language model untaught and taught, asked in plain words about made-up objects: no touch, and not the "
-        "tasks' own wording. Intervals are Wilson's over questions.",
+        "The base model untaught and taught, in plain words about made-up objects; Wilson's intervals over questions.",
         _over_seeds(DESCRIBED),
-        ("measure", "system", "measured", "n", "chance", "unread"),
+        ("measure", *SHOWN),
         folded=False,
     ),
     *(
