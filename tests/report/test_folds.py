@@ -1,4 +1,4 @@
-"""Reports over folds: what is pooled, what is said of folds that are missing, of spoilt test objects, of a taught base."""
+"""Reports over folds: what is pooled, and what is said of missing folds, spoilt test objects and a taught base."""
 
 from __future__ import annotations
 
