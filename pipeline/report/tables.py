@@ -122,7 +122,7 @@ COLUMNS: dict[str, tuple[str, Cell]] = {
     "task": ("Task", lambda row: task_title(row["task"])),
     "measure": ("Measure", lambda row: "all properties right" if row["measure"] == COMBINED else row["measure"]),
     "system": ("System", system),
-    "encoder": ("Encoder", lambda row: ENCODERS.get(row["encoder"], row["encoder"])),
+    "encoder": ("Encoder", lambda row: str(ENCODERS.get(row["encoder"], row["encoder"]))),
     **{name: (title, _text(name)) for name, title in (("lora", "LoRA"), ("opd", "OPD"), ("touch", "Touch"))},
     "measured": ("Measured % [95 %]", measured),
     "chance": ("Chance %", lambda row: number(row["chance"], scale=100)),

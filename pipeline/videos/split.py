@@ -107,14 +107,27 @@ def read_splits(data: Path, config: SplitConfig, seeds: Sequence[int]) -> dict[i
 
 
 def _deal(catalogue: Catalogue, present: Collection[str], config: SplitConfig, fold: int) -> dict[str, Part]:
-    """Shuffle the objects and deal them out class by class: sizes of folds differ by one at the most."""
+    """Shuffle the objects and deal them out, each to the fold that has least of its classes.
+
+    Sizes of folds differ by one at the most, since an object always goes to one of the smallest.
+    """
     if len(present) < config.folds:
         raise UserError(f"split.folds is {config.folds}, but only {len(present)} objects have videos; lower it")
     objects = sorted(present)
     random.Random(derive_seed(config.seed, "kfold")).shuffle(objects)
-    objects.sort(key=catalogue.labels)
+    labels = {o: catalogue.labels(o) for o in objects}
+    dealt: list[list[str]] = [[] for _ in range(config.folds)]
+    for o in sorted(objects, key=lambda o: labels[o]):
+        smallest = min(map(len, dealt))
+        open_folds = [members for members in dealt if len(members) == smallest]
+        min(open_folds, key=lambda members: sum(_alike(labels[o], labels[other]) for other in members)).append(o)
     part_of_fold = {fold: Part.TEST, (fold + 1) % config.folds: Part.VALIDATION}
-    return {o: part_of_fold.get(i % config.folds, Part.TRAIN) for i, o in enumerate(objects)}
+    return {o: part_of_fold.get(number, Part.TRAIN) for number, members in enumerate(dealt) for o in members}
+
+
+def _alike(one: Sequence[int], other: Sequence[int]) -> int:
+    """The properties in which two objects are of one class."""
+    return sum(a == b for a, b in zip(one, other, strict=True))
 
 
 def _develop(catalogue: Catalogue, present: Collection[str], config: SplitConfig) -> dict[str, Part]:
