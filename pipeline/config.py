@@ -112,15 +112,17 @@ class SplitConfig(Section):
     test_objects: Positive = 7
     """Test objects of the development split."""
     folds: Annotated[int, Field(ge=3, le=50)] = 5
-    fold: Annotated[int, Field(ge=0)] = 0
+    """Of kfold. Each seed of `ablation.seeds` has one for its test: seed s has fold s modulo `folds`."""
     missing: Literal["report", "error"] = "report"
     """What to do about validation or test objects without videos: go on and leave cells empty, or stop."""
 
-    @model_validator(mode="after")
-    def _fold_exists(self) -> Self:
-        if self.fold >= self.folds:
-            raise ValueError(f"split.fold is {self.fold}, allowed: 0 to {self.folds - 1}")
-        return self
+    def fold_of(self, seed: int) -> int | None:
+        """The fold that a seed of `ablation.seeds` tests on; None where all seeds share one split."""
+        return seed % self.folds if self.name == "kfold" else None
+
+    def replicate_of(self, seed: int) -> int:
+        """Seeds of one replicate test each object once together, so their answers are pooled as those of one seed."""
+        return seed // self.folds if self.name == "kfold" else seed
 
 
 class QuestionsConfig(Section):
@@ -128,7 +130,7 @@ class QuestionsConfig(Section):
 
     seed: Seed = 0
     train: QuestionCounts
-    """By the task's name in lower case; a task without a number gets none."""
+    """By the task's name in lower case; a task without a number gets none. With kfold these are for each fold."""
     evaluation: QuestionCounts
     facts: bool = False
     """Begin matching questions with what the named objects are like, for a language model that has never heard of
@@ -310,6 +312,7 @@ class AblationConfig(Section):
     opd: tuple[Opd, ...] = (Opd.ALL, Opd.NONE)
     """How much an answer describes before it concludes: `all`, what is `needed` for the question, or `none`."""
     seeds: tuple[Seed, ...] = Field(default=(0,), min_length=1)
+    """With split.name=kfold seeds are folds: [0, 1, 2] of three folds tests each object once, [0, ..., 5] twice."""
     touch: tuple[Literal[Touch.REMOVED, Touch.SWAPPED, Touch.NOISE], ...] = ()
     """Input ablations: what the full system is also given in place of its videos, to see whether it feels them."""
 
@@ -386,6 +389,18 @@ class Params(Section):
     def _scenes_have_their_place(self) -> Self:
         if self.data.source == "scenes" and Path(self.data.dir) != SCENES_DIR:
             raise ValueError(f"data.dir must be {SCENES_DIR} where data.source is scenes (set data.source=videos?)")
+        return self
+
+    @model_validator(mode="after")
+    def _replicates_hold_the_same_folds(self) -> Self:
+        held: dict[int, set[int | None]] = {}
+        for seed in self.ablation.seeds:
+            held.setdefault(self.split.replicate_of(seed), set()).add(self.split.fold_of(seed))
+        if len({frozenset(folds) for folds in held.values()}) > 1:
+            raise ValueError(
+                f"ablation.seeds {list(self.ablation.seeds)} test on some of the {self.split.folds} folds more often "
+                "than on others; take as many seeds for each fold"
+            )
         return self
 
     @property

@@ -123,18 +123,21 @@ def check_objects(params: Params, catalogue: Catalogue) -> None:
         present = {file.object_id for file in list_videos(Path(params.data.dir), catalogue).files}
         if not present:
             raise_errors(Path(params.data.dir), list_videos(Path(params.data.dir), catalogue).findings)
-    parts = assign_objects(catalogue, present, params.split)
-    training, tested = (sorted(o for o in present if parts.get(o) == part) for part in (Part.TRAIN, Part.TEST))
-    if len(training) < FEWEST_TRAINING_OBJECTS:
-        raise UserError(
-            f"split.name={params.split.name}: {len(training)} training objects have videos, but questions about three "
-            "objects need three; add objects, or choose another split.name"
-        )
-    if len(tested) == 1 and Touch.SWAPPED in params.ablation.touch:
-        raise UserError(
-            f"ablation.touch: swapped gives a test object the touch of another, but only {tested[0]} has videos; leave "
-            "swapped out, or add test objects"
-        )
+    for seed in params.ablation.seeds:
+        parts = assign_objects(catalogue, present, params.split, seed)
+        training, tested = (sorted(o for o in present if parts.get(o) == part) for part in (Part.TRAIN, Part.TEST))
+        fold = params.split.fold_of(seed)
+        where = f"split.name={params.split.name}" + (f", fold {fold}" if fold is not None else "")
+        if len(training) < FEWEST_TRAINING_OBJECTS:
+            raise UserError(
+                f"{where}: {len(training)} training objects have videos, but questions about three objects need three; "
+                "add objects, or choose another split.name"
+            )
+        if len(tested) == 1 and Touch.SWAPPED in params.ablation.touch:
+            raise UserError(
+                f"ablation.touch: swapped gives a test object the touch of another, but with {where} only {tested[0]} "
+                "has videos; leave swapped out, or add test objects"
+            )
     if len(present) < params.cross_validation.folds:
         raise UserError(
             f"cross_validation.folds is {params.cross_validation.folds}, but only {len(present)} objects have videos; "

@@ -24,7 +24,7 @@ def main() -> None:
             dtype=name_dtype(language.dtype, params.runtime.device),
             quantization=language.quantization,
         ).to(resolve_device(params.runtime.device))
-        questions = read_jsonl(DATA / "questions" / "evaluation.jsonl", Question)
+        questions = read_jsonl(DATA / "questions" / str(variant.seed) / "evaluation.jsonl", Question)
         for touch in (Touch.REAL, *(params.ablation.touch if variant.full else ())):
             settings = GenerationSettings(
                 system_prompt=language.system_prompt,

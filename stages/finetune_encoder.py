@@ -22,13 +22,14 @@ def main() -> None:
     with stage("finetune_encoder", str(seed)) as run:
         params = run.params
         check_encoder(Path(params.encoder.weights), params.frames.size)
+        split = DATA / "splits" / f"{seed}.parquet"
         data = EncoderData(
             store=FrameStore(DATA / "frames", params.encoder.reference),
             catalogue=load_catalogue(Path(params.data.catalogue)),
-            assignments=read_table(DATA / "splits.parquet", Assignment),
+            assignments=read_table(split, Assignment),
             per_video=params.frames.per_video,
         )
-        inputs = [DATA / "frames" / name for name in (TABLE_FILE, REFERENCES_FILE)] + [DATA / "splits.parquet"]
+        inputs = [DATA / "frames" / name for name in (TABLE_FILE, REFERENCES_FILE)] + [split]
         inputs.append(clip_file(Path(params.encoder.weights)))
         if "scenes" in params.encoder.backbone:
             inputs.append(PRETRAINED)

@@ -73,7 +73,10 @@ class Material:
     def load(cls, folder: Path, params: Params, encoder: Encoder, opd: Opd, seed: int) -> Self:
         """Read the questions and one encoder's embeddings from the chain's data folder."""
         dtype = name_dtype(params.language.dtype, params.runtime.device)
-        files = (folder / "questions" / "train.jsonl", folder / "embeddings" / f"{encoder}-{seed}" / TENSOR_FILE)
+        files = (
+            folder / "questions" / str(seed) / "train.jsonl",
+            folder / "embeddings" / f"{encoder}-{seed}" / TENSOR_FILE,
+        )
         return cls(
             questions=read_jsonl(files[0], Question),
             store=EmbeddingStore(files[1].parent),

@@ -42,7 +42,7 @@ def provenance(
     params: Params,
     catalogue: Catalogue,
     videos: Sequence[Video],
-    assignments: Sequence[Assignment],
+    splits: Sequence[Sequence[Assignment]],
     asked: Sequence[tuple[str, ...]],
     root: Path,
 ) -> dict[str, Any]:
@@ -51,11 +51,13 @@ def provenance(
     Args:
         catalogue: for the data set's name and its properties.
         videos: all that decode; their hashes are hashed.
-        assignments: for the test objects.
+        splits: those that differ, for the test objects; one a fold.
         asked: the objects of each question, for what is known of the intervals.
     """
     rows = "\n".join(video.model_dump_json() for video in videos)
-    test = [a for a in assignments if a.part is Part.TEST]
+    test = {a.video_id: a.object_id for assignments in splits for a in assignments if a.part is Part.TEST}
+    seeds, fold_of = params.ablation.seeds, params.split.fold_of
+    folds = sorted({fold for seed in seeds if (fold := fold_of(seed)) is not None})
     commit = _git(root, "log", "-1", "--format=%H", "--", *CODE) or UNKNOWN
     return {
         "report": params.report_name,
@@ -64,11 +66,13 @@ def provenance(
         "dataset": catalogue.language.dataset,
         "properties": {p.name: list(p.levels) for p in catalogue.properties},
         "split": params.split.name,
-        "test_objects": sorted({a.object_id for a in test}),
+        "test_objects": sorted(set(test.values())),
         "test_videos": len(test),
         "videos": len(videos),
-        "seeds": list(params.ablation.seeds),
-        "settings": notes().get(f"{params.report_name}/{params.split.name}", ""),
+        "seeds": list(seeds),
+        "folds": {"of": params.split.folds, "tested": folds} if folds else None,
+        "replicates": len({params.split.replicate_of(seed) for seed in seeds}),
+        "settings": settings_note(params.report_name, params.split.name),
         "intervals": coverage_note(asked),
         "facts_told": params.questions.facts,
         "command": "dvc repro",
@@ -79,8 +83,9 @@ def provenance(
         "encoder": encoder_words(params.encoder),
         "base_models": {
             "encoder": base_model(root, params.encoder.weights),
-            "language": base_model(root, params.language.weights),
+            "language": base_model(root, params.language.weights) | taught_words(params),
         },
+        "taught_from": taught_from(params),
         "python": platform.python_version(),
         "packages": {name: _version(name) for name in PACKAGES},
     }
@@ -145,9 +150,27 @@ def digest(folder: Path) -> str:
     return total.hexdigest() if files else UNKNOWN
 
 
-def notes() -> dict[str, str]:
-    """What people wrote about reports in notes.yaml, by name and split, such as `small-videos/development`."""
-    return yaml.safe_load(NOTES.read_text(encoding="utf-8")) or {}
+def taught_from(params: Params) -> str:
+    """The folder of the base model that the stage `teach` taught; empty where nothing was taught."""
+    return str(getattr(getattr(params, "teach", None), "base", ""))
+
+
+def taught_words(params: Params) -> dict[str, Any]:
+    """What the chain itself taught the language model, in place of what people noted; empty where it taught nothing."""
+    base = taught_from(params)
+    words = f"taught here in text alone to reason about described objects (from `{base}`)"
+    return {"taught": words, "known_templates": False} if base else {}
+
+
+def settings_note(report: str, split: str) -> str:
+    """What people wrote in notes.yaml about the test objects of a report and split, or else of the split; may be empty.
+
+    Args:
+        report: the folder's name, such as `small-videos`.
+        split: such as `development`.
+    """
+    notes: dict[str, str] = yaml.safe_load(NOTES.read_text(encoding="utf-8")) or {}
+    return notes.get(f"{report}/{split}", notes.get(split, ""))
 
 
 def _kind(folder: Path) -> str:

@@ -18,7 +18,7 @@ from pipeline.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
 from pipeline.encoder import finetune as training
 from pipeline.encoder.clip import load_visual_tower
 from pipeline.encoder.clips import ClipDataset, LabelledVideo
-from pipeline.encoder.embed import standardize
+from pipeline.encoder.embed import standardize, union
 from pipeline.encoder.finetune import accuracies, finetune, train_classifier, write_encoder_card
 from pipeline.encoder.frame_classifier import JointFrameClassifier
 from pipeline.encoder.model import Heads, PropertyClassifier
@@ -26,7 +26,7 @@ from pipeline.encoder.recipes import RECIPES, base_encoder, check_recipe, proper
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.errors import UserError
 from pipeline.io import save_tensors, write_table
-from pipeline.records import Embedding, Part
+from pipeline.records import Assignment, Embedding, Part
 from pipeline.runtime import seed_everything
 from pipeline.training.trainable import load_trainable, save_trainable, trainable_state
 from pipeline.training.trainer import TrainableTrainer
@@ -338,6 +338,14 @@ def test_standardized_by_training_frames_alone() -> None:
     assert done.isfinite().all(), "a constant dimension is only shifted"
     raw[[e.row for e in index if e.video_id == "test_0"]] += 5
     assert torch.equal(standardize(raw, index, {"train_0", "train_1"})[rows], done[rows])
+
+
+def test_a_video_that_any_split_trains_on_is_embedded_for_training() -> None:
+    train, test, unused = Part.TRAIN, Part.TEST, Part.UNUSED
+    parts = {"a": (train, test), "b": (test, train), "c": (test, test), "d": (unused, test), "e": (unused, unused)}
+    splits = [[Assignment(video_id=v, object_id=v, part=both[i]) for v, both in parts.items()] for i in (0, 1)]
+    found = {a.video_id: a.part for a in union(splits)}
+    assert found == {"a": train, "b": train, "c": test, "d": test, "e": unused}
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
