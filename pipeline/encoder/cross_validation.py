@@ -100,11 +100,8 @@ def cross_validate_candidate(
             f"cross_validation.folds is {config.folds} but only {objects} objects have videos; lower it, to 2 at least"
         )
     labelled = repr([(v.video_id, data.catalogue.labels(v.object_id)) for v in data.videos])
-    work = (
-        CHECKPOINTS
-        / "cross_validation"
-        / fingerprint(repr(candidate), config, data.encoder, data.per_video, labelled, *data.files)
-    )
+    key = fingerprint(repr(candidate), config, data.encoder, data.per_video, labelled, *data.files)
+    work = CHECKPOINTS / "cross_validation" / key
     predict = _limited(KINDS[candidate.kind](candidate, data), candidate, data)
     with progress(config.folds * config.repeats, "cross-validation", "fold") as advance:
 
@@ -227,8 +224,8 @@ def _gradient(candidate: Candidate, data: CrossValidationData) -> Predict:
     from pipeline.encoder.scene_encoder import SceneEncoder
 
     limit_threads(data.runtime.threads)
-    recipe = "release" if candidate.recipe == "release" else "paper"
-    config = data.encoder.model_copy(update={"recipe": recipe, "backbone": ("clip",), **candidate.settings})
+    named = {"recipe": "release" if candidate.recipe == "release" else "paper", "backbone": ("clip",)}
+    config = data.encoder.model_copy(update={**named, **candidate.settings})
     store, device = data.store(candidate), resolve_device(data.runtime.device)
 
     def predict(fold: Fold) -> Labels:
@@ -249,8 +246,9 @@ def _gradient(candidate: Candidate, data: CrossValidationData) -> Predict:
 
 
 def _tuned(candidate: Candidate, data: CrossValidationData) -> Predict:
-    """The trunks have seen no label and stay as they are, so they are run once for all folds."""
+    """Trunks have seen no label, so they are run once for all folds."""
     from pipeline.encoder import finetune
+    from pipeline.encoder.clips import EncoderData
     from pipeline.encoder.tuned import FLIPS, AboveTrunks, Trunks, base_encoder, property_classifier, run_trunks
 
     limit_threads(data.runtime.threads)

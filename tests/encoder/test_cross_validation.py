@@ -16,7 +16,7 @@ from torch.optim.optimizer import register_optimizer_step_pre_hook
 
 from pipeline.config import CrossValidationConfig, EncoderConfig, RuntimeConfig
 from pipeline.encoder import cross_validation as module
-from pipeline.encoder import finetune, frame_classifier
+from pipeline.encoder import finetune, frame_classifier, tuned
 from pipeline.encoder.baseline.features import video_features
 from pipeline.encoder.baseline.predictor import PropertyPredictor
 from pipeline.encoder.baseline.recordings import Recording, describe, recording_features
@@ -24,9 +24,10 @@ from pipeline.encoder.baseline.validation import Fold, Predict, cross_validate, 
 from pipeline.encoder.candidates import CANDIDATES, LEARNING_CURVE, Candidate, check_candidates
 from pipeline.encoder.clips import EncoderData
 from pipeline.encoder.cross_validation import CrossValidationData, cross_validate_candidate, frozen_encoder
-from pipeline.encoder.frame_classifier import Clips, FittedHeads, fit_frame_heads
+from pipeline.encoder.frame_classifier import Clips, FittedHeads, JointFrameClassifier, fit_frame_heads
 from pipeline.encoder.model import FrameEncoder, PropertyClassifier
 from pipeline.encoder.scene_encoder import SceneEncoder
+from pipeline.encoder.tuned import Trunks
 from pipeline.errors import UserError
 from pipeline.io import write_table
 from pipeline.records import Measurement, Part, Probe
@@ -178,6 +179,34 @@ def test_gradients_learn_from_no_object_that_they_are_tested_on(
     assert len(set(chosen)) > 1, "drawn anew in each fold"
     assert all(chosen)
     assert all(0 <= p < 3 for r in found for p in r.predicted)
+
+
+def test_tuning_learns_from_no_object_that_it_is_tested_on(
+    data: CrossValidationData, folds: list[Fold], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The trunks are run once for all folds, over frames alone; the rest is the fold's."""
+    write_pretrained()
+    folder = write_timm(tmp_path / "timm")
+    setting = config(folder, "tuned", backbone=("timm", "scenes"), feature_stage=2, epochs=1)
+    original, run, ran, tuned_on = finetune.tune, tuned.run_trunks, [], []
+
+    def spy(model: JointFrameClassifier, trunks: Trunks, clips: EncoderData, *rest: object, **others: object) -> object:
+        parts = {part: {a.object_id for a in clips.assignments if a.part == part} for part in Part}
+        assert parts[Part.TEST] == objects_of(data, folds[-1].tested)
+        assert parts[Part.TRAIN] | parts[Part.VALIDATION] == objects_of(data, folds[-1].trained)
+        assert parts[Part.VALIDATION]
+        assert not parts[Part.VALIDATION] & parts[Part.TRAIN]
+        assert clips.store.references is not None
+        tuned_on.append(frozenset(parts[Part.TRAIN]))
+        return original(model, trunks, clips, *rest, **others)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(finetune, "tune", spy)
+    monkeypatch.setattr(tuned, "run_trunks", lambda *given, **more: ran.append(1) or run(*given, **more))
+    found = cross_validate_candidate(CANDIDATES["backbone-tuned"], replace(data, encoder=setting), SMALL)
+    assert (len(ran), len(tuned_on), len(set(tuned_on))) == (1, 2, 2)
+    assert [r.video_id for r in found] == [v.video_id for v in data.videos]
+    frozen = cross_validate_candidate(CANDIDATES["backbone"], replace(data, encoder=setting), SMALL)
+    assert [r.video_id for r in frozen] == [v.video_id for v in data.videos]
 
 
 def test_a_limited_candidate_draws_anew_in_each_fold_and_nests(
@@ -485,9 +514,9 @@ def test_each_variation_changes_one_thing_of_its_parent() -> None:
 
 
 def test_a_candidate_that_cannot_be_trained_is_one_clear_line(weights: Path, tmp_path: Path) -> None:
-    paper, tuned = config(weights, "paper"), config(weights, "tuned")
+    paper, other = config(weights, "paper"), config(weights, "tuned")
     check_candidates([name for name in CANDIDATES if name != "backbone-tuned"], paper)
-    check_candidates([n for n in CANDIDATES if n not in ("paper", "paper-difference", "scratch")], tuned)
+    check_candidates([n for n in CANDIDATES if n not in ("paper", "paper-difference", "scratch")], other)
     with pytest.raises(UserError, match=r"^cross_validation.models: pretraind is no model; did you mean pretrained\?"):
         check_candidates(("paper", "pretraind"), paper)
     for names, setting in ((("constant", "paper"), "release"), (("scratch",), "tuned"), (("backbone-tuned",), "paper")):
