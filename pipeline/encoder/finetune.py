@@ -29,7 +29,8 @@ if TYPE_CHECKING:
     from transformers import EvalPrediction, TrainerCallback
 
 GRADIENT_SETTINGS = {
-    *("prompts", "prompt_layers", "epochs", "batch_size", "learning_rate", "weight_decay", "flip_probability")
+    *("prompts", "prompt_layers", "epochs", "batch_size", "micro_batch_size", "autocast"),
+    *("learning_rate", "weight_decay", "flip_probability"),
 }
 """Of the section `encoder`: they mean nothing where heads are fitted."""
 
@@ -101,14 +102,17 @@ def train_classifier(
         flip_probability=config.flip_probability,
     )
     validation = data.videos(Part.VALIDATION)
+    micro = min(config.micro_batch_size or config.batch_size, config.batch_size)
     folder = checkpoint_dir(f"finetune_encoder-{seed}", fingerprint(config, seed, data.per_video, *inputs))
     arguments = training_arguments(
         folder,
         runtime,
         seed,
         num_train_epochs=config.epochs,
-        per_device_train_batch_size=config.batch_size,
-        per_device_eval_batch_size=config.batch_size,
+        per_device_train_batch_size=micro,
+        per_device_eval_batch_size=micro,
+        gradient_accumulation_steps=config.batch_size // micro,
+        bf16=config.autocast == "bfloat16",
         learning_rate=config.learning_rate,
         weight_decay=config.weight_decay,
         eval_strategy="epoch" if validation else "no",

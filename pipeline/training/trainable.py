@@ -6,6 +6,7 @@ from pathlib import Path
 
 import torch
 from torch import nn
+from torch.distributed.tensor import DTensor, distribute_tensor
 
 from pipeline.errors import UserError
 from pipeline.io import load_tensors, save_tensors
@@ -22,13 +23,24 @@ def trainable_state(module: nn.Module) -> dict[str, torch.Tensor]:
     return state
 
 
+def whole_state(module: nn.Module) -> dict[str, torch.Tensor]:
+    """`trainable_state`, where it is sharded gathered from all processes: each must call it, and each gets all of it.
+
+    The frozen base stays where it is: gathering that too would take its whole size of memory in each process.
+    """
+    return {n: v.full_tensor() if isinstance(v, DTensor) else v for n, v in trainable_state(module).items()}
+
+
 def save_trainable(module: nn.Module, path: Path) -> None:
     """Write what is trained, and only that, as safetensors."""
     save_tensors(path, trainable_state(module))
 
 
 def load_trainable(module: nn.Module, path: Path) -> None:
-    """Read what `save_trainable` wrote; names and shapes must be exactly those of the module's `trainable_state`."""
+    """Read what `save_trainable` wrote; names and shapes must be exactly those of the module's `trainable_state`.
+
+    A sharded module takes its shards of it; every process must call this.
+    """
     loaded, own = load_tensors(path), trainable_state(module)
     wrong = sorted(loaded.keys() ^ own.keys()) or [n for n in own if loaded[n].shape != own[n].shape]
     if wrong:
@@ -38,4 +50,6 @@ def load_trainable(module: nn.Module, path: Path) -> None:
         )
     with torch.no_grad():
         for name, value in own.items():
-            value.copy_(loaded[name])
+            read = loaded[name].to(value.device)
+            sharded = isinstance(value, DTensor)
+            value.copy_(distribute_tensor(read, value.device_mesh, value.placements) if sharded else read)
