@@ -26,9 +26,13 @@ def scale(
     overrides: Annotated[list[str] | None, typer.Argument(help="key=value, for example split.name=kfold.")] = None,
 ) -> None:
     """Choose what `dvc repro` runs: write params.yaml from conf/NAME.yaml and the overrides."""
+    from pipeline.memory import count, table
     from pipeline.scales import check_inputs, compose, prune, write_params
 
     params = compose(name, overrides or ())
+    uses, notes = count(params)
+    # First, since what a scale takes is asked before its weights are fetched.
+    typer.echo("\n".join(["Memory in GiB on each device, counted from shapes:", table(uses), *notes]))
     check_inputs(params)
     changed = write_params(params)
     prune(params, Path("data"))

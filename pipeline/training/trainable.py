@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import nn
-from torch.distributed.tensor import DTensor, distribute_tensor
 
 from pipeline.errors import UserError
 from pipeline.io import load_tensors, save_tensors
@@ -28,7 +28,7 @@ def whole_state(module: nn.Module) -> dict[str, torch.Tensor]:
 
     The frozen base stays where it is: gathering that too would take its whole size of memory in each process.
     """
-    return {n: v.full_tensor() if isinstance(v, DTensor) else v for n, v in trainable_state(module).items()}
+    return {n: v.full_tensor() if _sharded(v) else v for n, v in trainable_state(module).items()}
 
 
 def save_trainable(module: nn.Module, path: Path) -> None:
@@ -51,5 +51,13 @@ def load_trainable(module: nn.Module, path: Path) -> None:
     with torch.no_grad():
         for name, value in own.items():
             read = loaded[name].to(value.device)
-            sharded = isinstance(value, DTensor)
-            value.copy_(distribute_tensor(read, value.device_mesh, value.placements) if sharded else read)
+            if _sharded(value):
+                from torch.distributed.tensor import distribute_tensor
+
+                read = distribute_tensor(read, value.device_mesh, value.placements)
+            value.copy_(read)
+
+
+def _sharded(value: Any) -> bool:
+    """Whether it is a DTensor; asked by what it has, since importing that class takes a second."""
+    return hasattr(value, "placements")

@@ -28,8 +28,8 @@ from tests.language.shared import SMALL, material
 CONFIG = LoraTrainConfig(**{**SMALL.model_dump(), "samples": 8, "epochs": 3}, rank=4, alpha=8, learning_rate=1e-3, dropout=0.0)
 """Six updates of four questions; each process sees two of the four, or one process two after two. No dropout: each
 process draws its own."""
-KINDS = {"align": "float32", "lora": "float32", "lora-bfloat16": "bfloat16"}
-"""Trainings and the number format of the frozen weights."""
+KINDS = {"align": "float32", "lora": "bfloat16"}
+"""Trainings and the number format of the frozen weights; adapters stand in one group with them."""
 DIES = 5
 """Update in which a process is killed; checkpoints are written after each second one."""
 
