@@ -121,8 +121,12 @@ class Llama:
         hidden, middle = self.hidden_size, self.intermediate_size
         queries, keys = self.num_attention_heads * self.head_dim, self.num_key_value_heads * self.head_dim
         return {
-            **{"q_proj": (hidden, queries), "k_proj": (hidden, keys), "v_proj": (hidden, keys)},
-            **{"o_proj": (queries, hidden), "gate_proj": (hidden, middle), "up_proj": (hidden, middle)},
+            "q_proj": (hidden, queries),
+            "k_proj": (hidden, keys),
+            "v_proj": (hidden, keys),
+            "o_proj": (queries, hidden),
+            "gate_proj": (hidden, middle),
+            "up_proj": (hidden, middle),
             "down_proj": (middle, hidden),
         }
 
@@ -178,18 +182,29 @@ class Llama:
 
 PUBLISHED_VISION: dict[str, dict[str, Any]] = {
     "clip-vit-large-patch14": {
-        **{"layers": 24, "width": 1024, "patch_size": 14, "image_size": 224, "embed_dim": 768, "quick_gelu": True}
+        "layers": 24,
+        "width": 1024,
+        "patch_size": 14,
+        "image_size": 224,
+        "embed_dim": 768,
+        "quick_gelu": True,
     }
 }
 """From open_clip_config.json of timm/vit_large_patch14_clip_224.openai, by the folder's name."""
 _VICUNA = {"vocab_size": 32000, "max_position_embeddings": 4096}
 PUBLISHED_LANGUAGE: dict[str, dict[str, Any]] = {
     "vicuna-7b-v1.5": {
-        **{"hidden_size": 4096, "intermediate_size": 11008, "num_hidden_layers": 32, "num_attention_heads": 32},
+        "hidden_size": 4096,
+        "intermediate_size": 11008,
+        "num_hidden_layers": 32,
+        "num_attention_heads": 32,
         **_VICUNA,
     },
     "vicuna-13b-v1.5": {
-        **{"hidden_size": 5120, "intermediate_size": 13824, "num_hidden_layers": 40, "num_attention_heads": 40},
+        "hidden_size": 5120,
+        "intermediate_size": 13824,
+        "num_hidden_layers": 40,
+        "num_attention_heads": 40,
         **_VICUNA,
     },
 }

@@ -28,7 +28,8 @@ def whole_state(module: nn.Module) -> dict[str, torch.Tensor]:
 
     The frozen base stays where it is: gathering that too would take its whole size of memory in each process.
     """
-    return {n: v.full_tensor() if _sharded(v) else v for n, v in trainable_state(module).items()}
+    state: dict[str, Any] = {**trainable_state(module)}
+    return {name: value.full_tensor() if _sharded(value) else value for name, value in state.items()}
 
 
 def save_trainable(module: nn.Module, path: Path) -> None:
@@ -41,7 +42,8 @@ def load_trainable(module: nn.Module, path: Path) -> None:
 
     A sharded module takes its shards of it; every process must call this.
     """
-    loaded, own = load_tensors(path), trainable_state(module)
+    loaded = load_tensors(path)
+    own: dict[str, Any] = {**trainable_state(module)}
     wrong = sorted(loaded.keys() ^ own.keys()) or [n for n in own if loaded[n].shape != own[n].shape]
     if wrong:
         raise UserError(

@@ -122,7 +122,9 @@ def test_accumulated_videos_weigh_alike(recipe: str, weights: Path, catalogue: C
     """The gradient of five videos in an update is that of all at once, however they are divided; some parts are odd."""
     data, gradients = encoder_data(tmp_path, catalogue, PARTS), list[torch.Tensor]()
     kept = register_optimizer_step_pre_hook(
-        lambda optimizer, *_: gradients.append(torch.cat([p.grad.flatten() for p in optimizer.param_groups[0]["params"]]))
+        lambda optimizer, *_: gradients.append(
+            torch.cat([p.grad.flatten() for p in optimizer.param_groups[0]["params"]])
+        )
     )
     for micro in (0, 3, 2):
         setting = config(weights, recipe, epochs=1, batch_size=6, micro_batch_size=micro)

@@ -1,4 +1,4 @@
-"""A process of a sharded training on CPUs: `accelerate launch ... -m tests.language.sharded FOLDER WEIGHTS EMBEDDINGS`."""
+"""A process of a sharded training on CPUs: `accelerate launch -m tests.language.sharded FOLDER WEIGHTS EMBEDDINGS WHAT`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from accelerate.utils import DistributedType
 from torch.distributed.tensor import DTensor
 from torch.nn import Module
 from torch.optim.optimizer import register_optimizer_step_pre_hook
-from torch.utils.data import Dataset
 
 from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig
 from pipeline.embeddings import EmbeddingStore
@@ -22,10 +21,12 @@ from pipeline.io import read_jsonl, save_tensors, write_json
 from pipeline.language.training import Job, add_lora, align, assemble, finetune_lora
 from pipeline.records import Question
 from pipeline.training import trainer as shared
-from pipeline.training.trainer import Trained, TrainableTrainer
+from pipeline.training.trainer import TrainableTrainer, Trained
 from tests.language.shared import SMALL, material
 
-CONFIG = LoraTrainConfig(**{**SMALL.model_dump(), "samples": 8, "epochs": 3}, rank=4, alpha=8, learning_rate=1e-3, dropout=0.0)
+CONFIG = LoraTrainConfig(
+    **{**SMALL.model_dump(), "samples": 8, "epochs": 3}, rank=4, alpha=8, learning_rate=1e-3, dropout=0.0
+)
 """Six updates of four questions; each process sees two of the four, or one process two after two. No dropout: each
 process draws its own."""
 KINDS = {"align": "float32", "lora": "bfloat16"}
