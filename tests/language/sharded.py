@@ -1,4 +1,4 @@
-"""A process of a sharded training on CPUs: `accelerate launch -m tests.language.sharded FOLDER WEIGHTS EMBEDDINGS WHAT`."""
+"""A process of a sharded training: `accelerate launch -m tests.language.sharded FOLDER WEIGHTS EMBEDDINGS WHAT`."""
 
 from __future__ import annotations
 
