@@ -21,7 +21,8 @@ from pipeline.tasks.questions import build_questions, counts_by_task, pool_of
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 
 GIB = 2**30
-BYTES = {"float32": 4, "bfloat16": 2, "float16": 2}
+BYTES = {"auto": 4, "float32": 4, "bfloat16": 2, "float16": 2}
+"""Of a value; `auto` may be less, which only the device knows that it will run on."""
 NF4 = 0.5 + 1 / 64 + 4 / (64 * 256)
 """Bytes a value: four bits, a byte of scale for 64 of them, and a float32 for 256 such bytes (Dettmers et al. 2023)."""
 ADAM = 3 * FULL
@@ -73,7 +74,7 @@ def count(params: Params) -> tuple[list[Use], list[str]]:
     """
     catalogue = load_catalogue(Path(params.data.catalogue))
     uses: list[Use] = []
-    notes: list[str] = []
+    notes: list[str] = ["language.dtype is auto: counted as float32."] if params.language.dtype == "auto" else []
     tower, encoder = Vision.read(Path(params.encoder.weights)), Path(params.encoder.weights)
     if tower is None:
         notes.append(f"{encoder}: no open_clip model whose shapes are known; the encoder's stages are not counted.")
