@@ -26,12 +26,16 @@ def scale(
     overrides: Annotated[list[str] | None, typer.Argument(help="key=value, for example split.name=kfold.")] = None,
 ) -> None:
     """Choose what `dvc repro` runs: write params.yaml from conf/NAME.yaml and the overrides."""
+    from pipeline.memory import count, table
     from pipeline.scales import check_inputs, compose, prune, write_params
     from pipeline.stage import running_stages
 
     if running := running_stages():
         raise UserError(f"{running[0]} is running, and would be recorded with other parameters; wait for it or stop it")
     params = compose(name, overrides or ())
+    uses, notes = count(params)
+    # First, since what a scale takes is asked before its weights are fetched.
+    typer.echo("\n".join(["Memory in GiB on each device, counted from shapes:", table(uses), *notes]))
     check_inputs(params)
     changed = write_params(params)
     prune(params, Path("data"))

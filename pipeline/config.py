@@ -157,6 +157,11 @@ class EncoderConfig(Section):
     """Layers, from the first, that get prompts of their own; 0 is all (paper)."""
     epochs: Positive = 30
     batch_size: Positive = 32
+    micro_batch_size: Annotated[int, Field(ge=0)] = 0
+    """Videos at a time, of the `batch_size` of an update; the rest is accumulated. 0, and what is no less than
+    `batch_size`, is all of them. `octopi scale` says what memory that takes."""
+    autocast: Literal["none", "bfloat16"] = "none"
+    """Number format that training computes in where torch holds it safe; what is trained stays in float32."""
     learning_rate: Rate = 1e-3
     weight_decay: Annotated[float, Field(ge=0, lt=1)] = 0.0
     flip_probability: Annotated[float, Field(ge=0, le=1)] = 0.5
@@ -167,6 +172,13 @@ class EncoderConfig(Section):
     """Shift and scale embeddings to mean 0 and deviation 1 over the training frames (the paper does not)."""
     embed_batch_size: Positive = 64
     """Frames at a time when embeddings are computed."""
+
+    @model_validator(mode="after")
+    def _batches_divide(self) -> Self:
+        micro = self.micro_batch_size
+        if 0 < micro < self.batch_size and self.batch_size % micro:
+            raise ValueError(f"encoder.micro_batch_size {micro} does not divide batch_size {self.batch_size}")
+        return self
 
     @model_validator(mode="after")
     def _backbones_fit(self) -> Self:

@@ -10,10 +10,10 @@ from tests.closure import ROOT, imported
 
 CORE = (
     *("__init__", "errors", "records", "runtime", "io", "config", "params", "progress", "parallel", "card"),
-    *("embeddings", "weights", "training", "stage"),
+    *("embeddings", "weights", "shapes", "training", "stage"),
 )
 ROOMS = ("videos", "scenes", "tasks", "encoder", "language", "evaluation", "report", "tracking")
-TOP = ("scales", "revisions", "compare", "reproduce", "cli")
+TOP = ("memory", "scales", "revisions", "compare", "reproduce", "cli")
 ORDER = (*CORE, *ROOMS, *TOP)
 MODULES = sorted((ROOT / "pipeline").rglob("*.py"))
 

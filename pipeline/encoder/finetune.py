@@ -181,14 +181,17 @@ def _train(
     # Imported here, since fitted heads need no Trainer, and importing it takes seconds.
     from pipeline.training.trainer import TrainableTrainer, TrainingMonitor, checkpoint_dir, train, training_arguments
 
+    micro = min(config.micro_batch_size or config.batch_size, config.batch_size)
     folder = checkpoint_dir(f"finetune_encoder-{seed}", fingerprint(config, seed, data.per_video, *inputs))
     arguments = training_arguments(
         folder,
         runtime,
         seed,
         num_train_epochs=config.epochs,
-        per_device_train_batch_size=config.batch_size,
-        per_device_eval_batch_size=config.batch_size,
+        per_device_train_batch_size=micro,
+        per_device_eval_batch_size=micro,
+        gradient_accumulation_steps=config.batch_size // micro,
+        bf16=config.autocast == "bfloat16",
         learning_rate=config.learning_rate,
         weight_decay=config.weight_decay,
         eval_strategy="epoch" if validation else "no",

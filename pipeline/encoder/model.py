@@ -139,6 +139,7 @@ class PropertyClassifier(nn.Module):
     """ViFi-CLIP's mean over frames (Rasheed et al. 2023), then the properties' heads."""
 
     _keys_to_ignore_on_save = None  # read by transformers' Trainer when it reloads a checkpoint
+    accepts_loss_kwargs = True  # has Trainer count an update's labels and give them to `forward`
     cosine_per_epoch: ClassVar[bool] = False
     """Whether the learning rate falls and rises again by a cosine as long as one epoch, or falls once in all."""
 
@@ -149,7 +150,11 @@ class PropertyClassifier(nn.Module):
         self.classes = tuple(classes)
 
     def forward(
-        self, frames: torch.Tensor, frame_indices: torch.Tensor, labels: torch.Tensor | None = None
+        self,
+        frames: torch.Tensor,
+        frame_indices: torch.Tensor,
+        labels: torch.Tensor | None = None,
+        num_items_in_batch: torch.Tensor | int | None = None,
     ) -> dict[str, torch.Tensor]:
         """Classify videos.
 
@@ -157,21 +162,30 @@ class PropertyClassifier(nn.Module):
             frames: uint8, batch x frames x side x side x RGB.
             frame_indices: int64, batch x frames: each frame's number in its video.
             labels: int64, batch x properties.
+            num_items_in_batch: Labels of the whole update, so that accumulated batches weigh each video alike; by
+                default those of this batch.
 
         Returns:
             `logits`, batch x (classes of all properties, side by side), and with labels `loss`: the sum of the
             properties' cross-entropies, so that the heads are trained simultaneously.
         """
         features = self.encoder.describe(frames.flatten(0, 1), frame_indices.flatten())
-        return self.judge(features.view(*frames.shape[:2], -1), labels)
+        return self.judge(features.view(*frames.shape[:2], -1), labels, num_items_in_batch)
 
-    def judge(self, features: torch.Tensor, labels: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
+    def judge(
+        self,
+        features: torch.Tensor,
+        labels: torch.Tensor | None = None,
+        num_items_in_batch: torch.Tensor | int | None = None,
+    ) -> dict[str, torch.Tensor]:
         """As `forward`, of the frames' features, batch x frames x dim."""
         logits = self.classify(features)
         output = {"logits": torch.cat(logits, dim=1)}
         if labels is not None:
-            losses = [F.cross_entropy(z, y) for z, y in zip(logits, labels.unbind(1), strict=True)]
-            output = {"loss": torch.stack(losses).sum(), **output}
+            pairs = zip(logits, labels.unbind(1), strict=True)
+            losses = [F.cross_entropy(z, y, reduction="sum") for z, y in pairs]
+            videos = len(labels) if num_items_in_batch is None else num_items_in_batch / len(losses)
+            output = {"loss": torch.stack(losses).sum() / videos, **output}
         return output
 
     def classify(self, features: torch.Tensor) -> list[torch.Tensor]:

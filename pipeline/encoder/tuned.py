@@ -91,6 +91,7 @@ class AboveTrunks(nn.Module):
     """What is trained: the classifier from the trunks' outputs on."""
 
     _keys_to_ignore_on_save = None  # read by transformers' Trainer when it reloads a checkpoint
+    accepts_loss_kwargs = True
     cosine_per_epoch = False
     """As `PropertyClassifier` has it."""
 
@@ -98,9 +99,14 @@ class AboveTrunks(nn.Module):
         super().__init__()
         self.classifier = classifier
 
-    def forward(self, outputs: Sequence[torch.Tensor], labels: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
+    def forward(
+        self,
+        outputs: Sequence[torch.Tensor],
+        labels: torch.Tensor | None = None,
+        num_items_in_batch: torch.Tensor | int | None = None,
+    ) -> dict[str, torch.Tensor]:
         """As `PropertyClassifier.forward`, of the trunks' outputs: each batch x frames x what its stage takes."""
-        return self.classifier.judge(self.features(outputs), labels)
+        return self.classifier.judge(self.features(outputs), labels, num_items_in_batch)
 
     def features(self, outputs: Sequence[torch.Tensor]) -> torch.Tensor:
         """The frames' features: batch x frames x dim."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import nn
@@ -22,14 +23,27 @@ def trainable_state(module: nn.Module) -> dict[str, torch.Tensor]:
     return state
 
 
+def whole_state(module: nn.Module) -> dict[str, torch.Tensor]:
+    """`trainable_state`, where it is sharded gathered from all processes: each must call it, and each gets all of it.
+
+    The frozen base stays where it is: gathering that too would take its whole size of memory in each process.
+    """
+    state: dict[str, Any] = {**trainable_state(module)}
+    return {name: value.full_tensor() if _sharded(value) else value for name, value in state.items()}
+
+
 def save_trainable(module: nn.Module, path: Path) -> None:
     """Write what is trained, and only that, as safetensors."""
     save_tensors(path, trainable_state(module))
 
 
 def load_trainable(module: nn.Module, path: Path) -> None:
-    """Read what `save_trainable` wrote; names and shapes must be exactly those of the module's `trainable_state`."""
-    loaded, own = load_tensors(path), trainable_state(module)
+    """Read what `save_trainable` wrote; names and shapes must be exactly those of the module's `trainable_state`.
+
+    A sharded module takes its shards of it; every process must call this.
+    """
+    loaded = load_tensors(path)
+    own: dict[str, Any] = {**trainable_state(module)}
     wrong = sorted(loaded.keys() ^ own.keys()) or [n for n in own if loaded[n].shape != own[n].shape]
     if wrong:
         raise UserError(
@@ -38,4 +52,14 @@ def load_trainable(module: nn.Module, path: Path) -> None:
         )
     with torch.no_grad():
         for name, value in own.items():
-            value.copy_(loaded[name])
+            read = loaded[name].to(value.device)
+            if _sharded(value):
+                from torch.distributed.tensor import distribute_tensor
+
+                read = distribute_tensor(read, value.device_mesh, value.placements)
+            value.copy_(read)
+
+
+def _sharded(value: Any) -> bool:
+    """Whether it is a DTensor; asked by what it has, since importing that class takes a second."""
+    return hasattr(value, "placements")

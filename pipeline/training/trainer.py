@@ -11,16 +11,20 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch
+from accelerate.utils import save_fsdp_optimizer
+from accelerate.utils.constants import OPTIMIZER_NAME
 from torch.utils.data import Sampler
 from transformers import PrinterCallback, Trainer, TrainerCallback, TrainerControl, TrainerState, TrainingArguments
+from transformers.trainer import SCHEDULER_NAME
 from transformers.trainer_utils import get_last_checkpoint
+from transformers.utils import SAFE_WEIGHTS_NAME
 
 from pipeline.config import RuntimeConfig
 from pipeline.errors import UserError
 from pipeline.records import Measurement
 from pipeline.runtime import CHECKPOINTS, LogLines
 from pipeline.training.sampling import EpochDataset
-from pipeline.training.trainable import trainable_state
+from pipeline.training.trainable import load_trainable, whole_state
 
 LOWEST = 0.01
 """Share of the rate at the bottom of a wave."""
@@ -87,13 +91,28 @@ class TrainableTrainer(Trainer):
         self.lr_scheduler = torch.optim.lr_scheduler.LambdaLR(stepped, rate)
         return self.lr_scheduler
 
-    def _save(self, output_dir: str | None = None, state_dict: dict[str, Any] | None = None) -> None:
-        trained = trainable_state(self.accelerator.unwrap_model(self.model))
-        if state_dict is not None:
-            # Gathered by the distributed backend: take the gathered values.
-            trained = {name: state_dict[name] for name in trained}
+    def save_model(self, output_dir: str | None = None, _internal_call: bool = False) -> None:
+        """Write what is trained; all processes must call it, the first one writes."""
+        trained = whole_state(self.accelerator.unwrap_model(self.model))
         check_finite(trained, self.state.global_step)
-        super()._save(output_dir, {name: value.contiguous() for name, value in trained.items()})
+        if self.args.should_save:
+            self._save(output_dir, {name: value.contiguous() for name, value in trained.items()})
+
+    def _save_optimizer_and_scheduler(self, output_dir: str) -> None:
+        if not self.is_fsdp_enabled:
+            super()._save_optimizer_and_scheduler(output_dir)
+            return
+        # The Trainer would also have accelerate write the whole model here.
+        plugin = self.accelerator.state.fsdp_plugin
+        save_fsdp_optimizer(plugin, self.accelerator, self.optimizer, self.model, output_dir)
+        if self.args.should_save:
+            torch.save(self.lr_scheduler.state_dict(), Path(output_dir) / SCHEDULER_NAME)
+
+    def _load_from_checkpoint(self, resume_from_checkpoint: str, model: torch.nn.Module | None = None) -> None:
+        if not self.is_fsdp_enabled:
+            super()._load_from_checkpoint(resume_from_checkpoint, model)
+            return
+        load_trainable(model or self.model, Path(resume_from_checkpoint) / SAFE_WEIGHTS_NAME)
 
     def _issue_warnings_after_load(self, load_result: Any) -> None:
         # The frozen base is missing in each checkpoint by design; only what the model does not know is a mistake.
@@ -191,8 +210,15 @@ def training_arguments(folder: Path, runtime: RuntimeConfig, seed: int, **own: A
 def train(trainer: Trainer) -> Trained:
     """Train to the end, from the last checkpoint where there is one, and tidy up."""
     folder = Path(str(trainer.args.output_dir))
-    _drop_unfinished(folder)
+    if trainer.is_world_process_zero():
+        _drop_unfinished(folder)
+    trainer.accelerator.wait_for_everyone()
     last = get_last_checkpoint(str(folder)) if folder.is_dir() else None
+    if last and (Path(last) / f"{OPTIMIZER_NAME}.bin").is_file() != trainer.is_fsdp_enabled:
+        raise UserError(
+            f"{last}: was written {'unsharded' if trainer.is_fsdp_enabled else 'sharded'}; go on with the "
+            "runtime.launcher that it was begun with, or delete the folder"
+        )
     trainer.train(resume_from_checkpoint=last)
     history = [
         Measurement(step=entry["step"], name=name, value=value)
@@ -200,9 +226,7 @@ def train(trainer: Trainer) -> Trained:
         # A state that was read back has its names in order, one that was not has them as they were logged.
         for name, value in sorted(measured(entry).items())
     ]
-    whole = trainer.accelerator.get_state_dict(trainer.model_wrapped)
-    names = trainable_state(trainer.accelerator.unwrap_model(trainer.model))
-    state = {name: whole[name] for name in names if name in whole}
+    state = whole_state(trainer.accelerator.unwrap_model(trainer.model))
     check_finite(state, trainer.state.global_step)
     if trainer.is_world_process_zero():
         shutil.rmtree(folder, ignore_errors=True)

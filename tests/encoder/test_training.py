@@ -118,6 +118,46 @@ def test_training_follows_its_recipe_and_leaves_the_backbone(
     assert [epoch for epoch, _ in drawn] == sorted(epoch for epoch, _ in drawn)
 
 
+@pytest.mark.parametrize("recipe", ["paper", "release"])
+def test_accumulated_videos_weigh_alike(recipe: str, weights: Path, catalogue: Catalogue, tmp_path: Path) -> None:
+    """The gradient of five videos in an update is that of all at once, however they are divided; some parts are odd."""
+    data, gradients = encoder_data(tmp_path, catalogue, PARTS), list[torch.Tensor]()
+    kept = register_optimizer_step_pre_hook(
+        lambda optimizer, *_: gradients.append(
+            torch.cat([p.grad.flatten() for p in optimizer.param_groups[0]["params"]])
+        )
+    )
+    for micro in (0, 3, 2):
+        setting = config(weights, recipe, epochs=1, batch_size=6, micro_batch_size=micro)
+        seed_everything(0)
+        model = property_classifier(setting, data.classes).double()
+        for module in model.modules():
+            if isinstance(module, torch.nn.Dropout):
+                module.p = 0.0
+        train_classifier(model, data, setting, CPU, seed=1, inputs=[])
+    kept.remove()
+    assert len(gradients) == 3
+    for other in gradients[1:]:
+        # The number of labels that the Trainer gives is float32's.
+        torch.testing.assert_close(other, gradients[0], atol=1e-6 * float(gradients[0].abs().max()), rtol=0)
+
+
+def test_autocast_computes_in_bfloat16_and_learns_in_float32(
+    weights: Path, catalogue: Catalogue, tmp_path: Path
+) -> None:
+    data, formats = encoder_data(tmp_path, catalogue, PARTS), list[set[torch.dtype]]()
+    for autocast in ("none", "bfloat16"):
+        setting = config(weights, "paper", epochs=1, autocast=autocast)
+        model = property_classifier(setting, data.classes)
+        seen = set[torch.dtype]()
+        attended = model.encoder.visual.get_submodule("transformer.resblocks.0.mlp.c_fc")
+        attended.register_forward_hook(lambda _, __, output, seen=seen: seen.add(output.dtype))
+        train_classifier(model, data, setting, CPU, seed=1, inputs=[])
+        formats.append(seen)
+        assert {value.dtype for value in trainable_state(model).values()} == {torch.float32}
+    assert formats == [{torch.float32}, {torch.bfloat16}]
+
+
 @pytest.mark.parametrize(
     ("reached", "kept"), [((0.1, 0.5, 0.5), 1), ((0.0, 0.0, 0.0), 0), ((0.1, 0.2, 0.3), 2), ((), 2)]
 )

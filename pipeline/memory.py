@@ -1,0 +1,264 @@
+"""The memory that each stage of a scale takes on a device, counted from shapes before anything runs.
+
+Counted are weights, what training adds to them, the values that a backward pass reads again, the widest passing values,
+and the keys and values of an answer in the making. Not counted are the CUDA context, fragments, and the kernels' own
+rooms: a GiB or two on a card.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import astuple, dataclass, fields
+from pathlib import Path
+
+import yaml
+
+from pipeline.config import LoraTrainConfig, Params, TrainConfig
+from pipeline.records import Assignment, Part, Question, Turn
+from pipeline.shapes import FULL, Llama, Vision
+from pipeline.tasks.questions import build_questions, counts_by_task, pool_of
+from pipeline.videos.catalogue import Catalogue, load_catalogue
+
+GIB = 2**30
+BYTES = {"auto": 4, "float32": 4, "bfloat16": 2, "float16": 2}
+"""Of a value; `auto` may be less, which only the device knows that it will run on."""
+NF4 = 0.5 + 1 / 64 + 4 / (64 * 256)
+"""Bytes a value: four bits, a byte of scale for 64 of them, and a float32 for 256 such bytes (Dettmers et al. 2023)."""
+ADAM = 3 * FULL
+"""Bytes a trained value besides its own: its gradient, and Adam's two means."""
+GATHERED = 2
+"""Layers whose weights a sharded training holds whole: the one that computes and the one that is fetched."""
+ASKED = 30
+"""Questions of each task that the longest is looked for among."""
+LETTERS = 4
+"""Letters a token of English text, where the tokenizer is not there to ask."""
+
+
+@dataclass(frozen=True)
+class Use:
+    """Memory of a stage in bytes, on each of its devices."""
+
+    stage: str
+    devices: int
+    parameters: float
+    optimizer: float
+    """Gradients and Adam's means of what is trained."""
+    activations: float
+    cache: float = 0.0
+    """Keys and values of answers."""
+
+    @property
+    def total(self) -> float:
+        """Of all."""
+        return self.parameters + self.optimizer + self.activations + self.cache
+
+
+@dataclass(frozen=True)
+class Lengths:
+    """Tokens of the longest conversations."""
+
+    training: int
+    """Question and answer, under any OPD mode that is trained."""
+    answer: int
+    """Of `training`, the tokens that are learnt."""
+    prompt: int
+    """The longest evaluation question, with the answers of earlier turns."""
+
+
+def count(params: Params) -> tuple[list[Use], list[str]]:
+    """Count all stages that run a base model.
+
+    Returns:
+        The stages, and sentences on what was assumed or left out.
+    """
+    catalogue = load_catalogue(Path(params.data.catalogue))
+    uses: list[Use] = []
+    notes: list[str] = ["language.dtype is auto: counted as float32."] if params.language.dtype == "auto" else []
+    tower, encoder = Vision.read(Path(params.encoder.weights)), Path(params.encoder.weights)
+    if tower is None:
+        notes.append(f"{encoder}: no open_clip model whose shapes are known; the encoder's stages are not counted.")
+    else:
+        if not encoder.is_dir():
+            notes.append(f"{encoder} is not there: counted with the shapes that are published for {encoder.name}.")
+        uses += encoder_uses(params, tower, sum(len(p.levels) for p in catalogue.properties))
+    llama, language = Llama.read(Path(params.language.weights)), Path(params.language.weights)
+    if llama is None:
+        notes.append(f"{language}: no Llama whose shapes are known; the language model's stages are not counted.")
+        return uses, notes
+    if not language.is_dir():
+        notes.append(f"{language} is not there: counted with the shapes that are published for {language.name}.")
+    lengths = longest(params, catalogue)
+    if not (language / "tokenizer.json").is_file():
+        notes.append(f"Without its tokenizer, a token is taken for {LETTERS} letters.")
+    notes.append(
+        f"Longest conversation {lengths.training} tokens, {lengths.answer} of them learnt; longest question "
+        f"{lengths.prompt}, answered in at most {params.language.max_new_tokens}."
+    )
+    embedding = (tower.width if params.encoder.recipe == "release" else tower.embed_dim) if tower else llama.hidden_size
+    return [*uses, *language_uses(params, llama, embedding, lengths)], notes
+
+
+def encoder_uses(params: Params, tower: Vision, classes: int) -> Iterator[Use]:
+    """Fine-tuning by gradients (recipes `paper` and `release`), and embedding.
+
+    Args:
+        classes: Of all properties together.
+    """
+    config, frames = params.encoder, params.frames.per_video
+    if config.recipe in ("paper", "release"):
+        layers = min(tower.layers, config.prompt_layers or tower.layers)
+        trained = layers * config.prompts * tower.width
+        if config.recipe == "paper":
+            trained += (tower.width + 1) * tower.width + (tower.embed_dim + 1) * classes
+        else:
+            trained += (tower.width + 1) * 512 + 513 * classes
+        pictures = frames * min(config.micro_batch_size or config.batch_size, config.batch_size)
+        size = BYTES["bfloat16" if config.autocast == "bfloat16" else "float32"]
+        yield Use(
+            "finetune_encoder",
+            1,
+            parameters=FULL * (tower.parameters + trained),
+            optimizer=ADAM * trained,
+            activations=tower.saved(pictures, config.prompts, size) + tower.passing(pictures, config.prompts, size),
+        )
+    passing = tower.passing(config.embed_batch_size, config.prompts, FULL)
+    yield Use("embed", 1, parameters=FULL * tower.parameters, optimizer=0, activations=passing)
+
+
+def language_uses(params: Params, llama: Llama, embedding: int, lengths: Lengths) -> Iterator[Use]:
+    """Alignment, LoRA and answering.
+
+    Args:
+        embedding: Length of a tactile embedding.
+    """
+    language, hidden = params.language, llama.hidden_size
+    size = BYTES[language.dtype]
+    linear = llama.num_hidden_layers * llama.layer_linear
+    held = NF4 if language.quantization == "nf4" else size
+    frozen = linear * held + (llama.parameters - linear) * size
+    connector = (embedding + 1) * hidden + (hidden + 1) * hidden + 2 * hidden
+    adapters = llama.adapters(params.lora.target_modules, params.lora.rank)
+    devices, sharded = launched(params.runtime.launcher)
+    trainings: tuple[tuple[str, TrainConfig, int], ...] = (
+        ("align", params.align, connector),
+        ("lora", params.lora, connector + adapters),
+    )
+    for stage, config, trained in trainings:
+        whole, layer = frozen + FULL * trained, llama.layer_linear * held
+        shards = devices if sharded else 1
+        gathered = GATHERED * layer + llama.words * size + FULL * connector if shards > 1 else 0.0
+        yield Use(
+            stage,
+            devices,
+            parameters=whole / shards + gathered,
+            optimizer=ADAM * trained / shards,
+            activations=sum(f(params, llama, config, lengths) for f in (language_saved, language_passing)),
+        )
+    rows = language.generation_batch_size
+    read = rows * lengths.prompt
+    yield Use(
+        "answer",
+        1,
+        parameters=frozen + FULL * (connector + adapters),
+        optimizer=0,
+        # The prompts are read at once: the widest maps' outcomes, and a mask for each pair of tokens.
+        activations=read * (3 * llama.intermediate_size + 2 * hidden + lengths.prompt) * size,
+        cache=llama.cache(rows * (lengths.prompt + language.max_new_tokens), size),
+    )
+
+
+def language_saved(params: Params, llama: Llama, config: TrainConfig, lengths: Lengths) -> int:
+    """Bytes that a training's forward keeps: a batch of the longest conversations."""
+    size, tokens = BYTES[params.language.dtype], config.micro_batch_size * lengths.training
+    layer = llama.saved_layer(size)
+    if isinstance(config, LoraTrainConfig):
+        layer += llama.saved_adapters(config.target_modules, config.rank, size, config.dropout > 0)
+    if params.runtime.gradient_checkpointing:
+        # Of each layer what it reads is kept; one at a time is computed again.
+        kept = llama.num_hidden_layers * tokens * llama.hidden_size * size + tokens * layer
+    else:
+        kept = llama.num_hidden_layers * tokens * layer
+    loss = llama.saved_loss(config.micro_batch_size * lengths.answer)
+    return kept + tokens * (llama.hidden_size + 1) * FULL + loss
+
+
+def language_passing(params: Params, llama: Llama, config: TrainConfig, lengths: Lengths) -> int:
+    """Bytes that come and go at the widest place: the logits and their gradient, or three of a layer's middle."""
+    rows, size = config.micro_batch_size, BYTES[params.language.dtype]
+    middle = 3 * rows * lengths.training * llama.intermediate_size * size
+    return max(2 * llama.saved_loss(rows * lengths.answer), middle)
+
+
+def launched(launcher: str) -> tuple[int, bool]:
+    """Devices that a launcher starts a training on, and whether they share the layers among them."""
+    words = shlex.split(launcher)
+    settings: dict[str, object] = {}
+    if "--config_file" in words:
+        file = Path(words[words.index("--config_file") + 1])
+        settings = yaml.safe_load(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    devices = int(str(settings.get("num_processes", 1)))
+    if "--num_processes" in words:
+        devices = int(words[words.index("--num_processes") + 1])
+    return devices, settings.get("distributed_type") == "FSDP"
+
+
+def longest(params: Params, catalogue: Catalogue) -> Lengths:
+    """Look for the longest conversations among questions on all objects of the catalogue."""
+    tokens = _tokenizer(Path(params.language.weights))
+
+    def length(question: Question, turns: Sequence[Turn]) -> int:
+        text = " ".join([params.language.system_prompt, *(f"USER: {t.user} ASSISTANT: {t.assistant}" for t in turns)])
+        # A video is its frames and two delimiters.
+        return tokens(text.replace("{tactile}", "")) + len(question.videos) * (params.frames.per_video + 2)
+
+    modes = params.ablation.opd
+    training = [
+        (length(q, d.turns), sum(tokens(t.assistant) + 1 for t in d.turns))
+        for q in _questions(params, catalogue, Part.TRAIN)
+        for d in q.dialogues
+        if d.opd in modes
+    ]
+    prompts = [
+        length(q, [*d.turns[:-1], Turn(user=d.turns[-1].user, assistant="")])
+        for q in _questions(params, catalogue, Part.TEST)
+        for d in q.dialogues
+        if d.opd in modes
+    ]
+    most, learnt = max(training, default=(0, 0))
+    return Lengths(most, learnt, max(prompts, default=0))
+
+
+def _questions(params: Params, catalogue: Catalogue, part: Part) -> list[Question]:
+    videos = [Assignment(video_id=f"{o}_0", object_id=o, part=part) for o in catalogue.objects]
+    wanted = counts_by_task(params.questions, "train" if part == Part.TRAIN else "evaluation")
+    counts = {task: min(number, ASKED) for task, number in wanted.items()}
+    pool = pool_of(part, videos, catalogue)
+    return build_questions(pool, counts, seed=params.questions.seed, distinct=False, facts=params.questions.facts)
+
+
+def _tokenizer(folder: Path) -> Callable[[str], int]:
+    """What counts a text's tokens."""
+    file = folder / "tokenizer.json"
+    if not file.is_file():
+        return lambda text: -(-len(text) // LETTERS)
+    from tokenizers import Tokenizer
+
+    tokenizer = Tokenizer.from_file(str(file))
+    return lambda text: len(tokenizer.encode(text).ids)
+
+
+def table(uses: Sequence[Use]) -> str:
+    """The stages as lines of text, in GiB on each device."""
+    names = [f.name for f in fields(Use)]
+    rows = [[*names, "total"]]
+    for use in uses:
+        stage, devices, *sizes = astuple(use)
+        rows.append([stage, str(devices), *(f"{s / GIB:.2f}" for s in (*sizes, use.total))])
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return "\n".join(
+        "  ".join(
+            cell.ljust(w) if i == 0 else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True))
+        )
+        for row in rows
+    )

@@ -1,0 +1,117 @@
+"""A process of a sharded training: `accelerate launch -m tests.language.sharded FOLDER WEIGHTS EMBEDDINGS WHAT`."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+import torch
+from accelerate.state import AcceleratorState
+from accelerate.utils import DistributedType
+from torch.distributed.tensor import DTensor
+from torch.nn import Module
+from torch.optim.optimizer import register_optimizer_step_pre_hook
+
+from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig
+from pipeline.embeddings import EmbeddingStore
+from pipeline.io import read_jsonl, save_tensors, write_json
+from pipeline.language.training import Job, add_lora, align, assemble, finetune_lora
+from pipeline.records import Question
+from pipeline.training import trainer as shared
+from pipeline.training.trainer import TrainableTrainer, Trained
+from tests.language.shared import SMALL, material
+
+CONFIG = LoraTrainConfig(
+    **{**SMALL.model_dump(), "samples": 8, "epochs": 3}, rank=4, alpha=8, learning_rate=1e-3, dropout=0.0
+)
+"""Six updates of four questions; each process sees two of the four, or one process two after two. No dropout: each
+process draws its own."""
+KINDS = {"align": "float32", "lora": "bfloat16"}
+"""Trainings and the number format of the frozen weights; adapters stand in one group with them."""
+DIES = 5
+"""Update in which a process is killed; checkpoints are written after each second one."""
+
+
+def run(kind: str, weights: str, questions: list[Question], store: EmbeddingStore, folder: Path) -> Trained:
+    """One training with its checkpoints below the folder."""
+    shared.CHECKPOINTS = folder
+    language = LanguageConfig(weights=weights, dtype=KINDS[kind])  # type: ignore[arg-type]
+    model, data = assemble(material(language, questions, store), CONFIG.samples, "test")
+    job, runtime = Job(kind, "x", 0), RuntimeConfig(device="cpu", save_steps=2)
+    if kind == "align":
+        return align(model, data, CONFIG, runtime, job)
+    add_lora(model, CONFIG)
+    return finetune_lora(model, data, CONFIG, runtime, job)
+
+
+def shard_on_cpus() -> None:
+    """Have accelerate shard on CPUs as on GPUs: it has no other reason to refuse than that nobody would want it."""
+    begin = AcceleratorState.__init__
+
+    def begin_sharded(self: AcceleratorState, *args: Any, fsdp_plugin: Any = None, **kwargs: Any) -> None:
+        begin(self, *args, fsdp_plugin=fsdp_plugin, **kwargs)
+        if self.distributed_type == DistributedType.MULTI_CPU:
+            self.distributed_type = DistributedType.FSDP
+            if fsdp_plugin is not None:
+                if self._mixed_precision != "no":
+                    fsdp_plugin.set_mixed_precision(self._mixed_precision)
+                self.fsdp_plugin = fsdp_plugin
+
+    AcceleratorState.__init__ = begin_sharded
+
+
+def watch(said: dict[str, Any]) -> None:
+    """Note how parameters are held and what format they compute in, of the first batch."""
+    step = TrainableTrainer.training_step
+
+    def watched(self: TrainableTrainer, model: Module, *args: Any, **kwargs: Any) -> torch.Tensor:
+        if "sharded" not in said:
+            said["sharded"] = all(isinstance(p, DTensor) for p in model.parameters())
+            said["share"] = sum(p.to_local().numel() for p in model.parameters()) / sum(
+                p.numel() for p in model.parameters()
+            )
+            projection = model.get_submodule("connector.projection.0")
+
+            def note(module: Module, *_: object) -> None:
+                said["computes"] = str(module.weight.dtype)
+
+            hook = projection.register_forward_hook(note)
+            loss = step(self, model, *args, **kwargs)
+            hook.remove()
+            return loss
+        return step(self, model, *args, **kwargs)
+
+    TrainableTrainer.training_step = watched  # type: ignore[method-assign]
+
+
+def main() -> None:
+    folder, weights, embeddings, what = Path(sys.argv[1]), sys.argv[2], Path(sys.argv[3]), sys.argv[4]
+    shard_on_cpus()
+    torch.set_num_threads(1)
+    questions, store = read_jsonl(folder / "questions.jsonl", Question), EmbeddingStore(embeddings)
+    rank = os.environ["RANK"]
+    if what == "killed":
+        for kind in KINDS:
+            said: dict[str, Any] = {}
+            watch(said)
+            trained = run(kind, weights, questions, store, folder / "whole")
+            write_json(folder / f"{kind}-{rank}.json", said)
+            save_tensors(folder / f"{kind}-whole-{rank}.safetensors", trained.state)
+        counter = iter(range(1, 100))
+
+        def die(*_: object) -> None:
+            if next(counter) == DIES and rank == "1":
+                os.kill(os.getpid(), signal.SIGKILL)
+
+        register_optimizer_step_pre_hook(die)
+        run("lora", weights, questions, store, folder / "killed")
+    else:
+        trained = run("lora", weights, questions, store, folder / "killed")
+        save_tensors(folder / f"lora-resumed-{rank}.safetensors", trained.state)
+
+
+if __name__ == "__main__":
+    main()
