@@ -31,9 +31,9 @@ CLIP: dict[str, dict[str, Any]] = {
         },
         "text_cfg": {"context_length": 8, "vocab_size": 64, "width": 32, "heads": 1, "layers": 1},
     },
-    "preprocess_cfg": {"mean": [0.5, 0.5, 0.5], "std": [0.25, 0.25, 0.25]},
+    "preprocess_cfg": {"mean": [0.481, 0.458, 0.408], "std": [0.269, 0.261, 0.276]},
 }
-"""The text tower is never read, so it is as small as it goes."""
+"""Pictures are normalised as for OpenAI's CLIP. The text tower is never read, so it is as small as it goes."""
 LLAMA = {
     "hidden_size": 192,
     "intermediate_size": 480,
