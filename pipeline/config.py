@@ -116,6 +116,9 @@ class QuestionsConfig(Section):
     train: QuestionCounts
     """By the task's name in lower case; a task without a number gets none."""
     evaluation: QuestionCounts
+    scenarios: Literal["published", "ours"] = "published"
+    """Scenario questions (PSR): whose right and wrong objects. `published`: the published code's. `ours`: this
+    project's reading of the situations, with clearer contrasts. A catalogue's own scenarios are asked in any case."""
     facts: bool = False
     """Begin matching questions with what the named objects are like, for a language model that has never heard of
     them: then touch and reasoning are asked for and no knowledge of the world. Tables say so."""
