@@ -93,22 +93,22 @@ def as_published(said: str, labels: tuple[int, ...], catalogue: Catalogue) -> di
     """By property, and `combined`, whether a description is right as the published code compares it.
 
     That code cuts the closing sentence at its fixed words and compares what stands between them letter by letter; the
-    last class, and the whole sentence, may be followed by anything. A sentence that lacks a fixed word is all wrong.
+    last class with its full stop, and the whole sentence, may be followed by anything. A sentence that lacks a fixed
+    word is all wrong.
     """
     right = catalogue.structured(labels)
     fields = [(before, name) for before, name, *_ in Formatter().parse(catalogue.language.structured) if name]
-    opening = fields[0][0]
-    end = rest = said.split(opening)[-1]
-    values = []
+    opening, (ending, last) = fields[0][0], fields[-1]
+    rest, values = said.split(opening)[-1], []
     for before, _ in fields[1:]:
-        value, cut, rest = rest.partition(before)
+        value, cut, rest = rest.partition(before.rstrip())
         if not cut or opening not in said:
             return dict.fromkeys((*catalogue.property_names, "combined"), False)
-        values.append(value)
+        values.append(value.strip())
     levels = {p.name: p.levels[label] for p, label in zip(catalogue.properties, labels, strict=True)}
     found = {name: value == levels[name] for (_, name), value in zip(fields, values, strict=False)}
-    last = fields[-1][1]
-    return {**found, last: rest.startswith(levels[last]), "combined": end.startswith(right.split(opening)[-1])}
+    found[last] = rest.strip().startswith(right.split(ending)[-1])
+    return {**found, "combined": said.split(opening)[-1].startswith(right.split(opening)[-1])}
 
 
 TASK = ObjectPropertyDescription()
