@@ -133,6 +133,10 @@ class EncoderConfig(Section):
     weights: str
     """Folder of the CLIP in open_clip's format: open_clip_config.json and open_clip_model.safetensors. With
     `pretrained` it is the ablation's base encoder only."""
+    embedding: Literal["projected", "class_token"] = "projected"
+    """`paper`: what is read of CLIP, for the heads and the language model (ViT-L/14: 768 or 1024 values). `projected`:
+    CLIP's own embedding. `class_token`: the normalised class token before CLIP's projection. `release` reads the
+    class token in any case: normalised for the heads, and before that for the language model."""
     prompts: Annotated[int, Field(ge=1, le=256)] = 8
     """Learnable prompts at each layer."""
     prompt_layers: Annotated[int, Field(ge=0)] = 0

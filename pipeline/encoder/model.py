@@ -140,12 +140,12 @@ class PropertyClassifier(nn.Module):
 
 def base_encoder(config: EncoderConfig) -> TactileEncoder:
     """CLIP as it comes."""
-    return TactileEncoder(load_visual_tower(Path(config.weights)))
+    return TactileEncoder(load_visual_tower(Path(config.weights), config.embedding))
 
 
 def property_classifier(config: EncoderConfig, classes: Sequence[int]) -> PropertyClassifier:
     """CLIP with visual prompts that pass one shared linear map, and one linear head a property."""
-    tower = load_visual_tower(Path(config.weights))
+    tower = load_visual_tower(Path(config.weights), config.embedding)
     encoder = TactileEncoder(tower, visual_prompts(config, tower, shared=True))
     return PropertyClassifier(encoder, Heads(encoder.dim, classes), classes)
 

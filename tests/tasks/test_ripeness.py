@@ -137,9 +137,7 @@ def test_a_hand_that_only_presses_turns_nothing() -> None:
         pressed, twisted = (make_motion(50, np.random.default_rng(seed), twist=twist) for twist in (False, True))
         assert set(pressed.angle) == {twisted.angle[0]}
         assert len(set(twisted.angle)) > 1
-        assert (pressed.force >= twisted.force - 1e-12).all()
-        held, kept = ((m.force > 0.99 * m.force.max()).sum() for m in (pressed, twisted))
-        assert held >= kept, "a twisting hand presses less towards the end"
+        assert (pressed.force >= twisted.force - 1e-12).all(), "a twisting hand presses less towards the end"
 
 
 def test_published_figures_stand_beside_avocados_only() -> None:
