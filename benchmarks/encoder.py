@@ -45,6 +45,7 @@ from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import list_videos
 from pipeline.videos.frames.extract import extract_frames
 from pipeline.videos.frames.store import FrameStore
+from pipeline.weights import CLIP_CONFIG
 
 PRETRAINED = Path("data") / "pretrained" / "encoder.safetensors"
 
@@ -108,13 +109,15 @@ def measure(root: Path, size: Size | None = None) -> list[Row]:
     folder, catalogue = bench_videos(root)
     pretrained = root / PRETRAINED
     if not pretrained.is_file():
-        raise UserError(
-            f"{pretrained}: no such file; `octopi scale small encoder.recipe=pretrained`, `dvc repro pretrain` make it"
-        )
+        raise UserError(f"{pretrained}: no such file; `octopi scale small`, `dvc repro pretrain` make it")
     if len({f.object_id for f in list_videos(folder, catalogue).files}) < 2 * size.folds:
         raise UserError(f"{folder}: bench encoder needs videos of {2 * size.folds} objects or more")
     params = load_params(root / "params.yaml").encoder
-    changed = {"recipe": "paper", "reference": "none", "weights": str(root / params.weights)}
+    changed = {"recipe": "paper", "backbone": ("clip",), "reference": "none", "weights": str(root / params.weights)}
+    if not (root / params.weights / CLIP_CONFIG).is_file():
+        raise UserError(
+            f"{root / params.weights}: bench encoder compares with a CLIP; name its folder in encoder.weights"
+        )
     with one_thread(), TemporaryDirectory() as made:
         frames = Path(made) / "frames"
         config = FramesConfig(selection="salient", size=SIDE)

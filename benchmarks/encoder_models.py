@@ -83,7 +83,9 @@ def _classifier(candidate: Candidate, bed: Bed) -> PropertyClassifier:
     """A candidate with heads that have learnt nothing."""
     seed_everything(0)
     if candidate.kind == "frame_heads":
-        return JointFrameClassifier(SceneEncoder() if candidate.pretrained else base_encoder(bed.config), bed.classes)
+        return JointFrameClassifier(
+            base_encoder(bed.config) if "clip" in candidate.backbone else SceneEncoder(), bed.classes
+        )
     if candidate.recipe == "scratch":
         encoder = SceneEncoder()
         return PropertyClassifier(encoder, Heads(encoder.dim, bed.classes), bed.classes)

@@ -63,14 +63,17 @@ def _sha256(file: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def _licence(path: Path) -> str | None:
-    """What the card beside the weights says in its front matter."""
-    card = (path if path.is_dir() else path.parent) / CARD_FILE
+def front_matter(folder: Path) -> dict[str, Any]:
+    """What the card in a folder says in its front matter; empty where there is none."""
+    card = folder / CARD_FILE
     text = card.read_text(encoding="utf-8") if card.is_file() else ""
-    if not text.startswith("---\n"):
-        return None
-    front: Any = yaml.safe_load(text.split("---\n")[1])
-    return str(front["license"]) if isinstance(front, dict) and "license" in front else None
+    front: Any = yaml.safe_load(text.split("---\n")[1]) if text.startswith("---\n") else None
+    return front if isinstance(front, dict) else {}
+
+
+def _licence(path: Path) -> str | None:
+    front = front_matter(path if path.is_dir() else path.parent)
+    return str(front["license"]) if "license" in front else None
 
 
 def _shown(value: object) -> str:

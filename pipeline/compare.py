@@ -18,7 +18,7 @@ from pipeline.records import Graded
 from pipeline.revisions import State, find_state
 from pipeline.tasks import TASKS
 
-GRADED, QUESTIONS = "data/graded.parquet", "data/questions/evaluation.jsonl"
+GRADED, QUESTIONS = "data/graded.parquet", "data/questions"
 KEY = ("task", "measure", "encoder", "lora", "opd", "touch", "seed")
 SHOWN = 40
 Rows = list[dict[str, Any]]
@@ -123,8 +123,10 @@ def _answers(state: State) -> list[Graded] | None:
 
 
 def _questions(state: State) -> dict[str, object]:
-    """By id, what makes a question this one: its videos and its right answer."""
-    rows = map(json.loads, (state.read(QUESTIONS) or b"").splitlines())
+    """By id, over all seeds, what makes a question this one: its videos and its right answer."""
+    seeds = (state.mapping("params.yaml").get("ablation") or {}).get("seeds", [0])
+    files = [state.read(f"{QUESTIONS}/{seed}/evaluation.jsonl") or b"" for seed in seeds]
+    rows = (json.loads(line) for file in files for line in file.splitlines())
     return {row["question_id"]: (row["videos"], row["gold"]) for row in rows}
 
 

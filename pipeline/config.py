@@ -23,16 +23,30 @@ QuestionCounts = dict[str, Annotated[int, Field(ge=0)]]
 
 Recipe = Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]*$")]
 """A name in `pipeline.encoder.recipes.RECIPES`; `octopi scale` checks that it is one."""
+CLIP_RECIPES = ("paper", "release")
+"""Recipes that are for `encoder.backbone=[clip]` alone."""
 Selection = Literal["salient", "release", "uniform", "contact", "adaptive"]
 
 SCENES_DIR = Path("data/scenes/videos")
 """Where the chain puts the videos that it makes itself."""
+PRETRAINED = Path("data/pretrained/encoder.safetensors")
+"""Where the chain puts the network that it pretrains on synthetic pictures, the backbone `scenes`."""
 
 
 class Section(BaseModel):
-    """A frozen part of the configuration; unknown keys are errors."""
+    """A frozen part of the configuration; unknown keys are errors, and so are numbers that are none."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _true_is_no_number(cls, values: object) -> object:
+        """Python counts `true` as 1, and so `epochs: true` would train for one epoch."""
+        for name, value in values.items() if isinstance(values, dict) else ():
+            field = cls.model_fields.get(name)
+            if isinstance(value, bool) and field is not None and field.annotation is not bool:
+                raise ValueError(f"{name} is {str(value).lower()}, but no switch")
+        return values
 
 
 class DataConfig(Section):
@@ -98,15 +112,17 @@ class SplitConfig(Section):
     test_objects: Positive = 7
     """Test objects of the development split."""
     folds: Annotated[int, Field(ge=3, le=50)] = 5
-    fold: Annotated[int, Field(ge=0)] = 0
+    """Of kfold. Each seed of `ablation.seeds` has one for its test: seed s has fold s modulo `folds`."""
     missing: Literal["report", "error"] = "report"
     """What to do about validation or test objects without videos: go on and leave cells empty, or stop."""
 
-    @model_validator(mode="after")
-    def _fold_exists(self) -> Self:
-        if self.fold >= self.folds:
-            raise ValueError(f"split.fold is {self.fold}, allowed: 0 to {self.folds - 1}")
-        return self
+    def fold_of(self, seed: int) -> int | None:
+        """The fold that a seed of `ablation.seeds` tests on; None where all seeds share one split."""
+        return seed % self.folds if self.name == "kfold" else None
+
+    def replicate_of(self, seed: int) -> int:
+        """Seeds of one replicate test each object once together, so their answers are pooled as those of one seed."""
+        return seed // self.folds if self.name == "kfold" else seed
 
 
 class QuestionsConfig(Section):
@@ -114,7 +130,7 @@ class QuestionsConfig(Section):
 
     seed: Seed = 0
     train: QuestionCounts
-    """By the task's name in lower case; a task without a number gets none."""
+    """By the task's name in lower case; a task without a number gets none. With kfold these are for each fold."""
     evaluation: QuestionCounts
     scenarios: Literal["published", "ours"] = "published"
     """Scenario questions (PSR): whose right and wrong objects. `published`: the published code's. `ours`: this
@@ -128,11 +144,16 @@ class EncoderConfig(Section):
     """The tactile encoder and its training on property labels."""
 
     recipe: Recipe = "paper"
-    """`paper`: CLIP with visual prompts, three heads. `release`: the same as the published code has it. `pretrained`: a
-    convolutional network pretrained on synthetic pictures (section `pretrain`), with a per-frame classifier."""
+    """`paper`: CLIP with visual prompts, three heads. `release`: the same as the published code has it. `tuned`: a
+    frame classifier on the features of any backbones, then their last stage, or prompts, with it."""
+    backbone: tuple[str, ...] = Field(default=("clip",), min_length=1)
+    """Names in `pipeline.encoder.backbones.BACKBONES`; of several, features stand side by side. `clip`: a ViT of
+    open_clip's. `timm`: a network of timm's. `scenes`: the one that the chain pretrains (section `pretrain`)."""
     weights: str
-    """Folder of the CLIP in open_clip's format: open_clip_config.json and open_clip_model.safetensors. With
-    `pretrained` it is the ablation's base encoder only."""
+    """Folder of `clip` in open_clip's format (open_clip_config.json and open_clip_model.safetensors), or of `timm` in
+    timm's (config.json and model.safetensors). The chain makes what is named below data/weights/."""
+    feature_stage: Annotated[int, Field(ge=0, le=200)] = 3
+    """`timm`: which of the network's stages (a transformer: blocks) is read, from 0 on; what follows is not used."""
     embedding: Literal["projected", "class_token"] = "projected"
     """`paper`: what is read of CLIP, for the heads and the language model (ViT-L/14: 768 or 1024 values). `projected`:
     CLIP's own embedding. `class_token`: the normalised class token before CLIP's projection. `release` reads the
@@ -146,7 +167,7 @@ class EncoderConfig(Section):
     learning_rate: Rate = 1e-3
     weight_decay: Annotated[float, Field(ge=0, lt=1)] = 0.0
     flip_probability: Annotated[float, Field(ge=0, le=1)] = 0.5
-    """Chance of each of the two flips in training. None of these from `prompts` on concerns `pretrained`."""
+    """Chance of each of the two flips in training."""
     reference: Literal["none", "subtract"] = "none"
     """`subtract`: show each frame's difference to the video's no-contact reference in place of the frame."""
     standardize: bool = False
@@ -155,14 +176,22 @@ class EncoderConfig(Section):
     """Frames at a time when embeddings are computed."""
 
     @model_validator(mode="after")
-    def _pretrained_sees_differences(self) -> Self:
-        if self.recipe == "pretrained" and self.reference != "subtract":
-            raise ValueError("encoder.recipe=pretrained was pretrained on differences: set encoder.reference=subtract")
+    def _backbones_fit(self) -> Self:
+        named = ",".join(self.backbone)
+        if len(set(self.backbone)) < len(self.backbone):
+            raise ValueError(f"encoder.backbone=[{named}] names one twice")
+        if self.recipe in CLIP_RECIPES and self.backbone != ("clip",):
+            raise ValueError(
+                f"encoder.recipe={self.recipe} is for CLIP alone, but encoder.backbone=[{named}]; set "
+                "encoder.backbone=[clip] and encoder.weights, or encoder.recipe=tuned"
+            )
+        if "scenes" in self.backbone and self.reference != "subtract":
+            raise ValueError("encoder.backbone: scenes was pretrained on differences: set encoder.reference=subtract")
         return self
 
 
 class PretrainConfig(Section):
-    """Pretraining of the pretrained recipe's encoder on pictures of invented objects."""
+    """Pretraining of the backbone `scenes` on pictures of invented objects."""
 
     objects: Annotated[int, Field(ge=8, le=1_000_000)] = 4000
     """Objects that are invented; each is drawn once."""
@@ -195,16 +224,51 @@ class LanguageConfig(Section):
     """The language model and its generation."""
 
     weights: str
-    """Folder in transformers' format with a Llama-like model (safetensors) and a fast tokenizer."""
+    """Folder in transformers' format with a Llama-like model (safetensors) and a fast tokenizer. The chain makes what
+    is named below data/weights/."""
     dtype: DtypeName = "float32"
-    """Number format of the frozen weights; whatever is trained stays in float32."""
+    """Number format of the frozen weights; whatever is trained stays in float32. `auto`: bfloat16 where the device
+    computes it in hardware, else float32."""
     quantization: Quantization = "none"
     """`nf4`: hold the frozen linear layers in four bits (needs bitsandbytes and a CUDA device)."""
     system_prompt: str = ""
-    """Put before each conversation (Vicuna has one; the stand-in was made without)."""
+    """Put before each conversation (Vicuna has one)."""
     max_new_tokens: Annotated[int, Field(ge=1, le=4096)] = 256
     """Of an answer; fewer where the language model has no more positions. Longer answers are cut and marked."""
     generation_batch_size: Positive = 32
+
+
+class TeachConfig(Section):
+    """Teaching a small language model, in text, to reason about described things (LoRA on all linear layers, AdamW)."""
+
+    base: str = ""
+    """Folder of the language model that is taught, for language.weights=data/taught; empty: nothing is taught."""
+    rank: Annotated[int, Field(ge=1, le=1024)] = 64
+    alpha: Annotated[float, Field(gt=0)] = 128
+    learning_rate: Rate = 5e-4
+    warmup: Annotated[int, Field(ge=0)] = 10
+    """Updates until the rate is reached; it stays there."""
+    batch_size: Positive = 32
+    """Items an update."""
+    micro_batch_size: Positive = 8
+    """Items at a time, of like length."""
+    max_updates: Positive = 200
+    """Longest either phase may take: short items, then whole descriptions."""
+    check_every: Positive = 20
+    """Updates between two looks at items that are not trained on."""
+    check_items: Positive = 64
+    advance: Fraction = 0.93
+    """Share of short items right at which whole descriptions begin."""
+    finish: Fraction = 0.97
+    """Share of whole descriptions right at which teaching ends."""
+    gate_questions: Annotated[int, Field(ge=0)] = 100
+    """Questions of each task that the untaught and the taught model are asked in words."""
+
+    @model_validator(mode="after")
+    def _batches_divide(self) -> Self:
+        if self.batch_size % self.micro_batch_size:
+            raise ValueError(f"micro_batch_size {self.micro_batch_size} does not divide batch_size {self.batch_size}")
+        return self
 
 
 class TrainConfig(Section):
@@ -236,8 +300,9 @@ class LoraTrainConfig(TrainConfig):
     rank: Annotated[int, Field(ge=1, le=1024)] = 128
     alpha: Annotated[float, Field(gt=0)] = 256
     dropout: Annotated[float, Field(ge=0, lt=1)] = 0.05
-    target_modules: tuple[str, ...] = Field(default=("q_proj", "k_proj"), min_length=1)
-    """Linear layers that get an adapter (the paper does not say; the published code: q_proj and k_proj)."""
+    target_modules: Literal["all-linear"] | Annotated[tuple[str, ...], Field(min_length=1)] = ("q_proj", "k_proj")
+    """Linear layers that get an adapter (the paper does not say; the published code: q_proj and k_proj); `all-linear`:
+    all but the one that gives the logits."""
 
 
 class AblationConfig(Section):
@@ -254,6 +319,7 @@ class AblationConfig(Section):
     opd: tuple[Opd, ...] = (Opd.ALL, Opd.NONE)
     """How much an answer describes before it concludes: `all`, what is `needed` for the question, or `none`."""
     seeds: tuple[Seed, ...] = Field(default=(0,), min_length=1)
+    """With split.name=kfold seeds are folds: [0, 1, 2] of three folds tests each object once, [0, ..., 5] twice."""
     touch: tuple[Literal[Touch.REMOVED, Touch.SWAPPED, Touch.NOISE], ...] = ()
     """Input ablations: what the full system is also given in place of its videos, to see whether it feels them."""
 
@@ -318,6 +384,7 @@ class Params(Section):
     encoder: EncoderConfig
     pretrain: PretrainConfig
     cross_validation: CrossValidationConfig
+    teach: TeachConfig
     language: LanguageConfig
     align: TrainConfig
     lora: LoraTrainConfig
@@ -329,6 +396,18 @@ class Params(Section):
     def _scenes_have_their_place(self) -> Self:
         if self.data.source == "scenes" and Path(self.data.dir) != SCENES_DIR:
             raise ValueError(f"data.dir must be {SCENES_DIR} where data.source is scenes (set data.source=videos?)")
+        return self
+
+    @model_validator(mode="after")
+    def _replicates_hold_the_same_folds(self) -> Self:
+        held: dict[int, set[int | None]] = {}
+        for seed in self.ablation.seeds:
+            held.setdefault(self.split.replicate_of(seed), set()).add(self.split.fold_of(seed))
+        if len({frozenset(folds) for folds in held.values()}) > 1:
+            raise ValueError(
+                f"ablation.seeds {list(self.ablation.seeds)} test on some of the {self.split.folds} folds more often "
+                "than on others; take as many seeds for each fold"
+            )
         return self
 
     @property

@@ -19,7 +19,9 @@ PARAMS_FILE = Path("params.yaml")
 def load_params(path: Path = PARAMS_FILE) -> Params:
     """Read and check params.yaml."""
     try:
-        values = yaml.load(path.read_text(encoding="utf-8"), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        values = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
+    except UnicodeDecodeError:
+        raise UserError(f"{path}: not UTF-8; save it as such, or `octopi scale smoke` rewrites it") from None
     except FileNotFoundError:
         raise UserError(f"{path}: no such file; `octopi scale smoke` writes it") from None
     except yaml.YAMLError as error:
@@ -29,6 +31,19 @@ def load_params(path: Path = PARAMS_FILE) -> Params:
     if not isinstance(values, dict):
         raise UserError(f"{path}: empty; `octopi scale smoke` writes it")
     return validate(values, str(path))
+
+
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+    """Refuses a key that stands twice, of which YAML readers take the last one silently."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key, _ in node.value:
+            if key.value in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"{key.value} stands twice", key.start_mark)
+            seen.add(key.value)
+        values: dict[Any, Any] = super().construct_mapping(node, deep)
+        return values
 
 
 def explain(error: ValidationError) -> str:

@@ -262,12 +262,15 @@ class Graded(Score):
     lora: Lora
     opd: Opd
     seed: int
+    """The replicate: with folds, all their answers together count as those of one seed."""
+    trained: int
+    """The seed of `ablation.seeds` under which the model was trained; with folds it says the fold."""
     touch: Touch
 
     @property
     def variant(self) -> Variant:
         """The answering system."""
-        return Variant(self.encoder, self.lora, self.opd, self.seed)
+        return Variant(self.encoder, self.lora, self.opd, self.trained)
 
 
 class Classification(Record):
@@ -293,12 +296,37 @@ class OutOfFold(Record):
     predicted: tuple[int, ...]
 
 
+class Described(Record):
+    """How a base model reasons about objects that are described in words, by task: a row of data/taught/gate.csv."""
+
+    model: str
+    """`untaught`, `taught`, or what else was asked."""
+    task: str
+    """Name of the task in `pipeline.tasks.TASKS` whose questions were asked in plain words."""
+    n: int = Field(ge=1)
+    right: int = Field(ge=0)
+    unread: int = Field(ge=0)
+    """Answers that could not be read, which count as wrong."""
+
+
 class Measurement(Record):
     """One logged value of a training: a point of a curve."""
 
     step: int = Field(ge=0)
     name: str
     value: float
+
+
+class GateScore(Record):
+    """How a language model answers one task's questions about objects that are described in words."""
+
+    model: str
+    """`untaught`, `taught`, or another name that a report gives it."""
+    task: str
+    n: int = Field(ge=0)
+    right: int = Field(ge=0)
+    unread: int = Field(ge=0)
+    """Answers that name no choice, or several; they count as wrong."""
 
 
 Flip = Literal["none", "horizontal", "vertical", "both"]

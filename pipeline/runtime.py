@@ -24,7 +24,7 @@ CHECKPOINTS = Path("checkpoints")
 """Where unfinished work waits to be resumed, outside DVC's reach: DVC deletes the outputs of a killed stage."""
 
 DeviceName = Literal["auto", "cpu", "cuda", "mps"]
-DtypeName = Literal["float32", "bfloat16", "float16"]
+DtypeName = Literal["auto", "float32", "bfloat16", "float16"]
 Quantization = Literal["none", "nf4"]
 
 
@@ -57,8 +57,29 @@ def resolve_device(name: DeviceName) -> torch.device:
     return torch.device(name)
 
 
+def name_dtype(name: DtypeName, device: DeviceName = "auto") -> DtypeName:
+    """What `auto` stands for on that device, for the record; other names stay as they are.
+
+    bfloat16 where it is computed in hardware (CUDA from Ampere on; processors with AVX512-BF16 or AMX), else float32:
+    elsewhere a processor takes many times as long for it.
+    """
+    import torch
+
+    if name != "auto":
+        return name
+    match resolve_device(device).type:
+        case "cuda":
+            fast = torch.cuda.is_bf16_supported(including_emulation=False)
+        case "cpu":
+            # No public name asks the processor.
+            fast = torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
+        case _:
+            fast = False
+    return "bfloat16" if fast else "float32"
+
+
 def resolve_dtype(name: DtypeName) -> torch.dtype:
-    """The torch dtype of that name."""
+    """The torch dtype of that name; `auto` for the device that `auto` is."""
     import torch
 
     dtypes: dict[str, torch.dtype] = {
@@ -66,7 +87,7 @@ def resolve_dtype(name: DtypeName) -> torch.dtype:
         "bfloat16": torch.bfloat16,
         "float16": torch.float16,
     }
-    return dtypes[name]
+    return dtypes[name_dtype(name)]
 
 
 def limit_threads(count: int) -> None:

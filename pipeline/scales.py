@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import re
+import shlex
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import yaml
+from pydantic import BaseModel
 
 from pipeline import weights
 from pipeline.config import Params
+from pipeline.encoder.backbones import check_backbones
 from pipeline.encoder.candidates import check_candidates
 from pipeline.encoder.recipes import check_recipe
 from pipeline.errors import UserError
@@ -22,6 +27,8 @@ from pipeline.videos.files import list_videos, raise_errors
 from pipeline.videos.split import FEWEST_TRAINING_OBJECTS, assign_objects
 
 CONF = Path("conf")
+TAUGHT = "data/taught"
+"""What the chain makes of `teach.base`."""
 RECIPE = "encoder.recipe"
 HEADER = "# Written by `octopi scale`; change it with that command, or edit conf/ and run it again.\n"
 
@@ -50,7 +57,7 @@ def compose(name: str, overrides: Sequence[str] = (), conf: Path = CONF) -> Para
         if "=" not in override:
             raise UserError(f"{override!r} is no override; write key=value, for example split.name=development")
     # Every key may be set here; whether it exists is the validation's matter, since that knows what is allowed.
-    forced = [o if o.startswith(("+", "~")) else f"++{o}" for o in overrides]
+    forced = [o if o.startswith(("+", "~")) else f"++{_literal(o)}" for o in overrides]
     # A recipe brings its own values; they give way to what is set beside it.
     asked = dict(o.lstrip("+").split("=", 1) for o in overrides).get(RECIPE)
     if asked is not None and (conf / "recipe" / f"{asked}.yaml").is_file():
@@ -64,14 +71,34 @@ def compose(name: str, overrides: Sequence[str] = (), conf: Path = CONF) -> Para
     return validate({str(k): v for k, v in values.items()}, f"scale {name}")
 
 
+def _literal(override: str) -> str:
+    """The override with a text as it stands: Hydra's grammar would read brackets, commas or blanks of a path."""
+    key, value = override.split("=", 1)
+    field: Any = Params
+    for part in key.split("."):
+        fields = field.model_fields if isinstance(field, type) and issubclass(field, BaseModel) else {}
+        field = fields[part].annotation if part in fields else None
+    if field is not str or (len(value) > 1 and value[0] == value[-1] and value[0] in "'\""):
+        return override
+    # Hydra halves backslashes only where a quotation mark follows.
+    escaped = re.sub(r"(\\*)('|$)", lambda found: found[1] * 2 + ("\\'" if found[2] else ""), value)
+    return f"{key}='{escaped}'"
+
+
 def check_inputs(params: Params) -> None:
     """Raise UserError where something that the scale needs is not there: videos, catalogue, objects, tasks, weights."""
     catalogue = load_catalogue(Path(params.data.catalogue))
     check_recipe(params.encoder.recipe)
-    check_candidates(params.cross_validation.models, params.encoder.recipe)
+    check_backbones(params.encoder.backbone)
+    check_candidates(params.cross_validation.models, params.encoder)
     counts_by_task(params.questions, "train")
     counts_by_task(params.questions, "evaluation")
+    launcher = shlex.split(params.runtime.launcher)
+    if not launcher or shutil.which(launcher[0]) is None:
+        raise UserError(f"runtime.launcher: no program {params.runtime.launcher!r}; set it to python, or install it")
     folder = Path(params.data.dir)
+    if params.data.source == "videos" and folder.exists() and not folder.is_dir():
+        raise UserError(f"data.dir: {folder} is a file; name the folder that the videos are in")
     if params.data.source == "videos" and not folder.is_dir():
         raise UserError(
             f"data.dir: {folder} does not exist; import the public data set (README, section Real videos) or name the "
@@ -81,8 +108,11 @@ def check_inputs(params: Params) -> None:
     if unknown:
         raise UserError(f"scenes.objects: {unknown[0]} is not in {params.data.catalogue}/objects.csv")
     check_objects(params, catalogue)
-    weights.check_encoder(Path(params.encoder.weights), params.frames.size)
-    weights.check_language(Path(params.language.weights))
+    backbone = getattr(params.encoder, "backbone", ("clip",))
+    weights.check_encoder(Path(params.encoder.weights), params.frames.size, backbone)
+    for key, base in (("teach.base", params.teach.base), ("language.weights", params.language.weights)):
+        if base not in ("", TAUGHT):
+            weights.check_language(Path(base), key)
 
 
 def check_objects(params: Params, catalogue: Catalogue) -> None:
@@ -93,18 +123,21 @@ def check_objects(params: Params, catalogue: Catalogue) -> None:
         present = {file.object_id for file in list_videos(Path(params.data.dir), catalogue).files}
         if not present:
             raise_errors(Path(params.data.dir), list_videos(Path(params.data.dir), catalogue).findings)
-    parts = assign_objects(catalogue, present, params.split)
-    training, tested = (sorted(o for o in present if parts.get(o) == part) for part in (Part.TRAIN, Part.TEST))
-    if len(training) < FEWEST_TRAINING_OBJECTS:
-        raise UserError(
-            f"split.name={params.split.name}: {len(training)} training objects have videos, but questions about three "
-            "objects need three; add objects, or choose another split.name"
-        )
-    if len(tested) == 1 and Touch.SWAPPED in params.ablation.touch:
-        raise UserError(
-            f"ablation.touch: swapped gives a test object the touch of another, but only {tested[0]} has videos; leave "
-            "swapped out, or add test objects"
-        )
+    for seed in params.ablation.seeds:
+        parts = assign_objects(catalogue, present, params.split, seed)
+        training, tested = (sorted(o for o in present if parts.get(o) == part) for part in (Part.TRAIN, Part.TEST))
+        fold = params.split.fold_of(seed)
+        where = f"split.name={params.split.name}" + (f", fold {fold}" if fold is not None else "")
+        if len(training) < FEWEST_TRAINING_OBJECTS:
+            raise UserError(
+                f"{where}: {len(training)} training objects have videos, but questions about three objects need three; "
+                "add objects, or choose another split.name"
+            )
+        if len(tested) == 1 and Touch.SWAPPED in params.ablation.touch:
+            raise UserError(
+                f"ablation.touch: swapped gives a test object the touch of another, but with {where} only {tested[0]} "
+                "has videos; leave swapped out, or add test objects"
+            )
     if len(present) < params.cross_validation.folds:
         raise UserError(
             f"cross_validation.folds is {params.cross_validation.folds}, but only {len(present)} objects have videos; "
@@ -116,7 +149,7 @@ def write_params(params: Params, path: Path = PARAMS_FILE) -> bool:
     """Write params.yaml if that changes it; return whether it did."""
     values = params.model_dump(mode="json")
     text = HEADER + yaml.dump(values, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)
-    if path.is_file() and path.read_text(encoding="utf-8") == text:
+    if path.is_file() and path.read_bytes() == text.encode():
         return False
     write_text(path, text)
     return True

@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import logging
 import os
+import re
+import shutil
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -18,9 +20,9 @@ from filelock import FileLock, Timeout
 from pipeline.config import Params
 from pipeline.errors import UserError
 from pipeline.io import write_json
-from pipeline.params import load_params
+from pipeline.params import PARAMS_FILE, load_params
 from pipeline.records import Measurement
-from pipeline.runtime import limit_threads, quiet_libraries
+from pipeline.runtime import CHECKPOINTS, limit_threads, quiet_libraries
 
 DATA = Path("data")
 RUNS = Path("runs")
@@ -51,8 +53,9 @@ class Stage:
 def stage(name: str, key: str | None = None) -> Iterator[Stage]:
     """Run the body as the DVC stage `name` (with `@key` in a matrix).
 
-    A UserError, a full disk or want of memory ends the process with one line and status 1. Metrics, time and memory go
-    to runs/, which is nobody's input, so that results stay identical from run to run; tracking shows them.
+    A UserError, a disk that cannot be read or written, or want of memory ends it with one line and status 1. So does a
+    params.yaml that was changed meanwhile: DVC would record the new values for what the old ones made. Metrics, time,
+    memory go to runs/, which is nobody's input, so that results stay identical from run to run; tracking shows them.
     """
     started = time.time()
     full = f"{name}@{key}" if key else name
@@ -65,6 +68,10 @@ def stage(name: str, key: str | None = None) -> Iterator[Stage]:
             if _main_process():
                 print(f"{full}: starts ({running.params.report_name})", flush=True)
             yield running
+            if load_params() != running.params:
+                raise UserError(
+                    f"{PARAMS_FILE} was changed while it ran, and what it made fits the old one; run it again"
+                )
             if _main_process():
                 _write_run(running, started)
                 said = ", ".join(f"{k} {v:g}" for k, v in list(running.metrics.items())[:4])
@@ -73,10 +80,50 @@ def stage(name: str, key: str | None = None) -> Iterator[Stage]:
         sys.exit(f"{full}: {error}")
     except MemoryError:
         sys.exit(f"{full}: out of memory; lower the batch sizes in params.yaml")
-    except OSError as error:
-        if error.errno == errno.ENOSPC:
-            sys.exit(f"{full}: no space left on the disk ({error.filename or 'data/'}); free some and run again")
-        raise
+    except Exception as error:
+        refused = disk_error(error)
+        if refused is None:
+            raise
+        sys.exit(f"{full}: {refused}")
+
+
+OS_ERROR = re.compile(r"\(os error (\d+)\)")
+"""How safetensors ends what the operating system said."""
+TORCH_WRITES = ("iostream error", "PytorchStreamWriter failed")
+"""How torch says that a file could not be written; it does not say why."""
+
+
+def disk_error(error: Exception) -> str | None:
+    """One line for what the operating system refused, in whichever library's words; None for any other error."""
+    number = error.errno if isinstance(error, OSError) else None
+    if found := OS_ERROR.search(str(error)):
+        number = int(found[1])
+    elif not isinstance(error, OSError) and any(words in str(error) for words in TORCH_WRITES):
+        number = errno.ENOSPC if shutil.disk_usage(".").free < LITTLE else errno.EIO
+    if number is None:
+        return None
+    where = getattr(error, "filename", None) or f"{DATA}/ or {CHECKPOINTS}/"
+    if number in (errno.ENOSPC, errno.EDQUOT):
+        return f"no space left on the disk ({where}); free some and run again"
+    if number in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return f"{where}: {os.strerror(number)}; make it readable and writable, and run again"
+    return f"{where}: {os.strerror(number)}; mend that and run again"
+
+
+LITTLE = 64 * 2**20
+"""Free bytes below which a disk counts as full where a library does not say why it could not write."""
+
+
+def running_stages() -> list[str]:
+    """Names of the stages that run in this folder at the moment, in whichever process."""
+    running = []
+    for file in sorted((RUNS / "locks").glob("*.lock")):
+        try:
+            with FileLock(file, timeout=0):
+                pass
+        except Timeout:
+            running.append(file.stem)
+    return running
 
 
 @contextmanager

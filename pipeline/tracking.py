@@ -34,7 +34,7 @@ from pipeline.config import Params, TrackingConfig
 from pipeline.errors import UserError
 from pipeline.io import read_json, read_table
 from pipeline.params import PARAMS_FILE
-from pipeline.records import Assignment, Encoder, Lora, Measurement, Part, Touch, Variant, Video
+from pipeline.records import Encoder, Graded, Lora, Measurement, Part, Touch, Variant, Video
 from pipeline.stage import DATA, RUNS, Stage
 from pipeline.tasks import TASKS
 
@@ -204,14 +204,13 @@ def settings(params: Params, axes: Mapping[str, str] | None = None) -> dict[str,
 
 
 def accuracies(params: Params) -> dict[str, dict[str, float]]:
-    """Metrics of each variant by its key, from the report's scores.csv: whatever tasks it has.
+    """Metrics of each variant by its key, from the report's scores.csv (of folds, from each fold's own answers).
 
     `accuracy/PC` is the share of right answers (0 to 1), `low/PC` and `high/PC` its interval, `swapped/PC` the share
     with another object's video; parts of an answer are named like `accuracy/OPD.hardness`.
     """
-    path = REPORTS / params.report_name / "scores.csv"
     found: dict[str, dict[str, float]] = {}
-    for row in csv.DictReader(path.read_text(encoding="utf-8").splitlines()) if path.is_file() else ():
+    for row in _score_rows(params):
         if row["lora"] and row["seed"].isdigit():
             whole = TASKS[row["task"]].measure if row["task"] in TASKS else "choice"
             task = row["task"] if row["measure"] == whole else f"{row['task']}.{row['measure']}"
@@ -221,6 +220,21 @@ def accuracies(params: Params) -> dict[str, dict[str, float]]:
             key = "-".join(row[axis] for axis in Variant._fields)
             found.setdefault(key, {}).update({name: round(float(cell), 4) for name, cell in cells.items() if cell})
     return found
+
+
+def _score_rows(params: Params) -> Iterator[Mapping[str, str]]:
+    path = REPORTS / params.report_name / "scores.csv"
+    if params.split.fold_of(0) is None:
+        yield from csv.DictReader(path.read_text(encoding="utf-8").splitlines()) if path.is_file() else ()
+    elif (DATA / "graded.parquet").is_file():
+        from pipeline.evaluation.scores import score_rows
+        from pipeline.videos.catalogue import load_catalogue
+
+        # The report pools folds, but a run in the dashboard is one model.
+        graded = read_table(DATA / "graded.parquet", Graded)
+        each = [g.model_copy(update={"seed": g.trained}) for g in graded]
+        for row in score_rows(each, load_catalogue(Path(params.data.catalogue))):
+            yield {name: "" if cell is None else str(cell) for name, cell in row}
 
 
 def _artifacts(variant: Variant) -> Iterator[tuple[Path, str]]:
@@ -235,21 +249,26 @@ def _artifacts(variant: Variant) -> Iterator[tuple[Path, str]]:
 
 
 def _datasets(params: Params) -> Iterator[tuple[str, Any]]:
-    """Training, validation and test videos as MLflow's datasets; their digest is over ids and contents of the files."""
+    """Training, validation and test videos of each split as MLflow's datasets; digests are over ids and contents."""
     import pandas as pd
     from mlflow.data import from_pandas
 
-    splits, videos = DATA / "splits.parquet", DATA / "videos.parquet"
-    if splits.is_file() and videos.is_file():
-        contents = {video.video_id: video.sha256 for video in read_table(videos, Video)}
-        assignments = read_table(splits, Assignment)
+    from pipeline.videos.split import read_splits
+
+    videos = DATA / "videos.parquet"
+    if not videos.is_file() or not (DATA / "splits").is_dir():
+        return
+    contents = {video.video_id: video.sha256 for video in read_table(videos, Video)}
+    for seed, assignments in read_splits(DATA, params.split, params.ablation.seeds).items():
+        fold = params.split.fold_of(seed)
         for part in (Part.TRAIN, Part.VALIDATION, Part.TEST):
             rows = sorted((a.video_id, a.object_id, contents[a.video_id]) for a in assignments if a.part == part)
             frame = pd.DataFrame(rows, columns=["video_id", "object_id", "sha256"])
+            name = part.value if fold is None else f"{part}-fold{fold}"
             with warnings.catch_warnings():
                 # MLflow has two readers of local folders, both the same, and says so.
                 warnings.simplefilter("ignore")
-                yield part.value, from_pandas(frame, source=params.data.dir, name=part.value)
+                yield part.value, from_pandas(frame, source=params.data.dir, name=name)
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:

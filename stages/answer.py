@@ -8,7 +8,7 @@ from pipeline.language.generate import GenerationSettings, answer
 from pipeline.language.input_ablation import ablate_input
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.records import Encoder, Lora, Opd, Question, Touch, Variant
-from pipeline.runtime import resolve_device
+from pipeline.runtime import name_dtype, resolve_device
 from pipeline.stage import DATA, stage
 
 
@@ -19,9 +19,12 @@ def main() -> None:
         store = EmbeddingStore(DATA / "embeddings" / f"{variant.encoder}-{variant.seed}")
         folder = DATA / "models" / variant.lora / f"{variant.encoder}-{variant.opd}-{variant.seed}"
         model = OctopiForCausalLM.from_pretrained(
-            folder, base=language.weights, dtype=language.dtype, quantization=language.quantization
+            folder,
+            base=language.weights,
+            dtype=name_dtype(language.dtype, params.runtime.device),
+            quantization=language.quantization,
         ).to(resolve_device(params.runtime.device))
-        questions = read_jsonl(DATA / "questions" / "evaluation.jsonl", Question)
+        questions = read_jsonl(DATA / "questions" / str(variant.seed) / "evaluation.jsonl", Question)
         for touch in (Touch.REAL, *(params.ablation.touch if variant.full else ())):
             settings = GenerationSettings(
                 system_prompt=language.system_prompt,

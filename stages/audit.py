@@ -3,11 +3,12 @@
 from pathlib import Path
 
 from pipeline.io import read_table, write_csv, write_text
-from pipeline.records import Assignment, Finding, Probe, Video
+from pipeline.records import Finding, Probe, Video
 from pipeline.stage import DATA, stage
 from pipeline.videos.audit.run import AUDIT_FILE, audit_chain, stop_on_errors, summary
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.frames.store import PROBES_FILE
+from pipeline.videos.split import read_splits
 
 
 def main() -> None:
@@ -16,7 +17,7 @@ def main() -> None:
             Path(run.params.data.dir),
             read_table(DATA / "frames" / PROBES_FILE, Probe),
             read_table(DATA / "videos.parquet", Video),
-            read_table(DATA / "splits.parquet", Assignment),
+            list(read_splits(DATA, run.params.split, run.params.ablation.seeds).values()),
             load_catalogue(Path(run.params.data.catalogue)),
         )
         out = DATA / "audit"

@@ -26,7 +26,6 @@ def main() -> None:
             per_video=params.frames.per_video,
             encoder=params.encoder,
             runtime=params.runtime,
-            pretrained=DATA / "pretrained" / "encoder.safetensors",
         )
         predictions = cross_validate_candidate(CANDIDATES[name], data, params.cross_validation)
         write_table(DATA / "cross_validation" / name / "out_of_fold.parquet", OutOfFold, predictions)

@@ -1,11 +1,10 @@
 """Compute the embeddings of every kept frame, by the base encoder and each fine-tuned one."""
 
-import shutil
 from pathlib import Path
 
 from pipeline.config import EncoderConfig
 from pipeline.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE
-from pipeline.encoder.embed import embed_videos, standardize
+from pipeline.encoder.embed import embed_videos, standardize, union
 from pipeline.encoder.model import FrameEncoder
 from pipeline.encoder.recipes import base_encoder, property_classifier
 from pipeline.io import read_table, save_tensors, write_table
@@ -30,30 +29,24 @@ def main() -> None:
     with stage("embed") as run:
         params = run.params
         check_encoder(Path(params.encoder.weights), params.frames.size)
-        assignments = read_table(DATA / "splits.parquet", Assignment)
+        splits = {seed: read_table(DATA / "splits" / f"{seed}.parquet", Assignment) for seed in params.ablation.seeds}
         store = FrameStore(DATA / "frames", params.encoder.reference)
-        training = {a.video_id for a in assignments if a.part == Part.TRAIN}
-        first, *others = params.ablation.seeds
         for which in params.ablation.encoders:
-            for seed in params.ablation.seeds:
+            for seed, assignments in splits.items():
                 out = DATA / "embeddings" / f"{which}-{seed}"
-                if which is Encoder.BASE and seed != first:
-                    continue
-                encoder = load_encoder(params.encoder, Path(params.data.catalogue), which, seed)
-                device = resolve_device(params.runtime.device)
-                size = params.encoder.embed_batch_size
-                tensor, index = embed_videos(encoder, store, assignments, batch_size=size, device=device)
-                if params.encoder.standardize:
-                    tensor = standardize(tensor, index, training)
+                # The base encoder has no seed: its embeddings are computed once and standardised for each seed.
+                if which is not Encoder.BASE or seed == params.ablation.seeds[0]:
+                    encoder = load_encoder(params.encoder, Path(params.data.catalogue), which, seed)
+                    device = resolve_device(params.runtime.device)
+                    size = params.encoder.embed_batch_size
+                    wanted = union(splits.values()) if which is Encoder.BASE else assignments
+                    raw, index = embed_videos(encoder, store, wanted, batch_size=size, device=device)
+                training = {a.video_id for a in assignments if a.part == Part.TRAIN}
+                tensor = standardize(raw, index, training) if params.encoder.standardize else raw
                 save_tensors(out / TENSOR_FILE, {TENSOR: tensor})
                 write_table(out / INDEX_FILE, Embedding, index)
                 run.metrics[f"{which}-{seed}.rows"] = len(index)
                 run.metrics[f"{which}-{seed}.norm"] = float(tensor.norm(dim=1).mean())
-        if Encoder.BASE in params.ablation.encoders:
-            # The base encoder has no seed: every seed's variants get the same embeddings.
-            for seed in others:
-                base = DATA / "embeddings" / Encoder.BASE
-                shutil.copytree(f"{base}-{first}", f"{base}-{seed}", dirs_exist_ok=True)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 import sys
 from pathlib import Path
 
+from pipeline.config import PRETRAINED
 from pipeline.encoder.clips import EncoderData, classify
 from pipeline.encoder.finetune import finetune, write_encoder_card
 from pipeline.io import read_table, write_table
@@ -21,15 +22,17 @@ def main() -> None:
     with stage("finetune_encoder", str(seed)) as run:
         params = run.params
         check_encoder(Path(params.encoder.weights), params.frames.size)
+        split = DATA / "splits" / f"{seed}.parquet"
         data = EncoderData(
             store=FrameStore(DATA / "frames", params.encoder.reference),
             catalogue=load_catalogue(Path(params.data.catalogue)),
-            assignments=read_table(DATA / "splits.parquet", Assignment),
+            assignments=read_table(split, Assignment),
             per_video=params.frames.per_video,
         )
-        inputs = [DATA / "frames" / name for name in (TABLE_FILE, REFERENCES_FILE)] + [DATA / "splits.parquet"]
+        inputs = [DATA / "frames" / name for name in (TABLE_FILE, REFERENCES_FILE)] + [split]
         inputs.append(clip_file(Path(params.encoder.weights)))
-        pretrained = DATA / "pretrained" / "encoder.safetensors"
+        if "scenes" in params.encoder.backbone:
+            inputs.append(PRETRAINED)
         with live(run) as callbacks:
             model, history = finetune(
                 data,
@@ -37,7 +40,6 @@ def main() -> None:
                 params.runtime,
                 seed=params.seed + seed,
                 inputs=inputs,
-                pretrained=pretrained,
                 callbacks=callbacks,
             )
         device = resolve_device(params.runtime.device)
@@ -46,7 +48,7 @@ def main() -> None:
         save_trainable(model, out / "encoder.safetensors")
         write_table(out / "history.parquet", Measurement, history)
         write_table(out / "classifications.parquet", Classification, classified)
-        write_encoder_card(out, data, params.encoder, params.seed + seed, pretrained, params.data.source)
+        write_encoder_card(out, data, params.encoder, params.seed + seed, params.data.source)
         run.finish_training(history)
         for part in (Part.VALIDATION, Part.TEST):
             chosen = [c for c in classified if c.part == part]

@@ -11,13 +11,14 @@ from pipeline.videos.catalogue import load_catalogue
 
 def main() -> None:
     with stage("grade") as run:
-        questions = read_jsonl(DATA / "questions" / "evaluation.jsonl", Question)
         catalogue = load_catalogue(Path(run.params.data.catalogue))
         graded = []
         for variant in run.params.ablation.variants():
+            questions = read_jsonl(DATA / "questions" / str(variant.seed) / "evaluation.jsonl", Question)
+            replicate = run.params.split.replicate_of(variant.seed)
             for touch in (Touch.REAL, *(run.params.ablation.touch if variant.full else ())):
                 predictions = read_jsonl(DATA / "answers" / variant.key / f"{touch}.jsonl", Prediction)
-                whose = {**variant._asdict(), "touch": touch}
+                whose = {**variant._asdict(), "seed": replicate, "trained": variant.seed, "touch": touch}
                 graded += [Graded(**score.model_dump(), **whose) for score in grade(questions, predictions, catalogue)]
         write_table(DATA / "graded.parquet", Graded, graded)
         run.metrics["answers"] = len({(g.variant, g.touch, g.question_id) for g in graded})

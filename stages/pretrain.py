@@ -1,5 +1,6 @@
-"""Pretrain an encoder on pictures of invented objects, where the recipe or a compared model begins with that."""
+"""Pretrain the backbone `scenes` on pictures of invented objects, where the encoder or a compared model has it."""
 
+from pipeline.config import PRETRAINED
 from pipeline.encoder.candidates import needs_pretraining
 from pipeline.io import write_table
 from pipeline.records import Measurement
@@ -11,7 +12,7 @@ def main() -> None:
     with stage("pretrain") as run:
         params = run.params
         out = DATA / "pretrained"
-        if not needs_pretraining(params.encoder.recipe, params.cross_validation.models):
+        if not needs_pretraining(params.encoder, params.cross_validation.models):
             write_table(out / "history.parquet", Measurement, [])
             return
         # Imported here, since most runs end above and need no torch.
@@ -20,7 +21,7 @@ def main() -> None:
 
         with live(run) as callbacks:
             encoder, history = pretrain(params.pretrain, params.frames, params.runtime, callbacks)
-        save_trainable(encoder, out / "encoder.safetensors")
+        save_trainable(encoder, PRETRAINED)
         write_table(out / "history.parquet", Measurement, history)
         run.finish_training(history)
 

@@ -1,4 +1,4 @@
-"""Build the training and evaluation questions, the same for every variant."""
+"""Build the training and evaluation questions: the same for every variant, and for every seed of one split."""
 
 from pathlib import Path
 
@@ -13,16 +13,23 @@ def main() -> None:
     with stage("questions") as run:
         config = run.params.questions
         catalogue = load_catalogue(Path(run.params.data.catalogue)).asking(config.scenarios)
-        assignments = read_table(DATA / "splits.parquet", Assignment)
-        for name, part, counts, distinct in (
-            ("train", Part.TRAIN, counts_by_task(config, "train"), False),
-            ("evaluation", Part.TEST, counts_by_task(config, "evaluation"), True),
-        ):
-            pool = pool_of(part, assignments, catalogue)
-            questions = build_questions(pool, counts, seed=config.seed, distinct=distinct, facts=config.facts)
-            write_jsonl(DATA / "questions" / f"{name}.jsonl", questions)
-            for task in counts:
-                run.metrics[f"{name}.{task}"] = sum(q.task == task for q in questions)
+        for seed in run.params.ablation.seeds:
+            assignments = read_table(DATA / "splits" / f"{seed}.parquet", Assignment)
+            for name, part, counts, distinct in (
+                ("train", Part.TRAIN, counts_by_task(config, "train"), False),
+                ("evaluation", Part.TEST, counts_by_task(config, "evaluation"), True),
+            ):
+                questions = build_questions(
+                    pool_of(part, assignments, catalogue),
+                    counts,
+                    seed=config.seed,
+                    distinct=distinct,
+                    facts=config.facts,
+                    fold=run.params.split.fold_of(seed),
+                )
+                write_jsonl(DATA / "questions" / str(seed) / f"{name}.jsonl", questions)
+                for task in counts:
+                    run.metrics[f"{seed}.{name}.{task}"] = sum(q.task == task for q in questions)
 
 
 if __name__ == "__main__":

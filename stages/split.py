@@ -1,4 +1,4 @@
-"""Assign each object, and with it its videos, to training, validation or test."""
+"""Assign each object, and with it its videos, to training, validation or test; with kfold anew for each seed."""
 
 from pathlib import Path
 
@@ -13,11 +13,12 @@ def main() -> None:
     with stage("split") as run:
         catalogue = load_catalogue(Path(run.params.data.catalogue))
         videos = read_table(DATA / "videos.parquet", Video)
-        split = assign(catalogue, videos, run.params.split)
-        write_table(DATA / "splits.parquet", Assignment, split.assignments)
-        for part in Part:
-            run.metrics[f"{part}_videos"] = sum(a.part == part for a in split.assignments)
-            run.metrics[f"{part}_objects"] = len({a.object_id for a in split.assignments if a.part == part})
+        for seed in run.params.ablation.seeds:
+            split = assign(catalogue, videos, run.params.split, seed)
+            write_table(DATA / "splits" / f"{seed}.parquet", Assignment, split.assignments)
+            for part in Part:
+                run.metrics[f"{seed}.{part}_videos"] = sum(a.part == part for a in split.assignments)
+                run.metrics[f"{seed}.{part}_objects"] = len({a.object_id for a in split.assignments if a.part == part})
 
 
 if __name__ == "__main__":

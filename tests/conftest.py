@@ -55,6 +55,14 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_tower(tmp_path_factory.mktemp("clip"))
 
 
+@pytest.fixture(scope="session")
+def smollm2_folder() -> Path:
+    """SmolLM2-135M-Instruct in transformers' format; leave it as it is."""
+    from tests.models import model_folder
+
+    return model_folder("smollm2")
+
+
 @pytest.fixture
 def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Checkpoints go to a folder of the working directory."""

@@ -9,11 +9,13 @@ import numpy as np
 import torch
 from safetensors.torch import load_file, save_file
 
-from pipeline.config import EncoderConfig, Recipe, RuntimeConfig
+from pipeline.config import PRETRAINED, EncoderConfig, Recipe, RuntimeConfig
 from pipeline.encoder.clips import EncoderData
 from pipeline.encoder.frame_classifier import FittedHeads
+from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.io import write_table
 from pipeline.records import Assignment, Frame, Part
+from pipeline.training.trainable import save_trainable
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FRAMES_FILE, REFERENCES_FILE, TABLE_FILE, FrameStore
 from tests.checkpoints import write_clip
@@ -66,10 +68,34 @@ def config(weights: Path, recipe: Recipe, **changes: object) -> EncoderConfig:
             "recipe": recipe,
             "weights": str(weights),
             "prompts": 3,
-            "reference": "subtract" if recipe == "pretrained" else "none",
+            **({"backbone": ("scenes",), "reference": "subtract"} if recipe == "tuned" else {}),
             **changes,
         }
     )
+
+
+def write_pretrained(seed: int = 0) -> SceneEncoder:
+    """The backbone `scenes`, with running statistics of noise, where the chain has it; in evaluation mode."""
+    torch.manual_seed(seed)
+    made = SceneEncoder()
+    made(torch.randint(0, 256, (8, 32, 32, 3), dtype=torch.uint8), torch.zeros(8))
+    save_trainable(made, PRETRAINED)
+    return made.eval()
+
+
+def write_timm(folder: Path, name: str = "test_efficientnet", seed: int = 0) -> Path:
+    """A tiny network of timm's in its hub's layout; no normalisation is the identity, which would hide a wrong one."""
+    import timm
+    from timm.models import save_for_hf
+
+    torch.manual_seed(seed)
+    model = timm.create_model(name, pretrained=False)
+    with torch.no_grad():
+        for key, value in model.state_dict().items():
+            if value.is_floating_point():
+                value.add_(0.1 * torch.rand_like(value) if "running" in key else 0.1 * torch.randn_like(value))
+    save_for_hf(model, folder, safe_serialization=True)
+    return folder
 
 
 def float64(tensor: torch.Tensor) -> Floats:

@@ -14,6 +14,7 @@ from pipeline.io import write_csv, write_jsonl, write_table
 from pipeline.records import (
     Assignment,
     Classification,
+    Described,
     Finding,
     Graded,
     Measurement,
@@ -28,19 +29,18 @@ from pipeline.records import (
 from pipeline.scales import compose
 from pipeline.tasks.questions import build_questions, counts_by_task, pool_of
 from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.videos.split import assign
+from pipeline.weights import is_tiny
 from tests.closure import ROOT
+from tests.models import model_folder
 
 VIDEOS_AN_OBJECT = 2
 
 
 def fake_params(*overrides: str) -> Params:
-    """The smoke scale with overrides; catalogue and weights are this repository's."""
-    here = {
-        "data.catalogue": "pipeline/physiclear",
-        "language.weights": "standins/llama",
-        "encoder.weights": "standins/clip",
-    }
-    return compose("smoke", [*(f"{key}='{ROOT / path}'" for key, path in here.items()), *overrides], conf=ROOT / "conf")
+    """The smoke scale with overrides; the catalogue is this repository's."""
+    here = f"data.catalogue='{ROOT / 'pipeline' / 'physiclear'}'"
+    return compose("smoke", [here, *overrides], conf=ROOT / "conf")
 
 
 def write_run(root: Path, params: Params, *, objects: Sequence[str] = (), skill: float = 0.6) -> Params:
@@ -54,29 +54,40 @@ def write_run(root: Path, params: Params, *, objects: Sequence[str] = (), skill:
     catalogue = load_catalogue(Path(params.data.catalogue))
     root.mkdir(parents=True, exist_ok=True)
     (root / "params.yaml").write_text(yaml.safe_dump(params.model_dump(mode="json"), sort_keys=False))
+    for folder in (params.encoder.weights, params.language.weights):
+        if is_tiny(folder):
+            (root / folder).parent.mkdir(parents=True, exist_ok=True)
+            (root / folder).symlink_to(model_folder(Path(folder).name))
     data, parts = root / "data", {o.object_id: o.splits["paper"] for o in catalogue.objects.values()}
     videos = [_video(o, i, rng) for o in sorted(objects or params.scenes.objects) for i in range(VIDEOS_AN_OBJECT)]
     assignments = [Assignment(video_id=v.video_id, object_id=v.object_id, part=parts[v.object_id]) for v in videos]
     write_table(data / "videos.parquet", Video, videos)
-    write_table(data / "splits.parquet", Assignment, assignments)
+    splits = dict.fromkeys(params.ablation.seeds, assignments)
+    if params.split.name == "kfold":
+        splits = {seed: list(assign(catalogue, videos, params.split, seed).assignments) for seed in splits}
     found = [("agreement, ICC(3,k)", name, "0.893 (0.843 to 0.929)") for name in catalogue.property_names]
     audit = [Finding(check=c, item=i, measured=m, severity=Severity.INFO) for c, i, m in found]
     write_csv(data / "audit" / "audit.csv", Finding, audit)
-    counts = counts_by_task(params.questions, "evaluation")
-    questions = build_questions(pool_of(Part.TEST, assignments, catalogue), counts, seed=0, distinct=True)
-    write_jsonl(data / "questions" / "evaluation.jsonl", questions)
-    for seed in params.ablation.seeds:
-        said = [c for a in assignments for c in _classify(a, catalogue, skill, rng)]
+    counts, asked = counts_by_task(params.questions, "evaluation"), {}
+    for seed, split in splits.items():
+        write_table(data / "splits" / f"{seed}.parquet", Assignment, split)
+        pool, fold = pool_of(Part.TEST, split, catalogue), params.split.fold_of(seed)
+        asked[seed] = build_questions(pool, counts, seed=0, distinct=True, fold=fold)
+        write_jsonl(data / "questions" / str(seed) / "evaluation.jsonl", asked[seed])
+        said = [c for a in split for c in _classify(a, catalogue, skill, rng)]
         write_table(data / "encoder" / str(seed) / "classifications.parquet", Classification, said)
         write_table(data / "encoder" / str(seed) / "history.parquet", Measurement, _history("loss", "validation_loss"))
+    gate = [Described(model=m, task="PC", n=50, right=r, unread=50 - r) for m, r in (("untaught", 20), ("taught", 49))]
+    write_csv(data / "taught" / "gate.csv", Described, gate)
     graded = []
     for variant in params.ablation.variants():
+        questions, replicate = asked[variant.seed], params.split.replicate_of(variant.seed)
         model = f"{variant.encoder}-{variant.opd}-{variant.seed}"
         write_table(data / "models" / variant.lora / model / "history.parquet", Measurement, _history("loss"))
         for touch in (Touch.REAL, *(params.ablation.touch if variant.full else ())):
             answers = [p for q in questions if (p := _say(q, variant.opd, skill, rng))]
             write_jsonl(data / "answers" / variant.key / f"{touch}.jsonl", answers)
-            whose = {**variant._asdict(), "touch": touch}
+            whose = {**variant._asdict(), "seed": replicate, "trained": variant.seed, "touch": touch}
             graded += [Graded(**s.model_dump(), **whose) for s in grade(questions, answers, catalogue)]
     write_table(data / "graded.parquet", Graded, graded)
     for name in params.cross_validation.models:

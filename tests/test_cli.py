@@ -22,7 +22,7 @@ RUNNER = CliRunner()
 @pytest.fixture
 def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder that sees the project's inputs, but has params.yaml, data/ and runs/ of its own."""
-    for name in ("conf", "pipeline", "standins"):
+    for name in ("conf", "pipeline"):
         (tmp_path / name).symlink_to(ROOT / name)
     monkeypatch.chdir(tmp_path)
     return tmp_path

@@ -60,7 +60,8 @@ def test_paper_scales_have_the_papers_hyper_parameters(scale: str) -> None:
         (["frames.per_video=0"], ["frames.per_video", "greater than or equal to 1"]),
         (["frames.fraction=1.5"], ["frames.fraction", "less than or equal to 1"]),
         (["split.name='Side ways'"], ["split.name", "Side ways", "pattern"]),
-        (["split.fold=7"], ["split", "0 to 4"]),
+        (["split.fold=1"], ["split.fold is not a parameter", "folds"]),
+        (["split.name=kfold", "split.folds=3", "ablation.seeds=[0,1,3]"], ["ablation.seeds [0, 1, 3]", "3 folds"]),
         (["ablation.seeds=[1,1]"], ["ablation.seeds", "repeats"]),
         (["ablation.opd=[none]"], ["ablation.opd", "lacks the full system's value all"]),
         (["ablation.lora=[perhaps]"], ["ablation.lora", "'with' or 'without'"]),
@@ -68,8 +69,11 @@ def test_paper_scales_have_the_papers_hyper_parameters(scale: str) -> None:
         (["align.batch_size=10"], ["align", "does not divide"]),
         (["data.dir=elsewhere"], ["data.dir", "data/scenes/videos"]),
         (["lora.target_modules=[]"], ["lora.target_modules"]),
+        (["lora.target_modules=all"], ["lora.target_modules", "'all-linear'"]),
         (["encoder.learning_rate=nan"], ["encoder.learning_rate"]),
         (["runtime.device=tpu"], ["runtime.device", "'cuda'"]),
+        (["lora.alpha=1e309"], ["lora.alpha", "finite"]),
+        (["encoder.epochs=true"], ["encoder", "epochs is true"]),
         (["justaword"], ["key=value"]),
         (["a b=[1"], ["a b"]),
     ],
@@ -90,20 +94,48 @@ def test_unknown_scale_names_the_known() -> None:
 
 @pytest.mark.parametrize(
     ("text", "word"),
-    [("", "octopi scale smoke"), ("scale: [", "not YAML"), ("scale: smoke\n", "missing"), (None, "no such file")],
+    [
+        (b"", "octopi scale smoke"),
+        (b"scale: [", "not YAML"),
+        (b"scale: smoke\n", "missing"),
+        (b"seed: 1\nseed: 2\n", "seed stands twice"),
+        (b"align: {epochs: 1, epochs: 2}\n", "epochs stands twice"),
+        ("scale: smoke\n".encode("utf-16"), "not UTF-8"),
+        (None, "no such file"),
+    ],
 )
-def test_broken_params_file(text: str | None, word: str, tmp_path: Path) -> None:
+def test_broken_params_file(text: bytes | None, word: str, tmp_path: Path) -> None:
     path = tmp_path / "params.yaml"
     if text is not None:
-        path.write_text(text)
+        path.write_bytes(text)
     with pytest.raises(UserError, match=word):
         load_params(path)
+    # Whatever stands there, the command that the line names writes it anew.
+    assert write_params(compose("smoke", conf=CONF), path)
+    assert load_params(path) == compose("smoke", conf=CONF)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["my data", "a[1]", "{x}", "a,b", "a=b", "a&b#c", "it's", '"said"', "Prüfling", "back\\slash", "end\\", "$x"],
+)
+def test_any_folder_may_hold_the_videos(name: str, tmp_path: Path) -> None:
+    folder = tmp_path / name
+    params = compose("small", ["data.source=videos", f"data.dir={folder}"], conf=CONF)
+    assert params.data.dir == str(folder)
+    write_params(params, tmp_path / "params.yaml")
+    assert load_params(tmp_path / "params.yaml").data.dir == str(folder)
 
 
 def test_missing_inputs_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     with pytest.raises(UserError, match="data.dir"):
         check_inputs(compose("small", ["data.source=videos", f"data.dir={tmp_path}/none"]))
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match="is a file"):
+        check_inputs(compose("small", ["data.source=videos", f"data.dir={tmp_path}/file"]))
+    with pytest.raises(UserError, match=r"runtime.launcher.*acelerate"):
+        check_inputs(compose("smoke", ["runtime.launcher=acelerate launch"]))
     with pytest.raises(UserError, match="hf download timm"):
         check_inputs(compose("smoke", [f"encoder.weights={tmp_path}/none"]))
     with pytest.raises(UserError, match="hf download lmsys"):
@@ -182,10 +214,19 @@ def test_a_recipe_brings_its_settings_and_gives_way_to_yours() -> None:
         composed = compose("smoke", [f"encoder.recipe={recipe}"], conf=CONF)
         assert composed.encoder.recipe == recipe
         assert composed.language == smoke.language
-        assert needs_pretraining(recipe, composed.cross_validation.models) == (recipe == "pretrained")
-    release = compose("small", ["encoder.recipe=release"], conf=CONF).encoder
+        assert composed.encoder.backbone == ("clip",)
+        assert not needs_pretraining(composed.encoder, composed.cross_validation.models)
+    scenes = compose("smoke", ["encoder.recipe=tuned", "encoder.backbone=[scenes]"], conf=CONF)
+    assert needs_pretraining(scenes.encoder, ())
+    assert needs_pretraining(smoke.encoder, ("trees", "pretrained-raw"))
+    clip = "encoder.backbone=[clip]"
+    release = compose("small", ["encoder.recipe=release", clip], conf=CONF).encoder
     assert {name: getattr(release, name) for name in RELEASE} == RELEASE, "the candidate is the recipe"
-    own = compose("small", ["encoder.recipe=release", "encoder.epochs=3"], conf=CONF).encoder
+    own = compose("small", ["encoder.recipe=release", clip, "encoder.epochs=3"], conf=CONF).encoder
     assert (own.epochs, own.batch_size) == (3, RELEASE["batch_size"])
-    with pytest.raises(UserError, match=r"encoder.recipe=pretrained .* set encoder.reference=subtract"):
-        compose("smoke", ["encoder.recipe=pretrained", "encoder.reference=none"], conf=CONF)
+    with pytest.raises(UserError, match=r"scenes was pretrained on differences: set encoder.reference=subtract"):
+        compose("smoke", ["encoder.recipe=tuned", "encoder.backbone=[scenes]", "encoder.reference=none"], conf=CONF)
+    with pytest.raises(
+        UserError, match=r"encoder.recipe=paper is for CLIP alone, but encoder.backbone=\[timm,scenes\]"
+    ):
+        compose("small", ["encoder.recipe=paper"], conf=CONF)

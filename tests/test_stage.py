@@ -11,7 +11,9 @@ import pytest
 from filelock import FileLock
 from hypothesis import given
 from hypothesis import strategies as st
+from typer.testing import CliRunner
 
+from pipeline.cli import app
 from pipeline.errors import UserError
 from pipeline.io import (
     atomic,
@@ -25,7 +27,7 @@ from pipeline.io import (
 )
 from pipeline.records import Assignment, Measurement, Part, Score, Video
 from pipeline.scales import compose, write_params
-from pipeline.stage import stage
+from pipeline.stage import running_stages, stage
 from tests.closure import ROOT
 
 
@@ -55,6 +57,12 @@ def test_a_stage_says_when_it_starts_and_ends_and_what_it_cost(here: Path, capsy
         (UserError("x.mov: does not decode; export it again"), "split: x.mov: does not decode"),
         (MemoryError(), "lower the batch sizes"),
         (OSError(errno.ENOSPC, "No space left on device", "data/frames"), "no space left on the disk (data/frames)"),
+        (PermissionError(errno.EACCES, "Permission denied", "data/x"), "data/x: Permission denied; make it readable"),
+        (OSError(errno.EROFS, "Read-only file system", "data/x"), "data/x: Read-only file system; make it"),
+        (OSError(errno.ENOTDIR, "Not a directory", "data/x"), "data/x: Not a directory"),
+        # As safetensors and torch say it.
+        (RuntimeError("I/O error: No space left on device (os error 28)"), "no space left on the disk"),
+        (RuntimeError("basic_ios::clear: iostream error"), "data/ or checkpoints/: Input/output error"),
     ],
 )
 def test_bad_end_is_one_line_and_leaves_no_metrics(here: Path, error: Exception, words: str) -> None:
@@ -79,6 +87,25 @@ def test_stage_runs_once_at_a_time(here: Path) -> None:
             pass
     with stage("split"):
         pass
+
+
+def test_parameters_that_change_while_a_stage_runs_are_no_silent_matter(here: Path) -> None:
+    with pytest.raises(SystemExit, match=r"params.yaml was changed while it ran"), stage("split"):
+        write_params(compose("smoke", ["seed=1"], conf=ROOT / "conf"), here / "params.yaml")
+    assert not (here / "runs/split.json").exists()
+    with stage("split"):
+        os.utime(here / "params.yaml")  # Written anew with the same values.
+
+
+def test_no_scale_is_chosen_while_a_stage_runs(here: Path) -> None:
+    before = (here / "params.yaml").read_bytes()
+    with stage("split"):
+        assert running_stages() == ["split"]
+        result = CliRunner().invoke(app, ["scale", "small"])
+    assert isinstance(result.exception, UserError)
+    assert "split is running" in str(result.exception)
+    assert (here / "params.yaml").read_bytes() == before
+    assert running_stages() == []
 
 
 def test_missing_params_name_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,11 +5,14 @@ from __future__ import annotations
 import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Literal
 
+from pipeline.config import EncoderConfig
 from pipeline.errors import UserError
+from pipeline.weights import CLIP_CONFIG
 
-Kind = Literal["constant", "trees", "frame_heads", "gradient"]
+Kind = Literal["constant", "trees", "frame_heads", "gradient", "tuned"]
 
 
 @dataclass(frozen=True)
@@ -19,15 +22,17 @@ class Candidate:
     title: str
     kind: Kind
     """`constant`: the training objects' most frequent combination. `trees`: hand-made features of whole frames and
-    tree ensembles. `frame_heads`: the recipe `pretrained`'s heads on frozen features of single frames. `gradient`:
-    trained by the Trainer."""
-    encoder: Literal["clip", "scenes", "untrained"] = "clip"
-    """`scenes`: pretrained on synthetic pictures; `untrained`: the same network with random weights."""
+    tree ensembles. `frame_heads`: a per-frame classifier on frozen features. `gradient`: trained by the Trainer.
+    `tuned`: that recipe."""
+    backbone: tuple[str, ...] = ()
+    """Whose features: names in `pipeline.encoder.backbones`; none stands for the chain's own `encoder.backbone`."""
+    untrained: bool = False
+    """`frame_heads`: the network of the backbone `scenes` with random weights in place of a backbone."""
     recipe: Literal["paper", "release", "scratch"] = "paper"
-    """`gradient`: which. `scratch` trains the network of the recipe `pretrained` end to end from random weights."""
-    reference: Literal["none", "own", "mean"] = "none"
-    """What is subtracted from a frame: nothing, its video's own no-contact picture, or the mean of the training
-    videos' ones."""
+    """`gradient`: which. `scratch` trains the network of the backbone `scenes` end to end from random weights."""
+    reference: Literal["chain", "none", "own", "mean"] = "none"
+    """What is subtracted from a frame: what `encoder.reference` says, nothing, its video's own no-contact picture, or
+    the mean of the training videos' ones."""
     joint: bool = True
     """`frame_heads`: whether the properties are decided together."""
     pooled: bool = False
@@ -42,29 +47,35 @@ class Candidate:
     """The model that this one changes in one thing."""
 
     @property
-    def pretrained(self) -> bool:
-        """Whether it needs the encoder that synthetic pictures have pretrained."""
-        return self.encoder == "scenes" and self.kind == "frame_heads"
+    def settings_of(self) -> str:
+        """The recipe whose settings in the section `encoder` it is trained with; "" where there are none."""
+        return "tuned" if self.kind == "tuned" else "paper" if self.kind == "gradient" and not self.settings else ""
 
 
 PRETRAINED = Candidate(
-    "pretrained on synthetic pictures, frame classifier, decided jointly", "frame_heads", "scenes", reference="own"
+    "pretrained on synthetic pictures, frame classifier, decided jointly", "frame_heads", ("scenes",), reference="own"
 )
-PAPER = Candidate("CLIP with visual prompts, three heads", "gradient")
+PAPER = Candidate("CLIP with visual prompts, three heads", "gradient", ("clip",))
 RELEASE = {"epochs": 40, "batch_size": 4, "learning_rate": 1e-3, "weight_decay": 0.01}
 LEARNING_CURVE = (10, 20, 30, 40)
 
 CANDIDATES: dict[str, Candidate] = {
     "constant": Candidate("the training objects' most frequent combination of classes", "constant"),
     "trees": Candidate("hand-made features of five uniform frames, random trees, decided jointly", "trees"),
-    "probe": Candidate("frozen CLIP, frame classifier, decided jointly", "frame_heads"),
-    "probe-difference": Candidate("frozen CLIP on difference pictures, likewise", "frame_heads", reference="own"),
+    "backbone": Candidate("the frozen backbones, frame classifier, decided jointly", "frame_heads", reference="chain"),
+    "backbone-tuned": Candidate("the same tuned on the properties", "tuned", reference="chain"),
+    "probe": Candidate("frozen CLIP, frame classifier, decided jointly", "frame_heads", ("clip",)),
+    "probe-difference": Candidate(
+        "frozen CLIP on difference pictures, likewise", "frame_heads", ("clip",), reference="own"
+    ),
     "paper": PAPER,
     "paper-difference": replace(PAPER, title="the paper's recipe on difference pictures", reference="own"),
     "release": replace(PAPER, title="the published code's recipe", recipe="release", settings=RELEASE),
-    "scratch": replace(PAPER, title="the pretrained network's layers, from scratch", recipe="scratch", reference="own"),
+    "scratch": replace(
+        PAPER, title="the pretrained network's layers, from scratch", backbone=(), recipe="scratch", reference="own"
+    ),
     "pretrained": PRETRAINED,
-    "pretrained-untrained": replace(PRETRAINED, title="without pretraining", encoder="untrained", parent="pretrained"),
+    "pretrained-untrained": replace(PRETRAINED, title="without pretraining", untrained=True, parent="pretrained"),
     "pretrained-raw": replace(
         PRETRAINED, title="without each video's own reference", reference="mean", parent="pretrained"
     ),
@@ -83,20 +94,27 @@ CANDIDATES: dict[str, Candidate] = {
 }
 
 
-def check_candidates(names: Sequence[str], recipe: str) -> None:
-    """Raise UserError where a name of `cross_validation.models` is none, or lacks settings under this recipe."""
+def check_candidates(names: Sequence[str], config: EncoderConfig) -> None:
+    """Raise UserError where a name of `cross_validation.models` is none, or lacks weights or settings in `encoder`."""
     for name in names:
         if name not in CANDIDATES:
             close = difflib.get_close_matches(name, CANDIDATES, n=1)
             hint = f"did you mean {close[0]}? " if close else ""
             raise UserError(f"cross_validation.models: {name} is no model; {hint}known: {', '.join(CANDIDATES)}")
-        if CANDIDATES[name].kind == "gradient" and not CANDIDATES[name].settings and recipe == "release":
+        candidate = CANDIDATES[name]
+        clip = "clip" in config.backbone or (Path(config.weights) / CLIP_CONFIG).is_file()
+        if "clip" in candidate.backbone and not clip:
             raise UserError(
-                f"cross_validation.models: {name} would be trained with the settings of encoder.recipe=release; "
-                "compare it under recipe paper or pretrained"
+                f"cross_validation.models: {name} needs a CLIP, but encoder.weights={config.weights} has no "
+                f"{CLIP_CONFIG}; leave it out, or name a CLIP's folder"
+            )
+        if candidate.settings_of not in ("", config.recipe):
+            raise UserError(
+                f"cross_validation.models: {name} would be trained with the settings of "
+                f"encoder.recipe={config.recipe}; compare it under recipe {candidate.settings_of}"
             )
 
 
-def needs_pretraining(recipe: str, models: Sequence[str]) -> bool:
-    """Whether the encoder's recipe, or one of the compared models, begins with synthetic pretraining."""
-    return recipe == "pretrained" or any(CANDIDATES[name].pretrained for name in models)
+def needs_pretraining(config: EncoderConfig, models: Sequence[str]) -> bool:
+    """Whether the encoder, or one of the compared models, has the backbone `scenes`."""
+    return "scenes" in config.backbone or any("scenes" in CANDIDATES[name].backbone for name in models)

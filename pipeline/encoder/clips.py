@@ -123,7 +123,7 @@ def describe_clips(
         described = encoder.describe(frames.flatten(0, 1), frame_indices.flatten())
         features.append(described.view(*frames.shape[:2], -1).float().cpu())
     found = torch.cat(features)
-    _check_finite(found.flatten(1), videos)
+    check_finite(found.flatten(1), videos)
     return found.numpy()
 
 
@@ -145,7 +145,7 @@ def classify(
         if not outputs:
             continue
         logits = torch.cat(outputs)
-        _check_finite(logits, videos)
+        check_finite(logits, videos)
         decided = model.decide(logits)
         for index, property_ in enumerate(data.catalogue.properties):
             rows = F.softmax(logits.split(data.classes, dim=1)[index].double(), dim=1)
@@ -164,8 +164,8 @@ def classify(
     return records
 
 
-def _check_finite(values: torch.Tensor, videos: Sequence[LabelledVideo]) -> None:
-    """Values are videos x whatever."""
+def check_finite(values: torch.Tensor, videos: Sequence[LabelledVideo]) -> None:
+    """Raise UserError naming the first video whose row of `values`, videos x whatever, is not finite."""
     for video, finite in zip(videos, values.isfinite().all(1).tolist(), strict=True):
         if not finite:
             raise UserError(

@@ -8,12 +8,13 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.config import CrossValidationConfig, EncoderConfig, RuntimeConfig
+from pipeline.config import PRETRAINED, CrossValidationConfig, EncoderConfig, RuntimeConfig
 from pipeline.encoder.baseline.predictor import Labels
 from pipeline.encoder.baseline.validation import Fold, Predict, cross_validate, deal, forest
 from pipeline.encoder.candidates import Candidate
@@ -26,8 +27,9 @@ from pipeline.videos.frames.store import PROBES_FILE, REFERENCES_FILE, TABLE_FIL
 from pipeline.weights import clip_file
 
 if TYPE_CHECKING:
+    from pipeline.encoder.clips import EncoderData
     from pipeline.encoder.frame_classifier import Clips
-    from pipeline.encoder.model import FrameEncoder, PropertyClassifier
+    from pipeline.encoder.model import FrameEncoder
 
 VALIDATION = 8
 """One in so many training objects is set aside where a training chooses its best epoch."""
@@ -47,8 +49,6 @@ class CrossValidationData:
     per_video: int
     encoder: EncoderConfig
     runtime: RuntimeConfig
-    pretrained: Path
-    """File of the encoder that synthetic pictures have pretrained; need not exist where no candidate takes it."""
 
     @property
     def objects(self) -> list[str]:
@@ -68,11 +68,13 @@ class CrossValidationData:
     @property
     def files(self) -> list[Path]:
         """What results depend on besides the catalogue and the parameters."""
-        return [self.frames / TABLE_FILE, self.frames / REFERENCES_FILE, clip_file(Path(self.encoder.weights))]
+        files = [self.frames / TABLE_FILE, self.frames / REFERENCES_FILE, clip_file(Path(self.encoder.weights))]
+        return [*files, *([PRETRAINED] if PRETRAINED.is_file() else [])]
 
     def store(self, candidate: Candidate) -> FrameStore:
         """The frames as the candidate sees them."""
-        return FrameStore(self.frames, "subtract" if candidate.reference == "own" else "none")
+        chosen = self.encoder.reference if candidate.reference == "chain" else candidate.reference
+        return FrameStore(self.frames, "none" if chosen == "none" else "subtract")
 
     def assignments(self, parts: dict[str, Part]) -> list[Assignment]:
         """All videos, in these parts; unused where `parts` does not say."""
@@ -92,7 +94,6 @@ def cross_validate_candidate(
     Raises:
         UserError: where fewer objects than folds have videos.
     """
-    made_of = [*data.files, *([data.pretrained] if data.pretrained.is_file() else [])]
     objects = len(set(data.objects))
     if objects < config.folds:
         raise UserError(
@@ -102,7 +103,7 @@ def cross_validate_candidate(
     work = (
         CHECKPOINTS
         / "cross_validation"
-        / fingerprint(repr(candidate), config, data.encoder, data.per_video, labelled, *made_of)
+        / fingerprint(repr(candidate), config, data.encoder, data.per_video, labelled, *data.files)
     )
     predict = _limited(KINDS[candidate.kind](candidate, data), candidate, data)
     with progress(config.folds * config.repeats, "cross-validation", "fold") as advance:
@@ -198,18 +199,15 @@ def _frame_heads(candidate: Candidate, data: CrossValidationData) -> Predict:
 
 def frozen_encoder(candidate: Candidate, data: CrossValidationData) -> FrameEncoder:
     """The encoder that gives a `frame_heads` candidate its features."""
-    from pipeline.encoder.recipes import base_encoder
+    from pipeline.encoder.backbones import load_backbones
+    from pipeline.encoder.model import SideBySide
     from pipeline.encoder.scene_encoder import SceneEncoder
-    from pipeline.training.trainable import load_trainable
 
-    if candidate.encoder == "clip":
-        # As CLIP reads it, whatever the recipe of the chain.
-        return base_encoder(data.encoder.model_copy(update={"recipe": "paper"}))
-    seed_everything(0)
-    encoder = SceneEncoder()
-    if candidate.encoder == "scenes":
-        load_trainable(encoder, data.pretrained)
-    return encoder
+    if candidate.untrained:
+        seed_everything(0)
+        return SceneEncoder()
+    backbone = candidate.backbone or data.encoder.backbone
+    return SideBySide(load_backbones(data.encoder.model_copy(update={"backbone": backbone})))
 
 
 def _features(encoder: FrameEncoder, candidate: Candidate, data: CrossValidationData, store: FrameStore) -> Clips:
@@ -223,33 +221,23 @@ def _features(encoder: FrameEncoder, candidate: Candidate, data: CrossValidation
 
 def _gradient(candidate: Candidate, data: CrossValidationData) -> Predict:
     from pipeline.encoder import finetune
-    from pipeline.encoder.clips import EncoderData, classify
+    from pipeline.encoder.clips import classify
+    from pipeline.encoder.model import Heads, PropertyClassifier
     from pipeline.encoder.recipes import property_classifier
+    from pipeline.encoder.scene_encoder import SceneEncoder
 
     limit_threads(data.runtime.threads)
     recipe = "release" if candidate.recipe == "release" else "paper"
-    config = data.encoder.model_copy(update={"recipe": recipe, **candidate.settings})
+    config = data.encoder.model_copy(update={"recipe": recipe, "backbone": ("clip",), **candidate.settings})
     store, device = data.store(candidate), resolve_device(data.runtime.device)
 
     def predict(fold: Fold) -> Labels:
-        seed = derive_seed("gradient", fold.repeat, fold.number) % 2**31
-        seed_everything(seed)
-        trained = np.unique(np.array(data.objects)[fold.trained]).tolist()
-        chosen = deal(trained, min(VALIDATION, len(trained)), seed)[0] if len(trained) > 1 else frozenset()
-        parts = {
-            video.video_id: Part.TEST if tested else Part.VALIDATION if video.object_id in chosen else Part.TRAIN
-            for video, trained, tested in zip(data.videos, fold.trained, fold.tested, strict=True)
-            if trained or tested
-        }
-        clips = EncoderData(store, data.catalogue, data.assignments(parts), data.per_video)
-        scratch = candidate.recipe == "scratch"
-        model = _from_scratch(data.classes) if scratch else property_classifier(config, data.classes)
-        inputs: list[Path | str] = [
-            repr(candidate),
-            repr(data.labels.tolist()),
-            repr(sorted(parts.items())),
-            *data.files,
-        ]
+        clips, seed, inputs = _training(candidate, data, store, fold)
+        if candidate.recipe == "scratch":
+            encoder = SceneEncoder()
+            model = PropertyClassifier(encoder, Heads(encoder.dim, data.classes), data.classes)
+        else:
+            model = property_classifier(config, data.classes)
         finetune.train_classifier(model, clips, config, data.runtime, seed=seed, inputs=inputs)
         found: dict[str, list[int]] = {}
         for record in classify(model, clips, [Part.TEST], config.batch_size, device):
@@ -260,12 +248,47 @@ def _gradient(candidate: Candidate, data: CrossValidationData) -> Predict:
     return predict
 
 
-def _from_scratch(classes: Sequence[int]) -> PropertyClassifier:
-    from pipeline.encoder.model import Heads, PropertyClassifier
-    from pipeline.encoder.scene_encoder import SceneEncoder
+def _tuned(candidate: Candidate, data: CrossValidationData) -> Predict:
+    """The trunks have seen no label and stay as they are, so they are run once for all folds."""
+    from pipeline.encoder import finetune
+    from pipeline.encoder.tuned import FLIPS, AboveTrunks, Trunks, base_encoder, property_classifier, run_trunks
 
-    encoder = SceneEncoder()
-    return PropertyClassifier(encoder, Heads(encoder.dim, classes), classes)
+    limit_threads(data.runtime.threads)
+    store, device, config = data.store(candidate), resolve_device(data.runtime.device), data.encoder
+
+    @lru_cache(maxsize=1)
+    def trunks() -> Trunks:
+        clips = EncoderData(store, data.catalogue, data.assignments({}), data.per_video)
+        flips = len(FLIPS) if config.flip_probability else 1
+        return run_trunks(base_encoder(config), clips, clips.videos(Part.UNUSED), device, flips=flips)
+
+    def predict(fold: Fold) -> Labels:
+        clips, seed, inputs = _training(candidate, data, store, fold)
+        model = property_classifier(config, data.classes)
+        finetune.tune(model, trunks(), clips, config, data.runtime, seed=seed, inputs=inputs)
+        logits = AboveTrunks(model).logits(trunks(), clips.videos(Part.TEST), device)
+        return model.decide(logits).numpy()
+
+    return predict
+
+
+def _training(
+    candidate: Candidate, data: CrossValidationData, store: FrameStore, fold: Fold
+) -> tuple[EncoderData, int, list[Path | str]]:
+    """A fold's videos in parts, some set aside to choose the epoch by; the seed; what its training depends on."""
+    from pipeline.encoder.clips import EncoderData
+
+    seed = derive_seed("gradient", fold.repeat, fold.number) % 2**31
+    seed_everything(seed)
+    trained = np.unique(np.array(data.objects)[fold.trained]).tolist()
+    chosen = deal(trained, min(VALIDATION, len(trained)), seed)[0] if len(trained) > 1 else frozenset()
+    parts = {
+        video.video_id: Part.TEST if tested else Part.VALIDATION if video.object_id in chosen else Part.TRAIN
+        for video, trained, tested in zip(data.videos, fold.trained, fold.tested, strict=True)
+        if trained or tested
+    }
+    inputs: list[Path | str] = [repr(candidate), repr(data.labels.tolist()), repr(sorted(parts.items())), *data.files]
+    return EncoderData(store, data.catalogue, data.assignments(parts), data.per_video), seed, inputs
 
 
 KINDS: dict[str, Callable[[Candidate, CrossValidationData], Predict]] = {
@@ -273,4 +296,5 @@ KINDS: dict[str, Callable[[Candidate, CrossValidationData], Predict]] = {
     "trees": _trees,
     "frame_heads": _frame_heads,
     "gradient": _gradient,
+    "tuned": _tuned,
 }

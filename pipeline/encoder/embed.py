@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
+from itertools import chain
 
 import numpy as np
 import torch
@@ -56,6 +57,16 @@ def embed_videos(
                 index.append(Embedding(video_id=assignment.video_id, frame_index=frame, flip=flip, row=len(index)))
         blocks.append(block)
     return torch.cat(blocks), index
+
+
+def union(splits: Iterable[Sequence[Assignment]]) -> list[Assignment]:
+    """What several splits of the same videos want embedded: a video is mirrored where any of them trains on it."""
+    found: dict[str, Assignment] = {}
+    for assignment in chain.from_iterable(splits):
+        known = found.get(assignment.video_id)
+        if known is None or assignment.part == Part.TRAIN or known.part == Part.UNUSED:
+            found[assignment.video_id] = assignment
+    return list(found.values())
 
 
 def standardize(embeddings: torch.Tensor, index: Sequence[Embedding], training: Collection[str]) -> torch.Tensor:

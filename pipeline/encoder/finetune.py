@@ -1,37 +1,40 @@
 """Training of the tactile encoder on property labels.
 
-`paper` and `release` learn visual prompts and heads on a frozen CLIP by gradients (the paper's section III-A);
-`pretrained` fits heads to the frozen features of an encoder that synthetic pictures have pretrained.
+`paper` and `release` learn visual prompts and heads on a frozen CLIP by gradients (the paper's section III-A); `tuned`
+fits heads to frozen backbones and then tunes both (`pipeline.encoder.tuned`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence, Sized
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+import numpy.typing as npt
+import torch
+from torch.utils.data import default_collate
 
 from pipeline.card import write_card
-from pipeline.config import EncoderConfig, RuntimeConfig
-from pipeline.encoder.clips import ClipDataset, EncoderData, collate_clips, describe_clips
-from pipeline.encoder.frame_classifier import JointFrameClassifier, choose_strength, fit_frame_heads
-from pipeline.encoder.model import PropertyClassifier
+from pipeline.config import PRETRAINED, EncoderConfig, RuntimeConfig
+from pipeline.encoder.clips import ClipDataset, EncoderData, LabelledVideo, collate_clips
+from pipeline.encoder.frame_classifier import Clips, JointFrameClassifier, choose_strength, fit_frame_heads
+from pipeline.encoder.model import PropertyClassifier, SideBySide
 from pipeline.encoder.recipes import property_classifier
+from pipeline.encoder.tuned import FLIPS, AboveTrunks, TrunkDataset, Trunks, run_trunks
 from pipeline.io import fingerprint
 from pipeline.records import Measurement, Part
 from pipeline.runtime import resolve_device, seed_everything
-from pipeline.training.trainable import load_trainable
+from pipeline.training.sampling import EpochDataset
+from pipeline.training.trainable import trainable_state
 from pipeline.videos.catalogue import Catalogue
 
 if TYPE_CHECKING:
     from transformers import EvalPrediction, TrainerCallback
 
-GRADIENT_SETTINGS = {
-    *("prompts", "prompt_layers", "epochs", "batch_size", "learning_rate", "weight_decay", "flip_probability")
-}
-"""Of the section `encoder`: they mean nothing where heads are fitted."""
+COMBINED = "validation_combined"
+"""The measure that chooses the epoch."""
 
 
 def finetune(
@@ -41,7 +44,6 @@ def finetune(
     *,
     seed: int,
     inputs: Sequence[Path],
-    pretrained: Path,
     callbacks: Sequence[TrainerCallback] = (),
 ) -> tuple[PropertyClassifier, list[Measurement]]:
     """Train the classifier of the recipe.
@@ -49,7 +51,6 @@ def finetune(
     Args:
         inputs: Files that a training by gradients depends on, for its checkpoints' fingerprint.
         callbacks: Further callbacks for its Trainer, such as tracking.
-        pretrained: File of the encoder that synthetic pictures have pretrained; read for `pretrained` alone.
 
     Returns:
         The classifier, and its training's curve.
@@ -57,17 +58,66 @@ def finetune(
     seed_everything(seed)
     model = property_classifier(config, data.classes)
     if isinstance(model, JointFrameClassifier):
-        load_trainable(model.encoder, pretrained)
-        return model, fit_heads(model, data, config, runtime, seed)
+        assert isinstance(model.encoder, SideBySide)
+        videos = [*data.videos(Part.TRAIN), *data.videos(Part.VALIDATION)]
+        flips = len(FLIPS) if config.flip_probability else 1
+        trunks = run_trunks(model.encoder, data, videos, resolve_device(runtime.device), flips=flips)
+        return model, tune(model, trunks, data, config, runtime, seed=seed, inputs=inputs, callbacks=callbacks)
     return model, train_classifier(model, data, config, runtime, seed=seed, inputs=inputs, callbacks=callbacks)
 
 
-def fit_heads(
-    model: JointFrameClassifier, data: EncoderData, config: EncoderConfig, runtime: RuntimeConfig, seed: int
+def tune(
+    model: JointFrameClassifier,
+    trunks: Trunks,
+    data: EncoderData,
+    config: EncoderConfig,
+    runtime: RuntimeConfig,
+    *,
+    seed: int,
+    inputs: Sequence[Path | str],
+    callbacks: Sequence[TrainerCallback] = (),
 ) -> list[Measurement]:
-    """Fit a per-frame classifier's heads to the evaluation clips of the training videos."""
-    videos = data.videos(Part.TRAIN)
-    clips = describe_clips(model.encoder, data, videos, config.embed_batch_size, resolve_device(runtime.device))
+    """Fit the heads, then tune them and what is unfrozen of the encoder; the best epoch is kept (ties: the first).
+
+    The fitted heads are epoch 0. Without validation videos nothing would show that tuning helps, and they are kept.
+
+    Args:
+        trunks: Of the training and validation videos, with all flips where `encoder.flip_probability` is above 0.
+    """
+    device, above = resolve_device(runtime.device), AboveTrunks(model)
+    training, validation = data.videos(Part.TRAIN), data.videos(Part.VALIDATION)
+    curve = fit_heads(model, above.describe(trunks, training, device), training, data, seed)
+    if not validation:
+        return curve
+    probe = {name: value.clone() for name, value in trainable_state(model).items()}
+    logits = above.logits(trunks, validation, device).numpy()
+    reached = accuracies(logits, np.array([v.labels for v in validation]), model.decide, data.catalogue)
+    curve += [Measurement(step=0, name=name, value=value) for name, value in sorted(reached.items())]
+    learnt = TrunkDataset(trunks, training, seed=seed, flip_probability=config.flip_probability)
+    history = _train(
+        above,
+        learnt,
+        TrunkDataset(trunks, validation),
+        default_collate,
+        model,
+        data,
+        config,
+        runtime,
+        seed=seed,
+        inputs=inputs,
+        callbacks=callbacks,
+    )
+    if max(m.value for m in history if m.name == COMBINED) <= reached[COMBINED]:
+        with torch.no_grad():
+            for name, value in trainable_state(model).items():
+                value.copy_(probe[name])
+    return [*curve, *history]
+
+
+def fit_heads(
+    model: JointFrameClassifier, clips: Clips, videos: Sequence[LabelledVideo], data: EncoderData, seed: int
+) -> list[Measurement]:
+    """Fit a per-frame classifier's heads to what its encoder says of these videos."""
     labels = np.array([video.labels for video in videos])
     owners = {a.video_id: a.object_id for a in data.assignments}
     objects = [owners[video.video_id] for video in videos]
@@ -90,10 +140,7 @@ def train_classifier(
 
     Without validation videos there is nothing to choose by, and the last epoch is kept.
     """
-    # Imported here, since fitted heads need no Trainer, and importing it takes seconds.
-    from pipeline.training.trainer import TrainableTrainer, TrainingMonitor, checkpoint_dir, train, training_arguments
-
-    train_set = ClipDataset(
+    training = ClipDataset(
         data.store,
         data.videos(Part.TRAIN),
         per_video=data.per_video,
@@ -101,6 +148,39 @@ def train_classifier(
         flip_probability=config.flip_probability,
     )
     validation = data.videos(Part.VALIDATION)
+    return _train(
+        model,
+        training,
+        ClipDataset(data.store, validation, per_video=data.per_video) if validation else None,
+        collate_clips,
+        model,
+        data,
+        config,
+        runtime,
+        seed=seed,
+        inputs=inputs,
+        callbacks=callbacks,
+    )
+
+
+def _train(
+    trained: torch.nn.Module,
+    training: EpochDataset[Any],
+    validation: EpochDataset[Any] | None,
+    collate: Callable[[Any], Any],
+    model: PropertyClassifier,
+    data: EncoderData,
+    config: EncoderConfig,
+    runtime: RuntimeConfig,
+    *,
+    seed: int,
+    inputs: Sequence[Path | str],
+    callbacks: Sequence[TrainerCallback],
+) -> list[Measurement]:
+    """Train a module, which is `model` or a part of it, by the settings of the section `encoder`."""
+    # Imported here, since fitted heads need no Trainer, and importing it takes seconds.
+    from pipeline.training.trainer import TrainableTrainer, TrainingMonitor, checkpoint_dir, train, training_arguments
+
     folder = checkpoint_dir(f"finetune_encoder-{seed}", fingerprint(config, seed, data.per_video, *inputs))
     arguments = training_arguments(
         folder,
@@ -115,34 +195,41 @@ def train_classifier(
         save_strategy="epoch",
         save_total_limit=2,
         load_best_model_at_end=bool(validation),
-        metric_for_best_model="validation_combined" if validation else None,
+        metric_for_best_model=COMBINED if validation else None,
         logging_strategy="epoch",
     )
+
+    def judged(prediction: EvalPrediction) -> dict[str, float]:
+        logits, labels = cast(np.ndarray, prediction.predictions), cast(np.ndarray, prediction.label_ids)
+        return accuracies(logits, labels, model.decide, data.catalogue)
+
     trainer = TrainableTrainer(
-        model=model,
+        model=trained,
         args=arguments,
-        train_dataset=train_set,
-        eval_dataset=ClipDataset(data.store, validation, per_video=data.per_video) if validation else None,
-        data_collator=collate_clips,
-        compute_metrics=lambda prediction: accuracies(prediction, data.catalogue),
+        train_dataset=training,
+        eval_dataset=validation,
+        data_collator=collate,
+        compute_metrics=judged,
         callbacks=[TrainingMonitor(), *callbacks],
-        wave=math.ceil(len(train_set) / config.batch_size) if model.cosine_per_epoch else None,
+        wave=math.ceil(len(cast(Sized, training)) / config.batch_size) if model.cosine_per_epoch else None,
     )
     return train(trainer).history
 
 
-def write_encoder_card(
-    folder: Path, data: EncoderData, config: EncoderConfig, seed: int, pretrained: Path, source: str
-) -> None:
+def write_encoder_card(folder: Path, data: EncoderData, config: EncoderConfig, seed: int, source: str) -> None:
     """Write the card of a fine-tuned encoder beside it."""
-    fitted = config.recipe == "pretrained"
+    bases = {name: Path(config.weights) for name in config.backbone if name != "scenes"}
+    if "scenes" in config.backbone:
+        bases["scenes"] = PRETRAINED
     names = [p.name for p in data.catalogue.properties]
     training = [a for a in data.assignments if a.part == Part.TRAIN]
-    unused = {"weights", "standardize", "embed_batch_size"} | (GRADIENT_SETTINGS if fitted else set())
+    unused = {"weights", "standardize", "embed_batch_size"}
+    unused |= set() if "clip" in config.backbone else {"prompts", "prompt_layers"}
+    unused |= set() if "timm" in config.backbone else {"feature_stage"}
     write_card(
         folder,
         f"Tactile encoder with property heads, recipe {config.recipe}",
-        bases={"network pretrained on synthetic pictures": pretrained} if fitted else {"CLIP": Path(config.weights)},
+        bases=bases,
         data={
             f"training videos ({source})": len(training),
             "training objects": len({a.object_id for a in training}),
@@ -154,15 +241,23 @@ def write_encoder_card(
             f"It gives classes of {', '.join(names)} as annotators rated them, and no physical quantity.",
             "It knows objects and sensors only as its training videos show them.",
             "Weights of the base model that were frozen are not in this folder.",
-        )[: 2 if fitted else 3],
+        ),
     )
 
 
-def accuracies(prediction: EvalPrediction, catalogue: Catalogue) -> dict[str, float]:
-    """Validation accuracy a property, and combined: all properties of a video right."""
-    logits, labels = cast(np.ndarray, prediction.predictions), cast(np.ndarray, prediction.label_ids)
-    borders = np.cumsum([len(p.levels) for p in catalogue.properties])[:-1]
-    guesses = np.stack([z.argmax(1) for z in np.split(logits, borders, axis=1)], axis=1)
-    right = guesses == labels
+def accuracies(
+    logits: npt.NDArray[np.floating],
+    labels: npt.NDArray[np.integer],
+    decide: Callable[[torch.Tensor], torch.Tensor],
+    catalogue: Catalogue,
+) -> dict[str, float]:
+    """Validation accuracy a property, and combined: all properties of a video right.
+
+    Args:
+        logits: Videos x (classes of all properties, side by side).
+        labels: Videos x properties.
+        decide: A classifier's decision about logits.
+    """
+    right = decide(torch.from_numpy(logits)).numpy() == labels
     single = {f"validation_{p.name}": float(r.mean()) for p, r in zip(catalogue.properties, right.T, strict=True)}
-    return {**single, "validation_combined": float(right.all(1).mean())}
+    return {**single, COMBINED: float(right.all(1).mean())}

@@ -1,4 +1,4 @@
-"""The recipe `pretrained`: a per-frame classifier on frozen features of a pretrained network, with joint decoding.
+"""A per-frame classifier on the features of a pretrained encoder, with joint decoding.
 
 Each property has a logistic regression on the standardised features of single frames. A video's probabilities are the
 mean over its frames. The properties are then decided together, as objects that share one class often share others.
@@ -10,19 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import nn
 
-from pipeline.config import EncoderConfig
 from pipeline.encoder.baseline.predictor import Labels, decode_jointly, log_dependence
 from pipeline.encoder.baseline.validation import deal
-from pipeline.encoder.clip import load_visual_tower
-from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier, TactileEncoder
-from pipeline.encoder.scene_encoder import SceneEncoder
+from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
 from pipeline.records import Measurement
 from pipeline.runtime import derive_seed
 
@@ -55,7 +51,7 @@ class JointFrameClassifier(PropertyClassifier):
 
     def standardise(self, features: torch.Tensor) -> torch.Tensor:
         """Features on the training frames' scale, within `FARTHEST`."""
-        scaled = (features - self.centre) / self.spread
+        scaled = (features - self.centre.detach()) / self.spread.detach()  # A scale, and not trained.
         # What is infinite stays so, and is found: a wild frame is held, a broken one is not.
         return torch.where(scaled.isinf(), scaled, scaled.clamp(-FARTHEST, FARTHEST))
 
@@ -168,13 +164,3 @@ def choose_strength(
         reached.append(float(right.mean()))
     curve = [Measurement(step=i, name="inner_combined", value=value) for i, value in enumerate(reached)]
     return STRENGTHS[int(np.argmax(reached))], curve
-
-
-def base_encoder(config: EncoderConfig) -> TactileEncoder:
-    """CLIP as it comes: the ablation's base stays the same under every recipe that reads CLIP as the paper does."""
-    return TactileEncoder(load_visual_tower(Path(config.weights)))
-
-
-def property_classifier(_: EncoderConfig, classes: Sequence[int]) -> JointFrameClassifier:
-    """The network that synthetic pictures have pretrained; its weights are loaded by `finetune`."""
-    return JointFrameClassifier(SceneEncoder(), classes)

@@ -43,6 +43,18 @@ class FrameEncoder(nn.Module):
         described: torch.Tensor = self(frames, frame_indices)
         return described
 
+    def trunk(self, frames: torch.Tensor) -> torch.Tensor:
+        """What lies below all that fine-tuning changes, computed once a picture: batch x anything.
+
+        By default that is nothing, and the frames themselves.
+        """
+        return frames
+
+    def stage(self, entering: torch.Tensor) -> torch.Tensor:
+        """The embedding, batch x dim, from what `trunk` gave."""
+        embedded: torch.Tensor = self(entering, torch.zeros(len(entering), dtype=torch.int64, device=entering.device))
+        return embedded
+
 
 class TactileEncoder(FrameEncoder):
     """CLIP's frozen visual tower, with visual prompts or (the base encoder) without, read as CLIP reads it.
@@ -80,6 +92,36 @@ class TactileEncoder(FrameEncoder):
         if pixels.shape[-1] != self.image.size:
             pixels = F.interpolate(pixels, self.image.size, mode="area")
         return (pixels - self.mean) / self.std
+
+
+class SideBySide(FrameEncoder):
+    """Several backbones as one encoder: their features one after the other.
+
+    They stay in evaluation mode, so that batch normalisation keeps its statistics and nothing is dropped.
+    """
+
+    def __init__(self, backbones: Sequence[FrameEncoder]) -> None:
+        super().__init__(dim=sum(backbone.dim for backbone in backbones))
+        self.backbones = nn.ModuleList(backbones)
+        self.eval()
+
+    def train(self, mode: bool = True) -> SideBySide:
+        """Stays in evaluation mode."""
+        super().train(False)
+        return self
+
+    def forward(self, frames: torch.Tensor, frame_indices: torch.Tensor) -> torch.Tensor:
+        """Features of all backbones: batch x dim, of frames, uint8, batch x side x side x RGB."""
+        return torch.cat([backbone(frames, frame_indices) for backbone in self.backbones], dim=1)
+
+    def trunks(self, frames: torch.Tensor) -> list[torch.Tensor]:
+        """What each backbone's `trunk` makes of frames."""
+        return [cast(FrameEncoder, backbone).trunk(frames) for backbone in self.backbones]
+
+    def stages(self, entering: Sequence[torch.Tensor]) -> torch.Tensor:
+        """Features of all backbones, batch x dim, from what `trunks` gave."""
+        pairs = zip(self.backbones, entering, strict=True)
+        return torch.cat([cast(FrameEncoder, backbone).stage(given) for backbone, given in pairs], dim=1)
 
 
 class Heads(nn.ModuleList):
@@ -121,7 +163,11 @@ class PropertyClassifier(nn.Module):
             properties' cross-entropies, so that the heads are trained simultaneously.
         """
         features = self.encoder.describe(frames.flatten(0, 1), frame_indices.flatten())
-        logits = self.classify(features.view(*frames.shape[:2], -1))
+        return self.judge(features.view(*frames.shape[:2], -1), labels)
+
+    def judge(self, features: torch.Tensor, labels: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
+        """As `forward`, of the frames' features, batch x frames x dim."""
+        logits = self.classify(features)
         output = {"logits": torch.cat(logits, dim=1)}
         if labels is not None:
             losses = [F.cross_entropy(z, y) for z, y in zip(logits, labels.unbind(1), strict=True)]
@@ -138,15 +184,34 @@ class PropertyClassifier(nn.Module):
         return torch.stack([z.argmax(1) for z in logits.split(self.classes, dim=1)], dim=1)
 
 
+def mean_and_deviation(maps: torch.Tensor) -> torch.Tensor:
+    """Mean and standard deviation of each channel: batch x 2 channels, of maps, batch x channels x places.
+
+    Computed in float32 at least. A channel that is the same everywhere has deviation 0, with a gradient of 0.
+    """
+    values = maps if maps.dtype == torch.float64 else maps.float()
+    mean = values.mean(2)
+    variance = (values - mean[..., None]).square().mean(2)
+    varies = variance > 0
+    # The root's slope at 0 is infinite, and 0 times that no number.
+    deviation = torch.where(varies, variance, 1.0).sqrt() * varies
+    return torch.cat([mean, deviation], dim=1).to(maps.dtype)
+
+
+def load_backbone(config: EncoderConfig, *, tuned: bool) -> TactileEncoder:
+    """The backbone `clip`: open_clip's ViT in `encoder.weights`; fine-tuning changes prompts of its own."""
+    tower = load_visual_tower(Path(config.weights), config.embedding)
+    return TactileEncoder(tower, visual_prompts(config, tower, shared=True) if tuned else None)
+
+
 def base_encoder(config: EncoderConfig) -> TactileEncoder:
     """CLIP as it comes."""
-    return TactileEncoder(load_visual_tower(Path(config.weights), config.embedding))
+    return load_backbone(config, tuned=False)
 
 
 def property_classifier(config: EncoderConfig, classes: Sequence[int]) -> PropertyClassifier:
     """CLIP with visual prompts that pass one shared linear map, and one linear head a property."""
-    tower = load_visual_tower(Path(config.weights), config.embedding)
-    encoder = TactileEncoder(tower, visual_prompts(config, tower, shared=True))
+    encoder = load_backbone(config, tuned=True)
     return PropertyClassifier(encoder, Heads(encoder.dim, classes), classes)
 
 

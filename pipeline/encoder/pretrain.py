@@ -1,4 +1,4 @@
-"""Synthetic pretraining of the recipe `pretrained`: predicting what is known of invented objects from pictures."""
+"""Synthetic pretraining of the backbone `scenes`: predicting what is known of invented objects from pictures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from transformers import TrainerCallback
 
 from pipeline.config import FramesConfig, PretrainConfig, RuntimeConfig
 from pipeline.encoder import synthetic
-from pipeline.encoder.scene_encoder import SceneEncoder
+from pipeline.encoder.scene_encoder import SIDE, SceneEncoder
 from pipeline.encoder.synthetic import SyntheticPictures, draw_pictures
 from pipeline.io import fingerprint
 from pipeline.records import Measurement
@@ -123,10 +123,13 @@ def pretrain(
 ) -> tuple[SceneEncoder, list[Measurement]]:
     """Draw the pictures and train the encoder on them; a killed run goes on where it was.
 
+    The pictures are as large as the encoder will see frames: `frames.size`, or its own side where that is larger.
+
     Returns:
         The encoder, and the curve of its loss; `held_out_*` at the last step are over objects that it never saw.
     """
     seed_everything(config.seed)
+    frames = frames.model_copy(update={"size": min(frames.size, SIDE)})
     # What decides how pictures look, so that half of them are never drawn by one version and half by another.
     code = [*sorted(Path(invent.__file__).parent.rglob("*.py")), Path(synthetic.__file__), Path(subtraction.__file__)]
     key = fingerprint(config, frames.fit, frames.size, *code)

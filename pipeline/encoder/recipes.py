@@ -1,4 +1,4 @@
-"""The registry of encoder recipes. A new backbone is a module with the two functions below, and a line in `RECIPES`."""
+"""The registry of encoder recipes. A new one is a module with the two functions below, and a line in `RECIPES`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 RECIPES = {
     "paper": "pipeline.encoder.model",
     "release": "pipeline.encoder.release",
-    "pretrained": "pipeline.encoder.frame_classifier",
+    "tuned": "pipeline.encoder.tuned",
 }
 """Values of `encoder.recipe` and their modules: named, not imported, as `octopi scale` checks them without torch."""
 

@@ -1,23 +1,32 @@
-"""A small convolutional encoder of difference pictures, pretrained on synthetic ones (`pipeline.encoder.pretrain`)."""
+"""The backbone `scenes`: a small CNN of difference pictures that `pipeline.encoder.pretrain` pretrains."""
 
 from __future__ import annotations
 
 import torch
 from torch import nn
+from torch.nn import functional as F
 
+from pipeline.config import PRETRAINED, EncoderConfig
 from pipeline.encoder.model import FrameEncoder
+from pipeline.training.trainable import load_trainable
 from pipeline.videos.frames.subtraction import GAIN, MIDDLE
+
+SIDE = 120
+"""Pixels of the pictures that it is pretrained on at most: as high as they are drawn. Larger ones are averaged."""
 
 STEPS = 12
 """8-bit steps of difference that count as 1: about the deviation where something touches."""
 CHANNELS = ((16, 2), (32, 2), (48, 1), (64, 2), (96, 1), (128, 2), (128, 1))
 """Outputs and stride of each convolution; the first is 5 x 5, the others 3 x 3."""
+TUNED = 2
+"""Convolutions of the last stage: from the last halving of the map on."""
 
 
 class SceneEncoder(FrameEncoder):
     """Seven convolutions with batch normalisation, then mean and maximum over the picture: 256 numbers a frame.
 
-    It takes difference pictures (`pipeline.videos.frames.subtraction`) of any side from 16 pixels.
+    It takes difference pictures (`pipeline.videos.frames.subtraction`) of any side from 16 pixels; those larger than
+    `SIDE` are averaged over areas.
     """
 
     def __init__(self) -> None:
@@ -31,9 +40,39 @@ class SceneEncoder(FrameEncoder):
             width = channels
         self.layers = nn.Sequential(*layers).to(memory_format=torch.channels_last)
 
+    @property
+    def last(self) -> nn.Sequential:
+        """The stage that fine-tuning changes."""
+        return self.layers[-3 * TUNED :]
+
     def forward(self, frames: torch.Tensor, frame_indices: torch.Tensor) -> torch.Tensor:
         """Embed difference pictures, uint8, batch x side x side x RGB: batch x dim, in the weights' number format."""
+        return self.stage(self.trunk(frames))
+
+    def trunk(self, frames: torch.Tensor) -> torch.Tensor:
+        """What enters the last stage: batch x channels x height x width."""
         # The bytes lie as channels-last wants them: a view, no copy.
-        pixels = (frames.permute(0, 3, 1, 2).to(next(self.parameters()).dtype) - MIDDLE) / (GAIN * STEPS)
-        maps = self.layers(pixels)
+        pixels = frames.permute(0, 3, 1, 2).to(next(self.parameters()).dtype)
+        if pixels.shape[-1] > SIDE:
+            pixels = F.interpolate(pixels, SIDE, mode="area")
+        maps: torch.Tensor = self.layers[: -3 * TUNED]((pixels - MIDDLE) / (GAIN * STEPS))
+        return maps
+
+    def stage(self, entering: torch.Tensor) -> torch.Tensor:
+        """Mean and maximum over the picture, batch x dim, from what `trunk` gave."""
+        maps = self.last(entering)
         return torch.cat([maps.mean((2, 3)), maps.amax((2, 3))], dim=1)
+
+
+def load_backbone(_: EncoderConfig, *, tuned: bool) -> SceneEncoder:
+    """The network that the stage `pretrain` wrote.
+
+    Raises:
+        UserError: where there is none, or one that does not fit.
+    """
+    encoder = SceneEncoder()
+    load_trainable(encoder, PRETRAINED)
+    encoder.requires_grad_(False).eval()
+    if tuned:
+        encoder.last.requires_grad_(True)
+    return encoder

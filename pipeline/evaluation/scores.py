@@ -24,9 +24,10 @@ from pipeline.videos.catalogue import Catalogue
 
 ALL_SEEDS = "all"
 """In place of a seed: the mean over seeds, or over the repeats of a cross-validation."""
-HEADS, VALIDATION_HEADS, CROSS_VALIDATION = "heads", "heads_validation", "cross_validation"
-"""What stands as the task where no language model answered: the fine-tuned encoder's property heads on test videos and
-on validation videos, and encoders on objects that they were not trained on."""
+HEADS, VALIDATION_HEADS, CROSS_VALIDATION, DESCRIBED = "heads", "heads_validation", "cross_validation", "described"
+"""What stands as the task where no language model with touch answered: the fine-tuned encoder's property heads on test
+videos and on validation videos, encoders on objects that they were not trained on, and base models about objects that
+are described to them in words."""
 
 DIGITS = 6
 Share = Annotated[float, AfterValidator(lambda value: round(value, DIGITS))]
@@ -40,7 +41,7 @@ class ScoreRow(Record):
     task: str
     measure: str
     encoder: str
-    """Of a cross-validation, the candidate's name."""
+    """Of a cross-validation, the candidate's name; of described objects, the base model's."""
     lora: str = ""
     opd: str = ""
     touch: str = ""
@@ -56,7 +57,8 @@ class ScoreRow(Record):
     low: Optional = None
     """Of the 95 % interval over objects; None where the questions cannot show that objects differ."""
     high: Optional = None
-    chance: Share
+    chance: Optional
+    """None of described objects, where the task is not registered."""
     strict: Optional = None
     """Accuracy by the published code's comparison of texts; None where that code has none, or nobody wrote a text."""
 
@@ -131,7 +133,7 @@ def score_rows(
     Args:
         graded: All graded answers of a run; some variants or tasks may be absent.
         catalogue: What chance follows from.
-        classifications: Of the property heads, by the encoder's seed; videos of other parts are passed over.
+        classifications: Of the property heads, by seed, those of its folds together; only test and validation count.
         out_of_fold: By candidate.
     """
     rows: list[ScoreRow] = []

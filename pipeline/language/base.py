@@ -23,7 +23,8 @@ from transformers import (
 
 from pipeline.errors import UserError
 from pipeline.io import read_json, write_json
-from pipeline.language.chat import add_tactile_tokens
+from pipeline.language.chat import add_tactile_tokens, render
+from pipeline.records import Turn
 from pipeline.runtime import Quantization
 from pipeline.weights import GET_LLM, check_language
 
@@ -38,15 +39,16 @@ def load_tokenizer(folder: Path) -> PreTrainedTokenizerBase:
     its id, so that an end token stays one that is learnt and stops an answer.
 
     Raises:
-        UserError: where there is no end token, which answers are stopped by.
+        UserError: where there is no end token, which answers are stopped by, or no chat template that `render` can use.
     """
-    check_language(folder)
-    tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True, use_fast=True)
+    check_language(folder, exists=True)
+    tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True, use_fast=True, trust_remote_code=False)
     if tokenizer.eos_token is None:
         raise UserError(
             f"language.weights: {folder / 'tokenizer_config.json'} names no eos_token; answers end with it, so add it"
         )
     add_tactile_tokens(tokenizer)
+    render([Turn(user="a", assistant="b")] * 2, tokenizer, system_prompt="", frames=1, complete=True)
     if tokenizer.pad_token is None:
         tokenizer.pad_token = tokenizer.unk_token or tokenizer.eos_token
     return tokenizer
@@ -63,11 +65,17 @@ def load_llm(folder: Path, dtype: torch.dtype, quantization: Quantization = "non
         UserError: for a missing folder or file, a pickle, a checkpoint that does not fit its configuration, or
             four bits where they cannot be had.
     """
-    check_language(folder)
+    check_language(folder, exists=True)
     own = _four_bits(dtype) if quantization == "nf4" else {}
     try:
         model, info = AutoModelForCausalLM.from_pretrained(
-            folder, dtype=dtype, local_files_only=True, use_safetensors=True, output_loading_info=True, **own
+            folder,
+            dtype=dtype,
+            local_files_only=True,
+            use_safetensors=True,
+            trust_remote_code=False,
+            output_loading_info=True,
+            **own,
         )
     except (OSError, ValueError, RuntimeError, KeyError, SafetensorError) as error:
         reason = " ".join(str(error).split())[:200]

@@ -43,6 +43,21 @@ class RoomyLayer(DynamicLayer):
         self.keys, self.values = (room[..., :needed, :] for room in self._room)
         return self.keys, self.values
 
+    def batch_repeat_interleave(self, repeats: int) -> None:
+        """Give each row that many copies."""
+        super().batch_repeat_interleave(repeats)
+        self._room = None
+
+    def batch_select_indices(self, indices: torch.Tensor) -> None:
+        """Keep these rows."""
+        super().batch_select_indices(indices)
+        self._room = None
+
+
+def extendable(config: PretrainedConfig) -> bool:
+    """Whether each layer keeps all it has read, so that what is read first may be kept apart from what follows."""
+    return all(type(layer) is DynamicLayer for layer in DynamicCache(config=config).layers)
+
 
 def roomy_cache(config: PretrainedConfig) -> Cache:
     """An empty cache for a model; layers with a sliding window keep the one that transformers has for them."""

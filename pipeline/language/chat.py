@@ -1,7 +1,8 @@
-"""The one renderer of a conversation: training, evaluation and the stand-ins' pretraining all speak through it.
+"""The one renderer of a conversation: training and evaluation speak through it.
 
-The chat format is Vicuna v1.5's: `SYSTEM USER: question ASSISTANT: answer</s>USER: ...`. A video in a question becomes
-`<tact_start>`, one `<tact_frame>` a frame and `<tact_end>`; the model puts tactile embeddings in the frames' places.
+The chat format is the tokenizer's own template where it has one, else Vicuna v1.5's:
+`SYSTEM USER: question ASSISTANT: answer</s>USER: ...`. A video in a question becomes `<tact_start>`, one `<tact_frame>`
+a frame and `<tact_end>`; the model puts tactile embeddings in the frames' places.
 """
 
 from __future__ import annotations
@@ -9,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
+
+from jinja2 import TemplateError
 
 from pipeline.errors import UserError
 from pipeline.records import Turn
@@ -28,6 +31,8 @@ class Rendered:
 
     text: str
     answers: tuple[tuple[int, int], ...]
+    templated: bool = False
+    """Written by the tokenizer's template, which writes the begin token too where there is one."""
 
 
 @dataclass(frozen=True)
@@ -44,27 +49,51 @@ def add_tactile_tokens(tokenizer: PreTrainedTokenizerBase) -> None:
     tokenizer.add_special_tokens({"additional_special_tokens": missing}, replace_extra_special_tokens=False)
 
 
-def render(turns: Sequence[Turn], *, system_prompt: str, frames: int, eos: str, complete: bool) -> Rendered:
+def render(
+    turns: Sequence[Turn], tokenizer: PreTrainedTokenizerBase, *, system_prompt: str, frames: int, complete: bool
+) -> Rendered:
     """Write a conversation out.
 
     Args:
         turns: Exchanges in order.
-        system_prompt: Put before the first turn; may be empty.
+        tokenizer: Whose template writes it; without one, Vicuna's format with its end token.
+        system_prompt: Put before the first turn. Where it is empty nothing is, or what the template puts there itself.
         frames: Tactile embeddings a video.
-        eos: The tokenizer's end token, written after each answer.
-        complete: With the last answer (training), or up to "ASSISTANT:" for it to be generated.
+        complete: With the last answer (training), or up to where it is to be generated.
+
+    Raises:
+        UserError: for a template that fails, that writes a conversation's beginning otherwise once it goes on (a
+            model would be asked what it was not trained on), or that ends answers with no end token.
     """
     video = TACT_START + TACT_FRAME * frames + TACT_END
-    text = f"{system_prompt} " if system_prompt else ""
-    answers = []
-    for number, turn in enumerate(turns, 1):
-        text += f"USER: {turn.user.replace(TACTILE, video)} ASSISTANT:"
-        if number == len(turns) and not complete:
-            break
-        start = len(text)
-        text += f" {turn.assistant}{eos}"
-        answers.append((start, len(text)))
-    return Rendered(text, tuple(answers))
+    shown = [Turn(user=turn.user.replace(TACTILE, video), assistant=turn.assistant) for turn in turns]
+    if tokenizer.chat_template is None:
+        return vicuna(shown, system_prompt, str(tokenizer.eos_token), complete)
+    messages = [{"role": "system", "content": system_prompt}] if system_prompt else []
+    prompts = []
+    for turn in shown:
+        messages.append({"role": "user", "content": turn.user})
+        prompts.append(_templated(messages, tokenizer, ask=True))
+        messages.append({"role": "assistant", "content": turn.assistant})
+    text = _templated(messages, tokenizer, ask=False) if complete else prompts.pop() if prompts else ""
+    ends = [str(tokenizer.convert_ids_to_tokens(i)) for i in end_ids(tokenizer)]
+    return Rendered(text, tuple(_answer(text, prompt, ends, tokenizer) for prompt in prompts), templated=True)
+
+
+def end_ids(tokenizer: PreTrainedTokenizerBase) -> tuple[int, ...]:
+    """Ids of the tokens that end an answer: the end token, and the one that the template writes behind an answer.
+
+    They differ for some: Llama-3's instruct models end a turn with `<|eot_id|>`, a text with `<|end_of_text|>`.
+    """
+    eos = [] if tokenizer.eos_token_id is None else [int(tokenizer.eos_token_id)]
+    if tokenizer.chat_template is None:
+        return tuple(eos)
+    messages = [{"role": "user", "content": "a"}, {"role": "assistant", "content": "b"}]
+    asked = _templated(messages[:1], tokenizer, ask=True)
+    said = _templated(messages, tokenizer, ask=False)[len(asked) :]
+    special = {i for i, token in tokenizer.added_tokens_decoder.items() if token.special}
+    behind = [i for i in tokenizer(said, add_special_tokens=False)["input_ids"] if i in special]
+    return tuple(dict.fromkeys(eos + behind[:1]))
 
 
 def encode(rendered: Rendered, tokenizer: PreTrainedTokenizerBase) -> Encoded:
@@ -75,10 +104,46 @@ def encode(rendered: Rendered, tokenizer: PreTrainedTokenizerBase) -> Encoded:
     """
     if not tokenizer.is_fast:
         raise UserError(f"{tokenizer.name_or_path}: has no fast tokenizer (tokenizer.json); labels need its offsets")
-    batch = tokenizer(rendered.text, return_offsets_mapping=True)
+    batch = tokenizer(rendered.text, return_offsets_mapping=True, add_special_tokens=not rendered.templated)
     ids: list[int] = batch["input_ids"]
     labels = [
         token if any(start <= a and b <= stop and a < b for start, stop in rendered.answers) else IGNORE_INDEX
         for token, (a, b) in zip(ids, batch["offset_mapping"], strict=True)
     ]
     return Encoded(tuple(ids), tuple(labels))
+
+
+def vicuna(turns: Sequence[Turn], system_prompt: str, eos: str, complete: bool) -> Rendered:
+    """Vicuna v1.5's format (FastChat's `vicuna_v1.1`), each answer followed by the end token `eos`."""
+    text = f"{system_prompt} " if system_prompt else ""
+    answers = []
+    for number, turn in enumerate(turns, 1):
+        text += f"USER: {turn.user} ASSISTANT:"
+        if number == len(turns) and not complete:
+            break
+        start = len(text)
+        text += f" {turn.assistant}{eos}"
+        answers.append((start, len(text)))
+    return Rendered(text, tuple(answers))
+
+
+def _templated(messages: Sequence[dict[str, str]], tokenizer: PreTrainedTokenizerBase, *, ask: bool) -> str:
+    """By the tokenizer's template; `ask`: with what it writes before an answer."""
+    try:
+        return str(tokenizer.apply_chat_template(list(messages), tokenize=False, add_generation_prompt=ask))
+    except (TemplateError, ValueError) as error:
+        raise UserError(
+            f"language.weights: the chat template in {tokenizer.name_or_path} fails ({' '.join(str(error).split())}); "
+            "where it knows no system message, empty language.system_prompt"
+        ) from None
+
+
+def _answer(text: str, prompt: str, ends: Sequence[str], tokenizer: PreTrainedTokenizerBase) -> tuple[int, int]:
+    """Where the answer to a prompt stands in the text, its end token included."""
+    where = f"language.weights: the chat template in {tokenizer.name_or_path}"
+    if not text.startswith(prompt):
+        raise UserError(f"{where} writes a prompt otherwise once it is answered; take one that only appends")
+    stops = [place + len(end) for end in ends if (place := text.find(end, len(prompt))) >= 0]
+    if not stops:
+        raise UserError(f"{where} ends an answer with none of {', '.join(ends)}; the model could not learn to stop")
+    return len(prompt), min(stops)

@@ -65,13 +65,7 @@ class ConversationDataset(EpochDataset[Sample]):
         for question in self.questions:
             dialogue = question.dialogue(opd)
             assert dialogue is not None
-            text = render(
-                dialogue.turns,
-                system_prompt=system_prompt,
-                frames=per_video,
-                eos=str(tokenizer.eos_token),
-                complete=True,
-            )
+            text = render(dialogue.turns, tokenizer, system_prompt=system_prompt, frames=per_video, complete=True)
             encoded = encode(text, tokenizer)
             check_length(question.question_id, len(encoded.input_ids), positions)
             if all(label == IGNORE_INDEX for label in encoded.labels):

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
 
 import torch
-from transformers import PreTrainedTokenizerBase, StoppingCriteria, StoppingCriteriaList
+from transformers import PreTrainedTokenizerBase
 
 from pipeline.embeddings import TactileFeatures
 from pipeline.errors import UserError
-from pipeline.language.chat import encode, render
-from pipeline.language.conversations import check_length, evaluation_features, pad_features
+from pipeline.language.chat import encode, end_ids, render
+from pipeline.language.conversations import check_length, evaluation_features
+from pipeline.language.decoding import greedy
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.records import Opd, Prediction, Question, Turn
 from pipeline.runtime import track
@@ -34,17 +34,6 @@ class _Generated:
     text: str
     tokens: int
     truncated: bool
-
-
-class _Limits(StoppingCriteria):
-    """Stops each row at its own number of new tokens, so that no row's limit depends on its neighbours."""
-
-    def __init__(self, limits: torch.Tensor) -> None:
-        self.limits = limits
-
-    def __call__(self, input_ids: torch.Tensor, scores: Any, **_: Any) -> torch.Tensor:
-        # With embeddings as input, these are the new tokens alone.
-        return self.limits <= input_ids.shape[1]
 
 
 def answer(
@@ -102,48 +91,23 @@ def answer(
 
 
 def _prompt(turns: Sequence[Turn], tokenizer: PreTrainedTokenizerBase, settings: GenerationSettings) -> tuple[int, ...]:
-    rendered = render(
-        turns,
-        system_prompt=settings.system_prompt,
-        frames=settings.per_video,
-        eos=str(tokenizer.eos_token),
-        complete=False,
-    )
+    rendered = render(turns, tokenizer, system_prompt=settings.system_prompt, frames=settings.per_video, complete=False)
     return encode(rendered, tokenizer).input_ids
 
 
 def _generate(
     model: OctopiForCausalLM, prompts: Sequence[Sequence[int]], features: Sequence[torch.Tensor], max_new_tokens: int
 ) -> list[_Generated]:
-    """Generate one answer a prompt; prompts are padded on the left, so that all answers start at one column."""
-    tokenizer = model.tokenizer
-    device = model.connector.delimiters.device
-    longest = max(map(len, prompts))
-    pad = cast(int, tokenizer.pad_token_id)
-    ids = torch.tensor([[pad] * (longest - len(p)) + list(p) for p in prompts], device=device)
-    lengths = torch.tensor([len(p) for p in prompts], device=device)
-    mask = (torch.arange(longest, device=device) >= longest - lengths[:, None]).long()
-    room = torch.full_like(lengths, max_new_tokens)
-    if model.positions is not None:
-        room = room.minimum(model.positions - lengths)
-    new = model.generate(
-        ids,
-        pad_features(features).to(device),
-        mask,
-        max_new_tokens=max_new_tokens,
-        stopping_criteria=StoppingCriteriaList([_Limits(room)]),
-        do_sample=False,
-        num_beams=1,
-        eos_token_id=tokenizer.eos_token_id,
-        pad_token_id=pad,
-    )
-    return [_read(row[:most], tokenizer) for row, most in zip(new.tolist(), room.tolist(), strict=True)]
+    """Generate one answer a prompt."""
+    ends = end_ids(model.tokenizer)
+    room = [
+        max_new_tokens if model.positions is None else min(max_new_tokens, model.positions - len(p)) for p in prompts
+    ]
+    return [_said(tokens, ends, model.tokenizer) for tokens in greedy(model, prompts, features, ends, room)]
 
 
-def _read(tokens: list[int], tokenizer: PreTrainedTokenizerBase) -> _Generated:
-    """What one row says, up to its end token; behind that is padding."""
-    end = tokenizer.eos_token_id
-    truncated = end not in tokens
-    kept = tokens if truncated else tokens[: tokens.index(end)]
-    text = tokenizer.decode(kept, skip_special_tokens=True).strip()
-    return _Generated(text=text, tokens=len(kept) + (not truncated), truncated=truncated)
+def _said(tokens: list[int], ends: Collection[int], tokenizer: PreTrainedTokenizerBase) -> _Generated:
+    """What one row says, without its end token."""
+    truncated = tokens[-1] not in ends
+    text = tokenizer.decode(tokens if truncated else tokens[:-1], skip_special_tokens=True).strip()
+    return _Generated(text=text, tokens=len(tokens), truncated=truncated)

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import Self, cast
 
 import torch
 from torch import nn
 from torch.nn import functional as F
-from transformers import PreTrainedModel, PreTrainedTokenizerBase
+from transformers import DynamicCache, PreTrainedModel, PreTrainedTokenizerBase
 from transformers.modeling_outputs import CausalLMOutput
 
 from pipeline.errors import UserError
 from pipeline.io import save_tensors, write_json
 from pipeline.language.base import load_adapter, load_llm, load_tokenizer, save_adapter
-from pipeline.language.cache import roomy_cache
+from pipeline.language.cache import extendable
 from pipeline.language.chat import IGNORE_INDEX, TACTILE_TOKENS
 from pipeline.language.connector import CONFIG_FILE, Connector, OctopiConfig, read_config
 from pipeline.runtime import DtypeName, Quantization, resolve_dtype
@@ -177,46 +177,40 @@ class OctopiForCausalLM(nn.Module):
             divided by their number; 0 where there is none. Logits are then computed only for columns that some row
             needs: in long prompts that saves the larger part of them.
         """
-        call: dict[str, Any] = {
-            "inputs_embeds": self.embed(input_ids, features),
-            "attention_mask": attention_mask,
-            "use_cache": False,
-        }
         if labels is None:
+            embeddings = self.embed(input_ids, features)
+            call = {"inputs_embeds": embeddings, "attention_mask": attention_mask, "use_cache": False}
             return CausalLMOutput(logits=self.llm(**call).logits)
-        targets = labels[:, 1:]
+        shared = self._shared(input_ids, labels) if attention_mask is None else 0
+        call = {"attention_mask": attention_mask, "use_cache": False}
+        if shared:
+            call = {"past_key_values": self._begin(input_ids[:, :shared]), "use_cache": True}
+        targets = labels[:, shared + 1 :]
         learned = targets != IGNORE_INDEX
         columns = learned.any(0).nonzero().flatten()
-        logits = self.llm(**call, logits_to_keep=columns).logits[learned[:, columns]]
+        embeddings = self.embed(input_ids[:, shared:], features)
+        logits = self.llm(inputs_embeds=embeddings, **call, logits_to_keep=columns).logits[learned[:, columns]]
         exact = logits.to(torch.promote_types(logits.dtype, torch.float32))
         loss = F.cross_entropy(exact, targets[learned], reduction="sum")
         count = len(logits) if num_items_in_batch is None else num_items_in_batch
         return CausalLMOutput(loss=loss / torch.as_tensor(count, device=loss.device).clamp(min=1))
 
-    @torch.inference_mode()
-    def generate(
-        self, input_ids: torch.Tensor, features: torch.Tensor, attention_mask: torch.Tensor, **options: Any
-    ) -> torch.Tensor:
-        """transformers' `generate` after tactile questions, padded on the left.
+    def _shared(self, input_ids: torch.Tensor, labels: torch.Tensor) -> int:
+        """Columns that all rows begin with alike, before any frame and before what foretells a label."""
+        if not extendable(self.llm.config) or (self.training and self.llm.is_gradient_checkpointing):
+            return 0
+        alike = (input_ids == input_ids[:1]) & (input_ids != self.start_id) & (labels == IGNORE_INDEX)
+        return max(0, int(alike.all(0).long().cumprod(0).sum()) - 1)
 
-        Args:
-            input_ids: batch x length.
-            features: batch x frames x tactile_dim, as `embed` wants them.
-            attention_mask: batch x length; 0 for padding.
-            options: What `generate` knows besides.
-
-        Returns:
-            The new tokens alone: batch x (at most max_new_tokens).
-        """
-        return cast(
-            torch.Tensor,
-            self.llm.generate(
-                inputs_embeds=self.embed(input_ids, features),
-                attention_mask=attention_mask,
-                past_key_values=roomy_cache(self.llm.config),
-                **options,
-            ),
-        )
+    def _begin(self, input_ids: torch.Tensor) -> DynamicCache:
+        """Keys and values of what all rows begin with: computed for one, and without gradient in a frozen model."""
+        cache = DynamicCache(config=self.llm.config)
+        adapted = any(parameter.requires_grad for parameter in self.llm.parameters())
+        with torch.set_grad_enabled(adapted and torch.is_grad_enabled()):
+            embeddings = self.llm.get_input_embeddings()(input_ids[:1])
+            self.llm(inputs_embeds=embeddings, past_key_values=cache, use_cache=True, logits_to_keep=1)
+        cache.batch_repeat_interleave(len(input_ids))
+        return cache
 
 
 def _below(prefix: str, state: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:

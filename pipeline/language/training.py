@@ -21,7 +21,7 @@ from pipeline.io import fingerprint, read_jsonl
 from pipeline.language.conversations import ConversationCollator, ConversationDataset, LengthBuckets
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.records import Encoder, Opd, Question
-from pipeline.runtime import derive_seed, seed_everything
+from pipeline.runtime import derive_seed, name_dtype, seed_everything
 from pipeline.training.trainer import (
     TrainableTrainer,
     Trained,
@@ -39,14 +39,15 @@ def add_lora(model: OctopiForCausalLM, config: LoraTrainConfig) -> None:
     from peft import LoraConfig, get_peft_model
 
     names = {name.rsplit(".", 1)[-1] for name, _ in model.llm.named_modules()}
-    unknown = [module for module in config.target_modules if module not in names]
+    modules = config.target_modules if isinstance(config.target_modules, str) else list(config.target_modules)
+    unknown = [] if isinstance(modules, str) else [module for module in modules if module not in names]
     if unknown:
         raise UserError(f"lora.target_modules: the language model has no layer {unknown[0]}; it has {_linear(names)}")
     lora = LoraConfig(
         r=config.rank,
         lora_alpha=config.alpha,
         lora_dropout=config.dropout,
-        target_modules=list(config.target_modules),
+        target_modules=modules,
         task_type="CAUSAL_LM",
     )
     model.llm = get_peft_model(model.llm, lora)
@@ -71,12 +72,16 @@ class Material:
     @classmethod
     def load(cls, folder: Path, params: Params, encoder: Encoder, opd: Opd, seed: int) -> Self:
         """Read the questions and one encoder's embeddings from the chain's data folder."""
-        files = (folder / "questions" / "train.jsonl", folder / "embeddings" / f"{encoder}-{seed}" / TENSOR_FILE)
+        dtype = name_dtype(params.language.dtype, params.runtime.device)
+        files = (
+            folder / "questions" / str(seed) / "train.jsonl",
+            folder / "embeddings" / f"{encoder}-{seed}" / TENSOR_FILE,
+        )
         return cls(
             questions=read_jsonl(files[0], Question),
             store=EmbeddingStore(files[1].parent),
             opd=opd,
-            language=params.language,
+            language=params.language.model_copy(update={"dtype": dtype}),
             per_video=params.frames.per_video,
             flip_probability=params.encoder.flip_probability,
             seed=params.seed + seed,

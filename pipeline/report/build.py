@@ -7,13 +7,14 @@ from pathlib import Path
 import pandas as pd
 
 from pipeline.config import AblationConfig, Params
+from pipeline.evaluation.described import described_rows
 from pipeline.evaluation.ordinal import ErrorRow, error_rows
 from pipeline.evaluation.scores import EffectRow, ScoreRow, candidate_rows, effect_rows, score_rows
 from pipeline.io import read_csv, read_jsonl, read_table, write_csv, write_json, write_text
 from pipeline.params import PARAMS_FILE
 from pipeline.records import (
-    Assignment,
     Classification,
+    Described,
     Finding,
     Graded,
     Measurement,
@@ -32,6 +33,7 @@ from pipeline.report.readme import render_readme
 from pipeline.report.samples import choose_samples
 from pipeline.report.tables import headline
 from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.videos.split import read_splits
 
 MOST_METRICS = 12
 """Columns of `dvc metrics show` that a person still reads."""
@@ -59,28 +61,31 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     """
     data, folder = root / "data", root / "reports" / params.report_name
     catalogue = load_catalogue(root / params.data.catalogue)
-    videos, assignments = read_table(data / "videos.parquet", Video), read_table(data / "splits.parquet", Assignment)
+    videos = read_table(data / "videos.parquet", Video)
+    splits = list(read_splits(data, params.split, params.ablation.seeds).values())
     graded = read_table(data / "graded.parquet", Graded)
     # By the lists in params.yaml and not by what lies there: a narrowed ablation leaves the others' files behind.
-    said = {
-        seed: read_table(file, Classification)
-        for seed in sorted(params.ablation.seeds)
-        if (file := data / "encoder" / str(seed) / "classifications.parquet").is_file()
-    }
+    said: dict[int, list[Classification]] = {}
+    for seed in sorted(params.ablation.seeds):
+        if (file := data / "encoder" / str(seed) / "classifications.parquet").is_file():
+            said.setdefault(params.split.replicate_of(seed), []).extend(read_table(file, Classification))
     out_of_fold = {
         name: read_table(data / "cross_validation" / name / "out_of_fold.parquet", OutOfFold)
         for name in params.cross_validation.models
         if (data / "cross_validation" / name / "out_of_fold.parquet").is_file()
     }
-    origin = provenance(params, catalogue, videos, assignments, [g.objects for g in graded], root)
-    write_csv(folder / "scores.csv", ScoreRow, score_rows(graded, catalogue, said, out_of_fold))
+    gate = data / "taught" / "gate.csv"
+    described = described_rows(read_csv(gate, Described) if gate.is_file() else [], catalogue)
+    scores = score_rows(graded, catalogue, said, out_of_fold) + described
+    origin = provenance(params, catalogue, videos, splits, [g.objects for g in graded], root)
+    write_csv(folder / "scores.csv", ScoreRow, scores)
     write_csv(folder / "effects.csv", EffectRow, effect_rows(graded, catalogue))
     write_csv(folder / "encoder_effects.csv", EffectRow, candidate_rows(out_of_fold, BASELINE))
     write_csv(folder / "encoder_errors.csv", ErrorRow, error_rows(out_of_fold, catalogue))
     write_json(folder / "samples.json", _samples(params, data, graded))
     audit = data / "audit" / "audit.csv"
     write_csv(folder / "audit.csv", Finding, read_csv(audit, Finding) if audit.is_file() else [])
-    _write(folder / "dataset.csv", dataset_frame(catalogue, videos, assignments))
+    _write(folder / "dataset.csv", dataset_frame(catalogue, videos, splits))
     _write(folder / "confusion.csv", confusion_frame(said, catalogue))
     _write(folder / "curves.csv", curves_frame(data, params.ablation))
     write_text(folder / "params.yaml", (root / PARAMS_FILE).read_text(encoding="utf-8"))
@@ -145,7 +150,8 @@ def curves_frame(data: Path, ablation: AblationConfig) -> pd.DataFrame:
 
 def _samples(params: Params, data: Path, graded: list[Graded]) -> dict[str, object]:
     full = next(variant for variant in params.ablation.variants() if variant.full)
-    asked, answered = data / "questions" / "evaluation.jsonl", data / "answers" / full.key / f"{Touch.REAL}.jsonl"
+    asked = data / "questions" / str(full.seed) / "evaluation.jsonl"
+    answered = data / "answers" / full.key / f"{Touch.REAL}.jsonl"
     if not asked.is_file() or not answered.is_file():
         return choose_samples([], [], [])
     scores = [g for g in graded if g.variant == full and g.touch is Touch.REAL]

@@ -26,15 +26,18 @@ TITLES = {
 HEADINGS = {"row": "", "with_videos": "With videos"}
 
 
-def dataset_frame(catalogue: Catalogue, videos: Sequence[Video], assignments: Sequence[Assignment]) -> pd.DataFrame:
+def dataset_frame(
+    catalogue: Catalogue, videos: Sequence[Video], splits: Sequence[Sequence[Assignment]]
+) -> pd.DataFrame:
     """The content of dataset.csv, with `COLUMNS`: a row a class, a combination of classes, and a figure of lengths.
 
+    Of several splits, an object counts in each part that any of them puts it in.
     Published figures stand beside where the catalogue is the paper's, joined by (table, row).
     """
     printed = published(catalogue.language.dataset)
     values = {(row["task"], row["measure"]): row["value"] for row in printed.to_dict("records") if not row["model"]}
     rows = [
-        _counted("property_counts", f"{p.name}: {level}", members, videos, assignments)
+        _counted("property_counts", f"{p.name}: {level}", members, videos, splits)
         | {"published": values.get(("property_counts", level))}
         for index, p in enumerate(catalogue.properties)
         for number, level in enumerate(p.levels)
@@ -45,7 +48,7 @@ def dataset_frame(catalogue: Catalogue, videos: Sequence[Video], assignments: Se
         words = ", ".join(p.levels[level] for p, level in zip(catalogue.properties, labels, strict=True))
         members = {o for o in catalogue.objects if catalogue.labels(o) == labels}
         rows.append(
-            _counted("property_combinations", words, members, videos, assignments)
+            _counted("property_combinations", words, members, videos, splits)
             | {"published": values.get(("property_combinations", words))}
         )
     lengths = [v.frames for v in videos]
@@ -97,9 +100,10 @@ def dataset_tables(folder: Path, dataset: str) -> dict[str, pd.DataFrame]:
 
 
 def _counted(
-    table: str, row: str, members: set[str], videos: Sequence[Video], assignments: Sequence[Assignment]
+    table: str, row: str, members: set[str], videos: Sequence[Video], splits: Sequence[Sequence[Assignment]]
 ) -> dict[str, Any]:
-    parts = Counter({a.object_id: a.part for a in assignments if a.object_id in members}.values())
+    pairs = {(a.object_id, a.part) for assignments in splits for a in assignments if a.object_id in members}
+    parts = Counter(part for _, part in pairs)
     return {
         "table": table,
         "row": row,

@@ -23,7 +23,7 @@ EFFECT_COLUMNS = (
 )
 TEXT = frozenset((*KEYS, "touch", "seed", "part", "change", "model", "dataset"))
 ALL_SEEDS = "all"
-HEADS, VALIDATION_HEADS, CROSS_VALIDATION = "heads", "heads_validation", "cross_validation"
+HEADS, VALIDATION_HEADS, CROSS_VALIDATION, DESCRIBED = "heads", "heads_validation", "cross_validation", "described"
 """As in `pipeline.evaluation.scores`, which takes seconds to import; a test holds them equal."""
 DATASET = "PhysiCLeAR"
 """The data set of most of the paper's figures, as properties.yaml names it: beside another's they would mislead."""

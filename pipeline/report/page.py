@@ -23,7 +23,7 @@ from pipeline.io import write_text
 from pipeline.report.dataset import dataset_tables
 from pipeline.report.drawing import SIZE, draw_table, place_points, share, span
 from pipeline.report.load import KEYS, Report, load_report, read_frame
-from pipeline.report.readme import OTHER_MODELS, SMOKE, finding, origin, stands_on
+from pipeline.report.readme import OTHER_MODELS, finding, looked_at, origin, stands_on
 from pipeline.report.tables import TABLES, difference, headline, measured, number, task_title, whole
 from pipeline.tasks import TASKS
 
@@ -123,7 +123,7 @@ def inline(text: str, folder: str = "") -> Markup:
 
 
 def _chapters(folder: Path, gaps: list[Gap]) -> list[dict[str, Any]]:
-    """The reports: real videos first, then scenes, smoke last; a folder that holds no whole report is a gap."""
+    """The reports: real videos, scenes, those on test objects that were looked at, smoke; a broken one is a gap."""
     found = []
     for place in sorted({file.parent for name in ("scores.csv", "README.md") for file in folder.glob(f"*/{name}")}):
         try:
@@ -132,7 +132,9 @@ def _chapters(folder: Path, gaps: list[Gap]) -> list[dict[str, Any]]:
             gaps.append((place.name, "the whole report", str(error).replace(f"{folder}/", "")))
         except KeyError as error:
             gaps.append((place.name, "the whole report", f"its provenance.json lacks {error}: {OLDER}"))
-    return sorted(found, key=lambda c: (c["scale"] == "smoke", c["source"] != "videos", c["name"]))
+    return sorted(
+        found, key=lambda c: (c["scale"] == "smoke", bool(c["looked_at"]), c["source"] != "videos", c["name"])
+    )
 
 
 def _chapter(report: Report, gaps: list[Gap]) -> dict[str, Any]:
@@ -146,7 +148,8 @@ def _chapter(report: Report, gaps: list[Gap]) -> dict[str, Any]:
         "name": name,
         "scale": scale,
         "source": source,
-        "finding": [*([SMOKE.strip("> \n")] if scale == "smoke" else []), *finding(report)],
+        "finding": finding(report),
+        "looked_at": report.provenance["settings"] if looked_at(report.provenance) else "",
         "tasks": tasks,
         "effects": effects,
         "points": points,

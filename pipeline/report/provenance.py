@@ -15,6 +15,7 @@ from typing import Any
 
 import yaml
 
+from pipeline.card import front_matter
 from pipeline.config import EncoderConfig, Params
 from pipeline.errors import UserError
 from pipeline.evaluation.intervals import coverage_note
@@ -26,18 +27,22 @@ CODE = ("pipeline", "stages", "conf", "dvc.yaml")
 """What a result can depend on. A commit of a report alone does not change its revision."""
 PACKAGES = ("torch", "transformers", "peft", "open_clip_torch", "scipy", "scikit-learn", "dvc")
 UNKNOWN = "unknown"
-ABOUT = "about.yaml"
-"""Beside the folders of weights, where people wrote down what the models were taught."""
 NOTES = Path(__file__).with_name("notes.yaml")
 """What only people know about a report: whether its settings were chosen on its test objects before."""
-ARCHITECTURES = {"llama": "Llama", "mistral": "Mistral", "qwen2": "Qwen2", "gpt_neox": "GPT-NeoX"}
+ARCHITECTURES = {
+    "llama": "Llama",
+    "mistral": "Mistral",
+    "qwen2": "Qwen2",
+    "gpt_neox": "GPT-NeoX",
+    "tf_efficientnet_lite0": "EfficientNet-Lite0",
+}
 
 
 def provenance(
     params: Params,
     catalogue: Catalogue,
     videos: Sequence[Video],
-    assignments: Sequence[Assignment],
+    splits: Sequence[Sequence[Assignment]],
     asked: Sequence[tuple[str, ...]],
     root: Path,
 ) -> dict[str, Any]:
@@ -46,11 +51,13 @@ def provenance(
     Args:
         catalogue: for the data set's name and its properties.
         videos: all that decode; their hashes are hashed.
-        assignments: for the test objects.
+        splits: those that differ, for the test objects; one a fold.
         asked: the objects of each question, for what is known of the intervals.
     """
     rows = "\n".join(video.model_dump_json() for video in videos)
-    test = [a for a in assignments if a.part is Part.TEST]
+    test = {a.video_id: a.object_id for assignments in splits for a in assignments if a.part is Part.TEST}
+    seeds, fold_of = params.ablation.seeds, params.split.fold_of
+    folds = sorted({fold for seed in seeds if (fold := fold_of(seed)) is not None})
     commit = _git(root, "log", "-1", "--format=%H", "--", *CODE) or UNKNOWN
     return {
         "report": params.report_name,
@@ -59,11 +66,13 @@ def provenance(
         "dataset": catalogue.language.dataset,
         "properties": {p.name: list(p.levels) for p in catalogue.properties},
         "split": params.split.name,
-        "test_objects": sorted({a.object_id for a in test}),
+        "test_objects": sorted(set(test.values())),
         "test_videos": len(test),
         "videos": len(videos),
-        "seeds": list(params.ablation.seeds),
-        "settings": notes().get(f"{params.report_name}/{params.split.name}", ""),
+        "seeds": list(seeds),
+        "folds": {"of": params.split.folds, "tested": folds} if folds else None,
+        "replicates": len({params.split.replicate_of(seed) for seed in seeds}),
+        "settings": settings_note(params.report_name, params.split.name),
         "intervals": coverage_note(asked),
         "facts_told": params.questions.facts,
         "command": "dvc repro",
@@ -74,11 +83,19 @@ def provenance(
         "encoder": encoder_words(params.encoder),
         "base_models": {
             "encoder": base_model(root, params.encoder.weights),
-            "language": base_model(root, params.language.weights),
+            "language": base_model(root, params.language.weights) | taught_words(params),
         },
+        "taught_from": taught_from(params),
         "python": platform.python_version(),
         "packages": {name: _version(name) for name in PACKAGES},
     }
+
+
+BACKBONE_WORDS = {
+    "clip": "the base CLIP with visual prompts",
+    "timm": "the network of encoder.weights",
+    "scenes": "a convolutional network with synthetic pretraining",
+}
 
 
 def encoder_words(config: EncoderConfig) -> str:
@@ -86,27 +103,24 @@ def encoder_words(config: EncoderConfig) -> str:
     words = {
         "paper": "the base CLIP with visual prompt tuning",
         "release": "the base CLIP with visual prompt tuning as the published code has it",
-        "pretrained": "a convolutional network with synthetic pretraining (not CLIP)",
+        "tuned": " beside ".join(BACKBONE_WORDS.get(n, n) for n in config.backbone) + ", tuned on the properties",
     }[config.recipe]
     return words + (" on pictures of the difference to the untouched gel" if config.reference == "subtract" else "")
 
 
 def base_model(root: Path, folder: str) -> dict[str, Any]:
-    """Folder, kind, size in parameters, hash of a base model, and what people wrote about what it was taught.
+    """Folder, kind, size in parameters, hash of a base model, and what its card says that it was taught.
 
     `parameters` are counted from the headers of its safetensors files. Where files are missing, they are 0 and the
-    hash is "unknown". `known_templates` says that it was taught in the wording of this pipeline's own questions.
+    hash is "unknown".
     """
     where = root / folder
-    about = where.parent / ABOUT
-    said = (yaml.safe_load(about.read_text(encoding="utf-8")) or {}).get(where.name, {}) if about.is_file() else {}
     return {
         "folder": folder,
         "kind": _kind(where),
         "parameters": sum(parameters(file) for file in sorted(where.glob("*.safetensors"))),
         "sha256": digest(where),
-        "taught": said.get("taught", ""),
-        "known_templates": bool(said.get("known_templates", False)),
+        "taught": str(front_matter(where).get("taught", "")),
     }
 
 
@@ -136,9 +150,27 @@ def digest(folder: Path) -> str:
     return total.hexdigest() if files else UNKNOWN
 
 
-def notes() -> dict[str, str]:
-    """What people wrote about reports in notes.yaml, by name and split, such as `small-videos/development`."""
-    return yaml.safe_load(NOTES.read_text(encoding="utf-8")) or {}
+def taught_from(params: Params) -> str:
+    """The folder of the base model that the stage `teach` taught; empty where nothing was taught."""
+    return str(getattr(getattr(params, "teach", None), "base", ""))
+
+
+def taught_words(params: Params) -> dict[str, Any]:
+    """What the chain itself taught the language model, in place of what people noted; empty where it taught nothing."""
+    base = taught_from(params)
+    words = f"taught here in text alone to reason about described objects (from `{base}`)"
+    return {"taught": words, "known_templates": False} if base else {}
+
+
+def settings_note(report: str, split: str) -> str:
+    """What people wrote in notes.yaml about the test objects of a report and split, or else of the split; may be empty.
+
+    Args:
+        report: the folder's name, such as `small-videos`.
+        split: such as `development`.
+    """
+    notes: dict[str, str] = yaml.safe_load(NOTES.read_text(encoding="utf-8")) or {}
+    return notes.get(f"{report}/{split}", notes.get(split, ""))
 
 
 def _kind(folder: Path) -> str:
@@ -146,7 +178,8 @@ def _kind(folder: Path) -> str:
         return "CLIP"
     if not (folder / "config.json").is_file():
         return "model"
-    kind = str(json.loads((folder / "config.json").read_text(encoding="utf-8")).get("model_type", "model"))
+    config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    kind = str(config.get("model_type") or config.get("architecture", "model"))
     return ARCHITECTURES.get(kind, kind)
 
 

@@ -12,9 +12,13 @@ import pandas as pd
 
 from pipeline.report.load import KEYS, Report, cells
 from pipeline.report.tables import TABLES, headline, measured, number, task_title
+from pipeline.weights import is_tiny
 
 MOST_LINES = 150
-SMOKE = "> **Scale `smoke`: its figures prove only that the chain runs.**\n"
+CHANCE = (
+    "The base models are tiny and random, drawn from a seed and taught nothing: these figures are chance and prove "
+    "only that the chain runs."
+)
 ALPHA = 0.05
 VICUNA = 5e9
 """Parameters below which a language model is no Vicuna 7b."""
@@ -28,6 +32,13 @@ NEAR_NULL = (
 )
 
 
+TAUGHT = (
+    "before it met touch, `{}` learnt from text alone to reason about described objects that were made up, never in "
+    "the tasks' own wording. What LoRA and OPD bring comes on top of that; the table *Reasoning about described "
+    "objects* has the untaught base."
+)
+
+
 def render_readme(report: Report, figures: Sequence[str]) -> str:
     """The text of README.md.
 
@@ -36,15 +47,16 @@ def render_readme(report: Report, figures: Sequence[str]) -> str:
         figures: names of the files in figures/ that were drawn.
     """
     said = report.provenance
+    # Figures that are no evidence are no headline.
+    spoilt = [f"## On test objects that were looked at\n\n{said['settings']}\n"] if looked_at(said) else []
+    tasks = [five_tasks(report), *([f"{OTHER_MODELS}\n"] if len(report.published) else []), *_pictures(figures)]
     sections = [
         f"# {report.name}: what was measured\n",
-        *([SMOKE] if said["scale"] == "smoke" else []),
         "\n\n".join(finding(report)) + "\n",
-        five_tasks(report),
-        *([f"{OTHER_MODELS}\n"] if len(report.published) else []),
-        *_pictures(figures),
+        *([] if spoilt else tasks),
         "## What the figures stand on\n\n" + "".join(f"- {fact}\n" for fact in stands_on(said)),
         "## Where it comes from\n\n" + "".join(f"- {fact}\n" for fact in origin(said)),
+        *([*spoilt, *tasks] if spoilt else []),
     ]
     lines = "\n".join(sections).count("\n") + 1
     elsewhere = []
@@ -63,9 +75,17 @@ def render_readme(report: Report, figures: Sequence[str]) -> str:
 
 
 def finding(report: Report) -> list[str]:
-    """Three paragraphs: what made the figures; how far from chance; whether touch is used and what parts bring."""
+    """Three paragraphs: what made the figures; how far from chance; whether touch is used and what parts bring.
+
+    Where a base model is a random one, the first sentence says so.
+    """
     chance, rest = _against_chance(headline(report.scores)), [*_touch(report.effects), *_parts(report.effects)]
     return [" ".join(sentences) for sentences in (_who(report), chance, rest)]
+
+
+def looked_at(said: dict[str, Any]) -> bool:
+    """Whether the test objects are those of the development split, which recipes were chosen by."""
+    return bool(said["split"] == "development" and said["settings"])
 
 
 def five_tasks(report: Report) -> str:
@@ -97,14 +117,16 @@ def stands_on(said: dict[str, Any]) -> list[str]:
     objects = said["test_objects"]
     named = f" ({', '.join(objects)})" if objects else ""
     facts = [
-        f"**Language model:** {model_words(language)}." + (f" {NEAR_NULL}" if language["known_templates"] else ""),
+        f"**Language model:** {model_words(language)}." + (f" {NEAR_NULL}" if language.get("known_templates") else ""),
         f"**Tactile encoder:** {said['encoder']}. Base encoder of the ablation: {model_words(encoder)}.",
         f"**Test objects:** {len(objects)}{named}, {said['test_videos']} videos, split `{said['split']}`.",
-        f"**Seeds:** {len(said['seeds'])} ({', '.join(map(str, said['seeds']))}).",
+        f"**Seeds:** {len(said['seeds'])} ({', '.join(map(str, said['seeds']))}).{_folds(said)}",
         f"**Chosen on these objects before?** {said['settings'] or 'Nothing is noted in pipeline/report/notes.yaml.'}",
         "**Intervals** are Wilson's with the effective number of questions, since questions share objects. "
         + said["intervals"],
     ]
+    if said.get("taught_from"):
+        facts.insert(1, f"**The base was taught:** {TAUGHT.format(said['taught_from'])}")
     if said["facts_told"]:
         facts.append(
             "**Matching questions** say what the named objects are like: they ask for touch, not for knowledge."
@@ -155,13 +177,20 @@ def _who(report: Report) -> list[str]:
     maker += f", {language['taught']}," if language["taught"] else ""
     maker += " made these figures"
     maker += " in place of the paper's Vicuna" if language["parameters"] < VICUNA else ""
-    maker += ": LoRA and OPD are near-null by construction" if language["known_templates"] else ""
+    maker += ": LoRA and OPD are near-null by construction" if language.get("known_templates") else ""
     clip = said["base_models"]["encoder"]
     encoder = said["encoder"].replace("the base CLIP", f"a {size_words(clip['parameters'])} {clip['kind']}")
     source = {"scenes": "synthetic", "videos": "real"}.get(said["source"], "")
     objects, seeds = _count(len(said["test_objects"]), "test object"), _count(len(said["seeds"]), "seed")
-    about = f"Its tactile encoder was {encoder}; it answered about {source} videos of {objects}, under {seeds}."
-    return [f"{maker}.", about, *([said["settings"]] if said["settings"] else [])]
+    under = f"under {seeds}"
+    if folds := said.get("folds"):
+        under = f"each of them in one of {len(folds['tested'])} folds that were not trained on"
+        under += f", {said['replicates']} times" if said["replicates"] > 1 else ""
+        if len(folds["tested"]) < folds["of"]:
+            under += f" ({folds['of'] - len(folds['tested'])} of {folds['of']} folds are still to be run)"
+    about = f"Its tactile encoder was {encoder}; it answered about {source} videos of {objects}, {under}."
+    chance = [CHANCE] if any(is_tiny(model["folder"]) for model in said["base_models"].values()) else []
+    return [*chance, f"{maker}.", about, *([said["settings"]] if said["settings"] else [])]
 
 
 def _against_chance(rows: pd.DataFrame) -> list[str]:
@@ -221,6 +250,18 @@ def _parts(effects: pd.DataFrame) -> list[str]:
         f"None of {len(rows)} effects of encoder, LoRA and OPD is significant after Holm's adjustment"
         f"{_impossible(effects) or found}."
     ]
+
+
+def _folds(said: dict[str, Any]) -> str:
+    folds = said.get("folds")
+    if not folds:
+        return ""
+    times = "once" if said["replicates"] == 1 else f"{said['replicates']} times"
+    return (
+        f" Each seed trains without one fold of objects and tests on it: {len(folds['tested'])} of {folds['of']} folds "
+        f"({', '.join(map(str, folds['tested']))}) are in, each object of theirs was tested {times}, and answers are "
+        "pooled over folds."
+    )
 
 
 def _pictures(figures: Sequence[str]) -> list[str]:

@@ -11,14 +11,15 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.report.load import ALL_SEEDS, CROSS_VALIDATION, HEADS, KEYS, VALIDATION_HEADS, cells
+from pipeline.report.load import ALL_SEEDS, CROSS_VALIDATION, DESCRIBED, HEADS, KEYS, VALIDATION_HEADS, cells
 from pipeline.tasks import TASKS
 
 Select = Callable[[pd.DataFrame], "pd.Series[bool]"]
+Cell = Callable[[dict[str, Any]], str]
 FULL = {"encoder": "finetuned", "lora": "with", "opd": "all"}
 CHOICE, COMBINED = "choice", "combined"
-NOT_ANSWERED = (HEADS, VALIDATION_HEADS, CROSS_VALIDATION)
-"""Tasks of scores.csv without a language model."""
+NOT_ANSWERED = (HEADS, VALIDATION_HEADS, CROSS_VALIDATION, DESCRIBED)
+"""Tasks of scores.csv that no language model with touch answered."""
 PUBLISHED_MODELS = ("7b", "13b", "CLIP")
 SYSTEM_WORDS = {"base": "base encoder", "without": "without LoRA", "none": "without OPD", "needed": "OPD as needed"}
 ENCODERS = {"finetuned": "fine-tuned", "base": "base"}
@@ -93,6 +94,7 @@ def task_title(task: str) -> str:
         HEADS: "Property heads",
         VALIDATION_HEADS: "Property heads, validation videos",
         CROSS_VALIDATION: "Cross-validation",
+        DESCRIBED: "Described objects",
         **{name: task.title for name, task in TASKS.items()},
     }
     return f"{titles[task]} ({task})" if task in TASKS else titles.get(task, task)
@@ -102,41 +104,35 @@ def system(row: dict[str, Any]) -> str:
     """A variant by what it leaves out of the full system."""
     if row["task"] in (HEADS, VALIDATION_HEADS):
         return "property heads, no language model"
-    if row["task"] == CROSS_VALIDATION:
+    if row["task"] in (CROSS_VALIDATION, DESCRIBED):
         return str(row["encoder"])
     words = [SYSTEM_WORDS[row[axis]] for axis in FULL if row[axis] in SYSTEM_WORDS]
     return ", ".join(words) or "Octopi (full system)"
 
 
-def _count(name: str, digits: int = 0) -> Callable[[dict[str, Any]], str]:
+def _count(name: str, digits: int = 0) -> Cell:
     return lambda row: number(row[name], digits)
 
 
-def _text(name: str) -> Callable[[dict[str, Any]], str]:
+def _text(name: str) -> Cell:
     return lambda row: str(row[name])
 
 
-COLUMNS: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
+COLUMNS: dict[str, tuple[str, Cell]] = {
     "task": ("Task", lambda row: task_title(row["task"])),
     "measure": ("Measure", lambda row: "all properties right" if row["measure"] == COMBINED else row["measure"]),
     "system": ("System", system),
-    "encoder": ("Encoder", lambda row: ENCODERS.get(row["encoder"], row["encoder"])),
-    "lora": ("LoRA", _text("lora")),
-    "opd": ("OPD", _text("opd")),
-    "touch": ("Touch", _text("touch")),
+    "encoder": ("Encoder", lambda row: str(ENCODERS.get(row["encoder"], row["encoder"]))),
+    **{name: (title, _text(name)) for name, title in (("lora", "LoRA"), ("opd", "OPD"), ("touch", "Touch"))},
     "measured": ("Measured % [95 %]", measured),
     "strict": ("As published %", lambda row: number(row["strict"], scale=100)),
-    "n": ("n", _count("n")),
     "chance": ("Chance %", lambda row: number(row["chance"], scale=100)),
     "unread": ("Unread %", lambda row: number(row["unread"] / row["n"], scale=100)),
-    "part": ("Part", _text("part")),
-    "change": ("Change", _text("change")),
+    **{name: (name.capitalize(), _text(name)) for name in ("part", "change")},
     "difference": ("Difference, points [95 %]", difference),
-    "p": ("p", _count("p", 3)),
-    "p_holm": ("p, Holm", _count("p_holm", 3)),
+    **{name: (title, _count(name, 3)) for name, title in (("p", "p"), ("p_holm", "p, Holm"))},
     "smallest": ("Smallest that could be found", lambda row: number(row["smallest_effect"], scale=100)),
-    "objects": ("Objects", _count("objects")),
-    "seeds": ("Seeds", _count("seeds")),
+    **{name: (title, _count(name)) for name, title in (("n", "n"), ("objects", "Objects"), ("seeds", "Seeds"))},
 }
 """Heading of a column, and how its cell is written."""
 
@@ -201,8 +197,8 @@ def _over_seeds(*tasks: str) -> Select:
     return lambda frame: frame["task"].isin(tasks) & (frame["seed"] == ALL_SEEDS)
 
 
-PAPER = ("task", "system", "measured", "n", "chance", "unread", "published")
-PROPERTIES = ("measure", "system", "measured", "n", "chance", "unread", "published")
+SHOWN = ("system", "measured", "n", "chance", "unread")
+PAPER, PROPERTIES = ("task", *SHOWN, "published"), ("measure", *SHOWN, "published")
 
 TABLES: tuple[Table, ...] = (
     Table(
@@ -227,6 +223,14 @@ TABLES: tuple[Table, ...] = (
         "Describing one object, as a language model's answer and by the encoder's property heads on the same videos.",
         lambda f: _variants(described=True)(f) | _over_seeds(HEADS)(f),
         PROPERTIES,
+        folded=False,
+    ),
+    Table(
+        "described",
+        "Reasoning about described objects",
+        "The base model untaught and taught, in plain words about made-up objects; Wilson's intervals over questions.",
+        _over_seeds(DESCRIBED),
+        ("measure", *SHOWN),
         folded=False,
     ),
     *(

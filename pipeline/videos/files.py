@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import unicodedata
 from collections import Counter, defaultdict
@@ -51,15 +52,14 @@ def list_videos(folder: Path, catalogue: Catalogue) -> Listing:
     A file is named `<object>_<number>` with one of `SUFFIXES`, or stands in the folder's `videos.csv`, and then only
     the files of that list count. Videos of objects that the catalogue lacks are left out with one warning.
     """
-    findings: list[Finding] = []
     if not folder.is_dir():
-        return Listing((), (_error(str(folder), "no such folder; set data.dir to the folder of the videos"),))
-    paths = _video_files(folder)
+        what = "a file and no folder" if folder.exists() else "no such folder"
+        return Listing((), (_error(str(folder), f"{what}; set data.dir to the folder of the videos"),))
+    paths, findings = _video_files(folder)
     if not paths:
         kinds = ", ".join(SUFFIXES)
-        return Listing(
-            (), (_error(str(folder), f"holds no video ({kinds}); set data.dir to the folder of the videos"),)
-        )
+        empty = _error(str(folder), f"holds no video ({kinds}); set data.dir to the folder of the videos")
+        return Listing((), (*findings, empty))
     listed = folder / LIST_FILE
     named, problems = _from_list(listed, folder, paths) if listed.is_file() else _from_names(folder, paths)
     findings += problems
@@ -89,22 +89,35 @@ def _error(item: str, message: str) -> Finding:
     return Finding(check="name", item=item, measured=message, severity=Severity.ERROR)
 
 
-def _video_files(folder: Path) -> list[Path]:
-    """Files that look like videos, sorted; nothing hidden. A dead link counts, so that reading it says so."""
-    return sorted(
-        path
-        for path in folder.rglob("*")
-        if path.suffix.lower() in SUFFIXES
-        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
-        and not path.is_dir()
-    )
+def _video_files(folder: Path) -> tuple[list[Path], list[Finding]]:
+    """Files that look like videos, sorted, and what cannot be looked into; nothing hidden.
+
+    A dead link counts, so that reading it says so. A pipe or a device does not: reading it may never end.
+    """
+    paths, findings = [], []
+
+    def unreadable(error: OSError) -> None:
+        where = Path(error.filename).relative_to(folder).as_posix()
+        findings.append(_error(where, f"cannot be read ({error.strerror}); make it readable, or move it"))
+
+    for place, folders, names in os.walk(folder, onerror=unreadable, followlinks=False):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        for path in (Path(place, name) for name in names if not name.startswith(".")):
+            if path.suffix.lower() not in SUFFIXES:
+                continue
+            if path.exists() and not path.is_file():
+                where = path.relative_to(folder).as_posix()
+                findings.append(_error(where, "is no file but a pipe, socket or device; move it"))
+            else:
+                paths.append(path)
+    return sorted(paths), findings
 
 
 def _from_names(folder: Path, paths: Sequence[Path]) -> tuple[list[VideoFile], list[Finding]]:
     files, findings = [], []
     for path in paths:
         relative = path.relative_to(folder).as_posix()
-        match = re.fullmatch(r"(.+)_(\d+)", unicodedata.normalize("NFC", path.stem), flags=re.ASCII)
+        match = re.fullmatch(r"([\w-]+)_([0-9]+)", unicodedata.normalize("NFC", path.stem))
         if match is None:
             message = "not named <object>_<number>, e.g. baseball_0.mov; rename it, move it, or list it in videos.csv"
             findings.append(_error(relative, message))

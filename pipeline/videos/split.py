@@ -5,9 +5,11 @@ from __future__ import annotations
 import random
 from collections import defaultdict
 from collections.abc import Collection, Sequence
+from pathlib import Path
 
 from pipeline.config import SplitConfig
 from pipeline.errors import UserError
+from pipeline.io import read_table
 from pipeline.records import Assignment, Part, Record, Video
 from pipeline.runtime import derive_seed
 from pipeline.videos.catalogue import RULED_SPLITS, Catalogue
@@ -28,19 +30,22 @@ class Split(Record):
     """Validation and test only; an empty tuple where nothing is missing."""
 
 
-def assign(catalogue: Catalogue, videos: Sequence[Video], config: SplitConfig) -> Split:
-    """Put every video into a part of the split, by its object.
+def assign(catalogue: Catalogue, videos: Sequence[Video], config: SplitConfig, seed: int = 0) -> Split:
+    """Put every video into a part of the split of one seed, by its object.
 
     `development` tests on some of the paper's training objects and leaves the paper's test objects unused. `kfold`
-    deals all objects that have videos into folds: fold `fold` is for test, the next one for validation, so that over
-    all folds every object is tested once. Any other name is that of a `split_` column of the catalogue.
+    deals all objects that have videos into folds: the seed's fold is for test, the next one for validation, so that
+    over all folds every object is tested once. Any other name is that of a `split_` column of the catalogue.
+
+    Args:
+        seed: of `ablation.seeds`; only kfold has another split for another one.
 
     Raises:
         UserError: if there is no such split, no training video remains, there are too few objects for the test
             objects or folds asked for, or (with `missing: error`) a validation or test object has no video.
     """
     present = {video.object_id for video in videos}
-    parts = assign_objects(catalogue, present, config)
+    parts = assign_objects(catalogue, present, config, seed)
     missing = {
         part: tuple(sorted(o for o, where in parts.items() if where == part and o not in present))
         for part in (Part.VALIDATION, Part.TEST)
@@ -51,15 +56,18 @@ def assign(catalogue: Catalogue, videos: Sequence[Video], config: SplitConfig) -
     return Split(assignments=assignments, missing=missing)
 
 
-def assign_objects(catalogue: Catalogue, present: Collection[str], config: SplitConfig) -> dict[str, Part]:
-    """The part of each object, by id; `present` are the objects that have videos.
+def assign_objects(
+    catalogue: Catalogue, present: Collection[str], config: SplitConfig, seed: int = 0
+) -> dict[str, Part]:
+    """The part of each object under one seed, by id; `present` are the objects that have videos.
 
     Raises:
         UserError: as `assign`.
     """
     check_split(catalogue, config.name)
-    if config.name == "kfold":
-        parts = _deal(present, config)
+    fold = config.fold_of(seed)
+    if fold is not None:
+        parts = _deal(catalogue, present, config, fold)
     elif config.name == "development":
         parts = _develop(catalogue, present, config)
     else:
@@ -88,14 +96,38 @@ def check_split(catalogue: Catalogue, name: str) -> None:
         raise UserError(f"split.name={name}{why}; allowed: {', '.join((*columns, *ruled))} (see objects.csv)")
 
 
-def _deal(present: Collection[str], config: SplitConfig) -> dict[str, Part]:
-    """Shuffle the objects and deal them out, so that fold sizes differ by one at the most."""
+def read_splits(data: Path, config: SplitConfig, seeds: Sequence[int]) -> dict[int, list[Assignment]]:
+    """The splits that differ, by the first seed that has each: one a fold with kfold, else one.
+
+    Args:
+        data: the chain's data folder.
+    """
+    first = {config.fold_of(seed): seed for seed in reversed(seeds)}
+    return {seed: read_table(data / "splits" / f"{seed}.parquet", Assignment) for seed in sorted(first.values())}
+
+
+def _deal(catalogue: Catalogue, present: Collection[str], config: SplitConfig, fold: int) -> dict[str, Part]:
+    """Shuffle the objects and deal them out, each to the fold that has least of its classes.
+
+    Sizes of folds differ by one at the most, since an object always goes to one of the smallest.
+    """
     if len(present) < config.folds:
         raise UserError(f"split.folds is {config.folds}, but only {len(present)} objects have videos; lower it")
     objects = sorted(present)
     random.Random(derive_seed(config.seed, "kfold")).shuffle(objects)
-    part_of_fold = {config.fold: Part.TEST, (config.fold + 1) % config.folds: Part.VALIDATION}
-    return {o: part_of_fold.get(i % config.folds, Part.TRAIN) for i, o in enumerate(objects)}
+    labels = {o: catalogue.labels(o) for o in objects}
+    dealt: list[list[str]] = [[] for _ in range(config.folds)]
+    for o in sorted(objects, key=lambda o: labels[o]):
+        smallest = min(map(len, dealt))
+        open_folds = [members for members in dealt if len(members) == smallest]
+        min(open_folds, key=lambda members: sum(_alike(labels[o], labels[other]) for other in members)).append(o)
+    part_of_fold = {fold: Part.TEST, (fold + 1) % config.folds: Part.VALIDATION}
+    return {o: part_of_fold.get(number, Part.TRAIN) for number, members in enumerate(dealt) for o in members}
+
+
+def _alike(one: Sequence[int], other: Sequence[int]) -> int:
+    """The properties in which two objects are of one class."""
+    return sum(a == b for a, b in zip(one, other, strict=True))
 
 
 def _develop(catalogue: Catalogue, present: Collection[str], config: SplitConfig) -> dict[str, Part]:

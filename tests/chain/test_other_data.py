@@ -175,7 +175,7 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
 def test_the_chain_runs_on_it(project: Project) -> None:
     data = project.folder / "data"
     for part in ("train", "evaluation"):
-        asked = read_jsonl(data / "questions" / f"{part}.jsonl", Question)
+        asked = read_jsonl(data / "questions" / "0" / f"{part}.jsonl", Question)
         about = Counter(q.task for q in asked if "stickiness" in q.gold.properties)
         assert {"OPD", "PC", "PSS", "POM"} <= about.keys()
         assert ("PSR" in about) == (part == "evaluation")
@@ -184,7 +184,7 @@ def test_the_chain_runs_on_it(project: Project) -> None:
     heads = load_file(data / "encoder" / "0" / "encoder.safetensors")
     assert [len(heads[f"heads.{i}.bias"]) for i in range(4)] == [3, 3, 3, 4]
     assert "heads.4.bias" not in heads
-    splits = Counter(a.part for a in read_table(data / "splits.parquet", Assignment))
+    splits = Counter(a.part for a in read_table(data / "splits" / "0.parquet", Assignment))
     assert splits == {Part.TRAIN: 8, Part.VALIDATION: 2, Part.TEST: 8}
 
 

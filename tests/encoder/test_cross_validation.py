@@ -31,7 +31,7 @@ from pipeline.errors import UserError
 from pipeline.io import write_table
 from pipeline.records import Measurement, Part, Probe
 from pipeline.runtime import derive_seed, seed_everything
-from pipeline.training.trainable import save_trainable, trainable_state
+from pipeline.training.trainable import trainable_state
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.decoding import decode
 from pipeline.videos.frames.reference import reference_indices
@@ -39,7 +39,7 @@ from pipeline.videos.frames.store import FrameStore
 from pipeline.videos.frames.subtraction import subtract
 from tests.audit_records import probe
 from tests.conftest import encode, fake_videos, moving_square
-from tests.encoders import write_frames
+from tests.encoders import config, write_frames, write_pretrained, write_timm
 
 OBJECTS = ("baseball", "controller_base", "cotton_ball", "ice_block", "millet", "pillow", "rug")
 CONFIG = CrossValidationConfig(folds=3, repeats=2, seed=4)
@@ -69,7 +69,6 @@ def data(weights: Path, catalogue: Catalogue, tmp_path: Path) -> CrossValidation
         per_video=2,
         encoder=EncoderConfig(weights=str(weights), prompts=2, epochs=2, batch_size=4),
         runtime=RuntimeConfig(device="cpu"),
-        pretrained=tmp_path / "none" / "encoder.safetensors",
     )
 
 
@@ -250,7 +249,7 @@ def test_what_the_pictures_show_is_found(data: CrossValidationData, monkeypatch:
 @pytest.mark.parametrize("name", ["probe-difference", "pretrained-untrained", "pretrained-raw"])
 def test_results_are_repeatable_and_independent_of_the_order(name: str, data: CrossValidationData) -> None:
     candidate = CANDIDATES[name]
-    candidate = replace(candidate, encoder="untrained") if candidate.pretrained else candidate
+    candidate = replace(candidate, untrained=True) if "scenes" in candidate.backbone else candidate
     pixels = np.load(data.frames / "frames.npy")
     pixels += np.random.default_rng(0).integers(0, 20, pixels.shape, dtype=np.uint8)
     np.save(data.frames / "frames.npy", pixels)
@@ -269,12 +268,10 @@ def test_the_untrained_network_is_always_the_same_and_the_pretrained_one_is_load
     one, other = state("pretrained-untrained", data), state("pretrained-untrained", data)
     assert all(torch.equal(one[n], other[n]) for n in one)
     with pytest.raises(UserError, match="encoder.safetensors: no such file"):
-        state("pretrained", data)
-    seed_everything(77)
-    pretrained = SceneEncoder()
-    save_trainable(pretrained, data.pretrained)
-    loaded = state("pretrained", data)
-    assert all(torch.equal(v, loaded[n]) for n, v in trainable_state(pretrained).items())
+        frozen_encoder(CANDIDATES["pretrained"], data)
+    pretrained = write_pretrained(77).state_dict()
+    loaded = frozen_encoder(CANDIDATES["pretrained"], data).get_submodule("backbones.0").state_dict()
+    assert all(torch.equal(v, loaded[n]) for n, v in pretrained.items())
     assert not torch.equal(loaded["layers.0.weight"], one["layers.0.weight"])
 
 
@@ -300,7 +297,7 @@ def test_the_mean_reference_is_of_training_videos_alone(
         used.append(video_ids)
 
     monkeypatch.setattr(FrameStore, "share_reference", spy)
-    cross_validate_candidate(replace(CANDIDATES["pretrained-raw"], encoder="untrained"), data, SMALL)
+    cross_validate_candidate(replace(CANDIDATES["pretrained-raw"], untrained=True), data, SMALL)
     assert len(used) == 2
 
 
@@ -363,8 +360,7 @@ def relabelled(data: CrossValidationData) -> CrossValidationData:
 
 
 def pretrained_anew(data: CrossValidationData) -> CrossValidationData:
-    seed_everything(1)
-    save_trainable(SceneEncoder(), data.pretrained)
+    write_pretrained(1)
     return data
 
 
@@ -384,7 +380,7 @@ def test_folds_of_other_inputs_or_settings_are_not_taken_for_these(
     data: CrossValidationData,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    save_trainable(SceneEncoder(), data.pretrained)
+    write_pretrained()
     killed(2, CANDIDATES["pretrained"], data, monkeypatch)
     begun = kill_after(99, monkeypatch)
     cross_validate_candidate(candidate, change(data), config)
@@ -488,12 +484,24 @@ def test_each_variation_changes_one_thing_of_its_parent() -> None:
     assert {CANDIDATES[f"pretrained-{n}-objects"].objects for n in LEARNING_CURVE} == set(LEARNING_CURVE)
 
 
-def test_an_unknown_candidate_is_one_clear_line() -> None:
-    check_candidates(tuple(CANDIDATES), "paper")
+def test_a_candidate_that_cannot_be_trained_is_one_clear_line(weights: Path, tmp_path: Path) -> None:
+    paper, tuned = config(weights, "paper"), config(weights, "tuned")
+    check_candidates([name for name in CANDIDATES if name != "backbone-tuned"], paper)
+    check_candidates([n for n in CANDIDATES if n not in ("paper", "paper-difference", "scratch")], tuned)
     with pytest.raises(UserError, match=r"^cross_validation.models: pretraind is no model; did you mean pretrained\?"):
-        check_candidates(("paper", "pretraind"), "paper")
-    with pytest.raises(UserError, match=r"paper would be trained with the settings of encoder.recipe=release"):
-        check_candidates(("constant", "paper"), "release")
+        check_candidates(("paper", "pretraind"), paper)
+    for names, setting in ((("constant", "paper"), "release"), (("scratch",), "tuned"), (("backbone-tuned",), "paper")):
+        with pytest.raises(
+            UserError, match=rf"{names[-1]} would be trained with the settings of encoder.recipe={setting}"
+        ):
+            check_candidates(names, config(weights, setting))
+    folder = write_timm(tmp_path / "timm")
+    check_candidates(("trees", "backbone", "backbone-tuned"), config(folder, "tuned"))
+    for name in ("probe", "release"):
+        with pytest.raises(
+            UserError, match=rf"{name} needs a CLIP, but encoder.weights=.*timm has no open_clip_config"
+        ):
+            check_candidates((name,), config(folder, "tuned"))
 
 
 @pytest.mark.parametrize(("key", "value"), [("folds", 1), ("folds", 51), ("repeats", 0), ("seed", -1), ("models", ())])

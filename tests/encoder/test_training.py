@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 import torch
 from torch.optim.optimizer import register_optimizer_step_pre_hook
-from transformers import EvalPrediction, TrainerCallback, TrainingArguments
+from transformers import TrainerCallback, TrainingArguments
 
 from pipeline.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
 from pipeline.encoder import finetune as training
 from pipeline.encoder.clip import load_visual_tower
 from pipeline.encoder.clips import ClipDataset, LabelledVideo
-from pipeline.encoder.embed import standardize
+from pipeline.encoder.embed import standardize, union
 from pipeline.encoder.finetune import accuracies, finetune, train_classifier, write_encoder_card
 from pipeline.encoder.frame_classifier import JointFrameClassifier
 from pipeline.encoder.model import Heads, PropertyClassifier
@@ -26,7 +26,7 @@ from pipeline.encoder.recipes import RECIPES, base_encoder, check_recipe, proper
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.errors import UserError
 from pipeline.io import save_tensors, write_table
-from pipeline.records import Embedding, Part
+from pipeline.records import Assignment, Embedding, Part
 from pipeline.runtime import seed_everything
 from pipeline.training.trainable import load_trainable, save_trainable, trainable_state
 from pipeline.training.trainer import TrainableTrainer
@@ -43,6 +43,7 @@ from tests.encoders import (
     float64,
     random_heads,
     write_frames,
+    write_pretrained,
 )
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
@@ -165,7 +166,8 @@ def test_a_clip_depends_on_seed_epoch_and_video_alone(tmp_path: Path) -> None:
 
 def test_validation_counts_videos_that_are_right_in_everything(catalogue: Catalogue) -> None:
     logits = np.array([[3, 1, 0, 0, 2, 1, 0, 0, 5], [0, 1, 0, 4, 0, 0, -1, -3, -2], [0, 0, 1, 0, 0, 1, 0, 1, 0]])
-    found = accuracies(EvalPrediction(logits, np.array([[0, 1, 2], [1, 0, 1], [1, 2, 1]])), catalogue)
+    decide = PropertyClassifier(SceneEncoder(), Heads(256, [3, 3, 3]), [3, 3, 3]).decide
+    found = accuracies(logits, np.array([[0, 1, 2], [1, 0, 1], [1, 2, 1]]), decide, catalogue)
     expected = {"hardness": 2 / 3, "roughness": 1, "bumpiness": 2 / 3, "combined": 1 / 3}
     assert found == pytest.approx({f"validation_{name}": value for name, value in expected.items()})
 
@@ -173,7 +175,7 @@ def test_validation_counts_videos_that_are_right_in_everything(catalogue: Catalo
 # The registry
 
 
-def test_a_new_backbone_is_a_module_and_a_line(
+def test_a_new_recipe_is_a_module_and_a_line(
     weights: Path, catalogue: Catalogue, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It trains, is saved and loaded, and embeds, without another change."""
@@ -186,7 +188,7 @@ def test_a_new_backbone_is_a_module_and_a_line(
     monkeypatch.setitem(RECIPES, "toy", "toy_recipe")
     check_recipe("toy")
     data, setting = encoder_data(tmp_path, catalogue, PARTS), config(weights, "toy", epochs=1)
-    model, history = finetune(data, setting, CPU, seed=0, inputs=[], pretrained=tmp_path / "none")
+    model, history = finetune(data, setting, CPU, seed=0, inputs=[])
     assert "validation_combined" in {m.name for m in history}
     save_trainable(model, tmp_path / "toy.safetensors")
     load_trainable(property_classifier(setting, data.classes), tmp_path / "toy.safetensors")
@@ -209,7 +211,7 @@ def test_the_card_names_weights_by_hash_data_and_settings_and_is_the_same_again(
     (weights / "README.md").write_text("---\nlicense: mit\n---\n")
     texts = []
     for folder in (tmp_path / "a", tmp_path / "b"):
-        write_encoder_card(folder, data, setting, 3, tmp_path / "none", "scenes")
+        write_encoder_card(folder, data, setting, 3, "scenes")
         texts.append((folder / "README.md").read_text())
     (weights / "README.md").unlink()
     assert texts[0] == texts[1]
@@ -248,7 +250,10 @@ def test_a_network_reloads_exactly_with_its_running_statistics(tmp_path: Path) -
 OWN = {
     "paper": ("encoder.prompts.prompts", "encoder.prompts.shared", "heads.0", "heads.1"),
     "release": ("encoder.prompts.prompts", "heads.shared", "heads.properties.0", "heads.properties.1"),
-    "pretrained": ("centre", "spread", "dependence", "encoder.layers", "heads.0", "heads.1"),
+    "tuned": (
+        *("centre", "spread", "dependence", "heads.0", "heads.1"),
+        *(f"encoder.backbones.0.layers.{layer}." for layer in (15, 16, 18, 19)),
+    ),
 }
 
 
@@ -256,6 +261,7 @@ OWN = {
 def test_each_recipe_saves_what_is_its_own_and_reloads_exactly(
     recipe: str, weights: Path, frames: torch.Tensor, tmp_path: Path
 ) -> None:
+    write_pretrained()
     model, other = (property_classifier(config(weights, recipe), [3, 2]).eval() for _ in range(2))
     if isinstance(model, JointFrameClassifier):
         random_heads(2, 256, [3, 2], 0.1).copy_into(model)
@@ -332,6 +338,14 @@ def test_standardized_by_training_frames_alone() -> None:
     assert done.isfinite().all(), "a constant dimension is only shifted"
     raw[[e.row for e in index if e.video_id == "test_0"]] += 5
     assert torch.equal(standardize(raw, index, {"train_0", "train_1"})[rows], done[rows])
+
+
+def test_a_video_that_any_split_trains_on_is_embedded_for_training() -> None:
+    train, test, unused = Part.TRAIN, Part.TEST, Part.UNUSED
+    parts = {"a": (train, test), "b": (test, train), "c": (test, test), "d": (unused, test), "e": (unused, unused)}
+    splits = [[Assignment(video_id=v, object_id=v, part=both[i]) for v, both in parts.items()] for i in (0, 1)]
+    found = {a.video_id: a.part for a in union(splits)}
+    assert found == {"a": train, "b": train, "c": test, "d": test, "e": unused}
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")

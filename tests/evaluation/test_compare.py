@@ -27,13 +27,13 @@ REPORT = "reports/smoke-scenes"
 CHAIN = {
     "stages": {
         "questions": {
-            "cmd": "mkdir -p data/questions && cp made/evaluation.jsonl data/questions/",
+            "cmd": "mkdir -p data/questions/0 && cp made/evaluation.jsonl data/questions/0/",
             "deps": ["made/evaluation.jsonl"],
-            "outs": ["data/questions/evaluation.jsonl"],
+            "outs": ["data/questions"],
         },
         "grade": {
             "cmd": "cp made/graded.parquet data/",
-            "deps": ["made/graded.parquet", "data/questions/evaluation.jsonl"],
+            "deps": ["made/graded.parquet", "data/questions"],
             "params": ["epochs"],
             "outs": ["data/graded.parquet"],
         },

@@ -56,6 +56,7 @@ def graded(
             lora=Lora(lora),
             opd=Opd(opd),
             seed=seed,
+            trained=seed,
             touch=Touch(touch),
         )
         for i, correct in enumerate(right)

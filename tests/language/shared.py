@@ -31,7 +31,7 @@ def prompt(question: Question, opd: Opd, model: OctopiForCausalLM) -> list[int]:
     """Token ids of a question's first turn."""
     dialogue = question.dialogue(opd)
     assert dialogue is not None
-    text = render(dialogue.turns, system_prompt="", frames=FRAMES, eos="</s>", complete=False)
+    text = render(dialogue.turns, model.tokenizer, system_prompt="", frames=FRAMES, complete=False)
     return list(encode(text, model.tokenizer).input_ids)
 
 

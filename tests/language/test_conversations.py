@@ -24,16 +24,17 @@ from pipeline.videos.catalogue import load_catalogue
 from tests.checkpoints import write_llama
 from tests.closure import ROOT
 from tests.language.shared import material
+from tests.models import model_folder
 
 WORDS = st.text(
     alphabet=st.characters(codec="utf-8", exclude_categories=("Cs",), exclude_characters="<>{}"), max_size=60
 )
 
 
-@pytest.fixture(scope="module", params=["random", "standin"])
+@pytest.fixture(scope="module", params=["random", "tiny"])
 def tokenizer(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> PreTrainedTokenizerBase:
-    if request.param == "standin":
-        return load_tokenizer(ROOT / "standins" / "llama")
+    if request.param == "tiny":
+        return load_tokenizer(model_folder("tiny-llama"))
     return load_tokenizer(write_llama(tmp_path_factory.mktemp("llama")))
 
 
@@ -53,9 +54,9 @@ def all_questions() -> list[Question]:
     )
 
 
-def test_vicuna_layout() -> None:
+def test_vicuna_layout(tokenizer: PreTrainedTokenizerBase) -> None:
     turns = [Turn(user="Feel {tactile}.", assistant="Soft."), Turn(user="Sure?", assistant="Yes.")]
-    rendered = render(turns, system_prompt="Be kind.", frames=2, eos="</s>", complete=True)
+    rendered = render(turns, tokenizer, system_prompt="Be kind.", frames=2, complete=True)
     assert rendered.text == (
         f"Be kind. USER: Feel {TACT_START}{TACT_FRAME}{TACT_FRAME}{TACT_END}. ASSISTANT: Soft.</s>"
         "USER: Sure? ASSISTANT: Yes.</s>"
@@ -66,13 +67,13 @@ def test_vicuna_layout() -> None:
 def test_every_question_is_prompted_as_it_was_trained(
     tokenizer: PreTrainedTokenizerBase, all_questions: list[Question]
 ) -> None:
-    eos, marks = str(tokenizer.eos_token), tokenizer.convert_tokens_to_ids(list(TACTILE_TOKENS))
+    marks = tokenizer.convert_tokens_to_ids(list(TACTILE_TOKENS))
     for question in all_questions:
         for dialogue in question.dialogues:
             for last in range(1, len(dialogue.turns) + 1):
                 turns = dialogue.turns[:last]
-                full = encode(render(turns, system_prompt="", frames=5, eos=eos, complete=True), tokenizer)
-                asked = encode(render(turns, system_prompt="", frames=5, eos=eos, complete=False), tokenizer)
+                full = encode(render(turns, tokenizer, system_prompt="", frames=5, complete=True), tokenizer)
+                asked = encode(render(turns, tokenizer, system_prompt="", frames=5, complete=False), tokenizer)
                 assert full.input_ids[: len(asked.input_ids)] == asked.input_ids
                 assert set(asked.labels[-3:]) == {IGNORE_INDEX}
                 answer = [i for i, y in zip(full.input_ids, full.labels, strict=True) if y != IGNORE_INDEX]
@@ -88,7 +89,7 @@ def test_every_question_is_prompted_as_it_was_trained(
 @given(st.lists(st.tuples(WORDS, WORDS), min_size=1, max_size=3))
 def test_labels_cover_answers_for_any_text(tokenizer: PreTrainedTokenizerBase, talk: list[tuple[str, str]]) -> None:
     turns = [Turn(user=u, assistant=a) for u, a in talk]
-    encoded = encode(render(turns, system_prompt="", frames=1, eos="</s>", complete=True), tokenizer)
+    encoded = encode(render(turns, tokenizer, system_prompt="", frames=1, complete=True), tokenizer)
     labelled = [i for i, y in zip(encoded.input_ids, encoded.labels, strict=True) if y != IGNORE_INDEX]
     assert labelled.count(tokenizer.eos_token_id) == len(turns)
     assert len(encoded.input_ids) == len(encoded.labels)

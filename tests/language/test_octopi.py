@@ -87,6 +87,19 @@ def test_unknown_target_module_is_named(model: OctopiForCausalLM) -> None:
         add_lora(model, LoraTrainConfig(samples=1, target_modules=("q_projection",)))
 
 
+def test_all_linear_layers_are_adapted_and_read_back(model: OctopiForCausalLM, tmp_path: Path) -> None:
+    """PEFT's own name for all but the layer of the logits."""
+    linear = {name.rsplit(".", 1)[-1] for name, part in model.llm.named_modules() if isinstance(part, torch.nn.Linear)}
+    add_lora(model, LORA.model_copy(update={"target_modules": "all-linear"}))
+    adapted = {name.split(".")[-3] for name, _ in model.llm.named_parameters() if "lora_B" in name}
+    assert adapted == linear - {"lm_head"}
+    model = trained(model)
+    model.save_pretrained(tmp_path)
+    assert set(json.loads((tmp_path / "adapter" / "adapter_config.json").read_text())["target_modules"]) == adapted
+    again = OctopiForCausalLM.from_pretrained(tmp_path)
+    assert torch.equal(again(**call(again)).logits, model.eval()(**call(model)).logits)
+
+
 def trained(model: OctopiForCausalLM) -> OctopiForCausalLM:
     """With an adapter that changes something, and a connector that no seed draws."""
     if not hasattr(model.llm, "peft_config"):

@@ -1,13 +1,13 @@
 """Encoders at their edges: frames without signal and with too much of it, late frames, batches of one.
 
-The towers and the pretrained network run in float64, float32 and bfloat16, and in float16 where a CUDA device is. CLIP
-is the committed stand-in; prompts and the network of difference pictures are random.
+All networks are tiny and random, and run in float64, float32 and bfloat16, and in float16 where a CUDA device is.
 """
 
 from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import cast
 
 import numpy as np
@@ -17,7 +17,8 @@ from torch.nn import functional as F
 
 from pipeline.config import EncoderConfig
 from pipeline.encoder.clips import ClipDataset, LabelledVideo, classify
-from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
+from pipeline.encoder.frame_classifier import JointFrameClassifier
+from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier, SideBySide, mean_and_deviation
 from pipeline.encoder.recipes import RECIPES, base_encoder, property_classifier
 from pipeline.encoder.release import sinusoid
 from pipeline.encoder.scene_encoder import CHANNELS, SceneEncoder
@@ -25,9 +26,8 @@ from pipeline.records import Part
 from pipeline.runtime import seed_everything
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
-from tests.closure import ROOT
-from tests.encoders import PARTS, encoder_data, write_frames
-from tests.numerics.bounds import longest_sum, magnification, rounded
+from tests.encoders import PARTS, config, encoder_data, write_frames, write_timm, write_tower
+from tests.numerics.bounds import longest_sum, magnification, rounded, summing
 from tests.numerics.harness import FLOAT32, FLOAT64, NETWORKS, Check, Format, formats
 
 PART = "encoder"
@@ -37,7 +37,9 @@ TIMES = torch.tensor([0, 1, 40_000, 10**6])
 """Numbers of the frames in their videos: float32 no longer holds the sinusoid of the last."""
 BASES = {"base": "paper", "base of release": "release"}
 """Encoders without prompts, and the recipe that they are read by."""
-CLASSIFIERS = (*RECIPES, "scratch")
+CLASSIFIERS = (*RECIPES, "timm", "scratch")
+"""Recipes; `tuned` stands on the backbone `scenes`, `timm` is that recipe on a network of timm's."""
+NETWORK_KINDS = [kind for kind in CLASSIFIERS if kind != "scratch"]
 
 
 def classifier(kind: str) -> PropertyClassifier:
@@ -45,20 +47,33 @@ def classifier(kind: str) -> PropertyClassifier:
     seed_everything(0)
     if kind == "scratch":
         model = PropertyClassifier(SceneEncoder(), Heads(256, CLASSES), CLASSES)
+        draw_statistics(model.encoder)
+    elif kind == "tuned":
+        network = SceneEncoder()
+        draw_statistics(network)
+        model = JointFrameClassifier(SideBySide([network]), CLASSES)
     else:
         model = property_classifier(settings(kind), CLASSES)
-    if isinstance(model.encoder, SceneEncoder):
-        # With running statistics of some pictures: a fresh network's are 0 and 1.
-        draw = torch.Generator().manual_seed(7)
-        for _ in range(20):
-            shown = torch.randint(0, 256, (8, 32, 32, 3), dtype=torch.uint8, generator=draw)
-            model.encoder.train()(shown, torch.zeros(8))
     return model
 
 
+def draw_statistics(network: FrameEncoder) -> None:
+    """Running statistics of some pictures: a fresh network's are 0 and 1."""
+    draw = torch.Generator().manual_seed(7)
+    for _ in range(20):
+        network.train()(torch.randint(0, 256, (8, 32, 32, 3), dtype=torch.uint8, generator=draw), torch.zeros(8))
+
+
+@cache
+def folder(kind: str) -> Path:
+    made = Path(mkdtemp())
+    return write_timm(made) if kind == "timm" else write_tower(made)
+
+
 def settings(kind: str) -> EncoderConfig:
-    reference = "subtract" if kind == "pretrained" else "none"
-    return EncoderConfig(recipe=kind, weights=str(ROOT / "standins" / "clip"), reference=reference)
+    if kind == "timm":
+        return config(folder(kind), "tuned", backbone=("timm",), feature_stage=2)
+    return config(folder("clip"), kind)
 
 
 @cache
@@ -101,13 +116,31 @@ def network(kind: str, name: str, fmt: Format) -> float:
 
 @formats(*NETWORKS)
 @pytest.mark.parametrize("name", FRAMES)
-@pytest.mark.parametrize("kind", [*BASES, *RECIPES])
+@pytest.mark.parametrize("kind", [*BASES, *NETWORK_KINDS])
 def test_hard_frames_are_embedded(check: Check, kind: str, name: str, fmt: Format) -> None:
     @torch.no_grad()
     def embedded(f: Format) -> torch.Tensor:
         return both(encoder(kind, f), FRAMES[name].to(f.device), TIMES.to(f.device))
 
     check(f"{kind}: {name}", fmt, embedded, lambda f: network(kind, name, f))
+
+
+@formats(*NETWORKS)
+@pytest.mark.parametrize("value", [0.0, 0.1, 6.0, 1e4])
+def test_a_channel_that_is_the_same_everywhere_has_no_deviation(check: Check, value: float, fmt: Format) -> None:
+    """roundings: of the value, and of a mean of 196 equal ones in float32. Its gradient is finite, also of 0."""
+    maps = torch.full((1, 2, 196), value, dtype=torch.float64)
+
+    def pooled(f: Format) -> torch.Tensor:
+        return mean_and_deviation(maps.to(f.device, f.torch))
+
+    bound = fmt.roundoff + summing(196, FLOAT32)
+    exact = np.array([[value, value, 0.0, 0.0]])
+    check(f"mean and deviation: {value} everywhere", fmt, pooled, bound, exact)
+    learnt = maps.to(fmt.device, fmt.torch).requires_grad_()
+    mean_and_deviation(learnt).sum().backward()
+    assert learnt.grad is not None
+    assert learnt.grad.isfinite().all()
 
 
 def test_positions_of_late_frames_are_told_apart(check: Check) -> None:
@@ -120,7 +153,7 @@ def test_positions_of_late_frames_are_told_apart(check: Check) -> None:
     assert not torch.equal(*sinusoid(torch.tensor([late, late + 1]), 64))
 
 
-@pytest.mark.parametrize("kind", [*BASES, *RECIPES])
+@pytest.mark.parametrize("kind", [*BASES, *NETWORK_KINDS])
 def test_a_batch_of_one_equals_a_batch_of_many(check: Check, kind: str) -> None:
     """condition: twice that of the network, as two ways are compared."""
 
@@ -158,8 +191,8 @@ def test_the_network_is_seven_convolutions_of_what_differs_from_128(check: Check
 
     condition: twice that of the network, as two ways are compared.
     """
-    model = encoder("pretrained", FLOAT64)
-    state = model.state_dict()
+    model = encoder("tuned", FLOAT64)
+    state = model.get_submodule("backbones.0").state_dict()
     shown = FRAMES["noise"].clone()
     shown[0] = 128
     maps = (shown.double().permute(0, 3, 1, 2) - 128) / 24
@@ -173,13 +206,13 @@ def test_the_network_is_seven_convolutions_of_what_differs_from_128(check: Check
 
     @torch.no_grad()
     def found(f: Format) -> torch.Tensor:
-        return cast(torch.Tensor, encoder("pretrained", f)(shown, TIMES))
+        return cast(torch.Tensor, encoder("tuned", f)(shown, TIMES))
 
     check(
-        "pretrained: against folded convolutions",
+        "scenes: against folded convolutions",
         FLOAT32,
         found,
-        2 * network("pretrained", "noise", FLOAT32),
+        2 * network("tuned", "noise", FLOAT32),
         exact.numpy(),
     )
 

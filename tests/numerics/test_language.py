@@ -1,9 +1,9 @@
 """The language model at its edges: tactile embeddings of any size, padding, adapters that do nothing or are merged,
 labels that are all ignored, losses of huge logits, answers beyond the cache's room.
 
-The model is the committed stand-in; the connector is random and stays float32 as in the pipeline, whatever the model's
-format is, which is that of the rows. transformers normalises in float32 even in a float64 model: what the other
-formats are held against is right to some 1e-7, and a float64 model gets float32's bound.
+The model is the tiny Llama that the pipeline makes; the connector is random and stays float32 as in the pipeline,
+whatever the model's format is, which is that of the rows. transformers normalises in float32 even in a float64 model:
+what the other formats are held against is right to some 1e-7, and a float64 model gets float32's bound.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from pipeline.language.chat import IGNORE_INDEX
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import add_lora
 from pipeline.runtime import seed_everything
-from tests.closure import ROOT
+from tests.models import model_folder
 from tests.numerics.bounds import longest_sum, magnification, rounded, summing
 from tests.numerics.cross_entropy import TARGETS, logits, mean_loss, rounded_loss
 from tests.numerics.harness import BFLOAT16, FLOAT16, FLOAT32, FLOAT64, NETWORKS, SOLVED, Check, Format, formats
@@ -39,7 +39,7 @@ PAPER = LoraTrainConfig(samples=1, rank=128, alpha=256, dropout=0)
 def octopi() -> OctopiForCausalLM:
     """A model with a random connector, in float32; equal at every call."""
     seed_everything(5)
-    made = OctopiForCausalLM.from_base(ROOT / "standins" / "llama", DIM).eval()
+    made = OctopiForCausalLM.from_base(model_folder("tiny-llama"), DIM).eval()
     nn.init.normal_(made.connector.delimiters, std=0.02)
     return made
 

@@ -32,8 +32,11 @@ HOSTILE = "</style><script>alert(1)</script><img src=//evil.example onerror=aler
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Reports of two scales and their page; not to be changed."""
+    """Reports of two scales, one of random models, and their page; not to be changed."""
     root = write_reports(tmp_path_factory.mktemp("page"), "smoke-scenes", "small-videos")
+    file = root / "reports" / "smoke-scenes" / "provenance.json"
+    models = json.loads(file.read_text())["base_models"]
+    edit(file, base_models={**models, "language": {**models["language"], "folder": "data/weights/tiny-llama"}})
     assert write_page(root) == root / PAGE
     return root
 
@@ -125,7 +128,10 @@ def test_the_finding_comes_first_and_real_videos_before_smoke(page: Page) -> Non
     parts = [e.attrib["id"].removeprefix("small-videos-") for e in page.named("small-videos").iter("h3")]
     assert parts == ["tasks", "parts", "stands-on", "origin", "tables", "files"]
     assert ["stand-in" in words(e) for e in page.all(kind="finding")] == [True, True]
-    assert ["only that the chain runs" in words(e) for e in page.all(kind="finding")] == [False, True]
+    assert [words(e).startswith("The base models are tiny and random") for e in page.all(kind="finding")] == [
+        False,
+        True,
+    ]
 
 
 def test_nothing_is_fetched_and_nothing_runs(page: Page) -> None:

@@ -142,9 +142,20 @@ def test_a_readme_stays_short_whatever_is_measured() -> None:
     assert "## Physical understanding" not in text
 
 
-def test_smoke_says_that_it_proves_nothing() -> None:
-    assert "prove only that the chain runs" in render_readme(report([score()], scale="smoke"), [])
-    assert "prove only" not in render_readme(report([score()]), [])
+@pytest.mark.parametrize("part", ["language", "encoder"])
+def test_random_base_models_are_said_to_be_chance_first(part: str) -> None:
+    """By what the models are, whatever the scale is called."""
+    said = report([score()])
+    said.provenance["base_models"][part]["folder"] = "data/weights/tiny-llama"
+    first = render_readme(said, []).splitlines()[2]
+    assert first.startswith(
+        "The base models are tiny and random, drawn from a seed and taught nothing: these figures are"
+    )
+    assert "chance and prove only that the chain runs. A 2.2 M-parameter Llama" in first
+    for folder in ("data/weights/smollm2", "weights/tiny-llama"):
+        said.provenance["base_models"][part]["folder"] = folder
+        assert "tiny and random" not in render_readme(said, [])
+    assert "tiny and random" not in render_readme(report([score()], scale="smoke"), [])
 
 
 def test_what_the_figures_stand_on_is_said_in_words() -> None:

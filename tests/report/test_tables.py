@@ -173,7 +173,7 @@ def test_published_keys_are_unique_percentages_of_their_n_and_of_registered_task
 
 
 def test_words_of_the_csv_are_those_of_the_evaluation() -> None:
-    same = ("ALL_SEEDS", "HEADS", "VALIDATION_HEADS", "CROSS_VALIDATION")
+    same = ("ALL_SEEDS", "HEADS", "VALIDATION_HEADS", "CROSS_VALIDATION", "DESCRIBED")
     assert [getattr(load, n) for n in same] == [getattr(evaluation, n) for n in same]
     assert tuple(evaluation.ScoreRow.model_fields) == load.SCORE_COLUMNS
     assert tuple(evaluation.EffectRow.model_fields) == load.EFFECT_COLUMNS

@@ -55,6 +55,17 @@ def test_equal_seeds_give_equal_questions() -> None:
     assert {key(q) for q in first} != {key(q) for q in other}
 
 
+def test_questions_of_two_folds_share_no_id_and_no_object() -> None:
+    config, asked = SplitConfig(name="kfold", folds=3), []
+    for seed in (0, 1, 3):
+        pool = pool_of(Part.TEST, assign(CATALOGUE, VIDEOS, config, seed).assignments, CATALOGUE)
+        asked.append(build_questions(pool, COUNTS, seed=1, distinct=True, fold=config.fold_of(seed)))
+    first, other, again = asked
+    assert first == again, "seeds of one fold answer the same questions"
+    assert not {q.question_id for q in first} & {q.question_id for q in other}
+    assert not {o for q in first for o in q.objects} & {o for q in other for o in q.objects}
+
+
 def test_a_task_does_not_depend_on_the_others() -> None:
     alone = build_questions(POOLS[Part.TEST], {"POM": 36}, seed=1, distinct=True)
     among = build_questions(POOLS[Part.TEST], COUNTS, seed=1, distinct=True)

@@ -137,7 +137,9 @@ def test_a_hand_that_only_presses_turns_nothing() -> None:
         pressed, twisted = (make_motion(50, np.random.default_rng(seed), twist=twist) for twist in (False, True))
         assert set(pressed.angle) == {twisted.angle[0]}
         assert len(set(twisted.angle)) > 1
-        assert (pressed.force >= twisted.force - 1e-12).all(), "a twisting hand presses less towards the end"
+        # No hand lets go in the first half; until then a twisting one presses less and less.
+        assert (pressed.force[:25] >= twisted.force[:25] - 1e-12).all()
+        assert pressed.force[24] == pressed.force.max() > 0
 
 
 def test_published_figures_stand_beside_avocados_only() -> None:

@@ -74,7 +74,7 @@ class FakeChain:
         Path("dvc.yaml").write_text(CHAIN)
         parts = {"a_0": Part.TRAIN, "a_1": Part.TRAIN, "b_0": Part.VALIDATION, "c_0": Part.TEST}
         assigned = [Assignment(video_id=v, object_id=v[0], part=p) for v, p in parts.items()]
-        write_table(Path("data/splits.parquet"), Assignment, assigned)
+        write_table(Path("data/splits/0.parquet"), Assignment, assigned)
         form = {"frames": 20, "fps": 25.0, "width": 160, "height": 120}
         videos = [Video(video_id=v, object_id=v[0], path=f"{v}.avi", sha256=v, **form) for v in parts]
         write_table(Path("data/videos.parquet"), Video, videos)

@@ -16,8 +16,10 @@ import yaml
 from typer.testing import CliRunner
 
 from pipeline.errors import UserError
+from pipeline.io import write_table
+from pipeline.records import Graded
 from pipeline.scales import compose, write_params
-from pipeline.tracking import TrackingError, publish, read_stages
+from pipeline.tracking import TrackingError, _datasets, accuracies, publish, read_stages
 from tests.closure import ROOT
 from tests.tracking.conftest import (
     BASE,
@@ -89,6 +91,26 @@ def test_a_new_task_is_a_metric_and_a_column_by_itself(again: FakeChain) -> None
     found = client().search_runs([experiment.experiment_id], view["searchFilter"])
     assert {run.info.run_name for run in found} == {FULL, BASE}
     assert "viewStateShareKey=variants" in experiment.tags["mlflow.note.content"]
+
+
+def test_a_run_of_a_fold_has_that_folds_accuracies_and_data(chain: FakeChain) -> None:
+    """The report pools folds, so that its rows are of no single model."""
+    folds = ("split.name=kfold", "split.folds=3", "ablation.seeds=[0,1]")
+    params = compose("smoke", [*folds, f"data.catalogue='{ROOT / 'pipeline' / 'physiclear'}'"], conf=ROOT / "conf")
+    score = {"task": "PC", "measure": "choice", "parsed": True, "truncated": False, "expected": "a", "predicted": "a"}
+    score |= {"encoder": "finetuned", "lora": "with", "opd": "all", "seed": 0, "touch": "real"}
+    rows = [
+        Graded(question_id=f"{seed}-{i}", correct=i < right, objects=(f"o{i}",), trained=seed, **score)
+        for seed, right in ((0, 1), (1, 3))
+        for i in range(4)
+    ]
+    write_table(Path("data/graded.parquet"), Graded, rows)
+    found = {key: metrics["accuracy/PC"] for key, metrics in accuracies(params).items()}
+    assert found == {FULL: 0.25, "finetuned-with-all-1": 0.75}
+    shutil.copy("data/splits/0.parquet", "data/splits/1.parquet")
+    assert [d.name for _, d in _datasets(params)] == [
+        f"{part}-fold{fold}" for fold in (0, 1) for part in ("train", "validation", "test")
+    ]
 
 
 def test_the_parent_has_parameters_report_and_data(again: FakeChain) -> None:
@@ -219,7 +241,7 @@ def test_the_command_says_in_one_line_why_it_could_not(chain: FakeChain, monkeyp
 
 
 def test_stages_are_those_that_dvc_lists(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for part in ("pipeline", "stages", "standins", "conf", "reports"):
+    for part in ("pipeline", "stages", "conf", "reports"):
         (tmp_path / part).symlink_to(ROOT / part)
     shutil.copy(ROOT / "dvc.yaml", tmp_path)
     monkeypatch.chdir(tmp_path)

@@ -193,7 +193,7 @@ def fill(root: Path, found: Sequence[Probe], parts: dict[str, Part]) -> None:
         (root / "videos" / p.path).touch()
     write_table(root / "data" / "frames" / "probes.parquet", Probe, found)
     write_table(root / "data" / "videos.parquet", Video, [video(p) for p in found])
-    write_table(root / "data" / "splits.parquet", Assignment, assigned(found, parts))
+    write_table(root / "data" / "splits" / "0.parquet", Assignment, assigned(found, parts))
 
 
 def run_stage() -> None:
@@ -239,8 +239,23 @@ def test_the_chains_audit_and_the_folders_agree(tmp_path: Path, catalogue: Catal
         write_video(tmp_path / f"{name}_0.avi", moving_square(20, seed))
     both = [look_at(tmp_path / f"{n}_0.avi", f"{n}_0") for n in names]
     parts = assigned([p for p, _ in both], {o: catalogue.objects[o].splits["paper"] for o in names})
-    chained = audit_chain(tmp_path, [p for p, _ in both], [v for _, v in both], parts, catalogue)
+    chained = audit_chain(tmp_path, [p for p, _ in both], [v for _, v in both], [parts], catalogue)
     assert chained == audit_folder(tmp_path, catalogue, PAPER)
+
+
+def test_every_fold_is_audited(workplace: Path, catalogue: Catalogue) -> None:
+    """Two equal files of different objects leak only where a fold parts them; what folds share is said once."""
+    found = probes(2)
+    twins = {"baseball_0", "rug_0"}
+    videos = [video(p, "same" if p.video_id in twins else "") for p in found]
+    together = assigned(found, {**GOOD_SPLIT, "baseball": Part.TRAIN, "rug": Part.TRAIN})
+    apart = assigned(found, {**GOOD_SPLIT, "baseball": Part.TRAIN, "rug": Part.TEST})
+    one = audit_chain(workplace / "videos", found, videos, [together], catalogue)
+    both = audit_chain(workplace / "videos", found, videos, [together, apart], catalogue)
+    assert [f.severity for f in of(one, "same content")] == [WARNING, INFO]
+    assert [f.severity for f in of(both, "same content")] == [ERROR, WARNING, INFO]
+    assert set(one) <= set(both)
+    assert len(set(both)) == len(both)
 
 
 def test_findings_survive_the_csv(tmp_path: Path) -> None:

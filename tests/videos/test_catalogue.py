@@ -110,6 +110,11 @@ def refused(folder: Path, words: Sequence[str]) -> None:
         ([HEADER, GOOD.replace("train,train", "train,trian")], ["line 2", "split_release", "trian", "validation"]),
         ([HEADER, GOOD.replace("a ball", "")], ["line 2", "name"]),
         ([HEADER, "," + GOOD.partition(",")[2]], ["line 2", "object_id"]),
+        ([HEADER, GOOD.replace("ball,", "../../evil,", 1)], ["line 2", "'../../evil'", "letters, digits"]),
+        (
+            [HEADER, GOOD.replace("a ball", '"a ball'), *[GOOD.replace("ball", "b") for _ in range(3)]],
+            ["line 2", "open"],
+        ),
         ([f"{SHORT},label_hardness", f"{BALL},3"], ["line 2", "label_hardness", "'3'", "0 to 2"]),
         ([f"{SHORT},label_hardness", f"{BALL},1 2"], ["line 2", "label_hardness", "one number"]),
         ([f"{SHORT},label_hardnes", f"{BALL},1"], ["objects.csv", "label_hardnes ", "no property"]),

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import itertools
 import logging
 import os
 import shutil
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
 import pipeline.parallel
@@ -24,6 +30,7 @@ from pipeline.videos.frames.extract import HEADER_BYTES, _header, _PixelFiles
 from pipeline.videos.frames.fit import fit
 from pipeline.videos.frames.reference import reference_indices
 from pipeline.videos.frames.scan import Scan, scan
+from tests.closure import ROOT
 from tests.conftest import moving_square, write_video
 from tests.frame_rules import CONFIG, FILES, Place, frames_of, luma, published, salience
 
@@ -217,6 +224,41 @@ def test_a_process_that_dies_is_an_error_that_names_the_place(place: Place, monk
     assert "\n" not in str(caught.value)
     monkeypatch.setattr(extract, "scan", scan)
     assert len(place.extract().videos) == 7
+
+
+@pytest.mark.parametrize("signal_number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_no_worker_outlives_its_parent(tmp_path: Path, signal_number: int) -> None:
+    script = tmp_path / "work.py"
+    script.write_text(
+        "import os, sys, time\nfrom pathlib import Path\nfrom pipeline.parallel import run_parallel\n"
+        "def work(i):\n    (Path(sys.argv[1]) / f'{os.getpid()}.pid').touch()\n    time.sleep(60)\n"
+        "if __name__ == '__main__':\n    list(run_parallel(work, range(4), 'x', 'y'))\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen([sys.executable, str(script), str(tmp_path)], env=environment, stderr=subprocess.DEVNULL)
+    while not (pids := [int(p.stem) for p in tmp_path.glob("*.pid")]):
+        assert process.poll() is None
+        time.sleep(0.05)
+    process.send_signal(signal_number)
+    for _ in range(100):
+        process.poll()
+        if not any(psutil.pid_exists(p) and psutil.Process(p).status() != psutil.STATUS_ZOMBIE for p in pids):
+            break
+        time.sleep(0.05)
+    else:
+        pytest.fail("a worker is alive five seconds after its parent's end")
+    process.kill()
+
+
+def test_a_full_disk_leaves_no_half_of_a_file(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    def half(source: object, target: Path) -> None:
+        Path(target).write_bytes(b"half")
+        raise OSError(errno.ENOSPC, "No space left on device", str(target))
+
+    monkeypatch.setattr(extract.shutil, "move", half)
+    with pytest.raises(OSError, match="No space left"):
+        place.extract()
+    assert not [f for f in place.out.iterdir() if f.suffix != ".parquet"], "nothing half-written stays"
 
 
 def test_short_videos_are_left_out_by_the_published_rule(place: Place, caplog: pytest.LogCaptureFixture) -> None:

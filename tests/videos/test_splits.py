@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 
 import pytest
@@ -27,16 +28,18 @@ def objects_of(split: Split, part: Part) -> set[str]:
 
 @settings(max_examples=16)
 @given(
-    st.sampled_from(NAMES), st.integers(0, 2**31 - 1), st.sets(st.sampled_from(OBJECTS), min_size=60), st.integers(0, 4)
+    st.sampled_from(NAMES), st.integers(0, 2**31 - 1), st.sets(st.sampled_from(OBJECTS), min_size=60), st.integers(0, 9)
 )
-def test_every_video_has_one_part_and_every_object_too(name: str, seed: int, objects: set[str], fold: int) -> None:
+def test_every_video_has_one_part_and_every_object_too(name: str, seed: int, objects: set[str], trained: int) -> None:
+    """So no object is both trained on and tested under one seed."""
     videos = fake_videos(sorted(objects), 2)
-    config = SplitConfig(name=name, seed=seed, fold=fold)
-    split = assign(CATALOGUE, videos, config)
+    config = SplitConfig(name=name, seed=seed)
+    split = assign(CATALOGUE, videos, config, trained)
     assert [a.video_id for a in split.assignments] == [v.video_id for v in videos]
     parts = {o: {a.part for a in split.assignments if a.object_id == o} for o in objects}
     assert all(len(where) == 1 for where in parts.values())
-    assert split == assign(CATALOGUE, videos, config)
+    again = trained + config.folds if name == "kfold" else trained + 1
+    assert split == assign(CATALOGUE, videos, config, again), "a seed of the same fold has the same split"
     present = {v.object_id for v in videos}
     for part, missing in split.missing.items():
         assert part in (Part.VALIDATION, Part.TEST)
@@ -55,11 +58,21 @@ def test_kfold_tests_every_object_once(folds: int, seed: int, objects: set[str])
     tested: Counter[str] = Counter()
     validated: Counter[str] = Counter()
     for fold in range(folds):
-        split = assign(CATALOGUE, videos, SplitConfig(name="kfold", folds=folds, fold=fold, seed=seed))
+        split = assign(CATALOGUE, videos, SplitConfig(name="kfold", folds=folds, seed=seed), fold)
         tested.update(objects_of(split, Part.TEST))
         validated.update(objects_of(split, Part.VALIDATION))
         assert len(objects_of(split, Part.TEST)) in (len(objects) // folds, -(-len(objects) // folds))
     assert tested == validated == Counter(objects)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_folds_have_each_class_alike(seed: int) -> None:
+    config = SplitConfig(name="kfold", folds=3, seed=seed)
+    tested = [objects_of(assign(CATALOGUE, fake_videos(OBJECTS, 1), config, fold), Part.TEST) for fold in range(3)]
+    assert sorted(map(len, tested)) == [24, 25, 25], "each of the catalogue's objects"
+    for place, level in itertools.product(range(3), range(3)):
+        counts = [sum(CATALOGUE.labels(o)[place] == level for o in fold) for fold in tested]
+        assert max(counts) - min(counts) <= 2, (place, level)
 
 
 @pytest.mark.parametrize("name", ["paper", "release"])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
 import unicodedata
 from collections.abc import Callable
@@ -108,6 +110,33 @@ def test_bad_names_are_one_line_with_their_mend(
     assert message.startswith(str(folder))
     assert all(word in message for word in words), message
     assert len(errors(listing)) == 1
+
+
+def test_pipes_and_closed_folders_are_findings_and_no_hang(
+    tmp_path: Path, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = touch(tmp_path, "baseball_0.mov", "closed/pillow_0.mov")
+    os.mkfifo(folder / "rug_0.mov")
+    # Root may read everything, so that permissions alone would not close the folder.
+    scan = os.scandir
+
+    def refuse(path: str) -> object:
+        if str(path).endswith("closed"):
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return scan(path)
+
+    monkeypatch.setattr(os, "scandir", refuse)
+    listing = list_videos(folder, catalogue)
+    assert ids(listing) == ["baseball_0"]
+    assert {item: message.split("(")[0] for item, message in errors(listing)} == {
+        "closed": "cannot be read ",
+        "rug_0.mov": "is no file but a pipe, socket or device; move it",
+    }
+
+
+def test_a_file_in_the_folders_place(tmp_path: Path, catalogue: Catalogue) -> None:
+    (tmp_path / "x.mov").touch()
+    assert "a file and no folder" in errors(list_videos(tmp_path / "x.mov", catalogue))[0][1]
 
 
 def test_all_errors_are_listed_and_the_first_is_raised(tmp_path: Path, catalogue: Catalogue) -> None:

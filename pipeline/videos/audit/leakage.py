@@ -47,14 +47,19 @@ def evidence(probes: Sequence[Probe], videos: Sequence[Video], assignments: Sequ
 
 def check_leakage(found: Evidence, catalogue: Catalogue, seed: int = 0) -> Iterator[Finding]:
     """All checks of this module; `seed` is of the permutations."""
+    yield from check_split(found, catalogue)
+    if found.probes:
+        yield from _untouched_predictions(found, sessions(found.probes), catalogue, seed)
+
+
+def check_split(found: Evidence, catalogue: Catalogue) -> Iterator[Finding]:
+    """The checks that depend on the split."""
     if not found.probes:
         return
     yield from _objects(found)
     yield from _copies(found)
     yield from _near_copies(found)
-    names = sessions(found.probes)
-    yield from _sessions(found, names, catalogue)
-    yield from _untouched_predictions(found, names, catalogue, seed)
+    yield from _sessions(found, sessions(found.probes), catalogue)
 
 
 def sessions(probes: Sequence[Probe]) -> list[str]:

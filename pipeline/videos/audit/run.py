@@ -12,7 +12,7 @@ from pipeline.parallel import run_parallel
 from pipeline.records import Assignment, Finding, Probe, Severity, Video
 from pipeline.videos.audit.files import check_files
 from pipeline.videos.audit.labels import check_labels, similar_names
-from pipeline.videos.audit.leakage import check_leakage, evidence
+from pipeline.videos.audit.leakage import check_leakage, check_split, evidence
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import VideoFile, list_videos
 from pipeline.videos.frames.scan import Scan, scan
@@ -26,7 +26,7 @@ def audit_folder(folder: Path, catalogue: Catalogue, split: SplitConfig | None =
     """Everything about a folder of videos, errors first; decodes every file once and raises nothing about them.
 
     Args:
-        split: also look for what leaks between its parts.
+        split: also look for what leaks between its parts, with kfold of every fold.
     """
     listing = list_videos(folder, catalogue)
     findings: list[Finding] = [*listing.findings, *similar_names(listing.unknown_objects, catalogue)]
@@ -36,14 +36,15 @@ def audit_folder(folder: Path, catalogue: Catalogue, split: SplitConfig | None =
     videos = [s.video for s in scans]
     findings += check_labels(catalogue)
     if videos:
-        assignments: Sequence[Assignment] = ()
+        splits: list[Sequence[Assignment]] = []
         if split is not None:
             try:
-                assignments = assign(catalogue, videos, split).assignments
+                folds = range(split.folds if split.fold_of(0) is not None else 1)
+                splits = [assign(catalogue, videos, split, fold).assignments for fold in folds]
             except UserError as error:
                 message = str(error)
                 findings.append(Finding(check="split", item=split.name, measured=message, severity=Severity.ERROR))
-        findings += _measured(probes, videos, assignments, catalogue)
+        findings += _measured(probes, videos, splits, catalogue)
     return by_severity(findings)
 
 
@@ -59,17 +60,17 @@ def audit_chain(
     folder: Path,
     probes: Sequence[Probe],
     videos: Sequence[Video],
-    assignments: Sequence[Assignment],
+    splits: Sequence[Sequence[Assignment]],
     catalogue: Catalogue,
 ) -> list[Finding]:
-    """The audit of what the chain has decoded and split, errors first; opens no video."""
+    """The audit of what the chain has decoded and split, once a fold with kfold, errors first; opens no video."""
     listing = list_videos(folder, catalogue)
     return by_severity(
         [
             *listing.findings,
             *similar_names(listing.unknown_objects, catalogue),
             *check_labels(catalogue),
-            *_measured(probes, videos, assignments, catalogue),
+            *_measured(probes, videos, splits, catalogue),
         ]
     )
 
@@ -97,11 +98,14 @@ def summary(findings: Sequence[Finding]) -> dict[str, float]:
 def _measured(
     probes: Sequence[Probe],
     videos: Sequence[Video],
-    assignments: Sequence[Assignment],
+    splits: Sequence[Sequence[Assignment]],
     catalogue: Catalogue,
 ) -> list[Finding]:
-    found = evidence(probes, videos, assignments)
-    return [*check_files(probes, catalogue), *check_leakage(found, catalogue)]
+    first, *others = [evidence(probes, videos, assignments) for assignments in splits or [()]]
+    found = [*check_files(probes, catalogue), *check_leakage(first, catalogue)]
+    found += [finding for other in others for finding in check_split(other, catalogue)]
+    # Most findings are the same under every split.
+    return list(dict.fromkeys(found))
 
 
 def _scan_all(files: Sequence[VideoFile]) -> tuple[list[Scan], list[Finding]]:

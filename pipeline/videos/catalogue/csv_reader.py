@@ -24,7 +24,8 @@ def read_rows(file: Path, needed: Sequence[str]) -> tuple[list[str], list[tuple[
     rows = []
     # Spreadsheets put a byte order mark before their UTF-8, and commas alone on lines that once held something.
     with file.open(encoding="utf-8-sig", newline="") as stream:
-        reader = csv.reader(stream)
+        # Strict, or an unclosed quotation mark swallows all lines behind it.
+        reader, begins = csv.reader(stream, strict=True), 1
         try:
             header = [cell.strip() for cell in next(reader, [])]
             missing = [c for c in needed if c not in header]
@@ -34,14 +35,17 @@ def read_rows(file: Path, needed: Sequence[str]) -> tuple[list[str], list[tuple[
             twice = [c for c in header if c and header.count(c) > 1]
             if twice:
                 raise UserError(f"{file}: column {twice[0]} stands twice; remove one")
+            begins = reader.line_num + 1
             for cells in reader:
-                where = f"{file}, line {reader.line_num}"
+                where, begins = f"{file}, line {begins}", reader.line_num + 1
                 if len(cells) > len(header):
                     fields = f"{len(cells)} fields for {len(header)} columns"
                     raise UserError(f"{where}: {fields}; put a text that has commas between quotation marks")
                 stripped = [cell.strip() for cell in cells]
                 if any(stripped):
                     rows.append((where, dict(zip_longest(header, stripped, fillvalue=""))))
-        except (UnicodeDecodeError, csv.Error) as error:
+        except UnicodeDecodeError as error:
             raise UserError(f"{file}: no CSV in UTF-8 ({error}); save it as such") from None
+        except csv.Error as error:
+            raise UserError(f"{file}, line {begins}: no CSV ({error}); is a quotation mark open?") from None
     return header, rows

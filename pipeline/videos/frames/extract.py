@@ -17,7 +17,7 @@ from pydantic import ValidationError
 
 from pipeline.config import FramesConfig
 from pipeline.errors import UserError
-from pipeline.io import write_table
+from pipeline.io import atomic, write_table
 from pipeline.parallel import run_parallel
 from pipeline.records import Finding, Frame, Probe, Record, Video
 from pipeline.videos import decoding
@@ -186,7 +186,8 @@ class _PixelFiles:
             stream.seek(0)
             stream.write(_header((count, self.size, self.size, 3)))
             stream.flush()
-            shutil.move(file, out / file.name)  # Which may be on another disk.
+            with atomic(out / file.name) as temporary:
+                shutil.move(file, temporary)  # Which may be on another, and a full, disk.
 
 
 def _work(job: _Job) -> _Done | Finding:

@@ -1,0 +1,44 @@
+"""The registry of backbones. A new one is a module with `load_backbone(config, *, tuned)` and a line in `BACKBONES`."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+from pipeline.config import EncoderConfig
+from pipeline.errors import UserError
+
+if TYPE_CHECKING:
+    from pipeline.encoder.model import FrameEncoder
+
+BACKBONES = {
+    "clip": "pipeline.encoder.model",
+    "timm": "pipeline.encoder.timm_backbone",
+    "scenes": "pipeline.encoder.scene_encoder",
+}
+"""Values in `encoder.backbone` and their modules: named, not imported, as `octopi scale` checks them without torch."""
+
+
+def check_backbones(names: Sequence[str]) -> None:
+    """Raise UserError where a name is no backbone's."""
+    for name in names:
+        if name not in BACKBONES:
+            close = difflib.get_close_matches(name, BACKBONES, n=1)
+            hint = f"did you mean {close[0]}? " if close else ""
+            raise UserError(f"encoder.backbone: {name} is no backbone; {hint}known: {', '.join(BACKBONES)}")
+
+
+def load_backbones(config: EncoderConfig, *, tuned: bool = False) -> list[FrameEncoder]:
+    """The backbones of `encoder.backbone` with their pretrained weights.
+
+    Args:
+        config: The section `encoder`.
+        tuned: Whether what fine-tuning changes is to be unfrozen: the last stage, or prompts. All else is frozen.
+
+    Raises:
+        UserError: for an unknown name, or weights that are missing or do not fit.
+    """
+    check_backbones(config.backbone)
+    return [import_module(BACKBONES[name]).load_backbone(config, tuned=tuned) for name in config.backbone]

@@ -1,0 +1,123 @@
+"""The backbone `timm`: any CNN or vision transformer of timm's, read at one of its stages, from a folder and no hub.
+
+A frame's features are the mean and the deviation of each channel over the map that the stage `encoder.feature_stage`
+leaves. Fine-tuning changes that stage alone, so that all below it is computed once a picture. Batch normalisation keeps
+the statistics of the pretraining.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from pipeline.config import EncoderConfig
+from pipeline.encoder.model import FrameEncoder, mean_and_deviation
+from pipeline.errors import UserError
+
+WEIGHTS = "model.safetensors"
+
+
+class TimmBackbone(FrameEncoder):
+    """A timm network up to one of its stages.
+
+    Args:
+        model: With `forward_intermediates`, as nearly all of timm's have it. What follows the stage is cut off.
+        stage: Index of the stage in its `feature_info`.
+    """
+
+    def __init__(self, model: nn.Module, stage: int) -> None:
+        self.info: dict[str, Any] = cast(Any, model).feature_info[stage]
+        super().__init__(dim=2 * self.info["num_chs"])
+        self.model, self.index = model, stage
+        cast(Any, model).prune_intermediate_layers([stage], prune_norm=True, prune_head=True)
+        form: dict[str, Any] = cast(Any, model).pretrained_cfg
+        # Position embeddings are as long as they were in pretraining; convolutions take any side.
+        self.side = int(form["input_size"][-1]) if form.get("fixed_input_size") else None
+        self.mean: torch.Tensor
+        self.std: torch.Tensor
+        self.register_buffer("mean", torch.tensor(form["mean"]).view(1, 3, 1, 1), persistent=False)
+        self.register_buffer("std", torch.tensor(form["std"]).view(1, 3, 1, 1), persistent=False)
+
+    @property
+    def last(self) -> nn.Module:
+        """The stage that is read."""
+        return self.model.get_submodule(self.info["module"])
+
+    def forward(self, frames: torch.Tensor, frame_indices: torch.Tensor) -> torch.Tensor:
+        """Mean and deviation a channel: batch x 2 channels, of frames, uint8, batch x side x side x RGB."""
+        return mean_and_deviation(self._map(frames).flatten(2))
+
+    def trunk(self, frames: torch.Tensor) -> torch.Tensor:
+        """What enters the stage: a CNN's map, batch x channels x height x width, or tokens, batch x tokens x width."""
+        entering: list[torch.Tensor] = []
+        handle = self.last.register_forward_pre_hook(lambda _, inputs: entering.append(inputs[0]))
+        try:
+            self._map(frames)
+        finally:
+            handle.remove()
+        return entering[0]
+
+    def stage(self, entering: torch.Tensor) -> torch.Tensor:
+        """The features, batch x dim, from what `trunk` gave."""
+        maps: torch.Tensor = self.last(entering)
+        if maps.dim() == 3:  # Tokens; class token and registers are no part of the map.
+            maps = maps[:, cast(int, self.model.num_prefix_tokens) :].transpose(1, 2)
+        return mean_and_deviation(maps.flatten(2))
+
+    def _map(self, frames: torch.Tensor) -> torch.Tensor:
+        pixels = frames.permute(0, 3, 1, 2).to(next(self.model.parameters()).dtype) / 255
+        if self.side is not None and pixels.shape[-1] != self.side:
+            pixels = F.interpolate(pixels, self.side, mode="area")
+        pixels = ((pixels - self.mean) / self.std).contiguous(memory_format=torch.channels_last)
+        found = cast(Any, self.model).forward_intermediates(
+            pixels, indices=[self.index], stop_early=True, intermediates_only=True
+        )
+        return cast(torch.Tensor, found[0])
+
+
+def load_backbone(config: EncoderConfig, *, tuned: bool) -> TimmBackbone:
+    """The network in `encoder.weights`, in timm's own layout; fine-tuning changes the stage that is read.
+
+    Raises:
+        UserError: for a folder that is none, weights that do not fit, or a network or stage that cannot be read so.
+    """
+    import timm
+    from safetensors import SafetensorError
+
+    folder = Path(config.weights)
+    for name in ("config.json", WEIGHTS):
+        if not (folder / name).is_file():
+            raise UserError(
+                f"encoder.weights: {folder / name} does not exist; encoder.backbone=timm needs a folder as timm's hub "
+                "has it, with safetensors (pickles are refused because they can run code)"
+            )
+    logging.getLogger("timm").setLevel(logging.WARNING)
+    try:
+        model = timm.create_model(f"local-dir:{folder}", pretrained=True)
+    except (RuntimeError, ValueError, LookupError, TypeError, AttributeError, OSError, SafetensorError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise UserError(f"encoder.weights: {folder} does not fit its config.json ({reason})") from None
+    stages = len(getattr(model, "feature_info", ()))
+    if not hasattr(model, "forward_intermediates") or not stages:
+        raise UserError(f"encoder.weights: {folder} is a network that timm cannot read at a stage; take another")
+    if config.feature_stage >= stages:
+        raise UserError(
+            f"encoder.feature_stage is {config.feature_stage}, but the network in {folder} has stages 0 to {stages - 1}"
+        )
+    backbone = TimmBackbone(model.requires_grad_(False).eval(), config.feature_stage)
+    with torch.inference_mode():
+        tried = torch.zeros(1, 64, 64, 3, dtype=torch.uint8)
+        whole, apart = backbone(tried, torch.zeros(1)), backbone.stage(backbone.trunk(tried))
+    if whole.shape != (1, backbone.dim) or apart.shape != whole.shape or not torch.allclose(whole, apart, 1e-3, 1e-3):
+        raise UserError(
+            f"encoder.weights: {folder} is neither a CNN nor a plain vision transformer; its stage "
+            f"{config.feature_stage} cannot be read apart"
+        )
+    if tuned:
+        backbone.last.requires_grad_(True)
+    return backbone

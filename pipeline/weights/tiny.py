@@ -1,0 +1,100 @@
+"""Tiny models with random weights, for runs that show that the chain works and nothing else."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.errors import UserError
+from pipeline.io import save_tensors, write_json
+from pipeline.runtime import derive_seed
+from pipeline.weights import CLIP_CONFIG, CLIP_WEIGHTS, MADE
+from pipeline.weights.source import Given
+
+if TYPE_CHECKING:
+    from transformers import PreTrainedTokenizerFast
+
+TAUGHT = "drawn at random and taught nothing"
+CLIP_CARD = {"license": "mit", "library_name": "open_clip", "taught": TAUGHT}
+LLAMA_CARD = {"license": "mit", "library_name": "transformers", "taught": TAUGHT}
+ABOUT = "A tiny model with random weights. It knows nothing: figures that it makes are chance."
+CLIP: dict[str, dict[str, Any]] = {
+    "model_cfg": {
+        "embed_dim": 64,
+        "vision_cfg": {
+            "image_size": MADE["tiny-clip"].size,
+            "patch_size": 8,
+            "width": 128,
+            "layers": 4,
+            "head_width": 32,
+        },
+        "text_cfg": {"context_length": 8, "vocab_size": 64, "width": 32, "heads": 1, "layers": 1},
+    },
+    "preprocess_cfg": {"mean": [0.5, 0.5, 0.5], "std": [0.25, 0.25, 0.25]},
+}
+"""The text tower is never read, so it is as small as it goes."""
+LLAMA = {
+    "hidden_size": 192,
+    "intermediate_size": 480,
+    "num_hidden_layers": 4,
+    "num_attention_heads": 6,
+    "max_position_embeddings": 1024,
+    "tie_word_embeddings": True,
+}
+SPECIAL = PAD, BOS, EOS, UNK = ("<pad>", "<s>", "</s>", "<unk>")
+MOST_TOKENS = 2048
+
+
+def write_clip(folder: Path, given: Given) -> None:
+    """Write a CLIP with a vision transformer as open_clip lays it out."""
+    import open_clip
+    import torch
+
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(derive_seed("tiny-clip", given.seed))
+        model = open_clip.CLIP(**CLIP["model_cfg"])
+    write_json(folder / CLIP_CONFIG, CLIP)
+    save_tensors(folder / CLIP_WEIGHTS[0], model.state_dict(), {"format": "pt"})
+
+
+def write_llama(folder: Path, given: Given) -> None:
+    """Write a Llama in float32 with a tokenizer as transformers lays them out."""
+    import torch
+    from transformers import LlamaConfig, LlamaForCausalLM
+
+    tokenizer = make_tokenizer(given.source)
+    ends = {f"{kind}_token_id": getattr(tokenizer, f"{kind}_token_id") for kind in ("pad", "bos", "eos")}
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(derive_seed("tiny-llama", given.seed))
+        model = LlamaForCausalLM(LlamaConfig(vocab_size=len(tokenizer), **LLAMA, **ends))
+    model.save_pretrained(folder)
+    tokenizer.save_pretrained(folder)
+
+
+def make_tokenizer(catalogue: Path) -> PreTrainedTokenizerFast:
+    """A byte-level BPE of the words in a catalogue's files; any other text falls back to bytes.
+
+    It has no chat template, so conversations are written in Vicuna's format.
+    """
+    from tokenizers import Tokenizer, decoders, models, pre_tokenizers, processors, trainers
+    from transformers import PreTrainedTokenizerFast
+
+    files = sorted(file for file in catalogue.glob("*") if file.suffix in (".csv", ".yaml"))
+    if not files:
+        raise UserError(f"{catalogue} holds no catalogue (.csv and .yaml files); name another with data.catalogue=...")
+    words = [w for file in files for w in re.findall(r"[^\W\d_]+", file.read_text(encoding="utf-8"))]
+    tokenizer = Tokenizer(models.BPE(unk_token=UNK))
+    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
+    tokenizer.decoder = decoders.ByteLevel()
+    alphabet = sorted(pre_tokenizers.ByteLevel.alphabet())
+    trainer = trainers.BpeTrainer(
+        vocab_size=MOST_TOKENS, special_tokens=list(SPECIAL), initial_alphabet=alphabet, show_progress=False
+    )
+    tokenizer.train_from_iterator([" ".join(words)], trainer)
+    tokenizer.post_processor = processors.TemplateProcessing(
+        single=f"{BOS} $A", special_tokens=[(BOS, tokenizer.token_to_id(BOS))]
+    )
+    return PreTrainedTokenizerFast(
+        tokenizer_object=tokenizer, pad_token=PAD, bos_token=BOS, eos_token=EOS, unk_token=UNK
+    )

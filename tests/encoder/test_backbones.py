@@ -1,0 +1,436 @@
+"""Backbones: what they compute against timm's own features, what is tuned of them, and training above cached trunks."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+from torch.nn import functional as F
+from torch.optim.optimizer import register_optimizer_step_pre_hook
+
+from pipeline.config import EncoderConfig
+from pipeline.encoder import finetune as training
+from pipeline.encoder import tuned
+from pipeline.encoder.backbones import BACKBONES, check_backbones, load_backbones
+from pipeline.encoder.clips import EncoderData, classify
+from pipeline.encoder.embed import embed_videos
+from pipeline.encoder.finetune import finetune, tune
+from pipeline.encoder.frame_classifier import JointFrameClassifier
+from pipeline.encoder.model import FrameEncoder, SideBySide, mean_and_deviation
+from pipeline.encoder.recipes import base_encoder, property_classifier
+from pipeline.encoder.scene_encoder import SIDE, SceneEncoder
+from pipeline.encoder.timm_backbone import TimmBackbone
+from pipeline.encoder.tuned import FLIPS, AboveTrunks, TrunkDataset, run_trunks
+from pipeline.errors import UserError
+from pipeline.records import Part
+from pipeline.runtime import seed_everything
+from pipeline.training.trainable import load_trainable, save_trainable, trainable_state
+from pipeline.videos.catalogue import Catalogue
+from tests.encoders import CPU, PARTS, close, config, encoder_data, float64, write_pretrained, write_timm
+
+pytestmark = pytest.mark.usefixtures("elsewhere")
+
+DEVICE = torch.device("cpu")
+CLASSES = [3, 3, 3]
+NETWORKS = {"test_efficientnet": 2, "test_resnet": 1, "test_convnext": 2, "test_vit": 3}
+"""Tiny networks of timm's, and the stage at which they are read."""
+
+
+@pytest.fixture(scope="module", params=NETWORKS)
+def network(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+    return request.param, write_timm(tmp_path_factory.mktemp(request.param), request.param)
+
+
+@pytest.fixture(scope="module")
+def timm_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_timm(tmp_path_factory.mktemp("timm"))
+
+
+def loaded(folder: Path, stage: int, *, tuned: bool = False) -> TimmBackbone:
+    setting = config(folder, "tuned", backbone=("timm",), feature_stage=stage)
+    (backbone,) = load_backbones(setting, tuned=tuned)
+    assert isinstance(backbone, TimmBackbone)
+    return backbone
+
+
+def noise(side: int, count: int = 3, seed: int = 0) -> torch.Tensor:
+    rng = np.random.default_rng(seed)
+    return torch.from_numpy(rng.integers(0, 256, (count, side, side, 3), dtype=np.uint8))
+
+
+# What they compute
+
+
+def test_timm_features_are_mean_and_deviation_of_its_own_map(network: tuple[str, Path]) -> None:
+    """Against `features_only`, timm's other way to the same map, and NumPy; the trunk and the stage make the same."""
+    import timm
+
+    name, folder = network
+    stage = NETWORKS[name]
+    backbone = loaded(folder, stage)
+    form = timm.get_pretrained_cfg(name)
+    side = form.input_size[-1] if form.fixed_input_size else 64
+    frames = noise(side)
+    pixels = (frames.permute(0, 3, 1, 2) / 255 - torch.tensor(form.mean)[:, None, None]) / torch.tensor(form.std)[
+        :, None, None
+    ]
+    whole = timm.create_model(f"local-dir:{folder}", pretrained=True, features_only=True, out_indices=(stage,)).eval()
+    with torch.no_grad():
+        maps = float64(whole(pixels)[0])
+        found, apart = backbone(frames, torch.zeros(3)), backbone.stage(backbone.trunk(frames))
+    assert maps.shape[1] == whole.feature_info.channels()[0] == backbone.dim // 2
+    assert len(set(maps.shape[2:])) == 1, "a square map"
+    assert maps.shape[2] > 1
+    close(found, np.concatenate([maps.mean((2, 3)), maps.std((2, 3))], axis=1), 1e-4)
+    torch.testing.assert_close(apart, found, rtol=1e-5, atol=1e-5)
+
+
+def test_a_transformer_of_one_side_is_shown_means_over_areas(tmp_path: Path) -> None:
+    backbone = loaded(write_timm(tmp_path, "vit_tiny_patch16_224"), 2)
+    assert backbone.side is not None
+    frames = noise(backbone.side)
+    larger = frames.repeat_interleave(2, 1).repeat_interleave(2, 2)
+    with torch.no_grad():
+        torch.testing.assert_close(backbone(larger, torch.zeros(3)), backbone(frames, torch.zeros(3)))
+
+
+def test_scenes_sees_large_frames_as_it_was_pretrained() -> None:
+    """A frame of twice its side, each pixel fourfold, is the frame; smaller ones are taken as they are."""
+    model = write_pretrained()
+    (backbone,) = load_backbones(config(Path("none"), "tuned"))
+    frames = noise(SIDE, 2)
+    with torch.no_grad():
+        expected = model(frames, torch.zeros(2))
+        assert torch.equal(backbone(frames, torch.zeros(2)), expected)
+        torch.testing.assert_close(
+            backbone(frames.repeat_interleave(2, 1).repeat_interleave(2, 2), torch.zeros(2)), expected
+        )
+        small = model.layers((noise(32).permute(0, 3, 1, 2) - 128.0) / 24)
+        torch.testing.assert_close(backbone(noise(32), torch.zeros(3))[:, :128], small.mean((2, 3)))
+
+
+def test_several_backbones_stand_side_by_side_in_their_order(timm_folder: Path) -> None:
+    write_pretrained()
+    frames = noise(64)
+    with torch.no_grad():
+        for names in (("timm", "scenes"), ("scenes", "timm")):
+            setting = config(timm_folder, "tuned", backbone=names, feature_stage=2)
+            single = [
+                b(frames, torch.zeros(3))
+                for name in names
+                for b in load_backbones(setting.model_copy(update={"backbone": (name,)}))
+            ]
+            both = base_encoder(setting)
+            assert isinstance(both, SideBySide)
+            assert torch.equal(both(frames, torch.zeros(3)), torch.cat(single, dim=1))
+            torch.testing.assert_close(both.stages(both.trunks(frames)), torch.cat(single, dim=1))
+            assert both.dim == sum(s.shape[1] for s in single)
+            assert not any(p.requires_grad for p in both.parameters()), "the base is frozen"
+
+
+@given(st.integers(0, 10**6), st.sampled_from([1, 2, 49]), st.sampled_from([0.0, 1e-3, 1.0, 1e4]))
+def test_pooling_against_numpy(seed: int, places: int, scale: float) -> None:
+    maps = (scale * np.random.default_rng(seed).normal(size=(2, 3, places)) + 7).astype(np.float32)
+    found = float64(mean_and_deviation(torch.from_numpy(maps)))
+    exact = maps.astype(np.float64)
+    bound = 1e-6 * np.abs(exact).max()
+    np.testing.assert_allclose(found, np.concatenate([exact.mean(2), exact.std(2)], axis=1), rtol=1e-5, atol=bound)
+
+
+# What is tuned
+
+
+def test_gradients_reach_the_last_stage_alone(network: tuple[str, Path]) -> None:
+    name, folder = network
+    backbone = loaded(folder, NETWORKS[name], tuned=True)
+    backbone(noise(64), torch.zeros(3)).square().sum().backward()
+    learnt = {id(p) for p in backbone.last.parameters()}
+    assert learnt
+    for parameter_name, parameter in backbone.named_parameters():
+        assert (id(parameter) in learnt) == parameter.requires_grad == (parameter.grad is not None), parameter_name
+    prefix = f"model.{backbone.info['module']}."
+    assert all(key.startswith(prefix) for key in trainable_state(backbone))
+
+
+def test_statistics_of_batch_normalisation_stay(timm_folder: Path, catalogue: Catalogue, tmp_path: Path) -> None:
+    model, _ = tuned_model(timm_folder, catalogue, tmp_path, epochs=2)
+    fresh = loaded(timm_folder, 2).state_dict()
+    running = {n: b for n, b in model.encoder.get_submodule("backbones.0").state_dict().items() if "running" in n}
+    assert running
+    assert all(torch.equal(b, fresh[n]) for n, b in running.items())
+
+
+def test_a_clip_among_several_backbones_gets_prompts(weights: Path, catalogue: Catalogue, tmp_path: Path) -> None:
+    write_pretrained()
+    setting = config(weights, "tuned", backbone=("clip", "scenes"), epochs=1)
+    model, history = finetune(encoder_data(tmp_path, catalogue, PARTS), setting, CPU, seed=0, inputs=[])
+    names = set(trainable_state(model))
+    assert "encoder.backbones.0.prompts.prompts" in names
+    assert not any(".visual." in name for name in names)
+    assert any(name.startswith("encoder.backbones.1.layers.18.") for name in names)
+    assert next(m.step for m in history if m.name == "validation_combined") == 0
+
+
+# Training above cached trunks
+
+
+def tuned_model(
+    folder: Path, catalogue: Catalogue, frames: Path, **changes: object
+) -> tuple[JointFrameClassifier, EncoderData]:
+    data = encoder_data(frames, catalogue, PARTS)
+    setting = config(folder, "tuned", backbone=("timm",), feature_stage=2, **changes)
+    model, _ = finetune(data, setting, CPU, seed=0, inputs=[])
+    assert isinstance(model, JointFrameClassifier)
+    return model, data
+
+
+def test_training_above_trunks_is_training_through_the_whole_network(
+    timm_folder: Path, catalogue: Catalogue, tmp_path: Path
+) -> None:
+    """Two steps of AdamW on mirrored clips, against the classifier on the frames themselves."""
+    write_pretrained()
+    data = encoder_data(tmp_path, catalogue, PARTS)
+    setting = config(timm_folder, "tuned", backbone=("timm", "scenes"), feature_stage=2)
+    videos = data.videos(Part.TRAIN)
+    states = []
+    for cached in (True, False):
+        seed_everything(0)
+        model = property_classifier(setting, CLASSES).train()
+        assert isinstance(model, JointFrameClassifier)
+        assert isinstance(model.encoder, SideBySide)
+        optimiser = torch.optim.AdamW([p for p in model.parameters() if p.requires_grad], lr=1e-3)
+        trunks = run_trunks(model.encoder, data, videos, DEVICE)
+        items = TrunkDataset(trunks, videos, seed=3, flip_probability=0.5)
+        for epoch in range(2):
+            items.follow(lambda epoch=epoch: epoch)  # type: ignore[misc]
+            for index, video in enumerate(videos):
+                item = items[index]
+                labels = item["labels"][None]
+                if cached:
+                    output = AboveTrunks(model)([o[None] for o in item["outputs"]], labels)
+                else:
+                    flip = flip_of(trunks.of, video.video_id, item["outputs"])
+                    rows = data.store.rows(video.video_id)
+                    places = [i * len(rows) // 2 for i in range(2)]
+                    shown = np.flip(data.store.pictures(video.video_id, places), FLIPS[flip]).copy()
+                    output = model(torch.from_numpy(shown)[None], torch.zeros(1, 2), labels)
+                optimiser.zero_grad()
+                output["loss"].backward()
+                optimiser.step()
+        states.append(trainable_state(model))
+    torch.testing.assert_close(states[0], states[1], rtol=1e-4, atol=1e-5)
+
+
+def flip_of(of: Callable[[str, int], list[torch.Tensor]], video_id: str, outputs: list[torch.Tensor]) -> int:
+    return next(f for f in range(4) if all(map(torch.equal, of(video_id, f), outputs)))
+
+
+def test_flips_are_drawn_by_seed_epoch_and_video(timm_folder: Path, catalogue: Catalogue, tmp_path: Path) -> None:
+    """Each of the four a quarter of the time; without a seed none."""
+    data = encoder_data(tmp_path, catalogue, PARTS)
+    encoder = base_encoder(config(timm_folder, "tuned", backbone=("timm",), feature_stage=2))
+    assert isinstance(encoder, SideBySide)
+    videos = data.videos(Part.TRAIN)
+    trunks = run_trunks(encoder, data, videos, DEVICE)
+    items = TrunkDataset(trunks, videos, seed=3, flip_probability=0.5)
+    drawn = []
+    for epoch in range(80):
+        items.follow(lambda epoch=epoch: epoch)  # type: ignore[misc]
+        drawn.append([flip_of(trunks.of, v.video_id, items[i]["outputs"]) for i, v in enumerate(videos)])
+    counts = np.bincount(np.ravel(drawn), minlength=4)
+    assert counts.min() > 400 / 4 * 0.7
+    assert len(set(map(tuple, drawn))) > 40
+    plain = TrunkDataset(trunks, videos)
+    assert all(flip_of(trunks.of, v.video_id, plain[i]["outputs"]) == 0 for i, v in enumerate(videos))
+
+
+def test_trunks_too_large_for_memory_are_kept_in_float16(
+    timm_folder: Path, catalogue: Catalogue, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = encoder_data(tmp_path, catalogue, PARTS)
+    encoder = base_encoder(config(timm_folder, "tuned", backbone=("timm",), feature_stage=2))
+    assert isinstance(encoder, SideBySide)
+    videos = data.videos(Part.TRAIN)
+    model = JointFrameClassifier(encoder, CLASSES)
+    exact = run_trunks(encoder, data, videos, DEVICE, flips=1)
+    monkeypatch.setattr(tuned, "MEMORY", 0)
+    short = run_trunks(encoder, data, videos, DEVICE, flips=1)
+    assert (exact.outputs[0][0].dtype, short.outputs[0][0].dtype) == (torch.float32, torch.float16)
+    found, expected = (AboveTrunks(model).describe(t, videos, DEVICE) for t in (short, exact))
+    np.testing.assert_allclose(found, expected, atol=2e-3 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize(
+    ("start", "reached", "kept"), [(0.5, (0.5, 0.5), 0), (0.2, (0.1, 0.3), 2), (0.2, (0.4, 0.3), 1)]
+)
+def test_the_probe_is_epoch_0_and_wins_where_it_is_as_good(
+    start: float,
+    reached: tuple[float, ...],
+    kept: int,
+    timm_folder: Path,
+    catalogue: Catalogue,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    data = encoder_data(tmp_path, catalogue, PARTS)
+    setting = config(timm_folder, "tuned", backbone=("timm",), feature_stage=2, epochs=2, batch_size=8)
+    seed_everything(0)
+    model = property_classifier(setting, data.classes)
+    assert isinstance(model, JointFrameClassifier)
+    seen: list[dict[str, torch.Tensor]] = []
+    script = iter((start, *reached))
+
+    def scripted(*_: object) -> dict[str, float]:
+        seen.append({n: v.clone() for n, v in trainable_state(model).items()})
+        return {"validation_combined": next(script)}
+
+    monkeypatch.setattr(training, "accuracies", scripted)
+    trunks = run_trunks(model.encoder, data, [*data.videos(Part.TRAIN), *data.videos(Part.VALIDATION)], DEVICE)  # type: ignore[arg-type]
+    history = tune(model, trunks, data, setting, CPU, seed=0, inputs=[])
+    found = trainable_state(model)
+    assert [all(torch.equal(v, found[n]) for n, v in epoch.items()) for epoch in seen] == [i == kept for i in range(3)]
+    assert [m.value for m in history if m.name == "validation_combined"] == [start, *reached]
+
+
+def test_what_is_tuned_is_saved_loaded_and_embeds_alike(
+    timm_folder: Path, catalogue: Catalogue, tmp_path: Path
+) -> None:
+    """The file holds less than the network; a model that is built anew says the same of every video."""
+    write_pretrained()
+    data = encoder_data(tmp_path, catalogue, PARTS)
+    setting = config(timm_folder, "tuned", backbone=("timm", "scenes"), feature_stage=2, epochs=2, learning_rate=1e-2)
+    model, _ = finetune(data, setting, CPU, seed=0, inputs=[])
+    save_trainable(model, tmp_path / "model.safetensors")
+    again = property_classifier(setting, data.classes)
+    load_trainable(again, tmp_path / "model.safetensors")
+    first, second = (classify(m, data, [Part.TRAIN, Part.VALIDATION], 4, DEVICE) for m in (model, again))
+    assert first == second
+    one, other = (
+        embed_videos(m.encoder, data.store, data.assignments, batch_size=4, device=DEVICE)[0] for m in (model, again)
+    )
+    assert torch.equal(one, other)
+    kept = sum(value.numel() for value in trainable_state(model).values())
+    assert kept < 0.9 * sum(p.numel() for p in model.parameters())
+
+
+@pytest.fixture
+def updates() -> Iterator[dict[str, int]]:
+    """Counts the updates of all optimisers; interrupts the one numbered `stop`."""
+    counter = {"made": 0, "stop": -1}
+
+    def count(*_: object) -> None:
+        counter["made"] += 1
+        if counter["made"] == counter["stop"]:
+            raise KeyboardInterrupt
+
+    handle = register_optimizer_step_pre_hook(count)
+    yield counter
+    handle.remove()
+
+
+def test_a_killed_tuning_ends_as_if_it_had_not_been(
+    timm_folder: Path, catalogue: Catalogue, tmp_path: Path, updates: dict[str, int]
+) -> None:
+    data = encoder_data(tmp_path, catalogue, PARTS)
+    setting = config(timm_folder, "tuned", backbone=("timm",), feature_stage=2, epochs=3, batch_size=2)
+    model, history = finetune(data, setting, CPU, seed=0, inputs=[])
+    assert updates["made"] == 9
+    updates.update(made=0, stop=5)
+    with pytest.raises(KeyboardInterrupt):
+        finetune(data, setting, CPU, seed=0, inputs=[])
+    updates.update(made=0, stop=-1)
+    resumed, again = finetune(data, setting, CPU, seed=0, inputs=[])
+    assert updates["made"] == 6, "the first epoch was done"
+    assert sorted((m.step, m.name, m.value) for m in again) == sorted((m.step, m.name, m.value) for m in history)
+    torch.testing.assert_close(trainable_state(resumed), trainable_state(model), rtol=0, atol=0)
+
+
+# The registry
+
+
+def test_a_new_backbone_is_a_module_and_a_line(
+    catalogue: Catalogue, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a trunk of its own it trains, is saved and loaded, and embeds, beside another."""
+    write_pretrained()
+
+    class Toy(FrameEncoder):
+        def __init__(self) -> None:
+            super().__init__(4)
+            self.layer = torch.nn.Linear(3, 4)
+
+        def forward(self, frames: torch.Tensor, frame_indices: torch.Tensor) -> torch.Tensor:
+            embedded: torch.Tensor = self.layer(frames.float().mean((1, 2)) / 255)
+            return F.relu(embedded)
+
+    module = ModuleType("toy_backbone")
+    module.load_backbone = lambda _, *, tuned: Toy().requires_grad_(tuned)  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "toy_backbone", module)
+    monkeypatch.setitem(BACKBONES, "toy", "toy_backbone")
+    data = encoder_data(tmp_path, catalogue, PARTS)
+    setting = config(Path("none"), "tuned", backbone=("toy", "scenes"), epochs=1)
+    model, history = finetune(data, setting, CPU, seed=0, inputs=[])
+    assert "validation_combined" in {m.name for m in history}
+    save_trainable(model, tmp_path / "toy.safetensors")
+    again = property_classifier(setting, data.classes)
+    load_trainable(again, tmp_path / "toy.safetensors")
+    assert torch.equal(again.encoder(noise(32), torch.zeros(3)), model.encoder(noise(32), torch.zeros(3)))
+    assert base_encoder(setting).dim == 4 + SceneEncoder().dim
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"backbone": ("timm", "timm")}, "names one twice"),
+        ({"backbone": ()}, "at least 1 item"),
+        ({"backbone": ("scenes",), "reference": "none"}, "set encoder.reference=subtract"),
+        ({"backbone": ("timm",), "recipe": "paper"}, "encoder.recipe=paper is for CLIP alone"),
+        ({"backbone": ("clip", "timm"), "recipe": "release"}, "encoder.recipe=release is for CLIP alone"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        EncoderConfig.model_validate({"recipe": "tuned", "weights": "w", "reference": "subtract", **changes})
+
+
+def test_an_unknown_backbone_is_one_line() -> None:
+    with pytest.raises(UserError, match=r"^encoder.backbone: tim is no backbone; did you mean timm\? known: clip, "):
+        check_backbones(("scenes", "tim"))
+
+
+@pytest.mark.parametrize(
+    ("broken", "message"),
+    [
+        ("missing", "config.json does not exist"),
+        ("pickle", "model.safetensors does not exist; .*pickles are refused"),
+        ("disguised pickle", "does not fit its config.json"),
+        ("another network", "does not fit its config.json"),
+        ("stage", "feature_stage is 9, but the network in .* has stages 0 to"),
+        ("windows", "neither a CNN nor a plain vision transformer"),
+    ],
+)
+def test_bad_weights_are_one_line(broken: str, message: str, tmp_path: Path) -> None:
+    folder, stage = tmp_path / "timm", 2
+    if broken != "missing":
+        write_timm(folder, "swin_s3_tiny_224" if broken == "windows" else "test_efficientnet")
+    match broken:
+        case "pickle":
+            (folder / "model.safetensors").rename(folder / "pytorch_model.bin")
+        case "disguised pickle":
+            torch.save({"a": torch.zeros(1)}, folder / "model.safetensors")
+        case "another network":
+            form = folder / "config.json"
+            form.write_text(form.read_text().replace("test_efficientnet", "test_resnet"))
+        case "stage":
+            stage = 9
+    with pytest.raises(UserError, match=message) as caught:
+        loaded(folder, stage)
+    assert "\n" not in str(caught.value)

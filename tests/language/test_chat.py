@@ -1,0 +1,185 @@
+"""Any tokenizer's own chat format: what is labelled, what ends an answer, and templates that are refused.
+
+The reference is transformers' own: the same format written with its `generation` blocks, whose tokens it marks.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tokenizers import Tokenizer, decoders, models, pre_tokenizers, processors, trainers
+from transformers import AutoTokenizer, PreTrainedTokenizerBase, PreTrainedTokenizerFast
+
+from pipeline.errors import UserError
+from pipeline.language.base import load_tokenizer
+from pipeline.language.chat import IGNORE_INDEX, TACTILE, add_tactile_tokens, encode, end_ids, render
+from pipeline.records import Turn
+from tests.checkpoints import write_llama
+
+VICUNA = (
+    "{% for m in messages %}{% if m.role == 'system' %}{{ m.content }} "
+    "{% elif m.role == 'user' %}USER: {{ m.content }} ASSISTANT:"
+    "{% else %}{% generation %} {{ m.content }}{{ eos_token }}{% endgeneration %}{% endif %}{% endfor %}"
+)
+LLAMA3 = (
+    "{{ bos_token }}{% for m in messages %}<|head|>{{ m.role }}<|/head|>\n\n"
+    "{% if m.role == 'assistant' %}{% generation %}{{ m.content | trim }}<|eot|>{% endgeneration %}"
+    "{% else %}{{ m.content | trim }}<|eot|>{% endif %}{% endfor %}"
+    "{% if add_generation_prompt %}<|head|>assistant<|/head|>\n\n{% endif %}"
+)
+"""As Llama-3 writes it, with shorter names."""
+PSR = (
+    Turn(user=f"Feel {TACTILE} and {TACTILE}. Describe both.", assistant="a) It is soft.\n\nb) It is hard — très dur."),
+    Turn(user="Which is better for a wound?", assistant="The first, since 1 < 2."),
+)
+WORDS = st.text(st.characters(codec="utf-8", exclude_categories=("Cs",), exclude_characters="<>{}"), max_size=40)
+
+
+def plain(template: str) -> str:
+    return template.replace("{% generation %}", "").replace("{% endgeneration %}", "")
+
+
+def sentence_piece() -> PreTrainedTokenizerFast:
+    """As Llama's: spaces are letters, words split before them, unknown letters as bytes, a token begins a text."""
+    tokenizer = Tokenizer(models.BPE(unk_token="<unk>", byte_fallback=True, fuse_unk=True))
+    tokenizer.pre_tokenizer = pre_tokenizers.Metaspace(prepend_scheme="first")
+    tokenizer.decoder = decoders.Sequence([decoders.Replace("▁", " "), decoders.ByteFallback(), decoders.Fuse()])
+    special = ["<unk>", "<s>", "</s>"]
+    letters = [f"<0x{byte:02X}>" for byte in range(256)]
+    trainer = trainers.BpeTrainer(vocab_size=420, special_tokens=special + letters, show_progress=False)
+    tokenizer.train_from_iterator([f"USER: {t.user} ASSISTANT: {t.assistant}" for t in PSR], trainer)
+    tokenizer.post_processor = processors.TemplateProcessing(single="<s> $A", special_tokens=[("<s>", 1)])
+    return PreTrainedTokenizerFast(
+        tokenizer_object=tokenizer, bos_token="<s>", eos_token="</s>", unk_token="<unk>", pad_token="<unk>"
+    )
+
+
+@pytest.fixture(scope="module", params=["smollm2", "bytes", "sentence pieces", "sentence pieces, own template"])
+def spoken(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[object, str]:
+    """A tokenizer, and its format with `generation` blocks."""
+    if request.param == "smollm2":
+        tokenizer = AutoTokenizer.from_pretrained(request.getfixturevalue("smollm2_folder"))
+        said = "message['content'] + '<|im_end|>' + '\n'"
+        assert said in tokenizer.chat_template
+        template = tokenizer.chat_template.replace(
+            "+ '\n' + " + said,
+            "+ '\n' }}{% if message['role'] == 'assistant' %}{% generation %}{{ message['content'] + '<|im_end|>' }}"
+            "{% endgeneration %}{% else %}{{ message['content'] + '<|im_end|>' }}{% endif %}{{ '\n'",
+        )
+    elif request.param == "bytes":
+        tokenizer = AutoTokenizer.from_pretrained(write_llama(tmp_path_factory.mktemp("llama")))
+        template = VICUNA
+    else:
+        tokenizer, template = sentence_piece(), VICUNA
+        if request.param.endswith("template"):
+            template = LLAMA3
+            tokenizer.chat_template = plain(template)
+            tokenizer.add_special_tokens({"additional_special_tokens": ["<|head|>", "<|/head|>", "<|eot|>"]})
+    add_tactile_tokens(tokenizer)
+    return tokenizer, template
+
+
+def reference(
+    turns: tuple[Turn, ...], tokenizer: PreTrainedTokenizerBase, template: str, system: str, frames: int
+) -> tuple[list[int], list[int]]:
+    """Token ids and labels by transformers alone."""
+    video = "<tact_start>" + frames * "<tact_frame>" + "<tact_end>"
+    messages = [{"role": "system", "content": system}] if system else []
+    for turn in turns:
+        messages += [
+            {"role": "user", "content": turn.user.replace(TACTILE, video)},
+            {"role": "assistant", "content": turn.assistant},
+        ]
+    found = tokenizer.apply_chat_template(
+        messages, chat_template=template, return_assistant_tokens_mask=True, return_dict=True
+    )
+    ids = found["input_ids"]
+    labels = [i if own else IGNORE_INDEX for i, own in zip(ids, found["assistant_masks"], strict=True)]
+    if tokenizer.chat_template is None:
+        # Without a template, the tokenizer itself begins the text.
+        return [tokenizer.bos_token_id, *ids], [IGNORE_INDEX, *labels]
+    return ids, labels
+
+
+@pytest.mark.parametrize("system", ["", "Be kind."])
+@pytest.mark.parametrize("turns", [PSR, PSR[:1]])
+def test_tokens_and_labels_are_those_that_transformers_marks(
+    spoken: tuple[PreTrainedTokenizerBase, str], turns: tuple[Turn, ...], system: str
+) -> None:
+    tokenizer, template = spoken
+    encoded = encode(render(turns, tokenizer, system_prompt=system, frames=5, complete=True), tokenizer)
+    ids, labels = reference(turns, tokenizer, template, system, frames=5)
+    assert list(encoded.input_ids) == ids
+    assert list(encoded.labels) == labels
+    runs = "".join("x" if label != IGNORE_INDEX else " " for label in encoded.labels).split()
+    assert len(runs) == len(turns), "each answer is one piece"
+    last = [y for y, after in zip(labels, [*labels[1:], IGNORE_INDEX], strict=True) if y >= 0 > after]
+    assert set(last) <= set(end_ids(tokenizer)), "the model must learn to stop"
+
+
+@given(talk=st.lists(st.tuples(WORDS, WORDS), min_size=1, max_size=3))
+def test_any_text_is_asked_as_it_was_trained(
+    spoken: tuple[PreTrainedTokenizerBase, str], talk: list[tuple[str, str]]
+) -> None:
+    """Labels are those of transformers, one end token an answer, and prompts begin the conversation."""
+    tokenizer, template = spoken
+    turns = tuple(Turn(user=u, assistant=f"It is {a}") for u, a in talk)
+    encoded = encode(render(turns, tokenizer, system_prompt="", frames=1, complete=True), tokenizer)
+    assert (list(encoded.input_ids), list(encoded.labels)) == reference(turns, tokenizer, template, "", frames=1)
+    for number in range(1, len(turns) + 1):
+        asked = encode(render(turns[:number], tokenizer, system_prompt="", frames=1, complete=False), tokenizer)
+        assert encoded.input_ids[: len(asked.input_ids)] == asked.input_ids
+        assert encoded.labels[len(asked.input_ids)] != IGNORE_INDEX
+        assert sum(label in end_ids(tokenizer) for label in asked.labels) == number - 1
+    assert sum(label in end_ids(tokenizer) for label in encoded.labels) == len(turns)
+
+
+def test_smollm2_is_asked_in_chatml_with_its_own_system_message_or_ours(smollm2_folder: Path) -> None:
+    tokenizer = load_tokenizer(smollm2_folder)
+    assert end_ids(tokenizer) == (tokenizer.convert_tokens_to_ids("<|im_end|>"),)
+    own = render(PSR[:1], tokenizer, system_prompt="", frames=1, complete=False).text
+    assert own.startswith("<|im_start|>system\nYou are a helpful AI assistant named SmolLM")
+    assert own.endswith("Describe both.<|im_end|>\n<|im_start|>assistant\n")
+    ours = render(PSR[:1], tokenizer, system_prompt="Feel.", frames=1, complete=False).text
+    assert ours.startswith("<|im_start|>system\nFeel.<|im_end|>\n<|im_start|>user\nFeel <tact_start><tact_frame>")
+
+
+def test_both_end_tokens_end_an_answer() -> None:
+    """As in Llama-3, whose text ends with another token than its turns."""
+    tokenizer = sentence_piece()
+    assert end_ids(tokenizer) == (2,)
+    tokenizer.add_special_tokens({"additional_special_tokens": ["<|head|>", "<|/head|>", "<|eot|>"]})
+    tokenizer.chat_template = plain(LLAMA3)
+    assert end_ids(tokenizer) == (2, tokenizer.convert_tokens_to_ids("<|eot|>"))
+
+
+REFUSED = {
+    "{{ messages | length }}{% for m in messages %}{{ m.content }}</s>{% endfor %}": "writes a prompt otherwise once",
+    "{% for m in messages %}{{ m.content }}\n{% endfor %}": "ends an answer with none of </s>; the model could not",
+    "{{ raise_exception('no\nsystem') }}": r"fails \(no system\); .*empty language.system_prompt",
+    "{% if %}": r"fails \(.*\); ",
+}
+
+
+@pytest.mark.parametrize("template", REFUSED)
+def test_a_template_that_cannot_be_trained_on_is_one_line(template: str, tmp_path: Path) -> None:
+    folder = write_llama(tmp_path)
+    (folder / "chat_template.jinja").write_text(template)
+    with pytest.raises(UserError, match=rf"^language.weights: the chat template in .* {REFUSED[template]}") as caught:
+        load_tokenizer(folder)
+    assert "\n" not in str(caught.value)
+
+
+def test_nothing_that_a_folder_brings_is_run(tmp_path: Path) -> None:
+    """A tokenizer may name code of its own: it stays where it is."""
+    folder = write_llama(tmp_path)
+    ran = tmp_path / "ran"
+    (folder / "own.py").write_text(f"open({str(ran)!r}, 'w')\n")
+    file = folder / "tokenizer_config.json"
+    text = file.read_text().rstrip().rstrip("}")
+    file.write_text(text + ', "auto_map": {"AutoTokenizer": [null, "own.Own"]}}')
+    load_tokenizer(folder)
+    assert not ran.exists()

@@ -1,0 +1,168 @@
+"""Greedy decoding against transformers' own, row for row; the loss after a shared beginning against all at once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch.nn import functional as F
+from transformers import MistralConfig, MistralForCausalLM
+
+from pipeline.config import LanguageConfig, LoraTrainConfig
+from pipeline.language import decoding
+from pipeline.language.chat import IGNORE_INDEX
+from pipeline.language.decoding import greedy
+from pipeline.language.octopi import OctopiForCausalLM
+from pipeline.language.training import add_lora
+from tests.checkpoints import write_llama
+from tests.language.shared import DIM
+
+MANY = (5, 9, 13, 40, 41)
+"""Tokens that end an answer: so many that rows end at different places."""
+
+
+def asked(model: OctopiForCausalLM, shared: int) -> tuple[list[list[int]], list[torch.Tensor]]:
+    """Prompts of 3 to 30 tokens behind so many that are alike, every other one with frames."""
+    draw = torch.Generator().manual_seed(shared)
+    begun = torch.randint(4, 250, (shared,), generator=draw).tolist()
+    prompts, features = [], []
+    for number in range(9):
+        ids = torch.randint(4, 250, (3 + (7 * number) % 28,), generator=draw).tolist()
+        frames = 2 * (number % 2)
+        video = [model.start_id, *[model.frame_id] * frames, model.end_id] if frames else []
+        prompts.append([*begun, *video, *ids])
+        features.append(torch.randn(frames, DIM, generator=draw))
+    return prompts, features
+
+
+def by_transformers(
+    model: OctopiForCausalLM, ids: list[int], features: torch.Tensor, ends: tuple[int, ...], limit: int
+) -> list[int]:
+    """One row alone, without padding, by `generate` and its own cache."""
+    prompt = torch.tensor([ids])
+    new = model.llm.generate(
+        inputs_embeds=model.embed(prompt, features[None]),
+        attention_mask=torch.ones_like(prompt),
+        max_new_tokens=limit,
+        do_sample=False,
+        eos_token_id=list(ends),
+        pad_token_id=0,
+    )
+    return [int(token) for token in new[0]]
+
+
+@pytest.fixture(scope="module", params=["llama", "window"])
+def steady(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> OctopiForCausalLM:
+    """A Llama, and a model whose layers see the last eight tokens alone."""
+    folder = write_llama(tmp_path_factory.mktemp("llama"), seed=4)
+    if request.param == "window":
+        torch.manual_seed(2)
+        shapes = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 4}
+        MistralForCausalLM(
+            MistralConfig(vocab_size=260, num_key_value_heads=2, sliding_window=8, **shapes)
+        ).save_pretrained(folder)
+    torch.manual_seed(1)
+    return OctopiForCausalLM.from_base(folder, DIM).eval()
+
+
+@pytest.mark.parametrize("shared", [0, 1, 25])
+@pytest.mark.parametrize("read", [1, 60, 1024])
+def test_each_row_is_decoded_as_it_is_alone(
+    steady: OctopiForCausalLM, shared: int, read: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In one part, in several, in as many as rows; each to its own limit or end."""
+    monkeypatch.setattr(decoding, "READ", read)
+    prompts, features = asked(steady, shared)
+    limits = [1 + (5 * number) % 17 for number in range(len(prompts))]
+    found = greedy(steady, prompts, features, MANY, limits)
+    with torch.inference_mode():
+        expected = [
+            by_transformers(steady, p, f, MANY, limit) for p, f, limit in zip(prompts, features, limits, strict=True)
+        ]
+    assert found == expected
+    assert len({len(row) for row in found}) > 3, "rows end at different places"
+
+
+def test_equal_prompts_and_a_prompt_that_begins_another(steady: OctopiForCausalLM) -> None:
+    """What is shared is never the whole of a prompt."""
+    ids = [7, 8, 9, 10]
+    prompts, none = [ids, ids, [*ids, 11], ids[:1]], [torch.zeros(0, DIM)] * 4
+    alone = [greedy(steady, [p], none[:1], (), [6])[0] for p in prompts]
+    assert greedy(steady, prompts, none, (), [6] * 4) == alone
+    assert greedy(steady, prompts[:3], none[:3], (), [6] * 3) == alone[:3]
+
+
+@pytest.mark.parametrize("adapted", [False, True])
+@pytest.mark.parametrize("kind", ["shared", "one row", "nothing shared", "no frames"])
+def test_loss_and_gradients_are_those_of_all_at_once(language: LanguageConfig, adapted: bool, kind: str) -> None:
+    torch.manual_seed(3)
+    model = OctopiForCausalLM.from_base(language.weights, DIM).eval()
+    if adapted:
+        add_lora(model, LoraTrainConfig(samples=1, rank=4, alpha=8, dropout=0.0, target_modules="all-linear"))
+        for name, parameter in model.named_parameters():
+            if "lora_B" in name:
+                torch.nn.init.normal_(parameter, std=0.1)
+    model.double()
+    ids = torch.randint(4, 250, (3, 24))
+    ids[:, :10] = ids[0, :10]
+    if kind == "nothing shared":
+        ids[1, 0] += 1
+    if kind == "one row":
+        ids = ids[:1]
+    features = torch.randn(len(ids), 2, DIM, dtype=torch.float64)
+    if kind != "no frames":
+        ids[:, 12:16] = torch.tensor([model.start_id, model.frame_id, model.frame_id, model.end_id])
+    labels = ids.clone()
+    labels[:, :17] = IGNORE_INDEX
+    trained = [p for p in model.parameters() if p.requires_grad]
+
+    def gradients(loss: torch.Tensor) -> list[torch.Tensor]:
+        found = torch.autograd.grad(loss, trained, allow_unused=True)
+        return [torch.zeros_like(p) if g is None else g for p, g in zip(trained, found, strict=True)]
+
+    loss = model(ids, features, labels=labels).loss
+    logits = model(ids, features).logits
+    expected = F.cross_entropy(logits[:, :-1].flatten(0, 1), labels[:, 1:].flatten())
+    torch.testing.assert_close(loss, expected, atol=1e-6, rtol=0)
+    if kind == "no frames" and not adapted:
+        assert not loss.requires_grad or max(float(g.abs().max()) for g in gradients(loss)) == 0
+        return
+    for found, whole in zip(gradients(loss), gradients(expected), strict=True):
+        # transformers' normalisation computes in float32 whatever it is given.
+        torch.testing.assert_close(found, whole, atol=1e-6, rtol=1e-5)
+
+
+def test_what_all_rows_begin_with_is_read_for_one(language: LanguageConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the places that the model's layers are given, in training and in answering."""
+    model = OctopiForCausalLM.from_base(language.weights, DIM).eval()
+    places: list[int] = []
+    model.llm.model.layers[0].mlp.register_forward_pre_hook(lambda _, given: places.append(given[0][..., 0].numel()))
+    ids = torch.randint(4, 250, (4, 30), generator=torch.Generator().manual_seed(0))
+    ids[:, :20] = ids[0, :20]
+    ids[:, 20:23] = torch.tensor([model.start_id, model.frame_id, model.end_id])
+    labels = ids.clone()
+    labels[:, :25] = IGNORE_INDEX
+    model(ids, torch.randn(4, 1, DIM), labels=labels)
+    assert sum(places) <= 20 + 4 * (30 - 20 + 1)
+    places.clear()
+    greedy(model, ids.tolist(), list(torch.randn(4, 1, DIM)), (), [1] * 4)
+    assert sum(places) == 20 + 4 * 10
+    places.clear()
+    greedy(model, ids.tolist(), list(torch.randn(4, 1, DIM)), (), [1, 1, 1, 9])
+    assert sum(places) == 20 + 4 * 10 + 8, "who has ended is computed no further"
+
+
+def test_gradient_checkpointing_still_gives_the_loss(tmp_path: Path) -> None:
+    model = OctopiForCausalLM.from_base(write_llama(tmp_path), DIM).train()
+    ids = torch.arange(4, 24).repeat(2, 1)
+    ids[:, 10:13] = torch.tensor([model.start_id, model.frame_id, model.end_id])
+    labels = ids.clone()
+    labels[:, :14] = IGNORE_INDEX
+    features = torch.ones(2, 1, DIM)
+    plain = model(ids, features, labels=labels).loss
+    model.llm.gradient_checkpointing_enable(gradient_checkpointing_kwargs={"use_reentrant": False})
+    saving = model(ids, features, labels=labels).loss
+    saving.backward()
+    torch.testing.assert_close(saving, plain, atol=1e-6, rtol=0)
+    assert model.connector.delimiters.grad is not None

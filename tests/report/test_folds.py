@@ -1,0 +1,150 @@
+"""Reports over folds: what is pooled, and what is said of missing folds, spoilt test objects and a taught base."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from pathlib import Path
+from statistics import fmean
+from types import SimpleNamespace
+
+import pandas as pd
+import pytest
+
+from pipeline.evaluation.described import described_rows
+from pipeline.evaluation.scores import effect_rows, score_rows
+from pipeline.io import read_table
+from pipeline.records import Assignment, Described, Graded, Part
+from pipeline.report.build import write_report
+from pipeline.report.load import load_report
+from pipeline.report.provenance import settings_note, taught_from, taught_words
+from pipeline.report.readme import render_readme
+from pipeline.videos.catalogue import Catalogue, load_catalogue
+from tests.closure import ROOT
+from tests.fake_run import fake_params, write_run
+from tests.report.conftest import score
+from tests.report.test_readme import report
+
+CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")
+
+
+def run(root: Path, seeds: str) -> Path:
+    """The folder of a report over these seeds of three folds."""
+    params = write_run(root, fake_params("split.name=kfold", "split.folds=3", f"ablation.seeds={seeds}"))
+    write_report(params, root)
+    return root / "reports" / params.report_name
+
+
+def rows(report_folder: Path, **named: str) -> list[dict[str, float]]:
+    frame = pd.read_csv(report_folder / "scores.csv", dtype={"seed": str})
+    for column, value in named.items():
+        frame = frame[frame[column] == value]
+    return frame.to_dict("records")
+
+
+def test_two_replicates_of_three_folds_test_each_object_twice(tmp_path: Path) -> None:
+    """An accuracy is the mean over all six models' answers; a replicate's that over its three."""
+    folder = run(tmp_path, "[0,1,2,3,4,5]")
+    graded = read_table(tmp_path / "data" / "graded.parquet", Graded)
+    full = [g for g in graded if g.variant.full and g.touch == "real" and (g.task, g.measure) == ("PC", "choice")]
+    assert {(g.trained, g.seed) for g in full} == {(s, s // 3) for s in range(6)}
+    for seed, kept in (("0", {0, 1, 2}), ("1", {3, 4, 5}), ("all", set(range(6)))):
+        mine = [g for g in full if g.trained in kept]
+        (row,) = rows(folder, task="PC", encoder="finetuned", lora="with", opd="all", touch="real", seed=seed)
+        assert row["n"] == len({g.question_id for g in mine})
+        assert row["accuracy"] == pytest.approx(fmean(g.correct for g in mine), abs=1e-6)
+    splits = [read_table(tmp_path / "data" / "splits" / f"{seed}.parquet", Assignment) for seed in range(3)]
+    tested = [a.video_id for assignments in splits for a in assignments if a.part is Part.TEST]
+    assert len(tested) == len(set(tested)) == len(splits[0])
+    (heads,) = rows(folder, task="heads", measure="combined", seed="0")
+    assert heads["n"] == len(tested)
+    confusion = pd.read_csv(folder / "confusion.csv")
+    assert (confusion.groupby(["seed", "property"]).size() == len(tested)).all()
+    said = load_report(folder).provenance
+    assert (said["replicates"], said["folds"]) == (2, {"of": 3, "tested": [0, 1, 2]})
+    assert len(said["test_objects"]) * 2 == said["test_videos"] == len(tested)
+    text = (folder / "README.md").read_text()
+    assert "each of them in one of 3 folds that were not trained on, 2 times." in text
+    assert "3 of 3 folds (0, 1, 2) are in, each object of theirs was tested 2 times" in text
+
+
+def test_effects_are_paired_within_a_fold(tmp_path: Path) -> None:
+    """The reference: the mean difference of two systems, question by question, whatever fold a question is of."""
+    run(tmp_path, "[0,1,2]")
+    graded = read_table(tmp_path / "data" / "graded.parquet", Graded)
+    right: dict[str, dict[str, bool]] = defaultdict(dict)
+    for g in graded:
+        if (g.task, g.measure, g.lora, g.opd, g.touch) == ("PC", "choice", "with", "all", "real"):
+            right[g.encoder][g.question_id] = g.correct
+    (row,) = [e for e in effect_rows(graded, CATALOGUE) if (e.part, e.task) == ("encoder", "PC")]
+    assert right["finetuned"].keys() == right["base"].keys()
+    assert (row.n, row.seeds) == (len(right["base"]), 1)
+    expected = fmean(right["finetuned"].values()) - fmean(right["base"].values())
+    assert row.difference == pytest.approx(expected, abs=1e-6)
+
+
+def test_one_fold_of_three_is_reported_as_one(tmp_path: Path) -> None:
+    folder = run(tmp_path, "[1]")
+    text = (folder / "README.md").read_text()
+    assert "1 of 3 folds (1) are in" in text
+    assert "2 of 3 folds are still to be run" in text
+    graded = read_table(tmp_path / "data" / "graded.parquet", Graded)
+    assert {(g.seed, g.trained) for g in graded} == {(0, 1)}
+    counts = pd.read_csv(folder / "dataset.csv").query("table == 'property_counts'")
+    assert (counts["train"] + counts["validation"] + counts["test"] == counts["with_videos"]).all()
+
+
+def test_without_folds_seeds_are_replicates(written: Path) -> None:
+    graded = read_table(written.parents[1] / "data" / "graded.parquet", Graded)
+    assert all(g.seed == g.trained for g in graded)
+    assert load_report(written).provenance["folds"] is None
+    assert "folds" not in (written / "README.md").read_text().split("## What the figures stand on")[0]
+
+
+@pytest.mark.parametrize("name", ["small-videos", "small-scenes", "paper-7b-videos"])
+def test_spoilt_test_objects_are_no_headline(name: str) -> None:
+    note = settings_note(name, "development")
+    assert "looked at four times while recipes changed" in note
+    spoilt = render_readme(report([score()], split="development", settings=note), ["tasks.png", "effects.png"])
+    head, _, rest = spoilt.partition("## On test objects that were looked at")
+    assert "| Task" not in head
+    assert "![What encoder" not in head
+    assert note in rest.split("| Task")[0]
+    kfold = render_readme(report([score()], split="kfold", settings=settings_note(name, "kfold")), ["tasks.png"])
+    assert "looked at four times" not in kfold
+    assert "| Task" in kfold.split("## What the figures stand on")[0]
+
+
+def test_described_objects_stand_in_a_table_with_wilsons_interval() -> None:
+    """The interval against its closed form (Wilson 1927)."""
+    rows = described_rows([Described(model="untaught", task="PSS", n=50, right=20, unread=5)], CATALOGUE)
+    z, p, n = 1.959964, 0.4, 50
+    middle, half = p + z**2 / (2 * n), z * (p * (1 - p) / n + z**2 / (4 * n**2)) ** 0.5
+    assert rows[0].low == pytest.approx((middle - half) / (1 + z**2 / n), abs=1e-6)
+    assert rows[0].high == pytest.approx((middle + half) / (1 + z**2 / n), abs=1e-6)
+    assert rows[0].chance == pytest.approx(score_rows_chance(CATALOGUE), abs=1e-6)
+    unknown = described_rows([Described(model="taught", task="WEIGHT", n=2, right=2, unread=0)], CATALOGUE)
+    assert unknown[0].chance is None
+    text = render_readme(report([score(), *(row.model_dump() for row in (*rows, *unknown))]), [])
+    table = text.partition("## Reasoning about described objects")[2].splitlines()
+    assert "| PSS | untaught | 40.0 [27.6, 53.8] | 50 | 33.3 | 10.0 |" in table
+    assert any(line.startswith("| WEIGHT | taught | 100.0 [") for line in table)
+
+
+def score_rows_chance(catalogue: Catalogue) -> float:
+    """Chance as the chain's own PSS has it."""
+    answer = {"measure": "choice", "parsed": True, "truncated": False, "expected": "a", "predicted": "a"}
+    answer |= {"encoder": "base", "lora": "with", "opd": "all", "seed": 0, "trained": 0, "touch": "real"}
+    one = Graded(question_id="x", task="PSS", correct=True, objects=("a", "b", "c"), **answer)
+    return float(score_rows([one], catalogue)[0].chance or 0)
+
+
+def test_a_taught_base_is_said_in_every_report() -> None:
+    params = SimpleNamespace(teach=SimpleNamespace(base="weights/some-base"))
+    assert taught_from(params) == "weights/some-base"
+    assert taught_from(SimpleNamespace()) == ""
+    assert taught_words(SimpleNamespace(teach=SimpleNamespace(base=""))) == {}
+    text = render_readme(report([score()], taught_from="weights/some-base", language=taught_words(params)), [])
+    assert "**The base was taught:** before it met touch, `weights/some-base` learnt from text alone" in text
+    assert "A 2.2 M-parameter Llama, taught here in text alone to reason about described objects" in text
+    assert "near-null" not in text
+    assert "The base was taught" not in render_readme(report([score()]), [])

