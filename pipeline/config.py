@@ -132,6 +132,9 @@ class QuestionsConfig(Section):
     train: QuestionCounts
     """By the task's name in lower case; a task without a number gets none. With kfold these are for each fold."""
     evaluation: QuestionCounts
+    scenarios: Literal["published", "ours"] = "published"
+    """Scenario questions (PSR): whose right and wrong objects. `published`: the published code's. `ours`: this
+    project's reading of the situations, with clearer contrasts. A catalogue's own scenarios are asked in any case."""
     facts: bool = False
     """Begin matching questions with what the named objects are like, for a language model that has never heard of
     them: then touch and reasoning are asked for and no knowledge of the world. Tables say so."""
@@ -151,6 +154,10 @@ class EncoderConfig(Section):
     timm's (config.json and model.safetensors). The chain makes what is named below data/weights/."""
     feature_stage: Annotated[int, Field(ge=0, le=200)] = 3
     """`timm`: which of the network's stages (a transformer: blocks) is read, from 0 on; what follows is not used."""
+    embedding: Literal["projected", "class_token"] = "projected"
+    """`paper`: what is read of CLIP, for the heads and the language model (ViT-L/14: 768 or 1024 values). `projected`:
+    CLIP's own embedding. `class_token`: the normalised class token before CLIP's projection. `release` reads the
+    class token in any case: normalised for the heads, and before that for the language model."""
     prompts: Annotated[int, Field(ge=1, le=256)] = 8
     """Learnable prompts at each layer."""
     prompt_layers: Annotated[int, Field(ge=0)] = 0

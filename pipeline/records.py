@@ -251,6 +251,8 @@ class Score(Record):
     objects: tuple[str, ...]
     tokens: int = Field(default=0, ge=0)
     """Tokens generated for the answer, over all turns; 0 where no language model answered."""
+    strict: bool | None = None
+    """Whether the published code's own comparison of texts calls it right; None where that code has none."""
 
 
 class Graded(Score):

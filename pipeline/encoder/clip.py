@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import nn
@@ -39,10 +40,14 @@ class VisualTower:
     """Whether an embedding comes from the mean over patches, and not from the class token."""
 
 
-def load_visual_tower(folder: Path) -> VisualTower:
+def load_visual_tower(folder: Path, embedding: Literal["projected", "class_token"] = "projected") -> VisualTower:
     """Load the visual tower in float32, frozen and in evaluation mode; the text tower is dropped.
 
     `weights.check_encoder` has seen that the files are there and are no pickles.
+
+    Args:
+        folder: In open_clip's format.
+        embedding: As `EncoderConfig.embedding`; a class token has the transformer's width.
 
     Raises:
         UserError: for a checkpoint that does not fit its configuration, or a
@@ -63,6 +68,8 @@ def load_visual_tower(folder: Path) -> VisualTower:
     if not isinstance(visual, open_clip.transformer.VisionTransformer) or not visual.transformer.batch_first:
         raise UserError(f"encoder.weights: {folder} is no vision transformer; visual prompts need one such as ViT-L/14")
     visual.requires_grad_(False).eval()
+    if embedding == "class_token":
+        visual.proj = None
     preprocess = visual.preprocess_cfg
     size = preprocess["size"]
     image = ImageFormat(

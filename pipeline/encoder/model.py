@@ -214,7 +214,7 @@ def mean_and_deviation(maps: torch.Tensor) -> torch.Tensor:
 
 def load_backbone(config: EncoderConfig, *, tuned: bool) -> TactileEncoder:
     """The backbone `clip`: open_clip's ViT in `encoder.weights`; fine-tuning changes prompts of its own."""
-    tower = load_visual_tower(Path(config.weights))
+    tower = load_visual_tower(Path(config.weights), config.embedding)
     return TactileEncoder(tower, visual_prompts(config, tower, shared=True) if tuned else None)
 
 

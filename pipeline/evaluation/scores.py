@@ -59,6 +59,8 @@ class ScoreRow(Record):
     high: Optional = None
     chance: Optional
     """None of described objects, where the task is not registered."""
+    strict: Optional = None
+    """Accuracy by the published code's comparison of texts; None where that code has none, or nobody wrote a text."""
 
 
 class EffectRow(Record):
@@ -111,6 +113,7 @@ class Answer(NamedTuple):
     correct: bool
     objects: Objects
     parsed: bool = True
+    strict: bool | None = None
 
 
 Runs = Mapping[int, Mapping[str, Answer]]
@@ -239,6 +242,7 @@ def _rows(runs: Runs, **named: object) -> list[ScoreRow]:
 def _row(questions: Sequence[Sequence[Answer]], **named: object) -> ScoreRow:
     """One accuracy from the answers to each question, one a seed."""
     right = [fmean(a.correct for a in answers) for answers in questions]
+    compared = [a.strict for answers in questions for a in answers]
     interval = accuracy_interval(np.array(right), [answers[0].objects for answers in questions])
     return ScoreRow.model_validate(
         {
@@ -249,6 +253,7 @@ def _row(questions: Sequence[Sequence[Answer]], **named: object) -> ScoreRow:
             "accuracy": fmean(right),
             "low": interval and interval.low,
             "high": interval and interval.high,
+            "strict": None if None in compared else fmean(map(bool, compared)),
         }
     )
 
@@ -260,7 +265,7 @@ def grouped(graded: Iterable[Graded]) -> Table:
     )
     for g in graded:
         setting = Setting(g.encoder, g.lora, g.opd, g.touch)
-        found[g.task, g.measure][setting][g.seed][g.question_id] = Answer(g.correct, g.objects, g.parsed)
+        found[g.task, g.measure][setting][g.seed][g.question_id] = Answer(g.correct, g.objects, g.parsed, g.strict)
     return found
 
 

@@ -14,17 +14,19 @@ from pipeline.errors import UserError
 
 KEYS = ("task", "measure", "encoder", "lora", "opd")
 """What a published cell and a measured row share; "" stands for "does not apply"."""
-SCORE_COLUMNS = (*KEYS, "touch", "seed", "n", "right", "unread", "accuracy", "low", "high", "chance")
+SCORE_COLUMNS = (*KEYS, "touch", "seed", "n", "right", "unread", "accuracy", "low", "high", "chance", "strict")
+LATER = frozenset({"strict"})
+"""Columns that older reports lack: empty there."""
 EFFECT_COLUMNS = (
     *("part", "change", "task", "measure", "difference", "low", "high", "p", "p_holm", "smallest_effect"),
     *("n", "objects", "seeds"),
 )
-TEXT = frozenset((*KEYS, "touch", "seed", "part", "change", "model"))
+TEXT = frozenset((*KEYS, "touch", "seed", "part", "change", "model", "dataset"))
 ALL_SEEDS = "all"
 HEADS, VALIDATION_HEADS, CROSS_VALIDATION, DESCRIBED = "heads", "heads_validation", "cross_validation", "described"
 """As in `pipeline.evaluation.scores`, which takes seconds to import; a test holds them equal."""
 DATASET = "PhysiCLeAR"
-"""The data set of the paper's figures, as properties.yaml names it: beside another's they would mislead."""
+"""The data set of most of the paper's figures, as properties.yaml names it: beside another's they would mislead."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,7 @@ def read_frame(file: Path, columns: tuple[str, ...]) -> pd.DataFrame:
     if not file.is_file():
         return pd.DataFrame({name: pd.Series(dtype=object if name in TEXT else float) for name in columns})
     frame = pd.read_csv(file, dtype=dict.fromkeys(TEXT, str))
+    frame[[name for name in columns if name in LATER and name not in frame]] = float("nan")
     missing = [name for name in columns if name not in frame]
     if missing:
         raise UserError(f"{file}: lacks {', '.join(missing)}; `dvc repro report` writes it anew")
@@ -85,16 +88,16 @@ def read_frame(file: Path, columns: tuple[str, ...]) -> pd.DataFrame:
 
 @cache
 def _published() -> pd.DataFrame:
-    return read_frame(Path(__file__).with_name("published.csv"), (*KEYS, "model", "value", "n"))
+    return read_frame(Path(__file__).with_name("published.csv"), (*KEYS, "model", "value", "n", "dataset"))
 
 
 def published(dataset: str = DATASET) -> pd.DataFrame:
-    """The paper's figures: `KEYS`, model, value and n; no row where `dataset` is not the paper's.
+    """The paper's figures about a data set: `KEYS`, model, value, n; no row where it has none about that one.
 
     `value` is as printed: percent, a count, frames or an ICC. `model` is 7b, 13b, CLIP (the heads, without a language
     model) or `chance`. The paper gives no numbers of questions: n are the ones that its percentages fit.
     """
-    return _published() if dataset == DATASET else _published().iloc[:0]
+    return _published()[_published()["dataset"] == dataset].drop(columns="dataset")
 
 
 def cells(published: pd.DataFrame) -> dict[tuple[str, ...], tuple[float, float]]:

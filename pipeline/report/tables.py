@@ -125,6 +125,7 @@ COLUMNS: dict[str, tuple[str, Cell]] = {
     "encoder": ("Encoder", lambda row: str(ENCODERS.get(row["encoder"], row["encoder"]))),
     **{name: (title, _text(name)) for name, title in (("lora", "LoRA"), ("opd", "OPD"), ("touch", "Touch"))},
     "measured": ("Measured % [95 %]", measured),
+    "strict": ("As published %", lambda row: number(row["strict"], scale=100)),
     "chance": ("Chance %", lambda row: number(row["chance"], scale=100)),
     "unread": ("Unread %", lambda row: number(row["unread"] / row["n"], scale=100)),
     **{name: (name.capitalize(), _text(name)) for name in ("part", "change")},
@@ -281,6 +282,13 @@ TABLES: tuple[Table, ...] = (
         "Every combination of encoder, LoRA and OPD that was trained.",
         lambda f: answers(f) & whole(f),
         ("task", "encoder", "lora", "opd", "measured", "n", "chance", "unread", "published"),
+    ),
+    Table(
+        "strict",
+        "How answers are read",
+        "Measured: by rules. As published: the right text must stand there. Scenarios were graded by hand.",
+        lambda f: answers(f) & _differs(f, "encoder", "lora", "opd") & f["strict"].notna(),
+        ("task", "measure", "system", "measured", "strict", "n"),
     ),
     Table(
         "heads",

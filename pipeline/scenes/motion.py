@@ -72,14 +72,19 @@ def draw_length(rng: np.random.Generator) -> tuple[int, float]:
     return RECORDED[int(rng.random() < SLOW_SHARE)]
 
 
-def make_motion(frames: int, rng: np.random.Generator) -> Motion:
-    """A hand's motion over a video of two frames or more, at any frame rate: times are shares of the video."""
+def make_motion(frames: int, rng: np.random.Generator, *, twist: bool = True) -> Motion:
+    """A hand's motion over a video of two frames or more, at any frame rate: times are shares of the video.
+
+    Without a twist the hand presses as before, but turns nothing and holds the force until it lets go.
+    """
     # Even a video of two frames has one in its very middle, while the object is held.
     time = np.arange(frames) / (2 * (frames // 2))
     rise, fall = _draw(RISE, rng) / (_ramp_inverse(0.9) - _ramp_inverse(0.1)), _draw(FALL, rng)
     touch = max(0.05, _draw(TOUCHED, rng) - _ramp_inverse(0.1) * rise)
     hold = min(touch + rise, 0.49)
     kept = _draw(KEPT, rng)
+    if not twist:
+        kept = 1.0
     # From .45 to .12 of the peak, and .3 of it, as shares of what was kept until then.
     fall /= _ramp_inverse(1 - 0.12 / kept) - _ramp_inverse(1 - 0.45 / kept)
     release = max(0.5, _draw(RELEASED, rng) - _ramp_inverse(1 - 0.3 / kept) * fall)
@@ -94,9 +99,9 @@ def make_motion(frames: int, rng: np.random.Generator) -> Motion:
     for (mean, deviation), part in zip(CENTRE_MM, (np.cos(heading), np.sin(heading)), strict=True):
         walk = TREMOR_MM / np.sqrt(frames) * np.cumsum(rng.standard_normal(frames))
         places.append(
-            np.clip(rng.normal(mean, deviation) + travel * part * (twisted - 0.5) + walk, -REACH_MM, REACH_MM)
+            np.clip(rng.normal(mean, deviation) + travel * twist * part * (twisted - 0.5) + walk, -REACH_MM, REACH_MM)
         )
-    return Motion(force * profile, start + turn * twisted, *places)
+    return Motion(force * profile, start + turn * twisted * twist, *places)
 
 
 def _draw(quantiles: Sequence[float], rng: np.random.Generator) -> float:

@@ -55,6 +55,8 @@ class Recipe(BaseModel):
     """Reduced modulus E / (1 - nu^2) in MPa."""
     body: Body = Flat(kind="flat")
     relief: tuple[AnyLayer, ...] = ()
+    twist: bool = True
+    """Whether the hand turns it under pressure, as in the public videos, or only presses."""
 
     @property
     def surface(self) -> Surface:

@@ -39,7 +39,7 @@ def make_scene(recipe: Recipe, config: ScenesConfig, frames: int, seed: int) -> 
     """Draw a patch and a motion, and press; everything random follows from `seed`."""
     rng = np.random.default_rng(seed)
     pitch = IMAGE_MM[0] / config.width
-    motion = make_motion(frames, rng)
+    motion = make_motion(frames, rng, twist=recipe.twist)
     # An odd side has a pixel in the middle, which is what turns.
     side = int(np.hypot(config.width, config.height) + 2 * MARGIN_MM / pitch) | 1
     patch = heights(recipe.surface, side, pitch, rng)

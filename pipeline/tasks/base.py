@@ -143,8 +143,39 @@ def find_level(text: str, prop: Property) -> int | None:
     return list(map(plain, prop.levels)).index(named[0]) if len(named) == 1 else None
 
 
-def choice_score(question: Question, prediction: Prediction, predicted: str | None) -> list[Score]:
-    """The score of a question with one right choice; `predicted` is None where no choice could be read."""
+def chosen_letter(text: str, before: str) -> str | None:
+    """The one letter, a or b, that stands as "x)" behind `before` (a pattern), or None.
+
+    Two different letters there, another one, or "a) or b)", are no choice.
+    """
+    pattern = rf"{before}\s+\(?([a-z])\)(?:,?\s*(?:or|and|/)\s*\(?([a-z])\))?"
+    said = re.findall(pattern, text, flags=re.IGNORECASE)
+    letters = {letter.lower() for pair in said for letter in pair if letter}
+    letter = letters.pop() if len(letters) == 1 else None
+    return letter if letter in ("a", "b") else None
+
+
+def begins_as_published(question: Question, prediction: Prediction) -> bool:
+    """Whether a conclusion begins with the right one letter by letter, as the published code compares them.
+
+    What stands behind the last "Conclusion: " is compared, or the whole answer where there is none. All OPD modes
+    conclude alike, so it does not matter which one was asked.
+    """
+    said, right = (
+        text.split("Conclusion: ")[-1] for text in (prediction.outputs[-1], question.dialogues[0].turns[-1].assistant)
+    )
+    return said.startswith(right)
+
+
+def choice_score(
+    question: Question, prediction: Prediction, predicted: str | None, strict: bool | None = None
+) -> list[Score]:
+    """The score of a question with one right choice.
+
+    Args:
+        predicted: None where no choice could be read.
+        strict: as `Score.strict`.
+    """
     return [
         Score(
             question_id=question.question_id,
@@ -157,5 +188,6 @@ def choice_score(question: Question, prediction: Prediction, predicted: str | No
             predicted=predicted or "",
             objects=question.objects,
             tokens=prediction.tokens,
+            strict=strict,
         )
     ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import random
 import re
+from string import Formatter
 
 from pipeline.records import Opd, Prediction, Question, Score
 from pipeline.tasks.base import Draft, Pool, TaskDefinition, draft_single_turn, find_level
@@ -47,8 +48,9 @@ class ObjectPropertyDescription(TaskDefinition):
         closing = "".join(re.split(rf"\b{OPENING}\b", prediction.outputs[0], flags=re.IGNORECASE)[1:][-1:])
         expected = question.gold.labels[0]
         predicted = [find_level(closing, p) for p in catalogue.properties]
+        strict = as_published(prediction.outputs[0], expected, catalogue)
         scores = [
-            self._score(question, prediction, p.name, p.levels[e], "" if g is None else p.levels[g])
+            self._score(question, prediction, p.name, p.levels[e], "" if g is None else p.levels[g], strict[p.name])
             for p, e, g in zip(catalogue.properties, expected, predicted, strict=True)
         ]
         complete = all(s.parsed for s in scores)
@@ -59,6 +61,7 @@ class ObjectPropertyDescription(TaskDefinition):
                 "combined",
                 ", ".join(s.expected for s in scores),
                 ", ".join(s.predicted for s in scores) if complete else "",
+                strict["combined"],
             )
         )
         return scores
@@ -68,7 +71,9 @@ class ObjectPropertyDescription(TaskDefinition):
         return {**single, "combined": math.prod(single.values())}
 
     @staticmethod
-    def _score(question: Question, prediction: Prediction, measure: str, expected: str, predicted: str) -> Score:
+    def _score(
+        question: Question, prediction: Prediction, measure: str, expected: str, predicted: str, strict: bool
+    ) -> Score:
         return Score(
             question_id=question.question_id,
             task=question.task,
@@ -80,7 +85,30 @@ class ObjectPropertyDescription(TaskDefinition):
             predicted=predicted,
             objects=question.objects,
             tokens=prediction.tokens,
+            strict=strict,
         )
+
+
+def as_published(said: str, labels: tuple[int, ...], catalogue: Catalogue) -> dict[str, bool]:
+    """By property, and `combined`, whether a description is right as the published code compares it.
+
+    That code cuts the closing sentence at its fixed words and compares what stands between them letter by letter; the
+    last class with its full stop, and the whole sentence, may be followed by anything. A sentence that lacks a fixed
+    word is all wrong.
+    """
+    right = catalogue.structured(labels)
+    fields = [(before, name) for before, name, *_ in Formatter().parse(catalogue.language.structured) if name]
+    opening, (ending, last) = fields[0][0], fields[-1]
+    rest, values = said.split(opening)[-1], []
+    for before, _ in fields[1:]:
+        value, cut, rest = rest.partition(before.rstrip())
+        if not cut or opening not in said:
+            return dict.fromkeys((*catalogue.property_names, "combined"), False)
+        values.append(value.strip())
+    levels = {p.name: p.levels[label] for p, label in zip(catalogue.properties, labels, strict=True)}
+    found = {name: value == levels[name] for (_, name), value in zip(fields, values, strict=False)}
+    found[last] = rest.strip().startswith(right.split(ending)[-1])
+    return {**found, "combined": said.split(opening)[-1].startswith(right.split(opening)[-1])}
 
 
 TASK = ObjectPropertyDescription()

@@ -11,6 +11,7 @@ from pipeline.tasks.base import (
     Draft,
     Pool,
     TaskDefinition,
+    begins_as_published,
     choice_score,
     concluded,
     conclusion,
@@ -50,7 +51,7 @@ class PropertyComparison(TaskDefinition):
         verdict = {
             "yes": f"Yes, the first object is {comparative}.",
             "no": f"No, the second object is {comparative}.",
-            "same": f"Both objects have the same {prop.spoken}.",
+            "same": f"Both objects are similar in {prop.spoken}.",
         }[choice]
         prefixes = [f"{o} object:" for o in ORDINALS]
         user = {
@@ -69,7 +70,8 @@ class PropertyComparison(TaskDefinition):
             flags=re.IGNORECASE,
         )
         read = {"yes": "yes", "no": "no", "both": "same"}
-        return choice_score(question, prediction, read[match[1].lower()] if match else None)
+        predicted = read[match[1].lower()] if match else None
+        return choice_score(question, prediction, predicted, begins_as_published(question, prediction))
 
     def chance(self, catalogue: Catalogue) -> dict[str, float]:
         return {"choice": 1 / 3}

@@ -14,6 +14,7 @@ from pipeline.tasks.base import (
     Draft,
     Pool,
     TaskDefinition,
+    begins_as_published,
     choice_score,
     concluded,
     conclusion,
@@ -91,7 +92,8 @@ class PropertyObjectMatching(TaskDefinition):
         pairs = re.findall(rf"\b([abc])\) is ({said})(?!['\w])", text, flags=re.IGNORECASE)
         read = {letter.lower(): [n.lower() for n in names].index(name.lower()) + 1 for letter, name in pairs}
         whole = len(pairs) == 3 and sorted(read) == list(LETTERS) and sorted(read.values()) == [1, 2, 3]
-        return choice_score(question, prediction, "".join(str(read[x]) for x in LETTERS) if whole else None)
+        predicted = "".join(str(read[x]) for x in LETTERS) if whole else None
+        return choice_score(question, prediction, predicted, begins_as_published(question, prediction))
 
     def chance(self, catalogue: Catalogue) -> dict[str, float]:
         return {"choice": 1 / 6}

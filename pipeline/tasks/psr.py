@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-import re
 from collections.abc import Mapping
 
 from pipeline.records import Dialogue, Opd, Prediction, Question, Score, Turn
@@ -13,6 +12,7 @@ from pipeline.tasks.base import (
     Pool,
     TaskDefinition,
     choice_score,
+    chosen_letter,
     descriptions,
     draw_videos,
     gold,
@@ -78,11 +78,7 @@ class PropertyScenarioReasoning(TaskDefinition):
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         """Read from "The most suitable object is x)"; two different letters there, or "x) or y)", are no answer."""
-        pattern = r"most suitable object is\s+\(?([a-z])\)(?:,?\s*(?:or|and|/)\s*\(?([a-z])\))?"
-        said = re.findall(pattern, prediction.outputs[-1], flags=re.IGNORECASE)
-        letters = {letter.lower() for pair in said for letter in pair if letter}
-        predicted = letters.pop() if len(letters) == 1 else None
-        return choice_score(question, prediction, predicted if predicted in {"a", "b"} else None)
+        return choice_score(question, prediction, chosen_letter(prediction.outputs[-1], "most suitable object is"))
 
     def chance(self, catalogue: Catalogue) -> dict[str, float]:
         return {"choice": 1 / 2}

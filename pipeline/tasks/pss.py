@@ -11,6 +11,7 @@ from pipeline.tasks.base import (
     Draft,
     Pool,
     TaskDefinition,
+    begins_as_published,
     choice_score,
     concluded,
     conclusion,
@@ -65,7 +66,8 @@ class PropertySuperlativeSelection(TaskDefinition):
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         """Read from the one letter that the conclusion calls the superlative."""
         letters = set(re.findall(r"\b([abc])\) is the\b", conclusion(prediction.outputs[0]), flags=re.IGNORECASE))
-        return choice_score(question, prediction, letters.pop().lower() if len(letters) == 1 else None)
+        predicted = letters.pop().lower() if len(letters) == 1 else None
+        return choice_score(question, prediction, predicted, begins_as_published(question, prediction))
 
     def chance(self, catalogue: Catalogue) -> dict[str, float]:
         return {"choice": 1 / 3}

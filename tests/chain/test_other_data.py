@@ -61,10 +61,14 @@ def write_catalogue(folder: Path, *, name: str = "stickiness", split: str = "min
     known = load_catalogue(PHYSICLEAR).objects
     with (folder / "objects.csv").open("w", newline="") as stream:
         writer = csv.writer(stream)
-        writer.writerow(["object_id", f"split_{split}", "name", "hardness", "roughness", "bumpiness", name])
+        writer.writerow(
+            ["object_id", f"split_{split}", "name", "hardness", "roughness", "bumpiness", name, "ripeness_thing"]
+        )
         for number, (object_id, part) in enumerate(zip(OBJECTS, PARTS, strict=True)):
             ratings = [" ".join(map(str, r)) for r in known[object_id].ratings]
-            writer.writerow([object_id, part, known[object_id].name, *ratings, f"{number % 4} {number % 4}"])
+            writer.writerow(
+                [object_id, part, known[object_id].name, *ratings, f"{number % 4} {number % 4}", number % 3]
+            )
     return folder
 
 

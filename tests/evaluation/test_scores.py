@@ -134,8 +134,8 @@ def test_one_object_has_an_accuracy_but_no_interval(tmp_path: Path) -> None:
     write_csv(tmp_path / "scores.csv", ScoreRow, rows)
     write_csv(tmp_path / "effects.csv", EffectRow, effects)
     assert (tmp_path / "scores.csv").read_text().splitlines()[:2] == [
-        "task,measure,encoder,lora,opd,touch,seed,n,right,unread,accuracy,low,high,chance",
-        "OPD,combined,finetuned,with,all,real,0,4,3.0,0.0,0.75,,,0.037037",
+        "task,measure,encoder,lora,opd,touch,seed,n,right,unread,accuracy,low,high,chance,strict",
+        "OPD,combined,finetuned,with,all,real,0,4,3.0,0.0,0.75,,,0.037037,",
     ]
     assert read_csv(tmp_path / "scores.csv", ScoreRow) == rows
     assert read_csv(tmp_path / "effects.csv", EffectRow) == effects

@@ -284,4 +284,5 @@ def test_the_committed_reports_are_whole_and_say_what_made_them() -> None:
         assert report.provenance["settings"] in text
         for table in TABLES:
             rows: Any = table.build(report.scores, report.effects, report.published)
-            assert len(rows) or table.key == "described", table.key
+            older = table.key == "strict" and report.scores["strict"].isna().all()
+            assert len(rows) or older or table.key == "described", table.key

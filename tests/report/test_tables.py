@@ -132,14 +132,41 @@ def test_every_variant_is_in_the_table_of_all_once_and_no_table_invents_one(
         assert len(found) == len(set(found))
 
 
-def test_published_keys_are_unique_percentages_of_their_n_and_of_registered_tasks(catalogue: Catalogue) -> None:
-    cells = published()
+def test_read_and_compared_answers_stand_side_by_side() -> None:
+    rows = score("PC", strict=0.25), score("PC", variant="base with all", strict=0.0), score("PSR")
+    shown = build("strict", *rows)
+    assert list(shown["As published %"]) == ["25.0", "0.0"]
+    assert list(shown["Measured % [95 %]"]) == ["50.0 [35.0, 65.0]"] * 2
+    assert build("strict", score("PC"), score("PSR")).empty, "nothing was compared"
+
+
+def test_an_older_report_has_no_strict_scores(tmp_path: Path) -> None:
+    scores_of(score("PC")).drop(columns="strict").to_csv(tmp_path / "scores.csv", index=False)
+    frame = read_frame(tmp_path / "scores.csv", load.SCORE_COLUMNS)
+    assert frame["strict"].isna().all()
+    assert len(BY_KEY["understanding"].build(frame, NO_EFFECTS, published())) == 1
+    assert BY_KEY["strict"].build(frame, NO_EFFECTS, published()).empty
+
+
+def test_each_data_set_has_the_papers_figures_about_it() -> None:
+    (shown,) = build("reasoning", score("RIPE"), dataset="avocados").to_dict("records")
+    assert shown["Published 13b % (n)"] == "63.00 (100)"
+    (described,) = build("description", score("OPD", "combined"), dataset="avocados").to_dict("records")
+    assert described["Published 13b % (n)"] == "35.50 (200)"
+    assert not any("Published" in name for name in build("reasoning", score("RIPE")))
+
+
+@pytest.mark.parametrize("dataset", [load.DATASET, "avocados"])
+def test_published_keys_are_unique_percentages_of_their_n_and_of_registered_tasks(
+    catalogue: Catalogue, dataset: str
+) -> None:
+    cells = published(dataset)
     assert not cells.duplicated([*KEYS, "model"]).any()
     answered = cells[cells["model"].isin(["7b", "13b", "CLIP"])]
     whole = answered["value"] * answered["n"] / 100
     # Two printed digits of a percentage leave so much of a question open.
     assert ((whole - whole.round()).abs() <= 0.005 * answered["n"] / 100 + 1e-9).all()
-    assert set(answered["task"]) == {*TASKS, "heads"}
+    assert set(answered["task"]) == ({*TASKS, "heads"} - {"RIPE"} if dataset == load.DATASET else {"OPD", "RIPE"})
     for row in cells[cells["model"] == "chance"].to_dict("records"):
         assert row["value"] == pytest.approx(100 * TASKS[row["task"]].chance(catalogue)[row["measure"]], abs=0.005)
     assert published("Other").empty

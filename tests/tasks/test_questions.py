@@ -15,7 +15,7 @@ from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.split import assign
 from tests.conftest import ROOT, fake_videos
 
-CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")
+CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear").asking("published")
 VIDEOS = fake_videos(sorted(CATALOGUE.objects), 5)
 ASSIGNMENTS = assign(CATALOGUE, VIDEOS, SplitConfig(name="paper")).assignments
 COUNTS = {"OPD": 40, "PC": 36, "PSS": 36, "POM": 36, "PSR": 12}

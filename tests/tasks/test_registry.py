@@ -18,7 +18,7 @@ from pipeline.tasks.questions import build_questions, counts_by_task
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from tests.conftest import ROOT
 
-CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")
+CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear").asking("published")
 POOL = Pool(Part.TEST, CATALOGUE, {o: [f"{o}_0"] for o in CATALOGUE.objects})
 
 
@@ -61,15 +61,16 @@ def test_the_papers_tasks_are_registered_in_its_order() -> None:
         "PSS": "Property Superlative Selection",
         "POM": "Property-object Matching",
         "PSR": "Property Scenario Reasoning",
+        "RIPE": "Ripeness Classification",
     }
-    assert [name for name, task in TASKS.items() if not task.trained] == ["PSR"]
+    assert [name for name, task in TASKS.items() if not task.trained] == ["PSR", "RIPE"]
     assert all(task.measure in task.chance(CATALOGUE) for task in TASKS.values())
 
 
 def test_a_registered_task_is_counted_built_stored_and_graded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(TASKS, "HARD", Hardest())
     counts = counts_by_task(config({}, {"hard": 6, "pc": 2}), "evaluation")
-    assert counts == {"OPD": 0, "PC": 2, "PSS": 0, "POM": 0, "PSR": 0, "HARD": 6}
+    assert counts == {"OPD": 0, "PC": 2, "PSS": 0, "POM": 0, "PSR": 0, "RIPE": 0, "HARD": 6}
     built = build_questions(POOL, counts, seed=0, distinct=True, facts=True)
     write_jsonl(tmp_path / "q.jsonl", built)
     questions = [q for q in read_jsonl(tmp_path / "q.jsonl", Question) if q.task == "HARD"]
@@ -93,7 +94,7 @@ def test_another_task_changes_no_question_of_the_others(monkeypatch: pytest.Monk
 @pytest.mark.parametrize(
     ("train", "message"),
     [
-        ({"pcc": 3}, "questions.train.pcc is not a task; did you mean pc. allowed here: opd, pc, pss, pom, psr"),
+        ({"pcc": 3}, "questions.train.pcc is not a task; did you mean pc. allowed here: opd, pc, pss, pom, psr, ripe"),
         ({"zzz": 3}, "questions.train.zzz is not a task; allowed here: opd"),
         ({"psr": 3}, "questions.train.psr must be 0: PSR is for evaluation only"),
     ],

@@ -18,7 +18,7 @@ from pipeline.tasks.base import Pool, conclusion, find_level
 from pipeline.videos.catalogue import load_catalogue
 from tests.conftest import ROOT
 
-CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")
+CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear").asking("published")
 POOL = Pool(Part.TRAIN, CATALOGUE, {o: [f"{o}_{i}" for i in range(3)] for o in CATALOGUE.objects})
 HARDNESS = CATALOGUE.properties[0]
 EACH = 2
@@ -143,7 +143,7 @@ def test_levels_are_read_whole(level: int | None, texts: list[str]) -> None:
 @every_task
 def test_an_answer_cut_off_before_its_end_is_never_right(task: str) -> None:
     """Cut before the sentence that holds the answer: wrong in every mode, whatever the descriptions said."""
-    markers = {"OPD": "Overall", "PSR": "The most suitable"}
+    markers = {"OPD": "Overall", "PSR": "The most suitable", "RIPE": "The riper"}
     for question in QUESTIONS[task][:: 1 + len(QUESTIONS[task]) // 40]:
         for opd, outputs in answers(question):
             marker = markers.get(task, "Conclusion:" if opd != Opd.NONE else "")
@@ -153,7 +153,7 @@ def test_an_answer_cut_off_before_its_end_is_never_right(task: str) -> None:
                 assert not any(s.correct or s.parsed for s in scores), outputs[-1][:stop]
 
 
-@pytest.mark.parametrize("task", ["PC", "PSS", "POM", "PSR"])
+@pytest.mark.parametrize("task", ["PC", "PSS", "POM", "PSR", "RIPE"])
 def test_the_answer_to_another_question_is_wrong(task: str) -> None:
     by_choice = {question.gold.choice: question for question in QUESTIONS[task]}
     for question in QUESTIONS[task]:
@@ -172,6 +172,7 @@ UNREADABLE = {
         *("", "a", "The hardest.", "a), b) or c)", "d) is the hardest.", "a) is the hardest. b) is the hardest."),
         "ba) is the",
     ],
+    "RIPE": ["", "a)", "The riper avocado is a) or b).", "The riper avocado is c).", "The riper kiwi is a)."],
     "PSR": [
         *(
             f"The most suitable object is {x}"
@@ -185,7 +186,7 @@ UNREADABLE = {
 @pytest.mark.parametrize("task", UNREADABLE)
 def test_nothing_is_read_from(task: str) -> None:
     for output in UNREADABLE[task]:
-        scores = grade(QUESTIONS[task][0], *(["descriptions"] if task == "PSR" else []), output)
+        scores = grade(QUESTIONS[task][0], *(["descriptions"] if task in ("PSR", "RIPE") else []), output)
         assert not any(s.parsed or s.correct or s.predicted for s in scores), output
 
 
@@ -258,7 +259,7 @@ def test_no_text_crashes_a_grader(task: str, number: int, text: str) -> None:
 
 
 def test_chance_is_that_of_a_uniform_guess() -> None:
-    expected = {"PC": 1 / 3, "PSS": 1 / 3, "POM": 1 / 6, "PSR": 1 / 2}
+    expected = {"PC": 1 / 3, "PSS": 1 / 3, "POM": 1 / 6, "PSR": 1 / 2, "RIPE": 1 / 2}
     assert {task: TASKS[task].chance(CATALOGUE) for task in expected} == {t: {"choice": v} for t, v in expected.items()}
     described = TASKS["OPD"].chance(CATALOGUE)
     assert described["combined"] == pytest.approx(1 / 27)

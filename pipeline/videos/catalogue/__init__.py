@@ -42,6 +42,8 @@ class Object(Entry):
     ratings: tuple[tuple[int, ...], ...]
     stated: tuple[int | None, ...] = ()
     """The final labels that the publishers state; None where they state none. `labels` never depends on them."""
+    ripeness: dict[str, float] = {}  # noqa: RUF012
+    """Its rank among the fruits of its kind, by the kind: a larger one is riper. Empty for what does not ripen."""
     description: str = ""
     """In the publishers' words; empty where there is none."""
 
@@ -71,6 +73,11 @@ class Catalogue(Entry):
     def split_names(self) -> tuple[str, ...]:
         """The splits that objects.csv has columns for, in the columns' order."""
         return tuple(next(iter(self.objects.values())).splits)
+
+    def asking(self, source: str) -> Catalogue:
+        """The catalogue with only those scenarios that are from `source` (`Scenario.source`) or from none."""
+        kept = tuple(s for s in self.language.scenarios if s.source in ("", source))
+        return self.model_copy(update={"language": self.language.model_copy(update={"scenarios": kept})})
 
     def labels(self, object_id: str) -> tuple[int, ...]:
         """The class of each property of one object."""
@@ -199,8 +206,14 @@ def _read_object(row: Row, language: Language, splits: dict[str, str], where: st
         if value not in set(Part):
             raise UserError(f"{where}: {column} is {value!r}; allowed: {', '.join(Part)}")
         parts[name] = Part(value)
+    ripeness = {}
+    for column, value in row.items():
+        if column.startswith("ripeness_") and value:
+            if not re.fullmatch(r"[0-9]+(\.[0-9]+)?", value):
+                raise UserError(f"{where}: {column} is {value!r}; write a number, larger for riper, or nothing")
+            ripeness[column.removeprefix("ripeness_").replace("_", " ")] = float(value)
     fields = {key: row.get(key, "") for key in ("object_id", "name", "material", "part_of", "part")}
-    return Object(**fields, splits=parts, ratings=tuple(ratings), stated=tuple(stated))
+    return Object(**fields, splits=parts, ratings=tuple(ratings), stated=tuple(stated), ripeness=ripeness)
 
 
 def _classes(text: str, most: int) -> tuple[int, ...]:

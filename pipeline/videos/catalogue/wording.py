@@ -14,7 +14,7 @@ OPENING = "Overall"
 """How the structured description begins: the grader reads an answer from its last such word on."""
 TAKEN = ("object_id", "name", "material", "part_of", "part", "combined", "choice", "loss")
 """Columns of objects.csv and measures of the report; no property may bear one of these names."""
-PREFIXES = ("label_", "split_")
+PREFIXES = ("label_", "split_", "ripeness_")
 
 Phrase = Annotated[str, Field(pattern=r"\w")]
 
@@ -101,6 +101,8 @@ class Scenario(Entry):
 
     name: str
     question: str
+    source: str = ""
+    """Whose reading of the situation the classes are; `questions.scenarios` chooses among them. Empty: always asked."""
     object: str | None = None
     target: dict[str, tuple[int, ...]] = Field(min_length=1)
     other: dict[str, tuple[int, ...]] = Field(min_length=1)

@@ -1,0 +1,123 @@
+"""Ripeness Classification: which of two fruits is the riper one? Evaluation only, after a talk about ripeness.
+
+Property prediction of the same fruits needs no task of its own: it is OPD, asked about their videos (docs/avocado.md).
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+
+from pipeline.records import Dialogue, Opd, Prediction, Question, Score, Turn
+from pipeline.tasks.base import (
+    LETTERS,
+    Draft,
+    Pool,
+    TaskDefinition,
+    choice_score,
+    chosen_letter,
+    descriptions,
+    draw_videos,
+    gold,
+    lettered,
+)
+from pipeline.videos.catalogue import Catalogue
+
+NUMBERS = {1: "one", 2: "two", 3: "three", 4: "four"}
+
+
+class Ripeness(TaskDefinition):
+    """First the model is asked which properties tell ripeness; its own answer stands before the pair, as in the paper.
+
+    Fruits are what a column `ripeness_<fruit>` of objects.csv ranks; a pair has two ranks.
+    """
+
+    name = "RIPE"
+    title = "Ripeness Classification"
+    trained = False
+
+    def strata(self, catalogue: Catalogue) -> int:
+        return 2 * len(_fruits(catalogue))
+
+    def draft(self, pool: Pool, stratum: int, rng: random.Random) -> Draft | None:
+        catalogue, fruits = pool.catalogue, _fruits(pool.catalogue)
+        position, fruit = stratum % 2, fruits[stratum // 2 % len(fruits)]
+        ranks = {
+            o: catalogue.objects[o].ripeness[fruit] for o in pool.objects if fruit in catalogue.objects[o].ripeness
+        }
+        if len(set(ranks.values())) < 2:
+            return None
+        objects = rng.sample(sorted(ranks), 2)
+        if ranks[objects[0]] == ranks[objects[1]]:
+            return None
+        objects.sort(key=ranks.__getitem__, reverse=position == 0)
+        names = _telling(catalogue, fruit)
+        prefixes = [f"{letter})" for letter in LETTERS[:2]]
+        spoken = _spoken(catalogue, names)
+        verdict = f"The riper {fruit} is {LETTERS[position]}), because of its {' and '.join(spoken)}."
+        talk = Turn(user=_question(catalogue, fruit), assistant=f"First to last: {', '.join(spoken)}.")
+        ask = f"Each shows one {fruit}. Which {fruit} is riper? Use the format 'The riper {fruit} is x), because xxx'."
+        first = {
+            Opd.NEEDED: Turn(
+                user=f"Describe the {' and '.join(spoken)} of these two tactile videos: {lettered(2)}.",
+                assistant=descriptions(catalogue, objects, prefixes, names),
+            ),
+            Opd.ALL: Turn(
+                user=f"Describe these two tactile videos: {lettered(2)}.",
+                assistant=descriptions(catalogue, objects, prefixes),
+            ),
+        }
+        bare = Turn(user=f"Given two tactile videos: {lettered(2)}. {ask}", assistant=verdict)
+        return Draft(
+            videos=draw_videos(pool, objects, rng),
+            objects=tuple(objects),
+            dialogues=(
+                Dialogue(opd=Opd.NONE, turns=(talk, bare)),
+                *(
+                    Dialogue(opd=mode, turns=(talk, turn, Turn(user=ask, assistant=verdict)))
+                    for mode, turn in first.items()
+                ),
+            ),
+            gold=gold(pool, objects, LETTERS[position], names),
+        )
+
+    def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
+        """Read from "The riper FRUIT is x)"; two different letters there are no answer."""
+        fruits = "|".join(_fruits(catalogue))
+        return choice_score(question, prediction, chosen_letter(prediction.outputs[-1], rf"riper (?:{fruits}|one) is"))
+
+    def chance(self, catalogue: Catalogue) -> dict[str, float]:
+        return {"choice": 1 / 2}
+
+
+def _fruits(catalogue: Catalogue) -> list[str]:
+    return sorted({fruit for o in catalogue.objects.values() for fruit in o.ripeness})
+
+
+def _telling(catalogue: Catalogue, fruit: str) -> list[str]:
+    """The properties whose classes differ between ripe and unripe ones; all, where none does."""
+    ranked = [o.labels for o in catalogue.objects.values() if fruit in o.ripeness]
+    return [p.name for i, p in enumerate(catalogue.properties) if len({labels[i] for labels in ranked}) > 1] or list(
+        catalogue.property_names
+    )
+
+
+def _spoken(catalogue: Catalogue, names: Sequence[str]) -> list[str]:
+    return [p.spoken for p in catalogue.properties if p.name in names]
+
+
+def _question(catalogue: Catalogue, fruit: str) -> str:
+    """The paper's question (section "Avocado Ripeness Classification"), about this catalogue's properties."""
+    count = NUMBERS.get(len(catalogue.properties), str(len(catalogue.properties)))
+    told = " ".join(
+        f"{p.spoken.capitalize()} categories in increasing {p.spoken}: {', '.join(p.levels)}."
+        for p in catalogue.properties
+    )
+    return (
+        f"You will be given tactile descriptions that consist of {count} physical properties: "
+        f"{', '.join(_spoken(catalogue, catalogue.property_names))}. {told} "
+        f"Which of these properties help to determine {fruit} ripeness? Rank them."
+    )
+
+
+TASK = Ripeness()

@@ -1,0 +1,151 @@
+"""Ripeness: pairs of unequal ranks, after the paper's question; the example catalogue and its videos."""
+
+from __future__ import annotations
+
+import csv
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.errors import UserError
+from pipeline.records import Opd, Part, Prediction, Question
+from pipeline.scenes.measure import check_recipe
+from pipeline.scenes.motion import make_motion
+from pipeline.scenes.recipe import load_recipes
+from pipeline.tasks import TASKS
+from pipeline.tasks.base import Pool
+from pipeline.tasks.questions import build_questions
+from pipeline.videos.catalogue import Catalogue, load_catalogue
+from tests.conftest import ROOT
+from tests.scenes.test_measure import look
+
+EXAMPLE, PHYSICLEAR = ROOT / "examples" / "avocado", ROOT / "pipeline" / "physiclear"
+CATALOGUE = load_catalogue(EXAMPLE)
+TESTED = [o for o, entry in CATALOGUE.objects.items() if entry.splits["avocado"] == Part.TEST]
+TALK = (
+    "You will be given tactile descriptions that consist of three physical properties: hardness, roughness, bumpiness. "
+    "Hardness categories in increasing hardness: soft, moderately hard, hard. Roughness categories in increasing "
+    "roughness: smooth, slightly rough, rough. Bumpiness categories in increasing bumpiness: no bumps, small bumps, "
+    "big bumps. Which of these properties help to determine avocado ripeness? Rank them."
+)
+"""As the paper prints it, but for its misprint "slightly smooth"."""
+
+
+def asked(catalogue: Catalogue, objects: list[str], count: int = 100) -> list[Question]:
+    pool = Pool(Part.TEST, catalogue, {o: [f"{o}_{i}" for i in range(20)] for o in objects})
+    return build_questions(pool, {"RIPE": count}, seed=0, distinct=True)
+
+
+def read(question: Question, *outputs: str) -> tuple[bool, bool]:
+    said = Prediction(question_id=question.question_id, task="RIPE", outputs=outputs, truncated=False, tokens=1)
+    (score,) = TASKS["RIPE"].grade(question, said, CATALOGUE)
+    return score.parsed, score.correct
+
+
+def test_pairs_have_two_ranks_and_the_softer_one_is_riper() -> None:
+    questions = asked(CATALOGUE, TESTED)
+    assert len(questions) == 100
+    assert Counter(q.gold.choice for q in questions) == {"a": 50, "b": 50}
+    for question in questions:
+        riper = question.objects["ab".index(question.gold.choice)]
+        (other,) = set(question.objects) - {riper}
+        assert CATALOGUE.objects[riper].ripeness["avocado"] > CATALOGUE.objects[other].ripeness["avocado"]
+        assert CATALOGUE.labels(riper)[0] < CATALOGUE.labels(other)[0]
+        assert question.gold.properties == ("hardness",), "what differs among these avocados"
+
+
+def test_the_papers_question_stands_before_the_pair() -> None:
+    for question in asked(CATALOGUE, TESTED, 10):
+        for mode, turns in ((Opd.NONE, 2), (Opd.NEEDED, 3), (Opd.ALL, 3)):
+            dialogue = question.dialogue(mode)
+            assert dialogue is not None
+            assert len(dialogue.turns) == turns
+            assert dialogue.turns[0].user == TALK
+            assert [turn.user.count("{tactile}") for turn in dialogue.turns] == [0, 2, 0][:turns]
+
+
+def test_the_public_data_sets_two_avocados_are_a_pair() -> None:
+    physiclear = load_catalogue(PHYSICLEAR)
+    questions = asked(physiclear, ["avocado_unripe", "avocado_kinda_ripe", "rug", "lemon"], 20)
+    assert {frozenset(q.objects) for q in questions} == {frozenset({"avocado_unripe", "avocado_kinda_ripe"})}
+    assert all(q.objects["ab".index(q.gold.choice)] == "avocado_kinda_ripe" for q in questions)
+
+
+@pytest.mark.parametrize("objects", [[], ["rug", "lemon"], ["avocado_1"], ["avocado_1", "avocado_3"]])
+def test_without_two_ranks_nothing_is_asked(objects: list[str]) -> None:
+    assert asked(CATALOGUE, objects) == []
+
+
+@pytest.mark.parametrize(
+    ("said", "letter"),
+    [
+        ("The riper avocado is a), because it is soft.", "a"),
+        ("The Riper Avocado is (B).", "b"),
+        ("b) is hard, so the riper one is a).", "a"),
+        ("The riper avocado is a) and b).", None),
+        ("The riper avocado is a). No: the riper avocado is b).", None),
+        ("The less ripe avocado is a).", None),
+        ("a", None),
+    ],
+)
+def test_what_is_read(said: str, letter: str | None) -> None:
+    for question in asked(CATALOGUE, TESTED, 4):
+        assert read(question, "Hardness.", "descriptions", said) == (letter is not None, letter == question.gold.choice)
+
+
+@pytest.mark.parametrize("value", ["ripe", "-1", "1,5", "nan"])
+def test_a_rank_that_is_no_number_is_one_line(tmp_path: Path, value: str) -> None:
+    (tmp_path / "properties.yaml").write_text((EXAMPLE / "properties.yaml").read_text())
+    (tmp_path / "objects.csv").write_text(
+        f'object_id,name,hardness,roughness,bumpiness,ripeness_kiwi\nkiwi,a kiwi,1,2,1,"{value}"\n'
+    )
+    with pytest.raises(UserError, match=r"objects\.csv, line 2: ripeness_kiwi is .*larger for riper"):
+        load_catalogue(tmp_path)
+
+
+def test_the_example_lists_physiclears_objects_as_they_are() -> None:
+    physiclear = load_catalogue(PHYSICLEAR)
+    for object_id, entry in physiclear.objects.items():
+        mine = CATALOGUE.objects[object_id]
+        assert (mine.name, mine.ratings, mine.material) == (entry.name, entry.ratings, entry.material)
+        assert mine.splits["avocado"] in {entry.splits["paper"], Part.UNUSED}
+    assert sorted(CATALOGUE.objects.keys() - physiclear.objects.keys()) == sorted(TESTED)
+    bare = [p.model_copy(update={"cues": ()}) for p in physiclear.properties]
+    assert list(CATALOGUE.properties) == bare
+    assert (CATALOGUE.language.structured, CATALOGUE.language.unstructured) == (
+        *(physiclear.language.structured, physiclear.language.unstructured),
+    )
+
+
+def test_the_examples_fruits_are_graded_and_only_pressed() -> None:
+    recipes = load_recipes(EXAMPLE, CATALOGUE, 0)
+    moduli = [recipes[o].modulus for o in TESTED]
+    assert len(set(moduli)) == len(TESTED) == 10
+    harder = sorted(TESTED, key=lambda o: recipes[o].modulus)
+    ranks = [CATALOGUE.objects[o].ripeness["avocado"] for o in harder]
+    assert ranks == sorted(ranks, reverse=True), "the softer, the riper"
+    assert all(not recipes[o].twist for o in TESTED)
+    for object_id in TESTED:
+        check_recipe(object_id, look(recipes[object_id], 0), CATALOGUE)
+    assert recipes["rug"].twist
+
+
+def test_a_hand_that_only_presses_turns_nothing() -> None:
+    for seed in range(20):
+        pressed, twisted = (make_motion(50, np.random.default_rng(seed), twist=twist) for twist in (False, True))
+        assert set(pressed.angle) == {twisted.angle[0]}
+        assert len(set(twisted.angle)) > 1
+        # No hand lets go in the first half; until then a twisting one presses less and less.
+        assert (pressed.force[:25] >= twisted.force[:25] - 1e-12).all()
+        assert pressed.force[24] == pressed.force.max() > 0
+
+
+def test_published_figures_stand_beside_avocados_only() -> None:
+    with (ROOT / "pipeline" / "report" / "published.csv").open(newline="") as stream:
+        rows = [r for r in csv.DictReader(stream) if r["dataset"] == CATALOGUE.language.dataset and r["n"]]
+    printed = {(r["task"], r["measure"]): (float(r["value"]), int(r["n"])) for r in rows}
+    assert printed["OPD", "combined"] == (35.5, 200)
+    assert printed["RIPE", "choice"] == (63.0, 100)
+    assert all((value * n / 100) % 1 == 0 for value, n in printed.values())

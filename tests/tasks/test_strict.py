@@ -1,0 +1,99 @@
+"""Strict scores: the published code's comparison of texts, beside the reading by rules."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.records import Opd, Part, Prediction, Question, Score
+from pipeline.tasks import TASKS
+from pipeline.tasks.base import Pool
+from pipeline.tasks.opd import as_published
+from pipeline.tasks.questions import build_questions
+from pipeline.videos.catalogue import load_catalogue
+from tests.conftest import ROOT
+
+CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear").asking("published")
+POOL = Pool(Part.TEST, CATALOGUE, {o: [f"{o}_0"] for o in CATALOGUE.objects})
+ASKED = {task: build_questions(POOL, {task: 12}, seed=0, distinct=True) for task in TASKS}
+LABELS = st.tuples(*(st.integers(0, len(p.levels) - 1) for p in CATALOGUE.properties))
+TAILS = ("", " Conclusion: yes", " The object is hard.", "\n", " USER: and more")
+
+
+def grade(question: Question, *outputs: str) -> dict[str, Score]:
+    said = Prediction(question_id=question.question_id, task=question.task, outputs=outputs, truncated=False, tokens=1)
+    return {s.measure: s for s in TASKS[question.task].grade(question, said, CATALOGUE)}
+
+
+def cut_at_words(said: str, right: str) -> list[bool]:
+    """The published rule once more, by the words "presents", "and" and "with" themselves."""
+
+    def parts(text: str) -> list[str]:
+        hard, rough = text.split("presents")[-1].strip().split("and")[:2]
+        smooth, bumps = rough.strip().split("with")[:2]
+        return [hard.strip(), smooth.strip(), bumps.strip()]
+
+    try:
+        told, wanted = parts(said), parts(right)
+    except ValueError:
+        return [False] * 4
+    whole = said.split("presents")[-1].startswith(right.split("presents")[-1])
+    return [told[0] == wanted[0], told[1] == wanted[1], told[2].startswith(wanted[2]), whole]
+
+
+@given(LABELS, LABELS, st.integers(0, 400), st.sampled_from(TAILS))
+def test_descriptions_are_cut_like_the_published_ones(
+    right: tuple[int, ...], said: tuple[int, ...], stop: int, tail: str
+) -> None:
+    text = ("The surface feels firm. " + CATALOGUE.structured(said))[:stop] + tail
+    assert list(as_published(text, right, CATALOGUE).values()) == cut_at_words(text, CATALOGUE.structured(right))
+
+
+@pytest.mark.parametrize("task", ["OPD", "PC", "PSS", "POM"])
+def test_gold_answers_are_strictly_right_and_so_is_what_follows_them(task: str) -> None:
+    assert ASKED[task]
+    for question in ASKED[task]:
+        for dialogue in question.dialogues:
+            text = dialogue.turns[-1].assistant
+            assert all(s.strict for s in grade(question, text).values())
+            assert all(s.strict for s in grade(question, f"{text} And so on.").values())
+            assert not any(s.strict for s in grade(question, text.upper()).values())
+            assert all(s.correct for s in grade(question, text.upper()).values()), "reading is tolerant"
+
+
+@pytest.mark.parametrize("task", ["PSR", "RIPE"])
+def test_what_was_graded_by_hand_has_no_strict_score(task: str) -> None:
+    for question in ASKED[task]:
+        dialogue = question.dialogue(Opd.ALL)
+        assert dialogue is not None
+        assert grade(question, *(turn.assistant for turn in dialogue.turns))["choice"].strict is None
+
+
+@pytest.mark.parametrize(
+    ("said", "read", "strict"),
+    [
+        ("Conclusion: Yes, the first object is harder.", True, True),
+        ("Conclusion: Yes.", True, False),
+        ("Conclusion: yes, the first object is harder.", True, False),
+        ("Yes, the first object is harder.", True, True),
+        ("conclusion: Yes, the first object is harder.", True, False),
+        ("Conclusion: No. Conclusion: Yes, the first object is harder. No.", True, True),
+        ("Conclusion: No, the second object is harder.", False, False),
+    ],
+)
+def test_a_comparison_is_read_and_compared(said: str, read: bool, strict: bool) -> None:
+    questions = build_questions(POOL, {"PC": 60}, seed=1, distinct=True)
+    verdict = "Yes, the first object is harder."
+    question = next(q for q in questions if q.dialogues[0].turns[-1].assistant == verdict)
+    score = grade(question, said)["choice"]
+    assert (score.correct, score.strict) == (read, strict)
+
+
+def test_a_matching_in_another_order_is_read_but_not_compared() -> None:
+    question = random.Random(0).choice(ASKED["POM"])
+    a, b, c = (CATALOGUE.objects[o].name for o in question.objects)
+    score = grade(question, f"Conclusion: b) is {b}, a) is {a} and c) is {c}.")["choice"]
+    assert (score.correct, score.strict) == (True, False)
