@@ -76,8 +76,8 @@ def told(item: Item) -> dict[str, dict[str, int]]:
     }
     said = " ".join(f"{t.user} {t.assistant}" for t in item.turns)
     found: dict[str, dict[str, int]] = {}
-    mark = r"(?:\b(First|Second|Third|[A-Z][a-z]{4,6}):|\b(The (?:first|second|third))(?: one| thing)? (?=is|has)|\b([abc]\)) "
-    mark += r"|\b([A-Z][a-z]{4,6}) (?=is|has))"
+    mark = r"(?:\b(First|Second|Third|[A-Z][a-z]{4,6}):|\b(The (?:first|second|third))(?: one| thing)? (?=is|has)"
+    mark += r"|\b([abc]\)) |\b([A-Z][a-z]{4,6}) (?=is|has))"
     marks = list(re.finditer(mark, said))
     for here, following in zip(marks, [*marks[1:], None], strict=True):
         part = said[here.end() : following.start() if following else None].split(".")[0]
@@ -95,9 +95,10 @@ def fields(item: Item) -> dict[str, str] | None:
     for template in words().questions[item.kind]:
         pattern = re.escape(template).replace(r"\{", "{").replace(r"\}", "}")
         for name in ("x", "y", "more", "most", "noun", "need"):
+            kind = r"the \w+(?: one| thing)?|[abc]\)|[A-Z]\w+" if name in "xy" else r"[\w ]+?"
             first, *rest = pattern.split(f"{{{name}}}")
             pattern = first + "".join(
-                (f"(?P<{name}>[\\w) ]+?)" if not i else f"(?P={name})") + r for i, r in enumerate(rest)
+                f"{f'(?P={name})' if i else f'(?P<{name}>{kind})'}{r}" for i, r in enumerate(rest)
             )
         match = re.search(rf"(?:^|[.):] ){pattern}(?= |$)", user, flags=re.IGNORECASE)
         if match:
@@ -106,7 +107,7 @@ def fields(item: Item) -> dict[str, str] | None:
 
 
 def plain(name: str) -> str:
-    return re.sub(r"^the | one$| thing$|\.$", "", name.lower())
+    return re.sub(r"^the | one$| thing$", "", name.lower().removesuffix("."))
 
 
 def expected(item: Item) -> str | None:
