@@ -148,6 +148,22 @@ def compare(
     typer.echo(describe(found))
 
 
+@app.command()
+def serve(
+    folder: Annotated[Path, typer.Argument(help="The folder of a trained model.")],
+    host: Annotated[str, typer.Option(help="Address; another than 127.0.0.1 needs a token.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="0 for any that is free.")] = 8000,
+    token_file: Annotated[Path | None, typer.Option(help="File with the token; else OCTOPI_TOKEN is taken.")] = None,
+    base: Annotated[Path | None, typer.Option(help="Folder of the base model, where it is not found.")] = None,
+    device: Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")] = "auto",
+    places: Annotated[int, typer.Option(min=1, help="Requests at once; the next is told to come later.")] = 32,
+) -> None:
+    """Answer questions about touches over HTTP, in the form of OpenAI's chat completions."""
+    from pipeline.use.server import serve
+
+    serve(folder, host, port, token_file=token_file, base=base, device=device, places=places)
+
+
 def main() -> None:
     """Run the command; bad input ends it with one line and status 1."""
     try:
