@@ -10,3 +10,12 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 # A start imports a million objects that all stay. Looking for garbage among them every 700 took a fifth of the start of
 # a training stage (8.7 s against 7.1 s, median of four in turn).
 gc.set_threshold(100_000, 50, 1000)
+
+
+def __getattr__(name: str) -> object:
+    """`from pipeline import Octopi`, which loads torch only where it is asked for."""
+    if name == "Octopi":
+        from pipeline.use.model import Octopi
+
+        return Octopi
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
