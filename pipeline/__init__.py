@@ -1,7 +1,9 @@
 """Teach a language model the sense of touch: the system of Octopi (RSS 2024) as a DVC pipeline."""
 
 import gc
+import importlib
 import os
+from typing import Any
 
 # Read by OpenMP when torch loads. Its default lets waiting threads spin: on a busy machine, answering 57 questions on
 # two threads then took 203 s in place of 9 s.
@@ -12,10 +14,9 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 gc.set_threshold(100_000, 50, 1000)
 
 
-def __getattr__(name: str) -> object:
-    """`from pipeline import Octopi`, which loads torch only where it is asked for."""
+def __getattr__(name: str) -> Any:
+    """`from pipeline import Octopi` loads torch only where it is asked for."""
     if name == "Octopi":
-        from pipeline.use.model import Octopi
-
-        return Octopi
+        # Named, not imported: the stages import this file, and do not depend on how a model is used.
+        return importlib.import_module("pipeline.use.model").Octopi
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

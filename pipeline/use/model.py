@@ -25,7 +25,12 @@ class Octopi:
 
     @classmethod
     def from_pretrained(
-        cls, folder: Path | str, *, base: Path | str | None = None, device: DeviceName = "auto", dtype: DtypeName = "auto"
+        cls,
+        folder: Path | str,
+        *,
+        base: Path | str | None = None,
+        device: DeviceName = "auto",
+        dtype: DtypeName = "auto",
     ) -> Self:
         raise NotImplementedError
 
@@ -49,9 +54,7 @@ class Octopi:
     ) -> Iterator[str]:
         raise NotImplementedError
 
-    def ask_all(
-        self, asked: Sequence[tuple[str, Sequence[Video]]], *, max_new_tokens: int | None = None
-    ) -> list[str]:
+    def ask_all(self, asked: Sequence[tuple[str, Sequence[Video]]], *, max_new_tokens: int | None = None) -> list[str]:
         raise NotImplementedError
 
     def look(self, video: Video) -> Touch:
