@@ -30,6 +30,9 @@ DATA_URI = re.compile(r"data:[\w.+/-]*(?:;[\w.+/=-]+)*;base64,", re.ASCII)
 FORMATS = "mov,mp4,m4a,3gp,3g2,mj2,avi,matroska,webm"
 """Containers that hold their own pictures; a playlist would make FFmpeg read other files."""
 SUFFIX = {b"RIFF": ".avi", b"\x1aE\xdf\xa3": ".mkv"}
+PREFIX = "octopi-"
+PLACE = re.compile(rf"\S*{PREFIX}\w+/video(\d+)\.\w+")
+"""A file of `Gate`, in a message."""
 SPARE_BYTES = 1 << 30
 """Memory that checking a video may take beyond what the interpreter and its libraries have."""
 
@@ -109,7 +112,7 @@ class Gate:
             message = f"{len(videos)} videos; a request may bring at most {self.limits.videos}, earlier turns included"
             raise Refused(message, 413)
         with ExitStack() as stack:
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="octopi-"))) if videos else Path()
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix=PREFIX))) if videos else Path()
             paths = []
             for number, data in enumerate(videos, 1):
                 paths.append(folder / f"video{number}{SUFFIX.get(data[:4], '.mov')}")

@@ -10,19 +10,12 @@ from typing import Annotated, Any, Literal, NamedTuple, Protocol
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from pipeline.use.media import Refused, from_base64
+from pipeline.use.results import Exchange
 
 MARK = "{tactile}"
 MESSAGES, CHARACTERS = 64, 20_000
 """The longest conversation, and the longest text of one part of it."""
 Json = dict[str, Any]
-
-
-class Exchange(NamedTuple):
-    """A question that was answered."""
-
-    question: str
-    videos: tuple[Any, ...]
-    answer: str
 
 
 class Model(Protocol):

@@ -24,7 +24,7 @@ from starlette.requests import ClientDisconnect
 from starlette.types import Message, Receive, Scope, Send
 
 from pipeline.errors import UserError
-from pipeline.use.media import Gate, Limits, Refused
+from pipeline.use.media import PLACE, Gate, Limits, Refused
 from pipeline.use.protocol import Model, Reply, error_body, model_entry, read_conversation, read_request
 from pipeline.use.worker import Failed, Job, Metrics, Worker
 
@@ -195,7 +195,8 @@ def _said(error: Exception) -> tuple[str, int]:
     if isinstance(error, ClientDisconnect):
         return "the client has left", 499
     status = error.status if isinstance(error, Refused) else 422 if isinstance(error, UserError) else 500
-    return " ".join(str(error).split()), status
+    # Videos lie in a folder of ours, whose name is nobody's business.
+    return PLACE.sub(r"video \1", " ".join(str(error).split())), status
 
 
 def make_app(

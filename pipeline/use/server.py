@@ -6,6 +6,7 @@ import asyncio
 import ipaddress
 import os
 import socket
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from fastapi import FastAPI
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from pipeline.errors import UserError
+from pipeline.use.protocol import Model
 
 SHORTEST_TOKEN = 16
 HEADER_SECONDS = 10.0
@@ -82,9 +84,7 @@ def checked(token: str) -> str:
     return token
 
 
-def serve(
-    folder: Path, host: str, port: int, *, token_file: Path | None, base: Path | None, device: str, places: int
-) -> None:
+def serve(load: Callable[[], Model], name: str, host: str, port: int, token_file: Path | None, places: int) -> None:
     """Serve a model until a signal comes; answers in flight are finished then.
 
     Raises:
@@ -95,11 +95,7 @@ def serve(
     token = checked(read_token(token_file))
     # First the address, which is known at once; loading takes its time.
     with listen(host, port, token) as listening:
-        from pipeline import Octopi
-
-        model = Octopi.from_pretrained(folder, base=base, device=device)
-        name = folder.resolve().name
-        app = make_app(model, name, token=token, places=places)
+        app = make_app(load(), name, token=token, places=places)
         address, number = listening.getsockname()[:2]
         place = f"[{address}]" if ":" in address else address
         print(f"{name} answers at http://{place}:{number}/v1; Ctrl-C ends it", flush=True)

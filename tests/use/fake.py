@@ -40,6 +40,8 @@ class FakeOctopi:
         self.tokens.append(max_new_tokens)
         if question.count("{tactile}") != len(videos):
             raise UserError(f"{question.count('{tactile}')} {{tactile}} and {len(videos)} videos; give one each")
+        if question == "blank {tactile}":
+            raise UserError(f"{videos[0]}: 12 frames show no touch; record it again")
         if question == "break":
             raise RuntimeError("a secret of /home/somebody")
         for word in self.words(question, [Path(v).read_bytes() for v in videos], history).split(" "):

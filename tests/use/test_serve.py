@@ -235,6 +235,7 @@ BAD: list[tuple[bytes | dict[str, Any], str]] = [
     (body(user(part(b"no video at all"))), "video 1: no video"),
     (body(user(text("no mark"), part(b"GIF89a" + bytes(50)))), "video 1: no video"),
     (body(user("one {tactile} and no video")), "{tactile}"),
+    (body(user(text("blank"), part(video()))), "video 1: 12 frames show no touch"),
     (body(user(text("{tactile} {tactile}"), part(video()))), "{tactile}"),
 ]
 
