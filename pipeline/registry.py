@@ -1,4 +1,4 @@
-"""Trained models in MLflow: each variant's folder as a model that can be loaded and served, the best one by an alias."""
+"""Trained models in MLflow: each variant's folder as a model to load and serve, the best one by an alias."""
 
 from __future__ import annotations
 

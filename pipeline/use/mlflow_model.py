@@ -21,7 +21,7 @@ ROWS = 64
 """Questions of one call."""
 
 
-class TouchModel(PythonModel):  # type: ignore[misc]
+class TouchModel(PythonModel):
     """Answers a table of questions."""
 
     def load_context(self, context: Any) -> None:

@@ -10,7 +10,6 @@ from typing import Annotated, Any, Literal, NamedTuple, Protocol
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from pipeline.use.media import Refused, from_base64
-from pipeline.use.results import Exchange
 
 MARK = "{tactile}"
 MESSAGES, CHARACTERS = 64, 20_000
@@ -108,12 +107,20 @@ class ChatRequest(BaseModel):
     response_format: dict[Literal["type"], Literal["text"]] | None = None
 
 
+class Earlier(NamedTuple):
+    """An exchange before the question; videos as bytes."""
+
+    question: str
+    videos: tuple[bytes, ...]
+    answer: str
+
+
 class Asked(NamedTuple):
     """A question with its conversation; videos as bytes."""
 
     question: str
     videos: tuple[bytes, ...]
-    history: tuple[Exchange, ...]
+    history: tuple[Earlier, ...]
 
 
 def read_request(body: bytes) -> ChatRequest:
@@ -153,7 +160,7 @@ def read_conversation(messages: Sequence[Message], most: int) -> Asked:
     pairs = zip(said[:-1:2], said[1::2], strict=True)
     if any(videos for _, videos in said[1::2]):
         raise Refused("messages: an assistant's message brings a video; only the user's may")
-    history = tuple(Exchange(text, videos, answer) for (text, videos), (answer, _) in pairs)
+    history = tuple(Earlier(text, videos, answer) for (text, videos), (answer, _) in pairs)
     return Asked(*said[-1], history)
 
 

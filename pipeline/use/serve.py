@@ -26,6 +26,7 @@ from starlette.types import Message, Receive, Scope, Send
 from pipeline.errors import UserError
 from pipeline.use.media import PLACE, Gate, Limits, Refused
 from pipeline.use.protocol import Model, Reply, error_body, model_entry, read_conversation, read_request
+from pipeline.use.results import Exchange
 from pipeline.use.worker import Failed, Job, Metrics, Worker
 
 UPLOAD_SECONDS, DRAIN_SECONDS = 30.0, 5.0
@@ -96,7 +97,7 @@ class Service:
         asked = read_conversation(wanted.messages, self.limits.videos)
         every = [*(video for turn in asked.history for video in turn.videos), *asked.videos]
         files = iter(stack.enter_context(self.gate.files(every)))
-        history = [turn._replace(videos=tuple(next(files) for _ in turn.videos)) for turn in asked.history]
+        history = [Exchange(q, tuple(next(files) for _ in videos), a) for q, videos, a in asked.history]
         videos = tuple(files)
         most = wanted.max_completion_tokens or wanted.max_tokens
         most = min(most, self.most_tokens) if most else None
