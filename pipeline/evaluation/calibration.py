@@ -5,6 +5,8 @@ Guo et al. 2017, "On Calibration of Modern Neural Networks" (arXiv 1706.04599).
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,8 +18,9 @@ from pipeline.runtime import derive_seed
 Floats = npt.NDArray[np.float64]
 
 BINS = 10
-RANGE = (0.1, 20.0)
+RANGE = (0.05, 20.0)
 """Temperatures that are looked at: beyond them probabilities are one-hot, or even, to the eye."""
+PRIOR = 2.0
 SMALLEST = 1e-12
 DRAWS = 1000
 
@@ -42,7 +45,10 @@ def rescale(probabilities: npt.ArrayLike, temperature: float) -> Floats:
 
 
 def fit_temperature(classified: Sequence[Classification]) -> float:
-    """The temperature under which the expected classes are likeliest; 1 where there is nothing to fit it on.
+    """The temperature that makes the expected classes likeliest; 1 where there is nothing to fit it on.
+
+    Videos of one object are alike, so each object counts once, by its videos' mean. Few objects say little: a normal
+    prior holds the temperature's logarithm at 0, with a factor of `PRIOR` as its deviation.
 
     Args:
         classified: Of one property, on videos that nothing was trained on.
@@ -53,13 +59,16 @@ def fit_temperature(classified: Sequence[Classification]) -> float:
         return 1.0
     probabilities = np.array([c.probabilities for c in classified])
     expected = np.array([c.expected for c in classified])
+    objects = Counter(c.object_id for c in classified)
+    weights = np.array([1 / objects[c.object_id] for c in classified])
 
     def loss(log_temperature: float) -> float:
         scaled = rescale(probabilities, float(np.exp(log_temperature)))
-        return -float(np.log(np.maximum(scaled[np.arange(len(expected)), expected], SMALLEST)).mean())
+        missed = -np.log(np.maximum(scaled[np.arange(len(expected)), expected], SMALLEST))
+        return float(weights @ missed) + (log_temperature / math.log(PRIOR)) ** 2 / 2
 
-    found = minimize_scalar(loss, bounds=np.log(RANGE), method="bounded", options={"xatol": 1e-4})
-    return float(np.exp(found.x)) if found.fun < loss(0.0) else 1.0
+    found = minimize_scalar(loss, bounds=np.log(RANGE), method="bounded", options={"xatol": 1e-5})
+    return float(np.exp(found.x))
 
 
 def reliability(classified: Sequence[Classification], temperature: float = 1.0) -> list[Bin]:

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
+from pydantic import BaseModel
+
 from pipeline.card import CARD_FILE, write_card
 from pipeline.config import PRETRAINED, Params
 from pipeline.embeddings import STATISTICS_FILE, EmbeddingStore, Statistics
@@ -204,11 +206,11 @@ def _write_card(
         bases["tactile encoder"] = Path(params.encoder.weights)
     if "scenes" in params.encoder.backbone:
         bases["tactile encoder, pretrained on synthetic scenes"] = PRETRAINED
-    dataset = {"type": "tactile-videos", "name": f"{params.data.source}, split {params.split.name}, test objects"}
+    dataset = f"{params.data.source}, split {params.split.name}, test objects"
     results = [
         {
             "task": {"type": "visual-question-answering", "name": TASKS[s.task].title},
-            "dataset": dataset,
+            "dataset": {"type": "tactile-videos", "name": dataset},
             "metrics": [{"type": "accuracy", "value": s.accuracy, "args": {"low": s.low, "high": s.high, "n": s.n}}],
         }
         for s in scores
@@ -220,9 +222,9 @@ def _write_card(
         data={
             "videos": params.data.source,
             "catalogue": params.data.catalogue,
-            "split": f"{params.split.name}; every score is of objects that were not trained on",
+            "split": f"{params.split.name}; scores are of its test objects, which nothing was trained or chosen on",
         },
-        settings={"frames": config.frames.model_dump(), "encoder": config.encoder.model_dump(), **config.versions},
+        settings={**_flat("frames", config.frames), **_flat("encoder", config.encoder), **config.versions},
         limits=LIMITS,
         front={"library_name": "octopi-pipeline", "model-index": [{"name": config.variant, "results": results}]},
         tables={
@@ -252,6 +254,10 @@ def _write_card(
             ],
         },
     )
+
+
+def _flat(section: str, settings: BaseModel) -> dict[str, object]:
+    return {f"{section}.{name}": value for name, value in settings.model_dump().items()}
 
 
 def _calibrated(name: str, rows: Sequence[Classification], temperature: float) -> dict[str, object]:
