@@ -58,6 +58,7 @@ def log_model(uri: str, run: str, params: Params, variant: Variant, folder: Path
             name=NAME,
             python_model=str(PACKAGE / "use" / "mlflow_model.py"),
             artifacts={"folder": str(folder)},
+            model_config={"base": "", "device": "auto", "dtype": "auto"},
             code_paths=[str(PACKAGE)],
             pip_requirements=requirements(),
             signature=signature,

@@ -6,6 +6,7 @@ a server can read none of its files.
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import mlflow.models
@@ -25,10 +26,15 @@ class TouchModel(PythonModel):
     """Answers a table of questions."""
 
     def load_context(self, context: Any) -> None:
-        """Load the folder that was logged; `model_config` may name `base`, `device` and `dtype`."""
+        """Load the folder that was logged.
+
+        Its language model lies where `model_config["base"]` says, else the variable OCTOPI_BASE, else in a known place.
+        """
         from pipeline.use.model import Octopi
 
-        self.model = Octopi.from_pretrained(context.artifacts["folder"], **(context.model_config or {}))
+        settings = {**(context.model_config or {})}
+        settings["base"] = settings.get("base") or os.environ.get("OCTOPI_BASE") or None
+        self.model = Octopi.from_pretrained(context.artifacts["folder"], **settings)
         self.gate = Gate(Limits())
 
     def predict(self, context: Any, model_input: pd.DataFrame, params: dict[str, Any] | None = None) -> pd.DataFrame:

@@ -254,3 +254,32 @@ def test_stages_are_those_that_dvc_lists(tmp_path: Path, monkeypatch: pytest.Mon
         [*dvc, "stage", "list", "--name-only"], capture_output=True, text=True, check=True, env=os.environ
     )
     assert [s.title for s in read_stages(params)] == [line for line in listed.stdout.split() if line != "publish"]
+
+
+def test_packaged_variants_are_models_and_the_validated_full_system_is_best(chain: FakeChain) -> None:
+    for key in (FULL, BASE):
+        folder = Path("models") / key
+        folder.mkdir(parents=True)
+        (folder / "config.json").write_text(json.dumps({"base": {"folder": "x"}}))
+        (folder / "README.md").write_text("---\nlicense: mit\n---\n# Card\n")
+    publish(chain.params)
+    there, variants = client(), by_name("variant")
+    experiment = there.get_experiment_by_name("octopi").experiment_id
+    models = there.search_logged_models([experiment])
+    assert {m.source_run_id for m in models} == {variants[FULL].info.run_id, variants[BASE].info.run_id}
+    name = f"octopi-{chain.params.report_name}"
+    best = there.get_model_version_by_alias(name, "best")
+    assert best.run_id == variants[FULL].info.run_id
+    assert best.tags == {"variant": FULL}
+    assert seconds(variants[FULL]) == SECONDS
+    assert mlflow.models.get_model_info(f"models:/{name}@best").metadata["license"] == "mit"
+    publish(chain.params)
+    assert len(there.search_logged_models([experiment])) == 2
+    assert len(there.search_model_versions(f"name = '{name}'")) == 1
+    # A model that was packaged anew is a new one.
+    (Path("models") / FULL / "config.json").write_text(json.dumps({"base": {"folder": "y"}}))
+    chain.ran(["grade"], 60)
+    publish(chain.params)
+    assert len(there.search_logged_models([experiment])) == 3
+    assert [m.version for m in there.search_model_versions(f"name = '{name}'")] in (["2", "1"], [2, 1])
+    assert str(there.get_model_version_by_alias(name, "best").version) == "2"
