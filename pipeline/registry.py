@@ -7,6 +7,7 @@ import json
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import yaml
@@ -40,36 +41,41 @@ def requirements() -> list[str]:
     return [f"{name}=={version(name).partition('+')[0]}" for name in NEEDED]
 
 
-def log_model(uri: str, run: str, params: Params, variant: Variant, folder: Path) -> None:
-    """Log a variant's folder as a model of its run, which MLflow ends by that."""
-    import mlflow
-    from mlflow.models import ModelSignature
+def log_model(client: Any, run: str, params: Params, variant: Variant, folder: Path) -> None:
+    """Log a variant's folder as a model of its run.
+
+    By MLflow's client and not by `mlflow.pyfunc.log_model`, which would load the model to try the example: minutes, and
+    memory that a machine with a dashboard need not have, where the weights are billions.
+    """
+    import mlflow.pyfunc
+    from mlflow.entities import LoggedModelOutput
+    from mlflow.models import Model, ModelSignature
     from mlflow.types import ColSpec, Schema
     from mlflow.types.schema import Array, DataType
 
     text = DataType.string
-    signature = ModelSignature(
-        Schema([ColSpec(text, "question"), ColSpec(Array(text), "videos")]), Schema([ColSpec(text, "answer")])
-    )
+    inputs, outputs = [ColSpec(text, "question"), ColSpec(Array(text), "videos")], [ColSpec(text, "answer")]
     card = json.loads((folder / "config.json").read_text(encoding="utf-8"))
-    mlflow.set_tracking_uri(uri)
-    with mlflow.start_run(run_id=run):
-        mlflow.pyfunc.log_model(
-            name=NAME,
+    about = {"variant": variant.key, "scale": params.report_name, "license": _licence(folder)}
+    experiment = client.get_run(run).info.experiment_id
+    made = client.create_logged_model(experiment, NAME, source_run_id=run, tags=about, model_type="pyfunc")
+    with TemporaryDirectory() as temporary:
+        saved = Path(temporary, "model")
+        mlflow.pyfunc.save_model(
+            saved,
+            mlflow_model=Model(made.artifact_location, run_id=run, model_uuid=made.model_id, model_id=made.model_id),
             python_model=str(PACKAGE / "use" / "mlflow_model.py"),
             artifacts={"folder": str(folder)},
             model_config={"base": "", "device": "auto", "dtype": "auto"},
             code_paths=[str(PACKAGE)],
             pip_requirements=requirements(),
-            signature=signature,
+            signature=ModelSignature(Schema(inputs), Schema(outputs)),
             input_example=_example(params),
-            metadata={
-                "variant": variant.key,
-                "scale": params.report_name,
-                "base": card.get("base", {}),
-                "license": _licence(folder),
-            },
+            metadata={**about, "base": card.get("base", {})},
         )
+        client.log_model_artifacts(made.model_id, str(saved))
+    client.finalize_logged_model(made.model_id, "READY")
+    client.log_outputs(run, [LoggedModelOutput(made.model_id, step=0)])
 
 
 def register(client: Any, params: Params, runs: Sequence[tuple[Variant, str]]) -> str:

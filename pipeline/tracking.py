@@ -325,6 +325,7 @@ class _Store:
             PGCONNECT_TIMEOUT=seconds,
             MLFLOW_DISABLE_TELEMETRY="true",
             MLFLOW_LOGGING_LEVEL="ERROR",
+            MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR="false",
             MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT="true",
             # The Trainer's hundred arguments would hide the parameters that a person sets.
             MLFLOW_MAX_LOG_PARAMS="0",
@@ -533,7 +534,7 @@ class _Publication:
                 if path.is_dir():
                     store.client.log_artifacts(run, str(path), place)
             if folder:
-                log_model(store.uri, run, self.params, variant, folder)
+                log_model(store.client, run, self.params, variant, folder)
                 models.append((variant, run))
             store.log(run, tags={CONTENT: content})
             store.client.set_terminated(run, "FINISHED", end)

@@ -43,7 +43,8 @@ def logged(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Any:
         client = MlflowClient(uri)
         experiment = client.create_experiment("octopi", artifact_location=Path("artifacts").resolve().as_posix())
         run = client.create_run(experiment).info.run_id
-        log_model(uri, run, made.params, made.variant, made.folder)
+        log_model(client, run, made.params, made.variant, made.folder)
+        mlflow.set_tracking_uri(uri)
         address = register(client, made.params, [(made.variant, run)])
         yield Logged(client, run, address, str(made.folder.parents[1] / "llama"))
     mlflow.set_tracking_uri(before)

@@ -7,12 +7,14 @@ import re
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 from starlette.testclient import TestClient
 
 from pipeline.use.media import Limits
+from pipeline.use.model import Octopi
 from pipeline.use.serve import make_app
 from tests.use.fake import FakeOctopi, digest
 from tests.use.videos import claims_frames, claims_pixels, uri, video
@@ -121,6 +123,19 @@ def test_openai_s_own_client(client: TestClient) -> None:
     there = openai.OpenAI(base_url="http://testserver/v1", api_key=TOKEN, http_client=client)
     assert there.chat.completions.create(**body(user("hello"))).choices[0].message.content == "hello "
     assert [m.id for m in there.models.list()] == ["octopi"]
+
+
+def test_the_real_model_answers_as_the_library_does(octopi: Octopi, files: list[Path]) -> None:
+    question = "Which is softer, {tactile} or {tactile}?"
+    asked = body(user(text(question), *(part(file.read_bytes()) for file in files[:2])))
+    blank = body(user(text("What is it?"), part(video(1, 2))))
+    with TestClient(make_app(octopi, "octopi"), base_url="http://localhost") as client:
+        whole = client.post(CHAT, json=asked).json()["choices"][0]["message"]["content"]
+        *chunks, _ = events(client.post(CHAT, json={**asked, "stream": True}).text)
+        refused = error(client.post(CHAT, json=blank), 422)
+    assert whole == "".join(c["choices"][0]["delta"].get("content", "") for c in chunks)
+    assert whole.strip() == octopi.ask(question, files[:2]).strip()
+    assert refused.startswith("video 1")
 
 
 @pytest.mark.parametrize(
