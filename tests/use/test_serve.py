@@ -128,7 +128,7 @@ def test_openai_s_own_client(client: TestClient) -> None:
 def test_the_real_model_answers_as_the_library_does(octopi: Octopi, files: list[Path]) -> None:
     question = "Which is softer, {tactile} or {tactile}?"
     asked = body(user(text(question), *(part(file.read_bytes()) for file in files[:2])))
-    blank = body(user(text("What is it?"), part(video(1, 2))))
+    blank = body(user(text("What is it?"), part(video(1, 1))))
     with TestClient(make_app(octopi, "octopi"), base_url="http://localhost") as client:
         whole = client.post(CHAT, json=asked).json()["choices"][0]["message"]["content"]
         *chunks, _ = events(client.post(CHAT, json={**asked, "stream": True}).text)
