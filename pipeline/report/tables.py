@@ -228,7 +228,7 @@ TABLES: tuple[Table, ...] = (
     Table(
         "described",
         "Reasoning about described objects",
-        "The language model untaught, taught, and with the adapter of a full system, asked in plain words about objects "
+        "The language model untaught, taught, and with a full system's adapter, asked in plain words about objects "
         "that are described and not felt; Wilson's intervals over questions.",
         _over_seeds(DESCRIBED),
         ("measure", *SHOWN),
