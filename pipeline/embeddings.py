@@ -5,18 +5,42 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 
 from pipeline.errors import UserError
-from pipeline.io import load_tensors, read_table
+from pipeline.io import load_tensors, read_table, save_tensors
 from pipeline.records import Embedding, Flip
 
 FLIPS: tuple[Flip, ...] = ("none", "horizontal", "vertical", "both")
 TENSOR = "embeddings"
 TENSOR_FILE = "embeddings.safetensors"
 INDEX_FILE = "index.parquet"
+STATISTICS_FILE = "statistics.safetensors"
+
+
+class Statistics(NamedTuple):
+    """What embeddings are standardised by, and of which frames they are."""
+
+    mean: torch.Tensor
+    scale: torch.Tensor
+    """float64, dim each."""
+    frames: str = ""
+    """Fingerprint of the settings that the frames were chosen by: those of others are standardised by others."""
+
+    def save(self, file: Path) -> None:
+        """Write them as safetensors."""
+        save_tensors(file, {"mean": self.mean, "scale": self.scale}, {"frames": self.frames})
+
+    @classmethod
+    def load(cls, file: Path) -> Statistics:
+        """Read what `save` wrote."""
+        from safetensors import safe_open
+
+        tensors = load_tensors(file)
+        with safe_open(file, framework="pt") as stream:
+            return cls(**tensors, **stream.metadata())
 
 
 class TactileFeatures(Protocol):
