@@ -26,9 +26,9 @@ from pipeline.runtime import (
 )
 from pipeline.tasks import opd, pc, pom, psr, pss
 from pipeline.tasks.base import LETTERS
-from pipeline.use.feel import TactileSense
 from pipeline.use.folder import LANGUAGE_DIR, ModelConfig, chat_sample, find_base, read_folder
 from pipeline.use.results import Choice, Comparison, Description, Exchange, Matching, Ranking, Touch, Video
+from pipeline.use.touch import TactileSense
 from pipeline.videos.catalogue import Catalogue, Property
 
 
