@@ -40,7 +40,7 @@ class Statistics(NamedTuple):
 
         tensors = load_tensors(file)
         with safe_open(file, framework="pt") as stream:
-            return cls(**tensors, **stream.metadata())
+            return cls(tensors["mean"], tensors["scale"], stream.metadata()["frames"])
 
 
 class TactileFeatures(Protocol):

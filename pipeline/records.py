@@ -296,17 +296,21 @@ class OutOfFold(Record):
     predicted: tuple[int, ...]
 
 
+GATE = "gate.csv"
+"""File of `Described` rows, beside the language model that they are about."""
+
+
 class Described(Record):
-    """How a base model reasons about objects that are described in words, by task: a row of data/taught/gate.csv."""
+    """How a language model reasons about objects that are described in words, by task: a row of a gate.csv."""
 
     model: str
-    """`untaught`, `taught`, or what else was asked."""
+    """`untaught`, `taught`, or the variant whose adapter was on it."""
     task: str
     """Name of the task in `pipeline.tasks.TASKS` whose questions were asked in plain words."""
     n: int = Field(ge=1)
     right: int = Field(ge=0)
     unread: int = Field(ge=0)
-    """Answers that could not be read, which count as wrong."""
+    """Answers that name no choice, or several; they count as wrong."""
 
 
 class Measurement(Record):
@@ -315,18 +319,6 @@ class Measurement(Record):
     step: int = Field(ge=0)
     name: str
     value: float
-
-
-class GateScore(Record):
-    """How a language model answers one task's questions about objects that are described in words."""
-
-    model: str
-    """`untaught`, `taught`, or another name that a report gives it."""
-    task: str
-    n: int = Field(ge=0)
-    right: int = Field(ge=0)
-    unread: int = Field(ge=0)
-    """Answers that name no choice, or several; they count as wrong."""
 
 
 Flip = Literal["none", "horizontal", "vertical", "both"]

@@ -1,15 +1,18 @@
 """Let one variant answer the evaluation questions; the full system also under every input ablation."""
 
 import sys
+from pathlib import Path
 
 from pipeline.embeddings import EmbeddingStore
-from pipeline.io import read_jsonl, write_jsonl
+from pipeline.io import read_jsonl, write_csv, write_jsonl
 from pipeline.language.generate import GenerationSettings, answer
 from pipeline.language.input_ablation import ablate_input
 from pipeline.language.octopi import OctopiForCausalLM
-from pipeline.records import Encoder, Lora, Opd, Question, Touch, Variant
+from pipeline.language.teach.gate import examine, gate_questions
+from pipeline.records import GATE, Described, Encoder, Lora, Opd, Question, Touch, Variant
 from pipeline.runtime import name_dtype, resolve_device
 from pipeline.stage import DATA, stage
+from pipeline.videos.catalogue import load_catalogue
 
 
 def main() -> None:
@@ -38,6 +41,17 @@ def main() -> None:
             run.metrics[f"{touch}.answers"] = len(predictions)
             run.metrics[f"{touch}.tokens"] = sum(p.tokens for p in predictions)
             run.metrics[f"{touch}.truncated"] = sum(p.truncated for p in predictions)
+        if variant.full and params.teach.base:
+            # What its adapter left of the reasoning that the base was taught.
+            scores = examine(
+                model.llm,
+                model.tokenizer,
+                gate_questions(load_catalogue(Path(params.data.catalogue)), params.teach.gate_questions, params.seed),
+                model=f"with LoRA, seed {variant.seed}",
+                system_prompt=language.system_prompt,
+                batch_size=language.generation_batch_size,
+            )
+            write_csv(DATA / "answers" / variant.key / GATE, Described, scores)
 
 
 if __name__ == "__main__":

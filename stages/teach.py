@@ -4,7 +4,7 @@ from functools import partial
 from pathlib import Path
 
 from pipeline.io import write_csv, write_table
-from pipeline.records import GateScore, Measurement
+from pipeline.records import GATE, Described, Measurement
 from pipeline.stage import DATA, stage
 from pipeline.tracking import live
 
@@ -14,7 +14,7 @@ OUT = DATA / "taught"
 def main() -> None:
     with stage("teach") as run:
         params = run.params
-        scores: list[GateScore] = []
+        scores: list[Described] = []
         if params.teach.base:
             from pipeline.language.teach.gate import examine, gate_questions
             from pipeline.language.teach.training import teach, write_taught
@@ -40,7 +40,7 @@ def main() -> None:
             taught = write_taught(OUT, llm, params.teach, params.language, params.seed, trained.history)
             scores += ask(taught, model="taught")
             run.metrics |= {f"{s.model}_{s.task}": s.right / max(1, s.n) for s in scores}
-        write_csv(OUT / "gate.csv", GateScore, scores)
+        write_csv(OUT / GATE, Described, scores)
 
 
 if __name__ == "__main__":

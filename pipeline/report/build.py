@@ -13,6 +13,7 @@ from pipeline.evaluation.scores import EffectRow, ScoreRow, candidate_rows, effe
 from pipeline.io import read_csv, read_jsonl, read_table, write_csv, write_json, write_text
 from pipeline.params import PARAMS_FILE
 from pipeline.records import (
+    GATE,
     Classification,
     Described,
     Finding,
@@ -74,8 +75,8 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
         for name in params.cross_validation.models
         if (data / "cross_validation" / name / "out_of_fold.parquet").is_file()
     }
-    gate = data / "taught" / "gate.csv"
-    described = described_rows(read_csv(gate, Described) if gate.is_file() else [], catalogue)
+    gates = [data / "taught" / GATE, *(data / "answers" / v.key / GATE for v in params.ablation.variants())]
+    described = described_rows([row for g in gates if g.is_file() for row in read_csv(g, Described)], catalogue)
     scores = score_rows(graded, catalogue, said, out_of_fold) + described
     origin = provenance(params, catalogue, videos, splits, [g.objects for g in graded], root)
     write_csv(folder / "scores.csv", ScoreRow, scores)

@@ -228,7 +228,8 @@ TABLES: tuple[Table, ...] = (
     Table(
         "described",
         "Reasoning about described objects",
-        "The base model untaught and taught, in plain words about made-up objects; Wilson's intervals over questions.",
+        "The language model untaught, taught, and with a full system's adapter, asked in plain words about objects "
+        "that are described and not felt; Wilson's intervals over questions.",
         _over_seeds(DESCRIBED),
         ("measure", *SHOWN),
         folded=False,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import logging
 import math
 import shutil
 import sys
@@ -9,13 +11,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
+from zipfile import BadZipFile, ZipFile
 
 import torch
 from accelerate.utils import save_fsdp_optimizer
 from accelerate.utils.constants import OPTIMIZER_NAME
+from safetensors import SafetensorError, safe_open
 from torch.utils.data import Sampler
 from transformers import PrinterCallback, Trainer, TrainerCallback, TrainerControl, TrainerState, TrainingArguments
-from transformers.trainer import SCHEDULER_NAME
+from transformers.trainer import SCHEDULER_NAME, TRAINER_STATE_NAME, TRAINING_ARGS_NAME
 from transformers.trainer_utils import get_last_checkpoint
 from transformers.utils import SAFE_WEIGHTS_NAME
 
@@ -25,6 +29,8 @@ from pipeline.records import Measurement
 from pipeline.runtime import CHECKPOINTS, LogLines
 from pipeline.training.sampling import EpochDataset
 from pipeline.training.trainable import load_trainable, whole_state
+
+logger = logging.getLogger(__name__)
 
 LOWEST = 0.01
 """Share of the rate at the bottom of a wave."""
@@ -211,7 +217,7 @@ def train(trainer: Trainer) -> Trained:
     """Train to the end, from the last checkpoint where there is one, and tidy up."""
     folder = Path(str(trainer.args.output_dir))
     if trainer.is_world_process_zero():
-        _drop_unfinished(folder)
+        _drop_damaged(folder)
     trainer.accelerator.wait_for_everyone()
     last = get_last_checkpoint(str(folder)) if folder.is_dir() else None
     if last and (Path(last) / f"{OPTIMIZER_NAME}.bin").is_file() != trainer.is_fsdp_enabled:
@@ -233,11 +239,33 @@ def train(trainer: Trainer) -> Trained:
     return Trained(history, state)
 
 
-def _drop_unfinished(folder: Path) -> None:
-    """Remove checkpoints that were being written when their process died: the Trainer writes its state last."""
+def _drop_damaged(folder: Path) -> None:
+    """Remove checkpoints that were being written when their process died, and those that cannot be read whole."""
     for checkpoint in folder.glob("checkpoint-*"):
-        if not (checkpoint / "trainer_state.json").is_file():
+        if not (checkpoint / TRAINER_STATE_NAME).is_file():  # The Trainer writes it last.
             shutil.rmtree(checkpoint)
+        elif (file := _damaged(checkpoint)) is not None:
+            logger.warning("%s is damaged; training goes on from the checkpoint before it, or begins anew", file)
+            shutil.rmtree(checkpoint)
+
+
+def _damaged(checkpoint: Path) -> Path | None:
+    """The first file of a checkpoint that cannot be read, or whose checksum is wrong; None where all can."""
+    for file in sorted(checkpoint.iterdir()):
+        try:
+            if file.suffix == ".json":
+                json.loads(file.read_text(encoding="utf-8"))
+            elif file.suffix == ".safetensors":
+                with safe_open(file, "pt"):
+                    pass
+            elif file.suffix in (".pt", ".pth", ".bin") and file.name != TRAINING_ARGS_NAME:
+                # torch's own format is a zip file, whose parts have checksums.
+                with ZipFile(file) as parts:
+                    if parts.testzip() is not None:
+                        return file
+        except (ValueError, BadZipFile, SafetensorError, EOFError, OSError):
+            return file
+    return None
 
 
 def measured(entry: Mapping[str, object]) -> dict[str, float]:

@@ -15,12 +15,20 @@ from pipeline.language.chat import TACTILE, TACTILE_TOKENS
 from pipeline.language.generate import GenerationSettings, reply, stream, write_prompt
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.records import Opd, Turn
-from pipeline.runtime import DeviceName, DtypeName, Quantization, derive_seed, name_dtype, resolve_device
+from pipeline.runtime import (
+    DeviceName,
+    DtypeName,
+    Quantization,
+    derive_seed,
+    name_dtype,
+    quiet_libraries,
+    resolve_device,
+)
 from pipeline.tasks import opd, pc, pom, psr, pss
 from pipeline.tasks.base import LETTERS
-from pipeline.use.feel import TactileSense
 from pipeline.use.folder import LANGUAGE_DIR, ModelConfig, chat_sample, find_base, read_folder
 from pipeline.use.results import Choice, Comparison, Description, Exchange, Matching, Ranking, Touch, Video
+from pipeline.use.touch import TactileSense
 from pipeline.videos.catalogue import Catalogue, Property
 
 
@@ -65,6 +73,7 @@ class Octopi:
         Raises:
             UserError: naming what is missing, changed, of another version, or another language model.
         """
+        quiet_libraries()
         folder = Path(folder)
         config, catalogue = read_folder(folder)
         found = find_base(folder, config.base, None if base is None else Path(base))

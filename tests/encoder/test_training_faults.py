@@ -286,6 +286,36 @@ def test_a_checkpoint_that_was_being_written_is_passed_over(
         same(whole, again)
 
 
+def cut(file: Path) -> None:
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+
+
+def flip(file: Path) -> None:
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    file.write_bytes(content)
+
+
+def test_a_damaged_checkpoint_is_dropped_with_a_warning(
+    weights: Path, catalogue: Catalogue, tmp_path: Path, before_updates: Hook, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Cut short, or with a byte changed where a checksum tells."""
+    run = training("release", weights, encoder_data(tmp_path, catalogue, PARTS), epochs=3, batch_size=2)
+    history, whole = run()
+    damages = [("optimizer.pt", cut), ("rng_state.pth", flip), ("trainer_state.json", cut), ("model.safetensors", cut)]
+    for name, damage in damages:
+        before_updates(killed_at(7, begun=[]))
+        with pytest.raises(KeyboardInterrupt):
+            run()
+        (last,) = tmp_path.glob("checkpoints/*/*/checkpoint-6")
+        damage(last / name)
+        caplog.clear()
+        resumed, again = run()
+        assert [f"{name} is damaged" in r.getMessage() for r in caplog.records].count(True) == 1
+        assert resumed == history
+        same(whole, again)
+
+
 # Synthetic pretraining
 
 

@@ -36,7 +36,7 @@ def test_its_answers_equal_the_stored_predictions(made: Made) -> None:
 
 def test_without_the_kept_statistics_they_would_not(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
     model = Octopi.from_pretrained(made.folder, device="cpu")
-    monkeypatch.setattr("pipeline.use.feel.standardize", lambda raw, _: raw)
+    monkeypatch.setattr("pipeline.use.touch.standardize", lambda raw, _: raw)
     asked = {q.question_id: q for q in made.questions if q.task == "OPD"}
     stored = {p.question_id: p.outputs[0] for p in made.predictions}
     said = {i: model.ask(_user(q), [made.videos / f"{q.videos[0]}.avi"]) for i, q in asked.items()}

@@ -20,7 +20,7 @@ from transformers import PreTrainedModel, PreTrainedTokenizerBase
 from pipeline.language.base import load_adapter, load_llm, load_tokenizer
 from pipeline.language.chat import encode, end_ids, render
 from pipeline.language.teach.items import held_out
-from pipeline.records import GateScore, Turn
+from pipeline.records import Described, Turn
 from pipeline.runtime import derive_seed, track
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.catalogue.wording import Scenario
@@ -85,7 +85,7 @@ def examine(
     model: str,
     system_prompt: str,
     batch_size: int,
-) -> list[GateScore]:
+) -> list[Described]:
     """Ask a loaded language model everything, greedily; one score a task.
 
     Args:
@@ -101,7 +101,7 @@ def examine(
     for task in dict.fromkeys(q.task for q in questions):
         read = [(q.right, q.read(said[q])) for q in questions if q.task == task]
         scores.append(
-            GateScore(
+            Described(
                 model=model,
                 task=task,
                 n=len(read),
@@ -123,7 +123,7 @@ def gate(
     batch_size: int,
     dtype: torch.dtype = torch.float32,
     adapter: Path | None = None,
-) -> list[GateScore]:
+) -> list[Described]:
     """The gate of the language model in a folder, with a PEFT adapter on it where one is named.
 
     Raises:

@@ -1,0 +1,154 @@
+"""`octopi ask` and `octopi describe`: what a person types, what machines read, and going on after a kill."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from pipeline.cli import app, main
+from pipeline.errors import UserError
+from pipeline.use import ask as asking
+from pipeline.use.ask import Chat, default_model, describe_folder
+from pipeline.use.model import Octopi
+from tests.use.shared import Made
+
+QUESTION = "Describe {tactile}."
+
+
+def test_one_question(made: Made, octopi: Octopi, files: list[Path]) -> None:
+    said = CliRunner().invoke(app, ["ask", QUESTION, str(files[0]), "--model", str(made.folder), "--device", "cpu"])
+    assert said.exit_code == 0, said.output
+    assert said.stdout == octopi.ask(QUESTION, files[:1]) + "\n"
+
+
+def test_one_question_for_machines(made: Made, octopi: Octopi, files: list[Path]) -> None:
+    said = CliRunner().invoke(app, ["ask", QUESTION, str(files[0]), "--model", str(made.folder), "--json"])
+    found = json.loads(said.stdout)
+    assert found["answer"] == octopi.ask(QUESTION, files[:1])
+    assert found["videos"][0]["frames"] == list(octopi.look(files[0]).numbers)
+
+
+def test_what_is_wrong_is_one_line(
+    made: Made, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for arguments, message in (
+        (["--model", str(made.folder / "nothing")], "holds no config.json"),
+        (["--model", str(made.folder), "--device", "gpu"], "allowed: auto, cpu, cuda, mps"),
+        (["--model", str(made.folder), QUESTION, "none.avi"], "none.avi: no such file"),
+    ):
+        monkeypatch.setattr(sys, "argv", ["octopi", "ask", *arguments])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        error = capsys.readouterr().err.strip().splitlines()[-1]
+        assert ended.value.code == 1
+        assert error.startswith("octopi: ")
+        assert message in error
+
+
+def test_a_chat(octopi: Octopi, files: list[Path]) -> None:
+    said: list[str] = []
+    chat = Chat(octopi, said.append)
+
+    def type_(*lines: str) -> str:
+        said.clear()
+        chat.run(lines)
+        return "".join(said)
+
+    assert "no video yet" in type_("/frames")
+    assert "1 for the next question" in type_(f"/add {files[0]}")
+    assert "nothing.avi: no such file" in type_("/add nothing.avi")
+    assert "0 {tactile} for 1 videos" in type_("Is it soft?"), "the chat goes on"
+    first = octopi.ask(QUESTION, files[:1])
+    assert type_(QUESTION) == first + "\n"
+    assert type_("And now?") == octopi.ask("And now?", history=chat.history[:1]) + "\n"
+    assert [len(e.videos) for e in chat.history] == [1, 0]
+    numbers = ", ".join(map(str, octopi.look(files[0]).numbers))
+    assert f"{files[0]}: frames {numbers}" in type_("/frames")
+    assert type_("/reset", QUESTION.replace("{tactile}", "it")).startswith("a new conversation\n")
+    assert "/quit" in type_("/unknown", "", "   ")
+    assert type_("/quit", "/frames") == ""
+
+
+def test_a_stopped_answer_is_forgotten(octopi: Octopi, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    said: list[str] = []
+    chat = Chat(octopi, said.append)
+    monkeypatch.setattr(octopi, "stream", stop)
+    chat.run(["Hello?", "/reset"])
+    assert not chat.history
+    assert "stopped" in said[0]
+
+
+@pytest.fixture
+def folder(files: list[Path], tmp_path: Path) -> Path:
+    place = tmp_path / "videos" / "a, b"
+    place.mkdir(parents=True)
+    for file in files:
+        shutil.copy(file, place)
+    (place / "broken.avi").write_text("no video")
+    (place / "notes.txt").touch()
+    return place.parent
+
+
+def rows(file: Path) -> list[dict[str, str]]:
+    with file.open(encoding="utf-8", newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_a_folder_is_described(octopi: Octopi, folder: Path, files: list[Path], tmp_path: Path) -> None:
+    assert describe_folder(octopi, folder, tmp_path / "out.csv") == (4, 1)
+    found = {row["file"]: row for row in rows(tmp_path / "out.csv")}
+    assert set(found) == {f"a, b/{name}" for name in ("broken.avi", *(f.name for f in files))}
+    assert "no frame decodes" in found["a, b/broken.avi"]["error"]
+    for file in files:
+        row, expected = found[f"a, b/{file.name}"], octopi.describe(file)
+        assert {name: row[name] for name in octopi.properties} == expected.levels
+        for name, known in expected.probabilities.items():
+            assert {level: float(row[f"{name}: {level}"]) for level in known} == pytest.approx(known, abs=1e-4)
+        assert row["error"] == ""
+
+
+def test_a_killed_description_goes_on(
+    octopi: Octopi, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(asking, "BATCH", 1)
+    whole, out = tmp_path / "whole.csv", tmp_path / "out.csv"
+    describe_folder(octopi, folder, whole)
+    text = whole.read_text()
+    for end in (0, 5, len(text) // 2, len(text) - 1, len(text)):
+        out.write_text(text[:end])
+        looked: list[object] = []
+        real = octopi.describe_all
+        monkeypatch.setattr(octopi, "describe_all", lambda videos: looked.extend(videos) or real(videos))  # noqa: B023
+        assert describe_folder(octopi, folder, out) == (4, 1)
+        monkeypatch.undo()
+        monkeypatch.setattr(asking, "BATCH", 1)
+        assert out.read_text() == text
+        assert len(looked) == 3 - sum(".avi" in line and "broken" not in line for line in text[:end].split("\n")[:-1])
+
+
+def test_anothers_table_is_left_alone(octopi: Octopi, folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.csv"
+    out.write_text("a,b\n1,2\n")
+    with pytest.raises(UserError, match="name another file with --csv"):
+        describe_folder(octopi, folder, out)
+    assert out.read_text() == "a,b\n1,2\n"
+    with pytest.raises(UserError, match="holds no video"):
+        describe_folder(octopi, tmp_path / "nothing", out)
+
+
+def test_the_full_system_is_asked_by_default(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="holds no trained model"):
+        default_model(tmp_path)
+    for name in ("base-with-all-0", "finetuned-with-all-1", "finetuned-with-all-0"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.json").touch()
+    assert default_model(tmp_path).name == "finetuned-with-all-0"
