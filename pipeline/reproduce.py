@@ -4,21 +4,30 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from pipeline.errors import UserError
 from pipeline.params import load_params
 
-CHAIN = "dvc.yaml"
+CHAIN, LOCK = "dvc.yaml", "dvc.lock"
 
 
 def outdated(root: Path) -> tuple[int, int]:
     """How many stages will run at the most, and how many there are.
 
     A stage runs where its inputs changed, and every stage after it unless its own inputs come out the same.
+
+    Raises:
+        UserError: where DVC cannot read its own files: one that is killed while it writes dvc.lock leaves half of it.
     """
     import networkx as nx
+    from dvc.exceptions import DvcException
     from dvc.repo import Repo
 
     with Repo(str(root)) as repo:
-        changed = set(repo.status(targets=[CHAIN]))
+        try:
+            changed = set(repo.status(targets=[CHAIN]))
+        except DvcException as error:
+            mend = "`git checkout dvc.lock` brings back the last one of Git" if LOCK in str(error) else "mend it"
+            raise UserError(f"{' '.join(str(error).split())}; {mend}") from None
         graph = repo.index.graph
         waiting = {stage for stage in graph if stage.addressing in changed}
         for stage in tuple(waiting):
