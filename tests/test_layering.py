@@ -12,7 +12,7 @@ CORE = (
     *("__init__", "errors", "records", "runtime", "io", "config", "params", "progress", "parallel", "card"),
     *("embeddings", "weights", "shapes", "training", "stage"),
 )
-ROOMS = ("videos", "scenes", "tasks", "encoder", "language", "evaluation", "report", "tracking")
+ROOMS = ("videos", "scenes", "tasks", "encoder", "language", "evaluation", "report", "tracking", "use")
 TOP = ("memory", "scales", "revisions", "compare", "reproduce", "cli")
 ORDER = (*CORE, *ROOMS, *TOP)
 MODULES = sorted((ROOT / "pipeline").rglob("*.py"))
