@@ -1,7 +1,9 @@
 """Teach a language model the sense of touch: the system of Octopi (RSS 2024) as a DVC pipeline."""
 
 import gc
+import importlib
 import os
+from typing import Any
 
 # Read by OpenMP when torch loads. Its default lets waiting threads spin: on a busy machine, answering 57 questions on
 # two threads then took 203 s in place of 9 s.
@@ -10,3 +12,11 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 # A start imports a million objects that all stay. Looking for garbage among them every 700 took a fifth of the start of
 # a training stage (8.7 s against 7.1 s, median of four in turn).
 gc.set_threshold(100_000, 50, 1000)
+
+
+def __getattr__(name: str) -> Any:
+    """`from pipeline import Octopi` loads torch only where it is asked for."""
+    if name == "Octopi":
+        # Named, not imported: the stages import this file, and do not depend on how a model is used.
+        return importlib.import_module("pipeline.use.model").Octopi
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

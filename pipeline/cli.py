@@ -37,7 +37,8 @@ def scale(
     params = compose(name, overrides or ())
     uses, notes = count(params)
     # First, since what a scale takes is asked before its weights are fetched.
-    typer.echo("\n".join(["Memory in GiB on each device, counted from shapes:", table(uses), *notes]))
+    counted = ["Memory in GiB on each device, counted from shapes:", table(uses)] if uses else []
+    typer.echo("\n".join([*counted, *notes]))
     check_inputs(params)
     changed = write_params(params)
     prune(params, Path("data"))

@@ -179,6 +179,8 @@ class EncoderConfig(Section):
     """Shift and scale embeddings to mean 0 and deviation 1 over the training frames (the paper does not)."""
     embed_batch_size: Positive = 64
     """Frames at a time when embeddings are computed."""
+    pretrained: str = Field(default=str(PRETRAINED), exclude=True)
+    """Not in params.yaml: the file of the backbone `scenes`. A packaged model has one of its own."""
 
     @model_validator(mode="after")
     def _batches_divide(self) -> Self:

@@ -5,18 +5,35 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 
 from pipeline.errors import UserError
-from pipeline.io import load_tensors, read_table
+from pipeline.io import load_tensors, read_table, save_tensors
 from pipeline.records import Embedding, Flip
 
 FLIPS: tuple[Flip, ...] = ("none", "horizontal", "vertical", "both")
 TENSOR = "embeddings"
 TENSOR_FILE = "embeddings.safetensors"
 INDEX_FILE = "index.parquet"
+STATISTICS_FILE = "statistics.safetensors"
+
+
+class Statistics(NamedTuple):
+    """What embeddings are standardised by; float64, dim each."""
+
+    mean: torch.Tensor
+    scale: torch.Tensor
+
+    def save(self, folder: Path) -> None:
+        """Write them beside the embeddings that they are of, or into a folder that needs them again."""
+        save_tensors(folder / STATISTICS_FILE, self._asdict())
+
+    @classmethod
+    def load(cls, folder: Path) -> Statistics:
+        """Read what `save` wrote."""
+        return cls(**load_tensors(folder / STATISTICS_FILE))
 
 
 class TactileFeatures(Protocol):

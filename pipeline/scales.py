@@ -110,6 +110,8 @@ def check_inputs(params: Params) -> None:
     check_objects(params, catalogue)
     backbone = getattr(params.encoder, "backbone", ("clip",))
     weights.check_encoder(Path(params.encoder.weights), params.frames.size, backbone)
+    if params.language.weights == TAUGHT and not params.teach.base:
+        raise UserError(f"language.weights: {TAUGHT} is what teaching makes; name the model to teach in teach.base")
     for key, base in (("teach.base", params.teach.base), ("language.weights", params.language.weights)):
         if base not in ("", TAUGHT):
             weights.check_language(Path(base), key)

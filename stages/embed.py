@@ -4,7 +4,7 @@ from pathlib import Path
 
 from pipeline.config import EncoderConfig
 from pipeline.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE
-from pipeline.encoder.embed import embed_videos, standardize, union
+from pipeline.encoder.embed import embed_videos, standardize, statistics, union
 from pipeline.encoder.model import FrameEncoder
 from pipeline.encoder.recipes import base_encoder, property_classifier
 from pipeline.io import read_table, save_tensors, write_table
@@ -42,7 +42,9 @@ def main() -> None:
                     wanted = union(splits.values()) if which is Encoder.BASE else assignments
                     raw, index = embed_videos(encoder, store, wanted, batch_size=size, device=device)
                 training = {a.video_id for a in assignments if a.part == Part.TRAIN}
-                tensor = standardize(raw, index, training) if params.encoder.standardize else raw
+                known = statistics(raw, index, training)
+                tensor = standardize(raw, known) if params.encoder.standardize else raw
+                known.save(out)
                 save_tensors(out / TENSOR_FILE, {TENSOR: tensor})
                 write_table(out / INDEX_FILE, Embedding, index)
                 run.metrics[f"{which}-{seed}.rows"] = len(index)

@@ -140,6 +140,8 @@ def test_missing_inputs_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         check_inputs(compose("smoke", [f"encoder.weights={tmp_path}/none"]))
     with pytest.raises(UserError, match="hf download lmsys"):
         check_inputs(compose("smoke", [f"language.weights={tmp_path}/none"]))
+    with pytest.raises(UserError, match="language.weights: data/taught is what teaching makes.*teach.base"):
+        check_inputs(compose("small", ["teach.base="]))
     with pytest.raises(UserError, match="scenes.objects"):
         check_inputs(compose("smoke", ["scenes.objects=[unicorn]"]))
     with pytest.raises(UserError, match="frames.size"):

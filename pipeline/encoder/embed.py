@@ -8,7 +8,7 @@ from itertools import chain
 import numpy as np
 import torch
 
-from pipeline.embeddings import FLIPS
+from pipeline.embeddings import FLIPS, Statistics
 from pipeline.encoder.model import FrameEncoder
 from pipeline.errors import UserError
 from pipeline.records import Assignment, Embedding, Flip, Part
@@ -69,12 +69,16 @@ def union(splits: Iterable[Sequence[Assignment]]) -> list[Assignment]:
     return list(found.values())
 
 
-def standardize(embeddings: torch.Tensor, index: Sequence[Embedding], training: Collection[str]) -> torch.Tensor:
-    """Mean 0 and deviation 1 in each dimension, by the statistics of the training videos' unmirrored frames alone.
+def statistics(embeddings: torch.Tensor, index: Sequence[Embedding], training: Collection[str]) -> Statistics:
+    """Mean and deviation of each dimension over the training videos' unmirrored frames alone.
 
-    A dimension that never changes there is only shifted.
+    A dimension that never changes there has the scale 1, and is so only shifted.
     """
     rows = [e.row for e in index if e.video_id in training and e.flip == "none"]
     mean, deviation = embeddings[rows].double().mean(0), embeddings[rows].double().std(0, correction=0)
-    scale = torch.where(deviation > 0, deviation, torch.ones_like(deviation))
-    return ((embeddings.double() - mean) / scale).float()
+    return Statistics(mean, torch.where(deviation > 0, deviation, torch.ones_like(deviation)))
+
+
+def standardize(embeddings: torch.Tensor, known: Statistics) -> torch.Tensor:
+    """Embeddings, rows x dim, in deviations from the training frames' mean: float32."""
+    return ((embeddings.double() - known.mean) / known.scale).float()

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import torch
 from torch import nn
 from torch.nn import functional as F
 
-from pipeline.config import PRETRAINED, EncoderConfig
+from pipeline.config import EncoderConfig
 from pipeline.encoder.model import FrameEncoder
 from pipeline.training.trainable import load_trainable
 from pipeline.videos.frames.subtraction import GAIN, MIDDLE
@@ -64,14 +66,14 @@ class SceneEncoder(FrameEncoder):
         return torch.cat([maps.mean((2, 3)), maps.amax((2, 3))], dim=1)
 
 
-def load_backbone(_: EncoderConfig, *, tuned: bool) -> SceneEncoder:
+def load_backbone(config: EncoderConfig, *, tuned: bool) -> SceneEncoder:
     """The network that the stage `pretrain` wrote.
 
     Raises:
         UserError: where there is none, or one that does not fit.
     """
     encoder = SceneEncoder()
-    load_trainable(encoder, PRETRAINED)
+    load_trainable(encoder, Path(config.pretrained))
     encoder.requires_grad_(False).eval()
     if tuned:
         encoder.last.requires_grad_(True)

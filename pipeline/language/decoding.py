@@ -6,7 +6,7 @@ transformers' `generate` goes on with all rows until the longest answer ends, an
 from __future__ import annotations
 
 import copy
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 import torch
 from torch.nn import functional as F
@@ -21,7 +21,6 @@ STAYING = 7 / 8
 """Rows leave when no more than this share goes on: their neighbours' keys and values are copied then."""
 
 
-@torch.inference_mode()
 def greedy(
     model: OctopiForCausalLM,
     prompts: Sequence[Sequence[int]],
@@ -29,6 +28,21 @@ def greedy(
     ends: Collection[int],
     limits: Sequence[int],
 ) -> list[list[int]]:
+    """All that `greedy_tokens` says: the new tokens of each prompt."""
+    said: list[list[int]] = [[] for _ in prompts]
+    for row, token in greedy_tokens(model, prompts, features, ends, limits):
+        said[row].append(token)
+    return said
+
+
+@torch.inference_mode()
+def greedy_tokens(
+    model: OctopiForCausalLM,
+    prompts: Sequence[Sequence[int]],
+    features: Sequence[torch.Tensor],
+    ends: Collection[int],
+    limits: Sequence[int],
+) -> Iterator[tuple[int, int]]:
     """The likeliest next token after each prompt, until one that ends an answer (kept) or the limit.
 
     Args:
@@ -37,22 +51,26 @@ def greedy(
         ends: Ids of tokens that end an answer.
         limits: Most new tokens of each, at least 1.
 
-    Returns:
-        The new tokens of each prompt. In float32 a row's tokens do not depend on its neighbours.
+    Yields:
+        The place of a prompt and its next token, as soon as it is known. In float32 a row's tokens do not depend on
+        its neighbours.
     """
     logits, cache, mask = _read(model, prompts, features)
-    said: list[list[int]] = [[] for _ in prompts]
+    said, ended = [0] * len(prompts), [False] * len(prompts)
     rows = list(range(len(prompts)))
     words = model.llm.get_input_embeddings()
     while True:
         tokens, going = logits.argmax(-1), []
         for place, (row, token) in enumerate(zip(rows, tokens.tolist(), strict=True)):
-            if not _ended(said[row], ends, limits[row]):
-                said[row].append(token)
-                if not _ended(said[row], ends, limits[row]):
-                    going.append(place)
+            if ended[row]:
+                continue
+            said[row] += 1
+            ended[row] = token in ends or said[row] == limits[row]
+            if not ended[row]:
+                going.append(place)
+            yield row, token
         if not going:
-            return said
+            return
         if len(going) <= STAYING * len(rows):
             rows = [rows[place] for place in going]
             chosen = torch.tensor(going, device=mask.device)
@@ -60,10 +78,6 @@ def greedy(
             cache.batch_select_indices(chosen)
         mask = F.pad(mask, (0, 1), value=1)
         logits = _step(model, words(tokens[:, None]), mask, cache)
-
-
-def _ended(said: Sequence[int], ends: Collection[int], limit: int) -> bool:
-    return bool(said) and (said[-1] in ends or len(said) == limit)
 
 
 def _step(model: OctopiForCausalLM, embeddings: torch.Tensor, mask: torch.Tensor, cache: Cache) -> torch.Tensor:

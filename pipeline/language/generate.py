@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -12,7 +12,7 @@ from pipeline.embeddings import TactileFeatures
 from pipeline.errors import UserError
 from pipeline.language.chat import encode, end_ids, render
 from pipeline.language.conversations import check_length, evaluation_features
-from pipeline.language.decoding import greedy
+from pipeline.language.decoding import greedy, greedy_tokens
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.records import Opd, Prediction, Question, Turn
 from pipeline.runtime import track
@@ -30,7 +30,9 @@ class GenerationSettings:
 
 
 @dataclass(frozen=True)
-class _Generated:
+class Generated:
+    """What was said to one prompt."""
+
     text: str
     tokens: int
     truncated: bool
@@ -59,25 +61,20 @@ def answer(
     model.eval()
     tokenizer = model.tokenizer
     asked = [(q, d) for q in questions if (d := q.dialogue(opd))]
-    said: dict[str, list[_Generated]] = {q.question_id: [] for q, _ in asked}
+    said: dict[str, list[Generated]] = {q.question_id: [] for q, _ in asked}
     for number in range(max((len(d.turns) for _, d in asked), default=0)):
         waiting = []
         for question, dialogue in asked:
             if number < len(dialogue.turns):
                 before = [s.text for s in said[question.question_id]]
                 turns = [Turn(user=t.user, assistant=a) for t, a in zip(dialogue.turns, [*before, ""], strict=False)]
-                prompt = _prompt(turns, tokenizer, settings)
+                prompt = write_prompt(turns, tokenizer, settings)
                 check_length(question.question_id, len(prompt) + 1, model.positions)
                 waiting.append((question, prompt))
-        # Neighbours of like length share a batch, so little is spent on padding.
-        waiting.sort(key=lambda item: len(item[1]))
-        starts = range(0, len(waiting), settings.batch_size)
-        for start in track(starts, f"answers, turn {number + 1}", "batch"):
-            batch = waiting[start : start + settings.batch_size]
-            features = [evaluation_features(q, store, settings.per_video) for q, _ in batch]
-            texts = _generate(model, [ids for _, ids in batch], features, settings.max_new_tokens)
-            for (question, _), text in zip(batch, texts, strict=True):
-                said[question.question_id].append(text)
+        features = [evaluation_features(q, store, settings.per_video) for q, _ in waiting]
+        texts = reply(model, [ids for _, ids in waiting], features, settings, f"answers, turn {number + 1}")
+        for (question, _), text in zip(waiting, texts, strict=True):
+            said[question.question_id].append(text)
     return [
         Prediction(
             question_id=q.question_id,
@@ -90,24 +87,65 @@ def answer(
     ]
 
 
-def _prompt(turns: Sequence[Turn], tokenizer: PreTrainedTokenizerBase, settings: GenerationSettings) -> tuple[int, ...]:
+def write_prompt(
+    turns: Sequence[Turn], tokenizer: PreTrainedTokenizerBase, settings: GenerationSettings
+) -> tuple[int, ...]:
+    """Token ids of a conversation up to where its last answer is to be said."""
     rendered = render(turns, tokenizer, system_prompt=settings.system_prompt, frames=settings.per_video, complete=False)
     return encode(rendered, tokenizer).input_ids
 
 
-def _generate(
-    model: OctopiForCausalLM, prompts: Sequence[Sequence[int]], features: Sequence[torch.Tensor], max_new_tokens: int
-) -> list[_Generated]:
-    """Generate one answer a prompt."""
-    ends = end_ids(model.tokenizer)
-    room = [
-        max_new_tokens if model.positions is None else min(max_new_tokens, model.positions - len(p)) for p in prompts
-    ]
-    return [_said(tokens, ends, model.tokenizer) for tokens in greedy(model, prompts, features, ends, room)]
+def reply(
+    model: OctopiForCausalLM,
+    prompts: Sequence[Sequence[int]],
+    features: Sequence[torch.Tensor],
+    settings: GenerationSettings,
+    label: str = "answers",
+) -> list[Generated]:
+    """An answer to each prompt, in the prompts' order.
+
+    Args:
+        prompts: Of `write_prompt`, each shorter than the language model has positions.
+        features: Of each prompt's frames in reading order: frames x tactile_dim.
+        label: What progress is called.
+    """
+    ends, said = end_ids(model.tokenizer), {}
+    # Neighbours of like length share a batch, so little is spent on padding.
+    order = sorted(range(len(prompts)), key=lambda place: len(prompts[place]))
+    for start in track(range(0, len(order), settings.batch_size), label, "batch"):
+        batch = order[start : start + settings.batch_size]
+        chosen = [prompts[place] for place in batch]
+        tokens = greedy(model, chosen, [features[place] for place in batch], ends, _room(model, chosen, settings))
+        for place, row in zip(batch, tokens, strict=True):
+            said[place] = _said(row, ends, model.tokenizer)
+    return [said[place] for place in range(len(prompts))]
 
 
-def _said(tokens: list[int], ends: Collection[int], tokenizer: PreTrainedTokenizerBase) -> _Generated:
+def stream(
+    model: OctopiForCausalLM, prompt: Sequence[int], features: torch.Tensor, settings: GenerationSettings
+) -> Iterator[str]:
+    """What `reply` says to one prompt, in pieces as they come; together they are the same text."""
+    ends, tokens, given = end_ids(model.tokenizer), [], ""
+    for _, token in greedy_tokens(model, [prompt], [features], ends, _room(model, [prompt], settings)):
+        tokens.append(token)
+        text = _said(tokens, ends, model.tokenizer).text
+        # A character may be spread over tokens; until it is whole it is shown as the replacement character.
+        if text.startswith(given) and len(text) > len(given) and not text.endswith("\N{REPLACEMENT CHARACTER}"):
+            yield text[len(given) :]
+            given = text
+    rest = _said(tokens, ends, model.tokenizer).text.removeprefix(given)
+    if rest:
+        yield rest
+
+
+def _room(model: OctopiForCausalLM, prompts: Sequence[Sequence[int]], settings: GenerationSettings) -> list[int]:
+    """Most tokens that each answer may have."""
+    most = settings.max_new_tokens
+    return [most if model.positions is None else min(most, model.positions - len(p)) for p in prompts]
+
+
+def _said(tokens: list[int], ends: Collection[int], tokenizer: PreTrainedTokenizerBase) -> Generated:
     """What one row says, without its end token."""
     truncated = tokens[-1] not in ends
     text = tokenizer.decode(tokens if truncated else tokens[:-1], skip_special_tokens=True).strip()
-    return _Generated(text=text, tokens=len(tokens), truncated=truncated)
+    return Generated(text=text, tokens=len(tokens), truncated=truncated)

