@@ -133,6 +133,24 @@ def bag(
     typer.echo(f"{len(written)} presses in {out}: {', '.join(path.name for path in written)}")
 
 
+@app.command()
+def demo(
+    folder: Annotated[Path, typer.Argument(help="A model's folder.")],
+    base: Annotated[Path | None, typer.Option(help="The base model's folder, where it is not found.")] = None,
+    catalogue: Annotated[Path, CATALOGUE] = Path("pipeline/physiclear"),
+    port: Annotated[int, typer.Option(help="Of 127.0.0.1.")] = 7860,
+) -> None:
+    """Show a page where videos are dropped: what the model sees, what it takes them for, and a chat. Nothing leaves."""
+    from pipeline.runtime import quiet_libraries
+    from pipeline.use.demo import serve_demo
+    from pipeline.use.model import Octopi
+
+    quiet_libraries()
+    model = Octopi.from_pretrained(folder, base=base)
+    typer.echo(f"http://127.0.0.1:{port} (ends with Ctrl-C)")
+    serve_demo(model, catalogue, port)
+
+
 def _show(findings: Sequence[Finding]) -> None:
     for f in findings:
         expected = f" (expected: {f.expected})" if f.expected else ""

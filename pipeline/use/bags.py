@@ -5,6 +5,7 @@ A press is where the picture differs from the untouched one by much more than th
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 from collections.abc import Iterator, Sequence
@@ -88,7 +89,7 @@ def import_bag(bag: Path, topic: str, out: Path, object_id: str, times: float = 
     if not ranges:
         raise UserError(
             f"{bag}: nothing touches the sensor in {len(strengths)} pictures of {topic} (strongest difference "
-            f"{strengths.max():.2f}, a press begins at {_threshold(strengths, times):.2f}); lower --times, or record again"
+            f"{strengths.max():.2f}, a press begins at {_threshold(strengths, times):.2f}); lower --times"
         )
     fps = _rate(bag, received)
     out.mkdir(parents=True, exist_ok=True)
@@ -125,9 +126,9 @@ def import_bag(bag: Path, topic: str, out: Path, object_id: str, times: float = 
 def presses(strengths: npt.NDArray[np.float64], times: float = FOUND) -> list[tuple[int, int]]:
     """Where something touches: (first frame, one behind the last), rising, none overlapping.
 
-    Hysteresis: a press holds a frame of `times` the quiet level, and goes on while strengths lie over `RELEASED` of that.
-    Each is widened by up to `LONGEST` untouched frames on both sides, which the chain takes its reference from, but not
-    beyond the middle to its neighbour.
+    Hysteresis: a press reaches `times` the quiet level, and lasts while strengths lie over `RELEASED` of that.
+    Each is widened on both sides by up to `LONGEST` untouched frames, which the chain takes its reference from, but
+    not beyond the middle to its neighbour.
 
     Args:
         strengths: contact strength by frame, in 8-bit steps.
@@ -141,10 +142,10 @@ def presses(strengths: npt.NDArray[np.float64], times: float = FOUND) -> list[tu
     ]
     if not found:
         return []
-    middles = [0, *((a[1] + b[0]) // 2 for a, b in zip(found, found[1:], strict=False)), len(strengths)]
+    middles = [0, *((a[1] + b[0]) // 2 for a, b in itertools.pairwise(found)), len(strengths)]
     return [
         (max(begin - LONGEST, low), min(end + LONGEST, high))
-        for (begin, end), low, high in zip(found, middles, middles[1:], strict=False)
+        for (begin, end), low, high in zip(found, middles[:-1], middles[1:], strict=True)
     ]
 
 
@@ -224,7 +225,8 @@ def _measure(source: Iterator[Shot]) -> tuple[list[int], npt.NDArray[np.float64]
 
 
 def _mean(thumbs: Sequence[Image]) -> Image:
-    return np.rint(np.mean(thumbs, axis=0)).astype(np.uint8)
+    mean: Image = np.rint(np.mean(thumbs, axis=0)).astype(np.uint8)
+    return mean
 
 
 def _threshold(strengths: npt.NDArray[np.float64], times: float) -> float:
