@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import queue
+import re
 import shutil
 import tempfile
 import threading
@@ -23,12 +24,15 @@ from fastapi import FastAPI, Request
 from fastapi.responses import JSONResponse, Response, StreamingResponse
 from fastapi.staticfiles import StaticFiles
 from pydantic import BaseModel, Field
+from starlette.concurrency import run_in_threadpool
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from pipeline.config import ScenesConfig
 from pipeline.errors import UserError
-from pipeline.scenes.recipe import load_recipes
-from pipeline.scenes.video import synthesize
+from pipeline.scenes.film import write_film
+from pipeline.scenes.light import make_sensor
+from pipeline.scenes.recipe import Recipe, load_recipes
+from pipeline.scenes.render import make_scene, render
 from pipeline.tasks.opd import TEMPLATES
 from pipeline.use.results import Exchange, Pictures, Touch
 from pipeline.videos.catalogue import Catalogue, load_catalogue
@@ -40,11 +44,10 @@ T = TypeVar("T")
 PAGE = Path(__file__).with_name("page")
 HOSTS = ["127.0.0.1", "localhost"]
 """Names that the page answers to, so that no other site's name can be pointed at it."""
-POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; connect-src 'self'"
-)
+POLICY = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'"
 MOST_BYTES, MOST_TOUCHES = 200_000_000, 30
 """Of one video; and touches that are remembered, the last ones."""
+SCENE, SCENE_FRAMES = ScenesConfig(), 60
 GLOW = 24.0
 """Difference to the untouched sensor, in 8-bit steps, that is painted at full strength where it touches."""
 
@@ -69,7 +72,7 @@ class Room:
     """The model, the touches that were shown to it, and one thread that all its work is done in."""
 
     def __init__(
-        self, model: Octopi, catalogue: Catalogue | None = None, recipes: dict[str, Any] | None = None
+        self, model: Octopi, catalogue: Catalogue | None = None, recipes: dict[str, Recipe] | None = None
     ) -> None:
         self.model = model
         self.scenes = recipes or {}
@@ -89,10 +92,12 @@ class Room:
 
     def scene(self, object_id: str) -> Path:
         """A synthetic press of an object, rendered once."""
-        folder = self.folder / "scenes"
-        if not (folder / f"{object_id}_0.mp4").exists():
-            synthesize(self.scenes, ScenesConfig(objects=(object_id,), videos_per_object=1, frames=60), folder)
-        return folder / f"{object_id}_0.mp4"
+        file = self.folder / f"{object_id}_0.mp4"
+        if not file.exists():
+            scene = make_scene(self.scenes[object_id], SCENE, SCENE_FRAMES, SCENE.seed)
+            sensor = make_sensor(SCENE.width, SCENE.height, SCENE.seed)
+            write_film(file, render(scene, SCENE, sensor, SCENE.seed), SCENE.fps)
+        return file
 
     def show(self, name: str, video: Path) -> dict[str, Any]:
         """Let the model feel a video; everything about it that the page draws.
@@ -171,7 +176,7 @@ def where(touch: Touch) -> Pictures:
 def uri(picture: Pictures) -> str:
     """A picture (height x width x RGB) as a PNG in a data URI."""
     _, png = cv2.imencode(".png", picture[:, :, ::-1])
-    return f"data:image/png;base64,{base64.b64encode(png).decode()}"
+    return f"data:image/png;base64,{base64.b64encode(png.tobytes()).decode()}"
 
 
 def make_app(room: Room) -> FastAPI:
@@ -194,8 +199,8 @@ def make_app(room: Room) -> FastAPI:
     @app.exception_handler(UserError)
     async def refuse(_: Request, error: UserError) -> Response:
         # A file is known to the user by its name, not by where it was put.
-        line = str(error).replace(f"{room.folder}/", "").partition("\n")[0]
-        return JSONResponse({"error": line[33:] if line[32:33] == "/" else line}, 422)
+        line = re.sub(rf"{re.escape(str(room.folder))}/([0-9a-f]{{32}}/)?", "", str(error))
+        return JSONResponse({"error": " ".join(line.split())}, 422)
 
     @app.get("/api/about")
     def about() -> dict[str, Any]:
@@ -205,8 +210,6 @@ def make_app(room: Room) -> FastAPI:
     @app.put("/api/touches/{name}")
     async def drop(name: str, request: Request) -> dict[str, Any]:
         """The body is the file itself."""
-        from starlette.concurrency import run_in_threadpool
-
         file = room.folder / uuid4().hex / (Path(name).name or "video")
         file.parent.mkdir()
         try:
