@@ -6,8 +6,9 @@ It holds facts alone and no score, as none is known when a model has been traine
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import yaml
@@ -25,6 +26,8 @@ def write_card(
     data: Mapping[str, object],
     settings: Mapping[str, object],
     limits: Sequence[str],
+    front: Mapping[str, object] = MappingProxyType({}),
+    tables: Mapping[str, Sequence[Mapping[str, object]]] = MappingProxyType({}),
 ) -> None:
     """Write README.md with the front matter of Hugging Face's model cards.
 
@@ -35,10 +38,13 @@ def write_card(
         data: What it was trained on.
         settings: Hyper-parameters by name.
         limits: What it cannot do, a sentence each.
+        front: What else the front matter says.
+        tables: Further tables by their heading, a mapping a row.
     """
     licences = {part: _licence(path) for part, path in bases.items()}
     stated = set(licences.values())
     front = {
+        **front,
         "license": stated.pop() if len(stated) == 1 and None not in stated else "other",
         "base_model": [path.as_posix() for path in bases.values()],
         "tags": ["tactile", "gelsight", "octopi"],
@@ -50,8 +56,16 @@ def write_card(
     for heading, values in (("Training data", data), ("Hyper-parameters", settings)):
         lines += ["", f"## {heading}", "", "| | |", "|---|---|"]
         lines += [f"| {name} | {_shown(value)} |" for name, value in values.items()]
+    for heading, rows in tables.items():
+        if rows:
+            lines += ["", f"## {heading}", "", _row(rows[0]), _row(["---"] * len(rows[0]))]
+            lines += [_row(row.values()) for row in rows]
     lines += ["", "## What it cannot do", "", *(f"- {limit}" for limit in limits)]
     write_text(folder / CARD_FILE, "\n".join(lines) + "\n")
+
+
+def _row(cells: Iterable[object]) -> str:
+    return f"| {' | '.join(map(_shown, cells))} |"
 
 
 def _weights(path: Path) -> list[Path]:

@@ -12,6 +12,7 @@ from pipeline.errors import UserError
 
 if TYPE_CHECKING:
     from pipeline.records import Finding
+    from pipeline.use.model import Octopi
 
 app = typer.Typer(
     help="Teach a language model the sense of touch.", no_args_is_help=True, pretty_exceptions_enable=False
@@ -182,6 +183,85 @@ def compare(
     if json is not None:
         write_json(json, found)
     typer.echo(describe(found))
+
+
+MODEL = typer.Option(help="Folder of a trained model; by default the full system in models/.")
+BASE = typer.Option(help="Folder of its language model, where it lies in none of the known places.")
+
+
+@app.command()
+def ask(
+    question: Annotated[
+        str, typer.Argument(help="With {tactile} once for each video; without a question: a chat.")
+    ] = "",
+    videos: Annotated[list[str] | None, typer.Argument(help="Videos, in the order of the question.")] = None,
+    model: Annotated[Path | None, MODEL] = None,
+    base: Annotated[Path | None, BASE] = None,
+    device: Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")] = "auto",
+    json: Annotated[bool, typer.Option("--json", help="Print the answer with what it stands on.")] = False,
+) -> None:
+    """Ask a trained model about touch; without a question, talk to it (/add FILE, /frames, /reset, /quit)."""
+    from json import dumps
+
+    from pipeline.use.ask import Chat, answer_once, lines_of_terminal
+
+    asked = _load(model, base, device)
+
+    def say(text: str) -> None:
+        typer.echo(text, nl=False)
+
+    if not question:
+        Chat(asked, say).run(lines_of_terminal())
+    elif json:
+        typer.echo(dumps(answer_once(asked, question, videos or ()), ensure_ascii=False))
+    else:
+        for piece in asked.stream(question, videos or ()):
+            say(piece)
+        say("\n")
+
+
+@app.command()
+def describe(
+    folder: Annotated[Path, typer.Argument(help="Folder with videos.")],
+    csv: Annotated[Path, typer.Option(help="File to write; a second call goes on in it.")],
+    model: Annotated[Path | None, MODEL] = None,
+    base: Annotated[Path | None, BASE] = None,
+    device: Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")] = "auto",
+) -> None:
+    """Describe every video of a folder: classes with probabilities, the sentence, frames, notes; a row each."""
+    from pipeline.use.ask import describe_folder
+
+    rows, failed = describe_folder(_load(model, base, device), folder, csv)
+    typer.echo(f"{csv}: {rows} videos{f', {failed} of them not described (column error)' if failed else ''}")
+
+
+@app.command()
+def export(
+    folder: Annotated[Path, typer.Argument(help="Folder of a trained model, such as models/finetuned-with-all-0.")],
+    to: Annotated[Path, typer.Argument(help="Folder to make.")],
+    with_base: Annotated[bool, typer.Option("--with-base", help="Put the language model in.")] = False,
+    base: Annotated[Path | None, BASE] = None,
+) -> None:
+    """Copy a trained model to where it is to be used."""
+    from pipeline.use.package import export as copy
+
+    copy(folder, to, with_base=with_base, base=base)
+    typer.echo(f"{to}: {sum(f.stat().st_size for f in to.rglob('*') if f.is_file()) / 1e6:.0f} MB")
+
+
+def _load(folder: Path | None, base: Path | None, device: str) -> Octopi:
+    from typing import cast, get_args
+
+    from pipeline.runtime import DeviceName, quiet_libraries
+    from pipeline.use.ask import default_model
+
+    folder = folder or default_model()
+    if device not in get_args(DeviceName):
+        raise UserError(f"--device is {device}; allowed: {', '.join(get_args(DeviceName))}")
+    quiet_libraries()
+    from pipeline.use.model import Octopi
+
+    return Octopi.from_pretrained(folder, base=base, device=cast(DeviceName, device))
 
 
 def main() -> None:

@@ -21,19 +21,26 @@ STATISTICS_FILE = "statistics.safetensors"
 
 
 class Statistics(NamedTuple):
-    """What embeddings are standardised by; float64, dim each."""
+    """What embeddings are standardised by, and of which frames they are."""
 
     mean: torch.Tensor
     scale: torch.Tensor
+    """float64, dim each."""
+    frames: str = ""
+    """Fingerprint of the settings that the frames were chosen by: those of others are standardised by others."""
 
-    def save(self, folder: Path) -> None:
-        """Write them beside the embeddings that they are of, or into a folder that needs them again."""
-        save_tensors(folder / STATISTICS_FILE, self._asdict())
+    def save(self, file: Path) -> None:
+        """Write them as safetensors."""
+        save_tensors(file, {"mean": self.mean, "scale": self.scale}, {"frames": self.frames})
 
     @classmethod
-    def load(cls, folder: Path) -> Statistics:
+    def load(cls, file: Path) -> Statistics:
         """Read what `save` wrote."""
-        return cls(**load_tensors(folder / STATISTICS_FILE))
+        from safetensors import safe_open
+
+        tensors = load_tensors(file)
+        with safe_open(file, framework="pt") as stream:
+            return cls(**tensors, **stream.metadata())
 
 
 class TactileFeatures(Protocol):

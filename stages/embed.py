@@ -3,11 +3,11 @@
 from pathlib import Path
 
 from pipeline.config import EncoderConfig
-from pipeline.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE
+from pipeline.embeddings import INDEX_FILE, STATISTICS_FILE, TENSOR, TENSOR_FILE
 from pipeline.encoder.embed import embed_videos, standardize, statistics, union
 from pipeline.encoder.model import FrameEncoder
 from pipeline.encoder.recipes import base_encoder, property_classifier
-from pipeline.io import read_table, save_tensors, write_table
+from pipeline.io import fingerprint, read_table, save_tensors, write_table
 from pipeline.records import Assignment, Embedding, Encoder, Part
 from pipeline.runtime import resolve_device
 from pipeline.stage import DATA, stage
@@ -44,7 +44,7 @@ def main() -> None:
                 training = {a.video_id for a in assignments if a.part == Part.TRAIN}
                 known = statistics(raw, index, training)
                 tensor = standardize(raw, known) if params.encoder.standardize else raw
-                known.save(out)
+                known._replace(frames=fingerprint(params.frames)).save(out / STATISTICS_FILE)
                 save_tensors(out / TENSOR_FILE, {TENSOR: tensor})
                 write_table(out / INDEX_FILE, Embedding, index)
                 run.metrics[f"{which}-{seed}.rows"] = len(index)

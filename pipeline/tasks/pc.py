@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import re
+from typing import Literal
 
 from pipeline.records import Opd, Prediction, Question, Score
 from pipeline.tasks.base import (
@@ -24,6 +25,7 @@ TEMPLATES = (
     "Is the object in {tactile} COMPARATIVE than the object in {tactile}?",
 )
 CHOICES = ("yes", "no", "same")
+Reading = Literal["yes", "no", "same"]
 
 
 def asked(template: str, comparative: str, spoken: str) -> dict[Opd, str]:
@@ -36,10 +38,11 @@ def asked(template: str, comparative: str, spoken: str) -> dict[Opd, str]:
     }
 
 
-def read(answer: str) -> str | None:
+def read(answer: str) -> Reading | None:
     """One of `CHOICES`, from how the conclusion begins: "Yes", "No" or "Both"; "yes and no" is none of them."""
     match = re.match(r"(yes|no|both)\b(?!\s*(?:and|or|/)\s*(?:yes|no|both)\b)", conclusion(answer), flags=re.IGNORECASE)
-    return {"yes": "yes", "no": "no", "both": "same"}[match[1].lower()] if match else None
+    readings: dict[str, Reading] = {"yes": "yes", "no": "no", "both": "same"}
+    return readings[match[1].lower()] if match else None
 
 
 class PropertyComparison(TaskDefinition):

@@ -2,16 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import difflib
+import random
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
-from pipeline.runtime import DeviceName, DtypeName
+import torch
+
+from pipeline.errors import UserError
+from pipeline.language.chat import TACTILE, TACTILE_TOKENS
+from pipeline.language.generate import GenerationSettings, reply, stream, write_prompt
+from pipeline.language.octopi import OctopiForCausalLM
+from pipeline.records import Opd, Turn
+from pipeline.runtime import DeviceName, DtypeName, Quantization, derive_seed, name_dtype, resolve_device
+from pipeline.tasks import opd, pc, pom, psr, pss
+from pipeline.tasks.base import LETTERS
+from pipeline.use.feel import TactileSense
+from pipeline.use.folder import LANGUAGE_DIR, ModelConfig, chat_sample, find_base, read_folder
 from pipeline.use.results import Choice, Comparison, Description, Exchange, Matching, Ranking, Touch, Video
+from pipeline.videos.catalogue import Catalogue, Property
 
 
 class Octopi:
     """A model that feels: `Octopi.from_pretrained("models/finetuned-with-all-0").ask("...{tactile}...", ["a.mov"])`.
+
+    It remembers no conversation: the caller hands the earlier exchanges in. One call at a time.
 
     Attributes:
         card: What the folder's config.json says.
@@ -19,9 +35,15 @@ class Octopi:
         names: The names of the catalogue's objects.
     """
 
-    card: Mapping[str, Any]
-    properties: tuple[str, ...]
-    names: tuple[str, ...]
+    def __init__(
+        self, folder: Path, config: ModelConfig, catalogue: Catalogue, llm: OctopiForCausalLM, device: torch.device
+    ) -> None:
+        self.config, self.catalogue = config, catalogue
+        self.llm = llm.to(device)
+        self.card: Mapping[str, Any] = config.model_dump(mode="json")
+        self.properties: tuple[str, ...] = catalogue.property_names
+        self.names: tuple[str, ...] = tuple(o.name for o in catalogue.objects.values())
+        self.sense = TactileSense(folder, config, catalogue, device)
 
     @classmethod
     def from_pretrained(
@@ -32,7 +54,34 @@ class Octopi:
         device: DeviceName = "auto",
         dtype: DtypeName = "auto",
     ) -> Self:
-        raise NotImplementedError
+        """Load a folder that `dvc repro package` wrote.
+
+        Args:
+            folder: `models/<variant>`, or a copy of it.
+            base: Folder of the language model; by default the first known place that has it.
+            device: What to compute on; `auto` takes CUDA, then MPS, then the CPU.
+            dtype: Number format of the language model; `auto` is that of the evaluation, where the device computes it.
+
+        Raises:
+            UserError: naming what is missing, changed, of another version, or another language model.
+        """
+        folder = Path(folder)
+        config, catalogue = read_folder(folder)
+        found = find_base(folder, config.base, None if base is None else Path(base))
+        place = resolve_device(device)
+        if dtype == "auto":
+            dtype = "float32" if config.language.dtype == "float32" else name_dtype("auto", device)
+        quantization: Quantization = config.language.quantization if place.type == "cuda" else "none"
+        llm = OctopiForCausalLM.from_pretrained(
+            folder / LANGUAGE_DIR, base=found, dtype=dtype, quantization=quantization
+        )
+        if chat_sample(llm.tokenizer, config.language) != config.chat:
+            raise UserError(
+                f"{found}: its chat format is another than in training; name the folder of {config.base.folder}"
+            )
+        return cls(folder, config, catalogue, llm, place)
+
+    # ---- asking ----
 
     def ask(
         self,
@@ -42,7 +91,18 @@ class Octopi:
         history: Sequence[Exchange] = (),
         max_new_tokens: int | None = None,
     ) -> str:
-        raise NotImplementedError
+        """Answer a question.
+
+        Args:
+            question: With "{tactile}" once for each video, in their order.
+            videos: Files, or arrays of uint8, frames x height x width x RGB.
+            history: Earlier exchanges of the conversation.
+            max_new_tokens: Of the answer; by default those of the evaluation.
+
+        Raises:
+            UserError: for a question that does not fit its videos or is too long, or a video that cannot be used.
+        """
+        return self._reply([(*history, Exchange(question, tuple(videos), ""))], max_new_tokens)[0]
 
     def stream(
         self,
@@ -52,28 +112,171 @@ class Octopi:
         history: Sequence[Exchange] = (),
         max_new_tokens: int | None = None,
     ) -> Iterator[str]:
-        raise NotImplementedError
+        """As `ask`, in pieces of text as they come. Bad input is refused here, before the first piece is asked for."""
+        prompt, features = self._prompt((*history, Exchange(question, tuple(videos), "")))
+        return stream(self.llm, prompt, features, self._settings(max_new_tokens))
 
     def ask_all(self, asked: Sequence[tuple[str, Sequence[Video]]], *, max_new_tokens: int | None = None) -> list[str]:
-        raise NotImplementedError
+        """As `ask`, of many questions in one batch."""
+        return self._reply([(Exchange(question, tuple(videos), ""),) for question, videos in asked], max_new_tokens)
 
     def look(self, video: Video) -> Touch:
-        raise NotImplementedError
+        """What the model sees of a video.
+
+        Raises:
+            UserError: for what is no video, or is too short.
+        """
+        felt = self.sense.feel(video)
+        return felt.seen.touch.model_copy(update={"notes": felt.notes})
+
+    # ---- the tasks ----
 
     def describe(self, video: Video) -> Description:
-        raise NotImplementedError
+        """The classes of a video's properties, with their probabilities, and the model's own sentence."""
+        return self.describe_all([video])[0]
 
     def describe_all(self, videos: Sequence[Video]) -> list[Description]:
-        raise NotImplementedError
+        """As `describe`, of many videos in one batch. A video without contact is described with a note."""
+        if self.config.opd is Opd.NONE:
+            sentences = [""] * len(videos)
+        else:
+            question = opd.TEMPLATES[0]
+            sentences = self._reply([(Exchange(question, (v,), ""),) for v in videos], None, untouched=True)
+        return [self._described(video, sentence) for video, sentence in zip(videos, sentences, strict=True)]
 
     def compare(self, a: Video, b: Video, property: str) -> Comparison:
-        raise NotImplementedError
+        """Whether the first video is more of a property than the second, in the wording of training."""
+        known = self._property(property)
+        question = pc.asked(pc.TEMPLATES[0], known.more, known.spoken)[self.config.opd]
+        answer = self.ask(question, [a, b])
+        return Comparison(question=question, answer=answer, choice=pc.read(answer))
 
     def rank(self, videos: Sequence[Video], property: str) -> Ranking:
-        raise NotImplementedError
+        """Videos by a property, least first: by the heads, and the model's own answer for two or three."""
+        known = self._property(property)
+        place = self.properties.index(known.name)
+        judged = [self.sense.judge(video).probabilities[place] for video in videos]
+        expected = [sum(level * p for level, p in enumerate(probabilities)) for probabilities in judged]
+        answer, most = "", None
+        if len(videos) == 3:
+            answer = self.ask(pss.asked(pss.TEMPLATES[0], known.most, known.spoken)[self.config.opd], videos)
+            letter = pss.read(answer)
+            most = None if letter is None else LETTERS.index(letter)
+        elif len(videos) == 2:
+            compared = self.compare(videos[0], videos[1], property)
+            answer = compared.answer
+            most = {"yes": 0, "no": 1}.get(compared.choice or "")
+        order = sorted(range(len(videos)), key=expected.__getitem__)
+        return Ranking(property=known.name, order=tuple(order), expected=tuple(expected), answer=answer, most=most)
 
     def match(self, videos: Sequence[Video], names: Sequence[str]) -> Matching:
-        raise NotImplementedError
+        """Which of three videos is of which of three objects of the catalogue."""
+        if len(videos) != 3 or len(names) != 3:
+            raise UserError(f"{len(videos)} videos and {len(names)} names: three of each can be matched")
+        ids = {o.name.lower(): i for i, o in self.catalogue.objects.items()}
+        for name in names:
+            if name.lower() not in ids:
+                raise UserError(f"{name}: the catalogue has no such object{_hint(name, ids)}")
+        listed = sorted(names, key=str.lower)
+        question = pom.asked(pom.OPENINGS[0], listed)[self.config.opd]
+        if self.config.facts:
+            rng = random.Random(derive_seed("facts", *listed))
+            told = pom.facts(self.catalogue, [ids[name.lower()] for name in names], rng)
+            question = f"{told} {question}"
+        answer = self.ask(question, videos)
+        found = pom.read(answer, listed)
+        given = None if found is None else tuple(listed[found[letter]] for letter in LETTERS)
+        return Matching(question=question, answer=answer, names=given)
 
     def scenario(self, question: str, videos: Sequence[Video]) -> Choice:
-        raise NotImplementedError
+        """Which of two videos suits a situation better, described first where the variant describes."""
+        if len(videos) != 2:
+            raise UserError(f"{len(videos)} videos: a situation chooses between two")
+        aspects = " and ".join(p.spoken for p in self.catalogue.properties)
+        history: list[Exchange] = []
+        for number, turn in enumerate(psr.asked(question, aspects)[self.config.opd]):
+            shown = () if number else tuple(videos)
+            history.append(Exchange(turn, shown, self.ask(turn, shown, history=history)))
+        letter = psr.read(history[-1].answer)
+        place = None if letter is None else LETTERS.index(letter)
+        return Choice(question=question, answer=history[-1].answer, choice=place)
+
+    # ---- within ----
+
+    def _settings(self, max_new_tokens: int | None) -> GenerationSettings:
+        language = self.config.language
+        return GenerationSettings(
+            system_prompt=language.system_prompt,
+            per_video=self.config.frames.per_video,
+            max_new_tokens=max_new_tokens or language.max_new_tokens,
+            batch_size=language.generation_batch_size,
+        )
+
+    def _reply(
+        self, conversations: Iterable[Sequence[Exchange]], max_new_tokens: int | None, *, untouched: bool = False
+    ) -> list[str]:
+        asked = [self._prompt(conversation, untouched=untouched) for conversation in conversations]
+        prompts, features = [prompt for prompt, _ in asked], [found for _, found in asked]
+        return [said.text for said in reply(self.llm, prompts, features, self._settings(max_new_tokens))]
+
+    def _prompt(
+        self, conversation: Sequence[Exchange], *, untouched: bool = False
+    ) -> tuple[tuple[int, ...], torch.Tensor]:
+        """Token ids of a conversation whose last answer is to be said, and its frames' embeddings."""
+        for exchange in conversation:
+            check_question(exchange.question, len(exchange.videos))
+        turns = [Turn(user=exchange.question, assistant=exchange.answer) for exchange in conversation]
+        prompt = write_prompt(turns, self.llm.tokenizer, self._settings(None))
+        positions = self.llm.positions
+        if positions is not None and len(prompt) >= positions:
+            raise UserError(
+                f"the conversation takes {len(prompt)} tokens, but the language model reads {positions} with the "
+                "answer; shorten the question, or begin a new conversation"
+            )
+        features = [torch.zeros(0, self.llm.octopi_config.tactile_dim)]
+        for video in (v for exchange in conversation for v in exchange.videos):
+            felt = self.sense.feel(video)
+            if not (felt.seen.felt or untouched):
+                raise UserError(f"{felt.seen.name}: {felt.notes[0]}; record the sensor being pressed")
+            features.append(felt.features)
+        return prompt, torch.cat(features)
+
+    def _described(self, video: Video, sentence: str) -> Description:
+        felt, judged = self.sense.feel(video), self.sense.judge(video)
+        each = list(zip(self.catalogue.properties, judged.probabilities, judged.levels, strict=True))
+        silent = ("this variant was not trained to describe, so there is no sentence",)
+        return Description(
+            levels={p.name: p.levels[level] for p, _, level in each},
+            probabilities={p.name: dict(zip(p.levels, found, strict=True)) for p, found, _ in each},
+            sentence=sentence,
+            frames=felt.seen.touch.numbers,
+            notes=(*felt.notes, *(silent if self.config.opd is Opd.NONE else ())),
+        )
+
+    def _property(self, name: str) -> Property:
+        for known in self.catalogue.properties:
+            if name.lower() in (known.name, known.spoken):
+                return known
+        hint = _hint(name, self.properties)
+        raise UserError(f"{name}: no property of this model{hint}; it knows {', '.join(self.properties)}")
+
+
+def check_question(question: str, videos: int) -> None:
+    """Raise UserError where a question does not name its videos, or writes the tokens that stand for them."""
+    marks = question.count(TACTILE)
+    if not question.strip():
+        raise UserError("the question is empty; write one")
+    if marks != videos:
+        raise UserError(
+            f"the question has {marks} {TACTILE} for {videos} videos; write {TACTILE} once for each, in their order"
+        )
+    for token in TACTILE_TOKENS:
+        if token in question:
+            raise UserError(
+                f"the question has {token}, which stands for a touch itself; write {TACTILE} and give a video"
+            )
+
+
+def _hint(name: str, known: Iterable[str]) -> str:
+    close = difflib.get_close_matches(name.lower(), list(known), n=1)
+    return f" (did you mean {close[0]}?)" if close else ""

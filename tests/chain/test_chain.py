@@ -13,10 +13,12 @@ import yaml
 from safetensors.torch import load_file
 
 from pipeline.io import read_jsonl, read_table
-from pipeline.records import Classification, Part, Prediction, Question
+from pipeline.records import Classification, Opd, Part, Prediction, Question
 from pipeline.tasks import TASKS
+from pipeline.use.model import Octopi
 from pipeline.videos.catalogue import load_catalogue
 from tests.project import REDUCED, Project, copy_project
+from tests.use.shared import replay
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +39,15 @@ def test_everything_a_person_looks_at_is_there(project: Project) -> None:
     header, values = project.run("dvc", "metrics", "show", "--md").splitlines()[:3:2]
     assert header.count("|") - 2 <= 12, header
     assert "smoke-scenes" in values
+
+
+def test_the_packaged_model_answers_as_the_evaluation_did(project: Project) -> None:
+    key, data = "finetuned-with-all-0", project.folder / "data"
+    model = Octopi.from_pretrained(project.folder / "models" / key, device="cpu")
+    questions = read_jsonl(data / "questions" / "0" / "evaluation.jsonl", Question)
+    predictions = read_jsonl(data / "answers" / key / "real.jsonl", Prediction)
+    files = {f.stem: f for f in (data / "scenes" / "videos").rglob("*.*")}
+    assert replay(model, questions, predictions, Opd.ALL, files) == len(questions) >= 16
 
 
 def test_second_time_does_nothing(project: Project) -> None:

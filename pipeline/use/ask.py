@@ -1,0 +1,211 @@
+"""Asking a trained model in a terminal: one question, a chat, or a description of every video of a folder."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.errors import UserError
+from pipeline.io import write_text
+from pipeline.runtime import progress
+from pipeline.use.results import Exchange, Video
+from pipeline.videos.files import SUFFIXES
+
+if TYPE_CHECKING:
+    from pipeline.use.model import Octopi
+
+MODELS = Path("models")
+PREFERRED = "finetuned-with-all-*"
+"""The full system: fine-tuned encoder, LoRA, all descriptions."""
+BATCH = 8
+"""Videos that are described at once; a killed description loses no more."""
+PROMPT = "> "
+HELP = """\
+/add FILE  take a video for the next question, which names it {tactile}
+/frames    what the model sees of the videos
+/reset     begin a new conversation
+/quit      end"""
+
+
+def default_model(models: Path = MODELS) -> Path:
+    """The full system's folder, or the first that there is; UserError where there is none."""
+    found = sorted(models.glob(f"{PREFERRED}/config.json")) or sorted(models.glob("*/config.json"))
+    if not found:
+        raise UserError(f"{models}: holds no trained model; `dvc repro` makes some, or name a folder with --model")
+    return found[0].parent
+
+
+def answer_once(model: Octopi, question: str, videos: Sequence[str]) -> dict[str, Any]:
+    """An answer with what it stands on, for machines."""
+    answer = model.ask(question, videos)
+    looked = [model.look(video) for video in videos]
+    return {
+        "model": model.card["variant"],
+        "question": question,
+        "videos": [
+            {"file": video, "frames": touch.numbers, "contact": touch.contact, "notes": touch.notes}
+            for video, touch in zip(videos, looked, strict=True)
+        ],
+        "answer": answer,
+    }
+
+
+def lines_of_terminal() -> Iterator[str]:
+    """What a person types, line by line, until the end of input."""
+    with suppress(ImportError):
+        import readline  # noqa: F401  (gives `input` a history and editing keys)
+    while True:
+        try:
+            yield input(PROMPT)
+        except EOFError:
+            return
+        except KeyboardInterrupt:
+            print("\n(/quit ends)")
+
+
+class Chat:
+    """A conversation: questions, and commands that begin with a slash.
+
+    Args:
+        say: Shows a piece of text; no line end is added.
+    """
+
+    def __init__(self, model: Octopi, say: Callable[[str], object], videos: Iterable[str] = ()) -> None:
+        self.model, self.say = model, say
+        self.history: list[Exchange] = []
+        self.waiting: list[Video] = []
+        for video in videos:
+            self.add(video)
+
+    def run(self, lines: Iterable[str]) -> None:
+        """Answer line by line; what is wrong is said, and the conversation goes on."""
+        for line in map(str.strip, lines):
+            if line == "/quit":
+                return
+            try:
+                if line.startswith("/"):
+                    self._command(*line.partition(" ")[::2])
+                elif line:
+                    self._ask(line)
+            except UserError as error:
+                self.say(f"{error}\n")
+            except KeyboardInterrupt:
+                self.say("\n(stopped; the question is forgotten)\n")
+
+    def add(self, file: str) -> None:
+        """Take a video for the next question, unless it cannot be used."""
+        touch = self.model.look(file)
+        self.waiting.append(file)
+        self.say("".join(f"{file}: {note}\n" for note in touch.notes))
+        self.say(f"{len(self.waiting)} for the next question: write {{tactile}} once for each\n")
+
+    def _command(self, name: str, rest: str) -> None:
+        match name:
+            case "/add" if rest.strip():
+                self.add(rest.strip())
+            case "/frames":
+                self._frames()
+            case "/reset":
+                self.history, self.waiting = [], []
+                self.say("a new conversation\n")
+            case _:
+                self.say(f"{HELP}\n")
+
+    def _ask(self, question: str) -> None:
+        said = ""
+        for piece in self.model.stream(question, self.waiting, history=self.history):
+            self.say(piece)
+            said += piece
+        self.say("\n")
+        self.history.append(Exchange(question, tuple(self.waiting), said))
+        self.waiting = []
+
+    def _frames(self) -> None:
+        videos = [*(v for exchange in self.history for v in exchange.videos), *self.waiting]
+        for video in videos:
+            touch = self.model.look(video)
+            numbers = ", ".join(map(str, touch.numbers))
+            self.say(f"{video}: frames {numbers}; touched {touch.contact:.0%} of the picture\n")
+            self.say("".join(f"  {note}\n" for note in touch.notes))
+        if not videos:
+            self.say("no video yet: /add FILE\n")
+
+
+def describe_folder(model: Octopi, folder: Path, out: Path) -> tuple[int, int]:
+    """Describe every video of a folder and its subfolders in a CSV file, a row each; a second call goes on.
+
+    Returns:
+        How many rows the file has, and how many of them are videos that could not be described (column `error`).
+
+    Raises:
+        UserError: for a folder without videos, or a file that another model or something else wrote.
+    """
+    files = sorted(f for f in folder.rglob("*") if f.suffix.lower() in SUFFIXES and f.is_file())
+    if not files:
+        raise UserError(f"{folder}: holds no video ({', '.join(SUFFIXES)}); name another folder")
+    columns = _columns(model)
+    done = _done(out, columns, str(model.card["variant"]))
+    rest = [f for f in files if f.relative_to(folder).as_posix() not in done]
+    failed = sum(bool(error) for error in done.values())
+    if not out.is_file() or not done:
+        write_text(out, _row(columns))
+    with progress(len(rest), "describe", "video") as advance:
+        for start in range(0, len(rest), BATCH):
+            rows = _describe(model, folder, rest[start : start + BATCH])
+            with out.open("a", encoding="utf-8", newline="") as stream:
+                stream.write("".join(_row([row.get(column, "") for column in columns]) for row in rows))
+            failed += sum(bool(row.get("error")) for row in rows)
+            for _ in rows:
+                advance()
+    return len(done) + len(rest), failed
+
+
+def _columns(model: Octopi) -> list[str]:
+    levels = {p.name: p.levels for p in model.catalogue.properties}
+    probabilities = [f"{name}: {level}" for name, known in levels.items() for level in known]
+    return ["file", *levels, *probabilities, "sentence", "frames", "notes", "error", "model"]
+
+
+def _done(out: Path, columns: Sequence[str], variant: str) -> dict[str, str]:
+    """Files that a CSV has already, each with its error; what a kill left of a last line is cut off."""
+    if not out.is_file():
+        return {}
+    text = out.read_text(encoding="utf-8")
+    whole = text[: text.rfind("\n") + 1]
+    rows = list(csv.DictReader(io.StringIO(whole)))
+    header = next(csv.reader(io.StringIO(whole)), [])
+    if (whole and header != columns) or any(row["model"] != variant for row in rows):
+        raise UserError(f"{out}: is no description by {variant}; name another file with --csv")
+    if whole != text:
+        write_text(out, whole)
+    return {row["file"]: row["error"] for row in rows}
+
+
+def _describe(model: Octopi, folder: Path, files: Sequence[Path]) -> list[dict[str, object]]:
+    rows: list[dict[str, object]] = []
+    good = []
+    for file in files:
+        row: dict[str, object] = {"file": file.relative_to(folder).as_posix(), "model": model.card["variant"]}
+        rows.append(row)
+        try:
+            model.look(file)
+            good.append((file, row))
+        except UserError as error:
+            row["error"] = str(error)
+    for (_, row), found in zip(good, model.describe_all([file for file, _ in good]), strict=True):
+        row |= found.levels
+        for name, known in found.probabilities.items():
+            row |= {f"{name}: {level}": round(p, 4) for level, p in known.items()}
+        row |= {"sentence": " ".join(found.sentence.split()), "frames": " ".join(map(str, found.frames))}
+        row["notes"] = "; ".join(found.notes)
+    return rows
+
+
+def _row(cells: Iterable[object]) -> str:
+    stream = io.StringIO()
+    csv.writer(stream, lineterminator="\n").writerow([" ".join(str(cell).split()) for cell in cells])
+    return stream.getvalue()

@@ -1,0 +1,137 @@
+"""What a trained model feels of a video: embeddings for its language model, and what its property heads say."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from functools import cached_property
+from hashlib import sha256
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from pipeline.config import EncoderConfig
+from pipeline.embeddings import STATISTICS_FILE, Statistics
+from pipeline.encoder.embed import standardize
+from pipeline.encoder.model import FrameEncoder, PropertyClassifier
+from pipeline.encoder.recipes import base_encoder, property_classifier
+from pipeline.errors import UserError
+from pipeline.evaluation.calibration import rescale
+from pipeline.io import fingerprint
+from pipeline.records import Encoder
+from pipeline.training.trainable import load_trainable
+from pipeline.use.folder import BACKBONE_DIR, CONFIG, ENCODER_DIR, SCENES, TRAINED, ModelConfig, distance
+from pipeline.use.results import Video
+from pipeline.use.sight import Seen, see
+from pipeline.videos.catalogue import Catalogue
+
+REMEMBERED = 32
+"""Videos whose embeddings are kept, so that a conversation about them goes on at once."""
+
+
+class Felt(NamedTuple):
+    """A video as the language model is given it."""
+
+    seen: Seen
+    features: torch.Tensor
+    """float32, frames x dim."""
+    notes: tuple[str, ...]
+    """What should make one doubt an answer."""
+
+
+class Judgement(NamedTuple):
+    """What the heads say, each by the catalogue's order of properties."""
+
+    probabilities: tuple[tuple[float, ...], ...]
+    """Calibrated, of each class."""
+    levels: tuple[int, ...]
+    """The classes that they take."""
+
+
+class TactileSense:
+    """The tactile encoder and heads of a folder, with what embeddings are standardised by.
+
+    Raises:
+        UserError: where the folder's frame settings are not those of training.
+    """
+
+    def __init__(self, folder: Path, config: ModelConfig, catalogue: Catalogue, device: torch.device) -> None:
+        self.place, self.config, self.catalogue, self.device = folder / ENCODER_DIR, config, catalogue, device
+        self.statistics = Statistics.load(self.place / STATISTICS_FILE)
+        if self.statistics.frames != fingerprint(config.frames):
+            raise UserError(
+                f"{folder / CONFIG}: its frame settings are not those of training; copy the whole folder again"
+            )
+        self._felt: OrderedDict[str, Felt] = OrderedDict()
+
+    @torch.inference_mode()
+    def feel(self, video: Video) -> Felt:
+        """A video's frames and their embeddings.
+
+        Raises:
+            UserError: for what is no video, is damaged as a whole or too short.
+        """
+        name, config = _name(video), self.config
+        if name not in self._felt:
+            seen = see(video, config.frames, subtracts=config.encoder.reference == "subtract", quiet=config.quiet)
+            raw = self._encoder(*self._frames(seen)).float().cpu()
+            if not raw.isfinite().all():
+                raise UserError(f"{seen.name}: its embedding is not finite; check the video")
+            standard = standardize(raw, self.statistics)
+            features = standard if config.encoder.standardize else raw
+            self._felt[name] = Felt(seen, features, (*seen.touch.notes, *self._unlike(standard)))
+        self._felt.move_to_end(name)
+        while len(self._felt) > REMEMBERED:
+            self._felt.popitem(last=False)
+        return self._felt[name]
+
+    @torch.inference_mode()
+    def judge(self, video: Video) -> Judgement:
+        """What the property heads say of a video."""
+        frames, numbers = self._frames(self.feel(video).seen)
+        logits = self._classifier(frames[None], numbers[None])["logits"].cpu()
+        parts = logits.double().split([len(p.levels) for p in self.catalogue.properties], dim=1)
+        probabilities = (
+            rescale(part.softmax(1)[0].numpy(), self.config.temperatures[p.name]).tolist()
+            for part, p in zip(parts, self.catalogue.properties, strict=True)
+        )
+        return Judgement(tuple(map(tuple, probabilities)), tuple(self._classifier.decide(logits)[0].tolist()))
+
+    def _unlike(self, standard: torch.Tensor) -> tuple[str, ...]:
+        far, usual = distance(standard.double().numpy()), self.config.usual
+        if far <= usual:
+            return ()
+        return (f"unlike training: {far:.1f} deviations from its mean, where its own videos reach {usual:.1f}",)
+
+    def _frames(self, seen: Seen) -> tuple[torch.Tensor, torch.Tensor]:
+        return torch.from_numpy(seen.pictures).to(self.device), torch.tensor(seen.touch.numbers, device=self.device)
+
+    @property
+    def _own(self) -> EncoderConfig:
+        """The encoder's settings with the folder's own files."""
+        files = {"weights": str(self.place / BACKBONE_DIR), "pretrained": str(self.place / SCENES)}
+        return self.config.encoder.model_copy(update=files)
+
+    @cached_property
+    def _classifier(self) -> PropertyClassifier:
+        classifier = property_classifier(self._own, [len(p.levels) for p in self.catalogue.properties])
+        load_trainable(classifier, self.place / TRAINED)
+        return classifier.to(self.device).eval()
+
+    @cached_property
+    def _encoder(self) -> FrameEncoder:
+        if self.config.encoder_used is Encoder.FINETUNED:
+            return self._classifier.encoder
+        return base_encoder(self._own).to(self.device).eval()
+
+
+def _name(video: Video) -> str:
+    """By which a video is known again: its place, size and time of change, or an array's bytes."""
+    if isinstance(video, np.ndarray):
+        return f"{video.shape} {video.dtype} {sha256(np.ascontiguousarray(video).data).hexdigest()}"
+    try:
+        status = Path(video).stat()
+    except OSError:
+        return str(video)
+    return f"{Path(video).resolve()} {status.st_size} {status.st_mtime_ns} {status.st_ino}"

@@ -1,0 +1,191 @@
+"""The folder that a trained model is used from: what is in it, and how it is read.
+
+    config.json            frames, encoder, language model, calibration; everything below by hash
+    catalogue.json         the properties and objects that it has words for
+    encoder/               encoder.safetensors (prompts or last stage, and heads), statistics.safetensors, backbone/
+    language/              connector.safetensors, adapter/
+    base/                  the language model itself, where it was put in
+    README.md              the model card
+
+All weights are safetensors, all else JSON: reading it runs no code. Apart from `base/` it needs nothing but the base
+language model, which is named by hash.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ValidationError
+
+from pipeline.config import EncoderConfig, FramesConfig, LanguageConfig
+from pipeline.errors import UserError
+from pipeline.io import read_json
+from pipeline.language.chat import render
+from pipeline.records import Encoder, Opd, Record, Turn
+from pipeline.videos.catalogue import Catalogue
+
+if TYPE_CHECKING:
+    from transformers import PreTrainedTokenizerBase
+
+FORMAT = 1
+CONFIG, CATALOGUE = "config.json", "catalogue.json"
+ENCODER_DIR, LANGUAGE_DIR, BASE_DIR, BACKBONE_DIR = "encoder", "language", "base", "backbone"
+TRAINED, SCENES = "encoder.safetensors", "scenes.safetensors"
+IDENTITY = ("*.safetensors", "tokenizer.json")
+"""Files by which a base language model is known."""
+
+M = TypeVar("M", bound=BaseModel)
+
+
+class Base(Record):
+    """The language model that a folder stands on."""
+
+    folder: str
+    """Where it lay when the model was trained."""
+    files: dict[str, str]
+    """sha256 by name, of `IDENTITY`."""
+
+
+class ModelConfig(Record):
+    """config.json."""
+
+    format: int
+    variant: str
+    encoder_used: Encoder
+    """Whose embeddings the language model reads; the heads are always those of the fine-tuned encoder."""
+    opd: Opd
+    """How much it was trained to describe before it concludes."""
+    trained_on: str
+    """`data.source`: whether its videos were synthetic."""
+    facts: bool
+    """Whether matching questions tell it what the named objects are like."""
+    frames: FramesConfig
+    encoder: EncoderConfig
+    language: LanguageConfig
+    base: Base
+    chat: str
+    """A conversation as its chat format writes it; another format would be asked what was never trained."""
+    quiet: float
+    """Contact strength that noise alone gives in its data."""
+    usual: float
+    """How far its training and validation videos lie from their mean at most, in deviations a dimension."""
+    temperatures: dict[str, float]
+    """By property, fitted on validation objects."""
+    scores: dict[str, tuple[float, float, float]]
+    """By task, on test questions: accuracy, and the ends of its interval."""
+    files: dict[str, str]
+    """sha256 of every other file by its path."""
+    versions: dict[str, str]
+    """Of the libraries that it was made with."""
+
+
+def sha256(file: Path) -> str:
+    """Of a file's bytes."""
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def identify(folder: Path) -> dict[str, str]:
+    """sha256 of the files that a base language model is known by."""
+    return {file.name: sha256(file) for pattern in IDENTITY for file in sorted(folder.glob(pattern))}
+
+
+def read_folder(folder: Path, *, check: bool = True) -> tuple[ModelConfig, Catalogue]:
+    """What a folder says of itself.
+
+    Args:
+        check: Whether its files are compared with their hashes.
+
+    Raises:
+        UserError: for a folder that is none, of another version, or with a file that is missing or was changed.
+    """
+    if not (folder / CONFIG).is_file():
+        raise UserError(f"{folder}: holds no {CONFIG}, so it is no trained model; `dvc repro package` makes models/")
+    values = _json(folder / CONFIG)
+    version = values.get("format") if isinstance(values, dict) else None
+    if version != FORMAT:
+        raise UserError(
+            f"{folder / CONFIG}: of format {version}, but this version reads {FORMAT}; run `dvc repro package` again, "
+            "or install the version that made it"
+        )
+    config = _validate(ModelConfig, values, folder / CONFIG)
+    for name, expected in config.files.items() if check else ():
+        file = folder / name
+        if not file.is_file():
+            raise UserError(f"{file}: is missing; copy the whole folder again")
+        if sha256(file) != expected:
+            raise UserError(f"{file}: differs from what {CONFIG} says; copy the whole folder again")
+    return config, _validate(Catalogue, _json(folder / CATALOGUE), folder / CATALOGUE)
+
+
+def find_base(folder: Path, base: Base, given: Path | None = None) -> Path:
+    """The folder of the language model: the one given, or the first of the known places that has it.
+
+    Known places: `base/` in the folder, where it lay in training (from here, and from above the folder), and weights/
+    by its name.
+
+    Raises:
+        UserError: where there is none, or it is another.
+    """
+    places = [given] if given else list(_places(folder, Path(base.folder)))
+    there = [place for place in places if any(place.glob("*.safetensors"))]
+    for place in there:
+        if wrong := sorted(set(identify(place).items()) ^ set(base.files.items())):
+            found = UserError(
+                f"{place}: is another language model than {folder} was trained on ({wrong[0][0]} differs); name the "
+                f"folder of {base.folder} with --base"
+            )
+            if place == there[-1]:
+                raise found
+            continue
+        return place
+    looked = ", ".join(map(str, dict.fromkeys(places)))
+    raise UserError(
+        f"{folder}: its language model {base.folder} is not there (looked in {looked}); name its folder with --base, "
+        f"or copy it with `octopi export {folder} TO --with-base` where it is"
+    )
+
+
+def chat_sample(tokenizer: PreTrainedTokenizerBase, language: LanguageConfig) -> str:
+    """Two turns as a language model's chat format writes them."""
+    turns = [Turn(user="a {tactile}", assistant="b"), Turn(user="c", assistant="d")]
+    return render(turns, tokenizer, system_prompt=language.system_prompt, frames=1, complete=True).text
+
+
+def distance(standardised: npt.NDArray[np.float64]) -> float:
+    """How far a video lies from the training videos' mean, in deviations a dimension (root mean square).
+
+    Args:
+        standardised: Its frames' embeddings, frames x dim, by the training frames' statistics.
+    """
+    return float(np.sqrt(np.square(standardised.mean(axis=0)).mean()))
+
+
+def _places(folder: Path, named: Path) -> Iterator[Path]:
+    yield folder / BASE_DIR
+    yield named
+    for above in folder.resolve().parents:
+        yield above / named
+    yield Path("weights") / named.name
+
+
+def _json(file: Path) -> Any:
+    try:
+        return read_json(file)
+    except UserError:
+        raise UserError(f"{file}: missing, or not JSON; copy the whole folder again") from None
+
+
+def _validate(model: type[M], values: Mapping[str, Any], file: Path) -> M:
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        found = error.errors(include_url=False)[0]
+        raise UserError(
+            f"{file}: {'.'.join(map(str, found['loc']))}: {found['msg']}; copy the whole folder again"
+        ) from None

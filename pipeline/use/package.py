@@ -1,0 +1,271 @@
+"""Packaging: what the chain made of one variant, and what its answers need, in one folder."""
+
+from __future__ import annotations
+
+import csv
+import platform
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+
+from pydantic import BaseModel
+
+from pipeline.card import CARD_FILE, write_card
+from pipeline.config import PRETRAINED, Params
+from pipeline.embeddings import STATISTICS_FILE, EmbeddingStore, Statistics
+from pipeline.errors import UserError
+from pipeline.evaluation.calibration import calibration_error, error_interval, fit_temperature, reliability
+from pipeline.io import atomic_folder, read_table, write_json
+from pipeline.language.base import load_tokenizer
+from pipeline.language.connector import CONFIG_FILE
+from pipeline.language.octopi import ADAPTER_DIR, CONNECTOR_FILE
+from pipeline.records import Assignment, Classification, Part, Probe, Touch, Variant
+from pipeline.tasks import TASKS
+from pipeline.training.sampling import sample_evaluation
+from pipeline.use.folder import (
+    BACKBONE_DIR,
+    BASE_DIR,
+    CATALOGUE,
+    CONFIG,
+    ENCODER_DIR,
+    FORMAT,
+    LANGUAGE_DIR,
+    SCENES,
+    TRAINED,
+    Base,
+    ModelConfig,
+    chat_sample,
+    distance,
+    find_base,
+    identify,
+    read_folder,
+    sha256,
+)
+from pipeline.videos.audit.files import quiet_level
+from pipeline.videos.catalogue import load_catalogue
+from pipeline.videos.frames.store import PROBES_FILE
+from pipeline.weights import CLIP_CONFIG, TIMM_CONFIG, TIMM_WEIGHTS, clip_file
+
+LIBRARIES = ("octopi-pipeline", "torch", "transformers", "peft", "open_clip_torch", "timm", "av")
+LIMITS = (
+    "It knows objects and sensors only as its training videos show them; for another sensor it must be trained anew.",
+    "It was asked templates of the tasks above; what it answers to other questions was never measured.",
+    "Its probabilities are calibrated on validation objects of the same sensor, and mean little for another.",
+    "It does not say that it does not know; heed the notes of `look` and `describe`.",
+    "Answers must not steer a machine that can hurt somebody.",
+)
+
+
+def package(data: Path, params: Params, variant: Variant, base: Base, out: Path) -> ModelConfig:
+    """Write one variant's folder.
+
+    Args:
+        data: The chain's folder of data.
+        base: The language model, as `describe_base` says.
+        out: The folder, made anew.
+    """
+    encoder, language = params.encoder, params.language
+    catalogue = load_catalogue(Path(params.data.catalogue))
+    judged = read_table(data / "encoder" / str(variant.seed) / "classifications.parquet", Classification)
+    embeddings = data / "embeddings" / f"{variant.encoder}-{variant.seed}"
+    seen = {p.name: [c for c in judged if c.property == p.name] for p in catalogue.properties}
+    temperatures = {
+        name: fit_temperature([c for c in rows if c.part == Part.VALIDATION]) for name, rows in seen.items()
+    }
+    scores = _scores(Path("reports") / params.report_name / "scores.csv", params, variant)
+    with atomic_folder(out) as folder:
+        _copy_encoder(folder / ENCODER_DIR, params, data / "encoder" / str(variant.seed))
+        _copy(embeddings / STATISTICS_FILE, folder / ENCODER_DIR / STATISTICS_FILE)
+        trained = data / "models" / variant.lora / f"{variant.encoder}-{variant.opd}-{variant.seed}"
+        for name in (CONFIG_FILE, CONNECTOR_FILE):
+            _copy(trained / name, folder / LANGUAGE_DIR / name)
+        if (trained / ADAPTER_DIR).is_dir():
+            shutil.copytree(trained / ADAPTER_DIR, folder / LANGUAGE_DIR / ADAPTER_DIR)
+        write_json(folder / CATALOGUE, catalogue.model_dump(mode="json"))
+        config = ModelConfig(
+            format=FORMAT,
+            variant=variant.key,
+            encoder_used=variant.encoder,
+            opd=variant.opd,
+            trained_on=params.data.source,
+            facts=params.questions.facts,
+            frames=params.frames,
+            encoder=encoder,
+            language=language,
+            base=base,
+            chat=chat_sample(load_tokenizer(Path(language.weights)), language),
+            quiet=quiet_level(read_table(data / "frames" / PROBES_FILE, Probe)),
+            usual=_usual(embeddings, data / "splits" / f"{variant.seed}.parquet", params),
+            temperatures=temperatures,
+            scores={score.task: (score.accuracy, score.low, score.high) for score in scores},
+            files={f.relative_to(folder).as_posix(): sha256(f) for f in sorted(folder.rglob("*")) if f.is_file()},
+            versions={"python": platform.python_version(), **{name: metadata.version(name) for name in LIBRARIES}},
+        )
+        write_json(folder / CONFIG, config.model_dump(mode="json"))
+        _write_card(folder, config, seen, scores, params)
+    return config
+
+
+def describe_base(folder: Path) -> Base:
+    """A language model by hash."""
+    return Base(folder=folder.as_posix(), files=identify(folder))
+
+
+def export(folder: Path, to: Path, *, with_base: bool = False, base: Path | None = None) -> None:
+    """Copy a folder, and put its language model in where `with_base`.
+
+    Raises:
+        UserError: where `to` is there already, the folder is no trained model, or its language model is not found.
+    """
+    config, _ = read_folder(folder)
+    if to.exists():
+        raise UserError(f"{to}: is there already; name a folder that is not")
+    with atomic_folder(to) as made:
+        shutil.copytree(folder, made, dirs_exist_ok=True, ignore=shutil.ignore_patterns(BASE_DIR))
+        if with_base:
+            shutil.copytree(find_base(folder, config.base, base), made / BASE_DIR)
+
+
+@dataclass(frozen=True)
+class Scored:
+    """A row of scores.csv."""
+
+    task: str
+    n: int
+    accuracy: float
+    low: float
+    high: float
+    chance: float
+
+
+def _scores(file: Path, params: Params, variant: Variant) -> list[Scored]:
+    """The variant's scores on test questions; with folds, those of all folds together."""
+    wanted = {
+        "encoder": variant.encoder,
+        "lora": variant.lora,
+        "opd": variant.opd,
+        "touch": Touch.REAL,
+        "seed": str(params.split.replicate_of(variant.seed)),
+    }
+    with file.open(encoding="utf-8", newline="") as stream:
+        rows = [row for row in csv.DictReader(stream) if all(row[name] == value for name, value in wanted.items())]
+    kept = [row for row in rows if row["task"] in TASKS and row["measure"] == TASKS[row["task"]].measure]
+    numbers = ("accuracy", "low", "high", "chance")
+    return [
+        Scored(row["task"], int(float(row["n"])), *(float(row[name]) for name in numbers))
+        for row in kept
+        if all(row[name] for name in ("n", *numbers))
+    ]
+
+
+def _usual(embeddings: Path, split: Path, params: Params) -> float:
+    """How far a training or validation video's mean embedding lies from that of all, at most."""
+    store, known = EmbeddingStore(embeddings), Statistics.load(embeddings / STATISTICS_FILE)
+    distances = []
+    for assignment in read_table(split, Assignment):
+        if assignment.part in (Part.TRAIN, Part.VALIDATION):
+            places = sample_evaluation(store.count(assignment.video_id), params.frames.per_video)
+            found = store.features(assignment.video_id, places).double()
+            distances.append(
+                distance(found.numpy() if params.encoder.standardize else ((found - known.mean) / known.scale).numpy())
+            )
+    return max(distances, default=0.0)
+
+
+def _copy(source: Path, to: Path) -> None:
+    to.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(source, to)
+
+
+def _copy_encoder(folder: Path, params: Params, trained: Path) -> None:
+    _copy(trained / TRAINED, folder / TRAINED)
+    weights = Path(params.encoder.weights)
+    files: list[Path] = []
+    if "clip" in params.encoder.backbone:
+        files += [weights / CLIP_CONFIG, clip_file(weights)]
+    if "timm" in params.encoder.backbone:
+        files += [weights / TIMM_CONFIG, weights / TIMM_WEIGHTS]
+    for file in {*files, *(f for f in (weights / CARD_FILE,) if files and f.is_file())}:
+        _copy(file, folder / BACKBONE_DIR / file.name)
+    if "scenes" in params.encoder.backbone:
+        _copy(PRETRAINED, folder / SCENES)
+
+
+def _write_card(
+    folder: Path,
+    config: ModelConfig,
+    seen: dict[str, list[Classification]],
+    scores: Sequence[Scored],
+    params: Params,
+) -> None:
+    tested = {name: [c for c in rows if c.part == Part.TEST] for name, rows in seen.items()}
+    bases = {"language model": Path(params.language.weights)}
+    if (folder / ENCODER_DIR / BACKBONE_DIR).is_dir():
+        bases["tactile encoder"] = Path(params.encoder.weights)
+    if "scenes" in params.encoder.backbone:
+        bases["tactile encoder, pretrained on synthetic scenes"] = PRETRAINED
+    dataset = f"{params.data.source}, split {params.split.name}, test objects"
+    results = [
+        {
+            "task": {"type": "visual-question-answering", "name": TASKS[s.task].title},
+            "dataset": {"type": "tactile-videos", "name": dataset},
+            "metrics": [{"type": "accuracy", "value": s.accuracy, "args": {"low": s.low, "high": s.high, "n": s.n}}],
+        }
+        for s in scores
+    ]
+    write_card(
+        folder,
+        f"Octopi: a language model with touch, {config.variant}",
+        bases=bases,
+        data={
+            "videos": params.data.source,
+            "catalogue": params.data.catalogue,
+            "split": f"{params.split.name}; scores are of its test objects, which nothing was trained or chosen on",
+        },
+        settings={**_flat("frames", config.frames), **_flat("encoder", config.encoder), **config.versions},
+        limits=LIMITS,
+        front={"library_name": "octopi-pipeline", "model-index": [{"name": config.variant, "results": results}]},
+        tables={
+            "Scores": [
+                {
+                    "Task": f"{TASKS[s.task].title} ({s.task})",
+                    "n": s.n,
+                    "Accuracy, %": f"{100 * s.accuracy:.1f} [{100 * s.low:.1f}, {100 * s.high:.1f}]",
+                    "Chance, %": f"{100 * s.chance:.1f}",
+                }
+                for s in scores
+            ],
+            "Calibration of the heads' probabilities": [
+                _calibrated(name, rows, config.temperatures[name]) for name, rows in tested.items() if rows
+            ],
+            "Reliability": [
+                {
+                    "Property": name,
+                    "Probability": f"{b.low:.1f} to {b.high:.1f}",
+                    "n": b.n,
+                    "Mean probability": f"{b.confidence:.2f}",
+                    "Right": f"{b.accuracy:.2f}",
+                }
+                for name, rows in tested.items()
+                if rows
+                for b in reliability(rows, config.temperatures[name])
+            ],
+        },
+    )
+
+
+def _flat(section: str, settings: BaseModel) -> dict[str, object]:
+    return {f"{section}.{name}": value for name, value in settings.model_dump().items()}
+
+
+def _calibrated(name: str, rows: Sequence[Classification], temperature: float) -> dict[str, object]:
+    low, high = error_interval(rows, temperature)
+    return {
+        "Property": name,
+        "Temperature": f"{temperature:.2f}",
+        "Test videos": len(rows),
+        "Expected calibration error": f"{calibration_error(rows, temperature):.3f} [{low:.3f}, {high:.3f}]",
+        "Without the temperature": f"{calibration_error(rows):.3f}",
+    }

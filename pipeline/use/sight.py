@@ -1,0 +1,112 @@
+"""From a video to what a model is given of it: the chain's own decoding, frame selection and embedding."""
+
+from __future__ import annotations
+
+import os
+import stat
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import av
+import numpy as np
+
+from pipeline.config import FramesConfig
+from pipeline.errors import UserError
+from pipeline.records import Finding
+from pipeline.training.sampling import sample_evaluation
+from pipeline.use.results import Pictures, Touch, Video
+from pipeline.videos.audit.files import FOUND
+from pipeline.videos.files import VideoFile
+from pipeline.videos.frames.scan import Scan, scan
+from pipeline.videos.frames.subtraction import GAIN, MIDDLE, subtract
+
+FEWEST = 2
+"""Frames of a video at least: touch is a change."""
+TOUCHED = 8
+"""Steps of difference to the untouched sensor, of 255, from which a pixel counts as touched."""
+FPS = 25
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A video as it is shown to a model."""
+
+    name: str
+    touch: Touch
+    pictures: Pictures
+    """What the encoder takes: the frames, or their differences to the reference."""
+    felt: bool
+    """Whether anything touches the sensor."""
+
+
+def see(video: Video, frames: FramesConfig, *, subtracts: bool, quiet: float) -> Seen:
+    """Decode a video, choose its frames and say what they show.
+
+    Args:
+        subtracts: Whether the encoder is shown differences.
+        quiet: Contact strength that noise alone gives.
+
+    Raises:
+        UserError: for what is no video, is damaged as a whole or too short.
+    """
+    with _as_file(video) as path:
+        name = str(path) if not isinstance(video, np.ndarray) else "the array"
+        found = scan(VideoFile(path, name, object_id="", video_id=path.stem), frames)
+    if isinstance(found, Finding):
+        raise UserError(f"{name}: {found.measured}")
+    if found.video.frames < FEWEST or not found.kept:
+        raise UserError(f"{name}: {found.video.frames} frames show no touch; record from before the contact to its end")
+    return _shown(name, found, frames, subtracts, quiet)
+
+
+def _shown(name: str, found: Scan, frames: FramesConfig, subtracts: bool, quiet: float) -> Seen:
+    chosen = [found.kept[place] for place in sample_evaluation(len(found.kept), frames.per_video)]
+    pictures = np.stack([kept.image for kept in chosen])
+    difference = subtract(pictures, found.reference)
+    beyond = np.abs(difference.astype(np.int16) - MIDDLE).max(axis=3) > GAIN * TOUCHED
+    notes, probe = [], found.probe
+    felt = probe.contact > quiet
+    if not felt:
+        notes.append(f"nothing touches the sensor: strength {probe.contact:.2f}, where noise alone has {quiet:.2f}")
+    elif probe.contact <= FOUND * quiet:
+        notes.append(f"little touches the sensor: strength {probe.contact:.2f}, where noise alone has {quiet:.2f}")
+    if probe.header_frames > probe.frames:
+        notes.append(f"damaged: only {probe.frames} of its {probe.header_frames} frames decode")
+    touch = Touch(
+        frames=pictures,
+        numbers=tuple(kept.index for kept in chosen),
+        reference=found.reference,
+        difference=difference,
+        contact=float(beyond.mean(axis=(1, 2)).max()),
+        strength=probe.contact,
+        notes=tuple(notes),
+    )
+    return Seen(name, touch, difference if subtracts else pictures, felt)
+
+
+@contextmanager
+def _as_file(video: Video) -> Iterator[Path]:
+    """The file of a video; an array becomes a lossless one, so that both take the same way."""
+    if not isinstance(video, np.ndarray):
+        path = Path(video)
+        # A pipe or a device is not opened: reading it may never end.
+        if not path.exists() or not stat.S_ISREG(path.stat().st_mode):
+            raise UserError(f"{path}: no such file; name a video")
+        yield path
+        return
+    if video.dtype != np.uint8 or video.ndim != 4 or video.shape[3] != 3 or not all(video.shape):
+        raise UserError(
+            f"an array of {video.dtype} and shape {video.shape} is no video; give uint8, frames x height x width x RGB"
+        )
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "array.mkv"
+        with av.open(os.fspath(path), "w") as container:
+            stream = container.add_stream("ffv1", rate=FPS)
+            stream.height, stream.width, stream.pix_fmt = *video.shape[1:3], "bgr0"
+            for picture in video:
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")))
+            container.mux(stream.encode(None))
+        yield path

@@ -1,0 +1,100 @@
+"""Temperatures and calibration errors against sums by hand, and against what they must be by construction."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import brentq
+from scipy.special import softmax
+
+from pipeline.evaluation.calibration import (
+    calibration_error,
+    error_interval,
+    fit_temperature,
+    reliability,
+    rescale,
+)
+from pipeline.records import Classification, Part
+
+
+def said(expected: int, *probabilities: float, object_id: str = "rug") -> Classification:
+    return Classification(
+        video_id=f"{object_id}_0",
+        object_id=object_id,
+        part=Part.TEST,
+        property="hardness",
+        expected=expected,
+        predicted=int(np.argmax(probabilities)),
+        probabilities=probabilities,
+    )
+
+
+def drawn(count: int, temperature: float, seed: int = 0) -> list[Classification]:
+    """Classes drawn by the softmax of logits that are then said `temperature` times as large, an object each."""
+    rng = np.random.default_rng(seed)
+    logits = rng.normal(size=(count, 3))
+    expected = [int(rng.choice(3, p=p)) for p in softmax(logits, axis=1)]
+    given = softmax(temperature * logits, axis=1).tolist()
+    return [said(e, *p, object_id=f"o{i}") for i, (e, p) in enumerate(zip(expected, given, strict=True))]
+
+
+def test_error_by_hand() -> None:
+    """Confidences .95 and .91 in one bin (one right), .6 and .55 in two; .1 steps belong to the bin below them."""
+    answers = [said(0, 0.95, 0.05), said(1, 0.91, 0.09), said(0, 0.6, 0.4), said(0, 0.45, 0.55)]
+    bins = reliability(answers)
+    assert [(round(b.low, 1), b.n, b.accuracy) for b in bins] == [(0.5, 2, 0.5), (0.9, 2, 0.5)]
+    assert [b.confidence for b in bins] == pytest.approx([0.575, 0.93])
+    assert calibration_error(answers) == pytest.approx(0.5 * 0.075 + 0.5 * 0.43)
+
+
+def test_certain_and_right_has_no_error_and_certain_and_wrong_has_all() -> None:
+    assert calibration_error([said(0, 1.0, 0.0)]) == 0
+    assert calibration_error([said(1, 1.0, 0.0)]) == 1
+    assert error_interval([said(1, 1.0, 0.0)]) == (1, 1)
+
+
+@pytest.mark.parametrize("temperature", [0.5, 1.0, 3.0])
+def test_finds_the_temperature_that_answers_were_made_by(temperature: float) -> None:
+    answers = drawn(4000, temperature)
+    assert fit_temperature(answers) == pytest.approx(temperature, rel=0.08)
+    assert calibration_error(answers, fit_temperature(answers)) < 0.03
+
+
+def test_minimum_is_where_the_slope_vanishes() -> None:
+    """The derivative written out: sum of (expected logit - mean logit) / T against the prior's, two videos an object."""
+    answers = [said(0, 0.9, 0.1, object_id="a"), said(1, 0.7, 0.3, object_id="a"), said(0, 0.8, 0.2, object_id="b")]
+    logits, weights = np.log([c.probabilities for c in answers]), np.array([0.5, 0.5, 1.0])
+
+    def slope(log_t: float) -> float:
+        scaled = logits / np.exp(log_t)
+        mean = (softmax(scaled, axis=1) * scaled).sum(axis=1)
+        own = scaled[np.arange(3), [c.expected for c in answers]]
+        return float(weights @ (own - mean)) + log_t / np.log(2) ** 2
+
+    assert fit_temperature(answers) == pytest.approx(np.exp(brentq(slope, -3, 3)), rel=1e-3)
+
+
+def test_few_objects_move_it_little() -> None:
+    assert fit_temperature([]) == 1
+    right = [said(0, 0.6, 0.4)]
+    assert 0.5 < fit_temperature(right) < 1
+    assert fit_temperature(right * 50) == pytest.approx(fit_temperature(right)), "one object, however many videos"
+    assert 1 < fit_temperature([said(1, 1.0, 0.0)]) < 20
+
+
+@given(st.lists(st.floats(0, 1), min_size=2, max_size=5).filter(lambda p: sum(p) > 0.1), st.floats(0.1, 20, width=32))
+def test_rescaling_keeps_a_distribution_and_its_order(values: list[float], temperature: float) -> None:
+    p = np.array(values) / sum(values)
+    scaled = rescale(p, temperature)
+    assert scaled.sum() == pytest.approx(1)
+    order = np.argsort(p)
+    assert (np.diff(scaled[order]) >= -1e-12).all()
+    np.testing.assert_allclose(rescale(p, 1.0), p, atol=1e-9)
+
+
+def test_interval_holds_objects_together() -> None:
+    """Many videos of two objects are no more than two draws: the interval spans from the one to the other."""
+    answers = [said(0, 0.95, 0.05, object_id="a")] * 40 + [said(1, 0.95, 0.05, object_id="b")] * 40
+    assert error_interval(answers) == pytest.approx((0.05, 0.95))

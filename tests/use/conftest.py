@@ -1,0 +1,30 @@
+"""A trained model of random weights, made once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.records import Encoder, Lora, Opd, Variant
+from pipeline.use.model import Octopi
+from tests.use.shared import Made, make
+
+
+@pytest.fixture(scope="package")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    where = tmp_path_factory.mktemp("use")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(where)
+        return make(where, Variant(Encoder.FINETUNED, Lora.WITH, Opd.ALL, 0))
+
+
+@pytest.fixture(scope="package")
+def octopi(made: Made) -> Octopi:
+    return Octopi.from_pretrained(made.folder, device="cpu")
+
+
+@pytest.fixture
+def files(made: Made) -> list[Path]:
+    """Videos of objects that were not trained on."""
+    return [made.videos / f"{name}_0.avi" for name in ("ice_block", "millet", "bath_towel")]

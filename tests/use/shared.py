@@ -1,0 +1,179 @@
+"""The chain in small, by its libraries: videos, an encoder, a language model and their stored answers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+import torch
+
+from pipeline.config import Params
+from pipeline.embeddings import INDEX_FILE, STATISTICS_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
+from pipeline.encoder.clips import EncoderData, classify
+from pipeline.encoder.embed import embed_videos, standardize, statistics
+from pipeline.encoder.recipes import base_encoder, property_classifier
+from pipeline.io import fingerprint, save_tensors, write_jsonl, write_table
+from pipeline.language.generate import GenerationSettings, answer
+from pipeline.language.octopi import OctopiForCausalLM
+from pipeline.language.training import add_lora
+from pipeline.records import (
+    Assignment,
+    Classification,
+    Embedding,
+    Encoder,
+    Lora,
+    Opd,
+    Part,
+    Prediction,
+    Probe,
+    Question,
+    Variant,
+)
+from pipeline.runtime import seed_everything
+from pipeline.scales import compose
+from pipeline.tasks import TASKS
+from pipeline.tasks.questions import build_questions, pool_of
+from pipeline.training.trainable import save_trainable
+from pipeline.use.model import Octopi
+from pipeline.use.package import describe_base, package
+from pipeline.use.results import Exchange
+from pipeline.videos.catalogue import load_catalogue
+from pipeline.videos.frames.extract import extract_frames
+from pipeline.videos.frames.store import PROBES_FILE, FrameStore
+from tests.checkpoints import write_llama
+from tests.closure import ROOT
+from tests.conftest import moving_square, write_video
+from tests.encoders import write_pretrained, write_timm, write_tower
+
+PARTS = {
+    **dict.fromkeys(("baseball", "rug", "pillow", "potato"), Part.TRAIN),
+    **dict.fromkeys(("cotton_ball", "denim"), Part.VALIDATION),
+    **dict.fromkeys(("ice_block", "millet", "bath_towel", "toilet_brush_bristles", "hairbrush_bristles"), Part.TEST),
+}
+CPU = torch.device("cpu")
+ASKED = {"OPD": 8, "PC": 12, "PSS": 12, "POM": 12, "PSR": 8}
+
+
+class Made(NamedTuple):
+    """A trained model in its folder, and what the evaluation stored of it."""
+
+    folder: Path
+    videos: Path
+    questions: list[Question]
+    predictions: list[Prediction]
+    classified: list[Classification]
+    params: Params
+    variant: Variant
+
+
+def make(where: Path, variant: Variant, *overrides: str) -> Made:
+    """Run what the stages run, in `where` as the working directory, down to `package`."""
+    params = compose(
+        "smoke",
+        [
+            *("frames.size=32", "frames.per_video=3", "language.max_new_tokens=12", "language.generation_batch_size=8"),
+            *("encoder.weights=clip", "language.weights=llama", "encoder.prompts=3", *overrides),
+        ],
+        ROOT / "conf",
+    )
+    catalogue = load_catalogue(ROOT / "pipeline" / "physiclear")
+    params = params.model_copy(
+        update={"data": params.data.model_copy(update={"catalogue": str(ROOT / "pipeline" / "physiclear")})}
+    )
+    videos, data = where / "videos", where / "data"
+    for seed, object_id in enumerate(PARTS):
+        for number in range(2):
+            frames = moving_square(14 + seed + 5 * number, 10 * seed + number)
+            frames[:2] = [np.full_like(frames[0], 90)] * 2
+            write_video(videos / f"{object_id}_{number}.avi", frames)
+    found = extract_frames(videos, catalogue, params.frames, data / "frames", where / "checkpoints")
+    write_table(data / "frames" / PROBES_FILE, Probe, found.probes)
+    parts = [Assignment(video_id=v.video_id, object_id=v.object_id, part=PARTS[v.object_id]) for v in found.videos]
+    write_table(data / "splits" / "0.parquet", Assignment, parts)
+
+    write_timm(Path("clip")) if "timm" in params.encoder.backbone else write_tower(Path("clip"))
+    write_pretrained()
+    seed_everything(2)
+    classifier = property_classifier(params.encoder, [len(p.levels) for p in catalogue.properties])
+    with torch.no_grad():
+        for name, value in classifier.named_parameters():
+            if name.startswith("heads."):
+                value.copy_(torch.randn(value.shape))
+    save_trainable(classifier, data / "encoder" / "0" / "encoder.safetensors")
+    store = FrameStore(data / "frames", params.encoder.reference)
+    material = EncoderData(store, catalogue, parts, params.frames.per_video)
+    classified = classify(classifier, material, [Part.VALIDATION, Part.TEST], 4, CPU)
+    write_table(data / "encoder" / "0" / "classifications.parquet", Classification, classified)
+
+    encoder = classifier.encoder if variant.encoder is Encoder.FINETUNED else base_encoder(params.encoder)
+    raw, index = embed_videos(encoder, store, parts, batch_size=16, device=CPU)
+    known = statistics(raw, index, {a.video_id for a in parts if a.part is Part.TRAIN})
+    folder = data / "embeddings" / f"{variant.encoder}-0"
+    save_tensors(folder / TENSOR_FILE, {TENSOR: standardize(raw, known) if params.encoder.standardize else raw})
+    write_table(folder / INDEX_FILE, Embedding, index)
+    known._replace(frames=fingerprint(params.frames)).save(folder / STATISTICS_FILE)
+    embeddings = EmbeddingStore(folder)
+
+    write_llama(Path("llama"))
+    model = OctopiForCausalLM.from_base("llama", embeddings.dim)
+    if variant.lora is Lora.WITH:
+        add_lora(model, params.lora)
+    draw = torch.Generator().manual_seed(3)
+    with torch.no_grad():  # Strong enough that answers hang on what is touched.
+        for name, value in model.named_parameters():
+            if name.startswith("connector.") or "lora_" in name:
+                value.copy_(torch.randn(value.shape, generator=draw) * (0.3 if "lora_" in name else 1))
+    trained = data / "models" / variant.lora / f"{variant.encoder}-{variant.opd}-0"
+    model.save_pretrained(trained)
+    questions = build_questions(pool_of(Part.TEST, parts, catalogue), ASKED, seed=0, distinct=False, facts=True)
+    settings = GenerationSettings(
+        system_prompt=params.language.system_prompt,
+        per_video=params.frames.per_video,
+        max_new_tokens=params.language.max_new_tokens,
+        batch_size=params.language.generation_batch_size,
+    )
+    predictions = answer(model.eval(), embeddings, questions, variant.opd, settings)
+    write_jsonl(data / "answers" / variant.key / "real.jsonl", predictions)
+    rows = [
+        {"task": t, "measure": TASKS[t].measure, **variant._asdict(), "touch": "real", "n": 8.0, "chance": 0.5}
+        | {"accuracy": 0.625, "low": 0.25, "high": 0.875}
+        for t in ASKED
+    ]
+    (where / "reports" / params.report_name).mkdir(parents=True)
+    pd.DataFrame(rows).to_csv(where / "reports" / params.report_name / "scores.csv", index=False)
+    out = where / "models" / variant.key
+    package(data, params, variant, describe_base(Path("llama")), out)
+    return Made(out, videos, questions, predictions, classified, params, variant)
+
+
+def replay(
+    model: Octopi,
+    questions: Sequence[Question],
+    predictions: Sequence[Prediction],
+    opd: Opd,
+    files: Mapping[str, Path],
+) -> int:
+    """Ask the evaluation's questions turn by turn, from the files: the answers must be the stored ones.
+
+    Returns:
+        How many questions were asked.
+    """
+    asked = {q.question_id: q for q in questions}
+    said = set()
+    for prediction in predictions:
+        question, history = asked[prediction.question_id], []
+        dialogue = question.dialogue(opd)
+        assert dialogue is not None
+        videos = iter(question.videos)
+        for turn, stored in zip(dialogue.turns, prediction.outputs, strict=True):
+            shown = tuple(files[next(videos)] for _ in range(turn.user.count("{tactile}")))
+            answer = model.ask(turn.user, shown, history=history)
+            assert answer == stored, question.question_id
+            assert "".join(model.stream(turn.user, shown, history=history)) == stored
+            history.append(Exchange(turn.user, shown, answer))
+            said.add(answer)
+    assert len(said) >= 5, "answers hang on what is asked and touched"
+    return len(predictions)

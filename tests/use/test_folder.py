@@ -1,0 +1,130 @@
+"""The folder of a trained model: whole, without pickles, and noticed where anything in it or below it is another."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import yaml
+
+from pipeline.errors import UserError
+from pipeline.use.folder import FORMAT, read_folder
+from pipeline.use.model import Octopi
+from pipeline.use.package import export
+from tests.checkpoints import write_llama
+from tests.use.shared import Made
+
+
+@pytest.fixture
+def copy(made: Made, tmp_path: Path) -> Path:
+    """A copy of the folder, far from its language model."""
+    return Path(shutil.copytree(made.folder, tmp_path / "copy"))
+
+
+@pytest.fixture
+def llama(made: Made) -> Path:
+    return made.folder.parents[1] / "llama"
+
+
+def test_holds_safetensors_and_text_alone(made: Made) -> None:
+    kinds = {f.suffix for f in made.folder.rglob("*") if f.is_file()}
+    assert kinds <= {".json", ".safetensors", ".md"}
+
+
+def test_the_card_says_what_it_stands_on(made: Made) -> None:
+    text = (made.folder / "README.md").read_text()
+    front = yaml.safe_load(text.split("---\n")[1])
+    assert front["base_model"][0] == "llama"
+    metric = front["model-index"][0]["results"][0]["metrics"][0]
+    assert metric == {"type": "accuracy", "value": 0.625, "args": {"low": 0.25, "high": 0.875, "n": 8}}
+    assert "62.5 [25.0, 87.5]" in text
+    assert next(iter(read_folder(made.folder)[0].base.files.values())) in text
+    for heading in ("What it cannot do", "Calibration", "Reliability", "licence"):
+        assert heading in text
+
+
+def test_equal_inputs_give_equal_bytes(made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from pipeline.use.package import describe_base, package
+
+    monkeypatch.chdir(made.folder.parents[1])
+    package(Path("data"), made.params, made.variant, describe_base(Path("llama")), tmp_path / "again")
+    first, second = (
+        {f.relative_to(d): f.read_bytes() for d in [folder] for f in d.rglob("*") if f.is_file()}
+        for folder in (made.folder, tmp_path / "again")
+    )
+    assert first == second
+
+
+def test_export_with_its_base_needs_nothing_else(made: Made, copy: Path, files: list[Path], tmp_path: Path) -> None:
+    question = ("Describe {tactile}.", files[:1])
+    expected = Octopi.from_pretrained(made.folder).ask(*question)
+    with pytest.raises(UserError, match=r"language model llama is not there .*--base"):
+        Octopi.from_pretrained(copy)
+    export(made.folder, tmp_path / "whole", with_base=True)
+    assert Octopi.from_pretrained(tmp_path / "whole").ask(*question) == expected
+    with pytest.raises(UserError, match="is there already"):
+        export(made.folder, tmp_path / "whole")
+
+
+def test_a_base_by_name(copy: Path, llama: Path, tmp_path: Path) -> None:
+    assert Octopi.from_pretrained(copy, base=llama).card["base"]["folder"] == "llama"
+    other = write_llama(tmp_path / "other", seed=5)
+    with pytest.raises(UserError, match=r"other: is another language model .*model.safetensors differs"):
+        Octopi.from_pretrained(copy, base=other)
+
+
+def test_a_known_place_with_another_model_is_passed_over(copy: Path, llama: Path) -> None:
+    write_llama(copy / "base", seed=5)
+    shutil.copytree(llama, copy.parent / "llama")
+    assert Octopi.from_pretrained(copy).card["variant"] == "finetuned-with-all-0"
+
+
+def test_another_chat_format_is_refused(copy: Path, llama: Path, tmp_path: Path) -> None:
+    other = Path(shutil.copytree(llama, tmp_path / "llama"))
+    template = "{% for m in messages %}<{{ m.role }}>{{ m.content }}</s>{% endfor %}"
+    template += "{% if add_generation_prompt %}<assistant>{% endif %}"
+    (other / "chat_template.jinja").write_text(template)
+    with pytest.raises(UserError, match="chat format is another"):
+        Octopi.from_pretrained(copy, base=other)
+
+
+def change(file: Path, **values: object) -> None:
+    file.write_text(json.dumps(json.loads(file.read_text()) | values))
+
+
+def test_another_version_is_refused(copy: Path) -> None:
+    change(copy / "config.json", format=FORMAT + 1)
+    with pytest.raises(UserError, match=f"of format {FORMAT + 1}, but this version reads {FORMAT}"):
+        Octopi.from_pretrained(copy)
+
+
+def test_other_frames_are_refused(copy: Path, llama: Path) -> None:
+    frames = json.loads((copy / "config.json").read_text())["frames"]
+    change(copy / "config.json", frames=frames | {"per_video": 4})
+    with pytest.raises(UserError, match="frame settings are not those of training"):
+        Octopi.from_pretrained(copy, base=llama)
+
+
+@pytest.mark.parametrize("name", ["encoder/encoder.safetensors", "language/connector.safetensors", "catalogue.json"])
+def test_a_changed_or_missing_file_is_named(name: str, copy: Path) -> None:
+    with (copy / name).open("ab") as stream:
+        stream.write(b" ")
+    with pytest.raises(UserError, match=f"{name}: differs"):
+        read_folder(copy)
+    (copy / name).unlink()
+    with pytest.raises(UserError, match=f"{name}: is missing"):
+        read_folder(copy)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [(None, "holds no config.json"), ("{", "not JSON"), ("[]", "of format None"), ('{"format": 1}', "Field required")],
+)
+def test_what_is_no_model_is_refused(text: str | None, message: str, tmp_path: Path) -> None:
+    if text is not None:
+        (tmp_path / "config.json").write_text(text)
+    with pytest.raises(UserError, match=message) as caught:
+        Octopi.from_pretrained(tmp_path)
+    assert "\n" not in str(caught.value)

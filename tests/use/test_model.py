@@ -1,0 +1,265 @@
+"""A packaged model answers as the evaluation did, and refuses what it cannot answer in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import BaseModel
+
+import pipeline
+from pipeline.errors import UserError
+from pipeline.records import Encoder, Lora, Opd, Part, Question, Variant
+from pipeline.use.model import Octopi, check_question
+from pipeline.use.results import Exchange
+from pipeline.videos.decoding import decode
+from tests.conftest import moving_square, write_video
+from tests.use.shared import Made, make, replay
+
+FULL = Variant(Encoder.FINETUNED, Lora.WITH, Opd.ALL, 0)
+TUNED = ("encoder.recipe=tuned", "encoder.reference=subtract", "encoder.standardize=false")
+
+
+def answers_as_stored(made: Made) -> int:
+    """Ask every stored question; how many were asked."""
+    model = Octopi.from_pretrained(made.folder, device="cpu")
+    files = {f.stem: f for f in made.videos.iterdir()}
+    return replay(model, made.questions, made.predictions, made.variant.opd, files)
+
+
+def test_its_answers_equal_the_stored_predictions(made: Made) -> None:
+    assert answers_as_stored(made) >= 50
+
+
+def test_without_the_kept_statistics_they_would_not(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = Octopi.from_pretrained(made.folder, device="cpu")
+    monkeypatch.setattr("pipeline.use.feel.standardize", lambda raw, _: raw)
+    asked = {q.question_id: q for q in made.questions if q.task == "OPD"}
+    stored = {p.question_id: p.outputs[0] for p in made.predictions}
+    said = {i: model.ask(_user(q), [made.videos / f"{q.videos[0]}.avi"]) for i, q in asked.items()}
+    assert any(said[i] != stored[i] for i in said)
+
+
+def _user(question: Question) -> str:
+    dialogue = question.dialogue(Opd.ALL)
+    assert dialogue is not None
+    return dialogue.turns[0].user
+
+
+@pytest.mark.parametrize(
+    ("variant", "overrides"),
+    [
+        (FULL._replace(opd=Opd.NONE, lora=Lora.WITHOUT), (*TUNED, "encoder.backbone=[timm,scenes]")),
+        (FULL._replace(encoder=Encoder.BASE), ("encoder.recipe=release", "frames.selection=contact")),
+        (FULL._replace(encoder=Encoder.BASE, opd=Opd.NEEDED), (*TUNED, "encoder.backbone=[clip,scenes]")),
+    ],
+    ids=["tuned", "release", "base of two backbones"],
+)
+def test_of_other_recipes_too(
+    variant: Variant, overrides: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    made = make(tmp_path, variant, *overrides)
+    monkeypatch.chdir("/")
+    assert answers_as_stored(made) >= 40
+
+
+def test_heads_say_what_the_stage_stored(made: Made, octopi: Octopi) -> None:
+    temperatures = octopi.card["temperatures"]
+    assert any(t != 1 for t in temperatures.values())
+    for c in made.classified:
+        if c.part is Part.TEST:
+            found = octopi.describe(made.videos / f"{c.video_id}.avi")
+            power = np.array(c.probabilities) ** (1 / temperatures[c.property])
+            given = list(found.probabilities[c.property].values())
+            np.testing.assert_allclose(given, power / power.sum(), rtol=1e-4, atol=1e-7)
+            assert list(found.probabilities[c.property]).index(found.levels[c.property]) == c.predicted
+
+
+def test_three_lines(made: Made, files: list[Path]) -> None:
+    model = pipeline.Octopi.from_pretrained(made.folder)
+    assert model.ask("Which is softer? {tactile} {tactile}", files[:2])
+    assert model.properties == ("hardness", "roughness", "bumpiness")
+    assert "a baseball" in [name.lower() for name in model.names]
+    with pytest.raises(AttributeError):
+        pipeline.Octopus  # noqa: B018
+
+
+def test_a_batch_answers_as_one_by_one(octopi: Octopi, files: list[Path]) -> None:
+    asked = [("Describe {tactile}.", [f]) for f in files] + [("What is touch?", [])]
+    asked += [("Compare {tactile} and {tactile}.", files[:2])]
+    assert octopi.ask_all(asked) == [octopi.ask(*a) for a in asked]
+    assert octopi.describe_all(files) == [octopi.describe(f) for f in files]
+
+
+def test_history_changes_the_answer_and_is_the_callers(octopi: Octopi, files: list[Path]) -> None:
+    first = octopi.ask("Describe {tactile}.", files[:1])
+    history = [Exchange("Describe {tactile}.", tuple(files[:1]), first)]
+    follow = octopi.ask("And now?", history=history)
+    assert follow == octopi.ask("And now?", history=history)
+    other = [Exchange("Describe {tactile}.", tuple(files[1:2]), first)]
+    assert follow != octopi.ask("And now?", history=other)
+    assert octopi.ask("Describe {tactile}.", files[:1]) == first, "it remembers nothing"
+
+
+def test_frames_of_an_array_are_those_of_its_file(octopi: Octopi, files: list[Path]) -> None:
+    array = np.stack([frame[:, :, ::-1] for frame in decode(files[0])])
+    file, other = octopi.look(files[0]), octopi.look(array)
+    assert file.numbers == other.numbers
+    assert np.abs(file.frames.astype(int) - other.frames).mean() < 2
+    assert np.abs(file.reference.astype(int) - other.reference).mean() < 2
+
+
+def test_look_shows_where_it_touches(octopi: Octopi) -> None:
+    ground = np.full((20, 64, 64, 3), 90, np.uint8)
+    touched = ground.copy()
+    touched[8:, 24:40, 24:40] = np.arange(140, 200, 5)[:, None, None, None]
+    touch = octopi.look(touched)
+    assert touch.frames.shape == (3, 32, 32, 3)
+    assert touch.contact == pytest.approx(1 / 16, rel=0.5)
+    inside = np.abs(touch.difference[-1, 13:19, 13:19].astype(int) - 128).min()
+    assert np.abs(touch.difference[-1, :8].astype(int) - 128).max() <= 4
+    assert inside > 50
+    assert np.abs(touch.reference.astype(int) - 90).max() <= 2
+
+
+def test_typed_tasks(octopi: Octopi, files: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    said = {
+        "Is the object": "First object: it. Conclusion: No, the second object is harder.",
+        "Given three tactile videos": "Conclusion: b) is the hardest.",
+        "match": "Conclusion: a) is Rug, b) is Millet and c) is Baseball.",
+        "Given two": "none",
+        "Describe these two": "a) soft. b) hard.",
+        "I must sleep": "The most suitable object is b), because of its hardness.",
+    }
+    asked: list[str] = []
+
+    def ask(question: str, videos: object = (), **_: object) -> str:
+        asked.append(question)
+        return next(text for start, text in reversed(said.items()) if start in question)
+
+    monkeypatch.setattr(octopi, "ask", ask)
+    compared = octopi.compare(files[0], files[1], "hardness")
+    assert (compared.choice, compared.question.count("{tactile}")) == ("no", 2)
+    ranked = octopi.rank(files, "Hardness")
+    assert ranked.most == 1
+    assert sorted(ranked.order) == [0, 1, 2]
+    assert [ranked.expected[i] for i in ranked.order] == sorted(ranked.expected)
+    assert octopi.rank(files[:2], "hardness").most == 1
+    assert octopi.rank([*files, files[0]], "hardness").answer == ""
+    names = [octopi.catalogue.objects[o].name for o in ("rug", "baseball", "millet")]
+    matched = octopi.match(files, names)
+    assert matched.names is None or sorted(matched.names) == sorted(names)
+    assert all(name in matched.question for name in names)
+    chosen = octopi.scenario("I must sleep.", files[:2])
+    assert chosen.choice == 1
+    assert [q.count("{tactile}") for q in asked[-2:]] == [2, 0], "described first"
+    for record in (compared, ranked, matched, chosen):
+        assert isinstance(record, BaseModel)
+        assert record.model_validate_json(record.model_dump_json()) == record
+
+
+def test_tasks_ask_in_the_wording_of_training(made: Made, octopi: Octopi, files: list[Path]) -> None:
+    asked = {t.user for q in made.questions for d in q.dialogues if d.opd is Opd.ALL for t in d.turns}
+    known = octopi.compare(files[0], files[1], "roughness").question
+    assert any(known.split("than")[1] in user for user in asked if "rougher" in user)
+
+
+REFUSED = {
+    "no mark": (("Which is softer?", 1), r"0 \{tactile\} for 1 videos"),
+    "too many marks": (("{tactile} {tactile}", 1), r"2 \{tactile\} for 1 videos"),
+    "a mark without a video": (("{tactile}?", 0), r"1 \{tactile\} for 0 videos"),
+    "empty": (("  ", 0), "question is empty"),
+    "its own tokens": (("Is <tact_frame> soft?", 0), "<tact_frame>, which stands for a touch"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_questions_that_do_not_fit_are_refused(case: str, octopi: Octopi, files: list[Path]) -> None:
+    (question, count), message = REFUSED[case]
+    with pytest.raises(UserError, match=message) as caught:
+        octopi.ask(question, files[:count])
+    assert "\n" not in str(caught.value)
+    with pytest.raises(UserError, match=message):
+        octopi.stream(question, files[:count])  # before the first piece is asked for
+
+
+@given(st.text(max_size=40), st.integers(0, 3))
+def test_a_question_is_taken_only_with_as_many_videos_as_it_names(text: str, videos: int) -> None:
+    marked = text + "{tactile}" * videos
+    if text.strip() and "{tactile}" not in text and "<tact" not in text:
+        check_question(marked, videos)
+    with pytest.raises(UserError):
+        check_question(marked + "{tactile}", videos)
+
+
+def test_too_long_a_conversation_is_refused(octopi: Octopi) -> None:
+    with pytest.raises(UserError, match="begin a new conversation"):
+        octopi.ask("long " * 1000)
+
+
+def test_videos_that_cannot_be_used_are_refused(octopi: Octopi, tmp_path: Path, files: list[Path]) -> None:
+    (tmp_path / "empty.avi").touch()
+    (tmp_path / "text.avi").write_text("no video")
+    whole = files[0].read_bytes()
+    (tmp_path / "cut.avi").write_bytes(whole[: len(whole) // 20])
+    one = write_video(tmp_path / "one.avi", moving_square(1))
+    still = write_video(tmp_path / "still.avi", [np.full((36, 48, 3), 90, np.uint8)] * 12)
+    refused = {
+        tmp_path / "nothing.avi": "no such file",
+        tmp_path: "no such file",
+        tmp_path / "empty.avi": "empty",
+        tmp_path / "text.avi": "no frame decodes",
+        tmp_path / "cut.avi": "no frame decodes|show no touch",
+        one: "show no touch",
+        still: "nothing touches the sensor",
+    }
+    for video, message in refused.items():
+        with pytest.raises(UserError, match=message) as caught:
+            octopi.ask("Describe {tactile}.", [video])
+        assert str(video) in str(caught.value)
+        assert "\n" not in str(caught.value)
+    described = octopi.describe(still)
+    assert any("nothing touches the sensor" in note for note in described.notes)
+
+
+@pytest.mark.parametrize(
+    "array",
+    [
+        np.zeros((4, 32, 32, 3), np.float32),
+        np.zeros((32, 32, 3), np.uint8),
+        np.zeros((4, 3, 32, 32), np.uint8),
+        np.zeros((0, 32, 32, 3), np.uint8),
+    ],
+)
+def test_arrays_that_are_no_videos_are_refused(array: np.ndarray, octopi: Octopi) -> None:
+    with pytest.raises(UserError, match="is no video; give uint8"):
+        octopi.look(array)
+
+
+def test_unknown_words_are_refused(octopi: Octopi, files: list[Path]) -> None:
+    with pytest.raises(UserError, match=r"hardnes: no property of this model \(did you mean hardness\?\)"):
+        octopi.compare(files[0], files[1], "hardnes")
+    with pytest.raises(UserError, match="the catalogue has no such object"):
+        octopi.match(files, ["rug", "millet", "a unicorn"])
+    with pytest.raises(UserError, match="three of each"):
+        octopi.match(files[:2], ["rug", "millet"])
+    with pytest.raises(UserError, match="chooses between two"):
+        octopi.scenario("I must sleep.", files)
+
+
+def test_a_changed_file_is_felt_anew(octopi: Octopi, tmp_path: Path) -> None:
+    file = write_video(tmp_path / "a.avi", moving_square(20, 5))
+    before = octopi.look(file)
+    write_video(file, moving_square(21, 77))
+    assert not np.array_equal(before.frames, octopi.look(file).frames)
+
+
+def test_what_is_unlike_training_is_noted(octopi: Octopi, files: list[Path]) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (12, 36, 48, 3), dtype=np.uint8)
+    assert any("unlike training" in note for note in octopi.look(noise).notes)
+    trained = octopi.look(files[0].with_name("baseball_0.avi"))
+    assert not [note for note in trained.notes if "unlike" in note]
