@@ -27,11 +27,13 @@ async function failed(response) {
 function strip(title, pictures, captions) {
   const row = make("div", "strip");
   pictures.forEach((source, i) => {
-    const figure = make("figure"), image = make("img");
+    const figure = make("figure");
+    row.append(figure);
+    if (!source) return;  // an empty place keeps the rows in columns
+    const image = make("img");
     image.src = source;
     image.alt = `${title}, ${captions[i]}`;
     figure.append(image, make("figcaption", "", captions[i]));
-    row.append(figure);
   });
   return [make("p", "note", title), row];
 }
@@ -60,12 +62,12 @@ function draw() {
       draw();
     });
     head.append(make("h2", "", `${place + 1}. ${touch.name}`), remove);
-    const frames = touch.numbers.map(n => `frame ${n}`);
+    const names = ["untouched", ...touch.numbers.map(n => `frame ${n}`)];
     box.append(head, ...touch.notes.map(note => make("p", "note", note)),
       ...strip("What the model is given, behind the untouched sensor", [touch.reference, ...touch.frames],
-        ["untouched", ...frames]),
-      ...strip("Difference to the untouched sensor (grey: none)", touch.difference, frames),
-      ...strip(`Where it touches: ${Math.round(100 * touch.contact)} % of the picture`, touch.touched, frames),
+        names),
+      ...strip("Difference to the untouched sensor (grey: none)", [null, ...touch.difference], names),
+      ...strip(`Where it touches: ${Math.round(100 * touch.contact)} % of the picture`, [null, ...touch.touched], names),
       bars(touch));
     return box;
   }));
