@@ -28,7 +28,7 @@ TIMEOUT = 120
 
 
 class TouchNode(Node):
-    """Action `ask_touch`. Parameters: `url` of the server, `topic` of the sensor, `rate` (frames/s) and `seconds` kept."""
+    """Action `ask_touch`. Parameters: `url` of the server; `topic`, `rate` (frames/s), `seconds` of the sensor."""
 
     def __init__(self):
         super().__init__("octopi")

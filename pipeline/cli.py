@@ -134,24 +134,6 @@ def bag(
     typer.echo(f"{len(written)} presses in {out}: {', '.join(path.name for path in written)}")
 
 
-@app.command()
-def demo(
-    folder: Annotated[Path, typer.Argument(help="A model's folder.")],
-    base: Annotated[Path | None, typer.Option(help="The base model's folder, where it is not found.")] = None,
-    catalogue: Annotated[Path, CATALOGUE] = Path("pipeline/physiclear"),
-    port: Annotated[int, typer.Option(help="Of 127.0.0.1.")] = 7860,
-) -> None:
-    """Show a page where videos are dropped: what the model sees, what it takes them for, and a chat. Nothing leaves."""
-    from pipeline.runtime import quiet_libraries
-    from pipeline.use.demo import serve_demo
-    from pipeline.use.model import Octopi
-
-    quiet_libraries()
-    model = Octopi.from_pretrained(folder, base=base)
-    typer.echo(f"http://127.0.0.1:{port} (ends with Ctrl-C)")
-    serve_demo(model, catalogue, port)
-
-
 def _show(findings: Sequence[Finding]) -> None:
     for f in findings:
         expected = f" (expected: {f.expected})" if f.expected else ""
@@ -247,6 +229,38 @@ def export(
 
     copy(folder, to, with_base=with_base, base=base)
     typer.echo(f"{to}: {sum(f.stat().st_size for f in to.rglob('*') if f.is_file()) / 1e6:.0f} MB")
+
+
+@app.command()
+def serve(
+    folder: Annotated[Path | None, typer.Argument(help="A trained model; by default the full system's.")] = None,
+    host: Annotated[str, typer.Option(help="Address; another than 127.0.0.1 needs a token.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="0 for any that is free.")] = 8000,
+    token_file: Annotated[Path | None, typer.Option(help="File with the token; else OCTOPI_TOKEN is taken.")] = None,
+    base: Annotated[Path | None, BASE] = None,
+    device: Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")] = "auto",
+    places: Annotated[int, typer.Option(min=1, help="Requests at once; the next is told to come later.")] = 32,
+) -> None:
+    """Answer questions about touches over HTTP, in the form of OpenAI's chat completions."""
+    from pipeline.use.ask import default_model
+    from pipeline.use.server import serve
+
+    folder = folder or default_model()
+    serve(lambda: _load(folder, base, device), folder.resolve().name, host, port, token_file, places)
+
+
+@app.command()
+def demo(
+    folder: Annotated[Path | None, typer.Argument(help="A trained model; by default the full system's.")] = None,
+    base: Annotated[Path | None, BASE] = None,
+    device: Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")] = "auto",
+    catalogue: Annotated[Path, CATALOGUE] = Path("pipeline/physiclear"),
+    port: Annotated[int, typer.Option(help="Of 127.0.0.1.")] = 7860,
+) -> None:
+    """Show a page to drop videos on: what the model sees, what it takes them for, and a chat. Nothing leaves."""
+    from pipeline.use.demo import serve_demo
+
+    serve_demo(_load(folder, base, device), catalogue, port)
 
 
 def _load(folder: Path | None, base: Path | None, device: str) -> Octopi:

@@ -35,6 +35,7 @@ from pipeline.errors import UserError
 from pipeline.io import read_json, read_table
 from pipeline.params import PARAMS_FILE
 from pipeline.records import Encoder, Graded, Lora, Measurement, Part, Touch, Variant, Video
+from pipeline.registry import log_model, packaged, register
 from pipeline.stage import DATA, RUNS, Stage
 from pipeline.tasks import TASKS
 
@@ -507,16 +508,20 @@ class _Publication:
         """Runs of variants whose results are new, and links to those of the others; return how many are new."""
         store, scores, new = self.store, accuracies(self.params), 0
         answers = {stage.title: stage for stage in self.stages}
+        models: list[tuple[Variant, str]] = []
         store.kill({KIND: "variant"})
         for variant in self.params.ablation.variants():
             stage = answers.get(f"answer@{variant.key}")
             if stage is None:
                 continue
             metrics = scores.get(variant.key, {})
-            content = _digest([metrics, stage.outs])
+            folder = packaged(variant)
+            made_of = [(folder / "config.json").read_text(encoding="utf-8")] if folder else []
+            content = _digest([metrics, stage.outs, *made_of])
             if old := store.find({VARIANT: variant.key, CONTENT: content}):
                 if old[0].data.tags.get(PARENT) != parent:
                     links[f"variant.{variant.key}"] = old[0].info.run_id
+                models += [(variant, old[0].info.run_id)] if folder else []
                 continue
             begin, end = stage.ran or (_milliseconds(time.time()),) * 2
             run = store.create(variant.key, "variant", begin, {VARIANT: variant.key, PARENT: parent})
@@ -527,9 +532,14 @@ class _Publication:
             for path, place in _artifacts(variant):
                 if path.is_dir():
                     store.client.log_artifacts(run, str(path), place)
+            if folder:
+                log_model(store.uri, run, self.params, variant, folder)
+                models.append((variant, run))
             store.log(run, tags={CONTENT: content})
             store.client.set_terminated(run, "FINISHED", end)
             new += 1
+        if address := register(store.client, self.params, models):
+            links["octopi.model"] = address
         every = {name for metrics in scores.values() for name in metrics}
         tasks = [name for name in every if name.startswith("accuracy/") and "." not in name]
         for name, value in _front_page(store.experiment, sorted(tasks)).items():

@@ -9,11 +9,12 @@ import base64
 import queue
 import re
 import shutil
+import socket
 import tempfile
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 from uuid import uuid4
@@ -242,5 +243,8 @@ def serve_demo(model: Octopi, catalogue: Path, port: int) -> None:
     import uvicorn
 
     known = load_catalogue(catalogue)
-    room = Room(model, known, load_recipes(catalogue, known, seed=0))
-    uvicorn.run(make_app(room), host="127.0.0.1", port=port, log_level="warning")
+    app = make_app(Room(model, known, load_recipes(catalogue, known, seed=0)))
+    with socket.create_server(("127.0.0.1", port)) as listening:
+        print(f"http://127.0.0.1:{listening.getsockname()[1]} shows the demo; Ctrl-C ends it", flush=True)
+        with suppress(KeyboardInterrupt):
+            uvicorn.Server(uvicorn.Config(app, log_level="warning")).run(sockets=[listening])

@@ -1,86 +1,59 @@
-"""A stand-in for the trained model, which answers at once with what it was asked."""
+"""A model of the contract's shape that needs no weights: it says what it was asked and what it was given."""
 
 from __future__ import annotations
 
-import os
+import hashlib
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from pipeline.config import FramesConfig
 from pipeline.errors import UserError
-from pipeline.use.results import Description, Exchange, Touch, Video
-from pipeline.videos.files import VideoFile
-from pipeline.videos.frames.scan import Scan, scan
 
-KEPT = 5
-LEVELS = {"hardness": ("soft", "hard"), "roughness": ("smooth", "slightly rough", "rough")}
+
+def digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()[:8]
 
 
 class FakeOctopi:
-    """`threads` are those that its work was done in; `heard` is every question with its files and history."""
+    """Answers `question | history | digest of each video`, word by word; `{tactile}` must fit as in the real one."""
 
-    card = {"variant": "finetuned-with-all-0"}  # noqa: RUF012
-    properties = tuple(LEVELS)
-    names = ("a baseball", "a rug")
-
-    def __init__(self) -> None:
+    def __init__(self, seconds: float = 0.0) -> None:
+        self.seconds = seconds
+        self.card = {"variant": "fake"}
         self.threads: set[int] = set()
-        self.heard: list[tuple[str, list[str], list[Exchange]]] = []
-        self.paused = threading.Event()
-        self.made = 0
-
-    @classmethod
-    def from_pretrained(cls, folder: Path | str, **_: Any) -> FakeOctopi:
-        return cls()
-
-    def look(self, video: Video) -> Touch:
-        self.threads.add(threading.get_ident())
-        assert isinstance(video, str | os.PathLike)
-        path = Path(video)
-        found = scan(VideoFile(path, str(path), "x", "x_0"), FramesConfig(size=96, fraction=0.15, selection="contact"))
-        if not isinstance(found, Scan):
-            raise UserError(f"{path}: {found.measured}")
-        frames = np.stack([kept.image for kept in found.kept])
-        difference = 128 + (frames.astype(int) - found.reference) // 2
-        return Touch(
-            frames=frames,
-            numbers=tuple(kept.index for kept in found.kept),
-            reference=found.reference,
-            difference=np.clip(difference, 0, 255).astype(np.uint8),
-            contact=0.25,
-            strength=found.probe.contact,
-            notes=() if found.probe.contact > 0.5 else ("Nothing touches the sensor in this video.",),
-        )
-
-    def describe(self, video: Video) -> Description:
-        share = {p: {level: 1 / 2 ** (i + 1) for i, level in enumerate(names)} for p, names in LEVELS.items()}
-        levels = {p: names[0] for p, names in LEVELS.items()}
-        return Description(levels=levels, probabilities=share, sentence="It is soft.", frames=(1, 2), notes=())
+        self.tokens: list[int | None] = []
+        self.asked = 0
+        self.gate: threading.Event | None = None
 
     def stream(
-        self, question: str, videos: Sequence[Video] = (), *, history: Sequence[Exchange] = (), **_: Any
+        self,
+        question: str,
+        videos: Sequence[Any] = (),
+        *,
+        history: Sequence[Any] = (),
+        max_new_tokens: int | None = None,
     ) -> Iterator[str]:
+        self.asked += 1
         self.threads.add(threading.get_ident())
+        self.tokens.append(max_new_tokens)
         if question.count("{tactile}") != len(videos):
-            raise UserError(f"the question has {question.count('{tactile}')} {{tactile}} for {len(videos)} videos")
-        self.heard.append((question, [Path(str(v)).name for v in videos], list(history)))
-        for piece in (*question.replace("{tactile}", "it").split(), f"<b>{len(history)}</b>"):
-            self.made += 1
-            yield f"{piece} "
-            if "wait" in question:
-                self.paused.wait(30)
-        if "break" in question:
-            raise ValueError("within")
+            raise UserError(f"{question.count('{tactile}')} {{tactile}} and {len(videos)} videos; give one each")
+        if question == "blank {tactile}":
+            raise UserError(f"{videos[0]}: 12 frames show no touch; record it again")
+        if question == "break":
+            raise RuntimeError("a secret of /home/somebody")
+        for word in self.words(question, [Path(v).read_bytes() for v in videos], history).split(" "):
+            if self.gate is not None:
+                self.gate.wait(20)
+            time.sleep(self.seconds)
+            yield f"{word} "
+            if word == "late":
+                raise UserError("the touch ended; send another")
 
-    def ask(self, question: str, videos: Sequence[Video] = (), **more: Any) -> str:
-        return "".join(self.stream(question, videos, **more)).strip()
-
-    def rank(self, videos: Sequence[Video], property: str) -> Any:
-        from pipeline.use.results import Ranking
-
-        places = tuple(range(len(videos)))
-        return Ranking(property=property, order=places, expected=tuple(map(float, places)), answer="", most=None)
+    def words(self, question: str, videos: Sequence[bytes], history: Sequence[Any] = ()) -> str:
+        before = [
+            f"{h.question}>{h.answer}:{','.join(digest(Path(v).read_bytes()) for v in h.videos)}" for h in history
+        ]
+        return " | ".join([question, *before, *map(digest, videos)])

@@ -24,7 +24,7 @@ from pipeline.use.demo import MOST_TOUCHES, Asked, Room, make_app, where
 from pipeline.videos.catalogue import Catalogue
 from tests.conftest import ROOT, encode
 from tests.use.browser import tab
-from tests.use.fake import KEPT, FakeOctopi
+from tests.use.stand_in import KEPT, FakeOctopi
 
 
 def press(file: Path, turned: bool = False) -> Path:

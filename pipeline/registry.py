@@ -1,0 +1,135 @@
+"""Trained models in MLflow: each variant's folder as a model that can be loaded and served, the best one by an alias."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from pipeline.config import Params
+from pipeline.io import read_table
+from pipeline.records import Classification, Part, Variant, Video
+from pipeline.stage import DATA
+
+MODELS = Path("models")
+NAME, ALIAS = "octopi", "best"
+PACKAGE = Path(__file__).parent
+NEEDED = (
+    *("accelerate", "av", "filelock", "joblib", "mlflow", "numpy", "open_clip_torch", "opencv-contrib-python-headless"),
+    *("pandas", "peft", "psutil", "pyarrow", "pydantic", "pyyaml", "safetensors", "scipy", "scikit-learn"),
+    *("statsmodels", "threadpoolctl", "timm", "tokenizers", "torch", "torchvision", "tqdm", "transformers"),
+)
+"""Distributions that answering imports; a test holds it to what the code imports."""
+QUESTION = "Describe the touch. {tactile}"
+
+
+def packaged(variant: Variant) -> Path | None:
+    """The folder of a variant, or None where none was made."""
+    folder = MODELS / variant.key
+    return folder if (folder / "config.json").is_file() else None
+
+
+def requirements() -> list[str]:
+    """The distributions that answering needs, at the versions of this environment."""
+    # A build's own mark, as in 2.6.0+cpu, is known to no registry.
+    return [f"{name}=={version(name).partition('+')[0]}" for name in NEEDED]
+
+
+def log_model(uri: str, run: str, params: Params, variant: Variant, folder: Path) -> None:
+    """Log a variant's folder as a model of its run, which MLflow ends by that."""
+    import mlflow
+    from mlflow.models import ModelSignature
+    from mlflow.types import ColSpec, Schema
+    from mlflow.types.schema import Array, DataType
+
+    text = DataType.string
+    signature = ModelSignature(
+        Schema([ColSpec(text, "question"), ColSpec(Array(text), "videos")]), Schema([ColSpec(text, "answer")])
+    )
+    card = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    mlflow.set_tracking_uri(uri)
+    with mlflow.start_run(run_id=run):
+        mlflow.pyfunc.log_model(
+            name=NAME,
+            python_model=str(PACKAGE / "use" / "mlflow_model.py"),
+            artifacts={"folder": str(folder)},
+            code_paths=[str(PACKAGE)],
+            pip_requirements=requirements(),
+            signature=signature,
+            input_example=_example(params),
+            metadata={
+                "variant": variant.key,
+                "scale": params.report_name,
+                "base": card.get("base", {}),
+                "license": _licence(folder),
+            },
+        )
+
+
+def register(client: Any, params: Params, runs: Sequence[tuple[Variant, str]]) -> str:
+    """Give the best variant's model the alias `best` in the registry; the same one is not registered again.
+
+    Best by validation, and by nothing that test questions say: among variants that are the system as the paper proposes
+    it (else all), the one whose seed's property heads are right on most validation videos. Language models are not
+    scored on validation questions, so nothing finer is known.
+
+    Args:
+        client: MLflow's client.
+        runs: Variants whose models are logged, with their runs.
+
+    Returns:
+        The address to load it by; empty where there is none.
+    """
+    from mlflow.exceptions import MlflowException
+
+    if not runs:
+        return ""
+    variant, run = max(runs, key=lambda pair: (pair[0].full, _validated(pair[0].seed), -pair[0].seed))
+    name = f"{NAME}-{params.report_name}"
+    address = f"models:/{name}@{ALIAS}"
+    try:
+        if client.get_model_version_by_alias(name, ALIAS).run_id == run:
+            return address
+    except MlflowException:
+        registered = {model.name for model in client.search_registered_models(f"name = '{name}'")}
+        if name not in registered:
+            client.create_registered_model(name, description=f"Touch for language models, scale {params.report_name}.")
+    found = client.search_logged_models([client.get_run(run).info.experiment_id], f"source_run_id = '{run}'")[0]
+    made = client.create_model_version(
+        name, found.artifact_location, run, tags={"variant": variant.key}, model_id=found.model_id
+    )
+    client.set_registered_model_alias(name, ALIAS, made.version)
+    return address
+
+
+def _validated(seed: int) -> float:
+    """Share of validation videos of which the heads have all properties right; 0 where nothing is known."""
+    file = DATA / "encoder" / str(seed) / "classifications.parquet"
+    right: dict[str, bool] = {}
+    for row in read_table(file, Classification) if file.is_file() else ():
+        if row.part is Part.VALIDATION:
+            right[row.video_id] = right.get(row.video_id, True) and row.predicted == row.expected
+    return sum(right.values()) / len(right) if right else 0.0
+
+
+def _example(params: Params) -> Any:
+    """A question about the first video; without one where the videos are not there."""
+    import pandas as pd
+
+    videos = read_table(DATA / "videos.parquet", Video) if (DATA / "videos.parquet").is_file() else []
+    file = next((path for v in videos if (path := Path(params.data.dir) / v.path).is_file()), None)
+    touch = [base64.b64encode(file.read_bytes()).decode()] if file else []
+    return pd.DataFrame({"question": [QUESTION if touch else "What can you feel?"], "videos": [touch]})
+
+
+def _licence(folder: Path) -> str:
+    """What the model card's front matter says."""
+    card = folder / "README.md"
+    parts = card.read_text(encoding="utf-8").split("---\n") if card.is_file() else []
+    front = yaml.safe_load(parts[1]) if len(parts) > 2 else None
+    return str(front.get("license", "")) if isinstance(front, dict) else ""

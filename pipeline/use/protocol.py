@@ -1,0 +1,210 @@
+"""OpenAI's chat completions, as far as a model of touch can keep them: requests in, a question with videos out."""
+
+from __future__ import annotations
+
+import time
+import uuid
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any, Literal, NamedTuple, Protocol
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from pipeline.use.media import Refused, from_base64
+from pipeline.use.results import Exchange
+
+MARK = "{tactile}"
+MESSAGES, CHARACTERS = 64, 20_000
+"""The longest conversation, and the longest text of one part of it."""
+Json = dict[str, Any]
+
+
+class Model(Protocol):
+    """What of `pipeline.Octopi` is served."""
+
+    @property
+    def card(self) -> Mapping[str, Any]:
+        """What its folder says of it."""
+
+    def stream(
+        self,
+        question: str,
+        videos: Sequence[Any] = (),
+        *,
+        history: Sequence[Any] = (),
+        max_new_tokens: int | None = None,
+    ) -> Iterator[str]:
+        """Pieces of the answer."""
+
+
+# ---- requests ----
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="ignore")
+
+
+Text = Annotated[str, Field(max_length=CHARACTERS)]
+
+
+class _Url(_Part):
+    url: str
+
+
+class TextPart(_Part):
+    """A piece of text."""
+
+    type: Literal["text"]
+    text: Text
+
+
+class VideoPart(_Part):
+    """A touch."""
+
+    type: Literal["video_url"]
+    video_url: _Url
+
+
+class ImagePart(_Part):
+    """A touch, sent by a client that knows pictures only."""
+
+    type: Literal["image_url"]
+    image_url: _Url
+
+
+Part = Annotated[TextPart | VideoPart | ImagePart, Field(discriminator="type")]
+
+
+class Message(_Part):
+    """One turn."""
+
+    role: Literal["system", "developer", "user", "assistant"]
+    content: Text | Annotated[list[Part], Field(min_length=1, max_length=MESSAGES)]
+
+
+class _StreamOptions(_Part):
+    include_usage: bool = False
+
+
+class ChatRequest(BaseModel):
+    """The body of a request.
+
+    Answers are greedy, so `temperature`, `top_p` and `seed` change nothing and are let through, as is what a client
+    says about itself. What would change the answer and cannot be kept (`n`, `tools`, ...) is refused.
+    """
+
+    model_config = ConfigDict(extra="ignore")
+
+    model: str = Field(max_length=200)
+    messages: Annotated[list[Message], Field(min_length=1, max_length=MESSAGES)]
+    stream: bool = False
+    stream_options: _StreamOptions | None = None
+    max_tokens: int | None = Field(default=None, ge=1)
+    max_completion_tokens: int | None = Field(default=None, ge=1)
+    n: Literal[1] | None = None
+    stop: Annotated[list[str], Field(max_length=0)] | None = None
+    tools: Annotated[list[Any], Field(max_length=0)] | None = None
+    functions: Annotated[list[Any], Field(max_length=0)] | None = None
+    logprobs: Literal[False] | None = None
+    response_format: dict[Literal["type"], Literal["text"]] | None = None
+
+
+class Asked(NamedTuple):
+    """A question with its conversation; videos as bytes."""
+
+    question: str
+    videos: tuple[bytes, ...]
+    history: tuple[Exchange, ...]
+
+
+def read_request(body: bytes) -> ChatRequest:
+    """Read a body.
+
+    Raises:
+        Refused: where it has not the form; the line names the first place.
+    """
+    try:
+        return ChatRequest.model_validate_json(body)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False, include_context=False)[0]
+        place = ".".join(str(part) for part in first["loc"]) or "body"
+        raise Refused(f"{place}: {first['msg'][:300]}") from None
+
+
+def read_conversation(messages: Sequence[Message], most: int) -> Asked:
+    """Turn messages into a question and what was said before it.
+
+    A video stands where its part stands, or, where the texts of a message say `{tactile}`, at those marks in order.
+    System messages are left out: the model was trained under its own and knows no other.
+
+    Args:
+        messages: User and assistant in turn, the user last.
+        most: Videos, at most.
+
+    Raises:
+        Refused: where turns are out of order, the assistant sends a video, or there are too many.
+    """
+    turns = [(i, m) for i, m in enumerate(messages) if m.role in ("user", "assistant")]
+    if len(turns) % 2 == 0 or any(m.role != ("user", "assistant")[place % 2] for place, (_, m) in enumerate(turns)):
+        raise Refused("messages: user and assistant must take turns, the user first and last")
+    count = sum(not isinstance(p, TextPart) for m in messages if not isinstance(m.content, str) for p in m.content)
+    if count > most:
+        raise Refused(f"messages: {count} videos; a request may bring at most {most}, earlier turns included", 413)
+    said = [_read(message, f"messages.{i}") for i, message in turns]
+    pairs = zip(said[:-1:2], said[1::2], strict=True)
+    if any(videos for _, videos in said[1::2]):
+        raise Refused("messages: an assistant's message brings a video; only the user's may")
+    history = tuple(Exchange(text, videos, answer) for (text, videos), (answer, _) in pairs)
+    return Asked(*said[-1], history)
+
+
+def _read(message: Message, place: str) -> tuple[str, tuple[bytes, ...]]:
+    if isinstance(message.content, str):
+        return message.content, ()
+    marked = any(isinstance(p, TextPart) and MARK in p.text for p in message.content)
+    text, videos = "", []
+    for i, part in enumerate(message.content):
+        if isinstance(part, TextPart):
+            piece = part.text
+        else:
+            url = part.video_url if isinstance(part, VideoPart) else part.image_url
+            videos.append(from_base64(url.url, f"{place}.content.{i}"))
+            piece = "" if marked else MARK
+        apart = text and piece and not text[-1].isspace() and not piece[0].isspace()
+        text += f" {piece}" if apart else piece
+    return text, tuple(videos)
+
+
+# ---- answers ----
+
+
+class Reply:
+    """The answer to one request, in OpenAI's form; token counts are left out, since the model hands out text.
+
+    `finish_reason` is `stop` also where an answer was cut at its longest, which the text does not tell.
+    """
+
+    def __init__(self, model: str) -> None:
+        self.head: Json = {"id": f"chatcmpl-{uuid.uuid4().hex}", "created": int(time.time()), "model": model}
+
+    def whole(self, text: str) -> Json:
+        """A `chat.completion`."""
+        message = {"role": "assistant", "content": text, "refusal": None}
+        choice = {"index": 0, "message": message, "logprobs": None, "finish_reason": "stop"}
+        return {**self.head, "object": "chat.completion", "choices": [choice]}
+
+    def chunk(self, delta: Mapping[str, str], finish: str | None = None) -> Json:
+        """A `chat.completion.chunk`."""
+        choice = {"index": 0, "delta": dict(delta), "logprobs": None, "finish_reason": finish}
+        return {**self.head, "object": "chat.completion.chunk", "choices": [choice]}
+
+
+def model_entry(name: str, created: int) -> Json:
+    """An entry of `/v1/models`."""
+    return {"id": name, "object": "model", "created": created, "owned_by": "octopi-pipeline"}
+
+
+def error_body(message: str, status: int) -> Json:
+    """An error in OpenAI's form."""
+    kinds = {401: "authentication_error", 404: "not_found_error", 429: "rate_limit_error"}
+    kind = kinds.get(status, "server_error" if status >= 500 else "invalid_request_error")
+    return {"error": {"message": message, "type": kind, "param": None, "code": None}}

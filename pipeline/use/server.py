@@ -1,0 +1,115 @@
+"""Where `octopi serve` listens, whom it lets in, and how it ends."""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import os
+import socket
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import h11
+import uvicorn
+from fastapi import FastAPI
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from pipeline.errors import UserError
+from pipeline.use.protocol import Model
+
+SHORTEST_TOKEN = 16
+HEADER_SECONDS = 10.0
+"""How long a client may take for a request's head."""
+
+
+class Patient(H11Protocol):
+    """Hangs up on a client that does not get a request's head sent in time, which uvicorn waits for without end."""
+
+    _timer: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Start the clock."""
+        super().connection_made(transport)
+        self._timer = self.loop.call_later(HEADER_SECONDS, transport.close)
+
+    def data_received(self, data: bytes) -> None:
+        """Stop it when a request is there; start it at the next one's first byte."""
+        super().data_received(data)
+        if self.conn.their_state is h11.IDLE:
+            self._timer = self._timer or self.loop.call_later(HEADER_SECONDS, self.transport.close)
+        elif self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Forget it."""
+        if self._timer is not None:
+            self._timer.cancel()
+        super().connection_lost(exc)
+
+
+def make_server(app: FastAPI) -> uvicorn.Server:
+    """The server of the application; `run(sockets=[...])` returns when a signal came and all answers are sent."""
+    config = uvicorn.Config(
+        app, http=Patient, ws="none", lifespan="on", access_log=False, log_level="warning", server_header=False
+    )
+    return uvicorn.Server(config)
+
+
+def listen(host: str, port: int, token: str) -> socket.socket:
+    """A socket for the server.
+
+    Raises:
+        UserError: where others could reach it and there is no token, or where the address cannot be had.
+    """
+    with suppress(ValueError):
+        if token or host == "localhost" or ipaddress.ip_address(host).is_loopback:
+            token = token or "none needed"
+    if not token:
+        raise UserError(f"--host {host}: others can reach it; set OCTOPI_TOKEN or --token-file, or leave --host out")
+    try:
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        return socket.create_server((host, port), family=family, backlog=256)
+    except (OSError, OverflowError) as error:
+        words = getattr(error, "strerror", None) or error
+        raise UserError(f"--host {host} --port {port}: cannot be had ({words}); choose another") from None
+
+
+def checked(token: str) -> str:
+    """The token without space around it; too short a one is a UserError."""
+    token = token.strip()
+    if token and (len(token) < SHORTEST_TOKEN or not token.isascii() or not token.isprintable()):
+        raise UserError(f"the token needs {SHORTEST_TOKEN} or more ASCII characters; `openssl rand -hex 32` makes one")
+    return token
+
+
+def serve(load: Callable[[], Model], name: str, host: str, port: int, token_file: Path | None, places: int) -> None:
+    """Serve a model until a signal comes; answers in flight are finished then.
+
+    Raises:
+        UserError: where the model, the token or the address cannot be used.
+    """
+    from pipeline.use.serve import make_app
+
+    token = checked(read_token(token_file))
+    # First the address, which is known at once; loading takes its time.
+    with listen(host, port, token) as listening:
+        app = make_app(load(), name, token=token, places=places)
+        address, number = listening.getsockname()[:2]
+        place = f"[{address}]" if ":" in address else address
+        print(f"{name} answers at http://{place}:{number}/v1; Ctrl-C ends it", flush=True)
+        with suppress(KeyboardInterrupt):
+            make_server(app).run(sockets=[listening])
+
+
+def read_token(file: Path | None) -> str:
+    """What the file says, or else the environment."""
+    if file is None:
+        return os.environ.get("OCTOPI_TOKEN", "")
+    try:
+        if found := file.read_text(encoding="utf-8").strip():
+            return found
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"--token-file {file}: cannot be read ({error}); name a text file") from None
+    raise UserError(f"--token-file {file}: empty; write the token into it")

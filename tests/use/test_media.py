@@ -1,0 +1,155 @@
+"""Videos from strangers: what is taken, what is refused, and at what cost."""
+
+from __future__ import annotations
+
+import base64
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.use.media import Gate, Limits, Refused, from_base64
+from tests.closure import ROOT
+from tests.use.videos import avi_of_giant_jpegs, blank, claims_frames, claims_pixels, video
+
+
+@pytest.fixture(scope="module")
+def gate() -> object:
+    with Gate(Limits(frames=200, seconds=5, pixels=500_000)) as gate:
+        yield gate
+
+
+@given(st.binary(min_size=1))
+def test_base64_comes_back_with_and_without_a_head(data: bytes) -> None:
+    text = base64.b64encode(data).decode()
+    assert from_base64(text) == from_base64(f"data:video/mp4;base64,{text}") == data
+    assert from_base64(f"data:;base64,{text}") == from_base64(f"data:video/mp4;codecs=avc1;base64,{text}") == data
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("", "data:video/mp4;base64,", "data:video/mp4;base64,AAA", "data:video/mp4;base64,AA AA", "AA\nAA", "ä"),
+        *("file:///etc/passwd", "/etc/passwd", "http://127.0.0.1/a.mp4", "C:\\a.mov", "data:video/mp4,AAAA", "-_-_"),
+        *("DATA:video/mp4;base64,AAAA", "concat:a|b", "pipe:0"),
+    ],
+)
+def test_paths_addresses_and_broken_base64_are_refused(text: str) -> None:
+    with pytest.raises(Refused) as refused:
+        from_base64(text)
+    assert refused.value.status == 422
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(("suffix", "codec"), [(".mp4", "mpeg4"), (".avi", "mjpeg"), (".mkv", "ffv1")])
+def test_good_videos_come_as_files_that_go(gate: Gate, suffix: str, codec: str) -> None:
+    videos = [video(1, suffix=suffix, codec=codec), video(2, suffix=suffix, codec=codec)]
+    with gate.files(videos) as paths:
+        assert [p.read_bytes() for p in paths] == videos
+        assert {p.suffix for p in paths} == {suffix if suffix != ".mp4" else ".mov"}
+    assert not any(p.parent.exists() for p in paths)
+
+
+PLAYLIST = b"#EXTM3U\n#EXT-X-TARGETDURATION:10\n#EXTINF:10,\n%s\n#EXT-X-ENDLIST\n"
+
+
+@pytest.mark.parametrize(
+    ("data", "status", "words"),
+    [
+        (lambda: claims_pixels(40_000, 40_000), 413, "pixels"),
+        (lambda: claims_pixels(15_000, 15_000), 413, "pixels"),
+        (lambda: blank(2, 1024, 1024), 413, "pixels"),
+        (lambda: avi_of_giant_jpegs(15_000, 15_000), 422, "no frame"),
+        (lambda: claims_frames(10**6), 413, "longer than 200 frames"),
+        (lambda: blank(201), 413, "longer than 200 frames"),
+        (lambda: b"hello", 422, "no video"),
+        (lambda: video()[:300], 422, "no video"),
+        (lambda: b"\x89PNG\r\n\x1a\n" + bytes(100), 422, "no video"),
+        (lambda: PLAYLIST % b"file:///etc/passwd", 422, "no video"),
+        (lambda: b"ffconcat version 1.0\nfile /etc/passwd\n", 422, "no video"),
+        (lambda: bytes(1000), 422, "no video"),
+    ],
+)
+def test_bombs_and_what_is_no_video(gate: Gate, data: object, status: int, words: str) -> None:
+    with pytest.raises(Refused, match=words) as refused, gate.files([data()]):  # type: ignore[operator]
+        pass
+    assert refused.value.status == status
+    assert str(refused.value).startswith("video 1: ")
+    assert "/tmp" not in str(refused.value)
+
+
+def test_the_last_allowed_frame_and_one_more() -> None:
+    with Gate(Limits(frames=12)) as gate, gate.files([blank(12)]):
+        pass
+    with Gate(Limits(frames=11)) as gate, pytest.raises(Refused, match="11 frames"), gate.files([blank(12)]):
+        pass
+
+
+def test_a_playlist_cannot_read_another_file(gate: Gate, tmp_path: Path) -> None:
+    # FFmpeg alone would play the other file.
+    other = tmp_path / "secret.mp4"
+    other.write_bytes(video())
+    for data in (PLAYLIST % str(other).encode(), b"ffconcat version 1.0\nfile %s\n" % str(other).encode()):
+        with pytest.raises(Refused, match="no video"), gate.files([data]):
+            pass
+
+
+def test_too_many_videos_cost_no_check() -> None:
+    gate = Gate(Limits(videos=2))
+    with pytest.raises(Refused, match="3 videos"), gate.files([b"x"] * 3):
+        pass
+    assert gate._checker is None
+
+
+def test_a_checker_that_dies_is_replaced(gate: Gate) -> None:
+    for _ in range(2):
+        with gate.files([video()]):
+            assert gate._checker is not None
+            gate._checker.kill()
+            gate._checker.wait()
+    with gate.files([video()]):
+        pass
+
+
+def test_time_is_limited(tmp_path: Path) -> None:
+    """A pipe that nobody writes to takes for ever to open, as a decoder may take."""
+    os.mkfifo(tmp_path / "endless.mov")
+    with Gate(Limits(check_seconds=1)) as gate:
+        with pytest.raises(Refused, match="too long") as refused:
+            gate._check(tmp_path / "endless.mov", "video 1")
+        assert refused.value.status == 413
+        with gate.files([video()]):
+            pass
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="measures the memory of a process as Linux does")
+def test_bombs_take_no_memory(tmp_path: Path) -> None:
+    """The checking process grows by less than a tenth of what the header claims."""
+    script = (
+        "import sys, resource, av\nfrom pathlib import Path\nfrom pipeline.use.media import check, Limits, Refused\n"
+        "check(Path(sys.argv[1]), Limits())\nbefore = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
+        "try:\n    check(Path(sys.argv[2]), Limits())\nexcept Refused:\n"
+        "    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)\n"
+    )
+    good = tmp_path / "good.mp4"
+    good.write_bytes(video())
+    for name, data in {"pixels": claims_pixels(15_000, 15_000), "frames": claims_frames(10**6)}.items():
+        bad = tmp_path / f"{name}.mp4"
+        bad.write_bytes(data)
+        env = {**os.environ, "PYTHONPATH": str(ROOT)}
+        command = [sys.executable, "-c", script, str(good), str(bad)]
+        grown = subprocess.run(command, env=env, capture_output=True, text=True, timeout=60, check=True).stdout
+        # Picture: 15,000 x 15,000 x 1.5 = 337 MB. Table: 10^6 entries of 24 bytes = 24 MB, twice while it grows.
+        assert int(grown) < 60_000, name
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="Linux limits the memory of a process")
+def test_a_table_beyond_memory_ends_in_one_line(gate: Gate) -> None:
+    with pytest.raises(Refused), gate.files([claims_frames(10**8)]):
+        pass
+    with gate.files([video()]):
+        pass

@@ -1,0 +1,277 @@
+"""`octopi serve` on a real socket: many clients, slow ones, rude ones, and its end."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+from typer.testing import CliRunner
+
+from pipeline.cli import app as cli
+from pipeline.errors import UserError
+from pipeline.use import serve, server
+from pipeline.use.media import Limits
+from pipeline.use.serve import make_app
+from pipeline.use.server import checked, listen, make_server
+from tests.closure import ROOT
+from tests.use.fake import FakeOctopi, digest
+from tests.use.test_serve import CHAT, body, events, part, text, user
+from tests.use.videos import video
+
+
+@contextmanager
+def running(fake: FakeOctopi, **options: Any) -> Iterator[int]:
+    """A server in a thread; its port."""
+    with listen("127.0.0.1", 0, "") as listening:
+        there = make_server(make_app(fake, "octopi", **options))
+        thread = threading.Thread(target=there.run, kwargs={"sockets": [listening]})
+        thread.start()
+        try:
+            yield listening.getsockname()[1]
+        finally:
+            there.should_exit = True
+            thread.join(30)
+            assert not thread.is_alive()
+
+
+def ask(port: int, content: dict[str, Any] | bytes, path: str = CHAT) -> tuple[int, Any]:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+    try:
+        data = content if isinstance(content, bytes) else json.dumps(content).encode()
+        connection.request("POST", path, data, {"Content-Type": "application/json"})
+        response = connection.getresponse()
+        found = response.read().decode()
+        return response.status, found if "event-stream" in str(response.headers) else json.loads(found)
+    finally:
+        connection.close()
+
+
+def get(port: int, path: str) -> Any:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+    try:
+        connection.request("GET", path)
+        return json.loads(connection.getresponse().read())
+    finally:
+        connection.close()
+
+
+def wait_for(condition: Any) -> None:
+    end = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def test_twenty_clients_ten_requests_none_lost_none_mixed_up() -> None:
+    """Each of 200 questions and videos is its own, so any answer that went astray shows."""
+    jobs = [(i, video(i % 10, 4 + i // 10)) for i in range(200)]
+    assert len({digest(data) for _, data in jobs}) == 200
+
+    def client(number: int) -> list[str]:
+        found = []
+        for i, data in jobs[number::20]:
+            content = body(user(text(f"number {i}"), part(data)), stream=bool(i % 2))
+            while (answer := ask(port, content))[0] == 429:
+                time.sleep(0.05)
+            assert answer[0] == 200, answer
+            if i % 2:
+                said = [e["choices"][0]["delta"].get("content", "") for e in events(answer[1]) if e != "[DONE]"]
+                found.append("".join(said))
+            else:
+                found.append(answer[1]["choices"][0]["message"]["content"])
+        return found
+
+    fake = FakeOctopi()
+    with running(fake, places=12) as port, ThreadPoolExecutor(20) as pool:
+        answers = list(pool.map(client, range(20)))
+    for number, found in enumerate(answers):
+        assert found == [f"number {i} {{tactile}} | {digest(data)} " for i, data in jobs[number::20]]
+    assert fake.asked == 200
+    assert len(fake.threads) == 1
+
+
+def test_a_refused_body_is_read_so_that_the_answer_is_seen() -> None:
+    with running(FakeOctopi(), limits=Limits(body_bytes=100_000)) as port:
+        assert ask(port, b"x" * 300_000)[0] == 413
+        assert ask(port, body(user("hello")))[0] == 200
+
+
+def test_slow_clients_are_hung_up_on_and_others_are_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, "HEADER_SECONDS", 0.3)
+    monkeypatch.setattr(serve, "UPLOAD_SECONDS", 0.6)
+    head = b"POST /v1/chat/completions HTTP/1.1\r\nHost: 127.0.0.1\r\n"
+    kept = b"GET /health HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+    with running(FakeOctopi(), places=1) as port:
+        silent, slow_head, slow_body, second = (socket.create_connection(("127.0.0.1", port), 20) for _ in range(4))
+        slow_head.sendall(head)
+        second.sendall(kept)
+        while not second.recv(10_000).endswith(b"}"):
+            pass
+        second.sendall(kept[:-2])
+        slow_body.sendall(head + b"Content-Type: application/json\r\nContent-Length: 50\r\n\r\n{")
+        for client in (silent, slow_head, second):
+            assert client.recv(10_000) == b""
+        answer = b""
+        while piece := slow_body.recv(10_000):
+            answer += piece
+        assert b" 408 " in answer.split(b"\r\n")[0]
+        # Its place is free again.
+        assert ask(port, body(user("hello")))[0] == 200
+        for client in (silent, slow_head, slow_body, second):
+            client.close()
+
+
+@pytest.mark.parametrize("stream", [False, True])
+def test_who_hangs_up_frees_the_place_and_stops_the_model(stream: bool) -> None:
+    fake = FakeOctopi()
+    fake.gate = threading.Event()
+    with running(fake, places=1) as port:
+        data = json.dumps(body(user(" ".join("abcdefgh")), stream=stream)).encode()
+        client = socket.create_connection(("127.0.0.1", port))
+        head = (
+            f"POST {CHAT} HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: {len(data)}"
+        )
+        client.sendall(f"{head}\r\n\r\n".encode() + data)
+        wait_for(lambda: fake.asked == 1)
+        client.close()
+        time.sleep(0.2)
+        fake.gate.set()
+        wait_for(lambda: get(port, "/health")["waiting"] == 0)
+        metrics = http.client.HTTPConnection("127.0.0.1", port)
+        metrics.request("GET", "/metrics")
+        # Given up before its end, it is no answer.
+        assert b"octopi_answer_seconds_count 0" in metrics.getresponse().read()
+        metrics.close()
+        assert ask(port, body(user("hello")))[0] == 200
+
+
+SCRIPT = """
+import threading
+from pipeline.use.serve import make_app
+from pipeline.use.server import listen, make_server
+from tests.use.fake import FakeOctopi
+with listen("127.0.0.1", 0, "") as listening:
+    print(listening.getsockname()[1], flush=True)
+    make_server(make_app(FakeOctopi(0.05), "octopi")).run(sockets=[listening])
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals")
+def test_stopping_finishes_what_was_asked_and_leaves_no_process() -> None:
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen([sys.executable, "-c", SCRIPT], stdout=subprocess.PIPE, text=True, env=env)
+    try:
+        assert process.stdout is not None
+        port = int(process.stdout.readline())
+        with ThreadPoolExecutor(4) as pool:
+            contents = [body(user(text(f"{i} " + "x " * 15), part(video(i))), stream=i == 3) for i in range(4)]
+            answers = [pool.submit(ask, port, content) for content in contents]
+            wait_for(lambda: get(port, "/health")["waiting"] == 4)
+            children = psutil.Process(process.pid).children()
+            process.send_signal(signal.SIGTERM)
+            assert [a.result()[0] for a in answers] == [200] * 4
+        for i, answer in enumerate(answers[:3]):
+            said = answer.result()[1]["choices"][0]["message"]["content"]
+            assert said.split() == [str(i), *"x" * 15, "{tactile}", "|", digest(video(i))]
+        assert events(answers[3].result()[1])[-1] == "[DONE]"
+        process.wait(20)
+        assert len(children) == 1
+        assert not psutil.wait_procs(children, timeout=10)[1]
+        with pytest.raises(ConnectionRefusedError):
+            socket.create_connection(("127.0.0.1", port), 1)
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_no_checking_process_outlives_a_killed_server() -> None:
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen([sys.executable, "-c", SCRIPT], stdout=subprocess.PIPE, text=True, env=env)
+    assert process.stdout is not None
+    assert ask(int(process.stdout.readline()), body(user(part(video()))))[0] == 200
+    children = psutil.Process(process.pid).children()
+    process.kill()
+    process.communicate()
+    assert len(children) == 1
+    assert not psutil.wait_procs(children, timeout=5)[1]
+
+
+def test_five_hundred_answers_take_no_memory() -> None:
+    """Memory is flat: 500 requests of 0.4 MB each leave less than 20 MB behind, ten times less than they brought."""
+    import gc
+
+    padding = json.dumps({**body(user(text("hello"), part(video()))), "x": "y" * 400_000}).encode()
+    with running(FakeOctopi()) as port:
+        for _ in range(30):
+            assert ask(port, padding)[0] == 200
+        gc.collect()
+        before = psutil.Process().memory_info().rss
+        for _ in range(500):
+            ask(port, padding)
+        gc.collect()
+        assert psutil.Process().memory_info().rss - before < 20_000_000
+
+
+# ---- the command ----
+
+
+@pytest.mark.parametrize(
+    ("host", "token", "fine"), [("127.0.0.1", "", True), ("localhost", "", True), ("0.0.0.0", "", False)]
+)
+def test_other_addresses_need_a_token(host: str, token: str, fine: bool) -> None:
+    if fine:
+        listen(host, 0, token).close()
+    else:
+        with pytest.raises(UserError, match="OCTOPI_TOKEN"):
+            listen(host, 0, token)
+        listen(host, 0, "x" * 16).close()
+
+
+def test_addresses_that_cannot_be_had() -> None:
+    with listen("127.0.0.1", 0, "") as taken, pytest.raises(UserError, match="choose another"):
+        listen("127.0.0.1", taken.getsockname()[1], "")
+    for host, port in (("localhost", 70_000), ("300.1.1.1", 0), ("no such name.invalid", 0)):
+        with pytest.raises(UserError):
+            listen(host, port, "x" * 16)
+
+
+@pytest.mark.parametrize("token", ["short", "x" * 15, "ü" * 20, "a b\nc" * 5])
+def test_weak_tokens(token: str) -> None:
+    with pytest.raises(UserError, match="openssl"):
+        checked(token)
+
+
+def test_tokens() -> None:
+    assert checked("") == checked(" \n") == ""
+    assert checked(f" {'x' * 16}\n") == "x" * 16
+
+
+def test_the_command_says_what_is_wrong_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("OCTOPI_TOKEN", raising=False)
+    (tmp_path / "empty").write_text("\n")
+    (tmp_path / "binary").write_bytes(b"\xff\xfe")
+    for options, words in {
+        ("--host", "0.0.0.0"): "OCTOPI_TOKEN",
+        ("--token-file", str(tmp_path / "none")): "--token-file",
+        ("--token-file", str(tmp_path / "empty")): "empty",
+        ("--token-file", str(tmp_path / "binary")): "--token-file",
+        ("--token-file", str(tmp_path)): "--token-file",
+    }.items():
+        result = CliRunner().invoke(cli, ["serve", str(tmp_path), "--port", "0", *options])
+        assert isinstance(result.exception, UserError)
+        assert words in str(result.exception)
+        assert "\n" not in str(result.exception)
