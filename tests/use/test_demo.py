@@ -20,7 +20,9 @@ import uvicorn
 
 from pipeline.errors import UserError
 from pipeline.scenes.recipe import load_recipes
-from pipeline.use.demo import MOST_TOUCHES, Asked, Room, make_app, where
+from pipeline.use.demo import MOST_TOUCHES, Asked, Room, Turn, make_app, where
+from pipeline.use.model import Octopi
+from pipeline.use.results import Exchange
 from pipeline.videos.catalogue import Catalogue
 from tests.conftest import ROOT, encode
 from tests.use.browser import tab
@@ -182,6 +184,21 @@ def test_old_touches_are_forgotten(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="forgotten"):
         room.stream(Asked(question="{tactile}", touches=ids[:1]))
     assert "".join(room.stream(Asked(question="{tactile}", touches=ids[1:2])))
+    room.close()
+
+
+def test_a_trained_model_is_shown_and_asked(octopi: Octopi, files: list[Path]) -> None:
+    """The class itself, of random weights: what the page is given is what it says by itself."""
+    room = Room(octopi)
+    shown = room.work(lambda: room.show("ice block", files[0]))
+    said = octopi.describe(files[0])
+    assert (shown["levels"], shown["probabilities"]) == (said.levels, said.probabilities)
+    assert len(shown["frames"]) == len(shown["touched"]) == len(said.frames)
+    first = "".join(room.stream(Asked(question="Soft? {tactile}", touches=[shown["id"]])))
+    assert first == octopi.ask("Soft? {tactile}", files[:1])
+    turn = Turn(question="Soft? {tactile}", touches=[shown["id"]], answer=first)
+    again = "".join(room.stream(Asked(question="Why?", history=[turn])))
+    assert again == octopi.ask("Why?", history=[Exchange("Soft? {tactile}", tuple(files[:1]), first)])
     room.close()
 
 
