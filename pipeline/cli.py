@@ -260,7 +260,7 @@ def demo(
     """Show a page to drop videos on: what the model sees, what it takes them for, and a chat. Nothing leaves."""
     from pipeline.use.demo import serve_demo
 
-    serve_demo(_load(folder, base, device), catalogue, port)
+    serve_demo(lambda: _load(folder, base, device), catalogue, port)
 
 
 def _load(folder: Path | None, base: Path | None, device: str) -> Octopi:

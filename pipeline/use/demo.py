@@ -9,7 +9,6 @@ import base64
 import queue
 import re
 import shutil
-import socket
 import tempfile
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
@@ -36,6 +35,7 @@ from pipeline.scenes.recipe import Recipe, load_recipes
 from pipeline.scenes.render import make_scene, render
 from pipeline.tasks.opd import TEMPLATES
 from pipeline.use.results import Exchange, Pictures, Touch
+from pipeline.use.server import listen, make_server
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 
 if TYPE_CHECKING:
@@ -238,13 +238,15 @@ def make_app(room: Room) -> FastAPI:
     return app
 
 
-def serve_demo(model: Octopi, catalogue: Path, port: int) -> None:
-    """Show the demo at http://127.0.0.1:`port` until it is interrupted; `catalogue` names the scenes."""
-    import uvicorn
+def serve_demo(load: Callable[[], Octopi], catalogue: Path, port: int) -> None:
+    """Show the demo at http://127.0.0.1:`port` until it is interrupted; `catalogue` names the scenes.
 
-    known = load_catalogue(catalogue)
-    app = make_app(Room(model, known, load_recipes(catalogue, known, seed=0)))
-    with socket.create_server(("127.0.0.1", port)) as listening:
+    Raises:
+        UserError: where the port, the catalogue or the model cannot be used.
+    """
+    with listen("127.0.0.1", port, "") as listening:
+        known = load_catalogue(catalogue)
+        app = make_app(Room(load(), known, load_recipes(catalogue, known, seed=0)))
         print(f"http://127.0.0.1:{listening.getsockname()[1]} shows the demo; Ctrl-C ends it", flush=True)
         with suppress(KeyboardInterrupt):
-            uvicorn.Server(uvicorn.Config(app, log_level="warning")).run(sockets=[listening])
+            make_server(app).run(sockets=[listening])

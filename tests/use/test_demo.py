@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import base64
 import json
+import os
+import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 import urllib.error
@@ -15,6 +19,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pandas as pd
 import pytest
 import uvicorn
 
@@ -26,7 +31,10 @@ from pipeline.use.results import Exchange
 from pipeline.videos.catalogue import Catalogue
 from tests.conftest import ROOT, encode
 from tests.use.browser import tab
+from tests.use.shared import Made
 from tests.use.stand_in import KEPT, FakeOctopi
+
+OBJECTS = ROOT / "pipeline" / "physiclear" / "objects.csv"
 
 
 def press(file: Path, turned: bool = False) -> Path:
@@ -200,6 +208,31 @@ def test_a_trained_model_is_shown_and_asked(octopi: Octopi, files: list[Path]) -
     again = "".join(room.stream(Asked(question="Why?", history=[turn])))
     assert again == octopi.ask("Why?", history=[Exchange("Soft? {tactile}", tuple(files[:1]), first)])
     room.close()
+
+
+def test_the_command_shows_it_until_it_is_interrupted(made: Made) -> None:
+    catalogue = ROOT / "pipeline" / "physiclear"
+    command = [Path(sys.executable).parent / "octopi", "demo", str(made.folder), "--device", "cpu", "--port"]
+    running = subprocess.Popen(
+        [*command, "0", "--catalogue", str(catalogue)],
+        cwd=made.folder.parents[1],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert running.stdout is not None
+        address, _, rest = running.stdout.readline().partition(" ")
+        assert rest == "shows the demo; Ctrl-C ends it\n"
+        about = json.loads(call(f"{address}/api/about", "GET")[1])
+        assert (about["variant"], len(about["scenes"])) == ("finetuned-with-all-0", len(pd.read_csv(OBJECTS)))
+        taken = subprocess.run([*command, address.rpartition(":")[2]], capture_output=True, text=True, check=False)
+        assert taken.returncode == 1
+        assert taken.stderr.count("\n") == 1
+        assert "choose another" in taken.stderr
+    finally:
+        running.send_signal(signal.SIGINT)
+    assert running.wait(60) == 0
 
 
 def test_in_a_browser(site: str, tmp_path: Path) -> None:
