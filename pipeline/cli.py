@@ -19,6 +19,8 @@ app = typer.Typer(
 )
 data_app = typer.Typer(help="Look at a folder of tactile videos.", no_args_is_help=True)
 app.add_typer(data_app, name="data")
+import_app = typer.Typer(help="Make videos of other recordings.", no_args_is_help=True)
+app.add_typer(import_app, name="import")
 
 
 @app.command()
@@ -115,6 +117,21 @@ def audit(
     write_csv(out, Finding, findings)
     typer.echo(f"{len(findings)} findings in {out}")
     _show(findings)
+
+
+@import_app.command()
+def bag(
+    file: Annotated[Path, typer.Argument(help="ROS 1 .bag, ROS 2 folder, .mcap or .db3.")],
+    topic: Annotated[str, typer.Option(help="Of sensor_msgs/Image or CompressedImage.")],
+    out: Annotated[Path, typer.Option(help="Folder of the videos.")],
+    object_id: Annotated[str, typer.Option("--object", help="What is touched; the recording's name by default.")] = "",
+    times: Annotated[float, typer.Option(help="A press begins at this many times the quiet level.")] = 2.0,
+) -> None:
+    """Cut a robot's recording into presses: videos for the chain and `octopi ask`, each with its times in a CSV."""
+    from pipeline.use.bags import import_bag
+
+    written = import_bag(file, topic, out, object_id or file.stem, times)
+    typer.echo(f"{len(written)} presses in {out}: {', '.join(path.name for path in written)}")
 
 
 def _show(findings: Sequence[Finding]) -> None:
@@ -230,6 +247,20 @@ def serve(
 
     folder = folder or default_model()
     serve(lambda: _load(folder, base, device), folder.resolve().name, host, port, token_file, places)
+
+
+@app.command()
+def demo(
+    folder: Annotated[Path | None, typer.Argument(help="A trained model; by default the full system's.")] = None,
+    base: Annotated[Path | None, BASE] = None,
+    device: Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")] = "auto",
+    catalogue: Annotated[Path, CATALOGUE] = Path("pipeline/physiclear"),
+    port: Annotated[int, typer.Option(help="Of 127.0.0.1.")] = 7860,
+) -> None:
+    """Show a page to drop videos on: what the model sees, what it takes them for, and a chat. Nothing leaves."""
+    from pipeline.use.demo import serve_demo
+
+    serve_demo(lambda: _load(folder, base, device), catalogue, port)
 
 
 def _load(folder: Path | None, base: Path | None, device: str) -> Octopi:

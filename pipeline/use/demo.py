@@ -1,0 +1,252 @@
+"""The demo: one page in the browser that shows what the model sees of a touch, and talks with it.
+
+Everything comes from this machine: the page asks for nothing elsewhere, and its security policy forbids it.
+"""
+
+from __future__ import annotations
+
+import base64
+import queue
+import re
+import shutil
+import tempfile
+import threading
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import asynccontextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+from uuid import uuid4
+
+import cv2
+import numpy as np
+from fastapi import FastAPI, Request
+from fastapi.responses import JSONResponse, Response, StreamingResponse
+from fastapi.staticfiles import StaticFiles
+from pydantic import BaseModel, Field
+from starlette.concurrency import run_in_threadpool
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+
+from pipeline.config import ScenesConfig
+from pipeline.errors import UserError
+from pipeline.scenes.film import write_film
+from pipeline.scenes.light import make_sensor
+from pipeline.scenes.recipe import Recipe, load_recipes
+from pipeline.scenes.render import make_scene, render
+from pipeline.tasks.opd import TEMPLATES
+from pipeline.use.results import Exchange, Pictures, Touch
+from pipeline.use.server import listen, make_server
+from pipeline.videos.catalogue import Catalogue, load_catalogue
+
+if TYPE_CHECKING:
+    from pipeline.use.model import Octopi
+
+T = TypeVar("T")
+PAGE = Path(__file__).with_name("page")
+HOSTS = ["127.0.0.1", "localhost"]
+"""Names that the page answers to, so that no other site's name can be pointed at it."""
+POLICY = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'"
+MOST_BYTES, MOST_TOUCHES = 200_000_000, 30
+"""Of one video; and touches that are remembered, the last ones."""
+SCENE, SCENE_FRAMES = ScenesConfig(), 60
+GLOW = 24.0
+"""Difference to the untouched sensor, in 8-bit steps, that is painted at full strength where it touches."""
+
+
+class Turn(BaseModel):
+    """What was asked, about which touches, and what the model said."""
+
+    question: str
+    touches: list[str] = []
+    answer: str
+
+
+class Asked(BaseModel):
+    """A question of the page; its touches are ids that the page was given."""
+
+    question: str = Field(max_length=4000)
+    touches: list[str] = Field(default=[], max_length=3)
+    history: list[Turn] = Field(default=[], max_length=50)
+
+
+class Room:
+    """The model, the touches that were shown to it, and one thread that all its work is done in."""
+
+    def __init__(
+        self, model: Octopi, catalogue: Catalogue | None = None, recipes: dict[str, Recipe] | None = None
+    ) -> None:
+        self.model = model
+        self.scenes = recipes or {}
+        self.names = {o: catalogue.objects[o].name for o in self.scenes} if catalogue else {}
+        self.folder = Path(tempfile.mkdtemp(prefix="octopi-demo-"))
+        self.videos: dict[str, Path] = {}
+        self._worker = ThreadPoolExecutor(1, "model")
+
+    def close(self) -> None:
+        """Forget everything that was shown."""
+        self._worker.shutdown(cancel_futures=True)
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def work(self, task: Callable[[], T]) -> T:
+        """Wait for the model's thread to do something."""
+        return self._worker.submit(task).result()
+
+    def scene(self, object_id: str) -> Path:
+        """A synthetic press of an object, rendered once."""
+        file = self.folder / f"{object_id}_0.mp4"
+        if not file.exists():
+            scene = make_scene(self.scenes[object_id], SCENE, SCENE_FRAMES, SCENE.seed)
+            sensor = make_sensor(SCENE.width, SCENE.height, SCENE.seed)
+            write_film(file, render(scene, SCENE, sensor, SCENE.seed), SCENE.fps)
+        return file
+
+    def show(self, name: str, video: Path) -> dict[str, Any]:
+        """Let the model feel a video; everything about it that the page draws.
+
+        Raises:
+            UserError: if it is no video that the model can take.
+        """
+        touch, said = self.model.look(video), self.model.describe(video)
+        key = uuid4().hex
+        self.videos[key] = video
+        while len(self.videos) > MOST_TOUCHES:
+            del self.videos[next(iter(self.videos))]
+        return {
+            "id": key,
+            "name": name,
+            "numbers": touch.numbers,
+            "frames": [uri(frame) for frame in touch.frames],
+            "difference": [uri(picture) for picture in touch.difference],
+            "touched": [uri(picture) for picture in where(touch)],
+            "reference": uri(touch.reference),
+            "contact": touch.contact,
+            "notes": list(dict.fromkeys([*touch.notes, *said.notes])),
+            "levels": said.levels,
+            "probabilities": said.probabilities,
+        }
+
+    def stream(self, asked: Asked) -> Iterator[str]:
+        """The answer in pieces. The model's thread makes them; it stops where nobody listens any more.
+
+        Raises:
+            UserError: if the question does not fit, before the first piece.
+        """
+        turns = [Exchange(t.question, self._find(t.touches), t.answer) for t in asked.history]
+        videos, pieces, gone = self._find(asked.touches), queue.Queue[str](), threading.Event()
+
+        def generate() -> None:
+            for piece in self.model.stream(asked.question, videos, history=turns):
+                if gone.is_set():
+                    return
+                pieces.put(piece)
+
+        done = self._worker.submit(generate)
+        done.add_done_callback(lambda _: pieces.put(""))
+        first = pieces.get()
+        if not first:
+            done.result()
+        return self._rest(first, pieces, gone, done)
+
+    def _rest(self, piece: str, pieces: queue.Queue[str], gone: threading.Event, done: Future[None]) -> Iterator[str]:
+        try:
+            while piece or not done.done():
+                yield piece
+                piece = pieces.get()
+            if (error := done.exception()) is not None:
+                yield f"\n[{error}]" if isinstance(error, UserError) else "\n[the answer broke off; see the terminal]"
+        finally:
+            gone.set()
+
+    def _find(self, keys: Sequence[str]) -> tuple[Path, ...]:
+        if unknown := [key for key in keys if key not in self.videos]:
+            raise UserError(f"{len(unknown)} touches are forgotten; drop them on the page again")
+        return tuple(self.videos[key] for key in keys)
+
+
+def where(touch: Touch) -> Pictures:
+    """The frames with a red glow where they differ from the untouched sensor; as `touch.frames`."""
+    found = []
+    for frame, difference in zip(touch.frames, touch.difference, strict=True):
+        change = 2 * np.abs(difference.astype(np.float32) - 128).max(axis=2)
+        share = np.clip(cv2.GaussianBlur(change, (0, 0), frame.shape[0] / 60) / GLOW, 0, 1)[:, :, None]
+        found.append(frame * (1 - share) + np.array([230, 30, 60]) * share)
+    painted: Pictures = np.rint(found).astype(np.uint8)
+    return painted
+
+
+def uri(picture: Pictures) -> str:
+    """A picture (height x width x RGB) as a PNG in a data URI."""
+    _, png = cv2.imencode(".png", picture[:, :, ::-1])
+    return f"data:image/png;base64,{base64.b64encode(png.tobytes()).decode()}"
+
+
+def make_app(room: Room) -> FastAPI:
+    """The page and what it asks for. Errors of the user come back as one line, with status 422."""
+
+    @asynccontextmanager
+    async def life(_: FastAPI) -> AsyncIterator[None]:
+        yield
+        room.close()
+
+    app = FastAPI(lifespan=life, openapi_url=None)  # Its documentation page would load scripts from elsewhere.
+    app.add_middleware(TrustedHostMiddleware, allowed_hosts=HOSTS)
+
+    @app.middleware("http")
+    async def guard(request: Request, answer: Callable[[Request], Any]) -> Response:
+        response: Response = await answer(request)
+        response.headers["Content-Security-Policy"] = POLICY
+        return response
+
+    @app.exception_handler(UserError)
+    async def refuse(_: Request, error: UserError) -> Response:
+        # A file is known to the user by its name, not by where it was put.
+        line = re.sub(rf"{re.escape(str(room.folder))}/([0-9a-f]{{32}}/)?", "", str(error))
+        return JSONResponse({"error": " ".join(line.split())}, 422)
+
+    @app.get("/api/about")
+    def about() -> dict[str, Any]:
+        named = sorted(room.names.items(), key=lambda item: item[1])
+        return {"variant": room.model.card.get("variant", ""), "example": TEMPLATES[0], "scenes": named}
+
+    @app.put("/api/touches/{name}")
+    async def drop(name: str, request: Request) -> dict[str, Any]:
+        """The body is the file itself."""
+        file = room.folder / uuid4().hex / (Path(name).name or "video")
+        file.parent.mkdir()
+        try:
+            with file.open("wb") as stream:
+                async for chunk in request.stream():
+                    if stream.tell() + len(chunk) > MOST_BYTES:
+                        raise UserError(f"{name}: more than {MOST_BYTES // 1_000_000} MB; drop a shorter video")
+                    stream.write(chunk)
+            return await run_in_threadpool(room.work, lambda: room.show(file.name, file))
+        except BaseException:
+            shutil.rmtree(file.parent)
+            raise
+
+    @app.put("/api/scenes/{object_id}")
+    def scene(object_id: str) -> dict[str, Any]:
+        if object_id not in room.scenes:
+            raise UserError(f"{object_id}: no such scene")
+        return room.work(lambda: room.show(f"{room.names[object_id]} (synthetic)", room.scene(object_id)))
+
+    @app.post("/api/ask")
+    def ask(asked: Asked) -> StreamingResponse:
+        return StreamingResponse(room.stream(asked), media_type="text/plain; charset=utf-8")
+
+    app.mount("/", StaticFiles(directory=PAGE, html=True))
+    return app
+
+
+def serve_demo(load: Callable[[], Octopi], catalogue: Path, port: int) -> None:
+    """Show the demo at http://127.0.0.1:`port` until it is interrupted; `catalogue` names the scenes.
+
+    Raises:
+        UserError: where the port, the catalogue or the model cannot be used.
+    """
+    with listen("127.0.0.1", port, "") as listening:
+        known = load_catalogue(catalogue)
+        app = make_app(Room(load(), known, load_recipes(catalogue, known, seed=0)))
+        print(f"http://127.0.0.1:{listening.getsockname()[1]} shows the demo; Ctrl-C ends it", flush=True)
+        with suppress(KeyboardInterrupt):
+            make_server(app).run(sockets=[listening])

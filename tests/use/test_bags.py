@@ -1,0 +1,246 @@
+"""A robot's recording: bags of both ROS versions become the videos that the chain takes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from pipeline.cli import app
+from pipeline.config import FramesConfig
+from pipeline.errors import UserError
+from pipeline.io import read_csv
+from pipeline.use.bags import QUIET, RELEASED, ROUNDING, SHORTEST, FrameTime, import_bag, presses, shots
+from pipeline.videos.audit.files import FOUND
+from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.decoding import decode
+from pipeline.videos.files import list_videos
+from pipeline.videos.frames.reference import LONGEST
+from pipeline.videos.frames.scan import Scan, scan
+
+pytest.importorskip("rosbags", reason="needs rosbags: pip install 'octopi-pipeline[robot]'")
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_typestore
+
+TOPIC, STEP_NS, START_NS = "/gelsight/image", 40_000_000, 1_700_000_000_000_000_000
+TOUCHED = (range(20, 40), range(70, 82))
+LENGTH = 110
+
+
+def recording(height: int = 48, width: int = 64) -> list[np.ndarray]:
+    """Pictures (BGR) of an uneven grey with noise; a bump brightens one side and darkens the other while touched."""
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[:height, :width]
+    ground = np.stack([90 + x / 3, 110 + y / 3, 100 + (x + y) / 5], axis=2)
+    bump = 40 * np.sign(x - width / 2) * (np.hypot(x - width / 2, y - height / 2) < height / 4)
+    return [
+        np.clip(
+            ground + bump[:, :, None] * any(i in touched for touched in TOUCHED) + rng.normal(0, 1, (height, width, 3)),
+            0,
+            255,
+        ).astype(np.uint8)
+        for i in range(LENGTH)
+    ]
+
+
+def message(store: Any, picture: np.ndarray, encoding: str, index: int) -> tuple[Any, str]:
+    """A ROS message of a picture (BGR) and its type; rows are padded by five bytes."""
+    types = store.types
+    at = START_NS + index * STEP_NS - 3_000_000
+    stamp = types["builtin_interfaces/msg/Time"](sec=at // 10**9, nanosec=at % 10**9)
+    extra = {"seq": index} if "seq" in types["std_msgs/msg/Header"].__dataclass_fields__ else {}
+    header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="gel", **extra)
+    if encoding in ("png", "broken"):
+        data = cv2.imencode(".png", picture)[1].ravel() if encoding == "png" else np.arange(40, dtype=np.uint8)
+        kind = "sensor_msgs/msg/CompressedImage"
+        return types[kind](header=header, format="bgr8; png compressed bgr8", data=data), kind
+    height, width = picture.shape[:2]
+    pixels = {"rgb8": picture[:, :, ::-1], "mono8": picture[:, :, :1]}.get(encoding, picture).reshape(height, -1)
+    padded = np.pad(pixels, ((0, 0), (0, 5)), constant_values=255)
+    kind = "sensor_msgs/msg/Image"
+    return types[kind](
+        header=header,
+        height=height,
+        width=width,
+        encoding=encoding,
+        is_bigendian=0,
+        step=padded.shape[1],
+        data=padded.ravel(),
+    ), kind
+
+
+def write_bag(folder: Path, kind: str, pictures: Sequence[np.ndarray], encoding: str = "bgr8") -> Path:
+    """A bag with a topic of images and one of text."""
+    store = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
+    bag = folder / ("touch.bag" if kind == "ros1" else f"touch_{kind}")
+    plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
+    writer: Any = Writer1(bag) if kind == "ros1" else Writer2(bag, version=8, storage_plugin=plugin)
+    serialize = store.serialize_ros1 if kind == "ros1" else store.serialize_cdr
+    with writer:
+        text = writer.add_connection("/chatter", "std_msgs/msg/String", typestore=store)
+        said = store.types["std_msgs/msg/String"](data="hello")
+        writer.write(text, START_NS, serialize(said, "std_msgs/msg/String"))
+        images = None
+        for index, picture in enumerate(pictures):
+            sent, of = message(store, picture, encoding, index)
+            images = images or writer.add_connection(TOPIC, of, typestore=store)
+            writer.write(images, START_NS + index * STEP_NS, serialize(sent, of))
+    return bag
+
+
+@pytest.fixture(scope="module")
+def pictures() -> list[np.ndarray]:
+    return recording()
+
+
+@pytest.mark.parametrize("kind", ["ros1", "sqlite3", "mcap"])
+@pytest.mark.parametrize("encoding", ["bgr8", "8UC3", "rgb8", "mono8", "png"])
+def test_pictures_come_back_as_they_were_sent(
+    tmp_path: Path, pictures: list[np.ndarray], kind: str, encoding: str
+) -> None:
+    bag = write_bag(tmp_path, kind, pictures[18:22], encoding)
+    found = list(shots(bag, TOPIC))
+    for index, (shot, sent) in enumerate(zip(found, pictures[18:22], strict=True)):
+        np.testing.assert_array_equal(shot.picture, sent[:, :, :1].repeat(3, 2) if encoding == "mono8" else sent)
+        assert shot.recorded == START_NS + index * STEP_NS
+        assert shot.stamped == shot.recorded - 3_000_000
+
+
+@pytest.mark.parametrize("kind", ["ros1", "sqlite3", "mcap"])
+def test_each_press_becomes_a_video_that_the_chain_takes(
+    tmp_path: Path, pictures: list[np.ndarray], kind: str, catalogue: Catalogue
+) -> None:
+    bag, out = write_bag(tmp_path, kind, pictures), tmp_path / "videos"
+    written = import_bag(bag, TOPIC, out, "baseball")
+    assert [p.name for p in written] == ["baseball_0.mp4", "baseball_1.mp4"]
+    assert sorted(p.suffix for p in out.iterdir()) == [".csv", ".csv", ".mp4", ".mp4"], "and nothing unfinished"
+    listing = list_videos(out, catalogue)
+    assert listing.findings == ()
+    for file, touched in zip(listing.files, TOUCHED, strict=True):
+        rows = read_csv(file.path.with_suffix(".csv"), FrameTime)
+        begin, end = touched.start - LONGEST, touched.stop + LONGEST
+        assert [r.recorded_ns for r in rows] == [START_NS + i * STEP_NS for i in range(begin, end)]
+        assert [r.frame for r in rows] == list(range(end - begin))
+        inside = [r.contact for r in rows if begin + r.frame in touched]
+        assert min(inside) > 3 * max(r.contact for r in rows if begin + r.frame not in touched)
+        seen = scan(file, FramesConfig(size=32, per_video=3, selection="contact"))
+        assert isinstance(seen, Scan)
+        assert (seen.video.frames, seen.video.fps, seen.probe.starts_touching) == (len(rows), 25.0, False)
+        assert all(begin + kept.index in touched for kept in seen.kept), "what is kept shows contact"
+        # The film is lossy; a frame's neighbours in it must not be what it shows.
+        shown = list(decode(file.path))
+        for place in (0, LONGEST + 3):
+            assert np.abs(shown[place].astype(int) - pictures[begin + place]).mean() < 4
+    assert [p.name for p in import_bag(bag, TOPIC, out, "baseball")] == ["baseball_2.mp4", "baseball_3.mp4"]
+
+
+def test_a_single_file_of_a_ros_2_bag_is_enough(tmp_path: Path, pictures: list[np.ndarray]) -> None:
+    for kind, pattern in (("mcap", "*.mcap"), ("sqlite3", "*.db3")):
+        (file,) = write_bag(tmp_path, kind, pictures[:3]).glob(pattern)
+        assert len(list(shots(file, TOPIC))) == 3
+
+
+def test_a_recording_that_begins_in_contact_is_measured_from_its_end(
+    tmp_path: Path, pictures: list[np.ndarray]
+) -> None:
+    from_contact = pictures[TOUCHED[0].start + 4 : TOUCHED[0].stop + 30]
+    (video,) = import_bag(write_bag(tmp_path, "ros1", from_contact), TOPIC, tmp_path / "out", "rug")
+    rows = read_csv(video.with_suffix(".csv"), FrameTime)
+    assert len(rows) == 16 + LONGEST
+    assert rows[0].contact > 3 * rows[-1].contact
+
+
+def test_odd_sizes_are_written(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path, "ros1", recording(47, 65))
+    assert {frame.shape for frame in decode(import_bag(bag, TOPIC, tmp_path / "out", "rug")[0])} == {(47, 65, 3)}
+
+
+@given(st.lists(st.sampled_from([0.1, 0.2, 0.32, 0.5, 3.0]), min_size=1, max_size=60), st.integers(12, 80))
+def test_presses_are_a_state_machine_with_two_thresholds(drawn: list[float], quiet: int) -> None:
+    """Against a plain loop; `quiet` frames in front set the level."""
+    strengths = np.array([0.2] * quiet + drawn)
+    start = FOUND * max(ROUNDING, float(np.quantile(strengths, QUIET)))
+    expected, begin = [], None
+    for index, value in enumerate([*strengths, 0.0]):
+        if value > RELEASED * start:
+            begin = index if begin is None else begin
+        elif begin is not None:
+            if index - begin >= SHORTEST and max(strengths[begin:index]) > start:
+                expected.append((begin, index))
+            begin = None
+    found = presses(strengths)
+    assert len(found) == len(expected)
+    before = 0
+    for (low, high), (begin, end) in zip(found, expected, strict=True):
+        assert before <= low <= begin < end <= high <= len(strengths), "they hold the contact and do not overlap"
+        assert begin - low <= LONGEST
+        assert high - end <= LONGEST
+        before = high
+    if expected:
+        assert found[0][0] == max(0, expected[0][0] - LONGEST)
+        assert found[-1][1] == min(len(strengths), expected[-1][1] + LONGEST)
+
+
+def refused(bag: Path, out: Path, topic: str = TOPIC, *options: str) -> str:
+    """The one line of `octopi import bag`."""
+    result = CliRunner().invoke(app, ["import", "bag", str(bag), "--topic", topic, "--out", str(out), *options])
+    assert isinstance(result.exception, UserError), result.output
+    assert "\n" not in str(result.exception)
+    assert not out.exists() or not list(out.iterdir()), "nothing half-written is left"
+    return str(result.exception)
+
+
+@pytest.mark.parametrize("kind", ["ros1", "sqlite3", "mcap"])
+def test_a_wrong_topic_is_told_the_right_ones(tmp_path: Path, pictures: list[np.ndarray], kind: str) -> None:
+    bag = write_bag(tmp_path, kind, pictures[:2])
+    assert refused(bag, tmp_path / "o", "/none").endswith(f"/none is not in it; its image topics: {TOPIC}")
+    assert "/chatter holds std_msgs/msg/String and no images" in refused(bag, tmp_path / "o", "/chatter")
+
+
+@pytest.mark.parametrize("kind", ["ros1", "sqlite3", "mcap"])
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
+def test_a_truncated_bag_is_no_recording(tmp_path: Path, pictures: list[np.ndarray], kind: str, share: float) -> None:
+    bag = write_bag(tmp_path, kind, pictures)
+    file = bag if bag.is_file() else next(p for p in bag.iterdir() if p.suffix in (".mcap", ".db3"))
+    file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
+    assert "copy it again" in refused(bag, tmp_path / "o")
+
+
+def test_what_is_no_recording_of_touch_is_refused_in_one_line(tmp_path: Path, pictures: list[np.ndarray]) -> None:
+    out = tmp_path / "o"
+    assert "no such recording" in refused(tmp_path / "none.bag", out)
+    quiet = [pictures[i] for i in range(LENGTH) if not any(i in touched for touched in TOUCHED)]
+    for number, (sent, encoding, told) in enumerate(
+        [
+            (quiet, "bgr8", "nothing touches the sensor in 78 pictures"),
+            (pictures[:1], "bgr8", "nothing touches the sensor in 1 pictures"),
+            (pictures[:2], "16UC1", "has encoding '16UC1'; send one of bgr8, 8UC3, rgb8, mono8"),
+            (pictures[:2], "broken", "is no picture that OpenCV reads"),
+            ([pictures[0], pictures[1][:-2]], "bgr8", "change their size"),
+        ]
+    ):
+        (folder := tmp_path / str(number)).mkdir()
+        assert told in refused(write_bag(folder, "ros1", sent, encoding), out)
+    text = tmp_path / "text.mcap"
+    text.write_text("no bag")
+    assert "not a whole recording" in refused(text, out)
+    (tmp_path / "empty").mkdir()
+    assert "not a whole recording" in refused(tmp_path / "empty", out)
+    bag = write_bag(tmp_path, "ros1", pictures)
+    assert "--object" in refused(bag, out, TOPIC, "--object", "../rug")
+
+
+def test_the_command_says_what_it_wrote(tmp_path: Path, pictures: list[np.ndarray]) -> None:
+    bag = write_bag(tmp_path, "mcap", pictures)
+    result = CliRunner().invoke(app, ["import", "bag", str(bag), "--topic", TOPIC, "--out", str(tmp_path / "videos")])
+    assert result.exit_code == 0, result.output
+    assert "touch_mcap_0.mp4, touch_mcap_1.mp4" in result.output

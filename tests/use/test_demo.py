@@ -1,0 +1,280 @@
+"""The demo: what the page is given, what it refuses, and all of it in a real browser."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+import uvicorn
+
+from pipeline.errors import UserError
+from pipeline.scenes.recipe import load_recipes
+from pipeline.use.demo import MOST_TOUCHES, Asked, Room, Turn, make_app, where
+from pipeline.use.model import Octopi
+from pipeline.use.results import Exchange
+from pipeline.videos.catalogue import Catalogue
+from tests.conftest import ROOT, encode
+from tests.use.browser import tab
+from tests.use.shared import Made
+from tests.use.stand_in import KEPT, FakeOctopi
+
+OBJECTS = ROOT / "pipeline" / "physiclear" / "objects.csv"
+
+
+def press(file: Path, turned: bool = False) -> Path:
+    """A video of a disc that presses into a sensor's uneven light."""
+    y, x = np.mgrid[:96, :128]
+    ground = np.stack([90 + x / 3, 110 + y / 3, 100 + (x + y) / 5], axis=2)
+    frames = []
+    for index in range(30):
+        depth = max(0.0, min(index - 8, 28 - index, 6)) * 8
+        side = np.sign((y - 48) if turned else (x - 64)) * (np.hypot(x - 64, y - 48) < 22)
+        frames.append(np.clip(ground + depth * side[:, :, None], 0, 255).astype(np.uint8))
+    return encode(file, frames, codec="mpeg4", pixels="yuv420p", bits=2_000_000)
+
+
+@pytest.fixture(scope="module")
+def room(catalogue: Catalogue) -> Room:
+    recipes = load_recipes(ROOT / "pipeline" / "physiclear", catalogue, 0)
+    model: Any = FakeOctopi()
+    return Room(model, catalogue, {o: recipes[o] for o in ("baseball", "pillow")})
+
+
+@pytest.fixture(scope="module")
+def site(room: Room) -> Iterator[str]:
+    with socket.socket() as listening:
+        listening.bind(("127.0.0.1", 0))
+        server = uvicorn.Server(uvicorn.Config(make_app(room), log_level="warning"))
+        thread = threading.Thread(target=server.run, args=([listening],))
+        thread.start()
+        while not server.started:
+            time.sleep(0.02)
+        yield f"http://127.0.0.1:{listening.getsockname()[1]}"
+        server.should_exit = True
+        thread.join(30)
+    assert not room.folder.exists(), "what was shown is forgotten"
+
+
+def call(address: str, method: str, body: bytes | dict[str, Any] | None = None, **headers: str) -> tuple[int, bytes]:
+    if isinstance(body, dict):
+        body, headers = json.dumps(body).encode(), {"Content-Type": "application/json", **headers}
+    request = urllib.request.Request(address, body, headers, method=method)
+    try:
+        with urllib.request.urlopen(request, timeout=60) as response:
+            return response.status, response.read()
+    except urllib.error.HTTPError as error:
+        return error.code, error.read()
+
+
+def picture(uri: str) -> np.ndarray:
+    kind, data = uri.split(",")
+    assert kind == "data:image/png;base64"
+    return cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1]
+
+
+def test_a_video_is_shown_as_the_model_sees_it(site: str, room: Room, tmp_path: Path) -> None:
+    video = press(tmp_path / "rug 1.mp4")
+    status, body = call(f"{site}/api/touches/rug%201.mp4", "PUT", video.read_bytes())
+    assert status == 200, body
+    shown, touch = json.loads(body), room.model.look(video)
+    assert (shown["name"], tuple(shown["numbers"]), shown["contact"]) == ("rug 1.mp4", touch.numbers, touch.contact)
+    np.testing.assert_array_equal([picture(f) for f in shown["frames"]], touch.frames)
+    np.testing.assert_array_equal([picture(f) for f in shown["difference"]], touch.difference)
+    np.testing.assert_array_equal([picture(f) for f in shown["touched"]], where(touch))
+    np.testing.assert_array_equal(picture(shown["reference"]), touch.reference)
+    assert shown["probabilities"]["roughness"] == {"smooth": 0.5, "slightly rough": 0.25, "rough": 0.125}
+
+
+def test_it_glows_where_it_touches_and_nowhere_else(room: Room, tmp_path: Path) -> None:
+    touch = room.model.look(press(tmp_path / "rug.mp4"))
+    change = np.abs(where(touch).astype(int) - touch.frames).max(axis=3)
+    y, x = np.mgrid[:96, :96]  # The sides of 128 pixels are cropped away.
+    distance = np.hypot(x - 48, y - 48)
+    assert change[:, (distance < 18) & (np.abs(x - 48) > 4)].min() > 25
+    assert np.median(change[:, distance > 30]) <= 6
+    still = touch.model_copy(update={"difference": np.full_like(touch.difference, 128)})
+    np.testing.assert_array_equal(where(still), still.frames)
+
+
+def test_an_answer_streams_with_its_history(site: str, room: Room, tmp_path: Path) -> None:
+    video = press(tmp_path / "rug.mp4").read_bytes()
+    ids = [json.loads(call(f"{site}/api/touches/{n}.mp4", "PUT", video)[1])["id"] for n in "ab"]
+    turn = {"question": "{tactile}?", "touches": ids[:1], "answer": "Soft."}
+    asked = {"question": "And {tactile} wait", "touches": ids[1:], "history": [turn]}
+    model: Any = room.model
+    model.paused.clear()
+    request = urllib.request.Request(
+        f"{site}/api/ask", json.dumps(asked).encode(), {"Content-Type": "application/json"}, method="POST"
+    )
+    with urllib.request.urlopen(request, timeout=30) as response:
+        assert response.read(4) == b"And ", "the first piece comes while the model goes on"
+        model.paused.set()
+        assert response.read() == b"it wait <b>1</b> "
+    question, videos, history = model.heard[-1]
+    assert (question, videos) == ("And {tactile} wait", ["b.mp4"])
+    assert [(h.question, [v.name for v in h.videos], h.answer) for h in history] == [("{tactile}?", ["a.mp4"], "Soft.")]
+    assert len(model.threads - {threading.get_ident()}) == 1, "one thread does all that the model does"
+
+
+def test_an_answer_that_nobody_hears_ends(room: Room) -> None:
+    model: Any = room.model
+    model.paused.clear()
+    pieces = room.stream(Asked(question="wait " + "on " * 50))
+    next(pieces)
+    pieces.close()  # type: ignore[attr-defined]
+    before = model.made
+    model.paused.set()
+    assert room.work(lambda: model.made) <= before + 1
+
+
+def test_an_answer_that_breaks_off_says_so(room: Room) -> None:
+    assert "".join(room.stream(Asked(question="break"))) == "break <b>0</b> \n[the answer broke off; see the terminal]"
+
+
+def test_what_is_wrong_comes_back_as_one_line(site: str, tmp_path: Path) -> None:
+    empty, text = ("PUT", b""), ("PUT", b"no video at all")
+    ask = ("POST", {"question": "{tactile}?", "touches": []})
+    lost = ("POST", {"question": "{tactile}?", "touches": ["0"]})
+    for (method, body), place, told in (
+        (empty, "touches/a.mp4", "a.mp4: empty (0 bytes); copy it again, or remove it"),
+        (text, "touches/notes.txt", "notes.txt: no frame decodes; copy it again, convert it, or remove it"),
+        (text, "touches/..%5C..%5Ca.mp4", "no frame decodes"),
+        (ask, "ask", "the question has 1 {tactile} for 0 videos"),
+        (lost, "ask", "1 touches are forgotten; drop them on the page again"),
+        (("PUT", None), "scenes/nothing", "nothing: no such scene"),
+    ):
+        status, answer = call(f"{site}/api/{place}", method, body)
+        assert status == 422
+        line = json.loads(answer)["error"]
+        assert told in line
+        assert "\n" not in line
+        assert str(tmp_path.parent.parent) not in line
+        assert "octopi-demo" not in line
+    assert call(f"{site}/api/about", "GET")[0] == 200, "the server goes on"
+
+
+def test_a_video_beyond_the_limit_is_refused(site: str, room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.use.demo.MOST_BYTES", 2_000_000)
+    before = set(room.folder.iterdir())
+    status, answer = call(f"{site}/api/touches/a.mp4", "PUT", bytes(2_000_001))
+    assert (status, json.loads(answer)) == (422, {"error": "a.mp4: more than 2 MB; drop a shorter video"})
+    assert set(room.folder.iterdir()) == before, "nothing of it is kept"
+
+
+def test_other_sites_are_not_let_in(site: str) -> None:
+    assert call(f"{site}/api/about", "GET", Host="evil.example")[0] == 400
+    plain = {"Content-Type": "text/plain"}  # What a page of another site may send without asking first.
+    request = urllib.request.Request(f"{site}/api/ask", b'{"question": "hi"}', plain, method="POST")
+    with pytest.raises(urllib.error.HTTPError, match="422"):
+        urllib.request.urlopen(request, timeout=30)
+
+
+def test_old_touches_are_forgotten(tmp_path: Path) -> None:
+    model: Any = FakeOctopi()
+    room, video = Room(model), press(tmp_path / "rug.mp4")
+    ids = [room.show("rug", video)["id"] for _ in range(MOST_TOUCHES + 1)]
+    with pytest.raises(UserError, match="forgotten"):
+        room.stream(Asked(question="{tactile}", touches=ids[:1]))
+    assert "".join(room.stream(Asked(question="{tactile}", touches=ids[1:2])))
+    room.close()
+
+
+def test_a_trained_model_is_shown_and_asked(octopi: Octopi, files: list[Path]) -> None:
+    """The class itself, of random weights: what the page is given is what it says by itself."""
+    room = Room(octopi)
+    shown = room.work(lambda: room.show("ice block", files[0]))
+    said = octopi.describe(files[0])
+    assert (shown["levels"], shown["probabilities"]) == (said.levels, said.probabilities)
+    assert len(shown["frames"]) == len(shown["touched"]) == len(said.frames)
+    first = "".join(room.stream(Asked(question="Soft? {tactile}", touches=[shown["id"]])))
+    assert first == octopi.ask("Soft? {tactile}", files[:1])
+    turn = Turn(question="Soft? {tactile}", touches=[shown["id"]], answer=first)
+    again = "".join(room.stream(Asked(question="Why?", history=[turn])))
+    assert again == octopi.ask("Why?", history=[Exchange("Soft? {tactile}", tuple(files[:1]), first)])
+    room.close()
+
+
+def test_the_command_shows_it_until_it_is_interrupted(made: Made) -> None:
+    catalogue = ROOT / "pipeline" / "physiclear"
+    command = [Path(sys.executable).parent / "octopi", "demo", str(made.folder), "--device", "cpu", "--port"]
+    running = subprocess.Popen(
+        [*command, "0", "--catalogue", str(catalogue)],
+        cwd=made.folder.parents[1],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert running.stdout is not None
+        address, _, rest = running.stdout.readline().partition(" ")
+        assert rest == "shows the demo; Ctrl-C ends it\n"
+        about = json.loads(call(f"{address}/api/about", "GET")[1])
+        assert (about["variant"], len(about["scenes"])) == ("finetuned-with-all-0", len(pd.read_csv(OBJECTS)))
+        taken = subprocess.run([*command, address.rpartition(":")[2]], capture_output=True, text=True, check=False)
+        assert taken.returncode == 1
+        assert taken.stderr.count("\n") == 1
+        assert "choose another" in taken.stderr
+    finally:
+        running.send_signal(signal.SIGINT)
+    assert running.wait(60) == 0
+
+
+def test_in_a_browser(site: str, tmp_path: Path) -> None:
+    files = [press(tmp_path / "soft <i>thing.mp4"), press(tmp_path / "other.mp4", turned=True)]
+    (notes := tmp_path / "notes.txt").write_text("no video")
+    with tab(tmp_path) as page:
+        page.call("Page.navigate", url=site)
+        page.until("document.querySelectorAll('#scene option').length === 3")
+        page.choose("#file", notes)
+        page.until("document.querySelector('#message').textContent.startsWith('notes.txt: no frame decodes')")
+        page.choose("#file", *files)
+        page.until("document.querySelectorAll('.touch').length === 2")
+        assert page.run("document.querySelector('#message').textContent") == "", "the message goes when all is well"
+        heads = page.run("[...document.querySelectorAll('.touch h2')].map(e => e.textContent)")
+        assert heads == ["1. soft <i>thing.mp4", "2. other.mp4"], "a name is text, never markup"
+        page.until("[...document.querySelectorAll('.strip img')].every(i => i.complete && i.naturalWidth === 96)")
+        assert page.run("document.querySelectorAll('.strip img').length") == 2 * (1 + 3 * KEPT)
+        widths = page.run(
+            "[...document.querySelectorAll('.touch')[0].querySelectorAll('.bar')]"
+            ".map(b => b.firstChild.offsetWidth / b.offsetWidth)"
+        )
+        np.testing.assert_allclose(widths, [0.5, 0.25, 0.5, 0.25, 0.125], atol=0.02)
+        page.type("#question", "Which is softer?")
+        page.until("!document.querySelector('#send').disabled && document.querySelector('.model')")
+        said = page.run("[...document.querySelectorAll('.said')].map(e => e.textContent)")
+        assert said == ["{tactile} {tactile} Which is softer?", "it it Which is softer? <b>0</b> "]
+        page.type("#question", "Why?")
+        page.until("document.querySelectorAll('.model').length === 2 && !document.querySelector('#send').disabled")
+        assert page.run("[...document.querySelectorAll('.model')].at(-1).textContent") == "Why? <b>1</b> "
+        page.type("#question", "{tactile} {tactile} {tactile}?")
+        page.until("document.querySelector('#message').textContent.includes('3 {tactile} for 2 videos')")
+        assert page.run("document.querySelectorAll('.said').length") == 4, "what was refused is no part of the talk"
+        page.run(
+            "document.querySelector('#scene').value = 'baseball',"
+            "document.querySelector('#scene').dispatchEvent(new Event('change'))"
+        )
+        page.until("document.querySelectorAll('.touch').length === 3")
+        assert page.run("document.querySelector('#file').disabled"), "three are enough"
+        assert page.run("document.documentElement.scrollWidth <= innerWidth")
+        page.screenshot(tmp_path / "demo.png")
+        assert {url.partition(":")[0] for url in page.requests() if not url.startswith(site)} <= {"data"}
+        assert page.complaints() == []
+        page.run("fetch('http://127.0.0.1:9/').catch(() => 0)")
+        page.until("true")
+        assert any("Content Security Policy" in line for line in page.complaints()), "the policy forbids other hosts"

@@ -1,0 +1,77 @@
+"""What stands in examples/ does what it says."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from pipeline.io import read_jsonl, read_table
+from pipeline.records import Assignment, Part, Question
+from pipeline.videos.catalogue import load_catalogue
+from tests.closure import ROOT
+from tests.project import copy_project
+from tests.use.shared import Made
+
+EXAMPLES = ROOT / "examples"
+
+
+def commands(readme: Path) -> list[list[str]]:
+    """The commands of all shell blocks."""
+    blocks = re.findall(r"```sh\n(.*?)```", readme.read_text(encoding="utf-8"), re.DOTALL)
+    return [shlex.split(line) for block in blocks for line in block.splitlines()]
+
+
+def test_the_walk_of_a_new_sensor(tmp_path: Path) -> None:
+    """As typed from its README, to the questions; from there on tests/chain walks."""
+    project = copy_project(tmp_path / "project")
+    (project.folder / "examples").mkdir()
+    (project.folder / "examples" / "new_sensor").symlink_to(EXAMPLES / "new_sensor")
+    typed = commands(EXAMPLES / "new_sensor" / "README.md")
+    last = typed.index(["octopi", "repro"])
+    assert [words[:2] for words in typed[last + 1 :]] == [["octopi", "describe"], ["octopi", "demo"]]
+    for command in typed[:last]:
+        output = project.run(*command)
+        if command[1] == "data":
+            assert "error" not in output, "its videos can be trusted"
+    project.run("dvc", "repro", "questions")
+    catalogue = load_catalogue(EXAMPLES / "new_sensor")
+    data = project.folder / "data"
+    parts = {a.object_id: a.part for a in read_table(data / "splits" / "0.parquet", Assignment)}
+    listed = pd.read_csv(EXAMPLES / "new_sensor" / "objects.csv").set_index("object_id")["split_lab"]
+    assert parts == {name: Part(part) for name, part in listed.items()}, "each object has videos, and its part"
+    asked = read_jsonl(data / "questions" / "0" / "evaluation.jsonl", Question)
+    assert {q.task for q in asked} == {"OPD", "PC", "PSS", "POM", "PSR"}
+    words = " ".join(turn.assistant for q in asked for d in q.dialogues for turn in d.turns)
+    for prop in catalogue.properties:
+        assert any(level in words for level in prop.levels), "answers speak the lab's words"
+    assert "moderately hard" not in words
+
+
+def test_the_notebook_runs(made: Made) -> None:
+    """With the paths of a tiny model in place of its own."""
+    nbformat = pytest.importorskip("nbformat", reason="needs nbclient: pip install 'octopi-pipeline[dev]'")
+    nbclient = pytest.importorskip("nbclient", reason="needs nbclient: pip install 'octopi-pipeline[dev]'")
+    notebook = nbformat.read(EXAMPLES / "touch.ipynb", as_version=4)
+    nbformat.validate(notebook)
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert not any(cell.outputs for cell in cells), "none is committed"
+    for ours, theirs in (("models/finetuned-with-all-0", str(made.folder)), ("data/scenes/videos", str(made.videos))):
+        assert sum(ours in cell.source for cell in cells) == 1
+        for cell in cells:
+            cell.source = cell.source.replace(ours, theirs)
+    client = nbclient.NotebookClient(
+        notebook, timeout=240, resources={"metadata": {"path": str(made.folder.parents[1])}}
+    )
+    done = [cell for cell in client.execute().cells if cell.cell_type == "code"]
+    shown = [
+        "".join(o.get("text", "") or o.data["text/plain"] for o in cell.outputs if o.get("name") != "stderr")
+        for cell in done
+    ]
+    assert shown[1] == "('hardness', 'roughness', 'bumpiness')"
+    assert "'hardness'" in shown[2]
+    assert shown[3].strip(), "an answer"
+    assert len(eval(shown[4])) == 3

@@ -1,0 +1,211 @@
+"""The example node: its ROS side against a double of rclpy, its HTTP side against a served model."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import socket
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import uvicorn
+
+from pipeline.use.serve import make_app
+from pipeline.videos.decoding import decode
+from tests.closure import ROOT, imported
+from tests.use.stand_in import FakeOctopi
+from tests.use.test_demo import press
+
+FILE = ROOT / "examples" / "robot_node.py"
+
+
+class Node:
+    """What of rclpy's Node the example uses; parameters come from the launch file `given`."""
+
+    given: dict[str, Any] = {}  # noqa: RUF012
+
+    def __init__(self, name: str) -> None:
+        self.said: list[str] = []
+
+    def declare_parameter(self, name: str, default: Any) -> Any:
+        return SimpleNamespace(value=self.given.get(name, default))
+
+    def create_subscription(self, kind: type, topic: str, callback: Any, depth: int, *, callback_group: Any) -> Any:
+        return SimpleNamespace(topic=topic, callback=callback)
+
+    def get_logger(self) -> Any:
+        return SimpleNamespace(error=self.said.append)
+
+
+class Goal:
+    """A goal's handle: how it ended, and what was fed back."""
+
+    def __init__(self, question: str, *videos: Path, cancelled_after: int = 10**6) -> None:
+        self.request = SimpleNamespace(question=question, videos=[str(v) for v in videos])
+        self.ended, self.texts, self._most = "", list[str](), cancelled_after
+
+    @property
+    def is_cancel_requested(self) -> bool:
+        return len(self.texts) >= self._most
+
+    def publish_feedback(self, feedback: Any) -> None:
+        self.texts.append(feedback.text)
+
+    def _end(self, how: str) -> None:
+        assert not self.ended, "a goal ends once"
+        self.ended = how
+
+    def succeed(self) -> None:
+        self._end("succeeded")
+
+    def abort(self) -> None:
+        self._end("aborted")
+
+    def canceled(self) -> None:
+        self._end("cancelled")
+
+
+@pytest.fixture(scope="module")
+def example() -> Iterator[ModuleType]:
+    """The example, with doubles in the places of what ROS installs."""
+
+    class Ask:
+        Feedback = SimpleNamespace
+
+        class Result(SimpleNamespace):
+            answer = error = ""
+
+    def server(node: Any, kind: Any, name: str, execute: Any, **_: Any) -> Any:
+        assert (kind, name) == (Ask, "ask_touch")
+        return SimpleNamespace(execute=execute)
+
+    doubles = {
+        "rclpy": {},
+        "rclpy.action": {"ActionServer": server, "CancelResponse": SimpleNamespace(ACCEPT=2)},
+        "rclpy.callback_groups": {"ReentrantCallbackGroup": object},
+        "rclpy.executors": {"MultiThreadedExecutor": object},
+        "rclpy.node": {"Node": Node},
+        "octopi_msgs": {},
+        "octopi_msgs.action": {"Ask": Ask},
+        "sensor_msgs": {},
+        "sensor_msgs.msg": {"CompressedImage": SimpleNamespace},
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        for name, content in doubles.items():
+            patch.setitem(sys.modules, name, ModuleType(name))
+            vars(sys.modules[name]).update(content)
+        spec = importlib.util.spec_from_file_location("robot_node", FILE)
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        yield module
+
+
+@pytest.fixture(scope="module")
+def model() -> FakeOctopi:
+    return FakeOctopi()
+
+
+@pytest.fixture(scope="module")
+def served(model: FakeOctopi) -> Iterator[str]:
+    """`octopi serve`, with a token."""
+    model_: Any = model
+    with socket.socket() as listening:
+        listening.bind(("127.0.0.1", 0))
+        app = make_app(model_, "finetuned-with-all-0", token="secret of the robot")
+        server = uvicorn.Server(uvicorn.Config(app, log_level="warning"))
+        thread = threading.Thread(target=server.run, args=([listening],))
+        thread.start()
+        while not server.started:
+            time.sleep(0.02)
+        yield f"http://127.0.0.1:{listening.getsockname()[1]}"
+        server.should_exit = True
+        thread.join(30)
+
+
+@pytest.fixture
+def node(example: ModuleType, served: str, monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.setenv("OCTOPI_TOKEN", "secret of the robot")
+    monkeypatch.setattr(Node, "given", {"url": f"{served}/", "rate": 10.0, "seconds": 2.0})
+    return example.TouchNode()
+
+
+def test_it_imports_nothing_of_ours() -> None:
+    assert imported(FILE) == set()
+
+
+def test_a_question_about_files_is_answered_piece_by_piece(node: Any, model: FakeOctopi, tmp_path: Path) -> None:
+    videos = [press(tmp_path / "a.mp4"), press(tmp_path / "b.mkv", turned=True)]
+    goal = Goal("Is {tactile} softer than {tactile} ?", *videos)
+    result = node.server.execute(goal)
+    assert (goal.ended, result.error) == ("succeeded", "")
+    assert result.answer == "Is it softer than it ? <b>0</b> "
+    assert goal.texts[-1] == result.answer
+    assert len(goal.texts) >= 7
+    assert all(later.startswith(earlier) for earlier, later in zip(goal.texts, goal.texts[1:], strict=False))
+    assert model.heard[-1][0] == "Is {tactile} softer than {tactile} ?"
+    assert len(model.heard[-1][1]) == 2
+
+
+def test_without_marks_the_touches_stand_before_the_question(node: Any, model: FakeOctopi, tmp_path: Path) -> None:
+    node.server.execute(Goal("Soft?", press(tmp_path / "a.mp4")))
+    assert model.heard[-1][0] == "{tactile} Soft?"
+
+
+def test_without_files_the_last_pictures_of_the_sensor_are_asked_about(node: Any, tmp_path: Path) -> None:
+    goal = Goal("Soft?")
+    assert node.server.execute(goal).error == "no picture of the sensor has come; is the topic right?"
+    assert (goal.ended, node.said) == ("aborted", ["no picture of the sensor has come; is the topic right?"])
+    for grey in range(60, 240, 3):
+        jpeg = cv2.imencode(".jpg", np.full((64, 96, 3), grey, np.uint8))[1]
+        node.subscription.callback(SimpleNamespace(data=jpeg.tobytes()))
+    (film := tmp_path / "film.mp4").write_bytes(node.record())
+    shown = [frame.mean() for frame in decode(film)]
+    assert len(shown) == 20, "two seconds at ten frames a second"
+    np.testing.assert_allclose(shown, range(180, 240, 3), atol=6)
+    goal = Goal("Soft?")
+    assert node.server.execute(goal).answer == "it Soft? <b>0</b> "
+    assert goal.ended == "succeeded"
+
+
+def test_a_goal_can_be_cancelled(node: Any) -> None:
+    goal = Goal("one two three four five", cancelled_after=2)
+    node.record = lambda: b"unused"
+    node.stream = lambda question, touches: iter(question.split())
+    result = node.server.execute(goal)
+    assert (goal.ended, result.answer, result.error) == ("cancelled", "onetwo", "cancelled")
+
+
+def test_what_goes_wrong_is_one_line_of_the_server(node: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (notes := tmp_path / "notes.mp4").write_text("no video")
+    for goal, told in (
+        (Goal("Soft?", notes), "video"),
+        (Goal("{tactile} {tactile}?", press(tmp_path / "a.mp4")), "the question has 2 {tactile} for 1 videos"),
+        (Goal("Soft?", tmp_path / "none.mp4"), "none.mp4"),
+    ):
+        result = node.server.execute(goal)
+        assert (goal.ended, result.answer) == ("aborted", "")
+        assert told in result.error
+        assert "\n" not in result.error
+        assert "Traceback" not in result.error
+    monkeypatch.setenv("OCTOPI_TOKEN", "another")
+    assert "token" in node.server.execute(Goal("Soft?", notes)).error
+    node.url = "http://127.0.0.1:9"
+    assert "is `octopi serve` running?" in node.server.execute(Goal("Soft?", notes)).error
+
+
+def test_an_answer_that_breaks_off_is_no_answer(node: Any, tmp_path: Path) -> None:
+    goal = Goal("break", press(tmp_path / "a.mp4"))
+    result = node.server.execute(goal)
+    assert goal.ended == "aborted"
+    assert result.error
+    assert json.dumps(result.answer) == '"it break <b>0</b> "', "what came is kept"
