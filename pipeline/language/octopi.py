@@ -8,6 +8,7 @@ from typing import Self, cast
 
 import torch
 from torch import nn
+from torch.distributed.fsdp import FSDPModule
 from torch.nn import functional as F
 from transformers import DynamicCache, PreTrainedModel, PreTrainedTokenizerBase
 from transformers.modeling_outputs import CausalLMOutput
@@ -196,8 +197,13 @@ class OctopiForCausalLM(nn.Module):
         return CausalLMOutput(loss=loss / torch.as_tensor(count, device=loss.device).clamp(min=1))
 
     def _shared(self, input_ids: torch.Tensor, labels: torch.Tensor) -> int:
-        """Columns that all rows begin with alike, before any frame and before what foretells a label."""
+        """Columns that all rows begin with alike, before any frame and before what foretells a label.
+
+        None in a sharded model: its layers are gathered once a pass, and processes with other batches would wait.
+        """
         if not extendable(self.llm.config) or (self.training and self.llm.is_gradient_checkpointing):
+            return 0
+        if any(isinstance(module, FSDPModule) for module in self.modules()):
             return 0
         alike = (input_ids == input_ids[:1]) & (input_ids != self.start_id) & (labels == IGNORE_INDEX)
         return max(0, int(alike.all(0).long().cumprod(0).sum()) - 1)

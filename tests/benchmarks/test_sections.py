@@ -191,7 +191,7 @@ def test_describing_takes_tokens_from_answers_and_errors_from_the_report(project
             own = {"lora": "with", "opd": opd, "touch": "real", "n": 8}
             scores.append(score(task, "choice", "finetuned", accuracy, accuracy - 0.1, accuracy + 0.2, **own))
             answer = {"question_id": task, "task": task, "measure": "choice", "correct": True, "parsed": True}
-            kind = {"encoder": "finetuned", "lora": "with", "opd": opd, "seed": 0, "touch": "real"}
+            kind = {"encoder": "finetuned", "lora": "with", "opd": opd, "seed": 0, "trained": 0, "touch": "real"}
             said = {"truncated": False, "expected": "A", "predicted": "A", "objects": ("rug",), "tokens": tokens}
             graded.append(Graded.model_validate({**answer, **kind, **said}))
     write_csv(root / "reports" / "smoke-videos" / "scores.csv", ScoreRow, scores)

@@ -26,6 +26,7 @@ from pipeline.config import LanguageConfig
 from pipeline.embeddings import EmbeddingStore
 from pipeline.errors import UserError
 from pipeline.io import write_jsonl
+from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.records import Question
 from tests.closure import ROOT
 from tests.language.sharded import CONFIG, KINDS, run
@@ -79,8 +80,16 @@ def trained(
 
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_two_processes_that_share_the_layers_train_like_one(
-    kind: str, trained: Path, language: LanguageConfig, questions: list[Question], store: EmbeddingStore, tmp_path: Path
+    kind: str,
+    trained: Path,
+    language: LanguageConfig,
+    questions: list[Question],
+    store: EmbeddingStore,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    # A sharded model reads the beginnings of questions anew for each row; a base in bfloat16 rounds otherwise then.
+    monkeypatch.setattr(OctopiForCausalLM, "_shared", lambda *_: 0)
     one = run(kind, language.weights, questions, store, tmp_path).state
     both = [load_file(trained / f"{kind}-whole-{rank}.safetensors") for rank in range(2)]
     said = [json.loads((trained / f"{kind}-{rank}.json").read_text()) for rank in range(2)]

@@ -15,6 +15,7 @@ import pandas as pd
 import pytest
 import yaml
 from safetensors.numpy import save_file
+from safetensors.torch import load_file
 
 from pipeline.errors import UserError
 from pipeline.io import read_jsonl, read_table, write_table
@@ -122,7 +123,8 @@ def test_provenance_counts_and_hashes_the_models(written: Path, tmp_path: Path) 
     said = load_report(written).provenance
     language = said["base_models"]["language"]
     assert (language["kind"], language["taught"]) == ("Llama", "drawn at random and taught nothing")
-    assert 2.0e6 < language["parameters"] < 2.4e6
+    stored = load_file(model_folder("tiny-llama") / "model.safetensors")
+    assert language["parameters"] == sum(t.numel() for t in stored.values())
     assert language["sha256"] == digest(model_folder("tiny-llama"))
     assert said["test_objects"] == ["bath_towel", "hairbrush_bristles", "ice_block", "toilet_brush_bristles"]
     assert said["seeds"] == [0, 1]

@@ -71,9 +71,13 @@ def gate_questions(catalogue: Catalogue, count: int, seed: int) -> list[GateQues
         makers["PSR"] = _psr
     questions = []
     for task, make in makers.items():
-        rng, tries = random.Random(derive_seed(seed, "gate", task)), itertools.count()
-        drawn = (make(catalogue, rng, next(tries) % 6) for _ in range(1000 * count))
-        questions += list(itertools.islice((q for q in drawn if q is not None), count))
+        rng = random.Random(derive_seed(seed, "gate", task))
+        made: list[GateQuestion] = []
+        for _ in range(1000 * count):
+            # By what was made and not by what was tried, so that every right answer comes as often.
+            question = make(catalogue, rng, len(made) % 6) if len(made) < count else None
+            made += [question] if question is not None else []
+        questions += made
     return questions
 
 
