@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 from collections import defaultdict
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 from pipeline.config import SplitConfig
@@ -18,6 +18,8 @@ CANDIDATES = 2000
 """Random sets of test objects that the development split chooses the best balanced one from."""
 FEWEST_TRAINING_OBJECTS = 3
 """A superlative or a matching question needs three objects."""
+VALIDATION = 8
+"""kfold: one in so many of a seed's training objects is for validation, as a whole fold would be missed in training."""
 ORIGIN = "paper"
 """The split of the catalogue that the development split is made from."""
 
@@ -34,8 +36,9 @@ def assign(catalogue: Catalogue, videos: Sequence[Video], config: SplitConfig, s
     """Put every video into a part of the split of one seed, by its object.
 
     `development` tests on some of the paper's training objects and leaves the paper's test objects unused. `kfold`
-    deals all objects that have videos into folds: the seed's fold is for test, the next one for validation, so that
-    over all folds every object is tested once. Any other name is that of a `split_` column of the catalogue.
+    deals all objects that have videos into folds: the seed's fold is for test, so that over all folds every object is
+    tested once. One in eight of the other objects is for validation. Any other name is that of a `split_` column of
+    the catalogue.
 
     Args:
         seed: of `ablation.seeds`; only kfold has another split for another one.
@@ -107,22 +110,29 @@ def read_splits(data: Path, config: SplitConfig, seeds: Sequence[int]) -> dict[i
 
 
 def _deal(catalogue: Catalogue, present: Collection[str], config: SplitConfig, fold: int) -> dict[str, Part]:
-    """Shuffle the objects and deal them out, each to the fold that has least of its classes.
-
-    Sizes of folds differ by one at the most, since an object always goes to one of the smallest.
-    """
+    """One fold for test, and of the other objects a few for validation, alike in classes to the rest."""
     if len(present) < config.folds:
         raise UserError(f"split.folds is {config.folds}, but only {len(present)} objects have videos; lower it")
-    objects = sorted(present)
-    random.Random(derive_seed(config.seed, "kfold")).shuffle(objects)
-    labels = {o: catalogue.labels(o) for o in objects}
-    dealt: list[list[str]] = [[] for _ in range(config.folds)]
+    labels = {o: catalogue.labels(o) for o in present}
+    tested = _balanced(labels, config.folds, derive_seed(config.seed, "kfold"))[fold]
+    learnt = {o: label for o, label in labels.items() if o not in tested}
+    chosen = _balanced(learnt, min(VALIDATION, len(learnt)), derive_seed(config.seed, f"validation {fold}"))[0]
+    return {o: Part.TEST if o in tested else Part.VALIDATION if o in chosen else Part.TRAIN for o in labels}
+
+
+def _balanced(labels: Mapping[str, Sequence[int]], count: int, seed: int) -> list[list[str]]:
+    """Shuffle the objects and deal them out, each to the group that has least of its classes.
+
+    Sizes of groups differ by one at the most, since an object always goes to one of the smallest.
+    """
+    objects = sorted(labels)
+    random.Random(seed).shuffle(objects)
+    groups: list[list[str]] = [[] for _ in range(count)]
     for o in sorted(objects, key=lambda o: labels[o]):
-        smallest = min(map(len, dealt))
-        open_folds = [members for members in dealt if len(members) == smallest]
-        min(open_folds, key=lambda members: sum(_alike(labels[o], labels[other]) for other in members)).append(o)
-    part_of_fold = {fold: Part.TEST, (fold + 1) % config.folds: Part.VALIDATION}
-    return {o: part_of_fold.get(number, Part.TRAIN) for number, members in enumerate(dealt) for o in members}
+        smallest = min(map(len, groups))
+        open_groups = [members for members in groups if len(members) == smallest]
+        min(open_groups, key=lambda members: sum(_alike(labels[o], labels[other]) for other in members)).append(o)
+    return groups
 
 
 def _alike(one: Sequence[int], other: Sequence[int]) -> int:
