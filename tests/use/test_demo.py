@@ -219,6 +219,8 @@ def test_the_command_shows_it_until_it_is_interrupted(made: Made) -> None:
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         stdout=subprocess.PIPE,
         text=True,
+        # What a shell starts in the background ignores it, and so would what is started here.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     try:
         assert running.stdout is not None

@@ -235,7 +235,13 @@ def test_no_worker_outlives_its_parent(tmp_path: Path, signal_number: int) -> No
         "if __name__ == '__main__':\n    list(run_parallel(work, range(4), 'x', 'y'))\n"
     )
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    process = subprocess.Popen([sys.executable, str(script), str(tmp_path)], env=environment, stderr=subprocess.DEVNULL)
+    process = subprocess.Popen(
+        [sys.executable, str(script), str(tmp_path)],
+        env=environment,
+        stderr=subprocess.DEVNULL,
+        # What a shell starts in the background ignores it, and so would what is started here.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
     while not (pids := [int(p.stem) for p in tmp_path.glob("*.pid")]):
         assert process.poll() is None
         time.sleep(0.05)
