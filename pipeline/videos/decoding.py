@@ -78,7 +78,7 @@ class Decoder:
             if packet is None:
                 return
             for frame in decoded:
-                yield frame if frame.format.name in PLANAR else _reformatter().reformat(frame, format="yuv444p")
+                yield frame if frame.format.name in PLANAR else _reformat(frame, "yuv444p")
 
 
 def decode(path: Path) -> Iterator[Image]:
@@ -90,7 +90,7 @@ def decode(path: Path) -> Iterator[Image]:
 
 def picture(frame: av.VideoFrame) -> Image:
     """A frame as uint8, height x width x BGR, turned as its metadata say."""
-    image = np.asarray(_reformatter().reformat(frame, format="bgr24", threads=1).to_ndarray(), dtype=np.uint8)
+    image = np.asarray(_reformat(frame, "bgr24").to_ndarray(), dtype=np.uint8)
     return np.ascontiguousarray(np.rot90(image, turns(frame)))
 
 
@@ -140,6 +140,11 @@ def _colours(full: bool, bt709: bool) -> npt.NDArray[np.float64]:
     matrix = matrix * scale
     shift = -matrix @ np.array([0 if full else 16, 128, 128])
     return np.column_stack([matrix, shift])
+
+
+def _reformat(frame: av.VideoFrame, pixels: str) -> av.VideoFrame:
+    """In one thread: a forked process that inherits threads which are not in it waits for them for ever."""
+    return _reformatter().reformat(frame, format=pixels, threads=1)
 
 
 @cache

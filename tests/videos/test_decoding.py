@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import struct
 from pathlib import Path
 
@@ -188,6 +189,19 @@ def test_sound_alone_is_no_video(tmp_path: Path) -> None:
         frame.rate = 8000
         container.mux(stream.encode(frame))
     assert list(decode(tmp_path / "v.mkv")) == []
+
+
+def test_a_fork_decodes_after_its_parent_has(tmp_path: Path) -> None:
+    """What converts pixels is kept from frame to frame: a fork would wait for ever for threads that it kept."""
+    for name, side in (("parent", 512), ("child", 64)):
+        encode(tmp_path / f"{name}.mkv", [gradient(side, side)] * 2, "ffv1", "bgr0")
+    assert len(frames_of(tmp_path / "parent.mkv")) == 2
+    child = multiprocessing.get_context("fork").Process(target=frames_of, args=(tmp_path / "child.mkv",))
+    child.start()
+    child.join(30)
+    child.kill()
+    child.join()
+    assert child.exitcode == 0
 
 
 def test_damage_in_the_middle_costs_no_more_than_what_it_hits(tmp_path: Path) -> None:
