@@ -120,7 +120,7 @@ def _deal(catalogue: Catalogue, present: Collection[str], config: SplitConfig, f
     return {o: Part.TEST if o in tested else Part.VALIDATION if o in chosen else Part.TRAIN for o in labels}
 
 
-def _balanced(labels: Mapping[str, Sequence[int]], count: int, seed: int) -> list[list[str]]:
+def _balanced(labels: Mapping[str, tuple[int, ...]], count: int, seed: int) -> list[list[str]]:
     """Shuffle the objects and deal them out, each to the group that has least of its classes.
 
     Sizes of groups differ by one at the most, since an object always goes to one of the smallest.

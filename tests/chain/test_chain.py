@@ -20,12 +20,15 @@ from pipeline.videos.catalogue import load_catalogue
 from tests.project import REDUCED, Project, copy_project
 from tests.use.shared import replay
 
+METRICS = "reports/smoke-scenes/metrics.json"
+
 
 @pytest.fixture(scope="module")
 def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
     project = copy_project(tmp_path_factory.mktemp("chain") / "a path with spaces")
     project.run("octopi", "scale", *REDUCED)
     project.run("octopi", "repro")
+    shutil.copy(project.folder / METRICS, project.folder / "first.json")
     return project
 
 
@@ -146,16 +149,14 @@ def test_folds_are_pooled_in_one_report(project: Project) -> None:
 
 
 def test_going_back_to_a_scale_restores_it(project: Project) -> None:
-    """After the other recipes: their encoders lie in data/ now."""
-    report = project.folder / "reports" / "smoke-scenes" / "metrics.json"
-    before = report.read_bytes()
+    """After other recipes, folds and a seed: their encoders and their report lie there now."""
     project.run("octopi", "scale", *REDUCED, "seed=1")
     project.run("octopi", "scale", *REDUCED)
     shutil.rmtree(project.folder / "data" / "models" / "with")
     output = project.run("dvc", "repro")
     assert "is cached - skipping run, checking out outputs" in output
     assert "Running stage 'lora" not in output
-    assert report.read_bytes() == before
+    assert (project.folder / METRICS).read_bytes() == (project.folder / "first.json").read_bytes()
     # Last, since it leaves the project without its videos.
     shutil.rmtree(project.folder / "data" / "scenes")
     (project.folder / "data" / "scenes" / "videos").mkdir(parents=True)
