@@ -46,6 +46,8 @@ Show = Callable[[str, str], list[str]]
 
 CACHE_FILE = "cache.jsonl"
 PHOTO_SUFFIXES = (".jpeg", ".jpg", ".png", ".webp")
+EXAMPLES = 3
+"""Most training questions that are told before a question."""
 LONGEST = 1024
 """Pixels of a photo's longer side that are sent at most."""
 FILTERS = ("content_filter", "content_policy_violation")
@@ -121,8 +123,8 @@ def _ask_all(params: Params, endpoint: Endpoint, shown: Shown, folder: Path, lim
     show = _frames(folder, most) if shown is Shown.FRAMES else _photos(folder, objects, most)
     asker, answered = _Asker(endpoint, place / CACHE_FILE, limit), {}
     for seed, questions in asked.items():
-        examples = {q.task: q for q in reversed(read_jsonl(files[seed].with_name("train.jsonl"), Question))}
-        told = {q.task: instruction(catalogue, shown, examples.get(q.task)) for q in questions}
+        training = read_jsonl(files[seed].with_name("train.jsonl"), Question)
+        told = {t: instruction(catalogue, shown, choose_examples(training, t)) for t in {q.task for q in questions}}
         said = (_answer(q, told[q.task], asker, show) for q in track(questions, place.name, "question"))
         answered[seed] = [prediction for prediction in said if prediction]
     ended = Counter(reply.ended for reply in asker.used.values())
@@ -154,23 +156,32 @@ def _ask_all(params: Params, endpoint: Endpoint, shown: Shown, folder: Path, lim
     return f"{place}: {'; '.join([f'{asker.sent} requests', *unusual, state, then])}"
 
 
-def instruction(catalogue: Catalogue, shown: Shown, example: Question | None) -> str:
+def choose_examples(training: Sequence[Question], task: str) -> list[Question]:
+    """Of a task the first training questions whose right choices differ, so that each kind of answer is seen."""
+    first: dict[str, Question] = {}
+    for question in training:
+        if question.task == task:
+            first.setdefault(question.gold.choice, question)
+    return list(first.values())[:EXAMPLES]
+
+
+def instruction(catalogue: Catalogue, shown: Shown, examples: Sequence[Question]) -> str:
     """What stands before a question: what is seen, the properties with their classes, and how an answer is worded.
 
     Args:
-        example: A training question of the task, told in words; None where the task has none.
+        examples: Training questions of the task, told in words; none where it is never trained.
     """
     classes = "; ".join(f"{p.spoken} ({', '.join(p.levels)})" for p in catalogue.properties)
     form = catalogue.language.structured.format(**{p.name: f"<{p.spoken}>" for p in catalogue.properties})
+    turns = [turn for q in examples for d in q.dialogues if d.opd is Opd.ALL for turn in d.turns]
     lines = [
         KINDS[shown],
         f"Objects have these properties, each in one of the classes in brackets: {classes}.",
         f'A description of an object ends with a sentence of exactly this form: "{form}"',
+        *(["Answer in the form of these examples, whose pictures are left out."] if turns else []),
+        *(f"Question: {turn.user}\nAnswer: {turn.assistant}" for turn in turns),
+        *(["Now the question:"] if turns else []),
     ]
-    dialogue = example and example.dialogue(Opd.ALL)
-    if dialogue:
-        turns = (f"Question: {t.user}\nAnswer: {t.assistant}" for t in dialogue.turns)
-        lines += ["Answer in the form of this example, whose pictures are left out.", *turns, "Now the question:"]
     return "\n".join(lines).replace("{tactile}", "[pictures]") + "\n\n"
 
 

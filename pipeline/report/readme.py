@@ -142,7 +142,7 @@ def vision_words(source: dict[str, Any]) -> str:
     return (
         f"**Vision alone:** {named} saw up to {source['per_video']} {SHOWN_WORDS[source['shown']]} in place of each "
         f"video ({source['first']} to {source['last']}, temperature {source['temperature']:g}). It was told the "
-        f"classes and, where a task is trained, one training question with its answer. How its replies ended: {ended}."
+        f"classes and, where a task is trained, up to three training questions. How its replies ended: {ended}."
     )
 
 

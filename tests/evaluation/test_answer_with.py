@@ -127,7 +127,9 @@ def made(tmp_path_factory: pytest.TempPathFactory, catalogue: Catalogue) -> Path
     assert params.frames.per_video == 5
     data = root / "data"
     split = read_table(data / "splits" / "0.parquet", Assignment)
-    training = build_questions(pool_of(Part.TRAIN, split, catalogue), {"PC": 2, "PSS": 2}, seed=0, distinct=True)
+    training = build_questions(
+        pool_of(Part.TRAIN, split, catalogue), {"PC": 9, "PSS": 1, "POM": 12}, seed=0, distinct=True
+    )
     write_jsonl(data / "questions" / "0" / "train.jsonl", training)
     videos = sorted(a.video_id for a in split if a.part is Part.TEST)
     kept = [(v, i) for n, v in enumerate(videos) for i in range(KEPT[n % 3])]
@@ -208,11 +210,17 @@ def test_frames_and_questions_arrive_whole_and_answers_are_graded(
     said = run(server)
     assert said == f"{PLACE}: 12 requests; 10 of 10 questions are answered; `dvc repro` grades them"
     pixels, index = np.load("data/frames/frames.npy"), read_table(Path("data/frames/frames.parquet"), Frame)
-    examples = {q.task: q for q in reversed(read_jsonl(Path("data/questions/0/train.jsonl"), Question))}
+    training = read_jsonl(Path("data/questions/0/train.jsonl"), Question)
+    kinds = {t: list(dict.fromkeys(q.gold.choice for q in training if q.task == t)) for t in ("PC", "PSS", "POM")}
+    assert {t: len(found) for t, found in kinds.items()} == {"PC": 3, "PSS": 1, "POM": 6}
+    examples = {
+        task: [next(q for q in training if (q.task, q.gold.choice) == (task, choice)) for choice in found[:3]]
+        for task, found in kinds.items()
+    }
     for (question, number, turn), body in zip(turns(), server.bodies, strict=True):
         assert (body["model"], body["temperature"], body["max_completion_tokens"]) == ("some-maker/sees-1", 0, 1024)
         assert [m["role"] for m in body["messages"]] == ["user", "assistant", "user"][: 2 * number + 1]
-        before = instruction(catalogue, Shown.FRAMES, examples.get(question.task)) if number == 0 else ""
+        before = instruction(catalogue, Shown.FRAMES, examples.get(question.task, [])) if number == 0 else ""
         text, pictures = shown_in(body["messages"][-1]["content"])
         assert text == before + turn.user
         assert len(pictures) == turn.user.count("{tactile}") == (0 if number else len(question.videos))
@@ -239,13 +247,13 @@ def test_instruction_names_every_class_and_only_its_own_example(catalogue: Catal
         some = {"part": "train", "videos": [], "objects": [], "gold": gold}
         return Question.model_validate({"question_id": "x", "task": task, "dialogues": [dialogue], **some})
 
-    text = instruction(catalogue, Shown.PHOTOS, question("PC", "Is {tactile} softer than {tactile}?"))
+    text = instruction(catalogue, Shown.PHOTOS, [question("PC", "Is {tactile} softer than {tactile}?")])
     for prop in catalogue.properties:
         assert f"{prop.spoken} ({', '.join(prop.levels)})" in text
     assert "Question: Is [pictures] softer than [pictures]?\nAnswer: An answer to PC." in text
     assert "{" not in text
     assert "photos" in text
-    assert "Question" not in instruction(catalogue, Shown.FRAMES, None)
+    assert "Question" not in instruction(catalogue, Shown.FRAMES, [])
 
 
 def test_budget_and_going_on_ask_nothing_twice(project: Path, server: Server) -> None:
@@ -318,6 +326,9 @@ def test_a_failing_endpoint_is_one_line_and_loses_nothing(project: Path, server:
     assert KEY not in said
     assert nobody_wrote_the_key(project)
     before = len(server.bodies)
+    assert before == 4 + (3 if name in ("too many", "broken") else 1), (
+        "the client's own repeats, and nothing after that"
+    )
     assert all(s.correct for s in graded())
     server.step = lambda n: right(n - before + 4)
     assert f"{12 - 4} requests; 10 of 10" in run(server)
