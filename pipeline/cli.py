@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -140,6 +140,32 @@ def _show(findings: Sequence[Finding]) -> None:
         typer.echo(f"{f.severity:8} {f.check}: {f.item}: {f.measured}{expected}")
     if any(f.severity == "error" for f in findings):
         raise typer.Exit(1)
+
+
+@app.command("answer-with")
+def answer_with(
+    endpoint: Annotated[str, typer.Option(help="URL that OpenAI's client takes, such as https://api.openai.com/v1.")],
+    model: Annotated[str, typer.Option(help="Its name there.")],
+    shown: Annotated[
+        Literal["frames", "photos"], typer.Option("--input", help="What it sees in place of each tactile video.")
+    ],
+    folder: Annotated[
+        Path | None, typer.Argument(metavar="[DIR]", help="Of the photos, or of kept frames (data/frames).")
+    ] = None,
+    limit: Annotated[int | None, typer.Option(min=0, help="Most requests; a later call goes on.")] = None,
+    temperature: Annotated[float, typer.Option(min=0, help="1 for models that take no other.")] = 0.0,
+    max_tokens: Annotated[int, typer.Option(min=1, help="Of a reply.")] = 1024,
+    timeout: Annotated[float, typer.Option(min=0.1, help="Seconds that a reply may take.")] = 120.0,
+) -> None:
+    """Let a model behind an endpoint answer the evaluation questions about pictures; OPENAI_API_KEY holds its key."""
+    from pipeline.evaluation.answer_with import Endpoint, ask_all
+    from pipeline.params import load_params
+    from pipeline.records import Shown
+
+    if folder is None and shown == "photos":
+        raise UserError("DIR: name the folder with photos, as in `--input photos DIR`")
+    asked = Endpoint(endpoint.rstrip("/"), model, temperature, max_tokens, timeout)
+    typer.echo(ask_all(load_params(), asked, Shown(shown), folder or Path("data/frames"), limit))
 
 
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})

@@ -61,6 +61,15 @@ class Touch(StrEnum):
     """Normal noise with each dimension's mean and deviation."""
 
 
+class Shown(StrEnum):
+    """What a model is shown that sees and does not feel."""
+
+    FRAMES = "frames"
+    """The salient frames of the question's videos."""
+    PHOTOS = "photos"
+    """Photos of the question's objects."""
+
+
 class Variant(NamedTuple):
     """One answering system of the ablation."""
 
@@ -271,6 +280,38 @@ class Graded(Score):
     def variant(self) -> Variant:
         """The answering system."""
         return Variant(self.encoder, self.lora, self.opd, self.trained)
+
+
+class VisionModel(Record):
+    """A model behind an endpoint that answered about pictures, and how it was asked: a source.json."""
+
+    model: str
+    """As it was asked for."""
+    served_as: tuple[str, ...]
+    """What the endpoint called it."""
+    endpoint: str
+    shown: Shown
+    per_video: int
+    """Most pictures in place of a video."""
+    temperature: float
+    max_tokens: int
+    first: str
+    """Day of the first reply, and of the last; UTC."""
+    last: str
+    ended: dict[str, int]
+    """How many replies ended with `stop`, `length`, `content_filter`, `refusal`, `nothing` (no text), `unsaid`, or
+    another word of the endpoint's."""
+    questions: dict[str, str]
+    """By seed, the fingerprint of the file of questions that it answered."""
+
+
+class GradedVision(Score):
+    """A score and which vision-only model's it is."""
+
+    model: str
+    shown: Shown
+    seed: int
+    """As in `Graded`."""
 
 
 class Classification(Record):

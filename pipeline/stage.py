@@ -62,7 +62,7 @@ def stage(name: str, key: str | None = None) -> Iterator[Stage]:
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     quiet_libraries()
     try:
-        with _alone(full):
+        with alone(full):
             running = Stage(full, load_params(), started)
             limit_threads(running.params.runtime.threads)
             if _main_process():
@@ -127,8 +127,12 @@ def running_stages() -> list[str]:
 
 
 @contextmanager
-def _alone(name: str) -> Iterator[None]:
-    """One process a stage: a killed `dvc` leaves its stage running, and the next must not write beside it."""
+def alone(name: str) -> Iterator[None]:
+    """One process a stage: a killed `dvc` leaves its stage running, and the next must not write beside it.
+
+    Raises:
+        UserError: where another process is in it; the caller puts the name before it.
+    """
     if not _main_process():
         yield
         return

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from pipeline.evaluation.grading import grade
+from pipeline.evaluation.grading import EXTERNAL, grade, grade_vision_models
 from pipeline.io import read_jsonl, write_table
-from pipeline.records import Graded, Prediction, Question, Touch
+from pipeline.records import Graded, GradedVision, Prediction, Question, Touch
 from pipeline.stage import DATA, stage
 from pipeline.videos.catalogue import load_catalogue
 
@@ -21,6 +21,10 @@ def main() -> None:
                 whose = {**variant._asdict(), "seed": replicate, "trained": variant.seed, "touch": touch}
                 graded += [Graded(**score.model_dump(), **whose) for score in grade(questions, predictions, catalogue)]
         write_table(DATA / "graded.parquet", Graded, graded)
+        files = {s: DATA / "questions" / str(s) / "evaluation.jsonl" for s in run.params.ablation.seeds}
+        outside = EXTERNAL / run.params.report_name
+        seen = grade_vision_models(outside, files, run.params.split.replicate_of, catalogue)
+        write_table(DATA / "graded_vision.parquet", GradedVision, seen)
         run.metrics["answers"] = len({(g.variant, g.touch, g.question_id) for g in graded})
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from tests.closure import ROOT
 
-PARTS = ("pipeline", "stages", "conf", "dvc.yaml", "pyproject.toml", ".gitignore", ".dvcignore")
+PARTS = ("pipeline", "stages", "conf", "external/.gitkeep", "dvc.yaml", "pyproject.toml", ".gitignore", ".dvcignore")
 OBJECTS = (
     *("baseball", "controller_base", "cotton_ball", "pillow", "rug"),
     "millet",

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from pydantic import ValidationError
 
 from pipeline.errors import UserError
-from pipeline.records import Prediction, Question, Score
+from pipeline.io import fingerprint, read_json, read_jsonl
+from pipeline.records import GradedVision, Prediction, Question, Score, VisionModel
 from pipeline.tasks import TASKS
 from pipeline.videos.catalogue import Catalogue
+
+EXTERNAL = Path("external")
+"""What models behind endpoints answered, by report and model: an input of the chain, where no stage asks a network."""
+SOURCE_FILE = "source.json"
 
 
 def grade(questions: Sequence[Question], predictions: Sequence[Prediction], catalogue: Catalogue) -> list[Score]:
@@ -20,3 +29,43 @@ def grade(questions: Sequence[Question], predictions: Sequence[Prediction], cata
             raise UserError(f"{prediction.question_id}: answered but not asked; run `dvc repro` to answer anew")
         scores += TASKS[question.task].grade(question, prediction, catalogue)
     return scores
+
+
+def vision_models(folder: Path) -> dict[Path, VisionModel]:
+    """Who answered in the folder of a report in `EXTERNAL`, by the folder of each; empty where there is none.
+
+    Raises:
+        UserError: for a source.json that is none.
+    """
+    found = {}
+    for file in sorted(folder.glob(f"*/{SOURCE_FILE}")):
+        try:
+            found[file.parent] = VisionModel.model_validate(read_json(file))
+        except ValidationError:
+            raise UserError(f"{file}: does not say who answered; run `octopi answer-with` again") from None
+    return found
+
+
+def grade_vision_models(
+    folder: Path, questions: Mapping[int, Path], replicate_of: Callable[[int], int], catalogue: Catalogue
+) -> list[GradedVision]:
+    """Grade what `vision_models` answered; answers to other questions than these are left out with a warning.
+
+    Args:
+        folder: Of a report in `EXTERNAL`.
+        questions: The file of evaluation questions of each seed.
+        replicate_of: The seed that a seed's answers count for.
+    """
+    graded = []
+    for place, source in vision_models(folder).items():
+        for seed, file in questions.items():
+            if source.questions.get(str(seed)) != fingerprint(file):
+                again = "run `octopi answer-with` again"
+                logging.warning(f"{place}: no answers to the questions of seed {seed} as they are now; {again}")
+                continue
+            scores = grade(read_jsonl(file, Question), read_jsonl(place / f"{seed}.jsonl", Prediction), catalogue)
+            graded += [
+                GradedVision(**s.model_dump(), model=source.model, shown=source.shown, seed=replicate_of(seed))
+                for s in scores
+            ]
+    return graded

@@ -18,7 +18,7 @@ from pydantic import AfterValidator, BeforeValidator
 
 from pipeline.evaluation.intervals import Objects, accuracy_interval
 from pipeline.evaluation.paired import Difference, holm, paired
-from pipeline.records import Classification, Encoder, Graded, Lora, Opd, OutOfFold, Part, Record, Touch
+from pipeline.records import Classification, Encoder, Graded, GradedVision, Lora, Opd, OutOfFold, Part, Record, Touch
 from pipeline.tasks import TASKS
 from pipeline.videos.catalogue import Catalogue
 
@@ -41,10 +41,12 @@ class ScoreRow(Record):
     task: str
     measure: str
     encoder: str
-    """Of a cross-validation, the candidate's name; of described objects, the base model's."""
+    """Of a cross-validation, the candidate's name; of described objects, the base model's; of vision alone, the
+    model's."""
     lora: str = ""
     opd: str = ""
     touch: str = ""
+    """Of vision alone, what the model was shown in place of touch."""
     seed: str
     """A number or `all`."""
     n: int
@@ -127,6 +129,7 @@ def score_rows(
     catalogue: Catalogue,
     classifications: Mapping[int, Sequence[Classification]] | None = None,
     out_of_fold: Mapping[str, Sequence[OutOfFold]] | None = None,
+    seen: Iterable[GradedVision] = (),
 ) -> list[ScoreRow]:
     """The rows of scores.csv: one a seed and one over all of them, for each measure and setting that has answers.
 
@@ -135,12 +138,20 @@ def score_rows(
         catalogue: What chance follows from.
         classifications: Of the property heads, by seed, those of its folds together; only test and validation count.
         out_of_fold: By candidate.
+        seen: Graded answers of vision-only models.
     """
     rows: list[ScoreRow] = []
     for (task, measure), settings in _table(graded, catalogue).items():
         chance = TASKS[task].chance(catalogue)[measure]
         for setting, runs in settings.items():
             rows += _rows(runs, task=task, measure=measure, chance=chance, **setting._asdict())
+    by_model: dict[tuple[str, ...], dict[int, dict[str, Answer]]] = defaultdict(lambda: defaultdict(dict))
+    for g in seen:
+        answer = Answer(g.correct, g.objects, g.parsed, g.strict)
+        by_model[g.task, g.measure, g.model, g.shown][g.seed][g.question_id] = answer
+    for (task, measure, model, shown), runs in by_model.items():
+        chance = TASKS[task].chance(catalogue)[measure]
+        rows += _rows(runs, task=task, measure=measure, chance=chance, encoder=model, opd=Opd.ALL, touch=shown)
     chances = {p.name: 1 / len(p.levels) for p in catalogue.properties}
     chances["combined"] = math.prod(chances.values())
     for task_name, part in ((HEADS, Part.TEST), (VALIDATION_HEADS, Part.VALIDATION)):

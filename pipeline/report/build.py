@@ -8,6 +8,7 @@ import pandas as pd
 
 from pipeline.config import AblationConfig, Params
 from pipeline.evaluation.described import described_rows
+from pipeline.evaluation.grading import EXTERNAL, vision_models
 from pipeline.evaluation.ordinal import ErrorRow, error_rows
 from pipeline.evaluation.scores import EffectRow, ScoreRow, candidate_rows, effect_rows, score_rows
 from pipeline.io import read_csv, read_jsonl, read_table, write_csv, write_json, write_text
@@ -18,6 +19,7 @@ from pipeline.records import (
     Described,
     Finding,
     Graded,
+    GradedVision,
     Measurement,
     OutOfFold,
     Part,
@@ -77,8 +79,14 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     }
     gates = [data / "taught" / GATE, *(data / "answers" / v.key / GATE for v in params.ablation.variants())]
     described = described_rows([row for g in gates if g.is_file() for row in read_csv(g, Described)], catalogue)
-    scores = score_rows(graded, catalogue, said, out_of_fold) + described
+    vision = data / "graded_vision.parquet"
+    seen = read_table(vision, GradedVision) if vision.is_file() else []
+    scores = score_rows(graded, catalogue, said, out_of_fold, seen) + described
     origin = provenance(params, catalogue, videos, splits, [g.objects for g in graded], root)
+    # Not those whose answers are to other questions, which were not graded.
+    rated = {(g.model, g.shown) for g in seen}
+    sources = vision_models(root / EXTERNAL / params.report_name).values()
+    origin["vision"] = [s.model_dump(mode="json") for s in sources if (s.model, s.shown) in rated]
     write_csv(folder / "scores.csv", ScoreRow, scores)
     write_csv(folder / "effects.csv", EffectRow, effect_rows(graded, catalogue))
     write_csv(folder / "encoder_effects.csv", EffectRow, candidate_rows(out_of_fold, BASELINE))

@@ -11,7 +11,7 @@ from typing import Any
 import pandas as pd
 
 from pipeline.report.load import KEYS, Report, cells
-from pipeline.report.tables import TABLES, headline, measured, number, task_title
+from pipeline.report.tables import SHOWN_WORDS, TABLES, headline, measured, number, task_title
 from pipeline.weights import is_tiny
 
 MOST_LINES = 150
@@ -131,7 +131,19 @@ def stands_on(said: dict[str, Any]) -> list[str]:
         facts.append(
             "**Matching questions** say what the named objects are like: they ask for touch, not for knowledge."
         )
-    return facts
+    return facts + [vision_words(source) for source in said.get("vision", ())]
+
+
+def vision_words(source: dict[str, Any]) -> str:
+    """A vision-only model: what it was shown, where and when it was asked, how its replies ended."""
+    served = ", ".join(name for name in source["served_as"] if name not in ("", source["model"]))
+    named = f"`{source['model']}`{f' (there {served})' if served else ''} at `{source['endpoint']}`"
+    ended = ", ".join(f"{how} {count}" for how, count in source["ended"].items())
+    return (
+        f"**Vision alone:** {named} saw up to {source['per_video']} {SHOWN_WORDS[source['shown']]} in place of each "
+        f"video ({source['first']} to {source['last']}, temperature {source['temperature']:g}). It was told the "
+        f"classes and, where a task is trained, up to three training questions. How its replies ended: {ended}."
+    )
 
 
 def origin(said: dict[str, Any]) -> list[str]:

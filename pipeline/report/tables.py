@@ -22,6 +22,8 @@ NOT_ANSWERED = (HEADS, VALIDATION_HEADS, CROSS_VALIDATION, DESCRIBED)
 """Tasks of scores.csv that no language model with touch answered."""
 PUBLISHED_MODELS = ("7b", "13b", "CLIP")
 SYSTEM_WORDS = {"base": "base encoder", "without": "without LoRA", "none": "without OPD", "needed": "OPD as needed"}
+SHOWN_WORDS = {"frames": "frames of the videos", "photos": "photos of the objects"}
+"""What vision-only models were shown, in the place where others have their touch."""
 ENCODERS = {"finetuned": "fine-tuned", "base": "base"}
 
 
@@ -101,11 +103,13 @@ def task_title(task: str) -> str:
 
 
 def system(row: dict[str, Any]) -> str:
-    """A variant by what it leaves out of the full system."""
+    """A variant by what it leaves out of the full system; another model by its name."""
     if row["task"] in (HEADS, VALIDATION_HEADS):
         return "property heads, no language model"
     if row["task"] in (CROSS_VALIDATION, DESCRIBED):
         return str(row["encoder"])
+    if row["touch"] in SHOWN_WORDS:
+        return f"{row['encoder']}, {SHOWN_WORDS[row['touch']]}"
     words = [SYSTEM_WORDS[row[axis]] for axis in FULL if row[axis] in SYSTEM_WORDS]
     return ", ".join(words) or "Octopi (full system)"
 
@@ -159,6 +163,11 @@ def _beside(rows: pd.DataFrame, published: pd.DataFrame) -> dict[str, list[str]]
     return columns
 
 
+def vision(frame: pd.DataFrame) -> pd.Series[bool]:
+    """Answers of vision-only models, over all seeds."""
+    return frame["touch"].isin(SHOWN_WORDS) & (frame["seed"] == ALL_SEEDS)
+
+
 def answers(frame: pd.DataFrame) -> pd.Series[bool]:
     """Answers of the language model to real touch, over all seeds."""
     over = ~frame["task"].isin(NOT_ANSWERED) & (frame["seed"] == ALL_SEEDS)
@@ -178,11 +187,16 @@ def _differs(frame: pd.DataFrame, *axes: str) -> pd.Series[bool]:
     return same
 
 
-def _variants(*axes: str, described: bool | None = None, trained: bool | None = None) -> Select:
-    """Answers of variants that differ in these axes; only descriptions, or only tasks that were trained, or not."""
+def _variants(*axes: str, described: bool | None = None, trained: bool | None = None, seen: bool = False) -> Select:
+    """Answers of variants that differ in these axes; only descriptions, or only tasks that were trained, or not.
+
+    With `seen` those of vision-only models, too.
+    """
 
     def select(frame: pd.DataFrame) -> pd.Series[bool]:
         rows = answers(frame) & _differs(frame, *axes)
+        if seen:
+            rows |= vision(frame)
         if described is not None:
             rows &= (frame["measure"] != CHOICE) == described
         if trained is not None:
@@ -205,7 +219,7 @@ TABLES: tuple[Table, ...] = (
         "understanding",
         "Physical understanding",
         "Questions about what was touched, with descriptions before the conclusion (OPD) and without.",
-        _variants("opd", described=False, trained=True),
+        _variants("opd", described=False, trained=True, seen=True),
         PAPER,
         folded=False,
     ),
@@ -213,7 +227,7 @@ TABLES: tuple[Table, ...] = (
         "reasoning",
         "Scenario reasoning",
         "Which of two objects fits a scenario: asked of every system, never trained.",
-        _variants("opd", described=False, trained=False),
+        _variants("opd", described=False, trained=False, seen=True),
         PAPER,
         folded=False,
     ),
@@ -221,7 +235,7 @@ TABLES: tuple[Table, ...] = (
         "description",
         "Object property description",
         "Describing one object, as a language model's answer and by the encoder's property heads on the same videos.",
-        lambda f: _variants(described=True)(f) | _over_seeds(HEADS)(f),
+        lambda f: _variants(described=True, seen=True)(f) | _over_seeds(HEADS)(f),
         PROPERTIES,
         folded=False,
     ),

@@ -1,0 +1,407 @@
+"""The evaluation questions to a model that sees and does not feel, behind an OpenAI-compatible endpoint.
+
+The paper compares with such a model, PG-InstructBLIP (Gao et al. 2024, arXiv:2309.02561). What any of them answers is
+written to `external/`, which the stages `grade` and `report` read: no stage asks a network.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import os
+import re
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import lru_cache
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.config import Params
+from pipeline.errors import UserError
+from pipeline.evaluation.grading import EXTERNAL, SOURCE_FILE
+from pipeline.io import fingerprint, read_jsonl, write_json, write_jsonl
+from pipeline.records import Opd, Prediction, Question, Record, Shown, VisionModel
+from pipeline.runtime import track
+from pipeline.stage import DATA, alone
+from pipeline.training.sampling import sample_evaluation
+from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.videos.frames.store import FrameStore
+
+if TYPE_CHECKING:
+    from openai.types.chat import ChatCompletion
+
+Picture = npt.NDArray[np.uint8]
+"""Rows x columns x BGR, as OpenCV has them."""
+Show = Callable[[str, str], list[str]]
+"""The pictures of a video, or of its object, as data URLs."""
+
+CACHE_FILE = "cache.jsonl"
+PHOTO_SUFFIXES = (".jpeg", ".jpg", ".png", ".webp")
+EXAMPLES = 3
+"""Most training questions that are told before a question."""
+LONGEST = 1024
+"""Pixels of a photo's longer side that are sent at most."""
+FILTERS = ("content_filter", "content_policy_violation")
+"""Codes by which an endpoint says that it will not answer this question, with status 400."""
+KINDS = {
+    Shown.FRAMES: "In place of each tactile video you see some of its frames, in their order in time: a camera behind "
+    "a soft gel films how an object presses into the gel.",
+    Shown.PHOTOS: "In place of each tactile video you see photos of the object that was touched in it.",
+}
+
+
+@dataclass(frozen=True)
+class Endpoint:
+    """Where a model answers, and how it is asked."""
+
+    url: str
+    """Up to and with the `/v1` that most have."""
+    model: str
+    temperature: float = 0.0
+    max_tokens: int = 1024
+    """Of a reply."""
+    timeout: float = 120.0
+    """Seconds that a reply may take; the client then asks again, as after a status that may pass."""
+
+
+class Reply(Record):
+    """What came back for one request: a line of the cache."""
+
+    request: str
+    """SHA-256 of what was sent and where."""
+    text: str
+    """Empty where nothing was said."""
+    ended: str
+    """As in `VisionModel.ended`."""
+    tokens: int
+    model: str
+    """As the endpoint calls it."""
+    day: str
+
+
+def ask_all(params: Params, endpoint: Endpoint, shown: Shown, folder: Path, limit: int | None = None) -> str:
+    """Ask what is not in the cache yet, and write what is answered by now to `external/<report>/<model>-<shown>/`.
+
+    Each reply is in the cache before the next request leaves, so a killed run goes on where it was. The chain must
+    have run up to its questions (and frames, where they are shown).
+
+    Args:
+        params: Whose questions, seeds and frames.
+        folder: Of the kept frames, or of the photos: for each object `<object>.jpg` or a folder `<object>/`.
+        limit: Most requests of this call, not counting what the client sends again; None: no limit.
+
+    Returns:
+        What was done, in a line.
+
+    Raises:
+        UserError: where an input is missing, or the endpoint fails (what it said before is kept and written).
+    """
+    _check(endpoint)
+    name = re.sub(r"[^\w.-]+", "-", f"{endpoint.model}-{shown}")
+    try:
+        with alone(f"answer-with@{name}"):
+            return _ask_all(params, endpoint, shown, folder, limit, EXTERNAL / params.report_name / name)
+    except UserError as error:
+        raise UserError(f"answer-with@{name}: {error}") from None
+
+
+def _ask_all(params: Params, endpoint: Endpoint, shown: Shown, folder: Path, limit: int | None, place: Path) -> str:
+    files = {seed: DATA / "questions" / str(seed) / "evaluation.jsonl" for seed in params.ablation.seeds}
+    asked = {seed: read_jsonl(file, Question) for seed, file in files.items()}
+    catalogue = load_catalogue(Path(params.data.catalogue))
+    objects = sorted({o for questions in asked.values() for q in questions for o in q.objects})
+    most = params.frames.per_video
+    show = _frames(folder, most) if shown is Shown.FRAMES else _photos(folder, objects, most)
+    asker, answered = _Asker(endpoint, place / CACHE_FILE, limit), {}
+    for seed, questions in asked.items():
+        training = read_jsonl(files[seed].with_name("train.jsonl"), Question)
+        told = {t: instruction(catalogue, shown, choose_examples(training, t)) for t in {q.task for q in questions}}
+        said = (_answer(q, told[q.task], asker, show) for q in track(questions, place.name, "question"))
+        answered[seed] = [prediction for prediction in said if prediction]
+    ended = Counter(reply.ended for reply in asker.used.values())
+    done, total = (sum(map(len, each.values())) for each in (answered, asked))
+    if done:
+        days = sorted(reply.day for reply in asker.used.values())
+        source = VisionModel(
+            model=endpoint.model,
+            served_as=tuple(sorted({reply.model for reply in asker.used.values()})),
+            endpoint=endpoint.url,
+            shown=shown,
+            per_video=most,
+            temperature=endpoint.temperature,
+            max_tokens=endpoint.max_tokens,
+            first=days[0],
+            last=days[-1],
+            ended=dict(sorted(ended.items())),
+            questions={str(seed): fingerprint(file) for seed, file in files.items()},
+        )
+        for seed, predictions in answered.items():
+            write_jsonl(place / f"{seed}.jsonl", predictions)
+        # Last: it says of what stands beside it that it belongs to these questions.
+        write_json(place / SOURCE_FILE, source.model_dump(mode="json"))
+    state = f"{done} of {total} questions are answered"
+    if asker.failure:
+        raise UserError(f"{asker.failure}; {state}, run it again to go on")
+    unusual = [f"{count} ended with {how}" for how, count in sorted(ended.items()) if how != "stop"]
+    then = "`dvc repro` grades them" if done == total else "run it again for the others"
+    return f"{place}: {'; '.join([f'{asker.sent} requests', *unusual, state, then])}"
+
+
+def choose_examples(training: Sequence[Question], task: str) -> list[Question]:
+    """Of a task the first training questions whose right choices differ, so that each kind of answer is seen."""
+    first: dict[str, Question] = {}
+    for question in training:
+        if question.task == task:
+            first.setdefault(question.gold.choice, question)
+    return list(first.values())[:EXAMPLES]
+
+
+def instruction(catalogue: Catalogue, shown: Shown, examples: Sequence[Question]) -> str:
+    """What stands before a question: what is seen, the properties with their classes, and how an answer is worded.
+
+    Args:
+        examples: Training questions of the task, told in words; none where it is never trained.
+    """
+    classes = "; ".join(f"{p.spoken} ({', '.join(p.levels)})" for p in catalogue.properties)
+    form = catalogue.language.structured.format(**{p.name: f"<{p.spoken}>" for p in catalogue.properties})
+    turns = [turn for q in examples for d in q.dialogues if d.opd is Opd.ALL for turn in d.turns]
+    lines = [
+        KINDS[shown],
+        f"Objects have these properties, each in one of the classes in brackets: {classes}.",
+        f'A description of an object ends with a sentence of exactly this form: "{form}"',
+        *(["Answer in the form of these examples, whose pictures are left out."] if turns else []),
+        *(f"Question: {turn.user}\nAnswer: {turn.assistant}" for turn in turns),
+        *(["Now the question:"] if turns else []),
+    ]
+    return "\n".join(lines).replace("{tactile}", "[pictures]") + "\n\n"
+
+
+def _answer(question: Question, told: str, asker: _Asker, show: Show) -> Prediction | None:
+    """All turns of a question, as the full system is asked; None where the budget does not reach to its end."""
+    dialogue = question.dialogue(Opd.ALL)
+    assert dialogue is not None, "every task has this mode"
+    messages: list[dict[str, Any]] = []
+    replies: list[Reply] = []
+    touched = iter(zip(question.videos, question.objects, strict=True))
+    for turn in dialogue.turns:
+        first, *others = (told + turn.user if not messages else turn.user).split("{tactile}")
+        content = [_text(first)]
+        for text in others:
+            content += [{"type": "image_url", "image_url": {"url": url}} for url in show(*next(touched))]
+            content += [_text(text)] if text else []
+        messages.append({"role": "user", "content": content})
+        reply = asker.ask(messages)
+        if reply is None:
+            return None
+        replies.append(reply)
+        if not reply.text:
+            # Endpoints take no empty turn, and nothing can follow from one.
+            break
+        messages.append({"role": "assistant", "content": reply.text})
+    unsaid = len(dialogue.turns) - len(replies)
+    return Prediction(
+        question_id=question.question_id,
+        task=question.task,
+        outputs=(*(r.text for r in replies), *[""] * unsaid),
+        truncated=any(r.ended == "length" for r in replies),
+        tokens=sum(r.tokens for r in replies),
+    )
+
+
+def _text(text: str) -> dict[str, Any]:
+    return {"type": "text", "text": text}
+
+
+class _Asker:
+    """Replies by what was asked: from the cache, else from the endpoint until it fails or the budget is spent.
+
+    Args:
+        limit: Most requests; None: no limit.
+    """
+
+    def __init__(self, endpoint: Endpoint, cache: Path, limit: int | None) -> None:
+        import openai
+
+        self._key = os.environ.get("OPENAI_API_KEY", "").strip()
+        if not (self._key.isascii() and self._key.isprintable()):
+            raise UserError("OPENAI_API_KEY: has characters that no key has; set it again")
+        self._endpoint, self._cache, self._limit = endpoint, cache, limit
+        # A server of one's own wants no key, but the client does.
+        self._client = openai.OpenAI(base_url=endpoint.url, api_key=self._key or "none", timeout=endpoint.timeout)
+        self._known = _read_cache(cache)
+        self.used: dict[str, Reply] = {}
+        self.sent = 0
+        self.failure = ""
+        """Why the endpoint is asked no more."""
+
+    def ask(self, messages: Sequence[dict[str, Any]]) -> Reply | None:
+        """The reply to a conversation; None where it is not known and may not be asked for."""
+        sent = json.dumps([self._endpoint.url, self._request(messages)], sort_keys=True)
+        request = hashlib.sha256(sent.encode()).hexdigest()
+        reply = self._known.get(request)
+        if reply is None:
+            if self.failure or self.sent == self._limit:
+                return None
+            self.sent += 1
+            reply = self._send(request, messages)
+            if reply is None:
+                return None
+            self._cache.parent.mkdir(parents=True, exist_ok=True)
+            with self._cache.open("a", encoding="utf-8") as stream:
+                stream.write(reply.model_dump_json() + "\n")
+            self._known[request] = reply
+        self.used[request] = reply
+        return reply
+
+    def _request(self, messages: Sequence[dict[str, Any]]) -> dict[str, Any]:
+        return {
+            "model": self._endpoint.model,
+            "messages": list(messages),
+            "temperature": self._endpoint.temperature,
+            "max_completion_tokens": self._endpoint.max_tokens,
+        }
+
+    def _send(self, request: str, messages: Sequence[dict[str, Any]]) -> Reply | None:
+        import openai
+
+        try:
+            completion = self._client.chat.completions.create(**self._request(messages))
+            if isinstance(getattr(completion, "choices", None), list):
+                return _read(completion, request)
+            self._fail(
+                f"its answer has no choices ({getattr(completion, 'error', None) or completion}); is the URL right?"
+            )
+        except openai.BadRequestError as error:
+            if error.code in FILTERS:
+                return Reply(request=request, text="", ended=FILTERS[0], tokens=0, model="", day=_today())
+            self._fail(error.message)
+        except openai.APIStatusError as error:
+            keyless = error.status_code in (401, 403) and not self._key
+            self._fail(f"{'OPENAI_API_KEY is not set: ' if keyless else ''}{error.message}")
+        except openai.APITimeoutError:
+            self._fail(f"no answer within {self._endpoint.timeout:g} s")
+        except openai.APIConnectionError as error:
+            self._fail(f"cannot be reached ({error.__cause__ or error})")
+        except (openai.OpenAIError, ValueError) as error:
+            self._fail(f"its answer is no JSON ({error}); is the URL right?")
+        return None
+
+    def _fail(self, why: str) -> None:
+        """Keep the reason in one short line; an endpoint may quote the key."""
+        words = " ".join(why.split())
+        self.failure = f"{self._endpoint.url}: {words.replace(self._key, '[key]') if self._key else words}"[:400]
+
+
+def _read(completion: ChatCompletion, request: str) -> Reply:
+    """What a completion says, whatever of it is missing or of another type: the client checks no types."""
+    choice: Any = next(iter(completion.choices), None)
+    message, ended = (getattr(choice, name, None) for name in ("message", "finish_reason"))
+    content, refused = (getattr(message, name, None) for name in ("content", "refusal"))
+    # Half a character, which JSON can hold, cannot be written to a file.
+    text = content.encode(errors="replace").decode().strip() if isinstance(content, str) and not refused else ""
+    if refused:
+        ended = "refusal"
+    elif not text and ended in (None, "stop"):
+        ended = "nothing"
+    tokens = getattr(completion.usage, "completion_tokens", None)
+    return Reply(
+        request=request,
+        text=text,
+        ended=str(ended or "unsaid"),
+        tokens=tokens if isinstance(tokens, int) else 0,
+        model=str(getattr(completion, "model", None) or ""),
+        day=_today(),
+    )
+
+
+def _read_cache(file: Path) -> dict[str, Reply]:
+    if not file.is_file():
+        return {}
+    content = file.read_bytes()
+    whole = content.rfind(b"\n") + 1
+    if whole < len(content):
+        # A run that was killed while it wrote: that reply is asked for again.
+        with file.open("rb+") as stream:
+            stream.truncate(whole)
+    return {reply.request: reply for reply in read_jsonl(file, Reply)}
+
+
+def _check(endpoint: Endpoint) -> None:
+    try:
+        parts = urlsplit(endpoint.url)
+        whole = parts.scheme in ("http", "https") and parts.hostname and parts.port != 0
+    except ValueError:
+        whole = False
+    if not whole:
+        raise UserError(f"--endpoint: {endpoint.url} is no URL such as https://api.openai.com/v1")
+    if parts.username or parts.password or parts.query or parts.fragment:
+        raise UserError("--endpoint: the URL is written beside the answers; put a key into OPENAI_API_KEY instead")
+    if not endpoint.model.strip():
+        raise UserError("--model: is empty; name one that the endpoint has")
+
+
+def _frames(folder: Path, most: int) -> Show:
+    """Those frames of a video that every variant is given, as PNG: what was kept, bit by bit."""
+    store = FrameStore(folder)
+
+    @lru_cache(maxsize=64)
+    def show(video_id: str, object_id: str) -> list[str]:
+        count = len(store.rows(video_id))
+        if not count:
+            raise UserError(f"{folder}: no frame of {video_id}; run `dvc repro extract_frames`")
+        frames = store.pictures(video_id, sorted(set(sample_evaluation(count, most))))
+        return [_url(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR), "png") for frame in frames]
+
+    return show
+
+
+def _photos(folder: Path, objects: Sequence[str], most: int) -> Show:
+    """Photos of an object, upright and without what a camera notes beside them (such as the place)."""
+    found = {o: _inside(folder, o) for o in objects}
+    if missing := [o for o, files in found.items() if not files]:
+        name, kinds = missing[0], ", ".join(PHOTO_SUFFIXES)
+        others = f" (nor of {len(missing) - 1} others)" if missing[1:] else ""
+        raise UserError(f"{folder}: no photo of {name}{others}; put {name}.jpg or a folder {name}/ there ({kinds})")
+
+    @lru_cache(maxsize=64)
+    def of_object(object_id: str) -> list[str]:
+        files = found[object_id]
+        return [_url(_read_photo(files[i]), "jpg") for i in sorted(set(sample_evaluation(len(files), most)))]
+
+    return lambda video_id, object_id: of_object(object_id)
+
+
+def _inside(folder: Path, object_id: str) -> list[Path]:
+    """The files of an object: those named after it, and those in the folder of its name."""
+    files = chain(folder.glob(f"{object_id}.*"), (folder / object_id).glob("[!.]*"))
+    return sorted(f for f in files if f.suffix.lower() in PHOTO_SUFFIXES)
+
+
+def _read_photo(file: Path) -> Picture:
+    data = np.fromfile(file, np.uint8)
+    # OpenCV turns it as its camera noted that it was held.
+    photo: Picture | None = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    if photo is None:
+        raise UserError(f"{file}: not a picture that can be read; replace it")
+    scale = min(1.0, LONGEST / max(photo.shape[:2]))
+    shrunk: Picture = cv2.resize(photo, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return shrunk
+
+
+def _url(picture: Picture, kind: str) -> str:
+    done, data = cv2.imencode(f".{kind}", picture)
+    assert done, "a picture of 8 bits can be encoded"
+    return f"data:image/{'jpeg' if kind == 'jpg' else kind};base64,{base64.b64encode(data.tobytes()).decode()}"
+
+
+def _today() -> str:
+    return datetime.now(UTC).date().isoformat()

@@ -1,0 +1,563 @@
+"""`octopi answer-with` against a server on this machine that speaks the protocol: well, badly, or not at all."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import os
+import re
+import runpy
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+from pipeline.cli import app, main
+from pipeline.errors import UserError
+from pipeline.evaluation.answer_with import instruction
+from pipeline.io import read_jsonl, read_table, write_jsonl, write_table
+from pipeline.records import Assignment, Frame, GradedVision, Opd, Part, Prediction, Question, Shown, Turn
+from pipeline.report.load import load_report
+from pipeline.stage import alone
+from pipeline.tasks.questions import build_questions, pool_of
+from pipeline.videos.catalogue import Catalogue
+from tests.closure import ROOT, closure
+from tests.fake_run import fake_params, write_run
+
+KEY = "sk-a-key-that-nobody-may-see"
+PLACE = Path("external/smoke-scenes/some-maker-sees-1-frames")
+KEPT = (7, 3, 1)
+"""Frames that were kept of the first, second and third video, and so on."""
+DRAWN = {7: [0, 1, 2, 4, 5], 3: [0, 1, 2], 1: [0]}
+"""Of so many, five at uniform intervals from the first, each once."""
+Step = Callable[[int], tuple[int, dict[str, str], bytes]]
+
+
+class Server:
+    """Keeps what it is sent, and answers the n-th request (from 0) as the test's `step` says."""
+
+    def __init__(self) -> None:
+        self.step: Step = lambda n: reply("I cannot tell.")
+        self.bodies: list[dict[str, Any]] = []
+        self.headers: list[Any] = []
+        outer = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_POST(self) -> None:
+                body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+                outer.bodies.append(body)
+                outer.headers.append(self.headers)
+                status, headers, content = outer.step(len(outer.bodies) - 1)
+                try:
+                    self.send_response(status)
+                    for name, value in {"Content-Length": str(len(content)), **headers}.items():
+                        self.send_header(name, value)
+                    self.end_headers()
+                    self.wfile.write(content)
+                except OSError:
+                    # The client waits no more.
+                    pass
+
+            def log_message(self, *_: Any) -> None:
+                pass
+
+        self.http = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self.url = f"http://127.0.0.1:{self.http.server_address[1]}/v1"
+
+
+@pytest.fixture
+def server() -> Iterator[Server]:
+    server = Server()
+    thread = threading.Thread(target=server.http.serve_forever, kwargs={"poll_interval": 0.01})
+    thread.start()
+    yield server
+    server.http.shutdown()
+    thread.join()
+    server.http.server_close()
+
+
+def answered(message: Any, ended: Any = "stop", **more: Any) -> dict[str, Any]:
+    return {
+        "id": "1",
+        "object": "chat.completion",
+        "created": 1,
+        "model": "sees-1-of-may",
+        "choices": [{"index": 0, "message": message, "finish_reason": ended}],
+        "usage": {"prompt_tokens": 9, "completion_tokens": 5, "total_tokens": 14},
+        **more,
+    }
+
+
+def as_json(content: Any, status: int = 200, **headers: str) -> tuple[int, dict[str, str], bytes]:
+    return status, {"Content-Type": "application/json", **headers}, json.dumps(content).encode()
+
+
+def reply(text: str) -> tuple[int, dict[str, str], bytes]:
+    return as_json(answered({"role": "assistant", "content": text}))
+
+
+def soon(status: int, message: str = "not now") -> tuple[int, dict[str, str], bytes]:
+    """An error after which the client need not wait long before it asks again."""
+    return as_json({"error": {"message": message, "code": None}}, status, **{"retry-after-ms": "1"})
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory, catalogue: Catalogue) -> Path:
+    """A run down to its answers, with frames of noise for the videos of the test objects."""
+    root = tmp_path_factory.mktemp("run")
+    params = write_run(
+        root,
+        fake_params(
+            *("ablation.encoders=[finetuned]", "ablation.lora=[with]", "ablation.opd=[all]", "ablation.touch=[]"),
+            *("questions.evaluation={opd:2,pc:2,pss:2,pom:2,psr:2}", "cross_validation.models=[probe]"),
+        ),
+    )
+    assert params.frames.per_video == 5
+    data = root / "data"
+    split = read_table(data / "splits" / "0.parquet", Assignment)
+    training = build_questions(
+        pool_of(Part.TRAIN, split, catalogue), {"PC": 9, "PSS": 1, "POM": 12}, seed=0, distinct=True
+    )
+    write_jsonl(data / "questions" / "0" / "train.jsonl", training)
+    videos = sorted(a.video_id for a in split if a.part is Part.TEST)
+    kept = [(v, i) for n, v in enumerate(videos) for i in range(KEPT[n % 3])]
+    frames = [Frame(video_id=v, frame_index=2 * i, score=0, row=row) for row, (v, i) in enumerate(kept)]
+    write_table(data / "frames" / "frames.parquet", Frame, frames)
+    pixels = np.random.default_rng(0).integers(0, 256, (len(kept), 16, 16, 3), np.uint8)
+    np.save(data / "frames" / "frames.npy", pixels)
+    return root
+
+
+@pytest.fixture
+def project(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of it as the working directory."""
+    shutil.copytree(made, tmp_path, symlinks=True, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("OPENAI_API_KEY", KEY)
+    return tmp_path
+
+
+def asked() -> list[Question]:
+    return read_jsonl(Path("data/questions/0/evaluation.jsonl"), Question)
+
+
+def turns() -> list[tuple[Question, int, Turn]]:
+    """What has to be asked, in order."""
+    return [(q, n, t) for q in asked() for d in q.dialogues if d.opd is Opd.ALL for n, t in enumerate(d.turns)]
+
+
+def right(n: int) -> tuple[int, dict[str, str], bytes]:
+    return reply(turns()[n][2].assistant)
+
+
+def run(server: Server, *more: str, shown: str = "frames", status: int = 0) -> str:
+    """Run the command; what it said, in one line."""
+    arguments = ["answer-with", "--endpoint", server.url, "--model", "some-maker/sees-1", "--input", shown, *more]
+    done = CliRunner().invoke(app, arguments)
+    if status:
+        assert isinstance(done.exception, UserError), done.output
+        said = str(done.exception)
+    else:
+        assert done.exit_code == 0, (done.output, done.exception)
+        said = done.output.strip()
+    assert "\n" not in said
+    return said
+
+
+def shown_in(content: list[dict[str, Any]]) -> tuple[str, list[list[Image.Image]]]:
+    """The text of a message with `{tactile}` for each run of pictures, and these pictures."""
+    text, pictures, last = "", [], "text"
+    for part in content:
+        if part["type"] == "text":
+            text += part["text"]
+        else:
+            kind, _, data = part["image_url"]["url"].partition(";base64,")
+            picture = Image.open(io.BytesIO(base64.b64decode(data, validate=True)))
+            assert kind == f"data:image/{picture.format.lower()}"
+            if last == "text":
+                text += "{tactile}"
+                pictures.append([])
+            pictures[-1].append(picture)
+        last = part["type"]
+    return text, pictures
+
+
+def graded() -> list[GradedVision]:
+    runpy.run_path(str(ROOT / "stages" / "grade.py"), run_name="__main__")
+    return read_table(Path("data/graded_vision.parquet"), GradedVision)
+
+
+def nobody_wrote_the_key(project: Path) -> bool:
+    return not [f for f in project.rglob("*") if f.is_file() and not f.is_symlink() and KEY.encode() in f.read_bytes()]
+
+
+def test_frames_and_questions_arrive_whole_and_answers_are_graded(
+    project: Path, server: Server, catalogue: Catalogue
+) -> None:
+    server.step = right
+    said = run(server)
+    assert said == f"{PLACE}: 12 requests; 10 of 10 questions are answered; `dvc repro` grades them"
+    pixels, index = np.load("data/frames/frames.npy"), read_table(Path("data/frames/frames.parquet"), Frame)
+    training = read_jsonl(Path("data/questions/0/train.jsonl"), Question)
+    kinds = {t: list(dict.fromkeys(q.gold.choice for q in training if q.task == t)) for t in ("PC", "PSS", "POM")}
+    assert {t: len(found) for t, found in kinds.items()} == {"PC": 3, "PSS": 1, "POM": 6}
+    examples = {
+        task: [next(q for q in training if (q.task, q.gold.choice) == (task, choice)) for choice in found[:3]]
+        for task, found in kinds.items()
+    }
+    for (question, number, turn), body in zip(turns(), server.bodies, strict=True):
+        assert (body["model"], body["temperature"], body["max_completion_tokens"]) == ("some-maker/sees-1", 0, 1024)
+        assert [m["role"] for m in body["messages"]] == ["user", "assistant", "user"][: 2 * number + 1]
+        before = instruction(catalogue, Shown.FRAMES, examples.get(question.task, [])) if number == 0 else ""
+        text, pictures = shown_in(body["messages"][-1]["content"])
+        assert text == before + turn.user
+        assert len(pictures) == turn.user.count("{tactile}") == (0 if number else len(question.videos))
+        for video, found in zip(question.videos, pictures, strict=False):
+            rows = [f.row for f in index if f.video_id == video]
+            wanted = [pixels[rows[i]] for i in DRAWN[len(rows)]]
+            np.testing.assert_array_equal([np.asarray(p) for p in found], wanted)
+    second = next(body for (_, n, _), body in zip(turns(), server.bodies, strict=True) if n == 1)
+    first = server.bodies[server.bodies.index(second) - 1]
+    assert second["messages"][0] == first["messages"][0], "the first turn stands before the second as it was asked"
+    assert {h["Authorization"] for h in server.headers} == {f"Bearer {KEY}"}
+    predictions = read_jsonl(PLACE / "0.jsonl", Prediction)
+    assert [p.question_id for p in predictions] == [q.question_id for q in asked()]
+    scores = graded()
+    assert len(scores) == 2 * 4 + 8
+    assert all(s.correct and s.parsed and (s.model, s.shown) == ("some-maker/sees-1", "frames") for s in scores)
+    assert nobody_wrote_the_key(project)
+
+
+def test_instruction_names_every_class_and_only_its_own_example(catalogue: Catalogue) -> None:
+    def question(task: str, user: str) -> Question:
+        dialogue = {"opd": Opd.ALL, "turns": [{"user": user, "assistant": f"An answer to {task}."}]}
+        gold = {"choice": "", "labels": [], "properties": []}
+        some = {"part": "train", "videos": [], "objects": [], "gold": gold}
+        return Question.model_validate({"question_id": "x", "task": task, "dialogues": [dialogue], **some})
+
+    text = instruction(catalogue, Shown.PHOTOS, [question("PC", "Is {tactile} softer than {tactile}?")])
+    for prop in catalogue.properties:
+        assert f"{prop.spoken} ({', '.join(prop.levels)})" in text
+    assert "Question: Is [pictures] softer than [pictures]?\nAnswer: An answer to PC." in text
+    assert "{" not in text
+    assert "photos" in text
+    assert "Question" not in instruction(catalogue, Shown.FRAMES, [])
+
+
+def test_budget_and_going_on_ask_nothing_twice(project: Path, server: Server) -> None:
+    server.step = right
+    assert "0 requests; 0 of 10 questions" in run(server, "--limit", "0")
+    assert not PLACE.exists()
+    assert "5 requests; " in run(server, "--limit", "5")
+    assert len(server.bodies) == 5
+    some = read_jsonl(PLACE / "0.jsonl", Prediction)
+    assert 0 < len(some) < 6
+    assert {s.question_id for s in graded()} == {p.question_id for p in some}, "what there is can be graded"
+    run(server)
+    assert "0 requests; 10 of 10" in run(server)
+    sent = [json.dumps(body) for body in server.bodies]
+    assert len(sent) == len(set(sent)) == len(turns())
+    server.http.server_close()
+    assert "0 requests" in run(server, "--limit", "0"), "what is known needs no server"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="kills by a signal")
+def test_a_killed_run_loses_nothing(project: Path, server: Server) -> None:
+    """Killed while the sixth reply is on its way; then half of the fifth's line is lost, too."""
+    process: list[subprocess.Popen[bytes]] = []
+
+    def step(n: int) -> tuple[int, dict[str, str], bytes]:
+        if n == 5:
+            process[0].send_signal(signal.SIGKILL)
+        return right(n)
+
+    server.step = step
+    options = ["--endpoint", server.url, "--model", "some-maker/sees-1", "--input", "frames"]
+    command = [sys.executable, "-c", "from pipeline.cli import main; main()", "answer-with", *options]
+    process.append(subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(ROOT)}))
+    assert process[0].wait(120) == -signal.SIGKILL
+    cache = PLACE / "cache.jsonl"
+    lines = cache.read_bytes().splitlines(keepends=True)
+    assert len(lines) == 5
+    cache.write_bytes(b"".join(lines[:4]) + lines[4][: len(lines[4]) // 2])
+    server.step = lambda n: right(n - 2)
+    run(server)
+    assert len(server.bodies) == 6 + 12 - 4
+    assert server.bodies[6:8] == server.bodies[4:6]
+    assert all(s.correct for s in graded())
+
+
+FAILURES: dict[str, tuple[Step, str]] = {
+    "key": (lambda n: as_json({"error": {"message": f"Incorrect key: {KEY}"}}, 401), r"401.*Incorrect key: \[key\]"),
+    "no such model": (lambda n: as_json({"error": {"message": "no such model"}}, 404), "404.*no such model"),
+    "too large": (lambda n: as_json({"error": {"message": "context\nlength", "code": "long"}}, 400), "400.*context"),
+    "too many": (lambda n: soon(429, "slow down"), "429.*slow down"),
+    "broken": (lambda n: soon(500), "500.*not now"),
+    "a page": (lambda n: (200, {"Content-Type": "text/html"}, b"<html>\n<p>Welcome"), "no choices.*Welcome.*URL"),
+    "no JSON": (lambda n: (200, {"Content-Type": "application/json"}, b'{"choices": ['), "no JSON.*URL"),
+    "no object": (lambda n: as_json(["a"]), "no choices"),
+    "null": (lambda n: as_json(None), "no choices"),
+    "nothing in it": (lambda n: as_json({}), "no choices"),
+    "error with status 200": (lambda n: as_json({"error": {"message": "upstream is down"}}), "upstream is down"),
+    "choices are null": (lambda n: as_json(answered(None, choices=None)), "no choices"),
+}
+
+
+@pytest.mark.parametrize("name", FAILURES)
+def test_a_failing_endpoint_is_one_line_and_loses_nothing(project: Path, server: Server, name: str) -> None:
+    failure, words = FAILURES[name]
+    server.step = lambda n: right(n) if n < 4 else failure(n)
+    said = run(server, status=1)
+    assert re.search(words, said), said
+    assert said.startswith(f"answer-with@some-maker-sees-1-frames: {server.url}: ")
+    assert said.endswith("questions are answered, run it again to go on")
+    assert KEY not in said
+    assert nobody_wrote_the_key(project)
+    before = len(server.bodies)
+    assert before == 4 + (3 if name in ("too many", "broken") else 1), (
+        "the client's own repeats, and nothing after that"
+    )
+    assert all(s.correct for s in graded())
+    server.step = lambda n: right(n - before + 4)
+    assert f"{12 - 4} requests; 10 of 10" in run(server)
+    assert all(s.correct for s in graded())
+
+
+def test_what_passes_is_asked_again_by_the_client(project: Path, server: Server) -> None:
+    """Twice 429, once 503, then the answer: four requests arrive for two of ours."""
+    hiccups = {0: 429, 1: 429, 4: 503}
+    order = iter(range(100))
+    server.step = lambda n: soon(hiccups[n]) if n in hiccups else right(next(order))
+    assert "12 requests; 10 of 10" in run(server)
+    assert len(server.bodies) == 12 + len(hiccups)
+    assert all(s.correct for s in graded())
+
+
+def test_a_server_that_is_silent_or_gone(
+    project: Path, server: Server, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("openai._base_client.INITIAL_RETRY_DELAY", 0.01)
+    asleep = threading.Event()
+
+    def step(n: int) -> tuple[int, dict[str, str], bytes]:
+        if n >= 2:
+            asleep.wait(30)
+        return right(n)
+
+    server.step = step
+    assert "no answer within 0.3 s" in run(server, "--timeout", "0.3", status=1)
+    asleep.set()
+    options = ["--endpoint", "http://127.0.0.1:9/v1", "--model", "m", "--input", "frames"]
+    monkeypatch.setattr(sys, "argv", ["octopi", "answer-with", *options])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    said = capsys.readouterr().err
+    assert ended.value.code == 1
+    assert said.count("\n") == 1
+    assert "http://127.0.0.1:9/v1: cannot be reached" in said
+
+
+SAYS_NOTHING: dict[str, tuple[Any, str]] = {
+    "no choice": (answered(None, choices=[]), "nothing"),
+    "null for a choice": (answered(None, choices=[None]), "nothing"),
+    "no message": (answered(None), "nothing"),
+    "null": (answered({"role": "assistant", "content": None}), "nothing"),
+    "empty": (answered({"role": "assistant", "content": " \n"}), "nothing"),
+    "another type": (answered({"role": "assistant", "content": [{"type": "text", "text": "Yes."}]}), "nothing"),
+    "refused": (answered({"role": "assistant", "content": None, "refusal": "I will not."}), "refusal"),
+    "filtered": (answered({"role": "assistant", "content": ""}, "content_filter"), "content_filter"),
+    "thought too long": (answered({"role": "assistant", "content": None}, "length", usage=None), "length"),
+}
+
+
+@pytest.mark.parametrize("name", [*SAYS_NOTHING, "status 400"])
+def test_no_answer_is_counted_and_not_asked_for_again(project: Path, server: Server, name: str) -> None:
+    if name == "status 400":
+        bad, ended = as_json({"error": {"message": "filtered", "code": "content_filter"}}, 400), "content_filter"
+    else:
+        content, ended = SAYS_NOTHING[name]
+        bad = as_json(content)
+    # A question of one turn, and the first of two turns: nobody asks the second.
+    spoilt = [
+        next(i for i, (q, _, _) in enumerate(turns()) if q.task == "PC"),
+        next(i for i, (q, _, _) in enumerate(turns()) if q.task == "PSR"),
+    ]
+    order = iter([i for i in range(12) if i != spoilt[1] + 1])
+
+    def step(n: int) -> tuple[int, dict[str, str], bytes]:
+        i = next(order)
+        return bad if i in spoilt else right(i)
+
+    server.step = step
+    assert f"11 requests; 2 ended with {ended}; 10 of 10" in run(server)
+    assert "0 requests; 2 ended" in run(server)
+    lost = {turns()[i][0].question_id for i in spoilt}
+    scores = graded()
+    assert len(scores) == 16
+    assert {s.question_id for s in scores if not s.parsed} == lost == {s.question_id for s in scores if not s.correct}
+    said = {p.question_id: p for p in read_jsonl(PLACE / "0.jsonl", Prediction)}
+    assert sorted(said[i].outputs for i in lost) == [("",), ("", "")]
+    assert {said[i].truncated for i in lost} == {ended == "length"}
+
+
+def test_odd_texts_survive(project: Path, server: Server) -> None:
+    """Line separators of Unicode, half a character, and an answer that was cut; the first two end for no reason."""
+    texts = ["No.\u2028Conclusion: Yes\x85and so", "Half \ud800 of one", "Both"]
+    bodies = [answered({"role": "assistant", "content": t}, "length" if t == "Both" else None) for t in texts]
+    one_turn = [q for q in asked() if q.task != "PSR"]
+    write_jsonl(Path("data/questions/0/evaluation.jsonl"), one_turn)
+    server.step = lambda n: as_json(bodies[n])
+    assert "3 requests; 1 ended with length; 2 ended with unsaid; 3 of 8" in run(server, "--limit", "3")
+    assert "0 requests; 1 ended with length; 2 ended with unsaid; 3 of 8" in run(server, "--limit", "0")
+    said = read_jsonl(PLACE / "0.jsonl", Prediction)
+    assert [p.outputs[0] for p in said] == [texts[0], "Half ? of one", "Both"]
+    assert [p.truncated for p in said] == [False, False, True]
+
+
+@pytest.fixture
+def photos(project: Path) -> Path:
+    """Of each object photos in a colour of its own: of one three files in a folder, of the others a file."""
+    folder = project / "my photos"
+    objects = sorted({o for q in asked() for o in q.objects})
+    for number, name in enumerate(objects):
+        colour = (20 + 60 * number % 230, 40, 90 * number % 200)
+        if number:
+            exif = Image.Exif()
+            exif[0x0112], exif[0x010F] = 6, "A camera's maker"
+            folder.mkdir(exist_ok=True)
+            Image.new("RGB", (2000, 1000), colour).save(folder / f"{name}.JPG", format="JPEG", exif=exif)
+        else:
+            (folder / name).mkdir(parents=True)
+            for i in range(7):
+                Image.new("RGB", (8, 8 + i), colour).save(folder / name / f"{i}.png")
+            (folder / name / ".hidden.png").write_bytes(b"")
+            (folder / name / "notes.txt").write_text("no picture")
+    return folder
+
+
+def test_photos_stand_in_place_of_the_videos_of_their_objects(project: Path, photos: Path, server: Server) -> None:
+    server.step = right
+    run(server, str(photos), shown="photos")
+    objects, seen = sorted({o for q in asked() for o in q.objects}), set()
+    for (question, number, turn), body in zip(turns(), server.bodies, strict=True):
+        text, pictures = shown_in(body["messages"][-1]["content"])
+        assert text.endswith(turn.user)
+        for name, found in zip(question.objects if number == 0 else (), pictures, strict=True):
+            place = objects.index(name)
+            seen.add(place)
+            sizes = [(512, 1024)] if place else [(8, 8 + i) for i in DRAWN[7]]
+            assert [p.size for p in found] == sizes, "upright, no larger than need be, five of seven"
+            for picture in found:
+                wanted = (20 + 60 * place % 230, 40, 90 * place % 200)
+                np.testing.assert_allclose(np.asarray(picture).mean((0, 1)), wanted, atol=3)
+                assert not picture.getexif()
+    assert {0, 1} <= seen
+    assert all(s.shown is Shown.PHOTOS and s.correct for s in graded())
+
+
+def test_photos_that_lack_or_cannot_be_read(project: Path, photos: Path, server: Server) -> None:
+    objects = sorted({o for q in asked() for o in q.objects})
+    (photos / f"{objects[1]}.JPG").write_bytes(b"no picture")
+    said = run(server, str(photos), shown="photos", status=1)
+    assert f"{objects[1]}.JPG: not a picture" in said
+    (photos / f"{objects[1]}.JPG").write_bytes(b"")
+    assert "not a picture" in run(server, str(photos), shown="photos", status=1)
+    (photos / f"{objects[1]}.JPG").unlink()
+    assert f"no photo of {objects[1]};" in run(server, str(photos), shown="photos", status=1)
+    assert "name the folder" in run(server, shown="photos", status=1)
+    assert f"no photo of {objects[0]} (nor of " in run(server, "nowhere", shown="photos", status=1)
+
+
+@pytest.mark.parametrize(
+    ("url", "words"),
+    [
+        ("api.example.org/v1", "is no URL"),
+        ("ftp://example.org", "is no URL"),
+        ("http://", "is no URL"),
+        ("http://[::1", "is no URL"),
+        ("http://host:99999/v1", "is no URL"),
+        (f"https://me:{KEY}@example.org/v1", "OPENAI_API_KEY"),
+        (f"https://example.org/v1?key={KEY}", "OPENAI_API_KEY"),
+    ],
+)
+def test_a_url_that_is_none_or_holds_a_key(project: Path, server: Server, url: str, words: str) -> None:
+    server.url = url
+    said = run(server, status=1)
+    assert words in said
+    assert KEY not in said
+
+
+def test_other_bad_inputs(project: Path, server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "no frame of" in run(server, str(empty_frames()), status=1)
+    assert "no such file" in run(server, "nowhere", status=1)
+    with alone("answer-with@some-maker-sees-1-frames"):
+        assert "still running" in run(server, status=1)
+    monkeypatch.setenv("OPENAI_API_KEY", f"{KEY}\nX: y")
+    said = run(server, status=1)
+    assert said.endswith("OPENAI_API_KEY: has characters that no key has; set it again")
+    monkeypatch.delenv("OPENAI_API_KEY")
+    server.step = lambda n: as_json({"error": {"message": "who are you"}}, 401)
+    assert "OPENAI_API_KEY is not set: " in run(server, status=1)
+
+
+def empty_frames() -> Path:
+    write_table(Path("other/frames.parquet"), Frame, [])
+    np.save("other/frames.npy", np.zeros((0, 16, 16, 3), np.uint8))
+    return Path("other")
+
+
+def test_it_is_a_row_of_the_report_with_where_it_comes_from(project: Path, server: Server) -> None:
+    """Of the two comparisons one is right and one cannot be read; all else is right."""
+    wrong = next(i for i, (q, _, _) in enumerate(turns()) if q.task == "PC")
+    server.step = lambda n: reply("Perhaps.") if n == wrong else right(n)
+    run(server)
+    graded()
+    runpy.run_path(str(ROOT / "stages" / "report.py"), run_name="__main__")
+    report = load_report(Path("reports/smoke-scenes"))
+    rows = report.scores[report.scores["encoder"].eq("some-maker/sees-1") & report.scores["seed"].eq("all")]
+    found = {(r["task"], r["measure"]): (r["n"], r["accuracy"], r["unread"]) for r in rows.to_dict("records")}
+    whole = dict.fromkeys((("PSS", "choice"), ("POM", "choice"), ("PSR", "choice"), ("OPD", "combined")), (2, 1.0, 0))
+    assert {**whole, ("PC", "choice"): (2, 0.5, 1)}.items() <= found.items()
+    assert set(rows["touch"]) == {"frames"}
+    text = (report.folder / "README.md").read_text()
+    lines = [line for line in text.splitlines() if "some-maker/sees-1, frames of the videos" in line]
+    assert len(lines) == 5 + 3, "a row a task, and one a property"
+    (source,) = report.provenance["vision"]
+    assert (source["endpoint"], source["served_as"], source["ended"]) == (server.url, ["sees-1-of-may"], {"stop": 12})
+    assert "**Vision alone:** `some-maker/sees-1` (there sees-1-of-may)" in text
+    assert pd.read_csv("reports/smoke-scenes/effects.csv").empty, "what parts bring is about our own system alone"
+    write_jsonl(Path("data/questions/0/evaluation.jsonl"), asked()[::-1])
+    assert graded() == []
+    runpy.run_path(str(ROOT / "stages" / "report.py"), run_name="__main__")
+    report = load_report(Path("reports/smoke-scenes"))
+    assert "some-maker/sees-1" not in set(report.scores["encoder"])
+    assert report.provenance["vision"] == []
+
+
+def test_answers_to_other_questions_are_left_out_aloud(
+    project: Path, server: Server, caplog: pytest.LogCaptureFixture
+) -> None:
+    run(server, "--limit", "2")
+    write_jsonl(Path("data/questions/0/evaluation.jsonl"), asked()[::-1])
+    assert graded() == []
+    assert f"{PLACE}: no answers to the questions of seed 0 as they are now" in caplog.text
+    Path(PLACE / "source.json").write_text("{}")
+    with pytest.raises(SystemExit, match=r"source.json: does not say who answered; run `octopi answer-with` again"):
+        graded()
+
+
+def test_no_stage_can_ask_a_network() -> None:
+    for name in ("grade", "report"):
+        assert "pipeline/evaluation/answer_with.py" not in closure(ROOT / "stages" / f"{name}.py")
