@@ -26,7 +26,7 @@ from pipeline.io import read_json, write_json
 from pipeline.language.chat import add_tactile_tokens, render
 from pipeline.records import Turn
 from pipeline.runtime import Quantization
-from pipeline.weights import GET_LLM, check_language
+from pipeline.weights import GET_LLM, check_finite, check_language
 
 ADAPTER_CONFIG = "adapter_config.json"
 ADAPTER_WEIGHTS = "adapter_model.safetensors"
@@ -88,6 +88,7 @@ def load_llm(folder: Path, dtype: torch.dtype, quantization: Quantization = "non
             f"language.weights: {folder} does not fit its config.json ({wrong[0]} is missing or of another shape); "
             f"{GET_LLM.format(folder=folder)}"
         )
+    check_finite(folder, "language.weights", model.named_parameters())
     return model.requires_grad_(False).eval()
 
 
