@@ -26,9 +26,8 @@ from pipeline.weights import DOWNLOADED
 from pipeline.weights.check import check_encoder_files, check_language_files
 from pipeline.weights.make import CATALOGUE
 from pipeline.weights.published import PICTURES
-from tests.checkpoints import CLIP_CONFIG, write_clip
+from tests.checkpoints import CLIP_CONFIG, cut, edit, write_clip
 from tests.closure import ROOT
-from tests.weights.test_whole import cut, edit
 
 REAL_CLIP = PUBLISHED_VISION["clip-vit-large-patch14"]
 WORDS = 600

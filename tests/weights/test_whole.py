@@ -19,26 +19,16 @@ from typer.testing import CliRunner
 
 from pipeline.cli import app
 from pipeline.encoder.clip import load_visual_tower
+from pipeline.encoder.timm_backbone import load_backbone
 from pipeline.errors import UserError
 from pipeline.io import tensor_shapes
-from pipeline.language.base import load_llm
+from pipeline.language.base import load_llm, load_tokenizer
 from pipeline.shapes import Llama, Vision
 from pipeline.weights import check_encoder, check_language
 from pipeline.weights.check import check_encoder_files, check_language_files
-from tests.checkpoints import write_clip, write_llama
+from tests.checkpoints import cut, edit, write_clip, write_llama
 from tests.closure import ROOT
-from tests.encoder.test_backbones import loaded
-from tests.encoders import write_timm
-
-
-def edit(file: Path, **changes: Any) -> None:
-    """Set keys of a JSON object; None takes a key away."""
-    form = json.loads(file.read_text()) | changes
-    file.write_text(json.dumps({k: v for k, v in form.items() if v is not None}))
-
-
-def cut(file: Path, by: int = 1) -> None:
-    file.write_bytes(file.read_bytes()[:-by])
+from tests.encoders import config, write_timm
 
 
 def copy(file: Path, other: Path) -> None:
@@ -199,12 +189,12 @@ def test_a_broken_clip_is_one_line(name: str) -> None:
 
 def test_the_command_names_what_is_broken_before_it_writes() -> None:
     """Also where counting memory reads the same file before."""
-    for name in ("cut by a byte", "empty tokenizer", "no hidden_size"):
+    for name in ("empty tokenizer", "no hidden_size"):
         damage, words = LANGUAGE[name]
         folder = write_llama(Path(name))
         damage(folder)
         assert re.search(words, scale(f"language.weights={folder}") or "")
-    for name in ("cut by a byte", "no width", "a ResNet"):
+    for name in ("cut by a byte", "no width"):
         damage, words = CLIP[name]
         folder = write_clip(Path(name) / "clip")
         damage(folder)
@@ -302,7 +292,15 @@ def test_tensors_are_those_that_open_clip_makes() -> None:
     assert tower.parameters == sum(map(prod, tower.tensors.values()))
 
 
-# Values, at loading
+# At loading
+
+
+@pytest.mark.parametrize("name", [name for name in LANGUAGE if "tokenizer" in name and "words" not in name])
+def test_a_broken_tokenizer_is_one_line_at_loading_too(name: str) -> None:
+    folder = write_llama(Path("llama"))
+    LANGUAGE[name][0](folder)
+    with pytest.raises(UserError, match=r"\Alanguage.weights: [^\n]*llama[^\n]*\Z"):
+        load_tokenizer(folder)
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
@@ -332,4 +330,4 @@ def test_a_timm_network_with_a_nan_in_its_statistics_is_named_at_loading() -> No
     name = next(n for n in load_file(folder / ONE) if n.endswith("running_var"))
     replaced(folder / ONE, name, torch.full_like(load_file(folder / ONE)[name], float("nan")))
     with pytest.raises(UserError, match=rf"{name} in timm/{ONE} holds values that are not finite"):
-        loaded(folder, 2)
+        load_backbone(config(folder, "tuned", backbone=("timm",)), tuned=False)
