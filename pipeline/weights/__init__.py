@@ -138,7 +138,9 @@ def check_finite(folder: Path, key: str, values: Iterable[tuple[str, torch.Tenso
         values: Weights by the name that they have in their file, or by the end of it.
     """
     for name, value in values:
-        if value.is_floating_point() and not value.isfinite().all():
+        # The extremes are not finite where a value is not; unlike a mask of all values, they take no memory, and a
+        # twentieth of the time. Bytes, of four-bit weights, have nothing that is not finite.
+        if value.numel() and value.dtype.itemsize > 1 and not all(e.isfinite() for e in value.aminmax()):
             files = sorted(folder.glob("*.safetensors"))
             file = next((f for f in files if any(stored.endswith(name) for stored in tensor_shapes(f))), folder)
             raise UserError(f"{key}: {name} in {file} holds values that are not finite; {again(folder)}")

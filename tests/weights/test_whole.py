@@ -24,7 +24,7 @@ from pipeline.errors import UserError
 from pipeline.io import tensor_shapes
 from pipeline.language.base import load_llm, load_tokenizer
 from pipeline.shapes import Llama, Vision
-from pipeline.weights import check_encoder, check_language
+from pipeline.weights import check_encoder, check_finite, check_language
 from pipeline.weights.check import check_encoder_files, check_language_files
 from tests.checkpoints import cut, edit, write_clip, write_llama
 from tests.closure import ROOT
@@ -314,6 +314,22 @@ def test_values_that_are_not_finite_are_named_at_loading(bad: float) -> None:
     check_language_files(folder)
     with pytest.raises(UserError, match=rf"\Alanguage.weights: {name} in {file} holds values that are not finite; d"):
         load_llm(folder, torch.float32)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+def test_one_value_that_is_not_finite_is_found_wherever_it_stands(bad: float, dtype: torch.dtype) -> None:
+    draw = torch.Generator().manual_seed(0)
+    largest = torch.finfo(dtype).max
+    for rows, columns in ((1, 1), (3, 7), (129, 65)):
+        value = torch.randn(rows, columns, generator=draw).to(dtype)
+        value[0, 0] = largest
+        check_finite(Path(), "key", [("a", value), ("empty", value[:0]), ("turned", value.T), ("bytes", value.byte())])
+        for place in torch.randint(rows * columns, (40,), generator=draw).tolist():
+            worse = value.clone()
+            worse.view(-1)[place] = bad
+            with pytest.raises(UserError, match="key: w in . holds values that are not finite; download it again"):
+                check_finite(Path(), "key", [("a", value), ("w", worse)])
 
 
 def test_a_tower_with_a_nan_is_named_at_loading() -> None:
