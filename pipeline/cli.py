@@ -51,17 +51,38 @@ def scale(
 
 @app.command()
 def weights(
-    name: Annotated[str, typer.Argument(help="smollm2, efficientnet-lite0, tiny-clip or tiny-llama.")],
-    to: Annotated[Path | None, typer.Option(help="Folder; weights/NAME by default.")] = None,
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="vicuna-7b, vicuna-13b or clip-vit-large of SOURCE; or smollm2, efficientnet-lite0, tiny-clip or "
+            "tiny-llama, which are made here."
+        ),
+    ],
+    source: Annotated[Path | None, typer.Argument(help="Folder that it was downloaded to.")] = None,
+    to: Annotated[Path | None, typer.Option(help="Folder; below weights/ by default.")] = None,
+    trust_pickle: Annotated[
+        bool, typer.Option("--trust-pickle", help="Read tensors from pickles; no code of them is run.")
+    ] = False,
 ) -> None:
-    """Make a base model as a folder of safetensors, from an installed package or (tiny) at random."""
+    """Make a base model as a folder of safetensors, or convert or check a downloaded one."""
     from pipeline.runtime import quiet_libraries
+    from pipeline.weights import DOWNLOADED, MADE
     from pipeline.weights.make import make
+    from pipeline.weights.published import SUMS, adopt
 
     quiet_libraries()
-    folder = to or Path("weights") / name
-    make(name, folder)
-    typer.echo(f"{folder}: made; name it as encoder.weights or language.weights of `octopi scale`")
+    if name not in DOWNLOADED:
+        if source is not None and name in MADE:
+            raise UserError(f"{name} is not downloaded but made; leave {source} out, and name a folder with --to")
+        folder, done = to or Path("weights") / name, "made"
+        make(name, folder)
+    elif source is None:
+        repository = DOWNLOADED[name].repository
+        raise UserError(f"{name}: name the folder that `hf download {repository} --local-dir FOLDER` put it in")
+    else:
+        folder = adopt(name, source, to, trust_pickle=trust_pickle)
+        done = f"{'checked' if folder == source else 'written'}, with {SUMS}"
+    typer.echo(f"{folder}: {done}; name it as encoder.weights or language.weights of `octopi scale`")
 
 
 @app.command()

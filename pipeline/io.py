@@ -176,6 +176,22 @@ def load_tensors(path: Path) -> dict[str, torch.Tensor]:
     return tensors
 
 
+def tensor_shapes(path: Path, mend: str = "get it again") -> dict[str, tuple[int, ...]]:
+    """Names and shapes of the tensors in a safetensors file; only its header is read, and held to the file's length.
+
+    Args:
+        path: It is there.
+        mend: What to do where it is broken, for the UserError.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, "np") as stored:
+            return {name: tuple(stored.get_slice(name).get_shape()) for name in stored.keys()}  # noqa: SIM118
+    except SafetensorError as error:
+        raise UserError(f"{path} is cut off or not a safetensors file ({error}); {mend}") from None
+
+
 def fingerprint(*parts: BaseModel | str | int | Path) -> str:
     """A short hash of settings and of input files (or all files of folders), by which unfinished work is known again.
 

@@ -19,6 +19,7 @@ from pipeline.records import Assignment, Part, Question, Turn
 from pipeline.shapes import FULL, Llama, Vision
 from pipeline.tasks.questions import build_questions, counts_by_task, pool_of
 from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.weights.check import TOKENIZER, read_tokenizer
 
 GIB = 2**30
 BYTES = {"auto": 4, "float32": 4, "bfloat16": 2, "float16": 2}
@@ -89,7 +90,7 @@ def count(params: Params) -> tuple[list[Use], list[str]]:
     if not language.is_dir():
         notes.append(f"{language} is not there: counted with the shapes that are published for {language.name}.")
     lengths = longest(params, catalogue)
-    if not (language / "tokenizer.json").is_file():
+    if not (language / TOKENIZER).is_file():
         notes.append(f"Without its tokenizer, a token is taken for {LETTERS} letters.")
     notes.append(
         f"Longest conversation {lengths.training} tokens, {lengths.answer} of them learnt; longest question "
@@ -239,12 +240,9 @@ def _questions(params: Params, catalogue: Catalogue, part: Part) -> list[Questio
 
 def _tokenizer(folder: Path) -> Callable[[str], int]:
     """What counts a text's tokens."""
-    file = folder / "tokenizer.json"
-    if not file.is_file():
+    if not (folder / TOKENIZER).is_file():
         return lambda text: -(-len(text) // LETTERS)
-    from tokenizers import Tokenizer
-
-    tokenizer = Tokenizer.from_file(str(file))
+    tokenizer = read_tokenizer(folder)
     return lambda text: len(tokenizer.encode(text).ids)
 
 

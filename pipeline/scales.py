@@ -25,6 +25,7 @@ from pipeline.tasks.questions import counts_by_task
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.files import list_videos, raise_errors
 from pipeline.videos.split import FEWEST_TRAINING_OBJECTS, assign_objects
+from pipeline.weights.check import check_encoder_files, check_language_files
 
 CONF = Path("conf")
 TAUGHT = "data/taught"
@@ -110,11 +111,13 @@ def check_inputs(params: Params) -> None:
     check_objects(params, catalogue)
     backbone = getattr(params.encoder, "backbone", ("clip",))
     weights.check_encoder(Path(params.encoder.weights), params.frames.size, backbone)
+    check_encoder_files(Path(params.encoder.weights), backbone)
     if params.language.weights == TAUGHT and not params.teach.base:
         raise UserError(f"language.weights: {TAUGHT} is what teaching makes; name the model to teach in teach.base")
     for key, base in (("teach.base", params.teach.base), ("language.weights", params.language.weights)):
         if base not in ("", TAUGHT):
             weights.check_language(Path(base), key)
+            check_language_files(Path(base), key)
 
 
 def check_objects(params: Params, catalogue: Catalogue) -> None:

@@ -6,18 +6,22 @@ their derivatives need it; tests hold it to what torch keeps.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-from pipeline.io import read_json
+from pipeline.errors import UserError
 
 CLIP_CONFIG, LLM_CONFIG = "open_clip_config.json", "config.json"
 FULL = 4
 """Bytes of a float32 value."""
 DROPPED = 1
 """Bytes that remember whether a value was dropped, on a GPU."""
+AGAIN = "get it again from where the weights are from"
+LIKE_LLAMA = ("llama", "mistral")
+"""Kinds (`model_type`) of language models whose tensors have a Llama's names and shapes."""
 
 
 @dataclass(frozen=True)
@@ -34,16 +38,27 @@ class Vision:
 
     @classmethod
     def read(cls, folder: Path) -> Self | None:
-        """The tower in a folder; by the published shapes of the folder's name where it is not there, or None."""
-        if not (folder / CLIP_CONFIG).is_file():
+        """The tower in a folder; by the published shapes of the folder's name where it is not there.
+
+        None for a name that is not known, and for a tower that is no vision transformer of open_clip's own.
+
+        Raises:
+            UserError: for a broken configuration.
+        """
+        file = folder / CLIP_CONFIG
+        if not file.is_file():
             known = PUBLISHED_VISION.get(folder.name)
             return cls(**known) if known else None
-        model = read_json(folder / CLIP_CONFIG)["model_cfg"]
-        form = model["vision_cfg"]
+        model = read_form(file).get("model_cfg")
+        form = model.get("vision_cfg") if isinstance(model, dict) else None
+        if not isinstance(model, dict) or not isinstance(form, dict):
+            raise UserError(f"{file} is no open_clip configuration (model_cfg, vision_cfg); {AGAIN}")
+        if isinstance(form.get("layers"), list) or "timm_model_name" in form:
+            return None
         return cls(
-            **{key: form[key] for key in ("layers", "width", "patch_size", "image_size")},
-            embed_dim=model["embed_dim"],
-            head_width=form.get("head_width", 64),
+            **sizes(form, ("layers", "width", "patch_size", "image_size"), file),
+            **sizes(model, ("embed_dim",), file),
+            **sizes({"head_width": 64} | form, ("head_width",), file),
             quick_gelu=bool(model.get("quick_gelu", False)),
         )
 
@@ -62,6 +77,31 @@ class Vision:
         """Of the whole tower."""
         patches = 3 * self.patch_size**2 * self.width
         return patches + self.width * (1 + self.tokens + 4 + self.embed_dim) + self.layers * self.layer
+
+    @property
+    def tensors(self) -> dict[str, tuple[int, ...]]:
+        """Shapes by name, as a checkpoint has them."""
+        width = self.width
+        layer: dict[str, tuple[int, ...]] = {
+            "attn.in_proj_weight": (3 * width, width),
+            "attn.in_proj_bias": (3 * width,),
+            "attn.out_proj.weight": (width, width),
+            "attn.out_proj.bias": (width,),
+            "mlp.c_fc.weight": (4 * width, width),
+            "mlp.c_fc.bias": (4 * width,),
+            "mlp.c_proj.weight": (width, 4 * width),
+            "mlp.c_proj.bias": (width,),
+        }
+        norms = [f"transformer.resblocks.{i}.{norm}" for i in range(self.layers) for norm in ("ln_1", "ln_2")]
+        found: dict[str, tuple[int, ...]] = {
+            "class_embedding": (width,),
+            "positional_embedding": (self.tokens, width),
+            "conv1.weight": (width, 3, self.patch_size, self.patch_size),
+            "proj": (width, self.embed_dim),
+            **{f"{norm}.{part}": (width,) for norm in ("ln_pre", "ln_post", *norms) for part in ("weight", "bias")},
+            **{f"transformer.resblocks.{i}.{n}": shape for i in range(self.layers) for n, shape in layer.items()},
+        }
+        return {f"visual.{name}": shape for name, shape in found.items()}
 
     def saved(self, frames: int, prompts: int, size: int) -> int:
         """Bytes that a training forward keeps.
@@ -101,19 +141,26 @@ class Llama:
 
     @classmethod
     def read(cls, folder: Path) -> Self | None:
-        """The model in a folder; by the published shapes of the folder's name where it is not there, or None."""
+        """The model in a folder; by the published shapes of the folder's name where it is not there.
+
+        None for a name that is not known, and for another kind of model whose configuration has not a Llama's keys.
+
+        Raises:
+            UserError: for a broken configuration.
+        """
         file = folder / LLM_CONFIG
-        form: dict[str, Any] | None = read_json(file) if file.is_file() else PUBLISHED_LANGUAGE.get(folder.name)
-        if form is None:
+        form = read_form(file) if file.is_file() else PUBLISHED_LANGUAGE.get(folder.name)
+        keys = ("hidden_size", "intermediate_size", "num_hidden_layers", "num_attention_heads", "vocab_size")
+        if form is None or (form.get("model_type") not in LIKE_LLAMA and not form.keys() >= set(keys)):
             return None
-        heads = form["num_attention_heads"]
-        return cls(
-            **{key: form[key] for key in ("hidden_size", "intermediate_size", "num_hidden_layers", "vocab_size")},
-            num_attention_heads=heads,
-            num_key_value_heads=form.get("num_key_value_heads") or heads,
-            head_dim=form.get("head_dim") or form["hidden_size"] // heads,
-            tie_word_embeddings=bool(form.get("tie_word_embeddings", False)),
-        )
+        found = sizes(form, keys, file)
+        # Both may be absent or null.
+        usual = {
+            "num_key_value_heads": found["num_attention_heads"],
+            "head_dim": found["hidden_size"] // found["num_attention_heads"],
+        }
+        own = usual | {key: form[key] for key in usual if form.get(key) is not None}
+        return cls(**found, **sizes(own, usual, file), tie_word_embeddings=bool(form.get("tie_word_embeddings", False)))
 
     @property
     def linear(self) -> dict[str, tuple[int, int]]:
@@ -129,6 +176,24 @@ class Llama:
             "up_proj": (hidden, middle),
             "down_proj": (middle, hidden),
         }
+
+    @property
+    def tensors(self) -> dict[str, tuple[int, ...]]:
+        """Shapes by name, as a checkpoint has them; a linear map has a row for each value that comes out."""
+        hidden = self.hidden_size
+        found: dict[str, tuple[int, ...]] = {
+            "model.embed_tokens.weight": (self.vocab_size, hidden),
+            "model.norm.weight": (hidden,),
+        }
+        if not self.tie_word_embeddings:
+            found["lm_head.weight"] = (self.vocab_size, hidden)
+        for layer in (f"model.layers.{i}" for i in range(self.num_hidden_layers)):
+            for name, (read, made) in self.linear.items():
+                part = "self_attn" if name in ("q_proj", "k_proj", "v_proj", "o_proj") else "mlp"
+                found[f"{layer}.{part}.{name}.weight"] = (made, read)
+            for norm in ("input_layernorm", "post_attention_layernorm"):
+                found[f"{layer}.{norm}.weight"] = (hidden,)
+        return found
 
     @property
     def layer_linear(self) -> int:
@@ -180,6 +245,26 @@ class Llama:
         return 2 * tokens * self.num_hidden_layers * self.num_key_value_heads * self.head_dim * size
 
 
+def read_form(file: Path) -> dict[str, Any]:
+    """A configuration that came with weights; raises UserError where it is no JSON object."""
+    try:
+        form = json.loads(file.read_text(encoding="utf-8"))
+    except ValueError:
+        form = None
+    if not isinstance(form, dict):
+        raise UserError(f"{file} is not a JSON object; {AGAIN}")
+    return form
+
+
+def sizes(form: dict[str, Any], keys: Iterable[str], file: Path) -> dict[str, int]:
+    """The values of these keys of a configuration; raises UserError where one is no whole number of 1 or more."""
+    for key in keys:
+        if type(form.get(key)) is not int or form[key] < 1:
+            found = repr(form[key]) if key in form else "missing"
+            raise UserError(f"{file}: {key} must be a whole number of 1 or more and is {found}; {AGAIN}")
+    return {key: form[key] for key in keys}
+
+
 PUBLISHED_VISION: dict[str, dict[str, Any]] = {
     "clip-vit-large-patch14": {
         "layers": 24,
@@ -191,7 +276,13 @@ PUBLISHED_VISION: dict[str, dict[str, Any]] = {
     }
 }
 """From open_clip_config.json of timm/vit_large_patch14_clip_224.openai, by the folder's name."""
-_VICUNA = {"vocab_size": 32000, "max_position_embeddings": 4096}
+_VICUNA = {
+    "model_type": "llama",
+    "vocab_size": 32000,
+    "max_position_embeddings": 4096,
+    "hidden_act": "silu",
+    "rms_norm_eps": 1e-5,
+}
 PUBLISHED_LANGUAGE: dict[str, dict[str, Any]] = {
     "vicuna-7b-v1.5": {
         "hidden_size": 4096,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors.torch import save_file
@@ -17,6 +18,17 @@ CLIP_CONFIG = {
     },
     "preprocess_cfg": {"mean": [0.5, 0.4, 0.3], "std": [0.2, 0.25, 0.3]},
 }
+
+
+def edit(file: Path, **changes: Any) -> None:
+    """Set keys of a JSON object; None takes a key away."""
+    form = json.loads(file.read_text()) | changes
+    file.write_text(json.dumps({k: v for k, v in form.items() if v is not None}))
+
+
+def cut(file: Path, by: int = 1) -> None:
+    """Take the last bytes of a file away."""
+    file.write_bytes(file.read_bytes()[:-by])
 
 
 def write_clip(folder: Path, seed: int = 0) -> Path:

@@ -10,7 +10,7 @@ from tests.closure import ROOT, imported
 
 CORE = (
     *("__init__", "errors", "records", "runtime", "io", "config", "params", "progress", "parallel", "card"),
-    *("embeddings", "weights", "shapes", "training", "stage"),
+    *("embeddings", "shapes", "weights", "training", "stage"),
 )
 ROOMS = ("videos", "scenes", "tasks", "encoder", "language", "evaluation", "report", "registry", "tracking", "use")
 TOP = ("memory", "scales", "revisions", "compare", "reproduce", "cli")

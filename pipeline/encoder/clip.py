@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from pipeline.errors import UserError
-from pipeline.weights import CLIP_CONFIG, GET_CLIP
+from pipeline.weights import CLIP_CONFIG, GET_CLIP, check_finite
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,7 @@ def load_visual_tower(folder: Path, embedding: Literal["projected", "class_token
     visual = model.visual
     if not isinstance(visual, open_clip.transformer.VisionTransformer) or not visual.transformer.batch_first:
         raise UserError(f"encoder.weights: {folder} is no vision transformer; visual prompts need one such as ViT-L/14")
+    check_finite(folder, "encoder.weights", visual.named_parameters())
     visual.requires_grad_(False).eval()
     if embedding == "class_token":
         visual.proj = None

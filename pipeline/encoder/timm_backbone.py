@@ -18,6 +18,7 @@ from torch.nn import functional as F
 from pipeline.config import EncoderConfig
 from pipeline.encoder.model import FrameEncoder, mean_and_deviation
 from pipeline.errors import UserError
+from pipeline.weights import check_finite
 
 WEIGHTS = "model.safetensors"
 
@@ -102,6 +103,7 @@ def load_backbone(config: EncoderConfig, *, tuned: bool) -> TimmBackbone:
     except (RuntimeError, ValueError, LookupError, TypeError, AttributeError, OSError, SafetensorError) as error:
         reason = " ".join(str(error).split())[:200]
         raise UserError(f"encoder.weights: {folder} does not fit its config.json ({reason})") from None
+    check_finite(folder, "encoder.weights", model.state_dict().items())
     stages = len(getattr(model, "feature_info", ()))
     if not hasattr(model, "forward_intermediates") or not stages:
         raise UserError(f"encoder.weights: {folder} is a network that timm cannot read at a stage; take another")

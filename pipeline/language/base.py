@@ -26,7 +26,7 @@ from pipeline.io import read_json, write_json
 from pipeline.language.chat import add_tactile_tokens, render
 from pipeline.records import Turn
 from pipeline.runtime import Quantization
-from pipeline.weights import GET_LLM, check_language
+from pipeline.weights import GET_LLM, again, check_finite, check_language
 
 ADAPTER_CONFIG = "adapter_config.json"
 ADAPTER_WEIGHTS = "adapter_model.safetensors"
@@ -39,10 +39,17 @@ def load_tokenizer(folder: Path) -> PreTrainedTokenizerBase:
     its id, so that an end token stays one that is learnt and stops an answer.
 
     Raises:
-        UserError: where there is no end token, which answers are stopped by, or no chat template that `render` can use.
+        UserError: for a broken file; where there is no end token, which answers are stopped by; and for no chat
+            template that `render` can use.
     """
     check_language(folder, exists=True)
-    tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True, use_fast=True, trust_remote_code=False)
+    try:
+        tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True, use_fast=True, trust_remote_code=False)
+    except Exception as error:  # The library for tokenizers raises nothing narrower.
+        reason = " ".join(str(error).split())[:200]
+        raise UserError(
+            f"language.weights: the tokenizer in {folder} cannot be read ({reason}); {again(folder)}"
+        ) from None
     if tokenizer.eos_token is None:
         raise UserError(
             f"language.weights: {folder / 'tokenizer_config.json'} names no eos_token; answers end with it, so add it"
@@ -88,6 +95,7 @@ def load_llm(folder: Path, dtype: torch.dtype, quantization: Quantization = "non
             f"language.weights: {folder} does not fit its config.json ({wrong[0]} is missing or of another shape); "
             f"{GET_LLM.format(folder=folder)}"
         )
+    check_finite(folder, "language.weights", model.named_parameters())
     return model.requires_grad_(False).eval()
 
 

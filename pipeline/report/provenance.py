@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-import struct
 import subprocess
 from collections.abc import Sequence
 from importlib import metadata
@@ -17,8 +16,8 @@ import yaml
 
 from pipeline.card import front_matter
 from pipeline.config import EncoderConfig, Params
-from pipeline.errors import UserError
 from pipeline.evaluation.intervals import coverage_note
+from pipeline.io import tensor_shapes
 from pipeline.params import PARAMS_FILE
 from pipeline.records import Assignment, Part, Video
 from pipeline.videos.catalogue import Catalogue
@@ -125,18 +124,8 @@ def base_model(root: Path, folder: str) -> dict[str, Any]:
 
 
 def parameters(file: Path) -> int:
-    """Numbers in a safetensors file, counted from its header.
-
-    Format: eight bytes with the header's length (little endian), then JSON with a shape a tensor
-    (https://huggingface.co/docs/safetensors).
-    """
-    with file.open("rb") as stream:
-        try:
-            (length,) = struct.unpack("<Q", stream.read(8))
-            header = json.loads(stream.read(length))
-        except (struct.error, ValueError, OverflowError, MemoryError):
-            raise UserError(f"{file}: not a safetensors file; get it again") from None
-    return sum(prod(tensor["shape"]) for name, tensor in header.items() if name != "__metadata__")
+    """Numbers in a safetensors file, counted from its header."""
+    return sum(prod(shape) for shape in tensor_shapes(file).values())
 
 
 def digest(folder: Path) -> str:

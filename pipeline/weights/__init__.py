@@ -6,12 +6,16 @@ Folders below data/weights/ are made by the stage `weights` (pipeline.weights.ma
 from __future__ import annotations
 
 import json
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from importlib import metadata
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from pipeline.errors import UserError
+from pipeline.io import tensor_shapes
+
+if TYPE_CHECKING:
+    import torch
 
 MADE_DIR = Path("data/weights")
 """Where the chain puts the base models that it makes itself."""
@@ -35,6 +39,23 @@ MADE = {
 }
 """By the name of the folder; `pipeline.weights.make.WRITERS` has the code of each."""
 
+
+class Downloaded(NamedTuple):
+    """A base model that the user downloads."""
+
+    repository: str
+    """Where it is published, on the Hugging Face hub."""
+    folder: str
+    """Below weights/, as conf/ names it; `pipeline.shapes` has the published values under this name."""
+
+
+DOWNLOADED = {
+    "vicuna-7b": Downloaded("lmsys/vicuna-7b-v1.5", "vicuna-7b-v1.5"),
+    "vicuna-13b": Downloaded("lmsys/vicuna-13b-v1.5", "vicuna-13b-v1.5"),
+    "clip-vit-large": Downloaded("timm/vit_large_patch14_clip_224.openai", "clip-vit-large-patch14"),
+}
+"""By the name that `octopi weights` takes; `pipeline.weights.published` checks and converts them."""
+
 CLIP_CONFIG = "open_clip_config.json"
 CLIP_WEIGHTS = ("open_clip_model.safetensors", "model.safetensors")
 TIMM_CONFIG = "config.json"
@@ -45,8 +66,8 @@ GET_CLIP = (
 )
 GET_TIMM = "set encoder.weights=data/weights/efficientnet-lite0, or save a timm model with timm.models.save_for_hf"
 GET_LLM = (
-    "get Vicuna with `hf download lmsys/vicuna-7b-v1.5 --local-dir {folder}` and convert it to safetensors (README, "
-    "section Real weights), or set language.weights=data/weights/smollm2"
+    "get Vicuna with `hf download lmsys/vicuna-7b-v1.5 --local-dir {folder}-pickled` and `octopi weights vicuna-7b "
+    "{folder}-pickled --to {folder} --trust-pickle`, or set language.weights=data/weights/smollm2"
 )
 
 
@@ -88,7 +109,7 @@ def check_encoder(folder: Path, size: int, backbone: Collection[str] = ("clip",)
 
 
 def check_language(folder: Path, key: str = "language.weights", *, exists: bool = False) -> None:
-    """Raise UserError where `folder` holds no transformers model as safetensors.
+    """Raise UserError where `folder` holds no transformers model as safetensors, with a fast tokenizer.
 
     Args:
         folder: One below data/weights/ may still have to be made.
@@ -98,7 +119,7 @@ def check_language(folder: Path, key: str = "language.weights", *, exists: bool 
     if not exists and _to_be_made(folder, "language", key):
         return
     mend = _mend(folder, GET_LLM)
-    for name in ("config.json", "tokenizer_config.json"):
+    for name in ("config.json", "tokenizer_config.json", "tokenizer.json"):
         if not (folder / name).is_file():
             raise UserError(f"{key}: {folder / name} does not exist; {mend}")
     if not any(folder.glob("*.safetensors")):
@@ -106,6 +127,28 @@ def check_language(folder: Path, key: str = "language.weights", *, exists: bool 
             "only pickles, which are refused because they can run code" if any(folder.glob("*.bin")) else "no weights"
         )
         raise UserError(f"{key}: {folder} has {found}; {mend}")
+
+
+def check_finite(folder: Path, key: str, values: Iterable[tuple[str, torch.Tensor]]) -> None:
+    """Raise UserError where a loaded weight is not finite.
+
+    Args:
+        folder: Where the weights were loaded from.
+        key: The parameter that names it.
+        values: Weights by the name that they have in their file, or by the end of it.
+    """
+    for name, value in values:
+        # The extremes are not finite where a value is not; unlike a mask of all values, they take no memory, and a
+        # twentieth of the time. Bytes, of four-bit weights, have nothing that is not finite.
+        if value.numel() and value.dtype.itemsize > 1 and not all(e.isfinite() for e in value.aminmax()):
+            files = sorted(folder.glob("*.safetensors"))
+            file = next((f for f in files if any(stored.endswith(name) for stored in tensor_shapes(f))), folder)
+            raise UserError(f"{key}: {name} in {file} holds values that are not finite; {again(folder)}")
+
+
+def again(folder: Path) -> str:
+    """What to do where a file of base weights is broken."""
+    return "`dvc repro weights` makes it" if made(folder) else "download it again"
 
 
 def _to_be_made(folder: Path, kind: str, key: str) -> bool:
@@ -138,7 +181,7 @@ def installed(package: str) -> metadata.Distribution:
 
 
 def _mend(folder: Path, text: str) -> str:
-    return "`dvc repro weights` makes it" if made(folder) else text.format(folder=folder)
+    return again(folder) if made(folder) else text.format(folder=folder)
 
 
 def _check_clip(folder: Path, size: int) -> None:

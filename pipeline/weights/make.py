@@ -14,7 +14,7 @@ import yaml
 
 from pipeline.errors import UserError
 from pipeline.io import atomic_folder, write_text
-from pipeline.weights import efficientnet, smollm2, tiny
+from pipeline.weights import DOWNLOADED, efficientnet, smollm2, tiny
 from pipeline.weights.source import Given, Origin
 
 CATALOGUE = Path(__file__).parents[1] / "physiclear"
@@ -56,7 +56,7 @@ def make(name: str, folder: Path, *, seed: int = 0, catalogue: Path = CATALOGUE)
     """
     recipe = RECIPES.get(name)
     if recipe is None:
-        raise UserError(f"weights {name!r} are not known; allowed: {', '.join(RECIPES)}")
+        raise UserError(f"weights {name!r} are not known; allowed: {', '.join((*RECIPES, *DOWNLOADED))}")
     origin = recipe.origin
     given = Given(origin.find() if origin else catalogue, seed)
     with atomic_folder(folder) as temporary:

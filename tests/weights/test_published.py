@@ -1,0 +1,547 @@
+"""Downloaded models in their published layouts, at tiny widths: converted, checked, or refused in a line."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import open_clip
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from sentencepiece import SentencePieceProcessor, SentencePieceTrainer
+from transformers import AutoTokenizer, CLIPConfig, CLIPModel, LlamaConfig, LlamaForCausalLM
+from typer.testing import CliRunner
+
+from pipeline.cli import app
+from pipeline.encoder.clip import load_visual_tower
+from pipeline.errors import UserError
+from pipeline.language.base import load_llm, load_tokenizer
+from pipeline.scales import compose
+from pipeline.shapes import PUBLISHED_LANGUAGE, PUBLISHED_VISION
+from pipeline.weights import DOWNLOADED
+from pipeline.weights.check import check_encoder_files, check_language_files
+from pipeline.weights.make import CATALOGUE
+from pipeline.weights.published import PICTURES
+from tests.checkpoints import CLIP_CONFIG, cut, edit, write_clip
+from tests.closure import ROOT
+
+REAL_CLIP = PUBLISHED_VISION["clip-vit-large-patch14"]
+WORDS = 600
+LLAMA = {
+    "vocab_size": WORDS,
+    "hidden_size": 32,
+    "intermediate_size": 48,
+    "num_hidden_layers": 2,
+    "num_attention_heads": 4,
+}
+FIRST, SECOND = "pytorch_model-00001-of-00002.bin", "pytorch_model-00002-of-00002.bin"
+INDEX = "pytorch_model.bin.index.json"
+TO = Path("weights/vicuna-7b-v1.5")
+LINES = [line for file in sorted(CATALOGUE.iterdir()) for line in file.read_text().splitlines()]
+HARD = [
+    "",
+    "東京 Überraschung 😀",
+    "two  spaces   three",
+    "\ttab\n\nline ",
+    "1.50 / 23",
+    "x ▁ y",
+    "\0",
+    "e\u0301 ﬁ \u3000x",
+]
+
+
+@pytest.fixture(autouse=True)
+def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An empty folder, and models published at these widths."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(PUBLISHED_LANGUAGE, "vicuna-7b-v1.5", PUBLISHED_LANGUAGE["vicuna-7b-v1.5"] | LLAMA)
+    tower = {"layers": 2, "width": 32, "patch_size": 16, "image_size": 32, "embed_dim": 16, "quick_gelu": True}
+    monkeypatch.setitem(PUBLISHED_VISION, "clip-vit-large-patch14", tower)
+
+
+@pytest.fixture(scope="module")
+def pieces(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A SentencePiece model trained with LLaMA's settings."""
+    folder = tmp_path_factory.mktemp("pieces")
+    (folder / "text").write_text("\n".join(LINES))
+    SentencePieceTrainer.train(
+        input=str(folder / "text"),
+        model_prefix=str(folder / "tokenizer"),
+        model_type="bpe",
+        vocab_size=WORDS,
+        byte_fallback=True,
+        split_digits=True,
+        allow_whitespace_only_pieces=True,
+        normalization_rule_name="identity",
+        remove_extra_whitespaces=False,
+        pad_id=-1,
+        unk_id=0,
+        bos_id=1,
+        eos_id=2,
+        minloglevel=2,
+    )
+    return folder / "tokenizer.model"
+
+
+def weights(seed: int = 0) -> dict[str, torch.Tensor]:
+    torch.manual_seed(seed)
+    return dict(LlamaForCausalLM(LlamaConfig(**LLAMA)).half().state_dict())
+
+
+def save_shards(folder: Path, state: dict[str, torch.Tensor], **how: Any) -> None:
+    """Two files with a buffer of each layer beside its weights, as transformers stored it then, and their index."""
+    first = {n: v for n, v in state.items() if "layers.1" not in n and "lm_head" not in n}
+    second = {n: v for n, v in state.items() if n not in first}
+    for layer, part in enumerate((first, second)):
+        part[f"model.layers.{layer}.self_attn.rotary_emb.inv_freq"] = torch.ones(4)
+    torch.save(first, folder / FIRST, **how)
+    torch.save(second, folder / SECOND, **how)
+    places = dict.fromkeys(first, FIRST) | dict.fromkeys(second, SECOND)
+    (folder / INDEX).write_text(json.dumps({"metadata": {"total_size": 0}, "weight_map": places}))
+
+
+def token(content: str) -> dict[str, Any]:
+    return {"content": content, "lstrip": False, "normalized": False, "rstrip": False, "single_word": False}
+
+
+@pytest.fixture
+def vicuna(pieces: Path) -> Path:
+    """A folder as lmsys/vicuna-7b-v1.5 has it: slow tokenizer, pickles, settings of transformers 4.31."""
+    folder = Path("download")
+    folder.mkdir()
+    (folder / "tokenizer.model").write_bytes(pieces.read_bytes())
+    files: dict[str, dict[str, Any]] = {
+        "config.json": {
+            "architectures": ["LlamaForCausalLM"],
+            "model_type": "llama",
+            "hidden_act": "silu",
+            "bos_token_id": 1,
+            "eos_token_id": 2,
+            "pad_token_id": 0,
+            "initializer_range": 0.02,
+            "max_position_embeddings": 4096,
+            "num_key_value_heads": 4,
+            "pretraining_tp": 1,
+            "rms_norm_eps": 1e-05,
+            "rope_scaling": None,
+            "tie_word_embeddings": False,
+            "torch_dtype": "float16",
+            "use_cache": True,
+            **LLAMA,
+        },
+        # Its temperature without sampling is one that transformers no longer saves.
+        "generation_config.json": {
+            "_from_model_config": True,
+            "bos_token_id": 1,
+            "eos_token_id": 2,
+            "pad_token_id": 0,
+            "max_length": 4096,
+            "temperature": 0.9,
+            "top_p": 0.6,
+        },
+        "tokenizer_config.json": {
+            **{f"{kind}_token": {"__type": "AddedToken", **token(text)} for kind, text in NAMED.items()},
+            "add_bos_token": True,
+            "add_eos_token": False,
+            "clean_up_tokenization_spaces": False,
+            "legacy": False,
+            "model_max_length": 4096,
+            "pad_token": None,
+            "padding_side": "right",
+            "sp_model_kwargs": {},
+            "tokenizer_class": "LlamaTokenizer",
+        },
+        "special_tokens_map.json": {"pad_token": "<unk>", **{f"{k}_token": token(text) for k, text in NAMED.items()}},
+    }
+    for name, content in files.items():
+        (folder / name).write_text(json.dumps(content))
+    (folder / "README.md").write_text("---\nlicense: llama2\n---\n")
+    (folder / ".gitattributes").write_text("*.bin filter=lfs")
+    save_shards(folder, weights())
+    return folder
+
+
+NAMED = {"bos": "<s>", "eos": "</s>", "unk": "<unk>"}
+
+
+def octopi(*arguments: str) -> str:
+    """What `octopi weights` prints; its UserError is raised."""
+    result = CliRunner().invoke(app, ["weights", *arguments])
+    if result.exception is not None:
+        raise result.exception
+    return result.output
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {f.relative_to(folder).as_posix(): f.read_bytes() for f in sorted(folder.rglob("*")) if f.is_file()}
+
+
+def refused(words: str) -> Any:
+    return pytest.raises(UserError, match=rf"\A[^\n]*{words}[^\n]*\Z")
+
+
+# ---- language models ----
+
+
+def test_a_downloaded_vicuna_becomes_what_the_chain_reads(vicuna: Path, pieces: Path) -> None:
+    before = contents(vicuna)
+    assert "weights/vicuna-7b-v1.5: written, with SHA256SUMS" in octopi("vicuna-7b", str(vicuna), "--trust-pickle")
+    assert contents(vicuna) == before
+    assert sorted(contents(Path("weights"))) == sorted(
+        f"vicuna-7b-v1.5/{name}"
+        for name in (
+            *("README.md", "SHA256SUMS", "config.json", "generation_config.json", "model-00001-of-00002.safetensors"),
+            *("model-00002-of-00002.safetensors", "model.safetensors.index.json", "special_tokens_map.json"),
+            *("tokenizer.json", "tokenizer.model", "tokenizer_config.json"),
+        )
+    )
+    subprocess.run(["sha256sum", "--check", "--strict", "--quiet", "SHA256SUMS"], cwd=TO, check=True)
+    assert len((TO / "SHA256SUMS").read_text().splitlines()) == 10
+    check_language_files(TO)
+
+    model = load_llm(TO, torch.float16)
+    assert all(torch.equal(value, model.state_dict()[name]) for name, value in weights().items())
+    assert not [name for file in TO.glob("*.safetensors") for name in load_file(file) if "inv_freq" in name]
+    ids = model.generate(torch.tensor([[1, 5, 9]]), max_new_tokens=3, do_sample=False)
+    assert ids.shape[1] > 3
+
+    slow = SentencePieceProcessor(model_file=str(pieces))
+    plain = AutoTokenizer.from_pretrained(TO, local_files_only=True)
+    assert (plain.bos_token, plain.eos_token, plain.unk_token, plain.pad_token) == ("<s>", "</s>", "<unk>", "<unk>")
+    assert len(plain) == WORDS
+    for tokenizer in (plain, load_tokenizer(TO)):
+        for text in [*(line.strip() for line in LINES[::20]), *HARD]:
+            assert tokenizer(text).input_ids == [1, *slow.encode(text)], text
+            assert tokenizer(text, add_special_tokens=False).input_ids == slow.encode(text), text
+    # An end token within a conversation is one, and what follows it is no new word.
+    said = plain("ASSISTANT: soft</s>USER: and", add_special_tokens=False).input_ids
+    assert said.count(2) == 1
+    assert plain.decode(said) == "ASSISTANT: soft</s>USER: and"
+
+
+def test_what_was_converted_is_checked_where_it_lies(vicuna: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    octopi("vicuna-7b", str(vicuna), "--to", "elsewhere", "--trust-pickle")
+    before = contents(Path("elsewhere"))
+    assert "elsewhere: checked, with SHA256SUMS" in octopi("vicuna-7b", "elsewhere")
+    assert contents(Path("elsewhere")) == before
+    octopi("vicuna-7b", "elsewhere", "--to", "copy")
+    assert contents(Path("copy")) == before
+    with refused("elsewhere/config.json has hidden_size 32, but vicuna-13b-v1.5 was published with 5120"):
+        octopi("vicuna-13b", "elsewhere")
+    cut(Path("elsewhere/model-00002-of-00002.safetensors"))
+    with refused("vicuna-7b: elsewhere/model-00002-of-00002.safetensors is cut off"):
+        octopi("vicuna-7b", "elsewhere")
+    with refused("vicuna-7b: elsewhere/model-00002-of-00002.safetensors is cut off"):
+        octopi("vicuna-7b", "elsewhere", "--to", "other")
+    assert not list(Path().glob("*other*"))
+
+
+def test_another_models_fast_tokenizer_is_noticed(vicuna: Path) -> None:
+    octopi("vicuna-7b", str(vicuna), "--trust-pickle")
+    file = TO / "tokenizer.json"
+    form = json.loads(file.read_text())
+    form["model"]["merges"] = form["model"]["merges"][::-1]
+    file.write_text(json.dumps(form))
+    with refused(f"{file} reads texts otherwise than tokenizer.model"):
+        octopi("vicuna-7b", str(TO))
+
+
+def test_safetensors_with_a_slow_tokenizer_need_no_trust(vicuna: Path) -> None:
+    save_file(weights(), vicuna / "model.safetensors", {"format": "pt"})
+    octopi("vicuna-7b", str(vicuna))
+    assert (TO / "model.safetensors").read_bytes() == (vicuna / "model.safetensors").read_bytes()
+    assert not list(TO.glob("*.bin*"))
+    load_tokenizer(TO)
+
+
+@pytest.mark.parametrize("form", ["one file", "before torch 1.6"])
+def test_other_pickles_are_read_too(form: str, vicuna: Path) -> None:
+    if form == "one file":
+        for name in (FIRST, SECOND, INDEX):
+            (vicuna / name).unlink()
+        torch.save(weights(), vicuna / "pytorch_model.bin")
+    else:
+        save_shards(vicuna, weights(), _use_new_zipfile_serialization=False)
+    octopi("vicuna-7b", str(vicuna), "--trust-pickle")
+    assert (TO / "model.safetensors").is_file() == (form == "one file")
+    state = load_llm(TO, torch.float16).state_dict()
+    assert all(torch.equal(value, state[name]) for name, value in weights().items())
+
+
+class Evil:
+    def __reduce__(self) -> Any:
+        return Path.touch, (Path("ran"),)
+
+
+def narrower(folder: Path) -> None:
+    state = weights()
+    state["model.layers.1.mlp.up_proj.weight"] = torch.zeros(48, 31)
+    save_shards(folder, state)
+
+
+def lacking(folder: Path) -> None:
+    save_shards(folder, {name: value for name, value in weights().items() if name != "model.norm.weight"})
+
+
+def fewer_words(folder: Path) -> None:
+    state = weights()
+    (folder / "text").write_text("a b c d e f g h")
+    SentencePieceTrainer.train(
+        input=str(folder / "text"),
+        model_prefix=str(folder / "tokenizer"),
+        vocab_size=WORDS - 1,
+        hard_vocab_limit=False,
+        byte_fallback=True,
+        minloglevel=2,
+    )
+    save_shards(folder, state)
+
+
+VICUNA: dict[str, tuple[Callable[[Path], object], str]] = {
+    "evil": (lambda f: torch.save({"a": Evil()}, f / SECOND), f"{SECOND} is cut off, or holds more than tensors"),
+    "cut": (lambda f: cut(f / SECOND), f"{SECOND} is cut off"),
+    "cut in the middle": (lambda f: cut(f / FIRST, 9000), f"{FIRST} is cut off"),
+    "empty": (lambda f: (f / FIRST).write_bytes(b""), f"{FIRST} is cut off"),
+    "a list": (lambda f: torch.save([torch.zeros(1)], f / FIRST), f"{FIRST} is cut off, or holds more"),
+    "a number": (lambda f: torch.save({"a": 1}, f / FIRST), f"{FIRST} is cut off, or holds more"),
+    "no shard": (lambda f: (f / FIRST).unlink(), f"{FIRST} does not exist, but {INDEX} names it; download it again"),
+    "no index": (lambda f: (f / INDEX).unlink(), "has no weights, neither safetensors nor pytorch_model.bin"),
+    "narrower": (narrower, rf"up_proj.weight in download/{SECOND} is 48 x 31, but .*config.json makes it 48 x 32"),
+    "lacking": (lacking, "download has no tensor model.norm.weight"),
+    "wider": (lambda f: edit(f / "config.json", hidden_size=64), "config.json has hidden_size 64, but .* with 32"),
+    "another norm": (lambda f: edit(f / "config.json", rms_norm_eps=1e-6), "config.json has rms_norm_eps 1e-06, but"),
+    "no config": (lambda f: (f / "config.json").unlink(), "config.json does not exist"),
+    "config cut": (lambda f: cut(f / "config.json", 9), "config.json is not a JSON object"),
+    "no tokenizer_config": (lambda f: (f / "tokenizer_config.json").unlink(), "tokenizer_config.json does not exist"),
+    "no tokenizer": (lambda f: (f / "tokenizer.model").unlink(), "neither tokenizer.json nor tokenizer.model"),
+    "tokenizer cut": (lambda f: cut(f / "tokenizer.model"), "tokenizer.model is no SentencePiece model"),
+    "tokenizer empty": (lambda f: (f / "tokenizer.model").write_bytes(b""), "tokenizer.model is no SentencePiece"),
+    "tokenizer a page": (lambda f: (f / "tokenizer.model").write_text("<html>"), "tokenizer.model is no SentencePiece"),
+    "fewer words": (fewer_words, "tokenizer.model has [0-9]+ words, but vicuna-7b-v1.5 was published with 600"),
+    "fast one empty": (lambda f: (f / "tokenizer.json").write_text(""), "tokenizer.json is no fast tokenizer"),
+}
+
+
+@pytest.mark.parametrize("name", VICUNA)
+def test_a_broken_download_is_one_line_and_leaves_nothing(name: str, vicuna: Path) -> None:
+    damage, words = VICUNA[name]
+    damage(vicuna)
+    with refused(words):
+        octopi("vicuna-7b", str(vicuna), "--trust-pickle")
+    assert not Path("ran").exists()
+    assert not contents(Path("weights"))
+
+
+def test_pickles_are_read_on_the_users_word_alone(vicuna: Path) -> None:
+    torch.save({"a": Evil()}, vicuna / FIRST)
+    with refused(f"download/{FIRST} is a pickle.* add --trust-pickle"):
+        octopi("vicuna-7b", str(vicuna))
+    assert not Path("ran").exists()
+    assert not contents(Path("weights"))
+
+
+def test_the_command_refuses_what_it_cannot_do(vicuna: Path) -> None:
+    with refused("nowhere is no folder; `hf download lmsys/vicuna-13b-v1.5 --local-dir nowhere` makes it"):
+        octopi("vicuna-13b", "nowhere")
+    with refused("clip-vit-large: name the folder that `hf download timm/vit_large_patch14_clip_224.openai"):
+        octopi("clip-vit-large")
+    with refused("tiny-clip is not downloaded but made; leave download out"):
+        octopi("tiny-clip", str(vicuna))
+    with refused("allowed: .*smollm2, tiny-clip, tiny-llama, vicuna-7b, vicuna-13b, clip-vit-large"):
+        octopi("vicuna-33b", str(vicuna))
+    before = contents(vicuna)
+    with refused("download is there already; remove it, or name another folder with --to"):
+        octopi("vicuna-7b", str(vicuna), "--to", str(vicuna), "--trust-pickle")
+    assert contents(vicuna) == before
+
+
+def test_they_go_where_the_scales_look_for_them() -> None:
+    conf = ROOT / "conf"
+    for scale, name in (("paper-7b", "vicuna-7b"), ("paper-13b", "vicuna-13b")):
+        params = compose(scale, conf=conf)
+        assert params.language.weights == f"weights/{DOWNLOADED[name].folder}"
+        assert params.encoder.weights == f"weights/{DOWNLOADED['clip-vit-large'].folder}"
+
+
+def test_openais_clip_is_known_as_open_clip_knows_it() -> None:
+    form = open_clip.get_model_config("ViT-L-14-quickgelu")
+    assert {**form["vision_cfg"], "embed_dim": form["embed_dim"], "quick_gelu": form["quick_gelu"]} == REAL_CLIP
+    known = open_clip.get_pretrained_cfg("ViT-L-14", "openai")
+    assert known["quick_gelu"]
+    assert {key: list(known[key]) for key in PICTURES} == PICTURES
+    assert known["hf_hub"] == f"{DOWNLOADED['clip-vit-large'].repository}/"
+
+
+# ---- CLIP ----
+
+CLIP_TO = Path("weights/clip-vit-large-patch14")
+FILE, FORM = "open_clip_model.safetensors", "open_clip_config.json"
+
+
+def published_clip() -> Path:
+    """As timm/vit_large_patch14_clip_224.openai has it."""
+    folder = write_clip(Path("clip"))
+    (folder / FORM).write_text(json.dumps({"model_cfg": CLIP_CONFIG["model_cfg"], "preprocess_cfg": PICTURES}))
+    return folder
+
+
+@pytest.fixture
+def hugging_face() -> tuple[Path, CLIPModel]:
+    """As openai/clip-vit-large-patch14 has it. No bias is 0 and no scale is 1: fresh ones would hide a wrong place."""
+    folder = Path("clip-hf")
+    torch.manual_seed(0)
+    sides = {"num_hidden_layers": 2, "hidden_act": "quick_gelu", "projection_dim": 16}
+    form = CLIPConfig(
+        projection_dim=16,
+        vision_config={
+            **sides,
+            "hidden_size": 32,
+            "intermediate_size": 128,
+            "num_attention_heads": 2,
+            "image_size": 32,
+            "patch_size": 16,
+        },
+        text_config={
+            **sides,
+            "hidden_size": 24,
+            "intermediate_size": 96,
+            "num_attention_heads": 3,
+            "vocab_size": 40,
+            "max_position_embeddings": 10,
+            "eos_token_id": 39,
+            "bos_token_id": 38,
+        },
+    )
+    model = CLIPModel(form).eval()
+    with torch.no_grad():
+        for value in model.parameters():
+            value.add_(0.2 * torch.randn(value.shape))
+    model.save_pretrained(folder)
+    pictures = {f"image_{key}": value for key, value in PICTURES.items()}
+    (folder / "preprocessor_config.json").write_text(json.dumps({"size": 32, **pictures}))
+    return folder, model
+
+
+def test_a_clip_as_open_clip_has_it_is_checked_where_it_lies() -> None:
+    folder = published_clip()
+    before = contents(folder)
+    assert "clip: checked, with SHA256SUMS" in octopi("clip-vit-large", str(folder))
+    after = contents(folder)
+    assert {name: after[name] for name in before} == before
+    subprocess.run(["sha256sum", "--check", "--strict", "--quiet", "SHA256SUMS"], cwd=folder, check=True)
+
+
+@pytest.mark.parametrize("form", ["open_clip", "transformers"])
+@pytest.mark.parametrize("pickled", [True, False])
+def test_a_clip_of_any_layout_computes_what_it_did(
+    form: str, pickled: bool, hugging_face: tuple[Path, CLIPModel]
+) -> None:
+    folder, model = hugging_face if form == "transformers" else (published_clip(), None)
+    draw = torch.Generator().manual_seed(1)
+    images = torch.randn(3, 3, 32, 32, generator=draw)
+    texts = torch.cat([torch.randint(0, 38, (3, 9), generator=draw), torch.full((3, 1), 39)], 1)
+    with torch.inference_mode():
+        if model is None:
+            wanted = load_visual_tower(folder).module(images)
+        else:
+            wanted = model.visual_projection(model.vision_model(pixel_values=images).pooler_output)
+            said = model.text_projection(model.text_model(input_ids=texts).pooler_output)
+    if pickled:
+        file = folder / ("model.safetensors" if model else FILE)
+        state = load_file(file)
+        torch.save(state, folder / ("pytorch_model.bin" if model else "open_clip_pytorch_model.bin"))
+        file.unlink()
+        with refused("is a pickle.* add --trust-pickle"):
+            octopi("clip-vit-large", str(folder), "--to", str(CLIP_TO))
+    octopi("clip-vit-large", str(folder), "--to", str(CLIP_TO), *(["--trust-pickle"] if pickled else []))
+    check_encoder_files(CLIP_TO, ("clip",))
+    tower = load_visual_tower(CLIP_TO)
+    assert (list(tower.image.mean), list(tower.image.std)) == (PICTURES["mean"], PICTURES["std"])
+    with torch.inference_mode():
+        torch.testing.assert_close(tower.module(images), wanted, atol=1e-5, rtol=1e-5)
+        if model is not None:
+            ours = open_clip.create_model(f"local-dir:{CLIP_TO}", require_pretrained=True).eval()
+            torch.testing.assert_close(ours.encode_text(texts), said, atol=1e-5, rtol=1e-5)
+            assert torch.equal(ours.logit_scale, model.logit_scale)
+
+
+def own(folder: Path, **changes: Any) -> None:
+    edit(folder / FORM, model_cfg=json.loads((folder / FORM).read_text())["model_cfg"] | changes)
+
+
+def pictures(folder: Path, **changes: Any) -> None:
+    edit(folder / FORM, preprocess_cfg=PICTURES | changes)
+
+
+def other_patches(folder: Path) -> None:
+    save_file(load_file(folder / FILE) | {"visual.conv1.weight": torch.zeros(32, 3, 8, 8)}, folder / FILE)
+
+
+HALVES = [0.5, 0.5, 0.5]
+CLIP: dict[str, tuple[Callable[[Path], object], str]] = {
+    "GELU": (lambda f: own(f, quick_gelu=False), "config.json has quick_gelu False, but .* with True"),
+    "no word of it": (lambda f: own(f, quick_gelu=None), "config.json has quick_gelu False, but .* with True"),
+    "another mean": (lambda f: pictures(f, mean=HALVES), r"config.json has mean \[0.5, 0.5, 0.5\], but"),
+    "another deviation": (lambda f: pictures(f, std=HALVES), r"config.json has std \[0.5, 0.5, 0.5\], but"),
+    "another length": (lambda f: own(f, embed_dim=8), "has embed_dim 8, but clip-vit-large-patch14 was .* with 16"),
+    "cut": (lambda f: cut(f / FILE), f"clip-vit-large: clip/{FILE} is cut off"),
+    "other patches": (other_patches, "visual.conv1.weight in clip/.* is 32 x 3 x 8 x 8"),
+    "settings cut": (lambda f: cut(f / FORM, 9), "open_clip_config.json is not a JSON object"),
+    "no settings": (lambda f: (f / FORM).unlink(), "clip/config.json does not exist"),
+    "no weights": (lambda f: (f / FILE).unlink(), "no weights, neither safetensors nor open_clip_pytorch_model.bin"),
+}
+
+
+@pytest.mark.parametrize("to", [(), ("--to", "there")])
+@pytest.mark.parametrize("name", CLIP)
+def test_a_wrong_clip_is_one_line(name: str, to: tuple[str, ...]) -> None:
+    folder = published_clip()
+    damage, words = CLIP[name]
+    damage(folder)
+    with refused(words):
+        octopi("clip-vit-large", str(folder), *to)
+    assert not (folder / "SHA256SUMS").exists()
+    assert not Path("there").exists()
+
+
+def activation(folder: Path) -> None:
+    form = json.loads((folder / "config.json").read_text())
+    edit(folder / "config.json", vision_config=form["vision_config"] | {"hidden_act": "gelu"})
+
+
+def without(folder: Path, name: str) -> None:
+    file = folder / "model.safetensors"
+    save_file({n: value for n, value in load_file(file).items() if n != name}, file)
+
+
+HUGGING_FACE: dict[str, tuple[Callable[[Path], object], str]] = {
+    "gelu": (
+        activation,
+        "clip-hf/config.json has quick_gelu False, but .* was published with True",
+    ),
+    "another mean": (
+        lambda f: edit(f / "preprocessor_config.json", image_mean=[0, 0, 0]),
+        r"has mean \[0, 0, 0\], but",
+    ),
+    "no mean": (lambda f: edit(f / "preprocessor_config.json", image_mean=None), "are no CLIP's .'image_mean'"),
+    "no pictures": (lambda f: (f / "preprocessor_config.json").unlink(), "preprocessor_config.json does not exist"),
+    "odd": (lambda f: edit(f / "config.json", vision_config={"hidden_size": "wide"}), "clip-hf/config.json"),
+    "no keys": (
+        lambda f: without(f, "vision_model.encoder.layers.1.self_attn.k_proj.bias"),
+        "model.safetensors has no 'vision_model.encoder.layers.1.self_attn.k_proj.bias'",
+    ),
+    "no class": (lambda f: without(f, "vision_model.embeddings.class_embedding"), "has no tensor visual.class_embed"),
+}
+
+
+@pytest.mark.parametrize("name", HUGGING_FACE)
+def test_a_wrong_clip_of_transformers_is_one_line(name: str, hugging_face: tuple[Path, CLIPModel]) -> None:
+    damage, words = HUGGING_FACE[name]
+    damage(hugging_face[0])
+    with refused(words):
+        octopi("clip-vit-large", str(hugging_face[0]))
+    assert not contents(Path("weights"))
