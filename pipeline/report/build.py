@@ -99,8 +99,7 @@ def finish_report(folder: Path) -> dict[str, float]:
     report = load_report(folder)
     metrics = summary(report.scores)
     confusion, curves = (pd.read_csv(folder / name) for name in ("confusion.csv", "curves.csv"))
-    tasks, properties = headline(report.scores), report.provenance["properties"]
-    figures = draw_figures(folder / "figures", tasks, report.effects, confusion, curves, report.published, properties)
+    figures = draw_figures(folder / "figures", report.effects, confusion, curves, report.provenance["properties"])
     write_json(folder / "metrics.json", metrics)
     write_text(folder / "README.md", render_readme(report, figures))
     return metrics

@@ -44,7 +44,7 @@ FILES = {
         "audit.csv",
     ),
     *("samples.json", "params.yaml", "provenance.json", "encoder_effects.csv", "encoder_errors.csv"),
-    *(f"figures/{name}.png" for name in ("tasks", "effects", "confusion", "curves")),
+    *(f"figures/{name}.png" for name in ("effects", "confusion", "curves")),
 }
 FEW = ("questions.evaluation={opd:4,pc:4,pss:4,pom:4,psr:4}",)
 REAL_PICTURES = {".png", ".jpg", ".webp", ".npy", ".avi", ".mp4"}
@@ -243,7 +243,7 @@ def test_a_run_that_measured_nothing_says_so(lean: Path) -> None:
 def test_a_report_on_real_videos_has_no_picture_of_them(lean: Path, written: Path) -> None:
     for folder in (lean, written):
         pictures = [name for name in files_of(folder) if Path(name).suffix in REAL_PICTURES]
-        assert set(pictures) <= {f"figures/{name}.png" for name in ("tasks", "effects", "confusion", "curves")}
+        assert set(pictures) <= {f"figures/{name}.png" for name in ("effects", "confusion", "curves")}
 
 
 def test_one_seed_of_one_variant_has_answers_but_no_effects(tmp_path: Path) -> None:
