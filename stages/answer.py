@@ -27,7 +27,8 @@ def main() -> None:
             dtype=name_dtype(language.dtype, params.runtime.device),
             quantization=language.quantization,
         ).to(resolve_device(params.runtime.device))
-        questions = read_jsonl(DATA / "questions" / str(variant.seed) / "evaluation.jsonl", Question)
+        asked = DATA / "questions" / str(variant.seed)
+        questions = read_jsonl(asked / "evaluation.jsonl", Question)
         for touch in (Touch.REAL, *(params.ablation.touch if variant.full else ())):
             settings = GenerationSettings(
                 system_prompt=language.system_prompt,
@@ -41,6 +42,9 @@ def main() -> None:
             run.metrics[f"{touch}.answers"] = len(predictions)
             run.metrics[f"{touch}.tokens"] = sum(p.tokens for p in predictions)
             run.metrics[f"{touch}.truncated"] = sum(p.truncated for p in predictions)
+            if variant.full and touch is Touch.REAL:
+                shown = answer(model, store, read_jsonl(asked / "examples.jsonl", Question), variant.opd, settings)
+                write_jsonl(DATA / "answers" / variant.key / "examples.jsonl", shown)
         if variant.full and params.teach.base:
             # What its adapter left of the reasoning that the base was taught.
             scores = examine(

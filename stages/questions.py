@@ -5,6 +5,7 @@ from pathlib import Path
 from pipeline.io import read_table, write_jsonl
 from pipeline.records import Assignment, Part
 from pipeline.stage import DATA, stage
+from pipeline.tasks.examples import build_examples
 from pipeline.tasks.questions import build_questions, counts_by_task, pool_of
 from pipeline.videos.catalogue import load_catalogue
 
@@ -30,6 +31,8 @@ def main() -> None:
                 write_jsonl(DATA / "questions" / str(seed) / f"{name}.jsonl", questions)
                 for task in counts:
                     run.metrics[f"{seed}.{name}.{task}"] = sum(q.task == task for q in questions)
+            examples = build_examples(assignments, catalogue, seed=config.seed)
+            write_jsonl(DATA / "questions" / str(seed) / "examples.jsonl", examples)
 
 
 if __name__ == "__main__":

@@ -27,6 +27,7 @@ from pipeline.records import (
     Video,
 )
 from pipeline.scales import compose
+from pipeline.tasks.examples import build_examples
 from pipeline.tasks.questions import build_questions, counts_by_task, pool_of
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.split import assign
@@ -74,6 +75,7 @@ def write_run(root: Path, params: Params, *, objects: Sequence[str] = (), skill:
         pool, fold = pool_of(Part.TEST, split, catalogue), params.split.fold_of(seed)
         asked[seed] = build_questions(pool, counts, seed=0, distinct=True, fold=fold)
         write_jsonl(data / "questions" / str(seed) / "evaluation.jsonl", asked[seed])
+        write_jsonl(data / "questions" / str(seed) / "examples.jsonl", build_examples(split, catalogue, seed=0))
         said = [c for a in split for c in _classify(a, catalogue, skill, rng)]
         write_table(data / "encoder" / str(seed) / "classifications.parquet", Classification, said)
         write_table(data / "encoder" / str(seed) / "history.parquet", Measurement, _history("loss", "validation_loss"))
@@ -84,6 +86,10 @@ def write_run(root: Path, params: Params, *, objects: Sequence[str] = (), skill:
         questions, replicate = asked[variant.seed], params.split.replicate_of(variant.seed)
         model = f"{variant.encoder}-{variant.opd}-{variant.seed}"
         write_table(data / "models" / variant.lora / model / "history.parquet", Measurement, _history("loss"))
+        if variant.full:
+            examples = build_examples(splits[variant.seed], catalogue, seed=0)
+            told = [p for q in examples if (p := _say(q, variant.opd, skill, rng))]
+            write_jsonl(data / "answers" / variant.key / "examples.jsonl", told)
         for touch in (Touch.REAL, *(params.ablation.touch if variant.full else ())):
             answers = [p for q in questions if (p := _say(q, variant.opd, skill, rng))]
             write_jsonl(data / "answers" / variant.key / f"{touch}.jsonl", answers)

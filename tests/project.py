@@ -12,7 +12,7 @@ from tests.closure import ROOT
 
 PARTS = ("pipeline", "stages", "conf", "external/.gitkeep", "dvc.yaml", "pyproject.toml", ".gitignore", ".dvcignore")
 OBJECTS = (
-    *("baseball", "controller_base", "cotton_ball", "pillow", "rug"),
+    *("baseball", "controller_base", "cotton_ball", "pillow", "rice"),
     "millet",
     *("bath_towel", "ice_block", "toilet_brush_bristles"),
 )

@@ -26,6 +26,7 @@ from pipeline.records import (
     Prediction,
     Question,
     Touch,
+    Variant,
     Video,
 )
 from pipeline.report.dataset import dataset_frame
@@ -33,7 +34,7 @@ from pipeline.report.figures import draw_figures
 from pipeline.report.load import HEADS, load_report
 from pipeline.report.provenance import provenance
 from pipeline.report.readme import render_readme
-from pipeline.report.samples import choose_samples
+from pipeline.report.samples import choose_examples, choose_samples
 from pipeline.report.tables import headline
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.split import read_splits
@@ -91,7 +92,7 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     write_csv(folder / "effects.csv", EffectRow, effect_rows(graded, catalogue))
     write_csv(folder / "encoder_effects.csv", EffectRow, candidate_rows(out_of_fold, BASELINE))
     write_csv(folder / "encoder_errors.csv", ErrorRow, error_rows(out_of_fold, catalogue))
-    write_json(folder / "samples.json", _samples(params, data, graded))
+    write_json(folder / "samples.json", _samples(params, data, graded, catalogue))
     audit = data / "audit" / "audit.csv"
     write_csv(folder / "audit.csv", Finding, read_csv(audit, Finding) if audit.is_file() else [])
     _write(folder / "dataset.csv", dataset_frame(catalogue, videos, splits))
@@ -107,8 +108,7 @@ def finish_report(folder: Path) -> dict[str, float]:
     report = load_report(folder)
     metrics = summary(report.scores)
     confusion, curves = (pd.read_csv(folder / name) for name in ("confusion.csv", "curves.csv"))
-    tasks, properties = headline(report.scores), report.provenance["properties"]
-    figures = draw_figures(folder / "figures", tasks, report.effects, confusion, curves, report.published, properties)
+    figures = draw_figures(folder / "figures", report.effects, confusion, curves, report.provenance["properties"])
     write_json(folder / "metrics.json", metrics)
     write_text(folder / "README.md", render_readme(report, figures))
     return metrics
@@ -157,14 +157,21 @@ def curves_frame(data: Path, ablation: AblationConfig) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=list(CURVES))
 
 
-def _samples(params: Params, data: Path, graded: list[Graded]) -> dict[str, object]:
-    full = next(variant for variant in params.ablation.variants() if variant.full)
-    asked = data / "questions" / str(full.seed) / "evaluation.jsonl"
-    answered = data / "answers" / full.key / f"{Touch.REAL}.jsonl"
-    if not asked.is_file() or not answered.is_file():
-        return choose_samples([], [], [])
-    scores = [g for g in graded if g.variant == full and g.touch is Touch.REAL]
-    return choose_samples(read_jsonl(asked, Question), read_jsonl(answered, Prediction), scores)
+def _samples(params: Params, data: Path, graded: list[Graded], catalogue: Catalogue) -> dict[str, object]:
+    full = [variant for variant in params.ablation.variants() if variant.full]
+    scores = [g for g in graded if g.variant == full[0] and g.touch is Touch.REAL]
+    examples = [pair for v in full for pair in zip(*_answered(data, v, "examples", "examples"), strict=True)]
+    chosen = choose_samples(*_answered(data, full[0], "evaluation", Touch.REAL), scores)
+    return {**chosen, **choose_examples(examples, catalogue)}
+
+
+def _answered(data: Path, variant: Variant, asked: str, said: str) -> tuple[list[Question], list[Prediction]]:
+    """A variant's questions and answers, by the names of their files; none where either file is missing."""
+    questions = data / "questions" / str(variant.seed) / f"{asked}.jsonl"
+    answers = data / "answers" / variant.key / f"{said}.jsonl"
+    if not questions.is_file() or not answers.is_file():
+        return [], []
+    return read_jsonl(questions, Question), read_jsonl(answers, Prediction)
 
 
 def _write(path: Path, frame: pd.DataFrame) -> None:

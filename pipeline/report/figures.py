@@ -1,4 +1,4 @@
-"""The figures of a report, as PNG: five tasks, effects, confusion of the heads, training curves.
+"""The figures of a report, as PNG: effects, confusion of the heads, training curves.
 
 Drawn without pyplot (no global state, no window) and saved without dates, so that equal input gives equal files.
 """
@@ -7,19 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pandas as pd
 
 from pipeline.io import atomic
-from pipeline.report.load import KEYS, cells
-from pipeline.report.tables import task_title
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MEASURED, PUBLISHED, QUIET, LINE = "#0a5fb4", "#8a4a00", "#555b66", "#c9ced6"
+MEASURED, QUIET, LINE = "#0a5fb4", "#555b66", "#c9ced6"
 SERIES = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#000000")
 """Okabe and Ito's colours, safe for the colour-blind."""
 PARTS = {"lora": "LoRA", "opd": "OPD"}
@@ -28,29 +26,24 @@ DPI = 150
 
 def draw_figures(
     folder: Path,
-    headline: pd.DataFrame,
     effects: pd.DataFrame,
     confusion: pd.DataFrame,
     curves: pd.DataFrame,
-    published: pd.DataFrame,
     properties: Mapping[str, Sequence[str]],
 ) -> list[str]:
     """Draw what there is figures for and remove figures of an earlier run.
 
     Args:
         folder: Of the PNG files.
-        headline: rows of scores.csv, one a task: the full system.
         effects: effects.csv.
         confusion: property, rated, predicted; one row a video.
         curves: stage, name, step, value.
-        published: as `load_report` gives it.
         properties: the classes of each, in rising order.
 
     Returns:
         The names of the files, in reading order.
     """
     wanted: list[tuple[str, pd.DataFrame, Callable[[], Figure]]] = [
-        ("tasks.png", headline, lambda: draw_tasks(headline, published)),
         ("effects.png", effects, lambda: draw_effects(effects)),
         ("confusion.png", confusion, lambda: draw_confusion(confusion, properties)),
         ("curves.png", curves[curves["name"] == "loss"], lambda: draw_curves(curves)),
@@ -64,34 +57,6 @@ def draw_figures(
         if len(rows):
             save(draw(), folder / name)
     return drawn
-
-
-def draw_tasks(headline: pd.DataFrame, published: pd.DataFrame) -> Figure:
-    """A line from 0 to 100 % a task: the interval, the measured value, chance, and what the paper printed."""
-    figure, (axes,) = panels(1, 7.2, 0.75 + 0.5 * len(headline), across=1)
-    printed = cells(published)
-    for place, row in enumerate(headline.to_dict("records")):
-        axes.plot([0, 100], [-place, -place], color=LINE, linewidth=1.2, zorder=1)
-        if pd.notna(row["low"]):
-            ends = [100 * row["low"], 100 * row["high"]]
-            axes.plot(ends, [-place, -place], color=MEASURED, alpha=0.45, linewidth=5, solid_capstyle="round", zorder=2)
-        chance = 100 * row["chance"]
-        axes.plot([chance, chance], [-place - 0.25, -place + 0.25], color=QUIET, linestyle=(0, (2.5, 2)), linewidth=1.2)
-        for model, face in (("7b", "white"), ("13b", PUBLISHED)):
-            cell = printed.get((*(row[k] for k in KEYS), model))
-            if cell:
-                axes.plot(cell[0], -place, "D", color=PUBLISHED, markerfacecolor=face, markersize=6.5, zorder=3)
-        axes.plot(100 * row["accuracy"], -place, "o", color=MEASURED, markeredgecolor="white", markersize=8, zorder=4)
-        axes.text(104, -place, f"{100 * row['accuracy']:.1f}", color=MEASURED, weight="bold", va="center", fontsize=11)
-    axes.set_yticks([-i for i in range(len(headline))], [task_title(task) for task in headline["task"]])
-    axes.set_ylim(-len(headline) + 0.4, 0.6)
-    axes.set_xlim(-2, 114)
-    axes.set_xticks(range(0, 101, 25), [f"{x} %" for x in range(0, 101, 25)])
-    _quiet(axes)
-    axes.spines["left"].set_visible(False)
-    axes.tick_params(length=0)
-    _legend_of_tasks(figure, bool(printed))
-    return figure
 
 
 def draw_effects(effects: pd.DataFrame) -> Figure:
@@ -200,17 +165,3 @@ def _quiet(axes: Axes) -> None:
     for spine in axes.spines.values():
         spine.set_color(LINE)
     axes.tick_params(colors=QUIET, labelcolor="#1a1d23", labelsize=9)
-
-
-def _legend_of_tasks(figure: Figure, printed: bool) -> None:
-    from matplotlib.lines import Line2D
-
-    shown: dict[str, dict[str, Any]] = {
-        "measured, 95 % interval over objects": {"color": MEASURED, "marker": "o", "linewidth": 3, "alpha": 0.7},
-        "chance": {"color": QUIET, "linestyle": (0, (2.5, 2))},
-    }
-    if printed:
-        mark = {"color": PUBLISHED, "marker": "D", "linestyle": ""}
-        shown |= {"published, 7b": {**mark, "markerfacecolor": "white"}, "published, 13b": mark}
-    handles = [Line2D([], [], label=label, **style) for label, style in shown.items()]
-    figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=8.5)

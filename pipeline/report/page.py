@@ -1,8 +1,8 @@
 """One page over all reports: reports/index.html, drawn from the files in reports/ and from nothing else.
 
 It needs no network, runs no script and opens from disk. Its tables are those of the registry
-(`pipeline.report.tables`); this module adds what stands around them: the tasks and effects as lines, speed against
-error, numerical stability, and what is missing.
+(`pipeline.report.tables`); this module adds what stands around them: all reports side by side, the tasks and effects
+as lines, speed against error, numerical stability, and what is missing.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,10 +21,10 @@ from markupsafe import Markup, escape
 from pipeline.errors import UserError
 from pipeline.io import write_text
 from pipeline.report.dataset import dataset_tables
-from pipeline.report.drawing import SIZE, draw_table, place_points, share, span
-from pipeline.report.load import KEYS, Report, load_report, read_frame
+from pipeline.report.drawing import draw_table, share, span
+from pipeline.report.load import KEYS, Report, cells, load_report, read_frame
 from pipeline.report.readme import OTHER_MODELS, finding, looked_at, origin, stands_on
-from pipeline.report.tables import TABLES, difference, headline, measured, number, task_title, whole
+from pipeline.report.tables import TABLES, difference, headline, measured, number, side_by_side, task_title, whole
 from pipeline.tasks import TASKS
 
 PAGE = Path("reports/index.html")
@@ -47,6 +47,15 @@ PARTS = {"encoder": "Encoder", "lora": "LoRA", "opd": "OPD", "touch": "Touch"}
 RANK = {"error": 0, "warning": 1, "info": 2}
 Gap = tuple[str, str, str]
 """Where something is missing, what, and why."""
+BY_USER = (
+    ("paper-7b-videos", "Octopi with Vicuna 7b", "needs a GPU of 48 GB, the videos and the weights (`README.md`)"),
+    ("paper-13b-videos", "Octopi with Vicuna 13b", "needs two such GPUs, the videos and the weights (`README.md`)"),
+    ("RIPE", "avocados, described and compared", "needs videos of ten and their ranks of ripeness (`docs/avocado.md`)"),
+    ("photos", "PG-InstructBLIP, which only sees", "needs photos and a model's endpoint (`octopi answer-with`)"),
+    ("robot", "the arm that sorts avocados", "needs one with such a sensor; it asks a trained model (`docs/robot.md`)"),
+)
+"""What of the paper only a user can measure: what in a report on real videos would show it (its name, a task, what was
+there in place of touch), what it is, and what it needs."""
 
 
 class Line(NamedTuple):
@@ -54,9 +63,9 @@ class Line(NamedTuple):
 
     task: str
     title: str
-    source: str = ""
-    """File and line that it comes from; empty where nothing was measured."""
-    said: str = ""
+    source: str
+    """File and line that it comes from."""
+    said: str
     note: str = ""
     value: float | None = None
     low: float | None = None
@@ -88,6 +97,8 @@ def write_page(root: Path) -> Path:
     chapters = _chapters(folder, gaps)
     if not chapters:
         raise UserError(f"{folder}: no whole report yet; `make repro` writes one")
+    reports = {c["name"] + ("†" if c["looked_at"] else ""): c["report"] for c in chapters}
+    gaps += left_to_users(reports.values())
     environment = Environment(
         loader=PackageLoader("pipeline.report"), autoescape=True, trim_blocks=True, undefined=StrictUndefined
     )
@@ -97,11 +108,11 @@ def write_page(root: Path) -> Path:
         style=Markup(style),
         digest=base64.b64encode(hashlib.sha256(style.encode()).digest()).decode(),
         chapters=chapters,
+        paper=[_paper(reports, every=every) for every in (False, True)],
         other_models=OTHER_MODELS,
         speed=list(_speed(folder, gaps)),
         stability=_stability(folder, gaps),
         gaps=gaps,
-        size=SIZE,
     )
     text = re.sub(r"\n\s*", "\n", text)
     if len(text.encode()) > LARGEST:
@@ -141,10 +152,13 @@ def _chapter(report: Report, gaps: list[Gap]) -> dict[str, Any]:
     """What the template shows of one report."""
     name, scale, source = report.name, report.provenance["scale"], report.provenance["source"]
     tasks, (effects, points) = list(_tasks(report)), _effects(report)
-    gaps += [(name, line.title, "the full system was not asked") for line in tasks if not line.source]
+    asked = {line.task for line in tasks}
+    printed = [task for task in TASKS if task in {*report.published["task"]} - asked]
+    gaps += [(name, task_title(task), "the full system was not asked") for task in printed]
     gaps += [(name, file, why) for file, why in EXPECTED.items() if not (report.folder / file).is_file()]
     files = sorted(p.relative_to(report.folder.parent).as_posix() for p in report.folder.rglob("*.*") if p.is_file())
     return {
+        "report": report,
         "name": name,
         "scale": scale,
         "source": source,
@@ -157,25 +171,39 @@ def _chapter(report: Report, gaps: list[Gap]) -> dict[str, Any]:
         "origin": origin(report.provenance),
         "blocks": list(_tables(report, scale != "smoke", gaps)),
         "samples": report.samples,
+        "examples": report.samples.get("examples", []),
+        "not_asked": _not_asked(report.samples),
         "files": files,
     }
 
 
+def left_to_users(reports: Iterable[Report]) -> list[Gap]:
+    """What of `BY_USER` no report has."""
+    filmed = [r for r in reports if r.provenance["source"] == "videos"]
+    known = {name for r in filmed for name in (r.name, *r.scores["task"], *r.scores["touch"])}
+    return [("paper", what, why) for name, what, why in BY_USER if name not in known]
+
+
+def _paper(reports: dict[str, Report], *, every: bool) -> Markup:
+    frame, title = side_by_side(reports, every=every), f"{'Every row' if every else 'Five tasks'} of the paper"
+    return draw_table(frame, title, "*/scores.csv", at_lines=False) if len(frame) else Markup()
+
+
+def _not_asked(samples: dict[str, Any]) -> str:
+    if "not_asked" not in samples:
+        return "Not asked: the report is older than these questions."
+    rest = [f"{name} (of {' and '.join(objects)})" for name, objects in samples["not_asked"].items()]
+    return f"Not asked, for want of videos: {', '.join(rest)}." if rest else ""
+
+
 def _tasks(report: Report) -> Iterator[Line]:
-    """Every task with the full system's accuracy on real touch over all seeds."""
-    printed = {(*(c[k] for k in KEYS), c["model"]): c for c in report.published.to_dict("records")}
-    rows = headline(report.scores)
-    lines = {row["task"]: (index, row) for index, row in zip(rows.index, rows.to_dict("records"), strict=True)}
-    for task in dict.fromkeys([*TASKS, *lines]):
-        title = task_title(task).removesuffix(f" ({task})")
-        if task not in lines:
-            yield Line(task, title)
-            continue
-        index, row = lines[task]
-        cells = {model: printed.get((*(row[k] for k in KEYS), model)) for model in MODELS}
+    """The tasks that were asked, with the full system's accuracy on real touch over all seeds."""
+    printed, rows = cells(report.published), headline(report.scores)
+    for index, row in zip(rows.index, rows.to_dict("records"), strict=True):
+        found = {model: printed.get((*(row[k] for k in KEYS), model)) for model in MODELS}
         yield Line(
-            task,
-            title,
+            row["task"],
+            task_title(row["task"]).removesuffix(f" ({row['task']})"),
             f"{report.name}/scores.csv:{index + 2}",
             measured(row),
             f"{row['right']:g} of {row['n']:g} right",
@@ -183,7 +211,7 @@ def _tasks(report: Report) -> Iterator[Line]:
             share(row["low"]),
             share(row["high"]),
             share(row["chance"]),
-            {m: (f"{c['value']:.1f}", f"n {c['n']:.0f}", c["value"]) for m, c in cells.items() if c},
+            {m: (f"{c[0]:.1f}", f"n {c[1]:.0f}", c[0]) for m, c in found.items() if c},
         )
 
 
@@ -245,17 +273,18 @@ def _block(
 
 
 def _speed(folder: Path, gaps: list[Gap]) -> Iterator[dict[str, Any]]:
-    """Each question of speed_error.csv: its points, its front in words, its table."""
+    """Each question of speed_error.csv: its figure, as `make bench` drew it, its front in words, its table."""
     rows = read_frame(folder / "speed_error.csv", SPEED)
     if rows.empty:
         gaps.append(("speed", "speed_error.csv", "nothing was measured yet: `make bench` measures it"))
     rows["front"] = rows["front"].astype(str).eq("True")
     for question, group in rows.groupby("question", sort=False):
+        figure = f"speed_error/{re.sub(r'[^a-z0-9]+', '-', str(question).lower()).strip('-')}.png"
         yield {
             "question": question,
             "costs": "; ".join(group["unit"].dropna().unique()),
             "errors": "; ".join(group["error_of"].dropna().unique()),
-            "points": place_points(group),
+            "figure": figure if (folder / figure).is_file() else "",
             "front": group[group["front"]].sort_values("cost_ratio").map(_said).to_dict("records"),
             "html": draw_table(_shown(group.drop(columns="question")), str(question), "speed_error.csv"),
         }

@@ -82,9 +82,9 @@ def provenance(
         "encoder": encoder_words(params.encoder),
         "base_models": {
             "encoder": base_model(root, params.encoder.weights),
-            "language": base_model(root, params.language.weights) | taught_words(params),
+            "language": base_model(root, params.language.weights) | taught_words(params.teach.base),
         },
-        "taught_from": taught_from(params),
+        "taught_from": params.teach.base,
         "python": platform.python_version(),
         "packages": {name: _version(name) for name in PACKAGES},
     }
@@ -139,14 +139,8 @@ def digest(folder: Path) -> str:
     return total.hexdigest() if files else UNKNOWN
 
 
-def taught_from(params: Params) -> str:
-    """The folder of the base model that the stage `teach` taught; empty where nothing was taught."""
-    return str(getattr(getattr(params, "teach", None), "base", ""))
-
-
-def taught_words(params: Params) -> dict[str, Any]:
-    """What the chain itself taught the language model, in place of what people noted; empty where it taught nothing."""
-    base = taught_from(params)
+def taught_words(base: str) -> dict[str, Any]:
+    """What the chain itself taught the language model, in place of what people noted; empty where `base` is."""
     words = f"taught here in text alone to reason about described objects (from `{base}`)"
     return {"taught": words, "known_templates": False} if base else {}
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.report.load import KEYS, Report, cells
-from pipeline.report.tables import SHOWN_WORDS, TABLES, headline, measured, number, task_title
+from pipeline.report.load import Report
+from pipeline.report.tables import FIVE_TASKS, SHOWN_WORDS, TABLES, headline, measured, number
 from pipeline.weights import is_tiny
 
 MOST_LINES = 150
@@ -90,25 +90,12 @@ def looked_at(said: dict[str, Any]) -> bool:
 
 def five_tasks(report: Report) -> str:
     """The table of the first screen: a row a task, the full system."""
-    rows = headline(report.scores)
-    models = [m for m in ("7b", "13b") if len(report.published)]
-    printed = cells(report.published)
-    size = report.provenance["base_models"]["language"]["parameters"]
-    shown: dict[str, list[str]] = {
-        "Task": [task_title(task) for task in rows["task"]],
-        f"Measured here ({size_words(size)} model) % [95 %]": [
-            f"**{measured(row)}**" for row in rows.to_dict("records")
-        ],
-        "n": [number(n, 0) for n in rows["n"]],
-        "Unread %": [number(row["unread"] / row["n"], scale=100) for row in rows.to_dict("records")],
-        "Chance %": [number(chance, scale=100) for chance in rows["chance"]],
-    }
-    for model in models:
-        found = [printed.get((*(row[k] for k in KEYS), model)) for row in rows.to_dict("records")]
-        shown[f"Published (Vicuna {model}) % (n)"] = [
-            f"{cell[0]:.2f} ({cell[1]:.0f})" if cell else "" for cell in found
-        ]
-    return markdown(pd.DataFrame(shown)) if len(rows) else "No answer of the full system was graded.\n"
+    shown = FIVE_TASKS.build(report.scores, report.effects, report.published)
+    size = size_words(report.provenance["base_models"]["language"]["parameters"])
+    shown["Measured % [95 %]"] = "**" + shown["Measured % [95 %]"] + "**"
+    shown.columns = shown.columns.str.replace("Measured", f"Measured here ({size} model)")
+    shown.columns = shown.columns.str.replace(r"Published (\d+b)", r"Published (Vicuna \1)", regex=True)
+    return markdown(shown) if len(shown) else "No answer of the full system was graded.\n"
 
 
 def stands_on(said: dict[str, Any]) -> list[str]:

@@ -7,6 +7,8 @@ from typing import Any
 
 from pipeline.records import Opd, Prediction, Question, Score
 from pipeline.tasks import TASKS
+from pipeline.tasks.examples import EXAMPLES, PARTS, grade_example
+from pipeline.videos.catalogue import Catalogue
 
 RULE = (
     "Of each task the first right and the first wrong answer, by the question's id, of the full system under its first "
@@ -39,6 +41,24 @@ def choose_samples(
             if score is not None:
                 samples.append(_sample(asked[score.question_id], said[score.question_id], score))
     return {"rule": RULE, "samples": samples}
+
+
+def choose_examples(answered: Iterable[tuple[Question, Prediction]], catalogue: Catalogue) -> dict[str, Any]:
+    """What samples.json says of the paper's examples: those with answers, and the objects of those without.
+
+    Args:
+        answered: by full systems, in the order of seeds. Of several answers to an example the first is shown that is
+            about objects of the test part, or else of validation, or else of training.
+    """
+    examples: dict[str, dict[str, Any]] = {}
+    for question, said in sorted(answered, key=lambda pair: PARTS.index(pair[0].part)):
+        if question.question_id not in examples:
+            sample = _sample(question, said, grade_example(question, said))
+            examples[question.question_id] = {**sample, "part": question.part}
+    asked = {sample["task"] for sample in examples.values()}
+    here = [e for e in EXAMPLES if catalogue.objects.keys() >= {*e.objects}]
+    rest = {e.name: list(e.objects) for e in here if e.name not in asked}
+    return {"examples": [examples[name] for name in sorted(examples)], "not_asked": rest}
 
 
 def _sample(question: Question, said: Prediction, score: Score) -> dict[str, Any]:

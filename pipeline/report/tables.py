@@ -5,13 +5,23 @@ To add one, add an entry to `TABLES`. A newly registered task is in all that its
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import pandas as pd
 
-from pipeline.report.load import ALL_SEEDS, CROSS_VALIDATION, DESCRIBED, HEADS, KEYS, VALIDATION_HEADS, cells
+from pipeline.report.load import (
+    ALL_SEEDS,
+    CROSS_VALIDATION,
+    DATASET,
+    DESCRIBED,
+    HEADS,
+    KEYS,
+    VALIDATION_HEADS,
+    Report,
+    cells,
+)
 from pipeline.tasks import TASKS
 
 Select = Callable[[pd.DataFrame], "pd.Series[bool]"]
@@ -46,7 +56,7 @@ class Table:
     def select(self, scores: pd.DataFrame, effects: pd.DataFrame) -> pd.DataFrame:
         """The rows of the table as the CSV has them, in the order of tasks, measures and systems."""
         frame = effects if self.source == "effects" else scores
-        return _ordered(frame[self.rows(frame).astype(bool)]) if len(frame) else frame
+        return ordered(frame[self.rows(frame).astype(bool)]) if len(frame) else frame
 
     def build(self, scores: pd.DataFrame, effects: pd.DataFrame, published: pd.DataFrame) -> pd.DataFrame:
         """The table as it is shown: text in every cell, headings as column names; no row where nothing was measured.
@@ -69,8 +79,37 @@ class Table:
 
 
 def headline(scores: pd.DataFrame) -> pd.DataFrame:
-    """One row a task that was asked: whole answers of the full system to real touch, over all seeds."""
-    return _ordered(scores[answers(scores) & whole(scores) & _differs(scores)])
+    """The rows of scores.csv that `FIVE_TASKS` shows."""
+    return FIVE_TASKS.select(scores, scores)
+
+
+def side_by_side(reports: Mapping[str, Report], *, every: bool) -> pd.DataFrame:
+    """The paper's rows: what is published and what each report measured, a column each; text in every cell.
+
+    Args:
+        reports: by what their columns are called; the paper's figures are joined by what data a report is about.
+        every: also the ablations, single properties and the encoder's heads, and not only whole answers of the
+            full system.
+    """
+    figures = {r.provenance["dataset"]: r.published for r in reports.values()}
+    place, blocks = [*KEYS, "touch"], []
+    for dataset, printed in sorted(figures.items(), key=lambda pair: pair[0] != DATASET):
+        rows = ordered(printed[printed["model"].isin(PUBLISHED_MODELS)].assign(touch="real").drop_duplicates(place))
+        rows = rows if every else rows[whole(rows) & _differs(rows)]
+        records, about = rows.to_dict("records"), "" if dataset == DATASET else f", {dataset}"
+        shown = {"Task": [task_title(row["task"]) + about for row in records]}
+        if every:
+            parts = ["" if row["measure"] == CHOICE else f": {COLUMNS['measure'][1](row)}" for row in records]
+            shown["System"] = [system(row) + part for row, part in zip(records, parts, strict=True)]
+        shown |= _beside(rows, printed)
+        for name, report in reports.items():
+            over = report.scores[(report.scores["seed"] == ALL_SEEDS) & (report.provenance["dataset"] == dataset)]
+            known = {
+                tuple(row[k] for k in place): f"{measured(row)} ({row['n']:.0f})" for row in over.to_dict("records")
+            }
+            shown[f"Measured {name} % [95 %] (n)"] = [known.get(tuple(row[k] for k in place), "") for row in records]
+        blocks.append(pd.DataFrame(shown, dtype=object))
+    return pd.concat(blocks, ignore_index=True).fillna("")
 
 
 def number(value: float, digits: int = 1, scale: float = 1.0) -> str:
@@ -141,7 +180,7 @@ COLUMNS: dict[str, tuple[str, Cell]] = {
 """Heading of a column, and how its cell is written."""
 
 
-def _ordered(frame: pd.DataFrame) -> pd.DataFrame:
+def ordered(frame: pd.DataFrame) -> pd.DataFrame:
     """Tasks in the registry's order, whole answers before parts, the full system before what lacks something."""
     tasks = [*TASKS, *NOT_ANSWERED]
     rank = pd.DataFrame(index=frame.index)
@@ -214,6 +253,14 @@ def _over_seeds(*tasks: str) -> Select:
 SHOWN = ("system", "measured", "n", "chance", "unread")
 PAPER, PROPERTIES = ("task", *SHOWN, "published"), ("measure", *SHOWN, "published")
 
+FIVE_TASKS = Table(
+    "five_tasks",
+    "The full system",
+    "Whole answers to real touch, over all seeds.",
+    lambda f: answers(f) & whole(f) & _differs(f),
+    ("task", "measured", "n", "unread", "chance", "published"),
+)
+"""A report's first table, one row a task that was asked."""
 TABLES: tuple[Table, ...] = (
     Table(
         "understanding",

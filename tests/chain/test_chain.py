@@ -12,7 +12,7 @@ import torch
 import yaml
 from safetensors.torch import load_file
 
-from pipeline.io import read_jsonl, read_table
+from pipeline.io import read_json, read_jsonl, read_table
 from pipeline.records import Classification, Opd, Part, Prediction, Question
 from pipeline.tasks import TASKS
 from pipeline.use.model import Octopi
@@ -39,6 +39,12 @@ def test_everything_a_person_looks_at_is_there(project: Project) -> None:
     assert "prove" in (report / "README.md").read_text(), "the smoke report says what its figures are worth"
     assert (project.folder / "mlruns" / "mlflow.db").is_file()
     assert (project.folder / "reports" / "index.html").is_file()
+    shown = read_json(report / "samples.json")
+    assert [(s["question_id"], s["part"], len(s["answered"])) for s in shown["examples"]] == [
+        ("rice-a", "train", 2),
+        ("rice-b", "train", 2),
+    ]
+    assert list(shown["not_asked"]) == ["toothbrush"]
     header, values = project.run("dvc", "metrics", "show", "--md").splitlines()[:3:2]
     assert header.count("|") - 2 <= 12, header
     assert "smoke-scenes" in values

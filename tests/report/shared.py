@@ -25,6 +25,7 @@ def write_reports(root: Path, *names: str) -> Path:
         scale, source = name.split("-")
         edit(reports / name / "provenance.json", report=name, scale=scale, source=source)
     shutil.copy(ROOT / "reports" / "speed_error.csv", reports)
+    shutil.copytree(ROOT / "reports" / "speed_error", reports / "speed_error")
     (reports / "stability.csv").write_text(STABILITY)
     return root
 

@@ -44,7 +44,7 @@ FILES = {
         "audit.csv",
     ),
     *("samples.json", "params.yaml", "provenance.json", "encoder_effects.csv", "encoder_errors.csv"),
-    *(f"figures/{name}.png" for name in ("tasks", "effects", "confusion", "curves")),
+    *(f"figures/{name}.png" for name in ("effects", "confusion", "curves")),
 }
 FEW = ("questions.evaluation={opd:4,pc:4,pss:4,pom:4,psr:4}",)
 REAL_PICTURES = {".png", ".jpg", ".webp", ".npy", ".avi", ".mp4"}
@@ -179,6 +179,23 @@ def test_samples_are_the_first_right_and_wrong_answer_of_each_task(written: Path
     assert choose_samples([], [], [])["samples"] == []
 
 
+def test_the_papers_examples_come_with_their_answers(written: Path, tmp_path: Path) -> None:
+    assert load_report(written).samples["not_asked"] == {
+        "rice": ["rice"],
+        "toothbrush": ["toothbrush_handle", "toothbrush_bristles"],
+    }
+    one = ("ablation.encoders=[finetuned]", "ablation.lora=[with]", "ablation.opd=[all]", "ablation.touch=[]")
+    params = write_run(tmp_path, fake_params(*FEW, *one), objects=["rice", "rug", "bath_towel", "ice_block"])
+    before = set(pd.read_csv(written / "scores.csv")["task"])
+    write_report(params, tmp_path)
+    report = load_report(tmp_path / "reports" / params.report_name)
+    told = read_jsonl(tmp_path / "data" / "answers" / "finetuned-with-all-0" / "examples.jsonl", Prediction)
+    assert [s["answered"] for s in report.samples["examples"]] == [list(p.outputs) for p in told]
+    assert [s["right"] for s in report.samples["examples"]] == [not p.truncated for p in told]
+    assert {s["part"] for s in report.samples["examples"]} == {"train"}
+    assert set(report.scores["task"]) <= before, "no figure counts them"
+
+
 def test_the_data_sets_tables_count_objects_and_set_the_papers_beside(written: Path) -> None:
     tables = list(dataset_tables(written, DATASET).values())
     counts = tables[0].set_index("")
@@ -243,7 +260,7 @@ def test_a_run_that_measured_nothing_says_so(lean: Path) -> None:
 def test_a_report_on_real_videos_has_no_picture_of_them(lean: Path, written: Path) -> None:
     for folder in (lean, written):
         pictures = [name for name in files_of(folder) if Path(name).suffix in REAL_PICTURES]
-        assert set(pictures) <= {f"figures/{name}.png" for name in ("tasks", "effects", "confusion", "curves")}
+        assert set(pictures) <= {f"figures/{name}.png" for name in ("effects", "confusion", "curves")}
 
 
 def test_one_seed_of_one_variant_has_answers_but_no_effects(tmp_path: Path) -> None:

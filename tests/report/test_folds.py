@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import defaultdict
 from pathlib import Path
 from statistics import fmean
-from types import SimpleNamespace
 
 import pandas as pd
 import pytest
@@ -16,7 +15,7 @@ from pipeline.io import read_table
 from pipeline.records import Assignment, Described, Graded, Part
 from pipeline.report.build import write_report
 from pipeline.report.load import load_report
-from pipeline.report.provenance import settings_note, taught_from, taught_words
+from pipeline.report.provenance import settings_note, taught_words
 from pipeline.report.readme import render_readme
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from tests.closure import ROOT
@@ -104,12 +103,12 @@ def test_without_folds_seeds_are_replicates(written: Path) -> None:
 def test_spoilt_test_objects_are_no_headline(name: str) -> None:
     note = settings_note(name, "development")
     assert "looked at four times while recipes changed" in note
-    spoilt = render_readme(report([score()], split="development", settings=note), ["tasks.png", "effects.png"])
+    spoilt = render_readme(report([score()], split="development", settings=note), ["effects.png"])
     head, _, rest = spoilt.partition("## On test objects that were looked at")
     assert "| Task" not in head
     assert "![What encoder" not in head
     assert note in rest.split("| Task")[0]
-    kfold = render_readme(report([score()], split="kfold", settings=settings_note(name, "kfold")), ["tasks.png"])
+    kfold = render_readme(report([score()], split="kfold", settings=settings_note(name, "kfold")), ["curves.png"])
     assert "looked at four times" not in kfold
     assert "| Task" in kfold.split("## What the figures stand on")[0]
 
@@ -139,11 +138,9 @@ def score_rows_chance(catalogue: Catalogue) -> float:
 
 
 def test_a_taught_base_is_said_in_every_report() -> None:
-    params = SimpleNamespace(teach=SimpleNamespace(base="weights/some-base"))
-    assert taught_from(params) == "weights/some-base"
-    assert taught_from(SimpleNamespace()) == ""
-    assert taught_words(SimpleNamespace(teach=SimpleNamespace(base=""))) == {}
-    text = render_readme(report([score()], taught_from="weights/some-base", language=taught_words(params)), [])
+    base = "weights/some-base"
+    assert taught_words("") == {}
+    text = render_readme(report([score()], taught_from=base, language=taught_words(base)), [])
     assert "**The base was taught:** before it met touch, `weights/some-base` learnt from text alone" in text
     assert "A 2.2 M-parameter Llama, taught here in text alone to reason about described objects" in text
     assert "near-null" not in text

@@ -11,19 +11,18 @@ from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
 
-import pandas as pd
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from pipeline.cli import app
 from pipeline.errors import UserError
 from pipeline.report import page as module
-from pipeline.report.drawing import SIZE, place_points, span
-from pipeline.report.page import LARGEST, PAGE, write_page
+from pipeline.report.drawing import span
+from pipeline.report.load import Report, published
+from pipeline.report.page import LARGEST, PAGE, left_to_users, write_page
 from pipeline.tasks import TASKS
 from tests.closure import ROOT
+from tests.report.conftest import effects_of, score, scores_of
 from tests.report.shared import Page, edit, rows_of, words, write_reports, write_rows
 
 NUMBER = re.compile(r"[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]\d+)?")
@@ -119,14 +118,14 @@ def test_published_figures_stand_only_beside_their_data(page: Page, changed: Pat
     (changed / "reports" / "small-videos" / "dataset.csv").unlink()
     other = Page(write_page(changed))
     assert not [cell for cell in other.all(kind="published") if cell.tag == "td"]
-    assert "so none stand here" in words(other.named("small-videos"))
+    assert all("so none stand here" in words(other.named(name)) for name in ("small-videos", "together"))
 
 
 def test_the_finding_comes_first_and_real_videos_before_smoke(page: Page) -> None:
     chapters = [e.get("id") for e in page.all(kind="chapter")]
-    assert chapters == ["small-videos", "smoke-scenes", "speed", "stability", "missing"]
+    assert chapters == ["together", "small-videos", "smoke-scenes", "speed", "stability", "missing"]
     parts = [e.attrib["id"].removeprefix("small-videos-") for e in page.named("small-videos").iter("h3")]
-    assert parts == ["tasks", "parts", "stands-on", "origin", "tables", "files"]
+    assert parts == ["tasks", "parts", "stands-on", "origin", "examples", "tables", "files"]
     assert ["stand-in" in words(e) for e in page.all(kind="finding")] == [True, True]
     assert [words(e).startswith("The base models are tiny and random") for e in page.all(kind="finding")] == [
         False,
@@ -135,15 +134,16 @@ def test_the_finding_comes_first_and_real_videos_before_smoke(page: Page) -> Non
 
 
 def test_nothing_is_fetched_and_nothing_runs(page: Page) -> None:
-    assert page.all("script", "iframe", "object", "embed", "img", "form", "base", "video") == []
+    assert page.all("script", "iframe", "object", "embed", "form", "base", "video") == []
     for element in page.root.iter():
-        assert not [name for name in element.attrib if name.startswith("on") or name in ("style", "src", "srcset")]
+        assert not [name for name in element.attrib if name.startswith("on") or name in ("style", "srcset")]
+        assert re.fullmatch(r"|speed_error/[a-z0-9-]+\.png", element.get("src", ""))
         assert element.get("href", "").partition(":")[0] not in ("http", "https", "javascript", "file")
     (style,) = page.all("style")
     assert not re.search(r"url\(|@import", str(style.text))
     policy = next(m.attrib["content"] for m in page.all("meta") if m.get("http-equiv"))
     digest = base64.b64encode(hashlib.sha256(str(style.text).encode()).digest()).decode()
-    assert policy.startswith(f"default-src 'none'; img-src data:; style-src 'sha256-{digest}'")
+    assert policy.startswith(f"default-src 'none'; img-src 'self' data:; style-src 'sha256-{digest}'")
 
 
 def test_it_can_be_read_aloud_and_links_lead_somewhere(page: Page, made: Path) -> None:
@@ -231,10 +231,52 @@ def test_what_is_missing_is_said_with_the_reason(changed: Path, monkeypatch: pyt
     assert "scores.csv" in said["small-scenes"]
     assert "lacks" in said["smoke-scenes"]
     assert ("make bench" in said["speed"], "make stability" in said["stability"]) == (True, True)
-    assert "not measured" in words(page.named("small-videos"))
+    (tasks,) = [t for t in page.named("small-videos").iter("table") if words(t).startswith("The full system, task")]
+    assert "Scenario" not in words(tasks), "what was not measured has no empty row"
     scores.unlink()
     monkeypatch.chdir(changed)
     assert "make repro" in str(CliRunner().invoke(app, ["page"]).exception)
+
+
+def test_what_only_users_can_measure_is_missing_until_they_have(page: Page) -> None:
+    def missing(name: str, source: str, **cells: str) -> set[str]:
+        report = Report(Path(name), scores_of(score(**cells)), effects_of(), published(), {"source": source}, {})
+        left = {what for _, what, _ in left_to_users([report])}
+        return {key for key, what, _ in module.BY_USER if what in left}
+
+    small, large, rest = "paper-7b-videos", "paper-13b-videos", {"RIPE", "photos", "robot"}
+    assert missing("small-videos", "videos") == {small, large, *rest}
+    assert missing("avocado-scenes", "scenes", task="RIPE") == {small, large, *rest}, "synthetic fruit is no avocado"
+    assert missing("avocado-videos", "videos", task="RIPE") == {small, large, *rest} - {"RIPE"}
+    assert missing(small, "videos", touch="photos") == {large, *rest} - {"photos"}
+    assert missing("paper-7b-scenes", "scenes") == {small, large, *rest}
+    assert {what for _, what, _ in module.BY_USER} <= {words(e) for e in page.named("missing").iter("b")}
+
+
+def test_all_reports_stand_beside_the_paper(page: Page) -> None:
+    few, every = page.named("together").iter("table")
+    heads = [words(e) for e in few.findall("thead/tr/th")]
+    assert heads[1:3] == ["Published 7b % (n)", "Published 13b % (n)"]
+    assert heads[3:] == [f"Measured {n}† % [95 %] (n)" for n in ("small-videos", "smoke-scenes")]
+    assert "† Settings were chosen on these test objects" in words(page.named("together"))
+    assert (len(few.findall("tbody/tr")), len(every.findall(".//td[@class='measured']"))) == (5, 2 * 32)
+
+
+def test_the_papers_examples_are_shown_right_and_wrong(page: Page, changed: Path) -> None:
+    folder = changed / "reports" / "small-videos"
+    assert "Not asked: the report is older" in words(page.named("small-videos"))
+    sample = json.loads((folder / "samples.json").read_text())["samples"][0]
+    asked = {"task": "rice", "part": "train", "asked": ["Describe.", "Cooked?"], "answered": ["Rough.", "Uncooked."]}
+    examples = [{**sample, **asked, "right": right} for right in (True, False)]
+    edit(folder / "samples.json", samples=[], examples=examples, not_asked={"toothbrush": ["handle", "bristles"]})
+    page = Page(write_page(changed))
+    shown = page.all("article")
+    assert [(e.get("class"), words(e[0])) for e in shown] == [
+        ("sample good", "rice (train): right"),
+        ("sample bad", "rice (train): wrong"),
+    ]
+    assert words(shown[0][1]).startswith("Asked Describe. Answered Rough. Asked Cooked? Answered Uncooked. Read as")
+    assert "for want of videos: toothbrush (of handle and bristles)." in words(page.named("small-videos"))
 
 
 def test_a_task_is_on_the_page_once_its_scores_are_there(changed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -245,7 +287,10 @@ def test_a_task_is_on_the_page_once_its_scores_are_there(changed: Path, monkeypa
     monkeypatch.chdir(changed)
     assert CliRunner().invoke(app, ["page"]).output.startswith(f"{PAGE}: ")
     page = Page(changed / PAGE)
-    for table in (page.all("table")[0], *(page.named(f"small-videos-{key}") for key in ("understanding", "variants"))):
+    for table in (
+        next(page.named("small-videos").iter("table")),
+        *(page.named(f"small-videos-{key}") for key in ("understanding", "variants")),
+    ):
         assert "Telling toys apart" in words(table)
 
 
@@ -254,19 +299,3 @@ def test_speed_and_stability_are_told(page: Page, made: Path) -> None:
     told = [words(e) for e in page.named("speed").iter("li")]
     assert sorted(text.partition(": cost")[0] for text in told) == sorted(row["setting"] for row in front)
     assert "2 hard cases, 1 failed" in words(page.named("stability"))
-
-
-@given(st.lists(st.tuples(st.floats(0.01, 100), st.floats(0, 5), st.floats(0, 1)), min_size=2, max_size=9))
-def test_points_lie_in_the_frame_and_keep_their_order(points: list[tuple[float, float, float]]) -> None:
-    points = sorted(points, key=lambda point: point[0])
-    cells = [{"cost_ratio": c, "error": e, "low": e - w, "high": e + w} for c, e, w in points]
-    placed = place_points(pd.DataFrame(cells).assign(setting="s", front=True))
-    assert placed is not None
-    assert len(placed.up) >= 2
-    for dot in placed.dots:
-        assert SIZE["left"] <= dot["x"] <= SIZE["width"] - SIZE["right"]
-        assert SIZE["top"] <= dot["high"] <= dot["y"] <= dot["low"] <= SIZE["bottom"]
-    assert [dot["number"] for dot in placed.dots] == list(range(1, len(points) + 1))
-    for (one, first), (other, second) in itertools.combinations(zip(points, placed.dots, strict=True), 2):
-        assert first["x"] <= second["x"]
-        assert (one[1] - other[1]) * (first["y"] - second["y"]) <= 0, "more error stands higher"

@@ -135,7 +135,7 @@ def test_effects_that_hold_are_named_and_those_that_do_not_are_not() -> None:
 
 def test_a_readme_stays_short_whatever_is_measured() -> None:
     tasks = [score(f"T{i}", variant=v) for i in range(60) for v in ("finetuned with all", "finetuned with none")]
-    text = render_readme(report(tasks), ["tasks.png", "effects.png"])
+    text = render_readme(report(tasks), ["curves.png", "effects.png"])
     assert text.count("\n") <= MOST_LINES
     assert "T59" in text
     assert "On the page" in text

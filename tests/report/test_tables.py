@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from pipeline.errors import UserError
 from pipeline.evaluation import scores as evaluation
 from pipeline.report import load
-from pipeline.report.load import KEYS, load_report, published, read_frame
-from pipeline.report.tables import TABLES, Table, headline, task_title
+from pipeline.report.load import KEYS, Report, load_report, published, read_frame
+from pipeline.report.tables import TABLES, Table, headline, side_by_side, task_title
 from pipeline.tasks import TASKS
 from pipeline.videos.catalogue import Catalogue
 from tests.report.conftest import effect, effects_of, score, scores_of
@@ -154,6 +154,50 @@ def test_each_data_set_has_the_papers_figures_about_it() -> None:
     (described,) = build("description", score("OPD", "combined"), dataset="avocados").to_dict("records")
     assert described["Published 13b % (n)"] == "35.50 (200)"
     assert not any("Published" in name for name in build("reasoning", score("RIPE")))
+
+
+def one(name: str, *rows: dict[str, object], dataset: str = load.DATASET) -> Report:
+    return Report(Path(name), scores_of(*rows), NO_EFFECTS, published(dataset), {"dataset": dataset}, {})
+
+
+def test_reports_stand_side_by_side_with_every_row_of_the_paper() -> None:
+    """7b measured two rows, 13b three others and, by seed and with other touch, what belongs to no row."""
+    small = one("paper-7b-videos", score("PC"), score("OPD", "combined"))
+    large = one(
+        "paper-13b-videos",
+        score("PC", accuracy=0.6, low=0.4, high=0.8, n=150),
+        score("PC", variant="base with all"),
+        score("heads", "hardness", variant="finetuned  "),
+        score("PSS", seed="0"),
+        score("PSS", touch="swapped"),
+    )
+    reports = {"7b here": small, "13b here": large}
+    few = side_by_side(reports, every=False).set_index("Task")
+    heads = [f"Measured {name} % [95 %] (n)" for name in reports]
+    assert list(few.columns) == ["Published 7b % (n)", "Published 13b % (n)", *heads]
+    assert list(few.index) == [task_title(task) for task in ("OPD", "PC", "PSS", "POM", "PSR")]
+    compared = ["48.10 (158)", "55.06 (158)", "50.0 [35.0, 65.0] (40)", "60.0 [40.0, 80.0] (150)"]
+    assert list(few.loc["Property Comparison (PC)"]) == compared
+    assert list(few.loc["Property Superlative Selection (PSS)"][heads]) == ["", ""]
+    every = side_by_side(reports, every=True)
+    cells = published()
+    answered = cells[cells["model"].isin(["7b", "13b", "CLIP"])]
+    assert len(every) == len(answered.drop_duplicates(list(KEYS))) == 32
+    base = every[every["System"].eq("base encoder") & every["Task"].eq("Property Comparison (PC)")]
+    assert base[heads].to_numpy().tolist() == [["", "50.0 [35.0, 65.0] (40)"]]
+    assert (every[heads] != "").sum().tolist() == [2, 3]
+
+
+def test_reports_about_other_data_stand_beside_what_is_published_of_these() -> None:
+    fruit = one("f", score("RIPE"), score("PC"), dataset="avocados")
+    own = one("o", score("PC"), dataset="Other")
+    rows = side_by_side({"fruit": fruit, "own": own, "paper": one("p", score("PC"))}, every=False).set_index("Task")
+    printed, here = [f"Published {m} % (n)" for m in ("7b", "13b")], "50.0 [35.0, 65.0] (40)"
+    heads = [f"Measured {name} % [95 %] (n)" for name in ("fruit", "own", "paper")]
+    assert list(rows.columns) == [*printed, *heads]
+    assert list(rows.loc["Property Comparison (PC)"]) == ["48.10 (158)", "55.06 (158)", "", "", here]
+    assert list(rows.loc["Ripeness Classification (RIPE), avocados"]) == ["", "63.00 (100)", here, "", ""]
+    assert side_by_side({"own": own}, every=True).empty
 
 
 @pytest.mark.parametrize("dataset", [load.DATASET, "avocados"])

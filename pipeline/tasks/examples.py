@@ -1,0 +1,87 @@
+"""The paper's figures of rice and of a toothbrush: described first, then reasoned about; shown, and counted nowhere."""
+
+from __future__ import annotations
+
+import random
+import re
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from pipeline.records import Assignment, Dialogue, Opd, Part, Prediction, Question, Score, Turn
+from pipeline.runtime import derive_seed
+from pipeline.tasks.base import LETTERS, Pool, choice_score, chosen_letter, descriptions, draw_videos, gold, lettered
+from pipeline.tasks.opd import TEMPLATES
+from pipeline.videos.catalogue import Catalogue
+
+PARTS = (Part.TEST, Part.VALIDATION, Part.TRAIN)
+"""The parts of a split, what a model knows least of first."""
+
+
+class Example(NamedTuple):
+    """A question about one object, of whose two options the first is right, or about two, of which the first is."""
+
+    name: str
+    objects: tuple[str, ...]
+    question: str
+    answer: str
+    """How an answer begins; the letter of its choice comes next."""
+    options: tuple[str, ...] = ()
+
+
+EXAMPLES = (
+    Example("rice", ("rice",), "Is this scoop of rice {options}?", "The rice is", ("uncooked", "cooked")),
+    Example(
+        "toothbrush",
+        ("toothbrush_handle", "toothbrush_bristles"),
+        "One of them is the handle and the other are the bristles of the same toothbrush. Which one is the handle?",
+        "The handle is",
+    ),
+)
+"""PhysiCLeAR's objects; a catalogue without them has no examples."""
+
+
+def build_examples(assignments: Sequence[Assignment], catalogue: Catalogue, *, seed: int) -> list[Question]:
+    """Each example whose objects all have videos in this split, with the right answer at a) and then at b).
+
+    A question's part is the most familiar one of its objects: `train` where the model was trained on one of them.
+    """
+    rng, questions = random.Random(derive_seed(seed, "examples")), []
+    parts = {a.object_id: a.part for a in assignments if a.part in PARTS}
+    for example in EXAMPLES:
+        if not parts.keys() >= {*example.objects}:
+            continue
+        part = max((parts[o] for o in example.objects), key=PARTS.index)
+        videos = {o: [a.video_id for a in assignments if a.object_id == o] for o in example.objects}
+        pool = Pool(part, catalogue, videos)
+        for letter, step in zip(LETTERS, (1, -1), strict=False):
+            objects, options = example.objects[::step], example.options[::step]
+            if options:
+                opening, described = TEMPLATES[0], catalogue.describe(*objects)
+            else:
+                opening = f"Describe these two tactile videos: {lettered(2)}."
+                described = descriptions(catalogue, objects, ("a)", "b)"))
+            named = " or ".join(f"{x}) {option}" for x, option in zip(LETTERS, options, strict=False))
+            request = f"{example.question.format(options=named)} Use the format '{example.answer} x), because xxx'."
+            turns = (
+                Turn(user=opening, assistant=described),
+                Turn(user=request, assistant=f"{example.answer} {letter})."),
+            )
+            questions.append(
+                Question(
+                    question_id=f"{example.name}-{letter}",
+                    task=example.name,
+                    part=part,
+                    videos=draw_videos(pool, objects, rng),
+                    objects=objects,
+                    dialogues=(Dialogue(opd=Opd.ALL, turns=turns),),
+                    gold=gold(pool, objects, letter, catalogue.property_names),
+                )
+            )
+    return questions
+
+
+def grade_example(question: Question, prediction: Prediction) -> Score:
+    """Read from the letter behind the example's `answer`; two different letters there are no choice."""
+    before = next(e.answer for e in EXAMPLES if e.name == question.task)
+    (score,) = choice_score(question, prediction, chosen_letter(prediction.outputs[-1], re.escape(before)))
+    return score
