@@ -62,8 +62,8 @@ def reference(model: OctopiForCausalLM, folder: Path, batch: dict[str, torch.Ten
 def test_a_step_is_that_of_plain_torch(
     tied: bool, questions: list[Question], store: EmbeddingStore, tmp_path: Path, checkpoints: Path
 ) -> None:
-    """In float64, questions that begin alike, and a matrix that is the head's too: that one stays as it was."""
-    folder = write_llama(tmp_path / "base", tie_word_embeddings=tied)
+    """In float64, of questions that begin alike; the base pads with a word, and its matrix may be its head too."""
+    folder = write_llama(tmp_path / "base", tie_word_embeddings=tied, pad_token_id=1)
     before = digests(folder)
     setting = LanguageConfig(weights=str(folder), system_prompt="You feel.")
     model, data = assemble(material(setting, questions, store), 4, "test")
