@@ -296,5 +296,5 @@ def _without_cache(model: OctopiForCausalLM, embeddings: torch.Tensor, limit: in
     while len(said) < limit and not (said and said[-1].item() == model.tokenizer.eos_token_id):
         logits = model.llm(inputs_embeds=embeddings, use_cache=False, logits_to_keep=1).logits
         said.append(logits[:, -1].argmax(-1, keepdim=True))
-        embeddings = torch.cat([embeddings, model.llm.get_input_embeddings()(said[-1])], dim=1)
+        embeddings = torch.cat([embeddings, model.embed_words(said[-1])], dim=1)
     return torch.cat(said, dim=1)

@@ -25,6 +25,7 @@ Recipe = Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]*$")]
 """A name in `pipeline.encoder.recipes.RECIPES`; `octopi scale` checks that it is one."""
 CLIP_RECIPES = ("paper", "release")
 """Recipes that are for `encoder.backbone=[clip]` alone."""
+TrainedEmbeddings = Literal["all", "new"]
 Selection = Literal["salient", "release", "uniform", "contact", "adaptive"]
 
 SCENES_DIR = Path("data/scenes/videos")
@@ -247,6 +248,9 @@ class LanguageConfig(Section):
     """`nf4`: hold the frozen linear layers in four bits (needs bitsandbytes and a CUDA device)."""
     system_prompt: str = ""
     """Put before each conversation (Vicuna has one)."""
+    bos: bool = True
+    """Begin each conversation about touch with the begin token, where the tokenizer writes one (the published code
+    takes it away). A chat template's own stays."""
     max_new_tokens: Annotated[int, Field(ge=1, le=4096)] = 256
     """Of an answer; fewer where the language model has no more positions. Longer answers are cut and marked."""
     generation_batch_size: Positive = 32
@@ -286,7 +290,7 @@ class TeachConfig(Section):
 
 
 class TrainConfig(Section):
-    """One stage of language training (AdamW, cosine)."""
+    """One stage of language training (AdamW)."""
 
     samples: Positive
     """Questions trained on (paper: 8k for alignment, 3k end to end)."""
@@ -296,15 +300,27 @@ class TrainConfig(Section):
     micro_batch_size: Positive = 16
     """Questions at a time on one device, of like length; the rest is accumulated, each token weighing the same."""
     projection_learning_rate: Rate = 2e-5
+    """Of the projection, and of word embeddings as far as they are trained."""
+    projection_schedule: Literal["cosine", "constant"] = "cosine"
+    """Of the projection alone (the published code has none for it); all else that is trained has a cosine."""
     warmup_ratio: Annotated[float, Field(ge=0, lt=1)] = 0.0
     weight_decay: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    max_grad_norm: Annotated[float, Field(gt=0)] = 1.0
+    max_grad_norm: Annotated[float, Field(ge=0)] = 1.0
+    """Gradients longer than this are shortened to it; 0 leaves all as they are (the published code)."""
 
     @model_validator(mode="after")
     def _batches_divide(self) -> Self:
         if self.batch_size % self.micro_batch_size:
             raise ValueError(f"micro_batch_size {self.micro_batch_size} does not divide batch_size {self.batch_size}")
         return self
+
+
+class AlignConfig(TrainConfig):
+    """Alignment of the projection."""
+
+    train_embeddings: TrainedEmbeddings = "new"
+    """Word embeddings that are trained, here and in the end-to-end training that follows: `all`, the whole layer
+    (paper), or only those of the two `new` tokens. All take another 16 bytes a value, 2 GiB for Vicuna-7b."""
 
 
 class LoraTrainConfig(TrainConfig):
@@ -400,7 +416,7 @@ class Params(Section):
     cross_validation: CrossValidationConfig
     teach: TeachConfig
     language: LanguageConfig
-    align: TrainConfig
+    align: AlignConfig
     lora: LoraTrainConfig
     ablation: AblationConfig
     tracking: TrackingConfig

@@ -140,28 +140,33 @@ def language_uses(params: Params, llama: Llama, embedding: int, lengths: Lengths
     frozen = linear * held + (llama.parameters - linear) * size
     connector = (embedding + 1) * hidden + (hidden + 1) * hidden + 2 * hidden
     adapters = llama.adapters(params.lora.target_modules, params.lora.rank)
+    # A copy beside the frozen ones, which a tied head still needs.
+    words = llama.vocab_size * hidden if params.align.train_embeddings == "all" else 0
     devices, sharded = launched(params.runtime.launcher)
     trainings: tuple[tuple[str, TrainConfig, int], ...] = (
-        ("align", params.align, connector),
-        ("lora", params.lora, connector + adapters),
+        ("align", params.align, connector + words),
+        ("lora", params.lora, connector + words + adapters),
     )
     for stage, config, trained in trainings:
         whole, layer = frozen + FULL * trained, llama.layer_linear * held
         shards = devices if sharded else 1
-        gathered = GATHERED * layer + llama.words * size + FULL * connector if shards > 1 else 0.0
+        gathered = GATHERED * layer + llama.words * size + FULL * (connector + words) if shards > 1 else 0.0
+        saved, passing = (f(params, llama, config, lengths) for f in (language_saved, language_passing))
         yield Use(
             stage,
             devices,
             parameters=whole / shards + gathered,
-            optimizer=ADAM * trained / shards,
-            activations=sum(f(params, llama, config, lengths) for f in (language_saved, language_passing)),
+            # Gradients are shared among devices at the end of an update; until then each adds up its own.
+            optimizer=FULL * trained + (ADAM - FULL) * trained / shards,
+            # The newest gradient of all words, when what the layers kept is gone.
+            activations=max(saved + passing, FULL * words),
         )
     rows = language.generation_batch_size
     read = rows * lengths.prompt
     yield Use(
         "answer",
         1,
-        parameters=frozen + FULL * (connector + adapters),
+        parameters=frozen + FULL * (connector + words + adapters),
         optimizer=0,
         # The prompts are read at once: the widest maps' outcomes, and a mask for each pair of tokens.
         activations=read * (3 * llama.intermediate_size + 2 * hidden + lengths.prompt) * size,

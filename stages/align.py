@@ -16,6 +16,8 @@ def main() -> None:
         config = run.params.align
         material = Material.load(DATA, run.params, encoder, opd, seed)
         model, data = assemble(material, config.samples, "align")
+        if config.train_embeddings == "all":
+            model.train_words()
         with live(run) as callbacks:
             job = Job(run.name, material.fingerprint(config), material.seed, callbacks)
             trained = align(model, data, config, run.params.runtime, job)

@@ -35,6 +35,7 @@ def main() -> None:
                 per_video=0 if touch is Touch.REMOVED else params.frames.per_video,
                 max_new_tokens=language.max_new_tokens,
                 batch_size=language.generation_batch_size,
+                bos=language.bos,
             )
             given = ablate_input(store, touch, questions, variant.seed)
             predictions = answer(model, given, questions, variant.opd, settings)

@@ -3,7 +3,6 @@
 import sys
 
 from pipeline.io import write_table
-from pipeline.language.octopi import CONNECTOR_FILE
 from pipeline.language.training import Job, Material, add_lora, assemble, finetune_lora, write_model_card
 from pipeline.records import Encoder, Measurement, Opd
 from pipeline.stage import DATA, stage
@@ -20,7 +19,9 @@ def main() -> None:
         model, data = assemble(material, config.samples, "lora", aligned)
         add_lora(model, config)
         with live(run) as callbacks:
-            job = Job(run.name, material.fingerprint(config, aligned / CONNECTOR_FILE), material.seed, callbacks)
+            # The connector, and the word embeddings where they were trained.
+            inputs = sorted(aligned.glob("*.safetensors"))
+            job = Job(run.name, material.fingerprint(config, *inputs), material.seed, callbacks)
             trained = finetune_lora(model, data, config, run.params.runtime, job)
         run.finish_training(trained.history)
         out = DATA / "models" / "with" / key

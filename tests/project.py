@@ -31,6 +31,7 @@ REDUCED = (
     "cross_validation.models=[probe]",
     "cross_validation.folds=2",
     "align.samples=16",
+    "align.train_embeddings=all",
     "lora.samples=16",
     "language.max_new_tokens=24",
 )

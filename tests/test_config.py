@@ -215,7 +215,10 @@ def test_a_recipe_brings_its_settings_and_gives_way_to_yours() -> None:
     for recipe in RECIPES:
         composed = compose("smoke", [f"encoder.recipe={recipe}"], conf=CONF)
         assert composed.encoder.recipe == recipe
-        assert composed.language == smoke.language
+        assert composed.language == smoke.language.model_copy(update={"bos": recipe != "release"})
+        assert (composed.align.train_embeddings, composed.lora.max_grad_norm) == (
+            ("all", 0.0) if recipe == "release" else ("new", 1.0)
+        )
         assert composed.encoder.backbone == ("clip",)
         assert not needs_pretraining(composed.encoder, composed.cross_validation.models)
     scenes = compose("smoke", ["encoder.recipe=tuned", "encoder.backbone=[scenes]"], conf=CONF)

@@ -96,7 +96,7 @@ def end_ids(tokenizer: PreTrainedTokenizerBase) -> tuple[int, ...]:
     return tuple(dict.fromkeys(eos + behind[:1]))
 
 
-def encode(rendered: Rendered, tokenizer: PreTrainedTokenizerBase) -> Encoded:
+def encode(rendered: Rendered, tokenizer: PreTrainedTokenizerBase, *, bos: bool = True) -> Encoded:
     """Tokenise a whole conversation at once and label the answers' tokens by their character offsets.
 
     Tokenising in one piece keeps prompt tokens equal in training and evaluation, whatever the tokenizer does at
@@ -104,7 +104,7 @@ def encode(rendered: Rendered, tokenizer: PreTrainedTokenizerBase) -> Encoded:
     """
     if not tokenizer.is_fast:
         raise UserError(f"{tokenizer.name_or_path}: has no fast tokenizer (tokenizer.json); labels need its offsets")
-    batch = tokenizer(rendered.text, return_offsets_mapping=True, add_special_tokens=not rendered.templated)
+    batch = tokenizer(rendered.text, return_offsets_mapping=True, add_special_tokens=bos and not rendered.templated)
     ids: list[int] = batch["input_ids"]
     labels = [
         token if any(start <= a and b <= stop and a < b for start, stop in rendered.answers) else IGNORE_INDEX

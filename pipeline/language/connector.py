@@ -8,6 +8,7 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import nn
 
+from pipeline.config import TrainedEmbeddings
 from pipeline.errors import UserError
 from pipeline.io import read_json
 from pipeline.language.chat import TACTILE_TOKENS
@@ -29,13 +30,15 @@ class OctopiConfig(BaseModel):
     hidden_size: int = Field(ge=1)
     """Length of a word embedding."""
     tactile_tokens: tuple[str, ...] = TACTILE_TOKENS
+    trained_embeddings: TrainedEmbeddings = "new"
+    """Whether words.safetensors holds embeddings of all words, or the language model's own are used."""
 
 
 class Connector(nn.Module):
     """The paper's projection (two linear layers, GELU between) and the embeddings of the two new tokens.
 
-    The new tokens' embeddings live here, not in the language model's matrix: they are the only word embeddings that
-    are trained, the matrix keeps its shape, and a plain PEFT adapter stays loadable on the untouched base.
+    The new tokens' embeddings live here, not in the language model's matrix, whether its rows are trained too or not:
+    the matrix keeps its shape, and a plain PEFT adapter stays loadable on the untouched base.
     """
 
     def __init__(self, tactile_dim: int, hidden: int) -> None:

@@ -54,6 +54,7 @@ class ConversationDataset(EpochDataset[Sample]):
         flip_probability: float,
         seed: int,
         positions: int | None = None,
+        bos: bool = True,
     ) -> None:
         super().__init__()
         self.questions = [q for q in questions if q.dialogue(opd)]
@@ -66,7 +67,7 @@ class ConversationDataset(EpochDataset[Sample]):
             dialogue = question.dialogue(opd)
             assert dialogue is not None
             text = render(dialogue.turns, tokenizer, system_prompt=system_prompt, frames=per_video, complete=True)
-            encoded = encode(text, tokenizer)
+            encoded = encode(text, tokenizer, bos=bos)
             check_length(question.question_id, len(encoded.input_ids), positions)
             if all(label == IGNORE_INDEX for label in encoded.labels):
                 raise UserError(f"{question.question_id}: has no answer to learn from; run `dvc repro questions -f`")

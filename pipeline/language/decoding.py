@@ -58,7 +58,6 @@ def greedy_tokens(
     logits, cache, mask = _read(model, prompts, features)
     said, ended = [0] * len(prompts), [False] * len(prompts)
     rows = list(range(len(prompts)))
-    words = model.llm.get_input_embeddings()
     while True:
         tokens, going = logits.argmax(-1), []
         for place, (row, token) in enumerate(zip(rows, tokens.tolist(), strict=True)):
@@ -77,7 +76,7 @@ def greedy_tokens(
             tokens, mask = tokens[chosen], mask[chosen]
             cache.batch_select_indices(chosen)
         mask = F.pad(mask, (0, 1), value=1)
-        logits = _step(model, words(tokens[:, None]), mask, cache)
+        logits = _step(model, model.embed_words(tokens[:, None]), mask, cache)
 
 
 def _step(model: OctopiForCausalLM, embeddings: torch.Tensor, mask: torch.Tensor, cache: Cache) -> torch.Tensor:
@@ -101,7 +100,7 @@ def _read(
     begun = roomy_cache(config)
     if shared:
         ids = torch.tensor([prompts[0][:shared]], device=device)
-        _step(model, model.llm.get_input_embeddings()(ids), torch.ones_like(ids), begun)
+        _step(model, model.embed_words(ids), torch.ones_like(ids), begun)
     parts: list[tuple[torch.Tensor, torch.Tensor, Cache]] = []
     for rows in _parts([len(p) - shared for p in prompts]):
         cache = copy.deepcopy(begun)

@@ -27,6 +27,7 @@ class GenerationSettings:
     """Frames a video; 0 asks without touch."""
     max_new_tokens: int
     batch_size: int
+    bos: bool = True
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ def write_prompt(
 ) -> tuple[int, ...]:
     """Token ids of a conversation up to where its last answer is to be said."""
     rendered = render(turns, tokenizer, system_prompt=settings.system_prompt, frames=settings.per_video, complete=False)
-    return encode(rendered, tokenizer).input_ids
+    return encode(rendered, tokenizer, bos=settings.bos).input_ids
 
 
 def reply(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Self, cast
@@ -22,7 +23,7 @@ from pipeline.language.connector import CONFIG_FILE, Connector, OctopiConfig, re
 from pipeline.runtime import DtypeName, Quantization, resolve_dtype
 from pipeline.training.trainable import load_trainable
 
-CONNECTOR_FILE = "connector.safetensors"
+CONNECTOR_FILE, WORDS_FILE = "connector.safetensors", "words.safetensors"
 ADAPTER_DIR = "adapter"
 
 
@@ -31,13 +32,17 @@ class OctopiForCausalLM(nn.Module):
 
     It is saved and loaded by `save_pretrained` and `from_pretrained`, but is no `PreTrainedModel`: those write all of
     their weights, and here the base (13 GB for Vicuna-7b) stays where it is, beside a connector and an adapter of some
-    megabytes. All that Trainer and accelerate ask of a model is that its `forward` gives a loss.
+    megabytes, and word embeddings (half a GB) where they were trained. All that Trainer and accelerate ask of a model
+    is that its `forward` gives a loss.
 
     Args:
         llm: A Llama-like model, or a PEFT model around one; frozen but for adapters.
         tokenizer: Knows the three tactile tokens.
         tactile_dim: Length of a tactile embedding.
         base: Folder that the language model came from.
+
+    Attributes:
+        words: The word embeddings where they are trained (`train_words`), in place of the language model's.
 
     Raises:
         UserError: where the tokenizer has tokens that the model has no embedding of.
@@ -55,6 +60,7 @@ class OctopiForCausalLM(nn.Module):
         self.connector = Connector(tactile_dim, matrix.shape[1])
         # Not named `config`: what has that name is transformers' own to Trainer, which writes into it.
         self.octopi_config = OctopiConfig(base_model=base, tactile_dim=tactile_dim, hidden_size=matrix.shape[1])
+        self.words: nn.Embedding | None = None
         with torch.no_grad():
             # The mean of all words is a neutral start for a new one.
             self.connector.delimiters.copy_(matrix.float().mean(0).expand(2, -1))
@@ -89,9 +95,9 @@ class OctopiForCausalLM(nn.Module):
         """Load what `save_pretrained` wrote, ready to answer.
 
         Args:
-            folder: With config.json, connector.safetensors and, where there is one, adapter/.
+            folder: With config.json, connector.safetensors and, where there are such, words.safetensors and adapter/.
             base: Folder of the language model; by default the one that config.json names.
-            dtype: Number format of the frozen weights; connector and adapter are float32 whatever it is.
+            dtype: Number format of the frozen weights; what was trained is float32 whatever it is.
             quantization: `nf4` for linear layers of four bits (bitsandbytes and CUDA).
 
         Raises:
@@ -107,15 +113,17 @@ class OctopiForCausalLM(nn.Module):
                 f"{config.base_model}, in language.weights"
             )
         load_trainable(model.connector, folder / CONNECTOR_FILE)
+        if config.trained_embeddings == "all":
+            load_trainable(model.train_words(), folder / WORDS_FILE)
         if (folder / ADAPTER_DIR).is_dir():
             model.llm = load_adapter(model.llm, folder / ADAPTER_DIR)
         for name, value in model.named_parameters():
-            if (name.startswith("connector.") or "lora_" in name) and not value.isfinite().all():
+            if (name.startswith(("connector.", "words.")) or "lora_" in name) and not value.isfinite().all():
                 raise UserError(f"{folder}: {name} is not finite; lower the learning rate it was trained at")
         return model.eval()
 
     def save_pretrained(self, folder: Path | str, state_dict: Mapping[str, torch.Tensor] | None = None) -> None:
-        """Write config.json, the connector and, where there is one, the adapter in PEFT's own format.
+        """Write config.json, the connector and, where there are such, word embeddings and an adapter in PEFT's format.
 
         Args:
             folder: Made where it is not there.
@@ -124,7 +132,36 @@ class OctopiForCausalLM(nn.Module):
         folder, state = Path(folder), self.state_dict() if state_dict is None else state_dict
         write_json(folder / CONFIG_FILE, self.octopi_config.model_dump(mode="json"))
         save_tensors(folder / CONNECTOR_FILE, _below("connector", state))
+        if self.words is not None:
+            save_tensors(folder / WORDS_FILE, _below("words", state))
         save_adapter(self.llm, folder / ADAPTER_DIR, _below("llm", state))
+
+    def train_words(self) -> nn.Embedding:
+        """Have all word embeddings trained: a copy in float32, which begins as the language model's own.
+
+        The base stays as it is, and so does its head. Where the two are one matrix (SmolLM2), it is the head's alone
+        from here on: the layer that reads words is trained, as in Vicuna, whose head is another, and the one that says
+        them is not.
+        """
+        words: nn.Embedding = copy.deepcopy(self.llm.get_input_embeddings()).float().requires_grad_(True)
+        # The end token pads some models, whose own layer would then leave it out; padding itself has no gradient here.
+        words.padding_idx = None
+        self.words = words
+        self.octopi_config = self.octopi_config.model_copy(update={"trained_embeddings": "all"})
+        return words
+
+    def embed_words(self, input_ids: torch.Tensor) -> torch.Tensor:
+        """Embeddings of words, the trained ones where there are.
+
+        Args:
+            input_ids: batch x length, without tactile tokens.
+
+        Returns:
+            batch x length x hidden, in the language model's number format.
+        """
+        own = self.llm.get_input_embeddings()
+        found = own(input_ids) if self.words is None else self.words(input_ids).to(own.weight.dtype)
+        return cast(torch.Tensor, found)
 
     @property
     def positions(self) -> int | None:
@@ -142,10 +179,9 @@ class OctopiForCausalLM(nn.Module):
         Returns:
             batch x length x hidden, in the language model's number format.
         """
-        words = self.llm.get_input_embeddings()
         tactile = torch.isin(input_ids, input_ids.new_tensor([self.start_id, self.frame_id, self.end_id]))
         # The tactile tokens have no row in the word matrix.
-        embeddings = words(input_ids.masked_fill(tactile, 0))
+        embeddings = self.embed_words(input_ids.masked_fill(tactile, 0))
         frames = input_ids == self.frame_id
         used = torch.arange(features.shape[1], device=features.device) < frames.sum(1, keepdim=True)
         projected = self.connector.projection(features[used].to(self.connector.delimiters.dtype))
@@ -153,7 +189,7 @@ class OctopiForCausalLM(nn.Module):
         for token, row in ((self.start_id, 0), (self.end_id, 1)):
             delimiter = self.connector.delimiters[row].to(embeddings.dtype)
             embeddings = torch.where((input_ids == token)[..., None], delimiter, embeddings)
-        return cast(torch.Tensor, embeddings)
+        return embeddings
 
     def forward(
         self,
@@ -183,14 +219,15 @@ class OctopiForCausalLM(nn.Module):
             call = {"inputs_embeds": embeddings, "attention_mask": attention_mask, "use_cache": False}
             return CausalLMOutput(logits=self.llm(**call).logits)
         shared = self._shared(input_ids, labels) if attention_mask is None else 0
+        embeddings = self.embed(input_ids, features)
         call = {"attention_mask": attention_mask, "use_cache": False}
         if shared:
-            call = {"past_key_values": self._begin(input_ids[:, :shared]), "use_cache": True}
+            call = {"past_key_values": self._begin(embeddings[:, :shared]), "use_cache": True}
         targets = labels[:, shared + 1 :]
         learned = targets != IGNORE_INDEX
         columns = learned.any(0).nonzero().flatten()
-        embeddings = self.embed(input_ids[:, shared:], features)
-        logits = self.llm(inputs_embeds=embeddings, **call, logits_to_keep=columns).logits[learned[:, columns]]
+        output = self.llm(inputs_embeds=embeddings[:, shared:], **call, logits_to_keep=columns)
+        logits = output.logits[learned[:, columns]]
         exact = logits.to(torch.promote_types(logits.dtype, torch.float32))
         loss = F.cross_entropy(exact, targets[learned], reduction="sum")
         count = len(logits) if num_items_in_batch is None else num_items_in_batch
@@ -208,14 +245,13 @@ class OctopiForCausalLM(nn.Module):
         alike = (input_ids == input_ids[:1]) & (input_ids != self.start_id) & (labels == IGNORE_INDEX)
         return max(0, int(alike.all(0).long().cumprod(0).sum()) - 1)
 
-    def _begin(self, input_ids: torch.Tensor) -> DynamicCache:
-        """Keys and values of what all rows begin with: computed for one, and without gradient in a frozen model."""
+    def _begin(self, embeddings: torch.Tensor) -> DynamicCache:
+        """Keys and values of what all rows begin with: of one row, and without gradient where none is trained there."""
         cache = DynamicCache(config=self.llm.config)
-        adapted = any(parameter.requires_grad for parameter in self.llm.parameters())
-        with torch.set_grad_enabled(adapted and torch.is_grad_enabled()):
-            embeddings = self.llm.get_input_embeddings()(input_ids[:1])
-            self.llm(inputs_embeds=embeddings, past_key_values=cache, use_cache=True, logits_to_keep=1)
-        cache.batch_repeat_interleave(len(input_ids))
+        learns = self.words is not None or any(parameter.requires_grad for parameter in self.llm.parameters())
+        with torch.set_grad_enabled(learns and torch.is_grad_enabled()):
+            self.llm(inputs_embeds=embeddings[:1], past_key_values=cache, use_cache=True, logits_to_keep=1)
+        cache.batch_repeat_interleave(len(embeddings))
         return cache
 
 

@@ -18,6 +18,7 @@ from pipeline.config import LanguageConfig, LoraTrainConfig, Params, RuntimeConf
 from pipeline.embeddings import TENSOR_FILE, EmbeddingStore
 from pipeline.errors import UserError
 from pipeline.io import fingerprint, read_jsonl
+from pipeline.language.connector import read_config
 from pipeline.language.conversations import ConversationCollator, ConversationDataset, LengthBuckets
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.records import Encoder, Opd, Question
@@ -132,6 +133,7 @@ def assemble(
         flip_probability=material.flip_probability,
         seed=material.seed,
         positions=model.positions,
+        bos=language.bos,
     )
     return model, data
 
@@ -149,16 +151,15 @@ class Job:
 def align(
     model: OctopiForCausalLM, data: ConversationDataset, config: TrainConfig, runtime: RuntimeConfig, job: Job
 ) -> Trained:
-    """Train the projection and the two new tokens; the language model stays frozen."""
-    return _fit(model, data, config, runtime, job, {"connector": config.projection_learning_rate})
+    """Train the projection, the two new tokens and the word embeddings, if they are; all else stays frozen."""
+    return _fit(model, data, config, runtime, job, {})
 
 
 def finetune_lora(
     model: OctopiForCausalLM, data: ConversationDataset, config: LoraTrainConfig, runtime: RuntimeConfig, job: Job
 ) -> Trained:
-    """Train adapters, projection and new tokens, each at its own rate."""
-    rates = {"connector": config.projection_learning_rate, "llm": config.learning_rate}
-    return _fit(model, data, config, runtime, job, rates)
+    """Train the adapters at their own rate, and what alignment trained."""
+    return _fit(model, data, config, runtime, job, {"llm": config.learning_rate})
 
 
 def write_model_card(folder: Path, material: Material, data: ConversationDataset, config: TrainConfig) -> None:
@@ -180,6 +181,7 @@ def write_model_card(folder: Path, material: Material, data: ConversationDataset
             **config.model_dump(),
             "flip_probability": material.flip_probability,
             "number format": f"{material.language.dtype}, quantization {material.language.quantization}",
+            "trained word embeddings": read_config(folder).trained_embeddings,
             "seed": material.seed,
         },
         limits=(
@@ -201,6 +203,8 @@ def _fit(
     job: Job,
     rates: Mapping[str, float],
 ) -> Trained:
+    # The new tokens' vectors are word embeddings, wherever they are kept.
+    trained = ("connector.projection", "connector.delimiters", *(("words",) if model.words is not None else ()))
     if runtime.gradient_checkpointing:
         model.llm.gradient_checkpointing_enable(gradient_checkpointing_kwargs={"use_reentrant": False})
     seed_everything(job.seed)
@@ -223,7 +227,8 @@ def _fit(
         train_dataset=data,
         data_collator=ConversationCollator(int(model.tokenizer.pad_token_id)),
         callbacks=[TrainingMonitor(), *job.callbacks],
-        rates=rates,
+        rates={**dict.fromkeys(trained, config.projection_learning_rate), **rates},
+        constant=("connector.projection",) if config.projection_schedule == "constant" else (),
         sampler=LengthBuckets(data.lengths, config.micro_batch_size, job.seed, lambda: data.epoch),
     )
     return train(trainer)

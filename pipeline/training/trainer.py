@@ -7,7 +7,7 @@ import logging
 import math
 import shutil
 import sys
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -43,6 +43,7 @@ class TrainableTrainer(Trainer):
 
     Args:
         rates: Learning rate of the parameters under each name.
+        constant: Of those names, the ones whose rate stays as it is throughout.
         wave: Updates after which the rate has fallen to a hundredth, to rise again in as many, for ever: the published
             code gives its cosine the length of one epoch. By default one cosine spans the training.
         sampler: The order of the training set, where it is not simply random.
@@ -52,6 +53,7 @@ class TrainableTrainer(Trainer):
         self,
         *args: Any,
         rates: Mapping[str, float] | None = None,
+        constant: Collection[str] = (),
         wave: int | None = None,
         sampler: Sampler[int] | None = None,
         **kwargs: Any,
@@ -59,6 +61,7 @@ class TrainableTrainer(Trainer):
         super().__init__(*args, **kwargs)
         self.remove_callback(PrinterCallback)
         self._rates = rates
+        self._constant = constant
         self._wave = wave
         self._sampler = sampler
         if isinstance(self.train_dataset, EpochDataset):
@@ -77,7 +80,7 @@ class TrainableTrainer(Trainer):
             # By name, not by identity: distributed wrappers replace the parameters and prefix their names.
             trained = [(n, p) for n, p in (model or self.model).named_parameters() if p.requires_grad]
             groups = [
-                {"params": [p for n, p in trained if f".{prefix}." in f".{n}"], "lr": rate}
+                {"params": [p for n, p in trained if f".{prefix}." in f".{n}."], "lr": rate}
                 for prefix, rate in self._rates.items()
             ]
             self.optimizer = torch.optim.AdamW(groups, weight_decay=self.args.weight_decay)
@@ -86,10 +89,16 @@ class TrainableTrainer(Trainer):
     def create_scheduler(
         self, num_training_steps: int, optimizer: torch.optim.Optimizer | None = None
     ) -> torch.optim.lr_scheduler.LRScheduler:
-        """The Trainer's own, or the wave."""
+        """The Trainer's own, but for what stays constant, or the wave."""
         wave, stepped = self._wave, optimizer or self.optimizer
         if wave is None or stepped is None:
-            return cast(torch.optim.lr_scheduler.LRScheduler, super().create_scheduler(num_training_steps, optimizer))
+            scheduler = cast(torch.optim.lr_scheduler.LambdaLR, super().create_scheduler(num_training_steps, optimizer))
+            for place, name in enumerate(self._rates or ()):
+                if name in self._constant:
+                    scheduler.lr_lambdas[place] = lambda _: 1.0
+                    # What it begins with was set when the scheduler was made, in a warm-up to nothing.
+                    scheduler.optimizer.param_groups[place]["lr"] = scheduler.base_lrs[place]
+            return scheduler
 
         def rate(step: int) -> float:
             return LOWEST + (1 - LOWEST) * (1 + math.cos(math.pi * step / wave)) / 2

@@ -3,7 +3,7 @@
     config.json            frames, encoder, language model, calibration; everything below by hash
     catalogue.json         the properties and objects that it has words for
     encoder/               encoder.safetensors (prompts or last stage, and heads), statistics.safetensors, backbone/
-    language/              connector.safetensors, adapter/
+    language/              connector.safetensors, adapter/, and words.safetensors where all words were trained
     base/                  the language model itself, where it was put in
     README.md              the model card
 

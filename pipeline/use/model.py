@@ -219,6 +219,7 @@ class Octopi:
             per_video=self.config.frames.per_video,
             max_new_tokens=max_new_tokens or language.max_new_tokens,
             batch_size=language.generation_batch_size,
+            bos=language.bos,
         )
 
     def _reply(

@@ -20,7 +20,7 @@ from pipeline.evaluation.calibration import calibration_error, error_interval, f
 from pipeline.io import atomic_folder, read_table, write_json
 from pipeline.language.base import load_tokenizer
 from pipeline.language.connector import CONFIG_FILE
-from pipeline.language.octopi import ADAPTER_DIR, CONNECTOR_FILE
+from pipeline.language.octopi import ADAPTER_DIR
 from pipeline.records import Assignment, Classification, Part, Probe, Touch, Variant
 from pipeline.tasks import TASKS
 from pipeline.training.sampling import sample_evaluation
@@ -79,8 +79,8 @@ def package(data: Path, params: Params, variant: Variant, base: Base, out: Path)
         _copy_encoder(folder / ENCODER_DIR, params, data / "encoder" / str(variant.seed))
         _copy(embeddings / STATISTICS_FILE, folder / ENCODER_DIR / STATISTICS_FILE)
         trained = data / "models" / variant.lora / f"{variant.encoder}-{variant.opd}-{variant.seed}"
-        for name in (CONFIG_FILE, CONNECTOR_FILE):
-            _copy(trained / name, folder / LANGUAGE_DIR / name)
+        for file in (trained / CONFIG_FILE, *sorted(trained.glob("*.safetensors"))):
+            _copy(file, folder / LANGUAGE_DIR / file.name)
         if (trained / ADAPTER_DIR).is_dir():
             shutil.copytree(trained / ADAPTER_DIR, folder / LANGUAGE_DIR / ADAPTER_DIR)
         write_json(folder / CATALOGUE, catalogue.model_dump(mode="json"))

@@ -53,6 +53,11 @@ def test_everything_a_person_looks_at_is_there(project: Project) -> None:
 def test_the_packaged_model_answers_as_the_evaluation_did(project: Project) -> None:
     key, data = "finetuned-with-all-0", project.folder / "data"
     model = Octopi.from_pretrained(project.folder / "models" / key, device="cpu")
+    words = [
+        project.folder / place / "words.safetensors"
+        for place in ("data/models/without/finetuned-all-0", f"models/{key}/language")
+    ]
+    assert not torch.equal(*(load_file(file)["weight"] for file in words)), "both trainings train them"
     questions = read_jsonl(data / "questions" / "0" / "evaluation.jsonl", Question)
     predictions = read_jsonl(data / "answers" / key / "real.jsonl", Prediction)
     files = {f.stem: f for f in (data / "scenes" / "videos").rglob("*.*")}

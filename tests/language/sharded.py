@@ -43,6 +43,7 @@ def run(kind: str, weights: str, questions: list[Question], store: EmbeddingStor
     job, runtime = Job(kind, "x", 0), RuntimeConfig(device="cpu", save_steps=2)
     if kind == "align":
         return align(model, data, CONFIG, runtime, job)
+    model.train_words()
     add_lora(model, CONFIG)
     return finetune_lora(model, data, CONFIG, runtime, job)
 

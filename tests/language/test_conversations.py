@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -17,13 +18,14 @@ from pipeline.embeddings import EmbeddingStore
 from pipeline.language.base import load_tokenizer
 from pipeline.language.chat import IGNORE_INDEX, TACT_END, TACT_FRAME, TACT_START, TACTILE_TOKENS, encode, render
 from pipeline.language.conversations import POOL, LengthBuckets
+from pipeline.language.generate import write_prompt
 from pipeline.language.training import assemble
 from pipeline.records import Assignment, Part, Question, Turn
 from pipeline.tasks.questions import build_questions, pool_of
 from pipeline.videos.catalogue import load_catalogue
 from tests.checkpoints import write_llama
 from tests.closure import ROOT
-from tests.language.shared import material
+from tests.language.shared import generation, material
 from tests.models import model_folder
 
 WORDS = st.text(
@@ -51,6 +53,26 @@ def all_questions() -> list[Question]:
         dict.fromkeys(("OPD", "PC", "PSS", "POM", "PSR"), 6),
         seed=1,
         distinct=True,
+    )
+
+
+def test_without_a_begin_token_all_else_is_the_same(
+    tokenizer: PreTrainedTokenizerBase, language: LanguageConfig, questions: list[Question], store: EmbeddingStore
+) -> None:
+    """As the published code trains and asks; what a chat template writes is its own."""
+    turns = [Turn(user="Feel {tactile}.", assistant="Soft.")]
+    rendered = render(turns, tokenizer, system_prompt="", frames=2, complete=True)
+    usual, without = (encode(rendered, tokenizer, bos=bos) for bos in (True, False))
+    assert (without.input_ids, without.labels) == (usual.input_ids[1:], usual.labels[1:])
+    own = replace(rendered, text="<s>" + rendered.text, answers=(), templated=True)
+    assert encode(own, tokenizer, bos=False) == encode(own, tokenizer)
+    held = material(language, questions, store)
+    _, theirs = assemble(replace(held, language=language.model_copy(update={"bos": False})), 6, "test")
+    _, ours = assemble(held, 6, "test")
+    assert [(1, *e.input_ids) for e in theirs.encoded] == [e.input_ids for e in ours.encoded]
+    asked = write_prompt(turns, tokenizer, replace(generation(1), bos=False))
+    assert asked == tuple(
+        i for i, label in zip(without.input_ids, without.labels, strict=True) if label == IGNORE_INDEX
     )
 
 

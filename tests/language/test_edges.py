@@ -85,7 +85,7 @@ def test_a_conversation_without_an_answer_is_named(
 ) -> None:
     monkeypatch.setattr(
         "pipeline.language.conversations.encode",
-        lambda rendered, tokenizer: Encoded((ids := encode(rendered, tokenizer).input_ids), (IGNORE_INDEX,) * len(ids)),
+        lambda *given, **bos: Encoded((ids := encode(*given, **bos).input_ids), (IGNORE_INDEX,) * len(ids)),
     )
     with pytest.raises(UserError, match=r"^[A-Z]+-train-\d+: has no answer to learn from"):
         assemble(material(language, questions, store), 3, "test")

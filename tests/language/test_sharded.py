@@ -110,7 +110,8 @@ def test_a_checkpoint_holds_what_is_trained_alone(trained: Path) -> None:
     assert {f.name for f in checkpoints[0].iterdir()} == CHECKPOINT
     names = load_file(trained / "lora-whole-0.safetensors").keys()
     assert load_file(checkpoints[0] / "model.safetensors").keys() == names
-    assert all(name.startswith("connector.") or "lora_" in name for name in names)
+    assert all(name.startswith(("connector.", "words.")) or "lora_" in name for name in names)
+    assert "words.weight" in names
     optimizer = torch.load(checkpoints[0] / "optimizer.bin", weights_only=True)
     assert optimizer["state"].keys() == names
 

@@ -107,6 +107,7 @@ def run(
         model, data = assemble(material(language, questions, store), 10, "test")
         if kind == "align":
             return align(model, data, CONFIG, RUNTIME, job)
+        model.train_words()
         add_lora(model, CONFIG)
         return finetune_lora(model, data, CONFIG, RUNTIME, job)
     finally:

@@ -119,13 +119,16 @@ def make(where: Path, variant: Variant, *overrides: str) -> Made:
 
     write_llama(Path("llama"))
     model = OctopiForCausalLM.from_base("llama", embeddings.dim)
+    if params.align.train_embeddings == "all":
+        model.train_words()
     if variant.lora is Lora.WITH:
         add_lora(model, params.lora)
     draw = torch.Generator().manual_seed(3)
     with torch.no_grad():  # Strong enough that answers hang on what is touched.
         for name, value in model.named_parameters():
-            if name.startswith("connector.") or "lora_" in name:
-                value.copy_(torch.randn(value.shape, generator=draw) * (0.3 if "lora_" in name else 1))
+            if name.startswith(("connector.", "words.")) or "lora_" in name:
+                strength = {"llm": 0.3, "words": 0.1, "connector": 1}[name.split(".")[0]]
+                value.copy_(torch.randn(value.shape, generator=draw) * strength)
     trained = data / "models" / variant.lora / f"{variant.encoder}-{variant.opd}-0"
     model.save_pretrained(trained)
     questions = build_questions(pool_of(Part.TEST, parts, catalogue), ASKED, seed=0, distinct=False, facts=True)
@@ -134,6 +137,7 @@ def make(where: Path, variant: Variant, *overrides: str) -> Made:
         per_video=params.frames.per_video,
         max_new_tokens=params.language.max_new_tokens,
         batch_size=params.language.generation_batch_size,
+        bos=params.language.bos,
     )
     predictions = answer(model.eval(), embeddings, questions, variant.opd, settings)
     write_jsonl(data / "answers" / variant.key / "real.jsonl", predictions)

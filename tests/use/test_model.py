@@ -63,6 +63,7 @@ def test_of_other_recipes_too(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     made = make(tmp_path, variant, *overrides)
+    assert (made.folder / "language" / "words.safetensors").is_file() == ("encoder.recipe=release" in overrides)
     monkeypatch.chdir("/")
     assert answers_as_stored(made) >= 40
 
