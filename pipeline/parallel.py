@@ -1,4 +1,8 @@
-"""Work on many files at once, in processes."""
+"""Work on many files at once: in processes of this machine, or on a cluster of Ray's or Dask's.
+
+joblib reaches all three, and loses by each: its own workers outlive a parent that is killed, and cost over a second of
+processor time a call; on Dask it waits for ever for a worker that died; from Ray it gives nothing before all is done.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +11,42 @@ import os
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from functools import partial
+from importlib.util import find_spec
 from typing import Any, TypeVar
 
+from pipeline.config import Backend
 from pipeline.errors import UserError
 from pipeline.runtime import cores, progress
 
 J = TypeVar("J")
 R = TypeVar("R")
+Spread = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[Any]]
+"""Applies work to jobs on a cluster and gives results in their order."""
+
+_chosen: Backend = "loky"
+NEEDED: dict[Backend, tuple[str, ...]] = {"loky": (), "ray": ("ray",), "dask": ("dask", "distributed")}
+"""Packages of each backend beside the pipeline's own."""
+
+
+def use_backend(name: Backend) -> None:
+    """Have `run_parallel` work there from now on (`runtime.parallel`); raises UserError where a package is missing."""
+    global _chosen
+    check_backend(name)
+    _chosen = name
+
+
+def check_backend(name: Backend) -> None:
+    """Raise UserError where a package of the backend is not installed."""
+    for package in NEEDED[name]:
+        if find_spec(package) is None:
+            raise UserError(
+                f"runtime.parallel: {name} takes the package {package}: pip install 'octopi-pipeline[{name}]'"
+            )
 
 
 def end_with_parent(parent: int) -> None:
@@ -34,16 +64,27 @@ def end_with_parent(parent: int) -> None:
 
 
 def run_parallel(work: Callable[[J], R], jobs: Sequence[J], label: str, unit: str) -> Iterator[R]:
-    """Apply `work` to every job in as many processes as there are cores; yield results in the order of the jobs.
+    """Apply `work` to every job on the chosen backend; yield results in the order of the jobs.
 
-    Linux forks, since a fresh interpreter costs more than many whole videos; elsewhere the platform's way is used, and
-    the caller's script needs a main guard. An error or an interrupt stops what has not begun.
+    An error or an interrupt stops what has not begun.
 
     Raises:
-        UserError: if a process dies, which a decoder can do to a broken file.
+        UserError: if a process dies, which a decoder can do to a broken file, or a cluster is not there.
     """
     if not jobs:
         return
+    with progress(len(jobs), label, unit) as advance:
+        for result in (_in_processes if _chosen == "loky" else _on_cluster)(work, jobs, label):
+            yield result
+            advance()
+
+
+def _in_processes(work: Callable[[J], R], jobs: Sequence[J], label: str) -> Iterator[R]:
+    """In as many processes as there are cores.
+
+    Linux forks, since a fresh interpreter costs more than many whole videos; elsewhere the platform's way is used, and
+    the caller's script needs a main guard.
+    """
     context = multiprocessing.get_context("fork" if sys.platform == "linux" else None)
     with ProcessPoolExecutor(
         min(cores(), len(jobs)), mp_context=context, initializer=end_with_parent, initargs=(os.getpid(),)
@@ -52,16 +93,11 @@ def run_parallel(work: Callable[[J], R], jobs: Sequence[J], label: str, unit: st
         results: Any = pool.map(work, jobs, chunksize=max(1, min(4, len(jobs) // (8 * cores()))))
         done = 0
         try:
-            with progress(len(jobs), label, unit) as advance:
-                for result in results:
-                    yield result
-                    done += 1
-                    advance()
+            for result in results:
+                yield result
+                done += 1
         except BrokenProcessPool:
-            raise UserError(
-                f"{label}: a process died at or soon after {jobs[done]}; was it killed for want of memory? Run again: "
-                "what is finished is kept"
-            ) from None
+            raise _died(label, jobs[done]) from None
         except KeyboardInterrupt:
             # The others wait for what is being worked on; a person who presses Ctrl-C does not.
             for worker in multiprocessing.active_children():
@@ -70,3 +106,72 @@ def run_parallel(work: Callable[[J], R], jobs: Sequence[J], label: str, unit: st
         except BaseException:
             pool.shutdown(wait=True, cancel_futures=True)
             raise
+
+
+def _on_cluster(work: Callable[[J], R], jobs: Sequence[J], label: str) -> Iterator[R]:
+    """On all workers of the cluster that `RAY_ADDRESS` or `DASK_SCHEDULER_ADDRESS` names, else of one on this machine.
+
+    Workers see the project under this machine's path.
+    """
+    try:
+        spread = {"ray": _ray, "dask": _dask}[_chosen]()
+    except (OSError, ValueError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise UserError(
+            f"runtime.parallel: {_chosen} has no cluster ({reason}); start it, or unset its address"
+        ) from None
+    done = 0
+    try:
+        for result in spread(partial(_there, os.getcwd(), work), jobs):
+            yield result
+            done += 1
+    except Exception as error:
+        # What a cluster says of a lost worker fills a page.
+        if type(error).__module__.split(".")[0] in NEEDED[_chosen]:
+            raise _died(label, jobs[done]) from None
+        raise
+
+
+def _ray() -> Spread:
+    import ray
+
+    ray.init(ignore_reinit_error=True, log_to_driver=False, logging_level="ERROR")
+
+    def spread(work: Callable[[Any], Any], jobs: Sequence[Any]) -> Iterator[Any]:
+        remote = ray.remote(lambda job: work(job))
+        waiting = deque(remote.remote(job) for job in jobs)
+        try:
+            while waiting:
+                yield ray.get(waiting.popleft())
+        except ray.exceptions.RayTaskError as error:
+            raise error.cause from None
+        finally:
+            for each in waiting:
+                ray.cancel(each)
+
+    return spread
+
+
+def _dask() -> Spread:
+    import dask
+    from distributed import Client, default_client
+
+    try:
+        client = default_client()
+    except ValueError:
+        local = {"n_workers": cores(), "threads_per_worker": 1, "dashboard_address": None}
+        client = Client() if dask.config.get("scheduler-address", None) else Client(**local)
+    return client.get_executor().map  # type: ignore[no-any-return]
+
+
+def _there(folder: str, work: Callable[[J], R], job: J) -> R:
+    """In a worker: jobs name files from the project's folder on."""
+    os.chdir(folder)
+    return work(job)
+
+
+def _died(label: str, job: object) -> UserError:
+    return UserError(
+        f"{label}: a process died at or soon after {job}; was it killed for want of memory? Run again: what is "
+        "finished is kept"
+    )

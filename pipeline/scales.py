@@ -19,6 +19,7 @@ from pipeline.encoder.candidates import check_candidates
 from pipeline.encoder.recipes import check_recipe
 from pipeline.errors import UserError
 from pipeline.io import write_text
+from pipeline.parallel import check_backend
 from pipeline.params import PARAMS_FILE, validate
 from pipeline.records import Part, Touch
 from pipeline.tasks.questions import counts_by_task
@@ -97,6 +98,7 @@ def check_inputs(params: Params) -> None:
     launcher = shlex.split(params.runtime.launcher)
     if not launcher or shutil.which(launcher[0]) is None:
         raise UserError(f"runtime.launcher: no program {params.runtime.launcher!r}; set it to python, or install it")
+    check_backend(params.runtime.parallel)
     folder = Path(params.data.dir)
     if params.data.source == "videos" and folder.exists() and not folder.is_dir():
         raise UserError(f"data.dir: {folder} is a file; name the folder that the videos are in")

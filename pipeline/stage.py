@@ -20,6 +20,7 @@ from filelock import FileLock, Timeout
 from pipeline.config import Params
 from pipeline.errors import UserError
 from pipeline.io import write_json
+from pipeline.parallel import use_backend
 from pipeline.params import PARAMS_FILE, load_params
 from pipeline.records import Measurement
 from pipeline.runtime import CHECKPOINTS, limit_threads, quiet_libraries
@@ -65,6 +66,7 @@ def stage(name: str, key: str | None = None) -> Iterator[Stage]:
         with alone(full):
             running = Stage(full, load_params(), started)
             limit_threads(running.params.runtime.threads)
+            use_backend(running.params.runtime.parallel)
             if _main_process():
                 print(f"{full}: starts ({running.params.report_name})", flush=True)
             yield running

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from safetensors.torch import save_file
 
-CLIP_CONFIG = {
+CLIP_CONFIG: dict[str, dict[str, Any]] = {
     "model_cfg": {
         "embed_dim": 16,
         "quick_gelu": True,
@@ -31,14 +31,14 @@ def cut(file: Path, by: int = 1) -> None:
     file.write_bytes(file.read_bytes()[:-by])
 
 
-def write_clip(folder: Path, seed: int = 0) -> Path:
+def write_clip(folder: Path, seed: int = 0, config: dict[str, dict[str, Any]] = CLIP_CONFIG) -> Path:
     """A CLIP as `hf download timm/vit_large_patch14_clip_224.openai` would lay it out."""
     import open_clip
 
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "open_clip_config.json").write_text(json.dumps(CLIP_CONFIG))
+    (folder / "open_clip_config.json").write_text(json.dumps(config))
     torch.manual_seed(seed)
-    model = open_clip.CLIP(**CLIP_CONFIG["model_cfg"])  # type: ignore[arg-type]
+    model = open_clip.CLIP(**config["model_cfg"])
     save_file({k: v.contiguous() for k, v in model.state_dict().items()}, folder / "open_clip_model.safetensors")
     return folder
 
@@ -81,4 +81,30 @@ def write_llama(
         "pad_token_id": 0,
     }
     LlamaForCausalLM(LlamaConfig(**(usual | shapes))).save_pretrained(folder, max_shard_size=shard)  # type: ignore[arg-type]
+    return folder
+
+
+def write_vicuna(folder: Path, words: str, **shapes: object) -> Path:
+    """A narrow Vicuna v1.5 as `save_pretrained` lays it out once it is converted: float16 in several files, pieces of
+    `words` as SentencePiece makes them, letters outside them as bytes, the unknown token for padding."""
+    from tokenizers import Tokenizer, models, pre_tokenizers, trainers
+    from transformers import LlamaConfig, LlamaForCausalLM, LlamaTokenizer
+
+    pieces = Tokenizer(models.BPE(unk_token="<unk>", byte_fallback=True))
+    pieces.pre_tokenizer = pre_tokenizers.Metaspace(prepend_scheme="first")
+    letters = [f"<0x{byte:02X}>" for byte in range(256)]
+    trainer = trainers.BpeTrainer(
+        vocab_size=1500, special_tokens=["<unk>", "<s>", "</s>", *letters], show_progress=False
+    )
+    pieces.train_from_iterator([words], trainer)
+    learnt = json.loads(pieces.to_str())["model"]
+    tokenizer = LlamaTokenizer(
+        vocab=learnt["vocab"], merges=[tuple(pair) for pair in learnt["merges"]], pad_token="<unk>"
+    )
+    tokenizer.save_pretrained(folder)
+    narrow = {"hidden_size": 64, "intermediate_size": 128, "num_attention_heads": 4, "vocab_size": len(tokenizer)}
+    vicuna = {"max_position_embeddings": 4096, "rms_norm_eps": 1e-5, "pad_token_id": 0, "tie_word_embeddings": False}
+    torch.manual_seed(0)
+    model = LlamaForCausalLM(LlamaConfig(**(narrow | vicuna | shapes)))  # type: ignore[arg-type]
+    model.half().save_pretrained(folder, max_shard_size="200KB")
     return folder

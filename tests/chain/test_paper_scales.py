@@ -1,0 +1,160 @@
+"""The paper's scales on narrow checkpoints with the published names and layouts, each training in two processes.
+
+What is set beside a scale is where things lie, how much there is of them and the device: CPUs, which gloo connects.
+Of each matrix one cell runs, since the others are the same command with another argument (tests/chain/test_chain.py
+has them). Nearly all of the time is importing: some thirty processes start.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections import Counter
+from pathlib import Path
+
+import cv2
+import pytest
+import torch
+import yaml
+from safetensors.torch import load_file
+
+from pipeline.io import read_jsonl
+from pipeline.records import Prediction
+from tests.checkpoints import write_clip, write_vicuna
+from tests.closure import ROOT
+from tests.conftest import moving_square
+from tests.project import OBJECTS, Project, copy_project
+
+WIDTH = 64
+VIT_L = {
+    "model_cfg": {
+        "embed_dim": 48,
+        "quick_gelu": True,
+        "vision_cfg": {"image_size": 224, "layers": 4, "width": WIDTH, "patch_size": 14},
+        "text_cfg": {"context_length": 77, "vocab_size": 64, "width": 16, "heads": 2, "layers": 1},
+    },
+    "preprocess_cfg": {"mean": [0.48145466, 0.4578275, 0.40821073], "std": [0.26862954, 0.26130258, 0.27577711]},
+}
+"""As open_clip_config.json of OpenAI's ViT-L/14 has it, but for widths, layers and words."""
+LAYERS = {"paper-7b": 2, "paper-13b": 3}
+FEW = (
+    "data.dir=physiclear",
+    "runtime.device=cpu",
+    "ablation.encoders=[finetuned]",
+    "ablation.lora=[with]",
+    "ablation.opd=[all]",
+    "questions.train={opd:12,pc:12,pss:12,pom:12}",
+    "questions.evaluation={opd:4,pc:4,pss:4,pom:4,psr:4}",
+    "language.max_new_tokens=8",
+    "encoder.epochs=1",
+    # Two updates, and a checkpoint after each.
+    "align.samples=32",
+    "lora.samples=32",
+    "runtime.save_steps=1",
+)
+LAUNCHED = '''"""Runs a stage as accelerate launched it, with layers sharded if asked to, and notes how."""
+import json, os, runpy, sys
+from pathlib import Path
+from accelerate.state import PartialState
+from tests.language.sharded import shard_on_cpus, watch
+
+said = {}
+_, how, *sys.argv = sys.argv
+if how == "sharded":
+    shard_on_cpus()
+    watch(said)
+try:
+    runpy.run_path(sys.argv[0], run_name="__main__")
+finally:
+    said["processes"] = PartialState().num_processes
+    Path(f"{Path(sys.argv[0]).stem}-{os.environ['RANK']}.json").write_text(json.dumps(said))
+'''
+LAUNCHER = "runtime.launcher=accelerate launch --config_file cpu.yaml launched.py"
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
+    project = copy_project(tmp_path_factory.mktemp("paper"))
+    folder = project.folder
+    project.environment |= {"PYTHONPATH": f"{folder}{os.pathsep}{ROOT}", "OMP_NUM_THREADS": "1"}
+    for number, name in enumerate(f"{o}_{n}" for o in OBJECTS for n in range(2)):
+        write_mov(folder / "physiclear" / f"{name}.mov", number)
+    write_clip(folder / "weights" / "clip-vit-large-patch14", config=VIT_L)
+    words = "\n".join(f.read_text() for f in sorted((ROOT / "pipeline" / "physiclear").glob("*.*")))
+    for scale, layers in LAYERS.items():
+        write_vicuna(folder / "weights" / f"vicuna-{scale[6:]}-v1.5", words, num_hidden_layers=layers)
+    (folder / "launched.py").write_text(LAUNCHED)
+    shipped = yaml.safe_load((folder / "conf" / "accelerate" / "fsdp.yaml").read_text())
+    (folder / "cpu.yaml").write_text(yaml.safe_dump({**shipped, "use_cpu": True}))
+    return project
+
+
+def write_mov(path: Path, seed: int) -> None:
+    """A video in the public data set's container, codec and size."""
+    path.parent.mkdir(exist_ok=True)
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"mp4v"), 25.0, (320, 240))
+    for frame in moving_square(12, seed, 320, 240):
+        writer.write(frame)
+    writer.release()
+
+
+def launches(project: Project) -> dict[str, dict[str, object]]:
+    """What each process of the last trainings noted."""
+    files = [f for stage in ("align", "lora") for f in project.folder.glob(f"{stage}-?.json")]
+    return {f.stem: json.loads(f.read_text()) for f in files}
+
+
+def check_trained(project: Project, scale: str) -> None:
+    """Trained parameters are in float32 and of the shapes that the published layouts and the scale give."""
+    folder = project.folder / "data" / "models" / "with" / "finetuned-all-0"
+    connector, adapter = (
+        load_file(folder / "connector.safetensors"),
+        load_file(folder / "adapter" / "adapter_model.safetensors"),
+    )
+    for value in (*connector.values(), *adapter.values()):
+        assert value.dtype == torch.float32
+        assert value.isfinite().all()
+    # The class token before its projection, as the paper's code hands it on.
+    assert connector["projection.0.weight"].shape[1] == WIDTH
+    layer = "base_model.model.model.layers.{}.self_attn.{}.lora_{}.weight"
+    expected = {layer.format(i, p, ab) for i in range(LAYERS[scale]) for p in ("q_proj", "k_proj") for ab in "AB"}
+    assert adapter.keys() == expected
+    assert {min(value.shape) for value in adapter.values()} == {64}, "rank 128, of a layer that is 64 wide"
+    assert {max(value.shape) for value in adapter.values()} == {128}
+    assert any(value.any() for name, value in adapter.items() if "lora_B" in name), "it was trained"
+
+
+def test_paper_13b_from_videos_to_the_report(project: Project) -> None:
+    table = project.run("octopi", "scale", "paper-13b", *FEW, f"{LAUNCHER} sharded")
+    assert "align                   2" in table, "two devices are counted"
+    project.run("dvc", "repro", "align")
+    project.run("octopi", "repro")
+    noted = launches(project)
+    assert noted.keys() == {f"{stage}-{rank}" for stage in ("align", "lora") for rank in (0, 1)}
+    for each in noted.values():
+        assert (each["processes"], each["sharded"], each["computes"]) == (2, True, "torch.float32")
+        assert float(str(each["share"])) < 0.6
+    check_trained(project, "paper-13b")
+    for touch in ("real", "removed", "swapped", "noise"):
+        said = read_jsonl(project.folder / "data" / "answers" / "finetuned-with-all-0" / f"{touch}.jsonl", Prediction)
+        assert Counter(p.task for p in said) == dict.fromkeys(("OPD", "PC", "PSS", "POM", "PSR"), 4)
+    report = project.folder / "reports" / "paper-13b-videos"
+    assert "weights/vicuna-13b-v1.5" in (report / "README.md").read_text()
+    assert (project.folder / "models" / "finetuned-with-all-0" / "README.md").is_file()
+    assert not list((project.folder / "checkpoints").glob("*/*")), "nothing waits any more"
+
+
+def test_paper_7b_to_the_trained_model(project: Project) -> None:
+    """On the same encoder, since everything before alignment is the same in both scales; here the layers are whole.
+
+    Without the patch accelerate does not shard on CPUs, and shares the questions out alone.
+    """
+    for noted in project.folder.glob("*-?.json"):
+        noted.unlink()
+    project.run("octopi", "scale", "paper-7b", *FEW, f"{LAUNCHER} whole")
+    output = project.run("dvc", "repro", "lora")
+    assert "Running stage 'align@finetuned-all-0'" in output
+    assert "Running stage 'embed'" not in output
+    assert "Running stage 'finetune_encoder" not in output
+    assert list(launches(project).values()) == [{"processes": 2}] * 4
+    check_trained(project, "paper-7b")

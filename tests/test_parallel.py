@@ -1,0 +1,121 @@
+"""Work on many files in processes of this machine and on local clusters of Ray and Dask: the same bytes come out.
+
+That a worker of this machine dies or outlives nothing is tests/videos/test_extract.py's.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import psutil
+import pytest
+
+from pipeline import parallel
+from pipeline.errors import UserError
+from pipeline.parallel import use_backend
+from pipeline.scales import check_inputs, compose, write_params
+from pipeline.stage import stage
+from tests.closure import ROOT
+
+SCRIPT = """
+import os, sys
+from pathlib import Path
+from pipeline.config import FramesConfig
+from pipeline.errors import UserError
+from pipeline.parallel import run_parallel, use_backend
+from pipeline.videos.catalogue import load_catalogue
+from pipeline.videos.frames.extract import extract_frames
+
+def fails(job):
+    Path("last").write_text(str(job))
+    if job == "refused":
+        raise UserError("file 7 is broken; mend it")
+    if job == "dies":
+        os._exit(9)
+    Path(f"{os.getpid()}.pid").touch()
+    return job, os.getpid()
+
+def main():
+    backend, videos, catalogue = sys.argv[1:]
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:2])
+    if backend == "ray":
+        import ray
+        ray.init(num_cpus=2, log_to_driver=False)
+    use_backend(backend)
+    extract_frames(Path(videos), load_catalogue(Path(catalogue)), FramesConfig(size=16), Path("out"), Path("partial"))
+    jobs = list(range(70))
+    results = list(run_parallel(fails, jobs, "numbers", "number"))
+    assert [job for job, _ in results] == jobs
+    workers = {pid for _, pid in results}
+    assert len(workers) == 2 and os.getpid() not in workers, workers
+    for bad in ("refused", "dies"):
+        try:
+            list(run_parallel(fails, ["good", bad], "numbers", "number"))
+        except UserError as error:
+            with open("said", "a") as stream:
+                print(error, file=stream)
+
+if __name__ == "__main__":
+    main()
+"""
+
+
+def work_on(backend: str, folder: Path, videos: Path) -> dict[str, str]:
+    """The sha256 of each file that two workers make of the videos; what is said of bad jobs is checked here."""
+    folder.mkdir()
+    (folder / "work.py").write_text(SCRIPT)
+    done = subprocess.run(
+        [sys.executable, "work.py", backend, str(videos), str(ROOT / "pipeline" / "physiclear")],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "PYTHONWARNINGS": "ignore"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    refused, died = (folder / "said").read_text().splitlines()
+    assert refused == "file 7 is broken; mend it"
+    assert died.startswith("numbers: a process died at or soon after "), died
+    assert died.endswith("Run again: what is finished is kept")
+    alive = [int(f.stem) for f in folder.glob("*.pid") if psutil.pid_exists(int(f.stem))]
+    _, alive_still = psutil.wait_procs([psutil.Process(pid) for pid in alive], timeout=20)
+    assert not alive_still, "a worker outlives the work"
+    return {f.name: hashlib.sha256(f.read_bytes()).hexdigest() for f in (folder / "out").iterdir()}
+
+
+@pytest.fixture(scope="module")
+def here(tiny_videos: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    return work_on("loky", tmp_path_factory.mktemp("work") / "here", tiny_videos)
+
+
+@pytest.mark.parametrize(("backend", "package"), [("ray", "ray"), ("dask", "distributed")])
+def test_two_workers_of_a_cluster_make_the_same_bytes(
+    backend: str, package: str, here: dict[str, str], tiny_videos: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip(package, reason=f"needs {backend}: pip install 'octopi-pipeline[{backend}]'")
+    assert len(here) == 4
+    assert work_on(backend, tmp_path / "there", tiny_videos) == here
+
+
+def test_a_missing_package_is_one_line_before_anything_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    params = compose("smoke", ["runtime.parallel=dask"])
+    monkeypatch.setattr(parallel, "find_spec", lambda name: None if name == "distributed" else True)
+    message = r"\Aruntime\.parallel: dask takes the package distributed: pip install 'octopi-pipeline\[dask\]'\Z"
+    with pytest.raises(UserError, match=message):
+        check_inputs(params)
+    with pytest.raises(UserError, match=message):
+        use_backend("dask")
+
+
+def test_a_stage_works_where_its_parameters_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(parallel, "_chosen", "loky")
+    monkeypatch.setattr(parallel, "find_spec", lambda _: True)
+    write_params(compose("smoke", ["runtime.parallel=ray"], ROOT / "conf"))
+    with stage("x"):
+        assert parallel._chosen == "ray"
