@@ -23,6 +23,7 @@ from pipeline.cli import main
 from pipeline.params import PARAMS_FILE, load_params, validate
 from pipeline.scales import write_params
 from tests import test_config
+from tests.checkpoints import write_clip, write_llama
 from tests.closure import ROOT
 from tests.conftest import moving_square, write_video
 from tests.scenes import test_recipes
@@ -100,7 +101,14 @@ def hard_video(name: str, make: Callable[[Path, Path], object], folder: Path) ->
     make(folder / name, write_video(folder.parent / "good.avi", moving_square(31)))
 
 
+def spoilt(write: Callable[[Path], Path], file: str, change: Callable[[bytes], bytes | None]) -> None:
+    """weights/ as `write` makes it, with one file changed or taken away."""
+    write(Path("weights"))
+    put(f"weights/{file}", change((Path("weights") / file).read_bytes()))
+
+
 NOT_THERE = "(no such file|does not exist).*dvc repro"
+CLIP, LLAMA = "scale smoke encoder.weights=weights frames.size=32", "scale smoke language.weights=weights"
 
 
 def bad_inputs() -> Iterator[BadInput]:
@@ -142,6 +150,16 @@ def bad_inputs() -> Iterator[BadInput]:
         yield BadInput("stages/extract_frames.py", [f"videos/{name}", re.escape(words)], bad)
     for split in ("nonsense", "Not a name!"):
         yield BadInput("data audit videos --split", ["allowed: paper, release"], partial(videos, good), [split])
+    # Folders of weights.
+    for command, write, stem in ((CLIP, write_clip, "open_clip_model"), (LLAMA, write_llama, "model")):
+        file = f"{stem}.safetensors"
+        for change in (lambda data: data[:-9], lambda data: b"garbage", lambda data: b"", lambda data: None):
+            yield BadInput(command, [f"{file}|has no weights"], partial(spoilt, write, file, change))
+    for file in ("config.json", "tokenizer.json"):
+        for change in (lambda data: b"{", lambda data: b"[]", lambda data: None, lambda data: b"\xff"):
+            yield BadInput(LLAMA, [file], partial(spoilt, write_llama, file, change))
+    for change in (lambda data: b"{", lambda data: b"[]", lambda data: None):
+        yield BadInput(CLIP, ["config.json"], partial(spoilt, write_clip, "open_clip_config.json", change))
     yield BadInput("weights gpt", ["smollm2"])
     # Stages: their command line, and what the stages before them left.
     for arguments, words in (
