@@ -251,9 +251,9 @@ def kill(chain: Chain, ledger: Ledger, stage: str, rng: random.Random, moment: S
     return True
 
 
-def drill_kills(chain: Chain, ledger: Ledger, kills: int, seed: int, until: float) -> None:
+def drill_kills(chain: Chain, ledger: Ledger, kills: int, minutes: float, seed: int) -> None:
     """Every second kill at a chosen moment, the others at random, until there are enough or time is over."""
-    done, moments = 0, itertools.cycle(MOMENTS)
+    done, moments, until = 0, itertools.cycle(MOMENTS), time.monotonic() + 60 * minutes
     for number in itertools.count():
         if done == kills or time.monotonic() > until:
             break
@@ -377,30 +377,32 @@ def reduced_kills(folder: Path, kills: int) -> Ledger:
     """A few kills of the chain's first stages."""
     ledger = Ledger()
     chain = Chain(folder, ["extract_frames"], ["scenes.videos_per_object=1"])
-    drill_kills(chain, ledger, kills, 0, time.monotonic() + LONGEST)
+    drill_kills(chain, ledger, kills, minutes=10, seed=0)
     return ledger
 
 
 def drill(kills: int, minutes: float, seed: int) -> int:
     """The whole drill; return how much was wrong."""
-    until, ledger = time.monotonic() + 60 * minutes, Ledger()
+    ledger = Ledger()
     with tempfile.TemporaryDirectory() as name:
-        drill_bad_inputs(ledger, Path(name) / "inputs")
-        chain = Chain(Path(name) / "a project")
-        for stage in [stage for stage in chain.stages if re.match("extract|align|report", stage)]:
-            print(f"clock, and two at once: {stage}", flush=True)
-            drill_clock(chain, ledger, stage)
-            drill_two(chain, ledger, stage)
-        drill_servers(chain, ledger, next(stage for stage in chain.stages if stage.startswith("finetune")))
-        drill_disks(chain, ledger)
-        drill_kills(chain, ledger, kills, seed, until)
-    ledger.write(ROOT / "reports" / "drill.csv")
+        try:
+            drill_bad_inputs(ledger, Path(name) / "inputs")
+            chain = Chain(Path(name) / "a project")
+            for stage in [stage for stage in chain.stages if re.match("extract|align|report", stage)]:
+                print(f"clock, and two at once: {stage}", flush=True)
+                drill_clock(chain, ledger, stage)
+                drill_two(chain, ledger, stage)
+            drill_servers(chain, ledger, next(stage for stage in chain.stages if stage.startswith("finetune")))
+            drill_disks(chain, ledger)
+            drill_kills(chain, ledger, kills, minutes, seed)
+        finally:
+            ledger.write(ROOT / "reports" / "drill.csv")
     return ledger.faults()
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=60)
-    parser.add_argument("--minutes", type=float, default=20, help="after which no further kill is begun")
+    parser.add_argument("--minutes", type=float, default=20, help="of killing, after which no kill is begun")
     parser.add_argument("--seed", type=int, default=0)
     sys.exit(min(1, drill(**vars(parser.parse_args()))))
