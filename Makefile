@@ -3,6 +3,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(CURDIR)/$(VENV)/bin
 PORT ?= 5000
+KILLS ?= 60
+MINUTES ?= 20
+SEED ?= 0
 DONE := $(VENV)/.installed
 # uv, where it is installed, does the same in a fraction of the time.
 UV := $(shell command -v uv)
@@ -12,7 +15,7 @@ export PATH := $(BIN):$(PATH)
 export PYTHONUNBUFFERED := 1
 export HF_HUB_OFFLINE := 1
 
-.PHONY: install repro test stability lint dashboard bench clean
+.PHONY: install repro test stability drill lint dashboard bench clean
 
 install: $(DONE)
 
@@ -33,6 +36,9 @@ test: install
 
 stability: install
 	python -m pytest tests/numerics --stability-csv reports/stability.csv
+
+drill: install
+	python -m tests.drill --kills $(KILLS) --minutes $(MINUTES) --seed $(SEED)
 
 lint: install
 	ruff check .

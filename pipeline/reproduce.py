@@ -26,7 +26,8 @@ def outdated(root: Path) -> tuple[int, int]:
         try:
             changed = set(repo.status(targets=[CHAIN]))
         except DvcException as error:
-            mend = "`git checkout dvc.lock` brings back the last one of Git" if LOCK in str(error) else "mend it"
+            back = "`git checkout dvc.lock` brings back the last one of Git; without one, delete it"
+            mend = back if LOCK in str(error) else "mend it"
             raise UserError(f"{' '.join(str(error).split())}; {mend}") from None
         graph = repo.index.graph
         waiting = {stage for stage in graph if stage.addressing in changed}

@@ -9,11 +9,12 @@ import re
 import shutil
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from filelock import FileLock, Timeout
 
@@ -48,6 +49,27 @@ class Stage:
             sys.exit(0)
         self.metrics |= {m.name: m.value for m in history}
         self.metrics["steps"] = max((m.step for m in history), default=0)
+
+
+def matrix_key(**axes: Iterable[Any] | None) -> list[Any]:
+    """Which stage of a matrix this process is: a value of each axis, in order, from the command line.
+
+    Args:
+        axes: The values of an axis, known by how they are printed; None for an axis of seeds.
+
+    Too few or too many values, or one that an axis lacks, end the process with one line and status 1.
+    """
+    script, given, values = Path(sys.argv[0]), sys.argv[1:], []
+    usage = f"python stages/{script.name} {' '.join(f'<{axis}>' for axis in axes)}"
+    if len(given) != len(axes):
+        sys.exit(f"{script.stem}: {len(given)} values instead of {len(axes)}; call it as {usage}")
+    for word, (axis, known) in zip(given, axes.items(), strict=True):
+        allowed = {str(value): value for value in known or ([int(word)] if word.isdecimal() else [])}
+        if word not in allowed:
+            names = ", ".join(allowed) or "0, 1, 2, ..."
+            sys.exit(f"{script.stem}: {axis} is {word!r}; allowed: {names}; call it as {usage}")
+        values.append(allowed[word])
+    return values
 
 
 @contextmanager

@@ -165,9 +165,9 @@ def read_stages(params: Params) -> list[ChainStage]:
     """The stages of dvc.yaml, in its order and without `publish`, as dvc.lock and runs/ know them.
 
     Raises:
-        UserError: where one of the two files is missing or not YAML.
+        UserError: where one of the two files is missing, or no YAML of DVC's.
     """
-    chain, entries = (_read_yaml(path).get("stages") or {} for path in (CHAIN, CHAIN_LOCK))
+    chain, entries = map(_stages_in, (CHAIN, CHAIN_LOCK))
     chain.pop("publish", None)
     today, values = settings(params), params.model_dump(mode="json")
 
@@ -272,14 +272,17 @@ def _datasets(params: Params) -> Iterator[tuple[str, Any]]:
                 yield part.value, from_pandas(frame, source=params.data.dir, name=name)
 
 
-def _read_yaml(path: Path) -> dict[str, Any]:
+def _stages_in(path: Path) -> dict[str, dict[str, Any]]:
     try:
         found = yaml.load(path.read_text(encoding="utf-8"), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
     except FileNotFoundError:
         raise UserError(f"{path}: no such file; `dvc repro` makes it") from None
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise UserError(f"{path}: not YAML ({' '.join(str(error).split())}); restore it from Git") from None
-    return found if isinstance(found, dict) else {}
+    stages = (found.get("stages") or {}) if isinstance(found, dict) else {}
+    if not isinstance(stages, dict) or not all(isinstance(stage, dict) for stage in stages.values()):
+        raise UserError(f"{path}: not as DVC writes it; restore it from Git")
+    return stages
 
 
 def _flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:

@@ -1,16 +1,14 @@
 """Align the projection to the language model."""
 
-import sys
-
 from pipeline.io import write_table
 from pipeline.language.training import Job, Material, align, assemble, write_model_card
 from pipeline.records import Encoder, Measurement, Opd
-from pipeline.stage import DATA, stage
+from pipeline.stage import DATA, matrix_key, stage
 from pipeline.tracking import live
 
 
 def main() -> None:
-    encoder, opd, seed = Encoder(sys.argv[1]), Opd(sys.argv[2]), int(sys.argv[3])
+    encoder, opd, seed = matrix_key(encoder=Encoder, opd=Opd, seed=None)
     key = f"{encoder}-{opd}-{seed}"
     with stage("align", key) as run:
         config = run.params.align

@@ -1,6 +1,5 @@
 """Let one variant answer the evaluation questions; the full system also under every input ablation."""
 
-import sys
 from pathlib import Path
 
 from pipeline.embeddings import EmbeddingStore
@@ -11,12 +10,12 @@ from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.teach.gate import examine, gate_questions
 from pipeline.records import GATE, Described, Encoder, Lora, Opd, Question, Touch, Variant
 from pipeline.runtime import name_dtype, resolve_device
-from pipeline.stage import DATA, stage
+from pipeline.stage import DATA, matrix_key, stage
 from pipeline.videos.catalogue import load_catalogue
 
 
 def main() -> None:
-    variant = Variant(Encoder(sys.argv[1]), Lora(sys.argv[2]), Opd(sys.argv[3]), int(sys.argv[4]))
+    variant = Variant(*matrix_key(encoder=Encoder, lora=Lora, opd=Opd, seed=None))
     with stage("answer", variant.key) as run:
         params, language = run.params, run.params.language
         store = EmbeddingStore(DATA / "embeddings" / f"{variant.encoder}-{variant.seed}")

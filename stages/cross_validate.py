@@ -1,19 +1,18 @@
 """Cross-validate one encoder or baseline over all objects with videos."""
 
-import sys
 from pathlib import Path
 
 from pipeline.encoder.candidates import CANDIDATES
 from pipeline.encoder.cross_validation import CrossValidationData, cross_validate_candidate
 from pipeline.io import read_table, write_table
 from pipeline.records import OutOfFold, Video
-from pipeline.stage import DATA, stage
+from pipeline.stage import DATA, matrix_key, stage
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.weights import check_encoder
 
 
 def main() -> None:
-    name = sys.argv[1]
+    (name,) = matrix_key(model=CANDIDATES)
     with stage("cross_validate", name) as run:
         params = run.params
         check_encoder(Path(params.encoder.weights), params.frames.size)

@@ -1,6 +1,5 @@
 """Fine-tune the encoder on property classification."""
 
-import sys
 from pathlib import Path
 
 from pipeline.config import PRETRAINED
@@ -9,7 +8,7 @@ from pipeline.encoder.finetune import finetune, write_encoder_card
 from pipeline.io import read_table, write_table
 from pipeline.records import Assignment, Classification, Measurement, Part
 from pipeline.runtime import resolve_device
-from pipeline.stage import DATA, stage
+from pipeline.stage import DATA, matrix_key, stage
 from pipeline.tracking import live
 from pipeline.training.trainable import save_trainable
 from pipeline.videos.catalogue import load_catalogue
@@ -18,7 +17,7 @@ from pipeline.weights import check_encoder, clip_file
 
 
 def main() -> None:
-    seed = int(sys.argv[1])
+    (seed,) = matrix_key(seed=None)
     with stage("finetune_encoder", str(seed)) as run:
         params = run.params
         check_encoder(Path(params.encoder.weights), params.frames.size)

@@ -1,16 +1,14 @@
 """Fine-tune the aligned model end to end, the language model through low-rank adapters."""
 
-import sys
-
 from pipeline.io import write_table
 from pipeline.language.training import Job, Material, add_lora, assemble, finetune_lora, write_model_card
 from pipeline.records import Encoder, Measurement, Opd
-from pipeline.stage import DATA, stage
+from pipeline.stage import DATA, matrix_key, stage
 from pipeline.tracking import live
 
 
 def main() -> None:
-    encoder, opd, seed = Encoder(sys.argv[1]), Opd(sys.argv[2]), int(sys.argv[3])
+    encoder, opd, seed = matrix_key(encoder=Encoder, opd=Opd, seed=None)
     key = f"{encoder}-{opd}-{seed}"
     with stage("lora", key) as run:
         config = run.params.lora

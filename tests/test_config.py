@@ -127,29 +127,33 @@ def test_any_folder_may_hold_the_videos(name: str, tmp_path: Path) -> None:
     assert load_params(tmp_path / "params.yaml").data.dir == str(folder)
 
 
-def test_missing_inputs_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("small data.source=videos data.dir=nowhere", "data.dir: nowhere does not exist"),
+        ("small data.source=videos data.dir=params.yaml", "data.dir: params.yaml is a file"),
+        ("smoke runtime.launcher=acelerate", "runtime.launcher.*acelerate"),
+        ("smoke encoder.weights=nowhere", "hf download timm"),
+        ("smoke language.weights=nowhere", "hf download lmsys"),
+        ("small teach.base=", "language.weights: data/taught is what teaching makes.*teach.base"),
+        ("smoke scenes.objects=[unicorn]", "scenes.objects: unicorn"),
+        ("smoke frames.size=48", "frames.size"),
+        ("smoke cross_validation.models=[papers]", "papers is no model; did you mean paper"),
+        (
+            "smoke encoder.recipe=release cross_validation.models=[trees,paper]",
+            "paper would be trained with the settings of encoder.recipe=release",
+        ),
+    ],
+)
+def test_missing_inputs_are_named(arguments: str, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
-    with pytest.raises(UserError, match="data.dir"):
-        check_inputs(compose("small", ["data.source=videos", f"data.dir={tmp_path}/none"]))
-    (tmp_path / "file").touch()
-    with pytest.raises(UserError, match="is a file"):
-        check_inputs(compose("small", ["data.source=videos", f"data.dir={tmp_path}/file"]))
-    with pytest.raises(UserError, match=r"runtime.launcher.*acelerate"):
-        check_inputs(compose("smoke", ["runtime.launcher=acelerate launch"]))
-    with pytest.raises(UserError, match="hf download timm"):
-        check_inputs(compose("smoke", [f"encoder.weights={tmp_path}/none"]))
-    with pytest.raises(UserError, match="hf download lmsys"):
-        check_inputs(compose("smoke", [f"language.weights={tmp_path}/none"]))
-    with pytest.raises(UserError, match="language.weights: data/taught is what teaching makes.*teach.base"):
-        check_inputs(compose("small", ["teach.base="]))
-    with pytest.raises(UserError, match="scenes.objects"):
-        check_inputs(compose("smoke", ["scenes.objects=[unicorn]"]))
-    with pytest.raises(UserError, match="frames.size"):
-        check_inputs(compose("smoke", ["frames.size=48"]))
-    with pytest.raises(UserError, match="pretrained is no model|did you mean paper"):
-        check_inputs(compose("smoke", ["cross_validation.models=[papers]"]))
-    with pytest.raises(UserError, match="paper would be trained with the settings of encoder.recipe=release"):
-        check_inputs(compose("smoke", ["encoder.recipe=release", "cross_validation.models=[trees,paper]"]))
+    name, *overrides = arguments.split()
+    with pytest.raises(UserError, match=words):
+        check_inputs(compose(name, overrides))
+
+
+def test_a_recipe_may_be_compared_with_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
     check_inputs(compose("smoke", ["encoder.recipe=release", "cross_validation.models=[trees,release]"]))
 
 

@@ -25,9 +25,9 @@ from pipeline.io import (
     write_jsonl,
     write_table,
 )
-from pipeline.records import Assignment, Measurement, Part, Score, Video
+from pipeline.records import Assignment, Encoder, Measurement, Opd, Part, Score, Video
 from pipeline.scales import compose, write_params
-from pipeline.stage import running_stages, stage
+from pipeline.stage import matrix_key, running_stages, stage
 from tests.closure import ROOT
 
 
@@ -106,6 +106,35 @@ def test_no_scale_is_chosen_while_a_stage_runs(here: Path) -> None:
     assert "split is running" in str(result.exception)
     assert (here / "params.yaml").read_bytes() == before
     assert running_stages() == []
+
+
+def called_with(monkeypatch: pytest.MonkeyPatch, words: str) -> list[object]:
+    monkeypatch.setattr("sys.argv", ["stages/align.py", *words.split()])
+    return matrix_key(encoder=Encoder, opd=Opd, seed=None)
+
+
+def test_a_stage_of_a_matrix_is_named_by_its_command_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert called_with(monkeypatch, "base needed 12") == [Encoder.BASE, Opd.NEEDED, 12]
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        ("nonsense all 0", "align: encoder is 'nonsense'; allowed: finetuned, base; call it as "),
+        ("finetuned All 0", "align: opd is 'All'; allowed: none, needed, all; call it as "),
+        ("finetuned all -1", "align: seed is '-1'; allowed: 0, 1, 2, ...; call it as "),
+        ("finetuned all x", "align: seed is 'x'; allowed: 0, 1, 2, ...; call it as "),
+        ("finetuned all ²", "align: seed is '²'; allowed: 0, 1, 2, ...; call it as "),
+        ("finetuned all 00", "align: seed is '00'; allowed: 0; call it as "),
+        ("finetuned all", "align: 2 values instead of 3; call it as "),
+        ("", "align: 0 values instead of 3; call it as "),
+        ("finetuned all 0 1", "align: 4 values instead of 3; call it as "),
+    ],
+)
+def test_a_command_line_that_names_no_stage_is_one_line(monkeypatch: pytest.MonkeyPatch, words: str, line: str) -> None:
+    with pytest.raises(SystemExit) as ended:
+        called_with(monkeypatch, words)
+    assert ended.value.code == f"{line}python stages/align.py <encoder> <opd> <seed>"
 
 
 def test_missing_params_name_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

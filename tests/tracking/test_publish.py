@@ -220,11 +220,20 @@ def test_a_moved_folder_keeps_its_artifacts(again: FakeChain, monkeypatch: pytes
     assert "nothing new" in publish(again.params)
 
 
-@pytest.mark.parametrize(("content", "message"), [(None, "no such file"), ("{", "not YAML")])
-def test_a_broken_lock_is_one_line(chain: FakeChain, content: str | None, message: str) -> None:
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "no such file"),
+        (b"{", "not YAML"),
+        (b"\xff\xfe", "not YAML"),
+        (b"stages: 3", "not as DVC writes it"),
+        (b"stages: {split: 3}", "not as DVC writes it"),
+    ],
+)
+def test_a_broken_lock_is_one_line(chain: FakeChain, content: bytes | None, message: str) -> None:
     Path("dvc.lock").unlink()
     if content:
-        Path("dvc.lock").write_text(content)
+        Path("dvc.lock").write_bytes(content)
     with pytest.raises(UserError, match=rf"dvc\.lock: {message}"):
         publish(chain.params)
 
