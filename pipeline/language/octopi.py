@@ -249,8 +249,8 @@ class OctopiForCausalLM(nn.Module):
         """Keys and values of what all rows begin with: of one row, and without gradient where none is trained there."""
         cache = DynamicCache(config=self.llm.config)
         learns = self.words is not None or any(parameter.requires_grad for parameter in self.llm.parameters())
-        with torch.set_grad_enabled(learns and torch.is_grad_enabled()):
-            self.llm(inputs_embeds=embeddings[:1], past_key_values=cache, use_cache=True, logits_to_keep=1)
+        first = embeddings[:1] if learns else embeddings[:1].detach()
+        self.llm(inputs_embeds=first, past_key_values=cache, use_cache=True, logits_to_keep=1)
         cache.batch_repeat_interleave(len(embeddings))
         return cache
 

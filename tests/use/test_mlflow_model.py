@@ -116,7 +116,8 @@ def test_a_process_without_this_repository_answers(
     there = {name.split(".")[0] for name in found["modules"]} & _imported() & homes.keys()
     assert there > {"torch", "av", "transformers", "pydantic"}
     brought = _brought(NEEDED)
-    assert {name for name in there if not {_plain(home) for home in homes[name]} & brought} == set()
+    unneeded = {"sentencepiece"}  # transformers imports it where it is installed; answering does without
+    assert {name for name in there - unneeded if not {_plain(home) for home in homes[name]} & brought} == set()
 
 
 def _brought(names: Iterable[str]) -> set[str]:
