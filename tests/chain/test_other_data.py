@@ -149,9 +149,9 @@ def test_a_described_fourth_property_is_graded(tacky: Catalogue) -> None:
 
 
 def test_scenes_need_three_properties_and_take_more(tacky: Catalogue) -> None:
-    assert recipe_of("rug", narrowed(tacky, slice(3)), 0) == recipe_of("rug", tacky, 0)
+    assert recipe_of("rice", narrowed(tacky, slice(3)), 0) == recipe_of("rice", tacky, 0)
     with pytest.raises(UserError, match=r"hardness.*data\.source=videos"):
-        recipe_of("rug", narrowed(tacky, slice(1, None)), 0)
+        recipe_of("rice", narrowed(tacky, slice(1, None)), 0)
 
 
 def narrowed(catalogue: Catalogue, kept: slice) -> Catalogue:
