@@ -43,6 +43,16 @@ def atomic(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def remove_rests(folder: Path) -> None:
+    """Remove the temporary files in a folder whose process was killed; nothing else would ever do it."""
+    import psutil
+
+    for rest in folder.glob(".*.part"):
+        process = rest.stem.rpartition(".")[2]
+        if process.isdecimal() and not psutil.pid_exists(int(process)):
+            rest.unlink(missing_ok=True)
+
+
 @contextmanager
 def atomic_folder(folder: Path) -> Iterator[Path]:
     """Give an empty folder beside `folder` that takes its place if the block succeeds; a killed one's rest goes."""

@@ -20,7 +20,7 @@ from filelock import FileLock, Timeout
 
 from pipeline.config import Params
 from pipeline.errors import UserError
-from pipeline.io import write_json
+from pipeline.io import remove_rests, write_json
 from pipeline.parallel import use_backend
 from pipeline.params import PARAMS_FILE, load_params
 from pipeline.records import Measurement
@@ -90,6 +90,7 @@ def stage(name: str, key: str | None = None) -> Iterator[Stage]:
             limit_threads(running.params.runtime.threads)
             use_backend(running.params.runtime.parallel)
             if _main_process():
+                remove_rests(DATA)
                 print(f"{full}: starts ({running.params.report_name})", flush=True)
             yield running
             if load_params() != running.params:

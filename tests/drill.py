@@ -267,7 +267,11 @@ def drill_kills(chain: Chain, ledger: Ledger, kills: int, minutes: float, seed: 
 def one_line(status: int, output: str, words: str) -> str:
     """What is wrong with how a command ended; nothing where one line says it."""
     said = [line for line in output.splitlines() if line and not re.match(r"WARNING|\S+: starts|.* s left$", line)]
-    return "" if status == 1 and len(said) == 1 and re.search(words, said[0]) else f"{status}: {output[-600:]}"
+    return (
+        ""
+        if status == 1 and len(said) == 1 and re.search(words, said[0], re.IGNORECASE)
+        else f"{status}: {output[-600:]}"
+    )
 
 
 def drill_disks(chain: Chain, ledger: Ledger) -> None:

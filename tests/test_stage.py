@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -160,6 +162,19 @@ SCORE = Score(
     question_id="q", task="PC", measure="choice", correct=True, parsed=True, truncated=False, expected="yes",
     predicted="yes", objects=("a", "b"),
 )  # fmt: skip
+
+
+def test_a_stage_removes_what_killed_ones_were_writing(here: Path) -> None:
+    kill = "import os; from pathlib import Path; from pipeline.io import atomic"
+    kill += "; t = atomic(Path('data/graded.parquet')).__enter__(); t.write_text('half'); os.kill(os.getpid(), 9)"
+    assert subprocess.run([sys.executable, "-c", kill], cwd=here, check=False).returncode == -9
+    (rest,) = (here / "data").iterdir()
+    others = [here / "data" / f".x.{os.getpid()}.part", here / "data" / ".frames.part", here / "data" / "x.1.csv"]
+    for other in others:
+        other.touch()
+    with stage("grade"):
+        assert not rest.exists()
+    assert sorted((here / "data").iterdir()) == sorted(others)
 
 
 def test_tables_come_back_as_they_went(tmp_path: Path) -> None:
