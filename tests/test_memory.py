@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import shlex
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -236,8 +237,9 @@ def test_a_gpu_takes_what_is_counted(autocast: bool) -> None:
 def test_launchers_are_read() -> None:
     assert launched("python") == (1, False)
     assert launched("accelerate launch --num_processes 1") == (1, False)
-    assert launched(f"accelerate launch --config_file {ROOT}/conf/accelerate/fsdp.yaml") == (2, True)
-    assert launched(f"accelerate launch --config_file {ROOT}/conf/accelerate/fsdp.yaml --num_processes 4") == (4, True)
+    named = f"accelerate launch --config_file {shlex.quote(f'{ROOT}/conf/accelerate/fsdp.yaml')}"
+    assert launched(named) == (2, True)
+    assert launched(f"{named} --num_processes 4") == (4, True)
 
 
 @pytest.fixture
