@@ -246,10 +246,9 @@ class OctopiForCausalLM(nn.Module):
         return max(0, int(alike.all(0).long().cumprod(0).sum()) - 1)
 
     def _begin(self, embeddings: torch.Tensor) -> DynamicCache:
-        """Keys and values of what all rows begin with: of one row, and without gradient where none is trained there."""
+        """Keys and values of what all rows begin with, of one row; only trained words have a gradient there."""
         cache = DynamicCache(config=self.llm.config)
-        learns = self.words is not None or any(parameter.requires_grad for parameter in self.llm.parameters())
-        first = embeddings[:1] if learns else embeddings[:1].detach()
+        first = embeddings[:1] if self.words is not None else embeddings[:1].detach()
         self.llm(inputs_embeds=first, past_key_values=cache, use_cache=True, logits_to_keep=1)
         cache.batch_repeat_interleave(len(embeddings))
         return cache
