@@ -269,15 +269,15 @@ class TeachConfig(Section):
     """Updates until the rate is reached; it stays there."""
     batch_size: Positive = 32
     """Items an update."""
-    micro_batch_size: Positive = 8
+    micro_batch_size: Positive = 16
     """Items at a time, of like length."""
     max_updates: Positive = 200
-    """Longest either phase may take: short items, then whole descriptions."""
+    """Longest each of the three phases may take: plain items, short ones, whole descriptions."""
     check_every: Positive = 20
     """Updates between two looks at items that are not trained on."""
     check_items: Positive = 64
     advance: Fraction = 0.93
-    """Share of short items right at which whole descriptions begin."""
+    """Share of a phase's items right at which the next phase begins."""
     finish: Fraction = 0.97
     """Share of whole descriptions right at which teaching ends."""
     gate_questions: Annotated[int, Field(ge=0)] = 100

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 import pytest
 
 from pipeline.language.teach.gate import GateQuestion, gate_questions
-from pipeline.language.teach.items import OURS, Item, draw, held_out, words
+from pipeline.language.teach.items import OURS, Item, Phase, draw, held_out, words
 from pipeline.records import Assignment, Opd, Part
 from pipeline.tasks import TASKS
 from pipeline.tasks.questions import build_questions, pool_of
@@ -30,7 +30,8 @@ def text(item: Item) -> str:
 
 @pytest.fixture(scope="module")
 def items() -> list[Item]:
-    return [draw(random.Random(i), whole=i % 2 == 1, held=i % 6 == 5, follow_ups=i % 3) for i in range(9000)]
+    phases: tuple[Phase, ...] = ("whole", "whole", "short", "plain")
+    return [draw(random.Random(i), phases[i % 4], held=i % 8 == 1, follow_ups=i % 3) for i in range(12000)]
 
 
 def asked(catalogue: Catalogue, facts: bool) -> Iterable[str]:
@@ -142,7 +143,7 @@ def expected(item: Item) -> str | None:
 def test_answers_follow_from_the_words() -> None:
     read = 0
     for i in range(3000):
-        item = draw(random.Random(f"answers {i}"), whole=False)
+        item = draw(random.Random(f"answers {i}"), "short" if i % 4 else "plain")
         if item.kind in SHORT_KINDS and (answer := expected(item)) is not None:
             read += 1
             given = " and ".join(plain(part) for part in item.learnt[-1].split(" and "))
@@ -150,9 +151,20 @@ def test_answers_follow_from_the_words() -> None:
     assert read > 2000, "the reader must understand most items, or the test says little"
 
 
-def test_answers_are_balanced() -> None:
+def test_plain_items_vary_in_what_they_are_about_alone() -> None:
+    items = [draw(random.Random(i), "plain") for i in range(1000)]
+    assert {item.kind for item in items} == {"compare", "extreme", "which"}
+    said = " ".join(map(text, items)).lower()
+    for name in OURS:
+        for first, *others in words().properties[name].levels:
+            assert f" {first}." in said
+            assert not [other for other in others if re.search(rf"\b{other}\b", said)]
+
+
+@pytest.mark.parametrize("phase", ["plain", "short", "whole"])
+def test_answers_are_balanced(phase: Phase) -> None:
     """A guess that ignores the things must not do well."""
-    items = [draw(random.Random(f"balance {i}"), whole=bool(i % 2)) for i in range(4000)]
+    items = [draw(random.Random(f"balance {i}"), phase) for i in range(4000)]
     compared = [item.learnt[-1] for item in items if item.kind == "compare"]
     for answer in ("Yes.", "No.", "Both alike."):
         assert 0.28 < compared.count(answer) / len(compared) < 0.39
@@ -164,7 +176,7 @@ def test_answers_are_balanced() -> None:
 def test_held_out_combinations_are_never_taught() -> None:
     seen: dict[bool, set[tuple[int, ...]]] = {True: set(), False: set()}
     for i in range(4000):
-        item = draw(random.Random(f"held {i}"), whole=True, held=i % 4 == 0, follow_ups=1)
+        item = draw(random.Random(f"held {i}"), "whole", held=i % 4 == 0, follow_ups=1)
         for thing in told(item).values():
             if set(OURS) <= thing.keys():
                 combination = tuple(thing[name] for name in OURS)

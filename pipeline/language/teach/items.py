@@ -1,7 +1,8 @@
 """What is taught: questions about invented things whose qualities are told in words.
 
-A short item tells one quality of each thing; a whole one describes things by several, and may ask about them again. The
-wordings stand in words.yaml. Everything is drawn from a random generator, so nothing needs to be stored.
+A plain item compares things by one of the catalogue's properties, in one wording. A short one is about any property,
+asks for more and is worded in many ways. A whole one describes things by several properties, and may ask about them
+again. The wordings stand in words.yaml. Everything is drawn from a random generator, so nothing needs to be stored.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import yaml
 from pydantic import BaseModel, ConfigDict
@@ -19,7 +20,9 @@ from pydantic import BaseModel, ConfigDict
 from pipeline.records import Turn
 
 OURS = ("hardness", "roughness", "bumpiness")
-"""Properties that the catalogue of PhysiCLeAR rates too: half of the items are about them."""
+"""Properties that the catalogue of PhysiCLeAR rates too: plain items are about them, and half of the others."""
+PLAIN = {"compare": 4, "extreme": 4, "which": 2}
+"""Kinds of plain questions, by how often they come."""
 SHORT = {"compare": 5, "which": 2, "extreme": 9, "same": 1, "pair": 1, "odd": 1, "match": 4, "need": 4}
 """Kinds of short questions (words.yaml says what each asks), by how often they come."""
 WHOLE = SHORT | {"match": 2, "sort": 2}
@@ -30,6 +33,9 @@ SYLLABLES = (
     *("bal", "bim", "dop", "fen", "gar", "hul", "jin", "kov", "lur", "mip"),
     *("nor", "pel", "quo", "rix", "sab", "tem", "vop", "wug", "yal", "zib"),
 )
+
+Phase = Literal["plain", "short", "whole"]
+"""What a training begins with, goes on with and ends with."""
 
 Place = Literal["behind", "ahead", "told", "earlier"]
 """Where a question stands: behind the descriptions; ahead of them; alone, so that the answer begins by describing, as
@@ -67,9 +73,18 @@ class Words(Strict):
 
 
 @cache
-def words() -> Words:
-    """The words of the teaching text."""
-    return Words.model_validate(yaml.safe_load(Path(__file__).with_name("words.yaml").read_text(encoding="utf-8")))
+def words(*, plain: bool = False) -> Words:
+    """The words of the teaching text; `plain`: the first wording of everything alone."""
+    read = yaml.safe_load(Path(__file__).with_name("words.yaml").read_text(encoding="utf-8"))
+    return Words.model_validate(_first_wordings(read) if plain else read)
+
+
+def _first_wordings(part: Any) -> Any:
+    if isinstance(part, dict):
+        return {key: _first_wordings(value) for key, value in part.items()}
+    if isinstance(part, list):
+        return part[:1] if isinstance(part[0], str) else [_first_wordings(wordings) for wordings in part]
+    return part
 
 
 def held_out(levels: Sequence[int]) -> bool:
@@ -101,29 +116,30 @@ class Things:
     answers: tuple[str, ...]
     topics: tuple[str, ...]
     levels: tuple[Mapping[str, int], ...]
+    words: Words
 
 
-def draw(rng: random.Random, *, whole: bool, held: bool = False, follow_ups: int = 0) -> Item:
+def draw(rng: random.Random, phase: Phase, *, held: bool = False, follow_ups: int = 0) -> Item:
     """Draw an item.
 
     Args:
-        whole: Things are described by several properties in place of one.
+        phase: Which one's.
         held: About combinations of our properties that are never taught, in place of those that may be.
         follow_ups: At most so many further questions about the same things, in turns of their own.
     """
-    kinds = WHOLE if whole else SHORT
+    kinds = {"plain": PLAIN, "short": SHORT, "whole": WHOLE}[phase]
     while True:
         kind = rng.choices(list(kinds), list(kinds.values()))[0]
-        things = _things(rng, COUNTS.get(kind, 3), whole, held)
+        things = _things(rng, COUNTS.get(kind, 3), phase, held)
         topic = rng.choice(things.topics)
         asked = _ask(kind, things, topic, rng) if _allowed(things, held) else None
         if asked is None:
             continue
         place: Place = "behind"
-        if kind not in ("match", "sort"):
-            weights = (9, 4, 7, 3) if whole else (13, 5, 2, 0)
+        if phase != "plain" and kind not in ("match", "sort"):
+            weights = (9, 4, 7, 3) if phase == "whole" else (13, 5, 2, 0)
             place = rng.choices(("behind", "ahead", "told", "earlier"), weights)[0]
-        turns, learnt = _place(*asked, _describe_all(things, whole, rng), place, rng)
+        turns, learnt = _place(*asked, _describe_all(things, phase, rng), place, things.words, rng)
         for _ in range(rng.randint(0, follow_ups)):
             further = _ask(rng.choice(("compare", "extreme")), things, rng.choice(things.topics), rng)
             if further is not None and further[0] not in {turn.user for turn in turns}:
@@ -132,28 +148,31 @@ def draw(rng: random.Random, *, whole: bool, held: bool = False, follow_ups: int
         return Item(kind, tuple(turns), tuple(learnt))
 
 
-def _things(rng: random.Random, count: int, whole: bool, held: bool) -> Things:
-    every = list(words().properties)
-    if held and whole:
+def _things(rng: random.Random, count: int, phase: Phase, held: bool) -> Things:
+    own = words(plain=phase == "plain")
+    every = list(own.properties)
+    if phase == "plain":
+        topics = [rng.choice(OURS)]
+    elif held and phase == "whole":
         topics = list(OURS)
-    elif whole:
+    elif phase == "whole":
         topics = [*OURS, *rng.sample(every, 1)] if rng.random() < 0.5 else rng.sample(every, rng.choice((2, 3, 4)))
     else:
         topics = [rng.choice(OURS if rng.random() < 0.5 else every)]
     topics = list(dict.fromkeys(topics))
     rng.shuffle(topics)
     levels = tuple({topic: rng.randrange(3) for topic in topics} for _ in range(count))
-    scheme = rng.choices(("ordinals", "letters", "names"), (2, 2, 1))[0]
+    scheme = rng.choices(("ordinals", "letters", "names"), (2, 2, 0 if phase == "plain" else 1))[0]
     if scheme == "ordinals":
-        plain, noun = ("first", "second", "third"), rng.choice(("", " one", " thing"))
-        labels, names = tuple(f"{p.capitalize()}:" for p in plain), tuple(f"the {p}{noun}" for p in plain)
-        answers = tuple(f"The {p}." for p in plain)
+        places, noun = ("first", "second", "third"), rng.choice(("",) if phase == "plain" else ("", " one", " thing"))
+        labels, names = tuple(f"{p.capitalize()}:" for p in places), tuple(f"the {p}{noun}" for p in places)
+        answers = tuple(f"The {p}." for p in places)
     elif scheme == "letters":
         labels = names = answers = ("a)", "b)", "c)")
     else:
         names = tuple(invent(rng, 3))
         labels, answers = tuple(f"{n}:" for n in names), tuple(f"{n}." for n in names)
-    return Things(labels[:count], names[:count], answers[:count], tuple(topics), levels)
+    return Things(labels[:count], names[:count], answers[:count], tuple(topics), levels, own)
 
 
 def invent(rng: random.Random, count: int) -> list[str]:
@@ -171,7 +190,7 @@ def _allowed(things: Things, held: bool) -> bool:
 
 def _ask(kind: str, things: Things, topic: str, rng: random.Random) -> tuple[str, str] | None:
     """A question and its answer; None where these things leave no clear one."""
-    own, rising = words().properties[topic], rng.random() < 0.5
+    own, rising = things.words.properties[topic], rng.random() < 0.5
     levels = [thing[topic] for thing in things.levels]
     order = rng.sample(range(len(levels)), len(levels))
     x, y = order[:2]
@@ -201,7 +220,7 @@ def _ask(kind: str, things: Things, topic: str, rng: random.Random) -> tuple[str
         return _sort(things, order, rng)
     if answer is None:
         return None
-    question = rng.choice(words().questions[kind]).format(**fields)
+    question = rng.choice(things.words.questions[kind]).format(**fields)
     return question[0].upper() + question[1:], answer
 
 
@@ -211,19 +230,19 @@ def _sort(things: Things, order: Sequence[int], rng: random.Random) -> tuple[str
     told = " ".join(_describe(f"{name}:", things, i, chosen, "list", rng) for name, i in zip(names, order, strict=True))
     owner = {i: name for name, i in zip(names, order, strict=True)}
     said = ", ".join(f"{things.names[i]} {owner[i]}" for i in range(len(order)))
-    return rng.choice(words().questions["sort"]).format(told=told), f"{said[0].upper()}{said[1:]}."
+    return rng.choice(things.words.questions["sort"]).format(told=told), f"{said[0].upper()}{said[1:]}."
 
 
 def _wordings(things: Things, rng: random.Random) -> dict[str, list[str]]:
     """One wording of each level of each topic: what is alike is called alike."""
-    return {topic: [rng.choice(level) for level in words().properties[topic].levels] for topic in things.topics}
+    return {topic: [rng.choice(level) for level in things.words.properties[topic].levels] for topic in things.topics}
 
 
-def _describe_all(things: Things, whole: bool, rng: random.Random) -> str:
-    chosen, style = (
-        _wordings(things, rng),
-        rng.choice(("list", "list", "sentence", "twice") if whole else ("list", "sentence")),
-    )
+STYLES = {"plain": ("list",), "short": ("list", "sentence"), "whole": ("list", "list", "sentence", "twice")}
+
+
+def _describe_all(things: Things, phase: Phase, rng: random.Random) -> str:
+    chosen, style = _wordings(things, rng), rng.choice(STYLES[phase])
     return " ".join(_describe(label, things, i, chosen, style, rng) for i, label in enumerate(things.labels))
 
 
@@ -235,12 +254,12 @@ def _describe(
     if style == "sentence":
         name = things.names[index]
         subject = "It" if not label else name if name.endswith(")") else f"{name[0].upper()}{name[1:]}"
-        clauses = [f"{words().properties[t].verb} {chosen[t][levels[t]]}" for t in things.topics]
+        clauses = [f"{things.words.properties[t].verb} {chosen[t][levels[t]]}" for t in things.topics]
         return f"{subject} {_joined(clauses)}."
     plain = _listed(chosen, things, index)
     if style == "twice":
-        loose = rng.choice(words().loosely).format(_joined(_listed(_wordings(things, rng), things, index)))
-        return f"{label} {loose} {rng.choice(words().finally_).format(', '.join(plain))}".strip()
+        loose = rng.choice(things.words.loosely).format(_joined(_listed(_wordings(things, rng), things, index)))
+        return f"{label} {loose} {rng.choice(things.words.finally_).format(', '.join(plain))}".strip()
     text = ", ".join(plain)
     return f"{label} {text}." if label else f"{text[0].upper()}{text[1:]}."
 
@@ -248,7 +267,7 @@ def _describe(
 def _listed(chosen: Mapping[str, Sequence[str]], things: Things, index: int) -> list[str]:
     """The qualities of a thing; beside others, what it has comes behind "with"."""
     linked = {"is": "", "has": "with " if len(things.topics) > 1 else ""}
-    return [linked[words().properties[t].verb] + chosen[t][things.levels[index][t]] for t in things.topics]
+    return [linked[things.words.properties[t].verb] + chosen[t][things.levels[index][t]] for t in things.topics]
 
 
 def _joined(parts: Sequence[str]) -> str:
@@ -256,17 +275,17 @@ def _joined(parts: Sequence[str]) -> str:
 
 
 def _place(
-    question: str, answer: str, described: str, place: Place, rng: random.Random
+    question: str, answer: str, described: str, place: Place, words: Words, rng: random.Random
 ) -> tuple[list[Turn], list[str]]:
     """The turns of a conversation, and what is learnt of each answer."""
     if place == "told":
-        said = f"{described} {rng.choice(words().therefore)} {answer}"
-        return [Turn(user=f"{question} {rng.choice(words().tell)}", assistant=said)], [answer]
+        said = f"{described} {rng.choice(words.therefore)} {answer}"
+        return [Turn(user=f"{question} {rng.choice(words.tell)}", assistant=said)], [answer]
     if place == "earlier":
-        return [Turn(user=rng.choice(words().tell), assistant=described), Turn(user=question, assistant=answer)], [
+        return [Turn(user=rng.choice(words.tell), assistant=described), Turn(user=question, assistant=answer)], [
             "",
             answer,
         ]
-    before = rng.choice(words().before)
+    before = rng.choice(words.before)
     asked = [before, described, question] if place == "behind" else [question, described]
     return [Turn(user=" ".join(filter(None, asked)), assistant=answer)], [answer]

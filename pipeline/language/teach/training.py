@@ -1,7 +1,7 @@
-"""Teaching: adapters on all linear layers learn short items, then whole descriptions, and are merged into the base.
+"""Teaching: adapters on all linear layers learn plain items, then short, then whole ones, and are merged into the base.
 
-Short items come first, and whole descriptions only when those are right: started with at once, they are not learnt in
-as long (curriculum by a gate, not by the clock).
+A phase begins when the one before it is passed. Whole descriptions at once are not learnt in as long, nor are short
+items in all their wordings: choosing between things has to be there first, and it is learnt where little else varies.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from pipeline.io import fingerprint
 from pipeline.language.base import load_llm
 from pipeline.language.chat import IGNORE_INDEX, Encoded, encode, render
 from pipeline.language.teach import items
-from pipeline.language.teach.items import Item, draw
+from pipeline.language.teach.items import Item, Phase, draw
 from pipeline.records import Measurement
 from pipeline.runtime import derive_seed, resolve_dtype, seed_everything
 from pipeline.training.trainer import (
@@ -39,10 +39,10 @@ from pipeline.training.trainer import (
     training_arguments,
 )
 
-SHORT_SHARE = 0.5
-"""Short items among whole ones, so that they are not forgotten."""
+PHASES: tuple[Phase, ...] = ("plain", "short", "whole")
+REVIEW = {"short": 0.25, "whole": 0.5}
+"""Items of the phase before among a phase's own, so that they are not forgotten."""
 FOLLOW_UPS = 2
-PHASES = ("short", "whole")
 KEPT = ("config.json", "README.md")
 """Files of the base that the taught model writes anew, beside the weights."""
 
@@ -78,28 +78,32 @@ class Course(Dataset[Encoded]):
 
     def __getitem__(self, index: int) -> Encoded:
         update, place = divmod(index, self.config.batch_size)
-        return self._update(update + 1, update > self.ended("short"))[place]
+        return self._update(update + 1, self.phase(update - 1))[place]
 
-    def ended(self, phase: str) -> int:
+    def phase(self, step: int) -> Phase:
+        """What is learnt when so many updates are done."""
+        return next((phase for phase in PHASES if step < self.ended(phase)), PHASES[-1])
+
+    def ended(self, phase: Phase) -> int:
         """The update after which a phase ended, or must end at the latest."""
-        config = self.config
-        first = self.ended("short") if phase == "whole" else 0
-        enough = config.finish if phase == "whole" else config.advance
+        config, number = self.config, PHASES.index(phase)
+        first = self.ended(PHASES[number - 1]) if number else 0
+        enough = config.finish if phase == PHASES[-1] else config.advance
         steps = (int(e["step"]) for e in self.log() if e["step"] > first and e.get(f"eval_{phase}_items", 0) >= enough)
         return min(steps, default=first + config.max_updates)
 
-    def exam(self, phase: str) -> list[Encoded]:
+    def exam(self, phase: Phase) -> list[Encoded]:
         """Items that are never trained on; whole ones about combinations of properties that are held out."""
-        whole = phase == "whole"
         rngs = (random.Random(derive_seed(self.seed, "exam", phase, i)) for i in range(self.config.check_items))
-        return self._encoded(draw(rng, whole=whole, held=whole) for rng in rngs)
+        return self._encoded(draw(rng, phase, held=phase == "whole") for rng in rngs)
 
-    def _draw_update(self, update: int, whole: bool) -> list[Encoded]:
+    def _draw_update(self, update: int, phase: Phase) -> list[Encoded]:
         drawn = []
         for place in range(self.config.batch_size):
             rng = random.Random(derive_seed(self.seed, "teach", update, place))
-            described = whole and rng.random() >= SHORT_SHARE
-            drawn.append(draw(rng, whole=described, follow_ups=FOLLOW_UPS if described else 0))
+            again = phase in REVIEW and rng.random() < REVIEW[phase]
+            own: Phase = PHASES[PHASES.index(phase) - 1] if again else phase
+            drawn.append(draw(rng, own, follow_ups=FOLLOW_UPS if own == "whole" else 0))
         return sorted(self._encoded(drawn), key=lambda e: len(e.input_ids))
 
     def _encoded(self, drawn: Iterable[Item]) -> list[Encoded]:
@@ -169,7 +173,8 @@ class Teacher(TrainableTrainer):
     def evaluate(self, *_: Any, **__: Any) -> dict[str, float]:
         """The exam of the phase that the training is in."""
         step, pupil = self.state.global_step, self.accelerator.unwrap_model(self.model)
-        phase = "whole" if step > self.course.ended("short") else "short"
+        # The exam at a phase's last update is that phase's.
+        phase = self.course.phase(step - 1)
         pupil.eval()
         metrics = {f"eval_{phase}_items": pupil.exact(self.course.exam(phase), self.args.per_device_eval_batch_size)}
         self.log(metrics)
@@ -202,7 +207,8 @@ def teach(
 
     folder = Path(config.base)
     seed_everything(seed)
-    base = load_llm(folder, resolve_dtype(language.dtype))
+    dtype = resolve_dtype(language.dtype)
+    base = load_llm(folder, dtype)
     tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True, use_fast=True)
     lora = LoraConfig(
         r=config.rank, lora_alpha=config.alpha, target_modules="all-linear", task_type="CAUSAL_LM", lora_dropout=0.0
@@ -224,6 +230,8 @@ def teach(
         logging_steps=config.check_every,
         eval_strategy="steps",
         eval_steps=config.check_every,
+        # The adapters stay in float32 and are multiplied in the base's format, which took a fifth less time.
+        bf16=dtype == torch.bfloat16,
     )
     trainer = Teacher(
         course,

@@ -1,0 +1,80 @@
+"""Teaching: its phases follow what was measured, and a kill changes nothing of what is learnt."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import pytest
+import torch
+
+from pipeline.config import LanguageConfig, RuntimeConfig, TeachConfig
+from pipeline.language.base import load_tokenizer
+from pipeline.language.teach import training
+from pipeline.language.teach.items import draw
+from pipeline.language.teach.training import Course, teach
+from pipeline.runtime import derive_seed
+from pipeline.training.trainer import Trained
+from tests.language.test_training import AtStep
+
+SMALL = TeachConfig(
+    rank=2, alpha=4, warmup=1, batch_size=4, micro_batch_size=2, max_updates=2, check_every=1, check_items=4
+)
+RUNTIME = RuntimeConfig(device="cpu", save_steps=1)
+
+
+def run(language: LanguageConfig, *callbacks: AtStep) -> Trained:
+    config = SMALL.model_copy(update={"base": language.weights})
+    return teach(config, language, RUNTIME, stage="teach", seed=0, callbacks=callbacks)[2]
+
+
+@pytest.fixture
+def course(language: LanguageConfig) -> Course:
+    config = SMALL.model_copy(update={"max_updates": 100, "batch_size": 40})
+    return Course(config, load_tokenizer(Path(language.weights)), "", seed=3)
+
+
+def test_a_phase_begins_when_the_one_before_is_passed(course: Course) -> None:
+    log: list[dict[str, float]] = []
+    course.log = lambda: log
+    assert [course.phase(s) for s in (0, 99, 100, 199, 200, 500)] == ["plain"] * 2 + ["short"] * 2 + ["whole"] * 2
+    log += [{"step": 20, "eval_plain_items": 0.5}, {"step": 40, "eval_plain_items": 0.95}]
+    assert [course.phase(s) for s in (39, 40, 139, 140)] == ["plain", "short", "short", "whole"]
+    # Enough for a phase, but measured in the one before: it does not count.
+    log += [{"step": 40, "eval_short_items": 1.0}, {"step": 60, "eval_short_items": 0.93}]
+    assert [course.phase(s) for s in (40, 59, 60)] == ["short", "short", "whole"]
+    log += [{"step": 80, "eval_whole_items": 0.96}]
+    assert course.ended("whole") == 160, "the last phase has a mark of its own"
+    log += [{"step": 100, "eval_whole_items": 0.97}]
+    assert course.ended("whole") == 100
+
+
+def test_an_update_holds_its_phase_and_some_of_the_phase_before(course: Course) -> None:
+    kinds = {phase: {draw(random.Random(i), phase).kind for i in range(300)} for phase in ("plain", "short", "whole")}
+    assert kinds["plain"] < kinds["short"] < kinds["whole"]
+    drawn = {}
+    for phase in kinds:
+        again = training.REVIEW.get(phase, 0)
+        rolls = [random.Random(derive_seed(3, "teach", 1, place)).random() < again for place in range(40)]
+        drawn[phase] = (sum(rolls), course._draw_update(1, phase))
+        assert course._draw_update(1, phase) == drawn[phase][1], "what is drawn follows from the seed"
+    assert drawn["plain"][0] == 0
+    assert 3 < drawn["short"][0] < drawn["whole"][0] < 30
+    lengths = [sum(len(e.input_ids) for e in drawn[phase][1]) for phase in ("plain", "short", "whole")]
+    assert lengths == sorted(lengths)
+
+
+def test_a_killed_teaching_goes_on_with_the_same_phase(language: LanguageConfig, checkpoints: Path) -> None:
+    whole = run(language)
+    exams = dict.fromkeys((m.step, m.name) for m in whole.history if m.name.endswith("_items"))
+    assert list(exams) == list(enumerate(["plain_items"] * 2 + ["short_items"] * 2 + ["whole_items"] * 2, start=1))
+
+    def die() -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(language, AtStep(3, die))
+    assert list(checkpoints.rglob("trainer_state.json"))
+    resumed = run(language)
+    assert resumed.history == whole.history
+    assert all(torch.equal(resumed.state[name], value) for name, value in whole.state.items())
