@@ -26,7 +26,7 @@ from transformers.utils import SAFE_WEIGHTS_NAME
 from pipeline.config import RuntimeConfig
 from pipeline.errors import UserError
 from pipeline.records import Measurement
-from pipeline.runtime import CHECKPOINTS, LogLines
+from pipeline.runtime import CHECKPOINTS, LogLines, resolve_device
 from pipeline.training.sampling import EpochDataset
 from pipeline.training.trainable import load_trainable, whole_state
 
@@ -213,7 +213,7 @@ def training_arguments(folder: Path, runtime: RuntimeConfig, seed: int, **own: A
         "report_to": "none",
         # A bar is for a person at a terminal; a log file gets a line now and then.
         "disable_tqdm": not sys.stderr.isatty(),
-        "use_cpu": runtime.device == "cpu",
+        "use_cpu": resolve_device(runtime.device).type == "cpu",
     }
     arguments = TrainingArguments(**shared | own)
     if arguments.device.type == "cuda":

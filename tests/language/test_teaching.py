@@ -78,3 +78,13 @@ def test_a_killed_teaching_goes_on_with_the_same_phase(language: LanguageConfig,
     resumed = run(language)
     assert resumed.history == whole.history
     assert all(torch.equal(resumed.state[name], value) for name, value in whole.state.items())
+
+
+def test_bfloat16_on_a_processor_that_was_not_named(language: LanguageConfig, checkpoints: Path) -> None:
+    """The adapters stay in float32 there, and `auto` finds the processor."""
+    config = SMALL.model_copy(update={"base": language.weights, "max_updates": 1})
+    half = language.model_copy(update={"dtype": "bfloat16"})
+    llm, _, trained = teach(config, half, RuntimeConfig(device="auto"), stage="teach", seed=0)
+    assert {value.dtype for value in trained.state.values()} == {torch.float32}
+    assert next(p.dtype for n, p in llm.named_parameters() if "base_layer" in n) == torch.bfloat16
+    assert all(value.isfinite().all() for value in trained.state.values())
