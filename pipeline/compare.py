@@ -13,6 +13,7 @@ from typing import Any
 import pandas as pd
 import pyarrow.parquet as pq
 
+from pipeline.errors import UserError
 from pipeline.evaluation.scores import difference, effect_row, grouped, with_holm
 from pipeline.records import Graded
 from pipeline.revisions import State, find_state
@@ -38,7 +39,7 @@ def compare(root: Path, old: str, new: str = "") -> dict[str, Any]:
     tested, notes = _tested(one, two)
     found: dict[str, Rows] = {
         "parameters": _changes(_flat(one.mapping("params.yaml")), _flat(two.mapping("params.yaml"))),
-        "stages": _stages(one.mapping("dvc.lock").get("stages") or {}, two.mapping("dvc.lock").get("stages") or {}),
+        "stages": _stages(_locked(one), _locked(two)),
         "metrics": _changes(_metrics(one), _metrics(two)),
         "scores": _changes(_scores(one), _scores(two)),
         "tested": tested,
@@ -55,6 +56,13 @@ def describe(found: dict[str, Any]) -> str:
             rest = f"\n... and {len(rows) - SHOWN} more; --json FILE has them all" if len(rows) > SHOWN else ""
             parts.append(f"{title.capitalize()}\n{table}{rest}")
     return "\n\n".join([*parts, *found["notes"]])
+
+
+def _locked(state: State) -> dict[str, Any]:
+    stages = state.mapping("dvc.lock").get("stages") or {}
+    if not isinstance(stages, dict) or not all(isinstance(entry, dict) for entry in stages.values()):
+        raise UserError(f"dvc.lock of {state.name}: its stages are no mapping; restore it from Git")
+    return stages
 
 
 def _stages(old: dict[str, Any], new: dict[str, Any]) -> Rows:

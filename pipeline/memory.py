@@ -14,7 +14,7 @@ from pathlib import Path
 
 import yaml
 
-from pipeline.config import LoraTrainConfig, Params, TrainConfig
+from pipeline.config import EncoderConfig, LoraTrainConfig, Params, TrainConfig
 from pipeline.records import Assignment, Part, Question, Turn
 from pipeline.shapes import FULL, Llama, Vision
 from pipeline.tasks.questions import build_questions, counts_by_task, pool_of
@@ -96,8 +96,14 @@ def count(params: Params) -> tuple[list[Use], list[str]]:
         f"Longest conversation {lengths.training} tokens, {lengths.answer} of them learnt; longest question "
         f"{lengths.prompt}, answered in at most {params.language.max_new_tokens}."
     )
-    embedding = (tower.width if params.encoder.recipe == "release" else tower.embed_dim) if tower else llama.hidden_size
+    embedding = embedding_length(params.encoder, tower) if tower else llama.hidden_size
     return [*uses, *language_uses(params, llama, embedding, lengths)], notes
+
+
+def embedding_length(config: EncoderConfig, tower: Vision) -> int:
+    """Values of a frame's embedding as the language model gets it."""
+    whole = config.recipe == "release" or (config.recipe == "paper" and config.embedding == "class_token")
+    return tower.width if whole else tower.embed_dim
 
 
 def encoder_uses(params: Params, tower: Vision, classes: int) -> Iterator[Use]:
@@ -111,7 +117,7 @@ def encoder_uses(params: Params, tower: Vision, classes: int) -> Iterator[Use]:
         layers = min(tower.layers, config.prompt_layers or tower.layers)
         trained = layers * config.prompts * tower.width
         if config.recipe == "paper":
-            trained += (tower.width + 1) * tower.width + (tower.embed_dim + 1) * classes
+            trained += (tower.width + 1) * tower.width + (embedding_length(config, tower) + 1) * classes
         else:
             trained += (tower.width + 1) * 512 + 513 * classes
         pictures = frames * min(config.micro_batch_size or config.batch_size, config.batch_size)

@@ -281,6 +281,10 @@ def test_settings_move_what_they_should() -> None:
         assert usual[stage].parameters - new[stage].parameters == 4 * words
         assert usual[stage].optimizer - new[stage].optimizer == 12 * words
     assert usual["answer"].total - new["answer"].total == 4 * words
+    # Of ViT-L/14: a class token of 1024 values, or 768 behind its projection; 9 classes.
+    projected = uses("encoder.embedding=projected")
+    assert usual["finetune_encoder"].optimizer - projected["finetune_encoder"].optimizer == 12 * 256 * 9
+    assert usual["align"].optimizer - projected["align"].optimizer == 12 * 256 * 4096
 
 
 @pytest.mark.usefixtures("elsewhere")

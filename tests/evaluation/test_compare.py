@@ -181,6 +181,13 @@ def test_the_working_tree_is_what_lies_on_disk(copy: History) -> None:
     assert found["stages"] == found["scores"] == found["tested"] == []
 
 
+@pytest.mark.parametrize("stages", ["3", "[align]", "{align: 3}"])
+def test_a_lock_without_stages_is_named(copy: History, stages: str) -> None:
+    copy.write("dvc.lock", f"stages: {stages}\n")
+    with pytest.raises(UserError, match=re.escape("dvc.lock of working tree: its stages are no mapping")):
+        compare(copy.folder, "HEAD")
+
+
 @pytest.mark.parametrize(
     ("file", "text"),
     [("params.yaml", "{"), ("params.yaml", "- 1\n"), ("dvc.lock", "{"), (f"{REPORT}/metrics.json", "{")],
