@@ -257,6 +257,14 @@ class LanguageConfig(Section):
     generation_batch_size: Positive = 32
 
 
+class PassMarks(Section):
+    """Share of items right at which a phase of teaching ends."""
+
+    plain: Fraction = 0.93
+    short: Fraction = 0.8
+    whole: Fraction = 0.9
+
+
 class TeachConfig(Section):
     """Teaching a small language model, in text, to reason about described things (LoRA on all linear layers, AdamW)."""
 
@@ -276,10 +284,7 @@ class TeachConfig(Section):
     check_every: Positive = 20
     """Updates between two looks at items that are not trained on."""
     check_items: Positive = 64
-    advance: Fraction = 0.93
-    """Share of a phase's items right at which the next phase begins."""
-    finish: Fraction = 0.97
-    """Share of whole descriptions right at which teaching ends."""
+    pass_marks: PassMarks = PassMarks()
     gate_questions: Annotated[int, Field(ge=0)] = 100
     """Questions of each task that the untaught and the taught model are asked in words."""
 

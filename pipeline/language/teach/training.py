@@ -88,7 +88,7 @@ class Course(Dataset[Encoded]):
         """The update after which a phase ended, or must end at the latest."""
         config, number = self.config, PHASES.index(phase)
         first = self.ended(PHASES[number - 1]) if number else 0
-        enough = config.finish if phase == PHASES[-1] else config.advance
+        enough = getattr(config.pass_marks, phase)
         steps = (int(e["step"]) for e in self.log() if e["step"] > first and e.get(f"eval_{phase}_items", 0) >= enough)
         return min(steps, default=first + config.max_updates)
 
