@@ -261,7 +261,7 @@ class PassMarks(Section):
     """Share of items right at which a phase of teaching ends."""
 
     plain: Fraction = 0.93
-    short: Fraction = 0.8
+    several: Fraction = 0.93
     whole: Fraction = 0.9
 
 
@@ -275,12 +275,12 @@ class TeachConfig(Section):
     learning_rate: Rate = 5e-4
     warmup: Annotated[int, Field(ge=0)] = 10
     """Updates until the rate is reached; it stays there."""
-    batch_size: Positive = 32
+    batch_size: Positive = 16
     """Items an update."""
     micro_batch_size: Positive = 16
     """Items at a time, of like length."""
-    max_updates: Positive = 200
-    """Longest each of the three phases may take: plain items, short ones, whole descriptions."""
+    max_updates: Positive = 300
+    """Longest each of the three phases may take: plain items, several properties, whole descriptions."""
     check_every: Positive = 20
     """Updates between two looks at items that are not trained on."""
     check_items: Positive = 64

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 from pathlib import Path
 
 import pytest
@@ -10,10 +9,7 @@ import torch
 
 from pipeline.config import LanguageConfig, PassMarks, RuntimeConfig, TeachConfig
 from pipeline.language.base import load_tokenizer
-from pipeline.language.teach import training
-from pipeline.language.teach.items import draw
-from pipeline.language.teach.training import Course, teach
-from pipeline.runtime import derive_seed
+from pipeline.language.teach.training import COURSE, PHASES, Course, teach
 from pipeline.training.trainer import Trained
 from tests.language.test_training import AtStep
 
@@ -30,7 +26,7 @@ def run(language: LanguageConfig, *callbacks: AtStep) -> Trained:
 
 @pytest.fixture
 def course(language: LanguageConfig) -> Course:
-    marks = PassMarks(plain=0.9, short=0.8, whole=0.95)
+    marks = PassMarks(plain=0.9, several=0.8, whole=0.95)
     config = SMALL.model_copy(update={"max_updates": 100, "batch_size": 40, "pass_marks": marks})
     return Course(config, load_tokenizer(Path(language.weights)), "", seed=3)
 
@@ -38,37 +34,34 @@ def course(language: LanguageConfig) -> Course:
 def test_a_phase_begins_when_the_one_before_is_passed(course: Course) -> None:
     log: list[dict[str, float]] = []
     course.log = lambda: log
-    assert [course.phase(s) for s in (0, 99, 100, 199, 200, 500)] == ["plain"] * 2 + ["short"] * 2 + ["whole"] * 2
+    assert [course.phase(s) for s in (0, 99, 100, 199, 200, 500)] == ["plain"] * 2 + ["several"] * 2 + ["whole"] * 2
     log += [{"step": 20, "eval_plain_items": 0.5}, {"step": 40, "eval_plain_items": 0.95}]
-    assert [course.phase(s) for s in (39, 40, 139, 140)] == ["plain", "short", "short", "whole"]
+    assert [course.phase(s) for s in (39, 40, 139, 140)] == ["plain", "several", "several", "whole"]
     # Enough for a phase, but measured in the one before: it does not count.
-    log += [{"step": 40, "eval_short_items": 1.0}, {"step": 60, "eval_short_items": 0.8}]
-    assert [course.phase(s) for s in (40, 59, 60)] == ["short", "short", "whole"]
+    log += [{"step": 40, "eval_several_items": 1.0}, {"step": 60, "eval_several_items": 0.8}]
+    assert [course.phase(s) for s in (40, 59, 60)] == ["several", "several", "whole"]
     log += [{"step": 80, "eval_whole_items": 0.94}]
     assert course.ended("whole") == 160, "the last phase has a mark of its own"
     log += [{"step": 100, "eval_whole_items": 0.95}]
     assert course.ended("whole") == 100
 
 
-def test_an_update_holds_its_phase_and_some_of_the_phase_before(course: Course) -> None:
-    kinds = {phase: {draw(random.Random(i), phase).kind for i in range(300)} for phase in ("plain", "short", "whole")}
-    assert kinds["plain"] < kinds["short"] < kinds["whole"]
-    drawn = {}
-    for phase in kinds:
-        again = training.REVIEW.get(phase, 0)
-        rolls = [random.Random(derive_seed(3, "teach", 1, place)).random() < again for place in range(40)]
-        drawn[phase] = (sum(rolls), course._draw_update(1, phase))
-        assert course._draw_update(1, phase) == drawn[phase][1], "what is drawn follows from the seed"
-    assert drawn["plain"][0] == 0
-    assert 3 < drawn["short"][0] < drawn["whole"][0] < 30
-    lengths = [sum(len(e.input_ids) for e in drawn[phase][1]) for phase in ("plain", "short", "whole")]
+def test_an_update_holds_its_phase_and_reviews(course: Course) -> None:
+    lengths = []
+    for phase, forms in COURSE.items():
+        assert sum(forms.values()) == pytest.approx(1)
+        drawn = course._draw_update(1, phase)
+        assert drawn == course._draw_update(1, phase), "what is drawn follows from the seed"
+        assert len(drawn) == 40
+        lengths.append(sum(len(e.input_ids) for e in drawn))
     assert lengths == sorted(lengths)
+    assert [COURSE[phase].get("several", 0) > 0 for phase in PHASES] == [False, True, True]
 
 
 def test_a_killed_teaching_goes_on_with_the_same_phase(language: LanguageConfig, checkpoints: Path) -> None:
     whole = run(language)
     exams = dict.fromkeys((m.step, m.name) for m in whole.history if m.name.endswith("_items"))
-    assert list(exams) == list(enumerate(["plain_items"] * 2 + ["short_items"] * 2 + ["whole_items"] * 2, start=1))
+    assert list(exams) == list(enumerate(["plain_items"] * 2 + ["several_items"] * 2 + ["whole_items"] * 2, start=1))
 
     def die() -> None:
         raise KeyboardInterrupt

@@ -1,8 +1,9 @@
 """What is taught: questions about invented things whose qualities are told in words.
 
-A plain item compares things by one of the catalogue's properties, in one wording. A short one is about any property,
-asks for more and is worded in many ways. A whole one describes things by several properties, and may ask about them
-again. The wordings stand in words.yaml. Everything is drawn from a random generator, so nothing needs to be stored.
+Items have four forms. A plain one compares things by one of the catalogue's properties, in one wording. One of several
+properties tells all of them, in that wording. A short one is about any one property, asks more and is worded in many
+ways. A whole one has all of this. The wordings stand in words.yaml. Everything is drawn from a random generator, so
+nothing needs to be stored.
 """
 
 from __future__ import annotations
@@ -20,13 +21,7 @@ from pydantic import BaseModel, ConfigDict
 from pipeline.records import Turn
 
 OURS = ("hardness", "roughness", "bumpiness")
-"""Properties that the catalogue of PhysiCLeAR rates too: plain items are about them, and half of the others."""
-PLAIN = {"compare": 4, "extreme": 4, "which": 2}
-"""Kinds of plain questions, by how often they come."""
-SHORT = {"compare": 5, "which": 2, "extreme": 9, "same": 1, "pair": 1, "odd": 1, "match": 4, "need": 4}
-"""Kinds of short questions (words.yaml says what each asks), by how often they come."""
-WHOLE = SHORT | {"match": 2, "sort": 2}
-"""Kinds about whole descriptions; `sort`: which of three is which."""
+"""Properties that the catalogue of PhysiCLeAR rates too. Items in one wording are about them, and half of the others."""
 COUNTS = {"compare": 2, "which": 2, "same": 2, "need": 2}
 """Things of an item; three for all other kinds."""
 SYLLABLES = (
@@ -34,8 +29,23 @@ SYLLABLES = (
     *("nor", "pel", "quo", "rix", "sab", "tem", "vop", "wug", "yal", "zib"),
 )
 
-Phase = Literal["plain", "short", "whole"]
-"""What a training begins with, goes on with and ends with."""
+Form = Literal["plain", "several", "short", "whole"]
+FEW = {"compare": 4, "extreme": 4, "which": 2}
+MANY = {"compare": 5, "which": 2, "extreme": 9, "same": 1, "pair": 1, "odd": 1, "match": 4, "need": 4}
+KINDS: dict[Form, dict[str, int]] = {
+    "plain": FEW,
+    "several": FEW,
+    "short": MANY,
+    "whole": MANY | {"match": 2, "sort": 2},
+}
+"""Kinds of questions (words.yaml says what each asks), by how often they come."""
+ONE_WORDING = ("plain", "several")
+ONE_PROPERTY = ("plain", "short")
+STYLES = {"short": ("list", "sentence"), "whole": ("list", "list", "sentence", "twice")}
+PLACES = {"short": (13, 5, 2, 0), "whole": (9, 4, 7, 3)}
+"""How often each place comes; "behind" in other forms."""
+FOLLOW_UPS = {"several": 3, "whole": 5}
+"""At most so many further questions about the same things: a description costs more than a question about it."""
 
 Place = Literal["behind", "ahead", "told", "earlier"]
 """Where a question stands: behind the descriptions; ahead of them; alone, so that the answer begins by describing, as
@@ -119,52 +129,48 @@ class Things:
     words: Words
 
 
-def draw(rng: random.Random, phase: Phase, *, held: bool = False, follow_ups: int = 0) -> Item:
+def draw(rng: random.Random, form: Form, *, held: bool = False, further: bool = False) -> Item:
     """Draw an item.
 
     Args:
-        phase: Which one's.
         held: About combinations of our properties that are never taught, in place of those that may be.
-        follow_ups: At most so many further questions about the same things, in turns of their own.
+        further: With further questions about the same things, in turns of their own, where the form has them.
     """
-    kinds = {"plain": PLAIN, "short": SHORT, "whole": WHOLE}[phase]
+    kinds = KINDS[form]
     while True:
         kind = rng.choices(list(kinds), list(kinds.values()))[0]
-        things = _things(rng, COUNTS.get(kind, 3), phase, held)
+        things = _things(rng, COUNTS.get(kind, 3), form, held)
         topic = rng.choice(things.topics)
         asked = _ask(kind, things, topic, rng) if _allowed(things, held) else None
         if asked is None:
             continue
         place: Place = "behind"
-        if phase != "plain" and kind not in ("match", "sort"):
-            weights = (9, 4, 7, 3) if phase == "whole" else (13, 5, 2, 0)
-            place = rng.choices(("behind", "ahead", "told", "earlier"), weights)[0]
-        turns, learnt = _place(*asked, _describe_all(things, phase, rng), place, things.words, rng)
-        for _ in range(rng.randint(0, follow_ups)):
-            further = _ask(rng.choice(("compare", "extreme")), things, rng.choice(things.topics), rng)
-            if further is not None and further[0] not in {turn.user for turn in turns}:
-                turns.append(Turn(user=further[0], assistant=further[1]))
-                learnt.append(further[1])
+        if form in PLACES and kind not in ("match", "sort"):
+            place = rng.choices(("behind", "ahead", "told", "earlier"), PLACES[form])[0]
+        turns, learnt = _place(*asked, _describe_all(things, form, rng), place, things.words, rng)
+        for _ in range(FOLLOW_UPS.get(form, 0) if further else 0):
+            again = _ask(rng.choice(("compare", "extreme")), things, rng.choice(things.topics), rng)
+            if again is not None and again[0] not in {turn.user for turn in turns}:
+                turns.append(Turn(user=again[0], assistant=again[1]))
+                learnt.append(again[1])
         return Item(kind, tuple(turns), tuple(learnt))
 
 
-def _things(rng: random.Random, count: int, phase: Phase, held: bool) -> Things:
-    own = words(plain=phase == "plain")
-    every = list(own.properties)
-    if phase == "plain":
-        topics = [rng.choice(OURS)]
-    elif held and phase == "whole":
+def _things(rng: random.Random, count: int, form: Form, held: bool) -> Things:
+    own, simple = words(plain=form in ONE_WORDING), form in ONE_WORDING
+    every, ours = list(own.properties), simple or rng.random() < 0.5
+    if form in ONE_PROPERTY:
+        topics = [rng.choice(OURS if ours else every)]
+    elif held or simple:
         topics = list(OURS)
-    elif phase == "whole":
-        topics = [*OURS, *rng.sample(every, 1)] if rng.random() < 0.5 else rng.sample(every, rng.choice((2, 3, 4)))
     else:
-        topics = [rng.choice(OURS if rng.random() < 0.5 else every)]
+        topics = [*OURS, *rng.sample(every, 1)] if ours else rng.sample(every, rng.choice((2, 3, 4)))
     topics = list(dict.fromkeys(topics))
     rng.shuffle(topics)
     levels = tuple({topic: rng.randrange(3) for topic in topics} for _ in range(count))
-    scheme = rng.choices(("ordinals", "letters", "names"), (2, 2, 0 if phase == "plain" else 1))[0]
+    scheme = rng.choices(("ordinals", "letters", "names"), (2, 2, 0 if simple else 1))[0]
     if scheme == "ordinals":
-        places, noun = ("first", "second", "third"), rng.choice(("",) if phase == "plain" else ("", " one", " thing"))
+        places, noun = ("first", "second", "third"), rng.choice(("",) if simple else ("", " one", " thing"))
         labels, names = tuple(f"{p.capitalize()}:" for p in places), tuple(f"the {p}{noun}" for p in places)
         answers = tuple(f"The {p}." for p in places)
     elif scheme == "letters":
@@ -238,11 +244,8 @@ def _wordings(things: Things, rng: random.Random) -> dict[str, list[str]]:
     return {topic: [rng.choice(level) for level in things.words.properties[topic].levels] for topic in things.topics}
 
 
-STYLES = {"plain": ("list",), "short": ("list", "sentence"), "whole": ("list", "list", "sentence", "twice")}
-
-
-def _describe_all(things: Things, phase: Phase, rng: random.Random) -> str:
-    chosen, style = _wordings(things, rng), rng.choice(STYLES[phase])
+def _describe_all(things: Things, form: Form, rng: random.Random) -> str:
+    chosen, style = _wordings(things, rng), rng.choice(STYLES.get(form, ("list",)))
     return " ".join(_describe(label, things, i, chosen, style, rng) for i, label in enumerate(things.labels))
 
 

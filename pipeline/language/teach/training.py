@@ -1,7 +1,7 @@
-"""Teaching: adapters on all linear layers learn plain items, then short, then whole ones, and are merged into the base.
+"""Teaching: adapters on all linear layers learn plain items, then several properties, then all, and are merged in.
 
-A phase begins when the one before it is passed. Whole descriptions at once are not learnt in as long, nor are short
-items in all their wordings: choosing between things has to be there first, and it is learnt where little else varies.
+A phase begins when the one before it is passed, and widens one thing. All at once is not learnt in as long: choosing
+between things comes first, then of which property, and both are learnt where the wording does not vary.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from pipeline.io import fingerprint
 from pipeline.language.base import load_llm
 from pipeline.language.chat import IGNORE_INDEX, Encoded, encode, render
 from pipeline.language.teach import items
-from pipeline.language.teach.items import Item, Phase, draw
+from pipeline.language.teach.items import Form, Item, draw
 from pipeline.records import Measurement
 from pipeline.runtime import derive_seed, resolve_dtype, seed_everything
 from pipeline.training.trainer import (
@@ -39,10 +39,14 @@ from pipeline.training.trainer import (
     training_arguments,
 )
 
-PHASES: tuple[Phase, ...] = ("plain", "short", "whole")
-REVIEW = {"short": 0.25, "whole": 0.5}
-"""Items of the phase before among a phase's own, so that they are not forgotten."""
-FOLLOW_UPS = 2
+COURSE: dict[Form, dict[Form, float]] = {
+    "plain": {"plain": 1},
+    "several": {"several": 0.85, "plain": 0.15},
+    "whole": {"whole": 0.5, "short": 0.25, "several": 0.25},
+}
+"""The phases, and the share of each form among a phase's items: what came before is reviewed. A phase has the name of the
+form that its exam is of."""
+PHASES = tuple(COURSE)
 KEPT = ("config.json", "README.md")
 """Files of the base that the taught model writes anew, beside the weights."""
 
@@ -80,11 +84,11 @@ class Course(Dataset[Encoded]):
         update, place = divmod(index, self.config.batch_size)
         return self._update(update + 1, self.phase(update - 1))[place]
 
-    def phase(self, step: int) -> Phase:
+    def phase(self, step: int) -> Form:
         """What is learnt when so many updates are done."""
         return next((phase for phase in PHASES if step < self.ended(phase)), PHASES[-1])
 
-    def ended(self, phase: Phase) -> int:
+    def ended(self, phase: Form) -> int:
         """The update after which a phase ended, or must end at the latest."""
         config, number = self.config, PHASES.index(phase)
         first = self.ended(PHASES[number - 1]) if number else 0
@@ -92,18 +96,17 @@ class Course(Dataset[Encoded]):
         steps = (int(e["step"]) for e in self.log() if e["step"] > first and e.get(f"eval_{phase}_items", 0) >= enough)
         return min(steps, default=first + config.max_updates)
 
-    def exam(self, phase: Phase) -> list[Encoded]:
-        """Items that are never trained on; whole ones about combinations of properties that are held out."""
+    def exam(self, phase: Form) -> list[Encoded]:
+        """Items that are never trained on, of one question; combinations of our properties are held out."""
         rngs = (random.Random(derive_seed(self.seed, "exam", phase, i)) for i in range(self.config.check_items))
-        return self._encoded(draw(rng, phase, held=phase == "whole") for rng in rngs)
+        return self._encoded(draw(rng, phase, held=True) for rng in rngs)
 
-    def _draw_update(self, update: int, phase: Phase) -> list[Encoded]:
+    def _draw_update(self, update: int, phase: Form) -> list[Encoded]:
         drawn = []
         for place in range(self.config.batch_size):
             rng = random.Random(derive_seed(self.seed, "teach", update, place))
-            again = phase in REVIEW and rng.random() < REVIEW[phase]
-            own: Phase = PHASES[PHASES.index(phase) - 1] if again else phase
-            drawn.append(draw(rng, own, follow_ups=FOLLOW_UPS if own == "whole" else 0))
+            form = rng.choices(list(COURSE[phase]), list(COURSE[phase].values()))[0]
+            drawn.append(draw(rng, form, further=True))
         return sorted(self._encoded(drawn), key=lambda e: len(e.input_ids))
 
     def _encoded(self, drawn: Iterable[Item]) -> list[Encoded]:
