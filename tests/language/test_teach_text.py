@@ -151,14 +151,13 @@ def test_answers_follow_from_the_words() -> None:
     assert read > 2000, "the reader must understand most items, or the test says little"
 
 
-@pytest.mark.parametrize("form", ["plain", "several"])
-def test_items_in_one_wording_vary_in_what_they_are_about_alone(form: Form) -> None:
-    items = [draw(random.Random(i), form, further=True) for i in range(1000)]
+def test_plain_items_vary_in_what_they_are_about_alone() -> None:
+    items = [draw(random.Random(i), "plain") for i in range(1000)]
     assert {item.kind for item in items} == {"compare", "extreme", "which"}
     said = " ".join(map(text, items)).lower()
     for name in OURS:
         for first, *others in words().properties[name].levels:
-            assert re.search(rf"\b{first}[.,]", said)
+            assert f" {first}." in said
             assert not [other for other in others if re.search(rf"\b{other}\b", said)]
 
 

@@ -1,16 +1,16 @@
 """What is taught: questions about invented things whose qualities are told in words.
 
 Items have four forms. A plain one compares things by one of the catalogue's properties, in one wording. One of several
-properties tells all of them, in that wording. A short one is about any one property, asks more and is worded in many
-ways. A whole one has all of this. The wordings stand in words.yaml. Everything is drawn from a random generator, so
-nothing needs to be stored.
+properties tells all of them in that wording, often behind looser words. A short one is about any one property, asks
+more and is worded in many ways. A whole one has all of this. The wordings stand in words.yaml. Everything is drawn from
+a random generator, so nothing needs to be stored.
 """
 
 from __future__ import annotations
 
 import random
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict
 from pipeline.records import Turn
 
 OURS = ("hardness", "roughness", "bumpiness")
-"""Properties that the catalogue of PhysiCLeAR rates too. Items in one wording are about them, and half of the others."""
+"""Properties that the catalogue of PhysiCLeAR rates too. Items in one wording are about them, as are half of others."""
 COUNTS = {"compare": 2, "which": 2, "same": 2, "need": 2}
 """Things of an item; three for all other kinds."""
 SYLLABLES = (
@@ -41,7 +41,11 @@ KINDS: dict[Form, dict[str, int]] = {
 """Kinds of questions (words.yaml says what each asks), by how often they come."""
 ONE_WORDING = ("plain", "several")
 ONE_PROPERTY = ("plain", "short")
-STYLES = {"short": ("list", "sentence"), "whole": ("list", "list", "sentence", "twice")}
+STYLES = {
+    "several": ("list", "sentence", "twice"),
+    "short": ("list", "sentence"),
+    "whole": ("list", "list", "sentence", "twice"),
+}
 PLACES = {"short": (13, 5, 2, 0), "whole": (9, 4, 7, 3)}
 """How often each place comes; "behind" in other forms."""
 FOLLOW_UPS = {"several": 3, "whole": 5}
@@ -261,8 +265,10 @@ def _describe(
         return f"{subject} {_joined(clauses)}."
     plain = _listed(chosen, things, index)
     if style == "twice":
-        loose = rng.choice(things.words.loosely).format(_joined(_listed(_wordings(things, rng), things, index)))
-        return f"{label} {loose} {rng.choice(things.words.finally_).format(', '.join(plain))}".strip()
+        # Loose words are any: what counts is said behind them.
+        loose = _joined(_listed(_wordings(replace(things, words=words()), rng), things, index))
+        said = f"{rng.choice(words().loosely).format(loose)} {rng.choice(words().finally_).format(', '.join(plain))}"
+        return f"{label} {said}".strip()
     text = ", ".join(plain)
     return f"{label} {text}." if label else f"{text[0].upper()}{text[1:]}."
 

@@ -44,8 +44,8 @@ COURSE: dict[Form, dict[Form, float]] = {
     "several": {"several": 0.85, "plain": 0.15},
     "whole": {"whole": 0.5, "short": 0.25, "several": 0.25},
 }
-"""The phases, and the share of each form among a phase's items: what came before is reviewed. A phase has the name of the
-form that its exam is of."""
+"""The phases, and the share of each form among a phase's items: what came before is reviewed. A phase is called by the
+form of its exam."""
 PHASES = tuple(COURSE)
 KEPT = ("config.json", "README.md")
 """Files of the base that the taught model writes anew, beside the weights."""
