@@ -114,9 +114,16 @@ def plain(name: str) -> str:
 def expected(item: Item) -> str | None:
     """The answer that follows from the words, worked out anew; None where the words cannot be read."""
     things, filled = told(item), fields(item)
-    if filled is None or len(things) < 2 or len({t for thing in things.values() for t in thing}) != 1:
+    if filled is None or len(things) < 2 or len({frozenset(thing) for thing in things.values()}) != 1:
         return None
-    (topic,) = {t for thing in things.values() for t in thing}
+    topics = set(next(iter(things.values())))
+    if len(topics) > 1:
+        asked = (filled.get("more") or filled.get("most") or "").lower()
+        every = words().properties
+        topics = {t for t in topics if asked in (*every[t].more, *every[t].less, *every[t].most, *every[t].least)}
+    if len(topics) != 1:
+        return None
+    (topic,) = topics
     own, levels = words().properties[topic], {name: thing[topic] for name, thing in things.items()}
     sign = 1
     word = (filled.get("more") or filled.get("most") or "").lower()
@@ -141,14 +148,15 @@ def expected(item: Item) -> str | None:
 
 
 def test_answers_follow_from_the_words() -> None:
-    read = 0
+    read: dict[Form, int] = {"plain": 0, "several": 0, "short": 0}
     for i in range(3000):
-        item = draw(random.Random(f"answers {i}"), "short" if i % 4 else "plain")
+        form = tuple(read)[i % 3]
+        item = draw(random.Random(f"answers {i}"), form)
         if item.kind in SHORT_KINDS and (answer := expected(item)) is not None:
-            read += 1
+            read[form] += 1
             given = " and ".join(plain(part) for part in item.learnt[-1].split(" and "))
             assert given == answer, item
-    assert read > 2000, "the reader must understand most items, or the test says little"
+    assert min(read.values()) > 600, "the reader must understand most items, or the test says little"
 
 
 def test_plain_items_vary_in_what_they_are_about_alone() -> None:
