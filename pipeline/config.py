@@ -261,8 +261,16 @@ class PassMarks(Section):
     """Share of items right at which a phase of teaching ends."""
 
     plain: Fraction = 0.93
-    several: Fraction = 0.93
+    several: Fraction = 0.95
     whole: Fraction = 0.9
+
+
+class MaxUpdates(Section):
+    """The longest that a phase of teaching takes: plain items, several properties, whole descriptions."""
+
+    plain: Positive = 300
+    several: Positive = 200
+    whole: Positive = 60
 
 
 class TeachConfig(Section):
@@ -279,8 +287,7 @@ class TeachConfig(Section):
     """Items an update."""
     micro_batch_size: Positive = 16
     """Items at a time, of like length."""
-    max_updates: Positive = 300
-    """Longest each of the three phases may take: plain items, several properties, whole descriptions."""
+    max_updates: MaxUpdates = MaxUpdates()
     check_every: Positive = 20
     """Updates between two looks at items that are not trained on."""
     check_items: Positive = 64

@@ -77,7 +77,8 @@ def told(item: Item) -> dict[str, dict[str, int]]:
     }
     said = " ".join(f"{t.user} {t.assistant}" for t in item.turns)
     found: dict[str, dict[str, int]] = {}
-    mark = r"(?:\b(First|Second|Third|[A-Z][a-z]{4,6}):|\b(The (?:first|second|third))(?: one| thing)? (?=is|has)"
+    mark = r"(?:\b(First|Second|Third|[A-Z][a-z]{4,6})(?: one| thing)?:"
+    mark += r"|\b(The (?:first|second|third))(?: one| thing)? (?=is|has)"
     mark += r"|\b([abc]\)) |\b([A-Z][a-z]{4,6}) (?=is|has))"
     marks = list(re.finditer(mark, said))
     for here, following in zip(marks, [*marks[1:], None], strict=True):

@@ -7,14 +7,26 @@ from pathlib import Path
 import pytest
 import torch
 
-from pipeline.config import LanguageConfig, PassMarks, RuntimeConfig, TeachConfig
+from pipeline.config import LanguageConfig, MaxUpdates, PassMarks, RuntimeConfig, TeachConfig
 from pipeline.language.base import load_tokenizer
 from pipeline.language.teach.training import COURSE, PHASES, Course, teach
 from pipeline.training.trainer import Trained
 from tests.language.test_training import AtStep
 
+
+def atmost(updates: int) -> MaxUpdates:
+    return MaxUpdates(plain=updates, several=updates, whole=updates)
+
+
 SMALL = TeachConfig(
-    rank=2, alpha=4, warmup=1, batch_size=4, micro_batch_size=2, max_updates=2, check_every=1, check_items=4
+    rank=2,
+    alpha=4,
+    warmup=1,
+    batch_size=4,
+    micro_batch_size=2,
+    max_updates=atmost(2),
+    check_every=1,
+    check_items=4,
 )
 RUNTIME = RuntimeConfig(device="cpu", save_steps=1)
 
@@ -27,7 +39,9 @@ def run(language: LanguageConfig, *callbacks: AtStep) -> Trained:
 @pytest.fixture
 def course(language: LanguageConfig) -> Course:
     marks = PassMarks(plain=0.9, several=0.8, whole=0.95)
-    config = SMALL.model_copy(update={"max_updates": 100, "batch_size": 40, "pass_marks": marks})
+    config = SMALL.model_copy(
+        update={"max_updates": MaxUpdates(plain=100, several=100, whole=100), "batch_size": 40, "pass_marks": marks}
+    )
     return Course(config, load_tokenizer(Path(language.weights)), "", seed=3)
 
 
@@ -76,7 +90,7 @@ def test_a_killed_teaching_goes_on_with_the_same_phase(language: LanguageConfig,
 
 def test_bfloat16_on_a_processor_that_was_not_named(language: LanguageConfig, checkpoints: Path) -> None:
     """The adapters stay in float32 there, and `auto` finds the processor."""
-    config = SMALL.model_copy(update={"base": language.weights, "max_updates": 1})
+    config = SMALL.model_copy(update={"base": language.weights, "max_updates": atmost(1)})
     half = language.model_copy(update={"dtype": "bfloat16"})
     llm, _, trained = teach(config, half, RuntimeConfig(device="auto"), stage="teach", seed=0)
     assert {value.dtype for value in trained.state.values()} == {torch.float32}

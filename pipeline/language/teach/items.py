@@ -24,6 +24,7 @@ OURS = ("hardness", "roughness", "bumpiness")
 """Properties that the catalogue of PhysiCLeAR rates too. Items in one wording are about them, as are half of others."""
 COUNTS = {"compare": 2, "which": 2, "same": 2, "need": 2}
 """Things of an item; three for all other kinds."""
+LETTERS = ("a)", "b)", "c)")
 SYLLABLES = (
     *("bal", "bim", "dop", "fen", "gar", "hul", "jin", "kov", "lur", "mip"),
     *("nor", "pel", "quo", "rix", "sab", "tem", "vop", "wug", "yal", "zib"),
@@ -31,10 +32,11 @@ SYLLABLES = (
 
 Form = Literal["plain", "several", "short", "whole"]
 FEW = {"compare": 4, "extreme": 4, "which": 2}
+SEVERAL = FEW | {"need": 3}
 MANY = {"compare": 5, "which": 2, "extreme": 9, "same": 1, "pair": 1, "odd": 1, "match": 4, "need": 4}
 KINDS: dict[Form, dict[str, int]] = {
     "plain": FEW,
-    "several": FEW,
+    "several": SEVERAL,
     "short": MANY,
     "whole": MANY | {"match": 2, "sort": 2},
 }
@@ -84,20 +86,25 @@ class Words(Strict):
     tell: tuple[str, ...]
     loosely: tuple[str, ...]
     finally_: tuple[str, ...]
+    hints: dict[str, tuple[str, ...]]
 
 
 @cache
-def words(*, plain: bool = False) -> Words:
-    """The words of the teaching text; `plain`: the first wording of everything alone."""
+def words(form: Form = "whole") -> Words:
+    """The words of the teaching text, of which plain items have the first wording of everything alone.
+
+    Items of several properties have all needs and hints as well: these are not another way to say the same.
+    """
     read = yaml.safe_load(Path(__file__).with_name("words.yaml").read_text(encoding="utf-8"))
-    return Words.model_validate(_first_wordings(read) if plain else read)
+    kept = ("needs", "hints") if form == "several" else ()
+    return Words.model_validate(_first_wordings(read, kept) if form in ONE_WORDING else read)
 
 
-def _first_wordings(part: Any) -> Any:
+def _first_wordings(part: Any, kept: Sequence[str]) -> Any:
     if isinstance(part, dict):
-        return {key: _first_wordings(value) for key, value in part.items()}
+        return {key: value if key in kept else _first_wordings(value, kept) for key, value in part.items()}
     if isinstance(part, list):
-        return part[:1] if isinstance(part[0], str) else [_first_wordings(wordings) for wordings in part]
+        return part[:1] if isinstance(part[0], str) else [_first_wordings(wordings, kept) for wordings in part]
     return part
 
 
@@ -161,7 +168,7 @@ def draw(rng: random.Random, form: Form, *, held: bool = False, further: bool = 
 
 
 def _things(rng: random.Random, count: int, form: Form, held: bool) -> Things:
-    own, simple = words(plain=form in ONE_WORDING), form in ONE_WORDING
+    own, simple = words(form), form in ONE_WORDING
     every, ours = list(own.properties), simple or rng.random() < 0.5
     if form in ONE_PROPERTY:
         topics = [rng.choice(OURS if ours else every)]
@@ -174,11 +181,11 @@ def _things(rng: random.Random, count: int, form: Form, held: bool) -> Things:
     levels = tuple({topic: rng.randrange(3) for topic in topics} for _ in range(count))
     scheme = rng.choices(("ordinals", "letters", "names"), (2, 2, 0 if simple else 1))[0]
     if scheme == "ordinals":
-        places, noun = ("first", "second", "third"), rng.choice(("",) if simple else ("", " one", " thing"))
-        labels, names = tuple(f"{p.capitalize()}:" for p in places), tuple(f"the {p}{noun}" for p in places)
+        places, noun = ("first", "second", "third"), "" if form == "plain" else rng.choice(("", " one", " thing"))
+        labels, names = tuple(f"{p.capitalize()}{noun}:" for p in places), tuple(f"the {p}{noun}" for p in places)
         answers = tuple(f"The {p}." for p in places)
     elif scheme == "letters":
-        labels = names = answers = ("a)", "b)", "c)")
+        labels = names = answers = LETTERS
     else:
         names = tuple(invent(rng, 3))
         labels, answers = tuple(f"{n}:" for n in names), tuple(f"{n}." for n in names)
@@ -231,7 +238,8 @@ def _ask(kind: str, things: Things, topic: str, rng: random.Random) -> tuple[str
     if answer is None:
         return None
     question = rng.choice(things.words.questions[kind]).format(**fields)
-    return question[0].upper() + question[1:], answer
+    hints = things.words.hints.get("letter" if answer in LETTERS else kind, ("",))
+    return f"{question[0].upper()}{question[1:]} {rng.choice(hints)}".strip(), answer
 
 
 def _sort(things: Things, order: Sequence[int], rng: random.Random) -> tuple[str, str]:

@@ -51,6 +51,11 @@ KEPT = ("config.json", "README.md")
 """Files of the base that the taught model writes anew, beside the weights."""
 
 
+def longest(config: TeachConfig) -> int:
+    """Updates of a teaching that passes no exam."""
+    return sum(getattr(config.max_updates, phase) for phase in PHASES)
+
+
 def encode_item(item: Item, tokenizer: PreTrainedTokenizerBase, system_prompt: str) -> Encoded:
     """Token ids of an item, with labels on what is learnt of its answers, end tokens included."""
     rendered = render(item.turns, tokenizer, system_prompt=system_prompt, frames=0, complete=True)
@@ -78,7 +83,7 @@ class Course(Dataset[Encoded]):
         self._update = lru_cache(maxsize=2)(self._draw_update)
 
     def __len__(self) -> int:
-        return len(PHASES) * self.config.max_updates * self.config.batch_size
+        return longest(self.config) * self.config.batch_size
 
     def __getitem__(self, index: int) -> Encoded:
         update, place = divmod(index, self.config.batch_size)
@@ -94,7 +99,7 @@ class Course(Dataset[Encoded]):
         first = self.ended(PHASES[number - 1]) if number else 0
         enough = getattr(config.pass_marks, phase)
         steps = (int(e["step"]) for e in self.log() if e["step"] > first and e.get(f"eval_{phase}_items", 0) >= enough)
-        return min(steps, default=first + config.max_updates)
+        return min(steps, default=first + getattr(config.max_updates, phase))
 
     def exam(self, phase: Form) -> list[Encoded]:
         """Items that are never trained on, of one question; combinations of our properties are held out."""
@@ -223,7 +228,7 @@ def teach(
         checkpoint_dir(stage, key),
         runtime,
         seed,
-        max_steps=len(PHASES) * config.max_updates,
+        max_steps=longest(config),
         learning_rate=config.learning_rate,
         lr_scheduler_type="constant_with_warmup",
         warmup_steps=config.warmup,
