@@ -28,7 +28,7 @@ def load_encoder(config: EncoderConfig, catalogue: Path, which: Encoder, seed: i
 def main() -> None:
     with stage("embed") as run:
         params = run.params
-        check_encoder(Path(params.encoder.weights), params.frames.size)
+        check_encoder(Path(params.encoder.weights), params.frames.size, params.encoder.backbone)
         splits = {seed: read_table(DATA / "splits" / f"{seed}.parquet", Assignment) for seed in params.ablation.seeds}
         store = FrameStore(DATA / "frames", params.encoder.reference)
         for which in params.ablation.encoders:
