@@ -111,7 +111,7 @@ def check_inputs(params: Params) -> None:
     if unknown:
         raise UserError(f"scenes.objects: {unknown[0]} is not in {params.data.catalogue}/objects.csv")
     check_objects(params, catalogue)
-    backbone = getattr(params.encoder, "backbone", ("clip",))
+    backbone = params.encoder.backbone
     weights.check_encoder(Path(params.encoder.weights), params.frames.size, backbone)
     check_encoder_files(Path(params.encoder.weights), backbone)
     if params.language.weights == TAUGHT and not params.teach.base:

@@ -87,7 +87,7 @@ def clip_file(folder: Path) -> Path:
     return next((file for file in files if file.is_file()), files[0])
 
 
-def check_encoder(folder: Path, size: int, backbone: Collection[str] = ("clip",)) -> None:
+def check_encoder(folder: Path, size: int, backbone: Collection[str]) -> None:
     """Raise UserError where `folder` does not hold what the backbones read from it.
 
     Args:

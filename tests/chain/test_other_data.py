@@ -163,12 +163,18 @@ def narrowed(catalogue: Catalogue, kept: slice) -> Catalogue:
 
 @pytest.fixture(scope="module")
 def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
-    """The chain up to the encoder; the language model's stages know nothing of the catalogue."""
+    """The chain up to the embeddings, by another backbone; later stages know nothing of the catalogue."""
     project = copy_project(tmp_path_factory.mktemp("other") / "project")
     write_catalogue(project.folder / "my catalogue")
     few = ("questions.train={opd:8,pc:24,pss:24,pom:6}", "questions.evaluation={opd:8,pc:24,pss:24,pom:6,psr:4}")
-    project.run("octopi", "scale", *REDUCED, *few, "data.catalogue='my catalogue'", "split.name=mine")
-    project.run("dvc", "repro", "questions", "finetune_encoder")
+    timm = (
+        "cross_validation.models=[trees]",
+        "encoder.recipe=tuned",
+        "encoder.backbone=[timm]",
+        "encoder.weights=data/weights/efficientnet-lite0",
+    )
+    project.run("octopi", "scale", *REDUCED, *few, *timm, "data.catalogue='my catalogue'", "split.name=mine")
+    project.run("dvc", "repro", "questions", "embed")
     return project
 
 

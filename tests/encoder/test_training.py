@@ -335,7 +335,7 @@ def test_each_recipe_saves_what_is_its_own_and_reloads_exactly(
 def test_bad_weights_are_one_line(broken: str, message: str, tmp_path: Path) -> None:
     folder = write_clip(tmp_path / "clip")
     file, form = folder / "open_clip_model.safetensors", folder / "open_clip_config.json"
-    check_encoder(folder, 32)
+    check_encoder(folder, 32, ("clip",))
     match broken:
         case "missing":
             folder = tmp_path / "nothing"
@@ -353,7 +353,7 @@ def test_bad_weights_are_one_line(broken: str, message: str, tmp_path: Path) -> 
         if broken == "language pickle":
             check_language(folder)
         else:
-            check_encoder(folder, 24 if broken == "small frames" else 32)
+            check_encoder(folder, 24 if broken == "small frames" else 32, ("clip",))
             load_visual_tower(folder)
 
     with pytest.raises(UserError, match=message) as caught:

@@ -161,7 +161,7 @@ def check_both(folder: Path) -> None:
 
 def check_tower(folder: Path) -> None:
     """What `octopi scale` asks of a CLIP's folder."""
-    check_encoder(folder, 32)
+    check_encoder(folder, 32, ("clip",))
     check_encoder_files(folder, ("clip",))
 
 
