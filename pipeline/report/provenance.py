@@ -142,7 +142,7 @@ def digest(folder: Path) -> str:
 def taught_words(base: str) -> dict[str, Any]:
     """What the chain itself taught the language model, in place of what people noted; empty where `base` is."""
     words = f"taught here in text alone to reason about described objects (from `{base}`)"
-    return {"taught": words, "known_templates": False} if base else {}
+    return {"taught": words} if base else {}
 
 
 def settings_note(report: str, split: str) -> str:

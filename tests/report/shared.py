@@ -18,12 +18,24 @@ loss,large,bfloat16,False,0.5,0.25,fail
 
 
 def write_reports(root: Path, *names: str) -> Path:
-    """reports/ with what the page shows: the report `small-videos` under each of these names, speed and stability."""
+    """reports/ with what the page shows: the report of `smoke` under each of these names, speed and stability.
+
+    Where a name is of another scale, the base models have its, and the test objects were looked at.
+    """
     reports = root / "reports"
     for name in names:
-        shutil.copytree(ROOT / "reports" / "small-videos", reports / name)
+        shutil.copytree(ROOT / "reports" / "smoke-scenes", reports / name)
         scale, source = name.split("-")
-        edit(reports / name / "provenance.json", report=name, scale=scale, source=source)
+        file = reports / name / "provenance.json"
+        edit(file, report=name, scale=scale, source=source)
+        if scale != "smoke":
+            models = json.loads(file.read_text())["base_models"]
+            edit(
+                file,
+                base_models={part: {**model, "folder": f"weights/{part}"} for part, model in models.items()},
+                split="development",
+                settings="Recipes were chosen on them.",
+            )
     shutil.copy(ROOT / "reports" / "speed_error.csv", reports)
     shutil.copytree(ROOT / "reports" / "speed_error", reports / "speed_error")
     (reports / "stability.csv").write_text(STABILITY)

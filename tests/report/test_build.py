@@ -8,7 +8,6 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -294,14 +293,10 @@ def test_the_stage_does_not_load_a_network() -> None:
     assert done.stdout.strip() == "[]"
 
 
-def test_the_committed_reports_are_whole_and_say_what_made_them() -> None:
-    for name in ("small-scenes", "small-videos"):
-        report = load_report(ROOT / "reports" / name)
-        text = (report.folder / "README.md").read_text()
-        assert text.count("\n") <= MOST_LINES
-        assert "a stand-in trained from scratch on the pipeline's own templates" in text
-        assert report.provenance["settings"] in text
-        for table in TABLES:
-            rows: Any = table.build(report.scores, report.effects, report.published)
-            older = table.key == "strict" and report.scores["strict"].isna().all()
-            assert len(rows) or older or table.key == "described", table.key
+def test_the_committed_report_says_what_made_it() -> None:
+    report = load_report(ROOT / "reports" / "small-videos")
+    text = (report.folder / "README.md").read_text()
+    assert text.count("\n") <= MOST_LINES
+    assert "taught here in text alone to reason about described objects" in text
+    assert report.provenance["settings"] in text
+    assert all(f"| {model} |" in text for model in ("untaught", "taught")), "the untaught base has a row"

@@ -33,9 +33,6 @@ HOSTILE = "</style><script>alert(1)</script><img src=//evil.example onerror=aler
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Reports of two scales, one of random models, and their page; not to be changed."""
     root = write_reports(tmp_path_factory.mktemp("page"), "smoke-scenes", "small-videos")
-    file = root / "reports" / "smoke-scenes" / "provenance.json"
-    models = json.loads(file.read_text())["base_models"]
-    edit(file, base_models={**models, "language": {**models["language"], "folder": "data/weights/tiny-llama"}})
     assert write_page(root) == root / PAGE
     return root
 
@@ -126,7 +123,6 @@ def test_the_finding_comes_first_and_real_videos_before_smoke(page: Page) -> Non
     assert chapters == ["together", "small-videos", "smoke-scenes", "speed", "stability", "missing"]
     parts = [e.attrib["id"].removeprefix("small-videos-") for e in page.named("small-videos").iter("h3")]
     assert parts == ["tasks", "parts", "stands-on", "origin", "examples", "tables", "files"]
-    assert ["stand-in" in words(e) for e in page.all(kind="finding")] == [True, True]
     assert [words(e).startswith("The base models are tiny and random") for e in page.all(kind="finding")] == [
         False,
         True,
@@ -257,14 +253,17 @@ def test_all_reports_stand_beside_the_paper(page: Page) -> None:
     few, every = page.named("together").iter("table")
     heads = [words(e) for e in few.findall("thead/tr/th")]
     assert heads[1:3] == ["Published 7b % (n)", "Published 13b % (n)"]
-    assert heads[3:] == [f"Measured {n}† % [95 %] (n)" for n in ("small-videos", "smoke-scenes")]
+    assert heads[3:] == [f"Measured {n} % [95 %] (n)" for n in ("small-videos†", "smoke-scenes")]
     assert "† Settings were chosen on these test objects" in words(page.named("together"))
     assert (len(few.findall("tbody/tr")), len(every.findall(".//td[@class='measured']"))) == (5, 2 * 32)
 
 
 def test_the_papers_examples_are_shown_right_and_wrong(page: Page, changed: Path) -> None:
     folder = changed / "reports" / "small-videos"
-    assert "Not asked: the report is older" in words(page.named("small-videos"))
+    told = json.loads((folder / "samples.json").read_text())
+    older = {name: value for name, value in told.items() if name not in ("examples", "not_asked")}
+    (folder / "samples.json").write_text(json.dumps(older))
+    assert "Not asked: the report is older" in words(Page(write_page(changed)).named("small-videos"))
     sample = json.loads((folder / "samples.json").read_text())["samples"][0]
     asked = {"task": "rice", "part": "train", "asked": ["Describe.", "Cooked?"], "answered": ["Rough.", "Uncooked."]}
     examples = [{**sample, **asked, "right": right} for right in (True, False)]

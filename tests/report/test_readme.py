@@ -20,7 +20,7 @@ def model(**other: Any) -> dict[str, Any]:
         "sha256": "ab" * 32,
         "taught": "taught by hand",
     }
-    return {**facts, "known_templates": True, **other}
+    return {**facts, **other}
 
 
 def report(scores: list[dict[str, Any]], effects: list[dict[str, Any]] | None = None, **said: Any) -> Report:
@@ -58,7 +58,6 @@ def test_who_made_the_figures_comes_first_with_size_and_teaching() -> None:
     assert first.startswith(
         "A 2.2 M-parameter Llama, taught by hand, made these figures in place of the paper's Vicuna"
     )
-    assert "LoRA and OPD are near-null by construction" in first
     assert "a 1.1 M-parameter CLIP with visual prompt tuning" in first
     assert "real videos of 2 test objects, under 1 seed" in first
     assert first.endswith("Looked at before.")
@@ -68,12 +67,11 @@ def test_who_made_the_figures_comes_first_with_size_and_teaching() -> None:
     assert "other models on other questions about other objects" in text
 
 
-def test_a_large_base_that_was_not_taught_the_templates_is_not_called_one_that_was() -> None:
-    large = report([score()], language={"parameters": 6_738_415_616, "known_templates": False, "taught": ""})
+def test_a_large_base_is_no_stand_in_and_has_no_teaching_noted() -> None:
+    large = report([score()], language={"parameters": 6_738_415_616, "taught": ""})
     said = finding(large)[0]
     assert said.startswith("A 6.7 B-parameter Llama made these figures.")
     assert "not noted" in stands_on(large.provenance)[0]
-    assert "near-null" not in render_readme(large, [])
 
 
 @pytest.mark.parametrize(
