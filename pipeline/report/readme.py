@@ -5,7 +5,7 @@ Every sentence is put together by rule from the report's own files.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import pandas as pd
@@ -73,8 +73,10 @@ def finding(report: Report) -> list[str]:
 
     Where a base model is a random one, the first sentence says so.
     """
-    chance, rest = _against_chance(headline(report.scores)), [*_touch(report.effects), *_parts(report.effects)]
-    return [" ".join(sentences) for sentences in (_who(report), chance, rest)]
+    rows = headline(report.scores)
+    solved = set(rows.loc[rows["low"] > rows["chance"], "task"])
+    rest = [*_touch(report.effects, solved), *_parts(report.effects)]
+    return [" ".join(sentences) for sentences in (_who(report), _against_chance(rows), rest)]
 
 
 def looked_at(said: dict[str, Any]) -> bool:
@@ -176,7 +178,9 @@ def _who(report: Report) -> list[str]:
     objects, seeds = _count(len(said["test_objects"]), "test object"), _count(len(said["seeds"]), "seed")
     under = f"under {seeds}"
     if folds := said.get("folds"):
-        under = f"each of them in one of {len(folds['tested'])} folds that were not trained on"
+        tested = len(folds["tested"])
+        under = f"each of them in one of {tested} folds that were" if tested > 1 else "all of them in one fold that was"
+        under += " not trained on"
         under += f", {said['replicates']} times" if said["replicates"] > 1 else ""
         if len(folds["tested"]) < folds["of"]:
             under += f" ({folds['of'] - len(folds['tested'])} of {folds['of']} folds are still to be run)"
@@ -203,7 +207,11 @@ def _against_chance(rows: pd.DataFrame) -> list[str]:
     return [f"{text}: it is {extremes}." if len(rows) > 1 else f"{text}."]
 
 
-def _touch(effects: pd.DataFrame) -> list[str]:
+def _touch(effects: pd.DataFrame, solved: Collection[str]) -> list[str]:
+    """Whether answers use touch. Where a task is not `solved`, no better than chance, a difference cannot show it.
+
+    An answer that is no choice at all counts as wrong, and without touch answers may lose their form.
+    """
     rows = effects[effects["part"] == "touch"]
     if not len(rows):
         return ["Whether answers depend on touch was not tested."]
@@ -211,15 +219,17 @@ def _touch(effects: pd.DataFrame) -> list[str]:
     span = f"{100 * rows['difference'].min():+.1f} to {100 * rows['difference'].max():+.1f} points"
     instead = f"{', '.join(others)} or {last}" if others else last
     fact = f"with real touch in place of {instead} accuracy differs by {span}, task by task"
-    sure, likely = rows[(rows["p_holm"] < ALPHA) & (rows["difference"] > 0)], rows[rows["low"] > 0]
+    better = rows[(rows["p_holm"] < ALPHA) & (rows["difference"] > 0)]
+    sure, likely = better[better["task"].isin(solved)], rows[(rows["low"] > 0) & rows["task"].isin(solved)]
     if len(sure):
-        return [f"Answers use touch in {', '.join(dict.fromkeys(sure['task']))}: {fact}."]
+        rest = [task for task in dict.fromkeys(better["task"]) if task not in solved]
+        none = f" In {' and '.join(rest)} real touch brings no more than chance, so the difference shows nothing."
+        return [f"Answers use touch in {', '.join(dict.fromkeys(sure['task']))}: {fact}.{none if rest else ''}"]
     if len(likely):
         some = f"{len(likely)} of {len(rows)} intervals lie above 0, none is significant after Holm's adjustment"
         return [f"Answers seem to use touch: {fact}; {some}{_impossible(effects)}."]
-    return [
-        f"That answers use touch is not shown: {fact}, none significant after Holm's adjustment{_impossible(effects)}."
-    ]
+    none = "none significant after Holm's adjustment where real touch brings more than chance"
+    return [f"That answers use touch is not shown: {fact}, {none}{_impossible(effects)}."]
 
 
 def _impossible(effects: pd.DataFrame) -> str:

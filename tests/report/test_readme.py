@@ -122,6 +122,16 @@ def test_whether_touch_is_used(rows: list[dict[str, Any]], expected: str) -> Non
     assert expected in finding(report([score()], rows))[2]
 
 
+def test_a_task_at_chance_shows_no_touch() -> None:
+    """Without touch its answers may be no choice at all: the difference is then of form."""
+    guessed = score("PSS", low=0.2)
+    unread = effect(**TOUCH, task="PSS", p_holm=0.01, difference=0.3, low=0.2)
+    assert "That answers use touch is not shown" in finding(report([guessed], [unread]))[2]
+    used = finding(report([guessed, score("PC")], [unread, effect(**TOUCH, p_holm=0.01, low=0.02)]))[2]
+    assert "Answers use touch in PC:" in used
+    assert "In PSS real touch brings no more than chance" in used
+
+
 def test_effects_that_hold_are_named_and_those_that_do_not_are_not() -> None:
     none = finding(report([score()], [effect(), effect("opd", "all - none", smallest_effect=0.12)]))[2]
     assert "None of 2 effects of encoder, LoRA and OPD is significant after Holm's adjustment; the smallest" in none
