@@ -42,14 +42,18 @@ KINDS: dict[Form, dict[str, int]] = {
 }
 """Kinds of questions (words.yaml says what each asks), by how often they come."""
 ONE_WORDING = ("plain", "several")
+KEPT = ("needs", "hints", "answers", "answer_as", "tell", "therefore")
+"""Of these, items of several properties have every wording: they say another thing, or stand where a task's do."""
 ONE_PROPERTY = ("plain", "short")
 STYLES = {
     "several": ("list", "sentence", "twice"),
     "short": ("list", "sentence"),
     "whole": ("list", "list", "sentence", "twice"),
 }
-PLACES = {"short": (13, 5, 2, 0), "whole": (9, 4, 7, 3)}
+PLACES = {"several": (9, 0, 7, 4), "short": (13, 5, 2, 0), "whole": (9, 4, 7, 3)}
 """How often each place comes; "behind" in other forms."""
+FORMED = {"which", "extreme", "need"}
+"""Kinds whose questions may say in which form the answer is wanted."""
 FOLLOW_UPS = {"several": 3, "whole": 5}
 """At most so many further questions about the same things: a description costs more than a question about it."""
 
@@ -87,16 +91,18 @@ class Words(Strict):
     loosely: tuple[str, ...]
     finally_: tuple[str, ...]
     hints: dict[str, tuple[str, ...]]
+    answers: tuple[str, ...]
+    answer_as: tuple[str, ...]
 
 
 @cache
 def words(form: Form = "whole") -> Words:
     """The words of the teaching text, of which plain items have the first wording of everything alone.
 
-    Items of several properties have all needs and hints as well: these are not another way to say the same.
+    Items of several properties have all of `KEPT` as well.
     """
     read = yaml.safe_load(Path(__file__).with_name("words.yaml").read_text(encoding="utf-8"))
-    kept = ("needs", "hints") if form == "several" else ()
+    kept = KEPT if form == "several" else ()
     return Words.model_validate(_first_wordings(read, kept) if form in ONE_WORDING else read)
 
 
@@ -160,7 +166,8 @@ def draw(rng: random.Random, form: Form, *, held: bool = False, further: bool = 
             place = rng.choices(("behind", "ahead", "told", "earlier"), PLACES[form])[0]
         turns, learnt = _place(*asked, _describe_all(things, form, rng), place, things.words, rng)
         for _ in range(FOLLOW_UPS.get(form, 0) if further else 0):
-            again = _ask(rng.choice(("compare", "extreme")), things, rng.choice(things.topics), rng)
+            kinds = ("compare", "extreme", "need")[: 5 - len(things.levels)]
+            again = _ask(rng.choice(kinds), things, rng.choice(things.topics), rng)
             if again is not None and again[0] not in {turn.user for turn in turns}:
                 turns.append(Turn(user=again[0], assistant=again[1]))
                 learnt.append(again[1])
@@ -238,8 +245,13 @@ def _ask(kind: str, things: Things, topic: str, rng: random.Random) -> tuple[str
     if answer is None:
         return None
     question = rng.choice(things.words.questions[kind]).format(**fields)
-    hints = things.words.hints.get("letter" if answer in LETTERS else kind, ("",))
-    return f"{question[0].upper()}{question[1:]} {rng.choice(hints)}".strip(), answer
+    hint = rng.choice(things.words.hints.get("letter" if answer in LETTERS else kind, ("",)))
+    if kind in FORMED and answer in things.answers and len(things.topics) > 1 and rng.random() < 0.25:
+        form = rng.choice(things.words.answers)
+        hint = rng.choice(things.words.answer_as).format(form.format("x", noun="y"))
+        answer = form.format(things.names[things.answers.index(answer)], noun=topic)
+        answer = f"{answer[0].upper()}{answer[1:]}"
+    return f"{question[0].upper()}{question[1:]} {hint}".strip(), answer
 
 
 def _sort(things: Things, order: Sequence[int], rng: random.Random) -> tuple[str, str]:

@@ -42,7 +42,7 @@ from pipeline.training.trainer import (
 COURSE: dict[Form, dict[Form, float]] = {
     "plain": {"plain": 1},
     "several": {"several": 0.85, "plain": 0.15},
-    "whole": {"whole": 0.5, "short": 0.25, "several": 0.25},
+    "whole": {"whole": 0.35, "short": 0.15, "several": 0.5},
 }
 """The phases, and the share of each form among a phase's items: what came before is reviewed. A phase is called by the
 form of its exam."""
