@@ -270,7 +270,7 @@ class MaxUpdates(Section):
 
     plain: Positive = 300
     several: Positive = 200
-    whole: Positive = 60
+    whole: Positive = 40
 
 
 class TeachConfig(Section):

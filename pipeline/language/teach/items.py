@@ -166,8 +166,8 @@ def draw(rng: random.Random, form: Form, *, held: bool = False, further: bool = 
             place = rng.choices(("behind", "ahead", "told", "earlier"), PLACES[form])[0]
         turns, learnt = _place(*asked, _describe_all(things, form, rng), place, things.words, rng)
         for _ in range(FOLLOW_UPS.get(form, 0) if further else 0):
-            kinds = ("compare", "extreme", "need")[: 5 - len(things.levels)]
-            again = _ask(rng.choice(kinds), things, rng.choice(things.topics), rng)
+            asks = ("compare", "extreme", "need")[: 5 - len(things.levels)]
+            again = _ask(rng.choice(asks), things, rng.choice(things.topics), rng)
             if again is not None and again[0] not in {turn.user for turn in turns}:
                 turns.append(Turn(user=again[0], assistant=again[1]))
                 learnt.append(again[1])
