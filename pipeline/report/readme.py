@@ -75,7 +75,7 @@ def finding(report: Report) -> list[str]:
     """
     rows = headline(report.scores)
     solved = set(rows.loc[rows["low"] > rows["chance"], "task"])
-    rest = [*_touch(report.effects, solved), *_parts(report.effects)]
+    rest = [*_touch(report.effects, solved), *_parts(report.effects, solved)]
     return [" ".join(sentences) for sentences in (_who(report), _against_chance(rows), rest)]
 
 
@@ -238,20 +238,26 @@ def _impossible(effects: pd.DataFrame) -> str:
     return f" ({objects} objects are too few for that)" if len(effects) * 2.0 ** (1 - objects) >= ALPHA else ""
 
 
-def _parts(effects: pd.DataFrame) -> list[str]:
+def _parts(effects: pd.DataFrame, solved: Collection[str]) -> list[str]:
+    """What encoder, LoRA and OPD bring; a gain that ends no better than chance is one of form, not of right answers."""
     rows = effects[effects["part"] != "touch"]
     if not len(rows):
         return []
-    shown = rows[rows["p_holm"] < ALPHA]
-    if len(shown):
-        words = ", ".join(f"{r['part']} in {r['task']} {100 * r['difference']:+.1f}" for r in shown.to_dict("records"))
-        return [f"Of {len(rows)} effects of encoder, LoRA and OPD these hold up (Holm): {words} points."]
+    form = rows["difference"].gt(0) & ~rows["task"].isin(solved)
+    sure, formal = (rows[rows["p_holm"].lt(ALPHA) & kind] for kind in (~form, form))
+    words, only = (
+        ", ".join(f"{r['part']} in {r['task']} {100 * r['difference']:+.1f}" for r in part.to_dict("records"))
+        for part in (sure, formal)
+    )
+    all_of_them = f"{len(rows)} effects of encoder, LoRA and OPD"
+    also = f" Significant too, but with it answers are no better than chance: {only} points." if only else ""
+    if words:
+        return [f"Of {all_of_them} these hold up (Holm): {words} points.{also}"]
+    if only:
+        return [f"None of {all_of_them} holds up.{also}"]
     smallest = rows["smallest_effect"].min()
     found = f"; the smallest that this design could have found is {100 * smallest:.0f} points" if smallest <= 1 else ""
-    return [
-        f"None of {len(rows)} effects of encoder, LoRA and OPD is significant after Holm's adjustment"
-        f"{_impossible(effects) or found}."
-    ]
+    return [f"None of {all_of_them} is significant after Holm's adjustment{_impossible(effects) or found}."]
 
 
 def _folds(said: dict[str, Any]) -> str:

@@ -141,6 +141,17 @@ def test_effects_that_hold_are_named_and_those_that_do_not_are_not() -> None:
     assert "opd in PC" not in some
 
 
+def test_a_gain_that_ends_at_chance_is_one_of_form() -> None:
+    guessed, formed = score("PSS", low=0.2), effect(task="PSS", p_holm=0.001, difference=0.3)
+    only = finding(report([guessed], [formed]))[2]
+    assert "None of 1 effects of encoder, LoRA and OPD holds up." in only
+    assert "with it answers are no better than chance: lora in PSS +30.0 points." in only
+    both = finding(report([guessed, score("PC")], [formed, effect(p_holm=0.001)]))[2]
+    assert "these hold up (Holm): lora in PC +10.0 points. Significant too, but" in both
+    worse = finding(report([guessed], [effect(task="PSS", p_holm=0.001, difference=-0.3)]))[2]
+    assert "these hold up (Holm): lora in PSS -30.0 points." in worse, "a loss is no matter of form"
+
+
 def test_a_readme_stays_short_whatever_is_measured() -> None:
     tasks = [score(f"T{i}", variant=v) for i in range(60) for v in ("finetuned with all", "finetuned with none")]
     text = render_readme(report(tasks), ["curves.png", "effects.png"])
