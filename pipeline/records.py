@@ -7,9 +7,14 @@ checks every row against the model.
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
+
+Share = Annotated[float, AfterValidator(lambda value: round(value, 6))]
+"""A figure of a report."""
+Optional = Annotated[Share | None, BeforeValidator(lambda value: None if value == "" else value)]
+"""Empty in a CSV where it is None."""
 
 
 class Record(BaseModel):

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.records import Classification, Record
+from pipeline.records import Classification, Optional, Part, Record, Share
 from pipeline.runtime import derive_seed
 
 Floats = npt.NDArray[np.float64]
@@ -23,6 +23,24 @@ RANGE = (0.05, 20.0)
 PRIOR = 2.0
 SMALLEST = 1e-12
 DRAWS = 1000
+
+
+class CalibrationRow(Record):
+    """How far one property's probabilities can be believed: all answers, or those of like confidence."""
+
+    property: str
+    probability: str
+    """Of the likeliest class: "all", or a bin."""
+    n: int
+    mean_probability: Share
+    right: Share
+    """Share of answers whose likeliest class is the rated one."""
+    error: Share
+    """|right - mean probability| of a bin; of all, the expected calibration error."""
+    low: Optional = None
+    high: Optional = None
+    without_temperature: Optional = None
+    """The expected calibration error of the probabilities as the heads give them."""
 
 
 class Bin(Record):
@@ -85,6 +103,54 @@ def reliability(classified: Sequence[Classification], temperature: float = 1.0) 
         )
         for place in np.unique(places).tolist()
     ]
+
+
+def calibration_rows(encoders: Sequence[Sequence[Classification]]) -> list[CalibrationRow]:
+    """Test videos of all encoders together, by property; a row for all of them, then one a bin.
+
+    Args:
+        encoders: What each says of validation and test videos. Its temperatures are fitted on its validation videos.
+    """
+    given: dict[str, list[Classification]] = {}
+    tempered: dict[str, list[Classification]] = {}
+    for said in encoders:
+        for name in dict.fromkeys(c.property for c in said):
+            mine = [c for c in said if c.property == name]
+            temperature = fit_temperature([c for c in mine if c.part is Part.VALIDATION])
+            for c in mine:
+                if c.part is Part.TEST:
+                    given.setdefault(name, []).append(c)
+                    changed = tuple(rescale(c.probabilities, temperature).tolist())
+                    tempered.setdefault(name, []).append(c.model_copy(update={"probabilities": changed}))
+    rows = []
+    for name, answers in tempered.items():
+        bins = reliability(answers)
+        low, high = error_interval(answers)
+        rows.append(
+            CalibrationRow(
+                property=name,
+                probability="all",
+                n=len(answers),
+                mean_probability=sum(b.n * b.confidence for b in bins) / len(answers),
+                right=sum(b.n * b.accuracy for b in bins) / len(answers),
+                error=calibration_error(answers),
+                low=low,
+                high=high,
+                without_temperature=calibration_error(given[name]),
+            )
+        )
+        rows += [
+            CalibrationRow(
+                property=name,
+                probability=f"{b.low:.1f} to {b.high:.1f}",
+                n=b.n,
+                mean_probability=b.confidence,
+                right=b.accuracy,
+                error=abs(b.accuracy - b.confidence),
+            )
+            for b in bins
+        ]
+    return rows
 
 
 def calibration_error(classified: Sequence[Classification], temperature: float = 1.0) -> float:

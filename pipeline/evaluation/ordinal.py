@@ -6,8 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from pipeline.evaluation.scores import Optional, Share
-from pipeline.records import OutOfFold, Record
+from pipeline.records import Optional, OutOfFold, Record, Share
 from pipeline.videos.catalogue import Catalogue
 
 

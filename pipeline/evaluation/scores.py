@@ -11,14 +11,26 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import groupby
 from statistics import fmean
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator
 
 from pipeline.evaluation.intervals import Objects, accuracy_interval
 from pipeline.evaluation.paired import Difference, holm, paired
-from pipeline.records import Classification, Encoder, Graded, GradedVision, Lora, Opd, OutOfFold, Part, Record, Touch
+from pipeline.records import (
+    Classification,
+    Encoder,
+    Graded,
+    GradedVision,
+    Lora,
+    Opd,
+    Optional,
+    OutOfFold,
+    Part,
+    Record,
+    Share,
+    Touch,
+)
 from pipeline.tasks import TASKS
 from pipeline.videos.catalogue import Catalogue
 
@@ -28,11 +40,6 @@ HEADS, VALIDATION_HEADS, CROSS_VALIDATION, DESCRIBED = "heads", "heads_validatio
 """What stands as the task where no language model with touch answered: the fine-tuned encoder's property heads on test
 videos and on validation videos, encoders on objects that they were not trained on, and base models about objects that
 are described to them in words."""
-
-DIGITS = 6
-Share = Annotated[float, AfterValidator(lambda value: round(value, DIGITS))]
-Optional = Annotated[Share | None, BeforeValidator(lambda value: None if value == "" else value)]
-"""Empty in a CSV where it is None."""
 
 
 class ScoreRow(Record):

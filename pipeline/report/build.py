@@ -7,6 +7,7 @@ from pathlib import Path
 import pandas as pd
 
 from pipeline.config import AblationConfig, Params
+from pipeline.evaluation.calibration import CalibrationRow, calibration_rows
 from pipeline.evaluation.described import described_rows
 from pipeline.evaluation.grading import EXTERNAL, vision_models
 from pipeline.evaluation.ordinal import ErrorRow, error_rows
@@ -70,9 +71,11 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     graded = read_table(data / "graded.parquet", Graded)
     # By the lists in params.yaml and not by what lies there: a narrowed ablation leaves the others' files behind.
     said: dict[int, list[Classification]] = {}
+    by_encoder = []
     for seed in sorted(params.ablation.seeds):
         if (file := data / "encoder" / str(seed) / "classifications.parquet").is_file():
-            said.setdefault(params.split.replicate_of(seed), []).extend(read_table(file, Classification))
+            by_encoder.append(read_table(file, Classification))
+            said.setdefault(params.split.replicate_of(seed), []).extend(by_encoder[-1])
     out_of_fold = {
         name: read_table(data / "cross_validation" / name / "out_of_fold.parquet", OutOfFold)
         for name in params.cross_validation.models
@@ -92,6 +95,7 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     write_csv(folder / "effects.csv", EffectRow, effect_rows(graded, catalogue))
     write_csv(folder / "encoder_effects.csv", EffectRow, candidate_rows(out_of_fold, BASELINE))
     write_csv(folder / "encoder_errors.csv", ErrorRow, error_rows(out_of_fold, catalogue))
+    write_csv(folder / "calibration.csv", CalibrationRow, calibration_rows(by_encoder))
     write_json(folder / "samples.json", _samples(params, data, graded, catalogue))
     audit = data / "audit" / "audit.csv"
     write_csv(folder / "audit.csv", Finding, read_csv(audit, Finding) if audit.is_file() else [])

@@ -45,6 +45,20 @@ EXPECTED = {
 """Files of a report, and why it may lack one."""
 PARTS = {"encoder": "Encoder", "lora": "LoRA", "opd": "OPD", "touch": "Touch"}
 RANK = {"error": 0, "warning": 1, "info": 2}
+BESIDE = (
+    (
+        "encoder_errors.csv",
+        "How far encoders are off",
+        "Classes are ordinal: classes that an answer is off on average, and Cohen's quadratically weighted kappa.",
+    ),
+    (
+        "calibration.csv",
+        "Calibration of the heads' probabilities",
+        "Test videos, by the probability of the likeliest class; `all` has the expected calibration error with its "
+        "interval over objects. The temperature is fitted on validation objects.",
+    ),
+)
+"""Files that are tables as they are, with title and caption."""
 Gap = tuple[str, str, str]
 """Where something is missing, what, and why."""
 BY_USER = (
@@ -238,12 +252,10 @@ def _tables(report: Report, unfold: bool, gaps: list[Gap]) -> Iterator[Block]:
             yield _block(report, table.key, table.title, table.caption, frame, file)._replace(open=shown)
         else:
             gaps.append((report.name, table.title, f"no row of its {file} belongs there: nothing such was run"))
-    errors = report.folder / "encoder_errors.csv"
-    if errors.is_file() and len(frame := _shown(pd.read_csv(errors))):
-        caption = (
-            "Classes are ordinal: classes that an answer is off on average, and Cohen's quadratically weighted kappa."
-        )
-        yield _block(report, "errors", "How far encoders are off", caption, frame, errors.name)
+    for name, title, caption in BESIDE:
+        path = report.folder / name
+        if path.is_file() and len(frame := _shown(pd.read_csv(path))):
+            yield _block(report, path.stem, title, caption, frame, name)
     for title, frame in dataset_tables(report.folder, report.provenance["dataset"]).items():
         file = "audit.csv" if "Measured" in frame else "dataset.csv"
         yield _block(report, re.split("[:,]", title)[0].replace(" ", "-").lower(), title, "", frame, file)

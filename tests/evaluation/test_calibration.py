@@ -11,6 +11,7 @@ from scipy.special import softmax
 
 from pipeline.evaluation.calibration import (
     calibration_error,
+    calibration_rows,
     error_interval,
     fit_temperature,
     reliability,
@@ -98,3 +99,24 @@ def test_interval_holds_objects_together() -> None:
     """Many videos of two objects are no more than two draws: the interval spans from the one to the other."""
     answers = [said(0, 0.95, 0.05, object_id="a")] * 40 + [said(1, 0.95, 0.05, object_id="b")] * 40
     assert error_interval(answers) == pytest.approx((0.05, 0.95))
+
+
+def test_rows_have_the_temperature_of_their_own_encoder() -> None:
+    """Two encoders that are too sure, each by its own factor, and what all their answers come to."""
+    encoders, tested = [], []
+    for number, temperature in enumerate((3.0, 0.5)):
+        seen = drawn(6000, temperature, seed=number)
+        encoders.append([c.model_copy(update={"part": Part.VALIDATION}) for c in seen[:3000]] + seen[3000:])
+        tested += seen[3000:]
+    whole, *bins = calibration_rows(encoders)
+    assert (whole.property, whole.probability, whole.n) == ("hardness", "all", 6000)
+    assert whole.without_temperature == pytest.approx(calibration_error(tested), abs=1e-6)
+    assert whole.error < 0.03 < 0.08 < whole.without_temperature
+    assert whole.low is not None
+    assert whole.high is not None
+    assert whole.low < whole.high
+    assert sum(b.n for b in bins) == 6000
+    assert sum(b.n * b.error for b in bins) / 6000 == pytest.approx(whole.error, abs=1e-5)
+    assert [b.error for b in bins] == pytest.approx([abs(b.right - b.mean_probability) for b in bins], abs=2e-6)
+    assert whole.right == pytest.approx(sum(c.predicted == c.expected for c in tested) / 6000, abs=1e-6)
+    assert calibration_rows([]) == []

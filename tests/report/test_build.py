@@ -42,7 +42,7 @@ FILES = {
         "dataset.csv",
         "audit.csv",
     ),
-    *("samples.json", "params.yaml", "provenance.json", "encoder_effects.csv", "encoder_errors.csv"),
+    *("samples.json", "params.yaml", "provenance.json", "encoder_effects.csv", "encoder_errors.csv", "calibration.csv"),
     *(f"figures/{name}.png" for name in ("effects", "confusion", "curves")),
 }
 FEW = ("questions.evaluation={opd:4,pc:4,pss:4,pom:4,psr:4}",)
