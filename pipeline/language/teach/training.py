@@ -189,8 +189,9 @@ class Teacher(TrainableTrainer):
         print(f"teach: {phase} items right at update {step}: {metrics[f'eval_{phase}_items']:.2f}", flush=True)
         if phase == "whole" and step >= self.course.ended("whole"):
             self.control.should_training_stop = True
-            # A checkpoint of a finished training would be trained on.
-            self.control.should_save = False
+            # The Trainer looks at these once more where the epoch ends, and a finished training's checkpoint would be
+            # trained on.
+            self.control.should_evaluate = self.control.should_save = False
         return metrics
 
 
