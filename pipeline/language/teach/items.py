@@ -9,7 +9,7 @@ a random generator, so nothing needs to be stored.
 from __future__ import annotations
 
 import random
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -50,12 +50,13 @@ STYLES = {
     "short": ("list", "sentence"),
     "whole": ("list", "list", "sentence", "twice"),
 }
-PLACES = {"plain": (10, 0, 8, 2), "several": (9, 0, 7, 4), "short": (13, 5, 2, 0), "whole": (9, 4, 7, 3)}
+PLACES = {"plain": (10, 0, 8, 2), "several": (7, 0, 9, 4), "short": (13, 5, 2, 0), "whole": (9, 4, 7, 3)}
 """How often each place comes. Plain items have most of them: the shortest are learnt in the least time."""
 FORMED = {"which", "extreme", "need"}
 """Kinds whose questions may say in which form the answer is wanted."""
 FOLLOW_UPS = {"several": 3, "whole": 5}
-"""At most so many further questions about the same things: a description costs more than a question about it."""
+"""At most so many further questions about the same things, in turns of their own or, ahead of an answer that begins by
+describing, in one list: a description costs more than a question about it."""
 
 Place = Literal["behind", "ahead", "told", "earlier"]
 """Where a question stands: behind the descriptions; ahead of them; alone, so that the answer begins by describing, as
@@ -164,14 +165,21 @@ def draw(rng: random.Random, form: Form, *, held: bool = False, further: bool = 
         place: Place = "behind"
         if kind not in ("match", "sort"):
             place = rng.choices(("behind", "ahead", "told", "earlier"), PLACES[form])[0]
-        turns, learnt = _place(*asked, _describe_all(things, form, rng), place, things.words, rng)
+        # By their text, so that nothing is asked twice.
+        more = dict([asked])
         for _ in range(FOLLOW_UPS.get(form, 0) if further else 0):
             asks = ("compare", "extreme", "need")[: 5 - len(things.levels)]
             again = _ask(rng.choice(asks), things, rng.choice(things.topics), rng)
-            if again is not None and again[0] not in {turn.user for turn in turns}:
-                turns.append(Turn(user=again[0], assistant=again[1]))
-                learnt.append(again[1])
-        return Item(kind, tuple(turns), tuple(learnt))
+            if again is not None:
+                more[again[0]] = again[1]
+        if place == "told" and len(more) > 1 and rng.random() < 0.7:
+            # A description is long, and so more is concluded from it.
+            questions, answers = (_numbered(texts) for texts in (more.keys(), more.values()))
+            more = {questions: answers}
+        first, *later = more.items()
+        turns, learnt = _place(*first, _describe_all(things, form, rng), place, things.words, rng)
+        turns += [Turn(user=question, assistant=answer) for question, answer in later]
+        return Item(kind, tuple(turns), (*learnt, *(answer for _, answer in later)))
 
 
 def _things(rng: random.Random, count: int, form: Form, held: bool) -> Things:
@@ -252,6 +260,10 @@ def _ask(kind: str, things: Things, topic: str, rng: random.Random) -> tuple[str
         answer = form.format(things.names[things.answers.index(answer)], noun=topic)
         answer = f"{answer[0].upper()}{answer[1:]}"
     return f"{question[0].upper()}{question[1:]} {hint}".strip(), answer
+
+
+def _numbered(texts: Iterable[str]) -> str:
+    return " ".join(f"{i}. {text}" for i, text in enumerate(texts, start=1))
 
 
 def _sort(things: Things, order: Sequence[int], rng: random.Random) -> tuple[str, str]:
