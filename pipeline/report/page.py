@@ -54,8 +54,8 @@ BESIDE = (
     (
         "calibration.csv",
         "Calibration of the heads' probabilities",
-        "Test videos, by the probability of the likeliest class; `all` has the expected calibration error with its "
-        "interval over objects. The temperature is fitted on validation objects.",
+        "Test videos, by the probability of the likeliest class; the row of all has the expected calibration error "
+        "with its interval over objects. The temperature is fitted on validation objects.",
     ),
 )
 """Files that are tables as they are, with title and caption."""
