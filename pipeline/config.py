@@ -269,7 +269,7 @@ class MaxUpdates(Section):
     """The longest that a phase of teaching takes: plain items, several properties, whole descriptions."""
 
     plain: Positive = 300
-    several: Positive = 200
+    several: Positive = 400
     whole: Positive = 40
 
 
