@@ -26,6 +26,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import chdir, contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -251,17 +252,34 @@ def kill(chain: Chain, ledger: Ledger, stage: str, rng: random.Random, moment: S
     return True
 
 
-def drill_kills(chain: Chain, ledger: Ledger, kills: int, minutes: float, seed: int) -> None:
-    """Every second kill at a chosen moment, the others at random, until there are enough or time is over."""
-    done, moments, until = 0, itertools.cycle(MOMENTS), time.monotonic() + 60 * minutes
-    for number in itertools.count():
-        if done == kills or time.monotonic() > until:
-            break
-        rng, moment = random.Random(f"{seed}/{number}"), next(moments) if number % 2 else None
-        if fitting := [name for name in chain.stages if not moment or re.match(moment[3], name)]:
-            stage = rng.choice(fitting)
-            print(f"kill {done + 1} of {kills} (seed {seed}/{number}): {stage}, {moment or 'at random'}", flush=True)
-            done += kill(chain, ledger, stage, rng, moment)
+def drill_kills(chains: Sequence[Chain], ledger: Ledger, kills: int, minutes: float, seed: int) -> None:
+    """Every second kill at a chosen moment, the others at random, until there are enough or time is over.
+
+    Each chain has a thread of its own: most of a kill is one process that starts.
+    """
+    numbers, until, lock, done = itertools.count(), time.monotonic() + 60 * minutes, threading.Lock(), 0
+
+    def go(chain: Chain) -> None:
+        nonlocal done
+        while time.monotonic() < until:
+            with lock:
+                if done >= kills:
+                    return
+                number = next(numbers)
+                rng, moment = random.Random(f"{seed}/{number}"), MOMENTS[number // 2 % len(MOMENTS)]
+                moment = moment if number % 2 else None
+                fitting = [name for name in chain.stages if not moment or re.match(moment[3], name)]
+                if not fitting:
+                    continue
+                stage = rng.choice(fitting)
+                done += 1
+                print(f"kill {done} of {kills} (seed {seed}/{number}): {stage}, {moment or 'at random'}", flush=True)
+            hit = kill(chain, ledger, stage, rng, moment)
+            with lock:
+                done -= not hit
+
+    with ThreadPoolExecutor(len(chains)) as pool:
+        list(pool.map(go, chains))
 
 
 def one_line(status: int, output: str, words: str) -> str:
@@ -381,7 +399,7 @@ def reduced_kills(folder: Path, kills: int) -> Ledger:
     """A few kills of the chain's first stages."""
     ledger = Ledger()
     chain = Chain(folder, ["extract_frames"], ["scenes.videos_per_object=1"])
-    drill_kills(chain, ledger, kills, minutes=10, seed=0)
+    drill_kills([chain], ledger, kills, minutes=10, seed=0)
     return ledger
 
 
@@ -391,14 +409,16 @@ def drill(kills: int, minutes: float, seed: int) -> int:
     with tempfile.TemporaryDirectory() as name:
         try:
             drill_bad_inputs(ledger, Path(name) / "inputs")
-            chain = Chain(Path(name) / "a project")
+            with ThreadPoolExecutor() as pool:
+                chains = list(pool.map(Chain, [Path(name) / which / "a project" for which in ("one", "other")]))
+            chain = chains[0]
             for stage in [stage for stage in chain.stages if re.match("extract|align|report", stage)]:
                 print(f"clock, and two at once: {stage}", flush=True)
                 drill_clock(chain, ledger, stage)
                 drill_two(chain, ledger, stage)
             drill_servers(chain, ledger, next(stage for stage in chain.stages if stage.startswith("finetune")))
             drill_disks(chain, ledger)
-            drill_kills(chain, ledger, kills, minutes, seed)
+            drill_kills(chains, ledger, kills, minutes, seed)
         finally:
             ledger.write(ROOT / "reports" / "drill.csv")
     return ledger.faults()
