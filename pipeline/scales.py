@@ -155,19 +155,32 @@ def check_objects(params: Params, catalogue: Catalogue) -> None:
 def write_params(params: Params, path: Path = PARAMS_FILE) -> bool:
     """Write params.yaml if that changes it; return whether it did."""
     values = params.model_dump(mode="json")
-    text = HEADER + yaml.dump(values, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)
+    lines = {
+        name: {key: _Line(v) if isinstance(v, dict) else v for key, v in section.items()}
+        if isinstance(section, dict)
+        else section
+        for name, section in values.items()
+    }
+    text = HEADER + yaml.dump(lines, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)
     if path.is_file() and path.read_bytes() == text.encode():
         return False
     write_text(path, text)
     return True
 
 
+class _Line(dict[str, Any]):
+    """A mapping within a section."""
+
+
 class _Dumper(yaml.SafeDumper):
-    """Writes lists in one line, so that params.yaml stays readable."""
+    """Writes lists, and mappings within a section, in one line, so that params.yaml stays readable."""
 
 
 _Dumper.add_representer(
     list, lambda dumper, data: dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=True)
+)
+_Dumper.add_representer(
+    _Line, lambda dumper, data: dumper.represent_mapping("tag:yaml.org,2002:map", data.items(), flow_style=True)
 )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pandas as pd
@@ -102,9 +103,14 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     _write(folder / "dataset.csv", dataset_frame(catalogue, videos, splits))
     _write(folder / "confusion.csv", confusion_frame(said, catalogue))
     _write(folder / "curves.csv", curves_frame(data, params.ablation))
-    write_text(folder / "params.yaml", (root / PARAMS_FILE).read_text(encoding="utf-8"))
+    write_text(folder / "params.yaml", without_places((root / PARAMS_FILE).read_text(encoding="utf-8")))
     write_json(folder / "provenance.json", origin)
     return finish_report(folder)
+
+
+def without_places(text: str) -> str:
+    """params.yaml with the last part alone of paths of this machine: a report is for others too."""
+    return re.sub(r"(?m)^(  \w+: )['\"]?(?:/|~|[A-Za-z]:\\).*?([^/\\'\"\n]+)['\"]?$", r"\1\2", text)
 
 
 def finish_report(folder: Path) -> dict[str, float]:

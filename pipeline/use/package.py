@@ -16,7 +16,7 @@ from pipeline.card import CARD_FILE, write_card
 from pipeline.config import PRETRAINED, Params
 from pipeline.embeddings import STATISTICS_FILE, EmbeddingStore, Statistics
 from pipeline.errors import UserError
-from pipeline.evaluation.calibration import calibration_error, error_interval, fit_temperature, reliability
+from pipeline.evaluation.calibration import calibration_rows, fit_temperature
 from pipeline.io import atomic_folder, read_table, write_json
 from pipeline.language.base import load_tokenizer
 from pipeline.language.connector import CONFIG_FILE
@@ -104,7 +104,7 @@ def package(data: Path, params: Params, variant: Variant, base: Base, out: Path)
             versions={"python": platform.python_version(), **{name: metadata.version(name) for name in LIBRARIES}},
         )
         write_json(folder / CONFIG, config.model_dump(mode="json"))
-        _write_card(folder, config, seen, scores, params)
+        _write_card(folder, config, judged, scores, params)
     return config
 
 
@@ -196,11 +196,11 @@ def _copy_encoder(folder: Path, params: Params, trained: Path) -> None:
 def _write_card(
     folder: Path,
     config: ModelConfig,
-    seen: dict[str, list[Classification]],
+    judged: Sequence[Classification],
     scores: Sequence[Scored],
     params: Params,
 ) -> None:
-    tested = {name: [c for c in rows if c.part == Part.TEST] for name, rows in seen.items()}
+    calibrated = calibration_rows([judged])
     bases = {"language model": Path(params.language.weights)}
     if (folder / ENCODER_DIR / BACKBONE_DIR).is_dir():
         bases["tactile encoder"] = Path(params.encoder.weights)
@@ -238,19 +238,26 @@ def _write_card(
                 for s in scores
             ],
             "Calibration of the heads' probabilities": [
-                _calibrated(name, rows, config.temperatures[name]) for name, rows in tested.items() if rows
+                {
+                    "Property": row.property,
+                    "Temperature": f"{config.temperatures[row.property]:.2f}",
+                    "Test videos": row.n,
+                    "Expected calibration error": f"{row.error:.3f} [{row.low:.3f}, {row.high:.3f}]",
+                    "Without the temperature": f"{row.without_temperature:.3f}",
+                }
+                for row in calibrated
+                if row.probability == "all"
             ],
             "Reliability": [
                 {
-                    "Property": name,
-                    "Probability": f"{b.low:.1f} to {b.high:.1f}",
-                    "n": b.n,
-                    "Mean probability": f"{b.confidence:.2f}",
-                    "Right": f"{b.accuracy:.2f}",
+                    "Property": row.property,
+                    "Probability": row.probability,
+                    "n": row.n,
+                    "Mean probability": f"{row.mean_probability:.2f}",
+                    "Right": f"{row.right:.2f}",
                 }
-                for name, rows in tested.items()
-                if rows
-                for b in reliability(rows, config.temperatures[name])
+                for row in calibrated
+                if row.probability != "all"
             ],
         },
     )
@@ -258,14 +265,3 @@ def _write_card(
 
 def _flat(section: str, settings: BaseModel) -> dict[str, object]:
     return {f"{section}.{name}": value for name, value in settings.model_dump().items()}
-
-
-def _calibrated(name: str, rows: Sequence[Classification], temperature: float) -> dict[str, object]:
-    low, high = error_interval(rows, temperature)
-    return {
-        "Property": name,
-        "Temperature": f"{temperature:.2f}",
-        "Test videos": len(rows),
-        "Expected calibration error": f"{calibration_error(rows, temperature):.3f} [{low:.3f}, {high:.3f}]",
-        "Without the temperature": f"{calibration_error(rows):.3f}",
-    }

@@ -20,7 +20,7 @@ from pipeline.errors import UserError
 from pipeline.io import read_jsonl, read_table, write_table
 from pipeline.params import load_params
 from pipeline.records import Classification, Graded, Part, Prediction, Question
-from pipeline.report.build import MOST_METRICS, write_report
+from pipeline.report.build import MOST_METRICS, without_places, write_report
 from pipeline.report.dataset import dataset_tables
 from pipeline.report.load import DATASET, load_report
 from pipeline.report.provenance import base_model, digest, encoder_words, parameters
@@ -60,6 +60,12 @@ def test_everything_that_was_promised_is_there_and_dvc_knows_of_it(written: Path
     promised = {path.removeprefix("reports/${scale}-${data.source}/") for out in outs for path in out}
     assert {name.split("/")[0] for name in FILES} == promised
     assert all(options == {"cache": False} for out in outs for options in out.values())
+
+
+@pytest.mark.parametrize("path", ["/home/me/my videos", "'/home/me/my videos'", "~/my videos"])
+def test_a_report_names_no_place_of_the_machine(path: str) -> None:
+    text = f"# By hand\ndata:\n  dir: {path}\n  catalogue: pipeline/physiclear\n"
+    assert without_places(text) == "# By hand\ndata:\n  dir: my videos\n  catalogue: pipeline/physiclear\n"
 
 
 def test_accuracies_are_those_of_the_graded_answers(written: Path) -> None:
