@@ -15,15 +15,16 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from functools import partial
+from functools import lru_cache, partial
 from importlib.util import find_spec
 from typing import Any, TypeVar
 
 from pipeline.config import Backend
 from pipeline.errors import UserError
-from pipeline.runtime import cores, progress
+from pipeline.runtime import cores, progress, track
 
 J = TypeVar("J")
+M = TypeVar("M")
 R = TypeVar("R")
 Spread = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[Any]]
 """Applies work to jobs on a cluster and gives results in their order."""
@@ -63,10 +64,15 @@ def end_with_parent(parent: int) -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def run_parallel(work: Callable[[J], R], jobs: Sequence[J], label: str, unit: str) -> Iterator[R]:
+def run_parallel(
+    work: Callable[[J], R], jobs: Sequence[J], label: str, unit: str, *, device: bool = False
+) -> Iterator[R]:
     """Apply `work` to every job on the chosen backend; yield results in the order of the jobs.
 
     An error or an interrupt stops what has not begun.
+
+    Args:
+        device: Whether a job takes a GPU of a cluster that has any.
 
     Raises:
         UserError: if a process dies, which a decoder can do to a broken file, or a cluster is not there.
@@ -74,9 +80,38 @@ def run_parallel(work: Callable[[J], R], jobs: Sequence[J], label: str, unit: st
     if not jobs:
         return
     with progress(len(jobs), label, unit) as advance:
-        for result in (_in_processes if _chosen == "loky" else _on_cluster)(work, jobs, label):
+        for result in _in_processes(work, jobs, label) if _chosen == "loky" else _on_cluster(work, jobs, label, device):
             yield result
             advance()
+
+
+def run_with(
+    model: M, source: Callable[[], M] | None, work: Callable[[M, J], R], jobs: Sequence[J], label: str, unit: str
+) -> Iterator[R]:
+    """Apply `work` to a model and every job; yield results in the order of the jobs.
+
+    Here, one after another, since this machine has one device. On a cluster each worker has a model of its own, loaded
+    once. On Ray it takes a GPU of its own where there are any; a worker of Dask's has those that it was started with.
+
+    Args:
+        model: Used in this process.
+        source: Loads the same model in a worker; equal sources must have equal hashes. Without one all is done here.
+        work: A function of a module, for workers to import.
+    """
+    if _chosen == "loky" or source is None:
+        for job in track(jobs, label, unit):
+            yield work(model, job)
+    else:
+        yield from run_parallel(partial(_with_loaded, source, work), jobs, label, unit, device=True)
+
+
+def _with_loaded(source: Callable[[], M], work: Callable[[M, J], R], job: J) -> R:
+    return work(_loaded(source), job)
+
+
+@lru_cache(maxsize=1)
+def _loaded(source: Callable[[], Any]) -> Any:
+    return source()
 
 
 def _in_processes(work: Callable[[J], R], jobs: Sequence[J], label: str) -> Iterator[R]:
@@ -108,13 +143,13 @@ def _in_processes(work: Callable[[J], R], jobs: Sequence[J], label: str) -> Iter
             raise
 
 
-def _on_cluster(work: Callable[[J], R], jobs: Sequence[J], label: str) -> Iterator[R]:
+def _on_cluster(work: Callable[[J], R], jobs: Sequence[J], label: str, device: bool) -> Iterator[R]:
     """On all workers of the cluster that `RAY_ADDRESS` or `DASK_SCHEDULER_ADDRESS` names, else of one on this machine.
 
     Workers see the project under this machine's path.
     """
     try:
-        spread = {"ray": _ray, "dask": _dask}[_chosen]()
+        spread = _ray(device) if _chosen == "ray" else _dask()
     except (OSError, ValueError) as error:
         reason = " ".join(str(error).split())[:200]
         raise UserError(
@@ -132,13 +167,16 @@ def _on_cluster(work: Callable[[J], R], jobs: Sequence[J], label: str) -> Iterat
         raise
 
 
-def _ray() -> Spread:
+def _ray(device: bool) -> Spread:
     import ray
 
     ray.init(ignore_reinit_error=True, log_to_driver=False, logging_level="ERROR")
 
+    gpus = 1 if device and ray.cluster_resources().get("GPU") else 0
+
     def spread(work: Callable[[Any], Any], jobs: Sequence[Any]) -> Iterator[Any]:
-        remote = ray.remote(lambda job: work(job))
+        # Ray hides GPUs from work that does not ask for them.
+        remote = ray.remote(num_gpus=gpus)(lambda job: work(job))
         waiting = deque(remote.remote(job) for job in jobs)
         try:
             while waiting:

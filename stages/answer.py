@@ -4,12 +4,11 @@ from pathlib import Path
 
 from pipeline.embeddings import EmbeddingStore
 from pipeline.io import read_jsonl, write_csv, write_jsonl
-from pipeline.language.generate import GenerationSettings, answer
+from pipeline.language.generate import GenerationSettings, ModelSource, answer
 from pipeline.language.input_ablation import ablate_input
-from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.teach.gate import examine, gate_questions
 from pipeline.records import GATE, Described, Encoder, Lora, Opd, Question, Touch, Variant
-from pipeline.runtime import name_dtype, resolve_device
+from pipeline.runtime import name_dtype
 from pipeline.stage import DATA, matrix_key, stage
 from pipeline.videos.catalogue import load_catalogue
 
@@ -20,12 +19,9 @@ def main() -> None:
         params, language = run.params, run.params.language
         store = EmbeddingStore(DATA / "embeddings" / f"{variant.encoder}-{variant.seed}")
         folder = DATA / "models" / variant.lora / f"{variant.encoder}-{variant.opd}-{variant.seed}"
-        model = OctopiForCausalLM.from_pretrained(
-            folder,
-            base=language.weights,
-            dtype=name_dtype(language.dtype, params.runtime.device),
-            quantization=language.quantization,
-        ).to(resolve_device(params.runtime.device))
+        dtype = name_dtype(language.dtype, params.runtime.device)
+        source = ModelSource(folder, language.weights, dtype, language.quantization, params.runtime.device)
+        model = source()
         asked = DATA / "questions" / str(variant.seed)
         questions = read_jsonl(asked / "evaluation.jsonl", Question)
         for touch in (Touch.REAL, *(params.ablation.touch if variant.full else ())):
@@ -37,13 +33,14 @@ def main() -> None:
                 bos=language.bos,
             )
             given = ablate_input(store, touch, questions, variant.seed)
-            predictions = answer(model, given, questions, variant.opd, settings)
+            predictions = answer(model, given, questions, variant.opd, settings, source)
             write_jsonl(DATA / "answers" / variant.key / f"{touch}.jsonl", predictions)
             run.metrics[f"{touch}.answers"] = len(predictions)
             run.metrics[f"{touch}.tokens"] = sum(p.tokens for p in predictions)
             run.metrics[f"{touch}.truncated"] = sum(p.truncated for p in predictions)
             if variant.full and touch is Touch.REAL:
-                shown = answer(model, store, read_jsonl(asked / "examples.jsonl", Question), variant.opd, settings)
+                examples = read_jsonl(asked / "examples.jsonl", Question)
+                shown = answer(model, store, examples, variant.opd, settings, source)
                 write_jsonl(DATA / "answers" / variant.key / "examples.jsonl", shown)
         if variant.full and params.teach.base:
             # What its adapter left of the reasoning that the base was taught.

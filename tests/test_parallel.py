@@ -63,15 +63,54 @@ if __name__ == "__main__":
     main()
 """
 
+MODELS = """
+import os, sys
+from pathlib import Path
+import torch
+from pipeline.embeddings import EmbeddingStore
+from pipeline.encoder.embed import EncoderSource, embed_videos
+from pipeline.io import read_table
+from pipeline.language import generate
+from pipeline.parallel import use_backend
+from pipeline.records import Assignment, Encoder, Lora, Opd, Variant
+from tests.use.shared import make
+
+def main():
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:2])
+    torch.set_num_threads(1)
+    made = make(Path.cwd(), Variant(Encoder.FINETUNED, Lora.WITH, Opd.ALL, 0))
+    params, data = made.params, Path("data")
+    encoder = EncoderSource(
+        params.encoder, "cpu", data / "frames", Path(params.data.catalogue), data / "encoder" / "0" / "encoder.safetensors"
+    )
+    parts = read_table(data / "splits" / "0.parquet", Assignment)
+    here = embed_videos(encoder(), parts, encoder)
+    source = generate.ModelSource(data / "models" / "with" / "finetuned-all-0", "llama", "float32", "none", "cpu")
+    settings = generate.GenerationSettings("", params.frames.per_video, 12, 8)
+    store, model = EmbeddingStore(data / "embeddings" / "finetuned-0"), source()
+    said = generate.answer(model, store, made.questions, Opd.ALL, settings, source)
+
+    use_backend(sys.argv[1])
+    generate.greedy = None  # Not in this process.
+    there = embed_videos(encoder()._replace(encoder=None), parts, encoder)
+    assert torch.equal(here[0], there[0]) and here[1] == there[1]
+    assert generate.answer(model, store, made.questions, Opd.ALL, settings, source) == said
+    assert len(said) > 40 and len({p.outputs for p in said}) > 10
+
+if __name__ == "__main__":
+    main()
+"""
+
 
 def work_on(backend: str, folder: Path, videos: Path) -> dict[str, str]:
     """The sha256 of each file that two workers make of the videos; what is said of bad jobs is checked here."""
     folder.mkdir()
     (folder / "work.py").write_text(SCRIPT)
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(
         [sys.executable, "work.py", backend, str(videos), str(ROOT / "pipeline" / "physiclear")],
         cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(ROOT), "PYTHONWARNINGS": "ignore"},
+        env={**os.environ, "PYTHONPATH": path, "PYTHONWARNINGS": "ignore"},
         capture_output=True,
         text=True,
         timeout=300,
@@ -100,6 +139,16 @@ def test_two_workers_of_a_cluster_make_the_same_bytes(
     pytest.importorskip(package, reason=f"needs {backend}: pip install 'octopi-pipeline[{backend}]'")
     assert len(here) == 4
     assert work_on(backend, tmp_path / "there", tiny_videos) == here
+
+
+@pytest.mark.parametrize(("backend", "package"), [("ray", "ray"), ("dask", "distributed")])
+def test_a_cluster_embeds_and_answers_to_the_same_bytes(backend: str, package: str, tmp_path: Path) -> None:
+    pytest.importorskip(package, reason=f"needs {backend}: pip install 'octopi-pipeline[{backend}]'")
+    (tmp_path / "models.py").write_text(MODELS)
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    command = [sys.executable, "models.py", backend]
+    done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
 
 
 def test_a_missing_package_is_one_line_before_anything_runs(monkeypatch: pytest.MonkeyPatch) -> None:

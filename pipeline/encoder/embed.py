@@ -3,32 +3,75 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
 from itertools import chain
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
+from pipeline.config import EncoderConfig
 from pipeline.embeddings import FLIPS, Statistics
 from pipeline.encoder.model import FrameEncoder
+from pipeline.encoder.recipes import base_encoder, property_classifier
 from pipeline.errors import UserError
+from pipeline.parallel import run_with
 from pipeline.records import Assignment, Embedding, Flip, Part
-from pipeline.runtime import track
+from pipeline.runtime import DeviceName, resolve_device
+from pipeline.training.trainable import load_trainable
+from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.frames.store import FrameStore
 
 AXES: dict[Flip, tuple[int, ...]] = {"none": (), "horizontal": (2,), "vertical": (1,), "both": (1, 2)}
 """Axes of frames x height x width that a flip reverses."""
 
 
-@torch.inference_mode()
+class Loaded(NamedTuple):
+    """What embeds: an encoder and the frames that it reads."""
+
+    encoder: FrameEncoder
+    store: FrameStore
+    device: torch.device
+    batch_size: int
+
+
+@dataclass(frozen=True)
+class EncoderSource:
+    """Where an encoder and its frames lie; called, it loads them, in this process or in a cluster's worker."""
+
+    config: EncoderConfig
+    device: DeviceName
+    frames: Path
+    catalogue: Path
+    state: Path | None
+    """What fine-tuning trained; None for the base encoder."""
+
+    def __call__(self) -> Loaded:
+        """Load them.
+
+        Raises:
+            UserError: for weights or frames that are missing or do not fit.
+        """
+        if self.state is None:
+            encoder = base_encoder(self.config)
+        else:
+            classes = [len(p.levels) for p in load_catalogue(self.catalogue).properties]
+            classifier = property_classifier(self.config, classes)
+            load_trainable(classifier, self.state)
+            encoder = classifier.encoder
+        device = resolve_device(self.device)
+        store = FrameStore(self.frames, self.config.reference)
+        return Loaded(encoder.to(device).eval(), store, device, self.config.embed_batch_size)
+
+
 def embed_videos(
-    encoder: FrameEncoder,
-    store: FrameStore,
-    assignments: Sequence[Assignment],
-    *,
-    batch_size: int,
-    device: torch.device,
+    loaded: Loaded, assignments: Sequence[Assignment], source: EncoderSource | None = None
 ) -> tuple[torch.Tensor, list[Embedding]]:
     """Embed each kept frame of each used video; training videos also mirrored in all the ways that training draws.
+
+    Args:
+        source: Of `loaded`, for the workers of a cluster.
 
     Returns:
         The embeddings (float32, rows x dim) and what each row is.
@@ -36,27 +79,35 @@ def embed_videos(
     Raises:
         UserError: naming the video, where an embedding is not finite.
     """
-    encoder = encoder.to(device).eval()
-    blocks: list[torch.Tensor] = []
-    index: list[Embedding] = []
     used = [a for a in assignments if a.part != Part.UNUSED]
-    for assignment in track(used, "embed", "video"):
-        rows = store.rows(assignment.video_id)
-        pixels = store.pictures(assignment.video_id)
-        flips = FLIPS if assignment.part == Part.TRAIN else FLIPS[:1]
-        # All mirrored versions in one tensor: larger batches cost less a frame.
-        frames = torch.from_numpy(np.concatenate([np.flip(pixels, AXES[flip]) for flip in flips]))
-        frame_indices = torch.tensor([store.index[row].frame_index for row in rows] * len(flips))
-        batches = zip(frames.split(batch_size), frame_indices.split(batch_size), strict=True)
-        block = torch.cat([encoder(some.to(device), when.to(device)).float().cpu() for some, when in batches])
-        if not block.isfinite().all():
-            raise UserError(f"{assignment.video_id}: its embedding is not finite; check the video and the encoder")
-        for flip in flips:
-            for row in rows:
-                frame = store.index[row].frame_index
+    blocks = [torch.from_numpy(b) for b in run_with(loaded, source, _embed_video, used, "embed", "video")]
+    index: list[Embedding] = []
+    for assignment in used:
+        frames = [loaded.store.index[row].frame_index for row in loaded.store.rows(assignment.video_id)]
+        for flip in _flips(assignment):
+            for frame in frames:
                 index.append(Embedding(video_id=assignment.video_id, frame_index=frame, flip=flip, row=len(index)))
-        blocks.append(block)
     return torch.cat(blocks), index
+
+
+def _flips(assignment: Assignment) -> Sequence[Flip]:
+    return FLIPS if assignment.part == Part.TRAIN else FLIPS[:1]
+
+
+@torch.inference_mode()
+def _embed_video(loaded: Loaded, assignment: Assignment) -> np.ndarray:
+    """Embeddings of a video's frames, flip by flip: float32, rows x dim."""
+    encoder, store, device, batch_size = loaded
+    rows, pixels, flips = store.rows(assignment.video_id), store.pictures(assignment.video_id), _flips(assignment)
+    # All mirrored versions in one tensor: larger batches cost less a frame.
+    frames = torch.from_numpy(np.concatenate([np.flip(pixels, AXES[flip]) for flip in flips]))
+    frame_indices = torch.tensor([store.index[row].frame_index for row in rows] * len(flips))
+    batches = zip(frames.split(batch_size), frame_indices.split(batch_size), strict=True)
+    block = torch.cat([encoder(some.to(device), when.to(device)).float().cpu() for some, when in batches])
+    if not block.isfinite().all():
+        raise UserError(f"{assignment.video_id}: its embedding is not finite; check the video and the encoder")
+    embeddings: np.ndarray = block.numpy()
+    return embeddings
 
 
 def union(splits: Iterable[Sequence[Assignment]]) -> list[Assignment]:

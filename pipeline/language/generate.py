@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from transformers import PreTrainedTokenizerBase
@@ -14,8 +16,9 @@ from pipeline.language.chat import encode, end_ids, render
 from pipeline.language.conversations import check_length, evaluation_features
 from pipeline.language.decoding import greedy, greedy_tokens
 from pipeline.language.octopi import OctopiForCausalLM
+from pipeline.parallel import run_with
 from pipeline.records import Opd, Prediction, Question, Turn
-from pipeline.runtime import track
+from pipeline.runtime import DeviceName, DtypeName, Quantization, resolve_device
 
 
 @dataclass(frozen=True)
@@ -28,6 +31,32 @@ class GenerationSettings:
     max_new_tokens: int
     batch_size: int
     bos: bool = True
+
+
+@dataclass(frozen=True)
+class ModelSource:
+    """Where a model lies; called, it loads it, in this process or in a cluster's worker."""
+
+    folder: Path
+    base: str
+    dtype: DtypeName
+    quantization: Quantization
+    device: DeviceName
+
+    def __call__(self) -> OctopiForCausalLM:
+        """Load it, as `OctopiForCausalLM.from_pretrained` does."""
+        model = OctopiForCausalLM.from_pretrained(
+            self.folder, base=self.base, dtype=self.dtype, quantization=self.quantization
+        )
+        return model.to(resolve_device(self.device))
+
+
+class Batch(NamedTuple):
+    """Prompts that are answered at once, with the frames' features and the most new tokens of each."""
+
+    prompts: list[Sequence[int]]
+    features: list[torch.Tensor]
+    limits: list[int]
 
 
 @dataclass(frozen=True)
@@ -45,11 +74,15 @@ def answer(
     questions: Sequence[Question],
     opd: Opd,
     settings: GenerationSettings,
+    source: ModelSource | None = None,
 ) -> list[Prediction]:
     """Answer every question that has a dialogue in this OPD mode; later turns see the model's own earlier answers.
 
     Greedy, so the same model always says the same; in float32 the batch size changes nothing. An answer ends with the
     end token, or is cut (and marked so) after `max_new_tokens` or where the language model has no more positions.
+
+    Args:
+        source: Of the model, for the workers of a cluster.
 
     Raises:
         UserError: naming the question whose prompt alone has more tokens than the language model has positions.
@@ -73,7 +106,7 @@ def answer(
                 check_length(question.question_id, len(prompt) + 1, model.positions)
                 waiting.append((question, prompt))
         features = [evaluation_features(q, store, settings.per_video) for q, _ in waiting]
-        texts = reply(model, [ids for _, ids in waiting], features, settings, f"answers, turn {number + 1}")
+        texts = reply(model, [ids for _, ids in waiting], features, settings, f"answers, turn {number + 1}", source)
         for (question, _), text in zip(waiting, texts, strict=True):
             said[question.question_id].append(text)
     return [
@@ -102,6 +135,7 @@ def reply(
     features: Sequence[torch.Tensor],
     settings: GenerationSettings,
     label: str = "answers",
+    source: ModelSource | None = None,
 ) -> list[Generated]:
     """An answer to each prompt, in the prompts' order.
 
@@ -109,17 +143,23 @@ def reply(
         prompts: Of `write_prompt`, each shorter than the language model has positions.
         features: Of each prompt's frames in reading order: frames x tactile_dim.
         label: What progress is called.
+        source: Of the model, for the workers of a cluster.
     """
-    ends, said = end_ids(model.tokenizer), {}
     # Neighbours of like length share a batch, so little is spent on padding.
     order = sorted(range(len(prompts)), key=lambda place: len(prompts[place]))
-    for start in track(range(0, len(order), settings.batch_size), label, "batch"):
-        batch = order[start : start + settings.batch_size]
-        chosen = [prompts[place] for place in batch]
-        tokens = greedy(model, chosen, [features[place] for place in batch], ends, _room(model, chosen, settings))
-        for place, row in zip(batch, tokens, strict=True):
-            said[place] = _said(row, ends, model.tokenizer)
-    return [said[place] for place in range(len(prompts))]
+    batches = []
+    for start in range(0, len(order), settings.batch_size):
+        places = order[start : start + settings.batch_size]
+        chosen = [prompts[place] for place in places]
+        batches.append(Batch(chosen, [features[place] for place in places], _room(model, chosen, settings)))
+    said = [row for rows in run_with(model, source, _reply_batch, batches, label, "batch") for row in rows]
+    return [text for _, text in sorted(zip(order, said, strict=True), key=lambda pair: pair[0])]
+
+
+def _reply_batch(model: OctopiForCausalLM, batch: Batch) -> list[Generated]:
+    ends = end_ids(model.tokenizer)
+    rows = greedy(model, batch.prompts, batch.features, ends, batch.limits)
+    return [_said(row, ends, model.tokenizer) for row in rows]
 
 
 def stream(

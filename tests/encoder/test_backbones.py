@@ -21,7 +21,7 @@ from pipeline.encoder import finetune as training
 from pipeline.encoder import tuned
 from pipeline.encoder.backbones import BACKBONES, check_backbones, load_backbones
 from pipeline.encoder.clips import EncoderData, classify
-from pipeline.encoder.embed import embed_videos
+from pipeline.encoder.embed import Loaded, embed_videos
 from pipeline.encoder.finetune import finetune, tune
 from pipeline.encoder.frame_classifier import JointFrameClassifier
 from pipeline.encoder.model import FrameEncoder, SideBySide, mean_and_deviation
@@ -314,7 +314,7 @@ def test_what_is_tuned_is_saved_loaded_and_embeds_alike(
     first, second = (classify(m, data, [Part.TRAIN, Part.VALIDATION], 4, DEVICE) for m in (model, again))
     assert first == second
     one, other = (
-        embed_videos(m.encoder, data.store, data.assignments, batch_size=4, device=DEVICE)[0] for m in (model, again)
+        embed_videos(Loaded(m.encoder.eval(), data.store, DEVICE, 4), data.assignments)[0] for m in (model, again)
     )
     assert torch.equal(one, other)
     kept = sum(value.numel() for value in trainable_state(model).values())

@@ -16,7 +16,7 @@ from pipeline.encoder import pretrain as pretraining
 from pipeline.encoder.candidates import CANDIDATES
 from pipeline.encoder.clips import EncoderData, classify, describe_clips
 from pipeline.encoder.cross_validation import CrossValidationData, cross_validate_candidate
-from pipeline.encoder.embed import embed_videos
+from pipeline.encoder.embed import Loaded, embed_videos
 from pipeline.encoder.finetune import fit_heads, train_classifier
 from pipeline.encoder.frame_classifier import STRENGTHS, JointFrameClassifier, fit_frame_heads
 from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
@@ -176,9 +176,9 @@ def test_what_is_not_finite_is_named_by_its_video(
     """Embeddings, logits in batches of any size, and features that heads are fitted to."""
     data = with_a_bright_video(tmp_path, catalogue, PARTS, "pillow_0")
     with pytest.raises(UserError, match=r"^pillow_0: .*not finite"):
-        embed_videos(Sick(value), data.store, data.assignments, batch_size=3, device=DEVICE)
+        embed_videos(Loaded(Sick(value), data.store, DEVICE, 3), data.assignments)
     unused = [a.model_copy(update={"part": Part.UNUSED}) if a.object_id == "pillow" else a for a in data.assignments]
-    tensor, index = embed_videos(Sick(value), data.store, unused, batch_size=3, device=DEVICE)
+    tensor, index = embed_videos(Loaded(Sick(value), data.store, DEVICE, 3), unused)
     assert tensor.isfinite().all()
     assert len(tensor) == len(index)
 

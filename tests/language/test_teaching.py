@@ -60,6 +60,14 @@ def test_a_phase_begins_when_the_one_before_is_passed(course: Course) -> None:
     assert course.ended("whole") == 100
 
 
+def test_the_rate_falls_in_the_last_phase(course: Course) -> None:
+    course.config = course.config.model_copy(update={"warmup": 4})
+    log: list[dict[str, float]] = [{"step": 40, "eval_plain_items": 1.0}, {"step": 60, "eval_several_items": 1.0}]
+    course.log = lambda: log
+    rates = [course.rate(step) for step in (0, 3, 39, 60, 110, 160, 200)]
+    assert rates == pytest.approx([0.25, 1, 1, 1, 0.55, 0.1, 0.1])
+
+
 def test_an_update_holds_its_phase_and_reviews(course: Course) -> None:
     lengths = []
     for phase, forms in COURSE.items():

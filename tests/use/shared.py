@@ -13,7 +13,7 @@ import torch
 from pipeline.config import Params
 from pipeline.embeddings import INDEX_FILE, STATISTICS_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
 from pipeline.encoder.clips import EncoderData, classify
-from pipeline.encoder.embed import embed_videos, standardize, statistics
+from pipeline.encoder.embed import Loaded, embed_videos, standardize, statistics
 from pipeline.encoder.recipes import base_encoder, property_classifier
 from pipeline.io import fingerprint, save_tensors, write_jsonl, write_table
 from pipeline.language.generate import GenerationSettings, answer
@@ -109,7 +109,7 @@ def make(where: Path, variant: Variant, *overrides: str) -> Made:
     write_table(data / "encoder" / "0" / "classifications.parquet", Classification, classified)
 
     encoder = classifier.encoder if variant.encoder is Encoder.FINETUNED else base_encoder(params.encoder)
-    raw, index = embed_videos(encoder, store, parts, batch_size=16, device=CPU)
+    raw, index = embed_videos(Loaded(encoder.eval(), store, CPU, 16), parts)
     known = statistics(raw, index, {a.video_id for a in parts if a.part is Part.TRAIN})
     folder = data / "embeddings" / f"{variant.encoder}-0"
     save_tensors(folder / TENSOR_FILE, {TENSOR: standardize(raw, known) if params.encoder.standardize else raw})

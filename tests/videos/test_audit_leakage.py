@@ -125,6 +125,27 @@ def test_sessions_are_told_apart_by_the_untouched_picture(seed: int) -> None:
     assert dict(zip((p.video_id for p in shuffled), sessions(shuffled), strict=True)) == names
 
 
+def test_more_videos_than_are_clustered_go_with_the_nearest(monkeypatch: pytest.MonkeyPatch) -> None:
+    found_videos, truth = three_sensors(videos=60)
+    whole = sessions(found_videos)
+    monkeypatch.setattr(leakage, "SAMPLE", 20)
+    assert sessions(found_videos) == whole
+    assert len(set(zip(truth, whole, strict=True))) == 3
+
+
+@pytest.mark.parametrize("block", [1, 2, 5])
+def test_copies_are_found_whatever_is_compared_at_a_time(
+    presses: list[tuple[Probe, Video]], monkeypatch: pytest.MonkeyPatch, block: int
+) -> None:
+    (first, _), *others = presses
+    twin = first.model_copy(update={"video_id": "lemon_9", "object_id": "lemon", "path": "lemon_9.avi"})
+    found = evidence([*(p for p, _ in others), twin, first], [v for _, v in presses], [])
+    whole = list(leakage._near_copies(found))
+    assert [f.item for f in whole[:-1]] == [first.path]
+    monkeypatch.setattr(leakage, "BLOCK", block)
+    assert list(leakage._near_copies(found)) == whole
+
+
 def test_drifting_brightness_is_one_session() -> None:
     rng = np.random.default_rng(2)
     look = rng.normal(90, 8, 144)

@@ -148,6 +148,18 @@ def test_a_picture_that_tells_the_label_is_a_warning(catalogue: Catalogue, monke
     assert quiet == of(leaks(coloured(catalogue, 0.0), {}, catalogue), check)
 
 
+def test_of_many_videos_a_sample_is_predicted(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(leakage, "PERMUTATIONS", 200)
+    monkeypatch.setattr(leakage, "SAMPLE", 50)
+    check = "predicted from the no-contact reference alone"
+    videos = coloured(catalogue, 1.0)
+    hardness, *_ = of(leaks(videos, {}, catalogue), check)
+    share = float(hardness.measured.partition(" ")[0]) / 100
+    assert len(videos) > 100
+    assert share * 50 == pytest.approx(round(share * 50), abs=0.05), "a share of fifty"
+    assert hardness.severity == WARNING
+
+
 def test_what_cannot_be_predicted_is_undefined() -> None:
     alike = "undefined: too few objects, classes or sessions"
     few = [f for f in leaks(probes(2, OBJECTS[:4]), {}, OTHER) if f.check.startswith("predicted")]

@@ -47,6 +47,7 @@ COURSE: dict[Form, dict[Form, float]] = {
 """The phases, and the share of each form among a phase's items: what came before is reviewed. A phase is called by the
 form of its exam."""
 PHASES = tuple(COURSE)
+LOWEST = 0.1
 KEPT = ("config.json", "README.md")
 """Files of the base that the taught model writes anew, beside the weights."""
 
@@ -100,6 +101,16 @@ class Course(Dataset[Encoded]):
         enough = getattr(config.pass_marks, phase)
         steps = (int(e["step"]) for e in self.log() if e["step"] > first and e.get(f"eval_{phase}_items", 0) >= enough)
         return min(steps, default=first + getattr(config.max_updates, phase))
+
+    def rate(self, step: int) -> float:
+        """Share of the learning rate after so many updates: it rises, stays, and falls to a tenth in the last phase.
+
+        What was learnt at a high rate settles while it falls (Hu et al. 2024, arXiv 2404.06395).
+        """
+        first = self.ended(PHASES[-2])
+        fallen = (step - first) / getattr(self.config.max_updates, PHASES[-1])
+        rise = (step + 1) / max(1, self.config.warmup)
+        return min(1.0, rise, 1 - (1 - LOWEST) * min(1.0, fallen))
 
     def exam(self, phase: Form) -> list[Encoded]:
         """Items that are never trained on, of one question; combinations of our properties are held out."""
@@ -178,6 +189,15 @@ class Teacher(TrainableTrainer):
         self.course = course
         course.log = lambda: self.state.log_history
 
+    def create_scheduler(
+        self, num_training_steps: int, optimizer: torch.optim.Optimizer | None = None
+    ) -> torch.optim.lr_scheduler.LRScheduler:
+        """The course's own."""
+        stepped = optimizer or self.optimizer
+        assert stepped is not None
+        self.lr_scheduler = torch.optim.lr_scheduler.LambdaLR(stepped, lambda step: self.course.rate(step))
+        return self.lr_scheduler
+
     def evaluate(self, *_: Any, **__: Any) -> dict[str, float]:
         """The exam of the phase that the training is in."""
         step, pupil = self.state.global_step, self.accelerator.unwrap_model(self.model)
@@ -231,8 +251,6 @@ def teach(
         seed,
         max_steps=longest(config),
         learning_rate=config.learning_rate,
-        lr_scheduler_type="constant_with_warmup",
-        warmup_steps=config.warmup,
         per_device_train_batch_size=config.micro_batch_size,
         per_device_eval_batch_size=config.micro_batch_size,
         gradient_accumulation_steps=config.batch_size // config.micro_batch_size,

@@ -24,6 +24,11 @@ nearest neighbours (average linkage)."""
 PERMUTATIONS = 2000
 FOLDS = 5
 RIDGE = 1.0
+BLOCK = 512
+"""Videos that are compared at a time with all others: a table of all pairs of 100,000 would take 80 GB."""
+SAMPLE = 5000
+"""Most videos that sessions are told apart by, and that labels are predicted on: the first takes memory and time by the
+square, the second by 2000 permutations. Of more, a sample is taken."""
 ALPHA = 0.1
 """Below this p value a prediction from nothing but the untouched sensor is a warning. Generous: a leak that is missed
 costs more than one that is looked into, and a few dozen objects give such a test little power."""
@@ -67,9 +72,6 @@ def sessions(probes: Sequence[Probe]) -> list[str]:
 
     The untouched picture carries the sensor's gel, dust and light. Its brightness is taken off, since that drifts.
     """
-    from scipy.cluster.hierarchy import fcluster, linkage
-    from scipy.spatial.distance import pdist, squareform
-
     names = [p.session for p in probes]
     groups: dict[tuple[float, int, int], list[int]] = defaultdict(list)
     for place, p in enumerate(probes):
@@ -79,12 +81,7 @@ def sessions(probes: Sequence[Probe]) -> list[str]:
         label = f"{fps:g} frames/s, {width}x{height}"
         pictures = np.array([probes[i].thumbnail for i in places]).reshape(len(places), -1, 3)
         pictures = (pictures - pictures.mean(1, keepdims=True)).reshape(len(places), -1)
-        clusters = np.ones(len(places), dtype=int)
-        if len(places) > 2:
-            distances = pdist(pictures) / np.sqrt(pictures.shape[1])
-            square = squareform(distances) + np.diag(np.full(len(places), np.inf))
-            usual = float(np.median(square.min(1)))
-            clusters = fcluster(linkage(distances, "average"), max(SPREAD * usual, 1e-9), "distance")
+        clusters = _clusters(pictures)
         # The largest cluster is A, so that names do not depend on the order of the videos.
         sizes = Counter(clusters.tolist())
         first = {c: min(probes[i].video_id for i, own in zip(places, clusters, strict=True) if own == c) for c in sizes}
@@ -92,6 +89,31 @@ def sessions(probes: Sequence[Probe]) -> list[str]:
         for i, cluster in zip(places, clusters, strict=True):
             names[i] = f"{label}, look {order.index(cluster) + 1}"
     return names
+
+
+def _clusters(pictures: np.ndarray) -> np.ndarray:
+    """A number for each picture (pictures x values), the same for those that look alike.
+
+    Of more than `SAMPLE` pictures a sample is clustered, and each other one goes with the nearest of it.
+    """
+    from scipy.cluster.hierarchy import fcluster, linkage
+    from scipy.spatial import cKDTree
+    from scipy.spatial.distance import pdist, squareform
+
+    if len(pictures) <= 2:
+        return np.ones(len(pictures), dtype=int)
+    some = pictures[_sampled(len(pictures))]
+    distances = pdist(some) / np.sqrt(some.shape[1])
+    square = squareform(distances)
+    np.fill_diagonal(square, np.inf)
+    usual = float(np.median(square.min(1)))
+    clusters: np.ndarray = fcluster(linkage(distances, "average"), max(SPREAD * usual, 1e-9), "distance")
+    return clusters if len(some) == len(pictures) else clusters[cKDTree(some).query(pictures)[1]]
+
+
+def _sampled(count: int) -> np.ndarray:
+    """At most `SAMPLE` places among so many, in order; at random, since videos in a list may come by turns."""
+    return np.sort(np.random.default_rng(0).permutation(count)[:SAMPLE])
 
 
 def predictability(
@@ -125,12 +147,11 @@ def predictability(
         test = fold[member] == number
         centre = scaled[~test].mean(0)
         inside, across = scaled[~test] - centre, scaled[test] - centre
-        weights = across @ inside.T @ np.linalg.inv(inside @ inside.T + RIDGE * np.eye(len(inside)))
         # A video's prediction is the mean of the training labels and what its likeness to training videos adds. Videos
-        # of an object share their label, so their weights can be added up before any label is looked at.
+        # of an object share their label, so what they add can be summed up before any label is looked at.
         owner = np.eye(len(names))[member[~test]]
-        share = owner.mean(0)
-        chances = weights @ owner + (1 - weights.sum(1, keepdims=True)) * share
+        ridge = inside.T @ inside + RIDGE * np.eye(inside.shape[1])
+        chances = across @ np.linalg.solve(ridge, inside.T @ owner) + owner.mean(0)
         scores = np.einsum("vn,onc->ovc", chances, classes, optimize=True)
         # Rounded, since sessions make classes exactly equally likely: the first then wins on every processor.
         right += (scores.round(9).argmax(2) == orders[:, member[test]]).sum(1)
@@ -173,21 +194,28 @@ def _near_copies(found: Evidence) -> Iterator[Finding]:
         yield _finding("near-duplicate", "all", nothing, f"at most {DUPLICATE}", Severity.INFO)
         return
     signatures = np.array([p.signature for p in shown])
-    alike = np.triu(signatures @ signatures.T, 1)
     same = {v.video_id: v.sha256 for v in found.videos}
-    for i, j in np.argwhere(alike > DUPLICATE).tolist():
-        one, other = shown[i], shown[j]
-        if same.get(one.video_id) != same.get(other.video_id):
-            crosses = _crosses(found, one.video_id, other.video_id)
-            measured = f"contact correlates at {alike[i, j]:.3f}"
-            if one.object_id == other.object_id and not crosses:
-                # One object pressed twice in the same way looks alike, and leaks nothing.
-                twice = f"{measured} with {one.path}, the same object"
-                yield _finding("near-duplicate", other.path, twice, "different videos", Severity.INFO)
-            else:
-                yield _pair("near-duplicate", other.path, one.path, measured, crosses)
-    measured = f"closest pair of {len(shown)} videos in contact correlates at {alike.max():.3f}"
+    closest = 0.0
+    for start in range(0, len(shown), BLOCK):
+        alike = np.triu(signatures[start : start + BLOCK] @ signatures[start:].T, 1)
+        closest = max(closest, float(alike.max()))
+        for i, j in np.argwhere(alike > DUPLICATE).tolist():
+            yield from _near_copy(found, shown[start + i], shown[start + j], alike[i, j], same)
+    measured = f"closest pair of {len(shown)} videos in contact correlates at {closest:.3f}"
     yield _finding("near-duplicate", "all", measured, f"at most {DUPLICATE}", Severity.INFO)
+
+
+def _near_copy(found: Evidence, one: Probe, other: Probe, alike: float, same: Mapping[str, str]) -> Iterator[Finding]:
+    if same.get(one.video_id) == same.get(other.video_id):
+        return  # `_copies` names them.
+    crosses = _crosses(found, one.video_id, other.video_id)
+    measured = f"contact correlates at {alike:.3f}"
+    if one.object_id == other.object_id and not crosses:
+        # One object pressed twice in the same way looks alike, and leaks nothing.
+        twice = f"{measured} with {one.path}, the same object"
+        yield _finding("near-duplicate", other.path, twice, "different videos", Severity.INFO)
+    else:
+        yield _pair("near-duplicate", other.path, one.path, measured, crosses)
 
 
 def _crosses(found: Evidence, one: str, other: str) -> bool:
@@ -229,11 +257,12 @@ def _shares(name: str, place: int, objects: set[str], catalogue: Catalogue) -> s
 
 def _untouched_predictions(found: Evidence, names: Sequence[str], catalogue: Catalogue, seed: int) -> Iterator[Finding]:
     """Whether the untouched sensor, or the session alone, tells the property of an object never seen."""
-    objects = [p.object_id for p in found.probes]
-    distinct = sorted(set(names))
+    chosen = _sampled(len(found.probes)).tolist()
+    objects = [found.probes[i].object_id for i in chosen]
+    distinct = sorted({names[i] for i in chosen})
     inputs = {
-        "no-contact reference": np.array([p.thumbnail for p in found.probes]),
-        "session": np.eye(len(distinct))[[distinct.index(n) for n in names]],
+        "no-contact reference": np.array([found.probes[i].thumbnail for i in chosen]),
+        "session": np.eye(len(distinct))[[distinct.index(names[i]) for i in chosen]],
     }
     for place, prop in enumerate(catalogue.properties):
         labels = [catalogue.labels(o)[place] for o in objects]
