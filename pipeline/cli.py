@@ -234,6 +234,8 @@ def ask(
 
     from pipeline.use.ask import Chat, answer_once, lines_of_terminal
 
+    if Path(question).is_file():
+        raise UserError(f"{question}: is a file; write the question before it, with {{tactile}} once for each video")
     asked = _load(model, base, device)
 
     def say(text: str) -> None:
@@ -251,7 +253,7 @@ def ask(
 
 @app.command()
 def describe(
-    folder: Annotated[Path, typer.Argument(help="Folder with videos.")],
+    folder: Annotated[Path, typer.Argument(help="A video, or a folder with videos.")],
     csv: Annotated[Path, typer.Option(help="File to write; a second call goes on in it.")],
     model: Annotated[Path | None, MODEL] = None,
     base: Annotated[Path | None, BASE] = None,
@@ -301,7 +303,7 @@ def demo(
     folder: Annotated[Path | None, typer.Argument(help="A trained model; by default the full system's.")] = None,
     base: Annotated[Path | None, BASE] = None,
     device: Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")] = "auto",
-    catalogue: Annotated[Path, CATALOGUE] = Path("pipeline/physiclear"),
+    catalogue: Annotated[Path, CATALOGUE] = Path(__file__).parent / "physiclear",
     port: Annotated[int, typer.Option(help="Of 127.0.0.1.")] = 7860,
 ) -> None:
     """Show a page to drop videos on: what the model sees, what it takes them for, and a chat. Nothing leaves."""

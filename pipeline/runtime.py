@@ -129,13 +129,19 @@ class LogLines:
             self._tenth, self._said = tenth, now
             left = (now - self._started) * (self.total - done) / max(1, done - self.after)
             note = f", {note}" if note else ""
-            print(f"{self.label}: {self.unit} {done} of {self.total}{note}, {left:.0f} s left", flush=True)
+            said = f"{self.label}: {self.unit} {done} of {self.total}{note}, {left:.0f} s left"
+            print(said, file=sys.stderr, flush=True)
 
 
 @contextmanager
 def progress(total: int, label: str, unit: str) -> Iterator[Callable[[], object]]:
-    """Give a function to be called once a finished unit: a bar with what is left at a terminal, else `LogLines`."""
-    if sys.stderr.isatty():
+    """Give a function to be called once a finished unit: a bar with what is left at a terminal, else `LogLines`.
+
+    What has no label shows nothing.
+    """
+    if not label:
+        yield lambda: None
+    elif sys.stderr.isatty():
         from tqdm import tqdm
 
         with tqdm(total=total, desc=label, unit=unit) as bar:

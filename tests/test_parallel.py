@@ -80,9 +80,8 @@ def main():
     torch.set_num_threads(1)
     made = make(Path.cwd(), Variant(Encoder.FINETUNED, Lora.WITH, Opd.ALL, 0))
     params, data = made.params, Path("data")
-    encoder = EncoderSource(
-        params.encoder, "cpu", data / "frames", Path(params.data.catalogue), data / "encoder" / "0" / "encoder.safetensors"
-    )
+    state, catalogue = data / "encoder" / "0" / "encoder.safetensors", Path(params.data.catalogue)
+    encoder = EncoderSource(params.encoder, "cpu", data / "frames", catalogue, state)
     parts = read_table(data / "splits" / "0.parquet", Assignment)
     here = embed_videos(encoder(), parts, encoder)
     source = generate.ModelSource(data / "models" / "with" / "finetuned-all-0", "llama", "float32", "none", "cpu")

@@ -80,14 +80,19 @@ def embed_videos(
         UserError: naming the video, where an embedding is not finite.
     """
     used = [a for a in assignments if a.part != Part.UNUSED]
-    blocks = [torch.from_numpy(b) for b in run_with(loaded, source, _embed_video, used, "embed", "video")]
     index: list[Embedding] = []
     for assignment in used:
         frames = [loaded.store.index[row].frame_index for row in loaded.store.rows(assignment.video_id)]
         for flip in _flips(assignment):
             for frame in frames:
                 index.append(Embedding(video_id=assignment.video_id, frame_index=frame, flip=flip, row=len(index)))
-    return torch.cat(blocks), index
+    embeddings, row = torch.empty(0), 0
+    for block in run_with(loaded, source, _embed_video, used, "embed", "video"):
+        if not row:
+            embeddings = torch.empty(len(index), block.shape[1])
+        embeddings[row : row + len(block)] = torch.from_numpy(block)
+        row += len(block)
+    return embeddings, index
 
 
 def _flips(assignment: Assignment) -> Sequence[Flip]:

@@ -74,12 +74,10 @@ class Chat:
         say: Shows a piece of text; no line end is added.
     """
 
-    def __init__(self, model: Octopi, say: Callable[[str], object], videos: Iterable[str] = ()) -> None:
+    def __init__(self, model: Octopi, say: Callable[[str], object]) -> None:
         self.model, self.say = model, say
         self.history: list[Exchange] = []
         self.waiting: list[Video] = []
-        for video in videos:
-            self.add(video)
 
     def run(self, lines: Iterable[str]) -> None:
         """Answer line by line; what is wrong is said, and the conversation goes on."""
@@ -136,7 +134,7 @@ class Chat:
 
 
 def describe_folder(model: Octopi, folder: Path, out: Path) -> tuple[int, int]:
-    """Describe every video of a folder and its subfolders in a CSV file, a row each; a second call goes on.
+    """Describe a video, or every one of a folder and its subfolders, in a CSV file, a row each; a second call goes on.
 
     Returns:
         How many rows the file has, and how many of them are videos that could not be described (column `error`).
@@ -144,11 +142,14 @@ def describe_folder(model: Octopi, folder: Path, out: Path) -> tuple[int, int]:
     Raises:
         UserError: for a folder without videos, or a file that another model or something else wrote.
     """
-    files = sorted(f for f in folder.rglob("*") if f.suffix.lower() in SUFFIXES and f.is_file())
+    if folder.is_file():
+        files, folder = [folder], folder.parent
+    else:
+        files = sorted(f for f in folder.rglob("*") if f.suffix.lower() in SUFFIXES and f.is_file())
     if not files:
         raise UserError(f"{folder}: holds no video ({', '.join(SUFFIXES)}); name another folder")
     columns = _columns(model)
-    done = _done(out, columns, str(model.card["variant"]))
+    done = _done(out, columns, model.config.name)
     rest = [f for f in files if f.relative_to(folder).as_posix() not in done]
     failed = sum(bool(error) for error in done.values())
     if not out.is_file() or not done:
@@ -170,7 +171,7 @@ def _columns(model: Octopi) -> list[str]:
     return ["file", *levels, *probabilities, "sentence", "frames", "notes", "error", "model"]
 
 
-def _done(out: Path, columns: Sequence[str], variant: str) -> dict[str, str]:
+def _done(out: Path, columns: Sequence[str], name: str) -> dict[str, str]:
     """Files that a CSV has already, each with its error; what a kill left of a last line is cut off."""
     if not out.is_file():
         return {}
@@ -178,8 +179,8 @@ def _done(out: Path, columns: Sequence[str], variant: str) -> dict[str, str]:
     whole = text[: text.rfind("\n") + 1]
     rows = list(csv.DictReader(io.StringIO(whole)))
     header = next(csv.reader(io.StringIO(whole)), [])
-    if (whole and header != columns) or any(row["model"] != variant for row in rows):
-        raise UserError(f"{out}: is no description by {variant}; name another file with --csv")
+    if (whole and header != columns) or any(row["model"] != name for row in rows):
+        raise UserError(f"{out}: is no description by {name}; name another file with --csv")
     if whole != text:
         write_text(out, whole)
     return {row["file"]: row["error"] for row in rows}
@@ -189,7 +190,7 @@ def _describe(model: Octopi, folder: Path, files: Sequence[Path]) -> list[dict[s
     rows: list[dict[str, object]] = []
     good = []
     for file in files:
-        row: dict[str, object] = {"file": file.relative_to(folder).as_posix(), "model": model.card["variant"]}
+        row: dict[str, object] = {"file": file.relative_to(folder).as_posix(), "model": model.config.name}
         rows.append(row)
         try:
             model.look(file)

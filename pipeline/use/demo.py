@@ -106,7 +106,7 @@ class Room:
         Raises:
             UserError: if it is no video that the model can take.
         """
-        touch, said = self.model.look(video), self.model.describe(video)
+        touch, said = self.model.look(video), self.model.describe(video, sentence=False)
         key = uuid4().hex
         self.videos[key] = video
         while len(self.videos) > MOST_TOUCHES:

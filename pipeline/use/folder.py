@@ -24,7 +24,7 @@ from pydantic import BaseModel, ValidationError
 
 from pipeline.config import EncoderConfig, FramesConfig, LanguageConfig
 from pipeline.errors import UserError
-from pipeline.io import read_json
+from pipeline.io import fingerprint, read_json
 from pipeline.language.chat import render
 from pipeline.records import Encoder, Opd, Record, Turn
 from pipeline.videos.catalogue import Catalogue
@@ -82,6 +82,11 @@ class ModelConfig(Record):
     """sha256 of every other file by its path."""
     versions: dict[str, str]
     """Of the libraries that it was made with."""
+
+    @property
+    def name(self) -> str:
+        """The variant and a hash of all that answers depend on: two trainings of one variant have two names."""
+        return f"{self.variant} {fingerprint(self.model_copy(update={'scores': {}, 'versions': {}}))}"
 
 
 def sha256(file: Path) -> str:

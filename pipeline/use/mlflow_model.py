@@ -6,6 +6,7 @@ a server can read none of its files.
 
 from __future__ import annotations
 
+import logging
 import os
 from typing import Any
 
@@ -18,8 +19,9 @@ from mlflow.pyfunc import PythonModel
 from pipeline.errors import UserError
 from pipeline.use.media import PLACE, Gate, Limits, Refused, from_base64
 
-ROWS = 64
-"""Questions of one call."""
+logger = logging.getLogger(__name__)
+ROWS, CHARACTERS = 64, 20_000
+"""Questions of one call, and the length of each."""
 
 
 class TouchModel(PythonModel):
@@ -56,10 +58,16 @@ class TouchModel(PythonModel):
                 answers.append(self._answer(question, list(videos)))
             except UserError as error:
                 raise _refusal(PLACE.sub(r"video \1", f"row {number}: {error}")) from None
+            except Exception:
+                # MLflow would put the traceback into the response.
+                logger.exception("row %d", number)
+                raise MlflowException(f"row {number}: the model broke; the server's log says why") from None
         return pd.DataFrame({"answer": answers})
 
     def _answer(self, question: str, videos: list[str]) -> str:
         limits = self.gate.limits
+        if not isinstance(question, str) or len(question) > CHARACTERS:
+            raise Refused(f"its question is no text of at most {CHARACTERS} characters; write one", 422)
         if sum(map(len, videos)) > limits.body_bytes:
             raise Refused(f"its videos are larger than {limits.body_bytes} bytes; send fewer or shorter ones", 413)
         data = [from_base64(text, f"video {i}") for i, text in enumerate(videos, 1)]

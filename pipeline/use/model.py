@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import difflib
+import os
 import random
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
 import torch
 
 from pipeline.errors import UserError
@@ -28,7 +30,7 @@ from pipeline.tasks import opd, pc, pom, psr, pss
 from pipeline.tasks.base import LETTERS
 from pipeline.use.folder import LANGUAGE_DIR, ModelConfig, chat_sample, find_base, read_folder
 from pipeline.use.results import Choice, Comparison, Description, Exchange, Matching, Ranking, Touch, Video
-from pipeline.use.touch import TactileSense
+from pipeline.use.touch import Felt, TactileSense
 from pipeline.videos.catalogue import Catalogue, Property
 
 
@@ -95,7 +97,7 @@ class Octopi:
     def ask(
         self,
         question: str,
-        videos: Sequence[Video] = (),
+        videos: Video | Sequence[Video] = (),
         *,
         history: Sequence[Exchange] = (),
         max_new_tokens: int | None = None,
@@ -104,30 +106,32 @@ class Octopi:
 
         Args:
             question: With "{tactile}" once for each video, in their order.
-            videos: Files, or arrays of uint8, frames x height x width x RGB.
+            videos: Files, or arrays of uint8, frames x height x width x RGB; one, or several in a list.
             history: Earlier exchanges of the conversation.
             max_new_tokens: Of the answer; by default those of the evaluation.
 
         Raises:
             UserError: for a question that does not fit its videos or is too long, or a video that cannot be used.
         """
-        return self._reply([(*history, Exchange(question, tuple(videos), ""))], max_new_tokens)[0]
+        return self._reply([(*history, Exchange(question, _listed(videos), ""))], max_new_tokens)[0]
 
     def stream(
         self,
         question: str,
-        videos: Sequence[Video] = (),
+        videos: Video | Sequence[Video] = (),
         *,
         history: Sequence[Exchange] = (),
         max_new_tokens: int | None = None,
     ) -> Iterator[str]:
         """As `ask`, in pieces of text as they come. Bad input is refused here, before the first piece is asked for."""
-        prompt, features = self._prompt((*history, Exchange(question, tuple(videos), "")))
+        prompt, features = self._prompt((*history, Exchange(question, _listed(videos), "")))
         return stream(self.llm, prompt, features, self._settings(max_new_tokens))
 
-    def ask_all(self, asked: Sequence[tuple[str, Sequence[Video]]], *, max_new_tokens: int | None = None) -> list[str]:
+    def ask_all(
+        self, asked: Sequence[tuple[str, Video | Sequence[Video]]], *, max_new_tokens: int | None = None
+    ) -> list[str]:
         """As `ask`, of many questions in one batch."""
-        return self._reply([(Exchange(question, tuple(videos), ""),) for question, videos in asked], max_new_tokens)
+        return self._reply([(Exchange(question, _listed(videos), ""),) for question, videos in asked], max_new_tokens)
 
     def look(self, video: Video) -> Touch:
         """What the model sees of a video.
@@ -140,29 +144,41 @@ class Octopi:
 
     # ---- the tasks ----
 
-    def describe(self, video: Video) -> Description:
-        """The classes of a video's properties, with their probabilities, and the model's own sentence."""
-        return self.describe_all([video])[0]
+    def describe(self, video: Video, *, sentence: bool = True) -> Description:
+        """The classes of a video's properties, with their probabilities, and the model's own sentence.
 
-    def describe_all(self, videos: Sequence[Video]) -> list[Description]:
+        Args:
+            sentence: False leaves it empty, which takes a fraction of the time.
+        """
+        return self.describe_all([video], sentence=sentence)[0]
+
+    def describe_all(self, videos: Sequence[Video], *, sentence: bool = True) -> list[Description]:
         """As `describe`, of many videos in one batch. A video without contact is described with a note."""
-        if self.config.opd is Opd.NONE:
+        if self.config.opd is Opd.NONE or not sentence:
             sentences = [""] * len(videos)
         else:
             question = opd.TEMPLATES[0]
             sentences = self._reply([(Exchange(question, (v,), ""),) for v in videos], None, untouched=True)
-        return [self._described(video, sentence) for video, sentence in zip(videos, sentences, strict=True)]
+        return [self._described(video, said) for video, said in zip(videos, sentences, strict=True)]
 
     def compare(self, a: Video, b: Video, property: str) -> Comparison:
         """Whether the first video is more of a property than the second, in the wording of training."""
         known = self._property(property)
         question = pc.asked(pc.TEMPLATES[0], known.more, known.spoken)[self.config.opd]
         answer = self.ask(question, [a, b])
-        return Comparison(question=question, answer=answer, choice=pc.read(answer))
+        return Comparison(question=question, answer=answer, choice=pc.read(answer), notes=self._notes([a, b]))
 
     def rank(self, videos: Sequence[Video], property: str) -> Ranking:
-        """Videos by a property, least first: by the heads, and the model's own answer for two or three."""
+        """Videos by a property, least first: by the heads, and the model's own answer for two or three.
+
+        Raises:
+            UserError: for fewer than two videos, or one in which nothing is touched.
+        """
+        if len(videos) < 2:
+            raise UserError(f"{len(videos)} videos: two or more can be ranked")
         known = self._property(property)
+        for video in videos:
+            self._touched(video)
         place = self.properties.index(known.name)
         judged = [self.sense.judge(video).probabilities[place] for video in videos]
         expected = [sum(level * p for level, p in enumerate(probabilities)) for probabilities in judged]
@@ -176,12 +192,21 @@ class Octopi:
             answer = compared.answer
             most = {"yes": 0, "no": 1}.get(compared.choice or "")
         order = sorted(range(len(videos)), key=expected.__getitem__)
-        return Ranking(property=known.name, order=tuple(order), expected=tuple(expected), answer=answer, most=most)
+        return Ranking(
+            property=known.name,
+            order=tuple(order),
+            expected=tuple(expected),
+            answer=answer,
+            most=most,
+            notes=self._notes(videos),
+        )
 
     def match(self, videos: Sequence[Video], names: Sequence[str]) -> Matching:
         """Which of three videos is of which of three objects of the catalogue."""
         if len(videos) != 3 or len(names) != 3:
             raise UserError(f"{len(videos)} videos and {len(names)} names: three of each can be matched")
+        if len({name.lower() for name in names}) < 3:
+            raise UserError(f"{', '.join(names)}: a name is given twice; name three objects")
         ids = {o.name.lower(): i for i, o in self.catalogue.objects.items()}
         for name in names:
             if name.lower() not in ids:
@@ -195,7 +220,7 @@ class Octopi:
         answer = self.ask(question, videos)
         found = pom.read(answer, listed)
         given = None if found is None else tuple(listed[found[letter]] for letter in LETTERS)
-        return Matching(question=question, answer=answer, names=given)
+        return Matching(question=question, answer=answer, names=given, notes=self._notes(videos))
 
     def scenario(self, question: str, videos: Sequence[Video]) -> Choice:
         """Which of two videos suits a situation better, described first where the variant describes."""
@@ -208,7 +233,7 @@ class Octopi:
             history.append(Exchange(turn, shown, self.ask(turn, shown, history=history)))
         letter = psr.read(history[-1].answer)
         place = None if letter is None else LETTERS.index(letter)
-        return Choice(question=question, answer=history[-1].answer, choice=place)
+        return Choice(question=question, answer=history[-1].answer, choice=place, notes=self._notes(videos))
 
     # ---- within ----
 
@@ -227,7 +252,7 @@ class Octopi:
     ) -> list[str]:
         asked = [self._prompt(conversation, untouched=untouched) for conversation in conversations]
         prompts, features = [prompt for prompt, _ in asked], [found for _, found in asked]
-        return [said.text for said in reply(self.llm, prompts, features, self._settings(max_new_tokens))]
+        return [said.text for said in reply(self.llm, prompts, features, self._settings(max_new_tokens), label="")]
 
     def _prompt(
         self, conversation: Sequence[Exchange], *, untouched: bool = False
@@ -245,11 +270,20 @@ class Octopi:
             )
         features = [torch.zeros(0, self.llm.octopi_config.tactile_dim)]
         for video in (v for exchange in conversation for v in exchange.videos):
-            felt = self.sense.feel(video)
-            if not (felt.seen.felt or untouched):
-                raise UserError(f"{felt.seen.name}: {felt.notes[0]}; record the sensor being pressed")
+            felt = self.sense.feel(video) if untouched else self._touched(video)
             features.append(felt.features)
         return prompt, torch.cat(features)
+
+    def _touched(self, video: Video) -> Felt:
+        felt = self.sense.feel(video)
+        if not felt.seen.felt:
+            raise UserError(f"{felt.seen.name}: {felt.notes[0]}; record the sensor being pressed")
+        return felt
+
+    def _notes(self, videos: Sequence[Video]) -> tuple[str, ...]:
+        """What is to be doubted of each video, behind its name."""
+        found = [self.sense.feel(video) for video in videos]
+        return tuple(f"{felt.seen.name}: {note}" for felt in found for note in felt.notes)
 
     def _described(self, video: Video, sentence: str) -> Description:
         felt, judged = self.sense.feel(video), self.sense.judge(video)
@@ -269,6 +303,12 @@ class Octopi:
                 return known
         hint = _hint(name, self.properties)
         raise UserError(f"{name}: no property of this model{hint}; it knows {', '.join(self.properties)}")
+
+
+def _listed(videos: Video | Sequence[Video]) -> tuple[Video, ...]:
+    """One video as a list of one."""
+    alone = isinstance(videos, (str, os.PathLike)) or (isinstance(videos, np.ndarray) and videos.ndim == 4)
+    return (videos,) if alone else tuple(videos)  # type: ignore[arg-type, return-value]
 
 
 def check_question(question: str, videos: int) -> None:

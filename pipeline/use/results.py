@@ -66,6 +66,8 @@ class Comparison(Record):
     answer: str
     choice: Literal["yes", "no", "same"] | None
     """None where the answer cannot be read."""
+    notes: tuple[str, ...]
+    """What should make one doubt it, behind the name of a video."""
 
 
 class Ranking(Record):
@@ -80,6 +82,7 @@ class Ranking(Record):
     """What the model answers when asked which video is the most so; empty unless there are two or three videos."""
     most: int | None
     """The place that this answer names; None where it cannot be read."""
+    notes: tuple[str, ...]
 
 
 class Matching(Record):
@@ -89,6 +92,7 @@ class Matching(Record):
     answer: str
     names: tuple[str, ...] | None
     """The name that the answer gives each video, in the videos' order; None where it cannot be read."""
+    notes: tuple[str, ...]
 
 
 class Choice(Record):
@@ -98,3 +102,4 @@ class Choice(Record):
     answer: str
     choice: int | None
     """Place in the list of videos, from 0; None where the answer cannot be read."""
+    notes: tuple[str, ...]

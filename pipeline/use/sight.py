@@ -91,6 +91,8 @@ def _shown(name: str, found: Scan, frames: FramesConfig, subtracts: bool, quiet:
 def _as_file(video: Video) -> Iterator[Path]:
     """The file of a video; an array becomes a lossless one, so that both take the same way."""
     if not isinstance(video, np.ndarray):
+        if not isinstance(video, (str, os.PathLike)):
+            raise UserError(f"a {type(video).__name__} is no video; give a file, or an array of uint8")
         path = Path(video)
         # A pipe or a device is not opened: reading it may never end.
         if not path.exists() or not stat.S_ISREG(path.stat().st_mode):

@@ -132,6 +132,6 @@ def _name(video: Video) -> str:
         return f"{video.shape} {video.dtype} {sha256(np.ascontiguousarray(video).data).hexdigest()}"
     try:
         status = Path(video).stat()
-    except OSError:
+    except (OSError, TypeError, ValueError):
         return str(video)
     return f"{Path(video).resolve()} {status.st_size} {status.st_mtime_ns} {status.st_ino}"

@@ -56,7 +56,7 @@ class FakeOctopi:
             notes=() if found.probe.contact > 0.5 else ("Nothing touches the sensor in this video.",),
         )
 
-    def describe(self, video: Video) -> Description:
+    def describe(self, video: Video, *, sentence: bool = True) -> Description:
         share = {p: {level: 1 / 2 ** (i + 1) for i, level in enumerate(names)} for p, names in LEVELS.items()}
         levels = {p: names[0] for p, names in LEVELS.items()}
         return Description(levels=levels, probabilities=share, sentence="It is soft.", frames=(1, 2), notes=())
@@ -83,4 +83,6 @@ class FakeOctopi:
         from pipeline.use.results import Ranking
 
         places = tuple(range(len(videos)))
-        return Ranking(property=property, order=places, expected=tuple(map(float, places)), answer="", most=None)
+        return Ranking(
+            property=property, order=places, expected=tuple(map(float, places)), answer="", most=None, notes=()
+        )

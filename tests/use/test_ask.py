@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from pipeline import runtime
 from pipeline.cli import app, main
 from pipeline.errors import UserError
 from pipeline.use import ask as asking
@@ -34,6 +35,29 @@ def test_one_question_for_machines(made: Made, octopi: Octopi, files: list[Path]
     assert found["videos"][0]["frames"] == list(octopi.look(files[0]).numbers)
 
 
+def test_progress_is_no_part_of_an_answer(
+    made: Made, files: list[Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """However long an answer takes."""
+    monkeypatch.setattr(runtime, "QUICK", 0)
+    monkeypatch.setattr(sys, "argv", ["octopi", "ask", QUESTION, str(files[0]), "--model", str(made.folder), "--json"])
+    with pytest.raises(SystemExit):
+        main()
+    said = capsys.readouterr()
+    assert json.loads(said.out)["answer"]
+    assert said.err == ""
+    assert list(runtime.track(["a"], "work", "piece")) == ["a"]
+    said = capsys.readouterr()
+    assert (said.out, said.err) == ("", "work: piece 1 of 1, 0 s left\n")
+
+
+def test_a_chat_from_standard_input(made: Made, octopi: Octopi, files: list[Path]) -> None:
+    typed = f"/add {files[0]}\n{QUESTION}\n/quit\n"
+    said = CliRunner().invoke(app, ["ask", "--model", str(made.folder), "--device", "cpu"], input=typed)
+    assert said.exit_code == 0, said.output
+    assert octopi.ask(QUESTION, files[:1]) in said.stdout
+
+
 def test_what_is_wrong_is_one_line(
     made: Made, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -41,6 +65,7 @@ def test_what_is_wrong_is_one_line(
         (["--model", str(made.folder / "nothing")], "holds no config.json"),
         (["--model", str(made.folder), "--device", "gpu"], "allowed: auto, cpu, cuda, mps"),
         (["--model", str(made.folder), QUESTION, "none.avi"], "none.avi: no such file"),
+        ([str(made.folder / "config.json")], "is a file; write the question before it"),
     ):
         monkeypatch.setattr(sys, "argv", ["octopi", "ask", *arguments])
         with pytest.raises(SystemExit) as ended:
@@ -116,6 +141,20 @@ def test_a_folder_is_described(octopi: Octopi, folder: Path, files: list[Path], 
         assert row["error"] == ""
 
 
+def test_a_folder_is_described_and_a_model_copied_by_command(
+    made: Made, octopi: Octopi, folder: Path, files: list[Path], tmp_path: Path
+) -> None:
+    out, model = tmp_path / "out.csv", ["--model", str(made.folder), "--device", "cpu"]
+    said = CliRunner().invoke(app, ["describe", str(folder), "--csv", str(out), *model])
+    assert said.exit_code == 0, said.output
+    assert f"{out}: 4 videos, 1 of them not described" in said.stdout
+    alone = tmp_path / "alone.csv"
+    assert CliRunner().invoke(app, ["describe", str(files[0]), "--csv", str(alone), *model]).exit_code == 0
+    assert [row["file"] for row in rows(alone)] == [files[0].name]
+    assert CliRunner().invoke(app, ["export", str(made.folder), str(tmp_path / "copy"), "--with-base"]).exit_code == 0
+    assert Octopi.from_pretrained(tmp_path / "copy", device="cpu").ask("Why?") == octopi.ask("Why?")
+
+
 def test_a_killed_description_goes_on(
     octopi: Octopi, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -135,8 +174,17 @@ def test_a_killed_description_goes_on(
         assert len(looked) == 3 - sum(".avi" in line and "broken" not in line for line in text[:end].split("\n")[:-1])
 
 
-def test_anothers_table_is_left_alone(octopi: Octopi, folder: Path, tmp_path: Path) -> None:
+def test_anothers_table_is_left_alone(
+    octopi: Octopi, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out = tmp_path / "out.csv"
+    describe_folder(octopi, folder, out)
+    text, again = out.read_text(), octopi.config.model_copy(update={"files": {}})
+    with monkeypatch.context() as patch:
+        patch.setattr(octopi, "config", again)
+        with pytest.raises(UserError, match="is no description by finetuned-with-all-0"):
+            describe_folder(octopi, folder, out)
+    assert out.read_text() == text, "another training of the same variant"
     out.write_text("a,b\n1,2\n")
     with pytest.raises(UserError, match="name another file with --csv"):
         describe_folder(octopi, folder, out)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import runpy
 import shlex
 from pathlib import Path
 
@@ -49,6 +50,16 @@ def test_the_walk_of_a_new_sensor(tmp_path: Path) -> None:
     for prop in catalogue.properties:
         assert any(level in words for level in prop.levels), "answers speak the lab's words"
     assert "moderately hard" not in words
+
+
+def test_the_script_runs(made: Made, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    files = [str(made.videos / f"{name}_0.avi") for name in ("ice_block", "millet")]
+    monkeypatch.setattr("sys.argv", ["ask.py", str(made.folder), *files])
+    runpy.run_path(str(EXAMPLES / "ask.py"), run_name="__main__")
+    answer, *rest = capsys.readouterr().out.splitlines()
+    assert answer
+    assert [line for line in rest if not line.startswith(" ")] == files
+    assert sum("hardness: " in line for line in rest) == 2
 
 
 def test_the_notebook_runs(made: Made) -> None:

@@ -176,6 +176,18 @@ def test_over_http_as_mlflow_serves_it(loaded: Any, octopi: Octopi, files: list[
     bad = client.post("/invocations", json={"dataframe_records": [{**question, "videos": ["/etc/passwd"]}]})
     assert bad.status_code == 400
     assert "Traceback" not in bad.text
+    for wrong in (None, "a" * 20_001):
+        bad = client.post("/invocations", json={"dataframe_records": [{"question": wrong, "videos": []}]})
+        assert bad.status_code == 400
+        assert "no text of at most 20000 characters" in bad.text
+    with pytest.MonkeyPatch.context() as patch:
+        model = loaded.unwrap_python_model().model
+        patch.setattr(model, "ask", lambda *_: 1 / 0)
+        broken = client.post("/invocations", json={"dataframe_records": [question]})
+    assert broken.status_code == 500
+    assert "row 1: the model broke" in broken.text
+    assert "Traceback" not in broken.text
+    assert "ZeroDivision" not in broken.text
     assert client.post("/invocations", json={"dataframe_records": [question]}).status_code == 200
 
 

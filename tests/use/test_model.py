@@ -15,6 +15,7 @@ from pipeline.errors import UserError
 from pipeline.records import Encoder, Lora, Opd, Part, Question, Variant
 from pipeline.use.model import Octopi, check_question
 from pipeline.use.results import Exchange
+from pipeline.use.touch import TactileSense
 from pipeline.videos.decoding import decode
 from tests.conftest import moving_square, write_video
 from tests.use.shared import Made, make, replay
@@ -96,6 +97,22 @@ def test_a_batch_answers_as_one_by_one(octopi: Octopi, files: list[Path]) -> Non
     assert octopi.describe_all(files) == [octopi.describe(f) for f in files]
 
 
+def test_one_video_needs_no_list(octopi: Octopi, files: list[Path]) -> None:
+    said = octopi.ask("Describe {tactile}.", files[:1])
+    array = np.stack([frame[:, :, ::-1] for frame in decode(files[0])])
+    assert octopi.ask("Describe {tactile}.", files[0]) == octopi.ask("Describe {tactile}.", str(files[0])) == said
+    assert octopi.ask("Describe {tactile}.", array) == octopi.ask("Describe {tactile}.", [array])
+    for nothing in (None, 3, [files[0]]):
+        with pytest.raises(UserError, match="is no video; give a file"):
+            octopi.ask("Describe {tactile}.", [nothing])  # type: ignore[list-item]
+
+
+def test_the_sentence_can_be_left_out(octopi: Octopi, files: list[Path]) -> None:
+    whole, short = octopi.describe(files[0]), octopi.describe(files[0], sentence=False)
+    assert whole.sentence
+    assert short == whole.model_copy(update={"sentence": ""})
+
+
 def test_history_changes_the_answer_and_is_the_callers(octopi: Octopi, files: list[Path]) -> None:
     first = octopi.ask("Describe {tactile}.", files[:1])
     history = [Exchange("Describe {tactile}.", tuple(files[:1]), first)]
@@ -128,10 +145,11 @@ def test_look_shows_where_it_touches(octopi: Octopi) -> None:
 
 
 def test_typed_tasks(octopi: Octopi, files: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    names = [octopi.catalogue.objects[o].name for o in ("rug", "baseball", "millet")]
     said = {
         "Is the object": "First object: it. Conclusion: No, the second object is harder.",
         "Given three tactile videos": "Conclusion: b) is the hardest.",
-        "match": "Conclusion: a) is Rug, b) is Millet and c) is Baseball.",
+        "match": f"Conclusion: a) is {names[0]}, b) is {names[2]} and c) is {names[1]}.",
         "Given two": "none",
         "Describe these two": "a) soft. b) hard.",
         "I must sleep": "The most suitable object is b), because of its hardness.",
@@ -151,9 +169,8 @@ def test_typed_tasks(octopi: Octopi, files: list[Path], monkeypatch: pytest.Monk
     assert [ranked.expected[i] for i in ranked.order] == sorted(ranked.expected)
     assert octopi.rank(files[:2], "hardness").most == 1
     assert octopi.rank([*files, files[0]], "hardness").answer == ""
-    names = [octopi.catalogue.objects[o].name for o in ("rug", "baseball", "millet")]
     matched = octopi.match(files, names)
-    assert matched.names is None or sorted(matched.names) == sorted(names)
+    assert matched.names == (names[0], names[2], names[1])
     assert all(name in matched.question for name in names)
     chosen = octopi.scenario("I must sleep.", files[:2])
     assert chosen.choice == 1
@@ -223,6 +240,9 @@ def test_videos_that_cannot_be_used_are_refused(octopi: Octopi, tmp_path: Path, 
             octopi.ask("Describe {tactile}.", [video])
         assert str(video) in str(caught.value)
         assert "\n" not in str(caught.value)
+        if video != tmp_path:
+            with pytest.raises(UserError, match=message):
+                octopi.rank([*files, video], "hardness")
     described = octopi.describe(still)
     assert any("nothing touches the sensor" in note for note in described.notes)
 
@@ -248,6 +268,10 @@ def test_unknown_words_are_refused(octopi: Octopi, files: list[Path]) -> None:
         octopi.match(files, ["rug", "millet", "a unicorn"])
     with pytest.raises(UserError, match="three of each"):
         octopi.match(files[:2], ["rug", "millet"])
+    with pytest.raises(UserError, match="a name is given twice"):
+        octopi.match(files, ["a rug", "A rug", "millet"])
+    with pytest.raises(UserError, match="1 videos: two or more can be ranked"):
+        octopi.rank(files[:1], "hardness")
     with pytest.raises(UserError, match="chooses between two"):
         octopi.scenario("I must sleep.", files)
 
@@ -257,6 +281,22 @@ def test_a_changed_file_is_felt_anew(octopi: Octopi, tmp_path: Path) -> None:
     before = octopi.look(file)
     write_video(file, moving_square(21, 77))
     assert not np.array_equal(before.frames, octopi.look(file).frames)
+
+
+def test_a_little_touch_and_a_damaged_video_are_noted(
+    made: Made, octopi: Octopi, files: list[Path], tmp_path: Path
+) -> None:
+    whole = files[0].read_bytes()
+    (cut := tmp_path / "cut.avi").write_bytes(whole[: 2 * len(whole) // 3])
+    assert any("damaged: only" in note for note in octopi.look(cut).notes)
+    assert octopi.look(files[0]).notes == ()
+    strength = octopi.look(files[0]).strength
+    quiet = octopi.config.model_copy(update={"quiet": 0.8 * strength})
+    weak = TactileSense(made.folder, quiet, octopi.catalogue, octopi.sense.device)
+    assert [n.partition(":")[0] for n in weak.feel(files[0]).notes] == ["little touches the sensor"]
+    compared = octopi.compare(files[0], cut, "hardness")
+    assert [n.partition(": ")[0] for n in compared.notes] == [str(cut)]
+    assert "damaged" in compared.notes[0]
 
 
 def test_what_is_unlike_training_is_noted(octopi: Octopi, files: list[Path]) -> None:

@@ -108,7 +108,7 @@ class Course(Dataset[Encoded]):
         What was learnt at a high rate settles while it falls (Hu et al. 2024, arXiv 2404.06395).
         """
         first = self.ended(PHASES[-2])
-        fallen = (step - first) / getattr(self.config.max_updates, PHASES[-1])
+        fallen = (step - first) / float(getattr(self.config.max_updates, PHASES[-1]))
         rise = (step + 1) / max(1, self.config.warmup)
         return min(1.0, rise, 1 - (1 - LOWEST) * min(1.0, fallen))
 
