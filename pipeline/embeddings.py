@@ -72,7 +72,8 @@ class EmbeddingStore:
         self.tensor = load_tensors(folder / TENSOR_FILE)[TENSOR]
         """float32, rows x dim."""
         self._rows: dict[tuple[str, str], list[int]] = defaultdict(list)
-        finite = self.tensor.isfinite().all(1).tolist()
+        # A part at a time, as the answers for all values take a quarter of the room of the values.
+        finite = [ok for part in self.tensor.split(2**16) for ok in part.isfinite().all(1).tolist()]
         for entry in read_table(folder / INDEX_FILE, Embedding):
             if not finite[entry.row]:
                 raise UserError(

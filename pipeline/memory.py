@@ -83,7 +83,11 @@ def count(params: Params) -> tuple[list[Use], list[str]]:
         if not encoder.is_dir():
             notes.append(f"{encoder} is not there: counted with the shapes that are published for {encoder.name}.")
         uses += encoder_uses(params, tower, sum(len(p.levels) for p in catalogue.properties))
-    llama, language = Llama.read(Path(params.language.weights)), Path(params.language.weights)
+    language = Path(params.language.weights)
+    if params.teach.base:
+        notes.append(f"teach is not counted; what it makes of {params.teach.base} has the same shapes.")
+        language = language if language.is_dir() else Path(params.teach.base)
+    llama = Llama.read(language)
     if llama is None:
         notes.append(f"{language}: no Llama whose shapes are known; the language model's stages are not counted.")
         return uses, notes

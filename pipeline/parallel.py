@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 
 from pipeline.config import Backend
 from pipeline.errors import UserError
-from pipeline.runtime import cores, progress, track
+from pipeline.runtime import DeviceName, cores, progress, track
 
 J = TypeVar("J")
 M = TypeVar("M")
@@ -95,7 +95,8 @@ def run_with(
 
     Args:
         model: Used in this process.
-        source: Loads the same model in a worker; equal sources must have equal hashes. Without one all is done here.
+        source: Loads the same model in a worker; equal sources must have equal hashes. A worker may outlive a stage, so
+            what lies at the same place later must be another source. Without one all is done here.
         work: A function of a module, for workers to import.
     """
     if _chosen == "loky" or source is None:
@@ -103,6 +104,11 @@ def run_with(
             yield work(model, job)
     else:
         yield from run_parallel(partial(_with_loaded, source, work), jobs, label, unit, device=True)
+
+
+def device_here(name: DeviceName) -> DeviceName:
+    """Where this process computes: on a cluster the workers have the devices, and it keeps off theirs."""
+    return name if _chosen == "loky" else "cpu"
 
 
 def _with_loaded(source: Callable[[], M], work: Callable[[M, J], R], job: J) -> R:

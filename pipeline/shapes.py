@@ -298,5 +298,16 @@ PUBLISHED_LANGUAGE: dict[str, dict[str, Any]] = {
         "num_attention_heads": 40,
         **_VICUNA,
     },
+    "smollm2": {
+        "model_type": "llama",
+        "hidden_size": 576,
+        "intermediate_size": 1536,
+        "num_hidden_layers": 30,
+        "num_attention_heads": 9,
+        "num_key_value_heads": 3,
+        "vocab_size": 49152,
+        "tie_word_embeddings": True,
+    },
 }
-"""From config.json of lmsys/vicuna-7b-v1.5 and lmsys/vicuna-13b-v1.5, by the folder's name."""
+"""From config.json of lmsys/vicuna-7b-v1.5, lmsys/vicuna-13b-v1.5 and HuggingFaceTB/SmolLM2-135M-Instruct, by the
+folder's name."""

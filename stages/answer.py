@@ -1,5 +1,6 @@
 """Let one variant answer the evaluation questions; the full system also under every input ablation."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from pipeline.embeddings import EmbeddingStore
@@ -7,6 +8,7 @@ from pipeline.io import read_jsonl, write_csv, write_jsonl
 from pipeline.language.generate import GenerationSettings, ModelSource, answer
 from pipeline.language.input_ablation import ablate_input
 from pipeline.language.teach.gate import examine, gate_questions
+from pipeline.parallel import device_here
 from pipeline.records import GATE, Described, Encoder, Lora, Opd, Question, Touch, Variant
 from pipeline.runtime import name_dtype
 from pipeline.stage import DATA, matrix_key, stage
@@ -20,8 +22,9 @@ def main() -> None:
         store = EmbeddingStore(DATA / "embeddings" / f"{variant.encoder}-{variant.seed}")
         folder = DATA / "models" / variant.lora / f"{variant.encoder}-{variant.opd}-{variant.seed}"
         dtype = name_dtype(language.dtype, params.runtime.device)
-        source = ModelSource(folder, language.weights, dtype, language.quantization, params.runtime.device)
-        model = source()
+        device = params.runtime.device
+        source = ModelSource(folder, language.weights, dtype, language.quantization, device, run.started)
+        model = replace(source, device=device_here(device))()
         asked = DATA / "questions" / str(variant.seed)
         questions = read_jsonl(asked / "evaluation.jsonl", Question)
         for touch in (Touch.REAL, *(params.ablation.touch if variant.full else ())):

@@ -1,13 +1,41 @@
 """Compute the embeddings of every kept frame, by the base encoder and each fine-tuned one."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+
+import torch
 
 from pipeline.embeddings import INDEX_FILE, STATISTICS_FILE, TENSOR, TENSOR_FILE
 from pipeline.encoder.embed import EncoderSource, embed_videos, standardize, statistics, union
 from pipeline.io import fingerprint, read_table, save_tensors, write_table
+from pipeline.parallel import device_here
 from pipeline.records import Assignment, Embedding, Encoder, Part
-from pipeline.stage import DATA, stage
+from pipeline.stage import DATA, Stage, stage
 from pipeline.weights import check_encoder
+
+
+def embed(run: Stage, videos: Sequence[Assignment], state: Path | None) -> tuple[torch.Tensor, list[Embedding]]:
+    params = run.params
+    source = EncoderSource(
+        params.encoder,
+        params.runtime.device,
+        frames=DATA / "frames",
+        catalogue=Path(params.data.catalogue),
+        state=state,
+        run=run.started,
+    )
+    return embed_videos(replace(source, device=device_here(source.device))(), videos, source)
+
+
+def write(run: Stage, key: str, split: Sequence[Assignment], raw: torch.Tensor, index: Sequence[Embedding]) -> None:
+    known = statistics(raw, index, {a.video_id for a in split if a.part == Part.TRAIN})
+    tensor, out = standardize(raw, known) if run.params.encoder.standardize else raw, DATA / "embeddings" / key
+    known._replace(frames=fingerprint(run.params.frames)).save(out / STATISTICS_FILE)
+    save_tensors(out / TENSOR_FILE, {TENSOR: tensor})
+    write_table(out / INDEX_FILE, Embedding, index)
+    run.metrics[f"{key}.rows"] = len(index)
+    run.metrics[f"{key}.norm"] = float(tensor.norm(dim=1).mean())
 
 
 def main() -> None:
@@ -16,27 +44,15 @@ def main() -> None:
         check_encoder(Path(params.encoder.weights), params.frames.size, params.encoder.backbone)
         splits = {seed: read_table(DATA / "splits" / f"{seed}.parquet", Assignment) for seed in params.ablation.seeds}
         for which in params.ablation.encoders:
-            for seed, assignments in splits.items():
-                out = DATA / "embeddings" / f"{which}-{seed}"
-                # The base encoder has no seed: its embeddings are computed once and standardised for each seed.
-                if which is not Encoder.BASE or seed == params.ablation.seeds[0]:
-                    source = EncoderSource(
-                        params.encoder,
-                        params.runtime.device,
-                        frames=DATA / "frames",
-                        catalogue=Path(params.data.catalogue),
-                        state=None if which is Encoder.BASE else DATA / "encoder" / str(seed) / "encoder.safetensors",
-                    )
-                    wanted = union(splits.values()) if which is Encoder.BASE else assignments
-                    raw, index = embed_videos(source(), wanted, source)
-                training = {a.video_id for a in assignments if a.part == Part.TRAIN}
-                known = statistics(raw, index, training)
-                tensor = standardize(raw, known) if params.encoder.standardize else raw
-                known._replace(frames=fingerprint(params.frames)).save(out / STATISTICS_FILE)
-                save_tensors(out / TENSOR_FILE, {TENSOR: tensor})
-                write_table(out / INDEX_FILE, Embedding, index)
-                run.metrics[f"{which}-{seed}.rows"] = len(index)
-                run.metrics[f"{which}-{seed}.norm"] = float(tensor.norm(dim=1).mean())
+            if which is Encoder.BASE:
+                # It has no seed: its embeddings are computed once and standardised for each.
+                found = embed(run, union(splits.values()), None)
+                for seed, split in splits.items():
+                    write(run, f"{which}-{seed}", split, *found)
+                continue
+            for seed, split in splits.items():
+                trained = DATA / "encoder" / str(seed) / "encoder.safetensors"
+                write(run, f"{which}-{seed}", split, *embed(run, split, trained))
 
 
 if __name__ == "__main__":

@@ -162,8 +162,12 @@ def test_published_models_have_their_published_sizes() -> None:
         shape = Llama.read(Path("nowhere") / name)
         assert shape is not None
         sizes[name] = shape.parameters
-    # Those of Llama 2 (Touvron et al. 2023), which Vicuna v1.5 was tuned from.
-    assert sizes == {"vicuna-7b-v1.5": 6_738_415_616, "vicuna-13b-v1.5": 13_015_864_320}
+    # Those of Llama 2 (Touvron et al. 2023), which Vicuna v1.5 was tuned from; and of what data/weights/smollm2 holds.
+    assert sizes == {
+        "vicuna-7b-v1.5": 6_738_415_616,
+        "vicuna-13b-v1.5": 13_015_864_320,
+        "smollm2": 134_515_008,
+    }
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the kernel's own mark of the highest memory")

@@ -9,17 +9,21 @@ import hashlib
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import psutil
 import pytest
 
 from pipeline import parallel
+from pipeline.encoder.embed import EncoderSource
 from pipeline.errors import UserError
-from pipeline.parallel import use_backend
+from pipeline.parallel import _loaded, use_backend
+from pipeline.records import Encoder, Lora, Opd, Variant
 from pipeline.scales import check_inputs, compose, write_params
 from pipeline.stage import stage
 from tests.closure import ROOT
+from tests.use.shared import make
 
 SCRIPT = """
 import os, sys
@@ -148,6 +152,19 @@ def test_a_cluster_embeds_and_answers_to_the_same_bytes(backend: str, package: s
     command = [sys.executable, "models.py", backend]
     done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
+
+
+def test_a_worker_that_outlives_a_stage_loads_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As one behind DASK_SCHEDULER_ADDRESS does: what is trained later lies at the same place."""
+    monkeypatch.chdir(tmp_path)
+    made = make(tmp_path, Variant(Encoder.FINETUNED, Lora.WITH, Opd.ALL, 0))
+    state, catalogue = Path("data/encoder/0/encoder.safetensors"), Path(made.params.data.catalogue)
+    first = EncoderSource(made.params.encoder, "cpu", Path("data/frames"), catalogue, state, run=1.0)
+    before = _loaded(first).encoder
+    assert _loaded(replace(first)).encoder is before
+    state.unlink()
+    with pytest.raises(UserError, match="encoder.safetensors"):
+        _loaded(replace(first, run=2.0))
 
 
 def test_a_missing_package_is_one_line_before_anything_runs(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -25,6 +25,8 @@ from pipeline.videos.frames.store import FrameStore
 
 AXES: dict[Flip, tuple[int, ...]] = {"none": (), "horizontal": (2,), "vertical": (1,), "both": (1, 2)}
 """Axes of frames x height x width that a flip reverses."""
+PART = 2**16
+"""Rows whose statistics are taken at a time."""
 
 
 class Loaded(NamedTuple):
@@ -46,6 +48,8 @@ class EncoderSource:
     catalogue: Path
     state: Path | None
     """What fine-tuning trained; None for the base encoder."""
+    run: float = 0.0
+    """Of the stage, such as its start: what an earlier one trained lay at the same place."""
 
     def __call__(self) -> Loaded:
         """Load them.
@@ -130,8 +134,11 @@ def statistics(embeddings: torch.Tensor, index: Sequence[Embedding], training: C
 
     A dimension that never changes there has the scale 1, and is so only shifted.
     """
-    rows = [e.row for e in index if e.video_id in training and e.flip == "none"]
-    mean, deviation = embeddings[rows].double().mean(0), embeddings[rows].double().std(0, correction=0)
+    rows = torch.tensor([e.row for e in index if e.video_id in training and e.flip == "none"])
+    # A part at a time, as float64 takes three times the room of all of them.
+    mean = sum((embeddings[part].double().sum(0) for part in rows.split(PART)), torch.tensor(0.0)) / len(rows)
+    squares = (((embeddings[part].double() - mean) ** 2).sum(0) for part in rows.split(PART))
+    deviation = (sum(squares, torch.tensor(0.0)) / len(rows)).sqrt()
     return Statistics(mean, torch.where(deviation > 0, deviation, torch.ones_like(deviation)))
 
 

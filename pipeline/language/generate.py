@@ -42,6 +42,8 @@ class ModelSource:
     dtype: DtypeName
     quantization: Quantization
     device: DeviceName
+    run: float = 0.0
+    """Of the stage, such as its start: what an earlier one trained lay at the same place."""
 
     def __call__(self) -> OctopiForCausalLM:
         """Load it, as `OctopiForCausalLM.from_pretrained` does."""

@@ -95,9 +95,15 @@ def published(dataset: str = DATASET) -> pd.DataFrame:
     """The paper's figures about a data set: `KEYS`, model, value, n; no row where it has none about that one.
 
     `value` is as printed: percent, a count, frames or an ICC. `model` is 7b, 13b, CLIP (the heads, without a language
-    model) or `chance`. The paper gives no numbers of questions: n are the ones that its percentages fit.
+    model), PG-InstructBLIP (which only sees) or `chance`. The paper gives no numbers of questions: n are the ones that
+    its percentages fit.
     """
     return _published()[_published()["dataset"] == dataset].drop(columns="dataset")
+
+
+def published_datasets() -> tuple[str, ...]:
+    """The data sets that the paper has figures about."""
+    return tuple(dict.fromkeys(_published()["dataset"]))
 
 
 def cells(published: pd.DataFrame) -> dict[tuple[str, ...], tuple[float, float]]:

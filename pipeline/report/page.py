@@ -65,11 +65,15 @@ BY_USER = (
     ("paper-7b-videos", "Octopi with Vicuna 7b", "needs a GPU of 48 GB, the videos and the weights (`README.md`)"),
     ("paper-13b-videos", "Octopi with Vicuna 13b", "needs two such GPUs, the videos and the weights (`README.md`)"),
     ("RIPE", "avocados, described and compared", "needs videos of ten and their ranks of ripeness (`docs/avocado.md`)"),
-    ("photos", "PG-InstructBLIP, which only sees", "needs photos and a model's endpoint (`octopi answer-with`)"),
+    (
+        "avocados photos",
+        "a model that only sees them, in place of PG-InstructBLIP",
+        "needs photos of the avocados and a model's endpoint (`octopi answer-with`)",
+    ),
     ("robot", "the arm that sorts avocados", "needs one with such a sensor; it asks a trained model (`docs/robot.md`)"),
 )
-"""What of the paper only a user can measure: what in a report on real videos would show it (its name, a task, what was
-there in place of touch), what it is, and what it needs."""
+"""What of the paper only a user can measure: what in a report on real videos would show it (its name, a task, the data
+set and what was there in place of touch), what it is, and what it needs."""
 
 
 class Line(NamedTuple):
@@ -194,7 +198,8 @@ def _chapter(report: Report, gaps: list[Gap]) -> dict[str, Any]:
 def left_to_users(reports: Iterable[Report]) -> list[Gap]:
     """What of `BY_USER` no report has."""
     filmed = [r for r in reports if r.provenance["source"] == "videos"]
-    known = {name for r in filmed for name in (r.name, *r.scores["task"], *r.scores["touch"])}
+    known = {name for r in filmed for name in (r.name, *r.scores["task"])}
+    known |= {f"{r.provenance['dataset']} {touch}" for r in filmed for touch in r.scores["touch"]}
     return [("paper", what, why) for name, what, why in BY_USER if name not in known]
 
 

@@ -21,6 +21,8 @@ from pipeline.report.load import (
     VALIDATION_HEADS,
     Report,
     cells,
+    published,
+    published_datasets,
 )
 from pipeline.tasks import TASKS
 
@@ -30,7 +32,7 @@ FULL = {"encoder": "finetuned", "lora": "with", "opd": "all"}
 CHOICE, COMBINED = "choice", "combined"
 NOT_ANSWERED = (HEADS, VALIDATION_HEADS, CROSS_VALIDATION, DESCRIBED)
 """Tasks of scores.csv that no language model with touch answered."""
-PUBLISHED_MODELS = ("7b", "13b", "CLIP")
+PUBLISHED_MODELS = ("7b", "13b", "CLIP", "PG-InstructBLIP")
 SYSTEM_WORDS = {"base": "base encoder", "without": "without LoRA", "none": "without OPD", "needed": "OPD as needed"}
 SHOWN_WORDS = {"frames": "frames of the videos", "photos": "photos of the objects"}
 """What vision-only models were shown, in the place where others have their touch."""
@@ -92,6 +94,8 @@ def side_by_side(reports: Mapping[str, Report], *, every: bool) -> pd.DataFrame:
             full system.
     """
     figures = {r.provenance["dataset"]: r.published for r in reports.values()}
+    if every and DATASET in figures:
+        figures |= {dataset: published(dataset) for dataset in published_datasets()}
     place, blocks = [*KEYS, "touch"], []
     for dataset, printed in sorted(figures.items(), key=lambda pair: pair[0] != DATASET):
         rows = ordered(printed[printed["model"].isin(PUBLISHED_MODELS)].assign(touch="real").drop_duplicates(place))
@@ -109,7 +113,8 @@ def side_by_side(reports: Mapping[str, Report], *, every: bool) -> pd.DataFrame:
             }
             shown[f"Measured {name} % [95 %] (n)"] = [known.get(tuple(row[k] for k in place), "") for row in records]
         blocks.append(pd.DataFrame(shown, dtype=object))
-    return pd.concat(blocks, ignore_index=True).fillna("")
+    table = pd.concat(blocks, ignore_index=True).fillna("")
+    return table[sorted(table, key=lambda name: name.startswith("Measured"))]
 
 
 def number(value: float, digits: int = 1, scale: float = 1.0) -> str:

@@ -32,11 +32,12 @@ def write(folder: Path, given: Given) -> None:
     from transformers import AutoModelForCausalLM, AutoTokenizer
 
     where, file = given.source.parent, given.source.name
-    model = AutoModelForCausalLM.from_pretrained(where, gguf_file=file, dtype=torch.float32, local_files_only=True)
+    safely = {"local_files_only": True, "trust_remote_code": False}
+    model = AutoModelForCausalLM.from_pretrained(where, gguf_file=file, dtype=torch.float32, **safely)
     # The weights have been widened, but transformers still marks them as quantized and would not save them.
     if hasattr(model.config, "quantization_config"):
         del model.config.quantization_config
     model.is_quantized, model.hf_quantizer = False, None
     model.save_pretrained(folder)
-    tokenizer = AutoTokenizer.from_pretrained(where, gguf_file=file, local_files_only=True)
+    tokenizer = AutoTokenizer.from_pretrained(where, gguf_file=file, **safely)
     tokenizer.save_pretrained(folder)

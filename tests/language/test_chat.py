@@ -5,19 +5,22 @@ The reference is transformers' own: the same format written with its `generation
 
 from __future__ import annotations
 
+import io
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from tokenizers import Tokenizer, decoders, models, pre_tokenizers, processors, trainers
 from transformers import AutoTokenizer, PreTrainedTokenizerBase, PreTrainedTokenizerFast
 
 from pipeline.errors import UserError
-from pipeline.language.base import load_tokenizer
+from pipeline.language.base import load_llm, load_tokenizer
 from pipeline.language.chat import IGNORE_INDEX, TACTILE, add_tactile_tokens, encode, end_ids, render
 from pipeline.records import Turn
-from tests.checkpoints import write_llama
+from tests.checkpoints import edit, write_llama
 
 VICUNA = (
     "{% for m in messages %}{% if m.role == 'system' %}{{ m.content }} "
@@ -173,13 +176,33 @@ def test_a_template_that_cannot_be_trained_on_is_one_line(template: str, tmp_pat
     assert "\n" not in str(caught.value)
 
 
-def test_nothing_that_a_folder_brings_is_run(tmp_path: Path) -> None:
-    """A tokenizer may name code of its own: it stays where it is."""
-    folder = write_llama(tmp_path)
-    ran = tmp_path / "ran"
-    (folder / "own.py").write_text(f"open({str(ran)!r}, 'w')\n")
-    file = folder / "tokenizer_config.json"
-    text = file.read_text().rstrip().rstrip("}")
-    file.write_text(text + ', "auto_map": {"AutoTokenizer": [null, "own.Own"]}}')
-    load_tokenizer(folder)
-    assert not ran.exists()
+@pytest.mark.parametrize("answer", ["y", "n"])
+def test_nothing_that_a_folder_brings_is_run(answer: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A configuration may name code of its own; transformers would ask, and run it on "y"."""
+    ran, folder = tmp_path / "ran", write_llama(tmp_path / "llama")
+    (folder / "own.py").write_text(
+        f"""open({str(ran)!r}, "w").close()
+from transformers import LlamaConfig, LlamaForCausalLM, PreTrainedTokenizerFast
+class Config(LlamaConfig): model_type = "own"
+class Model(LlamaForCausalLM): config_class = Config
+class Tokenizer(PreTrainedTokenizerFast): pass
+"""
+    )
+    edit(
+        folder / "config.json",
+        model_type="own",
+        auto_map={"AutoConfig": "own.Config", "AutoModelForCausalLM": "own.Model"},
+    )
+    edit(
+        folder / "tokenizer_config.json",
+        tokenizer_class="Tokenizer",
+        auto_map={"AutoTokenizer": [None, "own.Tokenizer"]},
+    )
+    monkeypatch.setattr("builtins.input", lambda *_: answer)
+    monkeypatch.setattr("sys.stdin", io.StringIO(f"{answer}\n" * 4))
+    for load in (lambda: load_llm(folder, torch.float32), lambda: load_tokenizer(folder)):
+        with suppress(UserError):
+            load()
+        assert not ran.exists()
+    with pytest.raises(UserError, match=r"^language\.weights: "):
+        load_llm(folder, torch.float32)

@@ -235,16 +235,18 @@ def test_what_is_missing_is_said_with_the_reason(changed: Path, monkeypatch: pyt
 
 
 def test_what_only_users_can_measure_is_missing_until_they_have(page: Page) -> None:
-    def missing(name: str, source: str, **cells: str) -> set[str]:
-        report = Report(Path(name), scores_of(score(**cells)), effects_of(), published(), {"source": source}, {})
+    def missing(name: str, source: str, dataset: str = "avocados", **cells: str) -> set[str]:
+        origin = {"source": source, "dataset": dataset}
+        report = Report(Path(name), scores_of(score(**cells)), effects_of(), published(), origin, {})
         left = {what for _, what, _ in left_to_users([report])}
         return {key for key, what, _ in module.BY_USER if what in left}
 
-    small, large, rest = "paper-7b-videos", "paper-13b-videos", {"RIPE", "photos", "robot"}
+    small, large, rest = "paper-7b-videos", "paper-13b-videos", {"RIPE", "avocados photos", "robot"}
     assert missing("small-videos", "videos") == {small, large, *rest}
     assert missing("avocado-scenes", "scenes", task="RIPE") == {small, large, *rest}, "synthetic fruit is no avocado"
     assert missing("avocado-videos", "videos", task="RIPE") == {small, large, *rest} - {"RIPE"}
-    assert missing(small, "videos", touch="photos") == {large, *rest} - {"photos"}
+    assert missing(small, "videos", touch="photos") == {large, *rest} - {"avocados photos"}
+    assert missing(small, "videos", "PhysiCLeAR", touch="photos") == {large, *rest}, "photos of other objects"
     assert missing("paper-7b-scenes", "scenes") == {small, large, *rest}
     assert {what for _, what, _ in module.BY_USER} <= {words(e) for e in page.named("missing").iter("b")}
 
@@ -255,7 +257,7 @@ def test_all_reports_stand_beside_the_paper(page: Page) -> None:
     assert heads[1:3] == ["Published 7b % (n)", "Published 13b % (n)"]
     assert heads[3:] == [f"Measured {n} % [95 %] (n)" for n in ("small-videos†", "smoke-scenes")]
     assert "† Settings were chosen on these test objects" in words(page.named("together"))
-    assert (len(few.findall("tbody/tr")), len(every.findall(".//td[@class='measured']"))) == (5, 2 * 32)
+    assert (len(few.findall("tbody/tr")), len(every.findall(".//td[@class='measured']"))) == (5, 2 * 37)
 
 
 def test_the_papers_examples_are_shown_right_and_wrong(page: Page, changed: Path) -> None:

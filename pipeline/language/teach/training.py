@@ -238,7 +238,7 @@ def teach(
     seed_everything(seed)
     dtype = resolve_dtype(language.dtype)
     base = load_llm(folder, dtype)
-    tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True, use_fast=True)
+    tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True, use_fast=True, trust_remote_code=False)
     lora = LoraConfig(
         r=config.rank, lora_alpha=config.alpha, target_modules="all-linear", task_type="CAUSAL_LM", lora_dropout=0.0
     )
