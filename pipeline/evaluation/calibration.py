@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -105,6 +105,16 @@ def reliability(classified: Sequence[Classification], temperature: float = 1.0) 
     ]
 
 
+def calibrated(said: Sequence[Classification]) -> Iterator[tuple[Classification, Classification]]:
+    """What an encoder says of test videos, property by property, as it is and by the temperature of its validation."""
+    for name in dict.fromkeys(c.property for c in said):
+        mine = [c for c in said if c.property == name]
+        temperature = fit_temperature([c for c in mine if c.part is Part.VALIDATION])
+        for c in mine:
+            if c.part is Part.TEST:
+                yield c, c.model_copy(update={"probabilities": tuple(rescale(c.probabilities, temperature).tolist())})
+
+
 def calibration_rows(encoders: Sequence[Sequence[Classification]]) -> list[CalibrationRow]:
     """Test videos of all encoders together, by property; a row for all of them, then one a bin.
 
@@ -114,14 +124,9 @@ def calibration_rows(encoders: Sequence[Sequence[Classification]]) -> list[Calib
     given: dict[str, list[Classification]] = {}
     tempered: dict[str, list[Classification]] = {}
     for said in encoders:
-        for name in dict.fromkeys(c.property for c in said):
-            mine = [c for c in said if c.property == name]
-            temperature = fit_temperature([c for c in mine if c.part is Part.VALIDATION])
-            for c in mine:
-                if c.part is Part.TEST:
-                    given.setdefault(name, []).append(c)
-                    changed = tuple(rescale(c.probabilities, temperature).tolist())
-                    tempered.setdefault(name, []).append(c.model_copy(update={"probabilities": changed}))
+        for before, after in calibrated(said):
+            given.setdefault(before.property, []).append(before)
+            tempered.setdefault(after.property, []).append(after)
     rows = []
     for name, answers in tempered.items():
         bins = reliability(answers)

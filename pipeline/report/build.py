@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import pandas as pd
 
 from pipeline.config import AblationConfig, Params
-from pipeline.evaluation.calibration import CalibrationRow, calibration_rows
+from pipeline.evaluation.calibration import CalibrationRow, calibrated, calibration_rows
 from pipeline.evaluation.described import described_rows
 from pipeline.evaluation.grading import EXTERNAL, vision_models
 from pipeline.evaluation.ordinal import ErrorRow, error_rows
@@ -72,11 +73,11 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     graded = read_table(data / "graded.parquet", Graded)
     # By the lists in params.yaml and not by what lies there: a narrowed ablation leaves the others' files behind.
     said: dict[int, list[Classification]] = {}
-    by_encoder = []
+    by_encoder: dict[int, list[Classification]] = {}
     for seed in sorted(params.ablation.seeds):
         if (file := data / "encoder" / str(seed) / "classifications.parquet").is_file():
-            by_encoder.append(read_table(file, Classification))
-            said.setdefault(params.split.replicate_of(seed), []).extend(by_encoder[-1])
+            by_encoder[seed] = read_table(file, Classification)
+            said.setdefault(params.split.replicate_of(seed), []).extend(by_encoder[seed])
     out_of_fold = {
         name: read_table(data / "cross_validation" / name / "out_of_fold.parquet", OutOfFold)
         for name in params.cross_validation.models
@@ -96,12 +97,13 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     write_csv(folder / "effects.csv", EffectRow, effect_rows(graded, catalogue))
     write_csv(folder / "encoder_effects.csv", EffectRow, candidate_rows(out_of_fold, BASELINE))
     write_csv(folder / "encoder_errors.csv", ErrorRow, error_rows(out_of_fold, catalogue))
-    write_csv(folder / "calibration.csv", CalibrationRow, calibration_rows(by_encoder))
+    write_csv(folder / "calibration.csv", CalibrationRow, calibration_rows(list(by_encoder.values())))
     write_json(folder / "samples.json", _samples(params, data, graded, catalogue))
     audit = data / "audit" / "audit.csv"
     write_csv(folder / "audit.csv", Finding, read_csv(audit, Finding) if audit.is_file() else [])
     _write(folder / "dataset.csv", dataset_frame(catalogue, videos, splits))
     _write(folder / "confusion.csv", confusion_frame(said, catalogue))
+    _write(folder / "described.csv", described_frame(by_encoder, params, data, catalogue))
     _write(folder / "curves.csv", curves_frame(data, params.ablation))
     write_text(folder / "params.yaml", without_places((root / PARAMS_FILE).read_text(encoding="utf-8")))
     write_json(folder / "provenance.json", origin)
@@ -145,6 +147,32 @@ def confusion_frame(said: dict[int, list[Classification]], catalogue: Catalogue)
         if c.part is Part.TEST and c.property == name
     ]
     return pd.DataFrame(rows, columns=list(CONFUSION))
+
+
+def described_frame(
+    by_encoder: Mapping[int, Sequence[Classification]], params: Params, data: Path, catalogue: Catalogue
+) -> pd.DataFrame:
+    """What `octopi describe` says of test videos, beside their labels: a row a seed and video.
+
+    Of each property: its label, the heads' class, and its calibrated probability; then the full system's own sentence.
+    """
+    levels = {p.name: p.levels for p in catalogue.properties}
+    sentences: dict[tuple[int, str], str] = {}
+    for variant in (v for v in params.ablation.variants() if v.full):
+        asked, answers = _answered(data, variant, "evaluation", Touch.REAL)
+        about = {q.question_id: q.videos[0] for q in asked if q.task == "OPD"}
+        for said in (a for a in answers if a.question_id in about):
+            sentences[variant.seed, about[said.question_id]] = " ".join(said.outputs[-1].split())
+    rows: dict[tuple[int, str], dict[str, object]] = {}
+    for seed, found in by_encoder.items():
+        for _, c in calibrated(found):
+            row = rows.setdefault((seed, c.video_id), {"seed": seed, "video_id": c.video_id})
+            row[c.property] = levels[c.property][c.expected]
+            row[f"{c.property}, heads"] = levels[c.property][c.predicted]
+            row[f"{c.property}, probability"] = round(c.probabilities[c.predicted], 4)
+    for key, row in rows.items():
+        row["sentence"] = sentences.get(key, "")
+    return pd.DataFrame(rows.values())
 
 
 def curves_frame(data: Path, ablation: AblationConfig) -> pd.DataFrame:

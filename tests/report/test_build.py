@@ -17,6 +17,7 @@ from safetensors.numpy import save_file
 from safetensors.torch import load_file
 
 from pipeline.errors import UserError
+from pipeline.evaluation.calibration import fit_temperature
 from pipeline.io import read_jsonl, read_table, write_table
 from pipeline.params import load_params
 from pipeline.records import Classification, Graded, Part, Prediction, Question
@@ -27,6 +28,7 @@ from pipeline.report.provenance import base_model, digest, encoder_words, parame
 from pipeline.report.readme import MOST_LINES
 from pipeline.report.samples import choose_samples
 from pipeline.report.tables import TABLES, headline
+from pipeline.videos.catalogue import load_catalogue
 from tests.closure import ROOT
 from tests.fake_run import fake_params, write_run
 from tests.models import model_folder
@@ -39,6 +41,7 @@ FILES = {
         "metrics.json",
         "curves.csv",
         "confusion.csv",
+        "described.csv",
         "dataset.csv",
         "audit.csv",
     ),
@@ -103,6 +106,27 @@ def test_confusion_and_metrics_are_the_heads_on_test_videos(written: Path) -> No
     assert metrics["encoder_roughness"] == pytest.approx(np.mean(rough), abs=1e-6)
     assert {"OPD", "PC", "PSS", "POM", "PSR", "encoder_combined"} <= set(metrics)
     assert len(metrics) <= MOST_METRICS
+
+
+def test_what_is_said_of_each_test_video_stands_beside_its_labels(written: Path) -> None:
+    data, catalogue = written.parents[1] / "data", load_catalogue(ROOT / "pipeline" / "physiclear")
+    frame = pd.read_csv(written / "described.csv").set_index(["seed", "video_id"])
+    for seed in (0, 1):
+        said = read_table(data / "encoder" / str(seed) / "classifications.parquet", Classification)
+        answers = read_jsonl(data / "answers" / f"finetuned-with-all-{seed}" / "real.jsonl", Prediction)
+        told = {a.question_id: a.outputs[0] for a in answers}
+        for c in (c for c in said if c.part is Part.TEST):
+            row, place = frame.loc[(seed, c.video_id)], catalogue.property_index(c.property)
+            levels = catalogue.properties[place].levels
+            assert (row[c.property], row[f"{c.property}, heads"]) == (levels[c.expected], levels[c.predicted])
+            others = [o for o in said if o.property == c.property and o.part is Part.VALIDATION]
+            power = np.array(c.probabilities) ** (1 / fit_temperature(others))
+            assert row[f"{c.property}, probability"] == pytest.approx(power[c.predicted] / power.sum(), abs=1e-4)
+        questions = read_jsonl(data / "questions" / str(seed) / "evaluation.jsonl", Question)
+        described = {q.videos[0]: told[q.question_id] for q in questions if q.task == "OPD"}
+        own = frame.loc[seed]["sentence"].dropna()
+        assert dict(own) == {video: " ".join(text.split()) for video, text in described.items()}
+        assert len(own) > 3
 
 
 def test_curves_name_their_stages_as_dvc_does(written: Path) -> None:
