@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from functools import partial
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 import torch
 import yaml
 
-from benchmarks import contact, describing, encoder, encoder_models, frames, language
+from benchmarks import contact, describing, encoder, encoder_models, frames, language, serving
 from benchmarks.table import Row, merge, read_rows
 from benchmarks.timing import counting_ffts, flops_of
 from pipeline.encoder import frame_classifier
@@ -20,7 +21,7 @@ from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.errors import UserError
 from pipeline.evaluation.scores import ScoreRow
 from pipeline.io import write_csv, write_table
-from pipeline.records import Graded, Opd
+from pipeline.records import Encoder, Graded, Lora, Opd, Variant
 from pipeline.scenes.elastic.kernels import half_space_table, make_kernel
 from pipeline.scenes.elastic.solver import solve
 from pipeline.scenes.film import write_film
@@ -29,6 +30,7 @@ from pipeline.training.trainable import save_trainable
 from pipeline.videos.catalogue import Catalogue
 from tests.checkpoints import write_clip, write_llama
 from tests.conftest import ROOT
+from tests.use.shared import make
 
 LENGTH = 20
 """Frames of a video; the published rule leaves out videos of ten."""
@@ -241,3 +243,21 @@ def test_transforms_of_the_solver_follow_from_its_iterations() -> None:
         solution = solve(gap, 0.5, kernel, 0.1, tolerance=1e-4)
     # Forth and back for the surface; in all steps but the last also for the direction and what it moves.
     assert count.value == 6 * int(solution.iterations[0]) - 4
+
+
+def test_serving_asks_a_fresh_process_and_a_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    made = make(tmp_path, Variant(Encoder.FINETUNED, Lora.WITH, Opd.ALL, 0))
+    values = yaml.safe_load((ROOT / "params.yaml").read_text())
+    values["data"] |= {"source": "videos", "dir": "videos"}
+    (tmp_path / "params.yaml").write_text(yaml.safe_dump(values))
+    assert made.folder.parent == tmp_path / "models"
+    rows = {row.setting: row for row in serving.measure(tmp_path, clients=3, each=2)}
+    once, crowded = rows["a server, one client: median"], rows["a server, 3 clients: median"]
+    assert once.cost_ratio == 1
+    assert rows["a fresh process, first answer"].cost > once.cost
+    assert crowded.cost <= rows["a server, 3 clients: 95 % are quicker"].cost
+    assert "6 requests, none lost" in crowded.machine
+    monkeypatch.setattr(serving, "post", lambda *_: str(time.perf_counter()))
+    with pytest.raises(UserError, match="not the one given alone"):
+        serving.measure(tmp_path, clients=1, each=1)

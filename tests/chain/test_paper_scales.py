@@ -144,7 +144,7 @@ def test_paper_13b_from_videos_to_the_report(project: Project) -> None:
     assert not list((project.folder / "checkpoints").glob("*/*")), "nothing waits any more"
 
 
-def test_paper_7b_to_the_trained_model(project: Project) -> None:
+def test_paper_7b_to_the_report(project: Project) -> None:
     """On the same encoder, since everything before alignment is the same in both scales; here the layers are whole.
 
     Without the patch accelerate does not shard on CPUs, and shares the questions out alone.
@@ -158,3 +158,7 @@ def test_paper_7b_to_the_trained_model(project: Project) -> None:
     assert "Running stage 'finetune_encoder" not in output
     assert list(launches(project).values()) == [{"processes": 2}] * 4
     check_trained(project, "paper-7b")
+    project.run("octopi", "repro")
+    report = project.folder / "reports" / "paper-7b-videos" / "README.md"
+    assert "weights/vicuna-7b-v1.5" in report.read_text()
+    assert "Published 7b" in report.read_text()

@@ -1,0 +1,121 @@
+"""What a trained model takes in use: the first answer of a fresh process, and answers of a server under load."""
+
+from __future__ import annotations
+
+import base64
+import json
+import signal
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from statistics import quantiles
+
+from benchmarks.table import Row, make_rows
+from benchmarks.timing import machine, milliseconds
+from pipeline.errors import UserError
+from pipeline.params import load_params
+from pipeline.use.ask import default_model
+from pipeline.videos.files import SUFFIXES
+
+QUESTION = "Describe the touch. {tactile}"
+CLIENTS, EACH = 20, 10
+"""Clients at once, and requests of each one after another."""
+COMMAND = [str(Path(sys.executable).with_name("octopi"))]
+
+
+def measure(root: Path, clients: int = CLIENTS, each: int = EACH) -> list[Row]:
+    """Milliseconds of one answer about a video: alone in a fresh process, from a server, and under load.
+
+    Raises:
+        UserError: where there is no trained model or no video, or an answer under load is not the one given alone.
+    """
+    folder = default_model(root / "models")
+    place = root / load_params(root / "params.yaml").data.dir
+    videos = sorted(f for f in place.rglob("*") if f.suffix.lower() in SUFFIXES)[:clients]
+    if not videos:
+        raise UserError(f"{place}: holds no video to ask about; `dvc repro` makes or finds some")
+    ask = [*COMMAND, "ask", QUESTION, str(videos[0]), "--model", str(folder)]
+    first = milliseconds(lambda: subprocess.run(ask, check=True, capture_output=True))
+    with served(folder) as address:
+        bodies = [body(folder.name, video) for video in videos]
+        alone = {b: post(address, b) for b in bodies}
+        once = [milliseconds(lambda b=b: post(address, b)) for b in bodies]  # type: ignore[misc]
+
+        def client(number: int) -> list[float]:
+            return [timed(address, bodies[(number + i) % len(bodies)], alone) for i in range(each)]
+
+        with ThreadPoolExecutor(clients) as pool:
+            loaded = [spent for found in pool.map(client, range(clients)) for spent in found]
+    costs = {
+        "a fresh process, first answer": first,
+        "a server, one client: median": percentile(once, 50),
+        "a server, one client: 95 % are quicker": percentile(once, 95),
+        f"a server, {clients} clients: median": percentile(loaded, 50),
+        f"a server, {clients} clients: 95 % are quicker": percentile(loaded, 95),
+    }
+    return make_rows(
+        "serving",
+        {name: [spent] for name, spent in costs.items()},
+        unit="ms an answer",
+        baseline="a server, one client: median",
+        machine=machine(f"clients on the same; {len(loaded)} requests, none lost"),
+    )
+
+
+def body(model: str, video: Path) -> bytes:
+    """A request in the form of OpenAI's chat completions."""
+    touch = base64.b64encode(video.read_bytes()).decode()
+    content = [
+        {"type": "text", "text": QUESTION},
+        {"type": "video_url", "video_url": {"url": f"data:video/mp4;base64,{touch}"}},
+    ]
+    return json.dumps({"model": model, "messages": [{"role": "user", "content": content}]}).encode()
+
+
+def post(address: str, data: bytes) -> str:
+    """The answer; comes again where the server says that it is full."""
+    request = urllib.request.Request(
+        f"{address}/chat/completions", data, headers={"Content-Type": "application/json"}, method="POST"
+    )
+    while True:
+        try:
+            with urllib.request.urlopen(request, timeout=600) as response:
+                return str(json.load(response)["choices"][0]["message"]["content"])
+        except urllib.error.HTTPError as error:
+            if error.code != 429:
+                raise UserError(f"the server answers {error.code}: {error.read().decode()[:200]}") from None
+            time.sleep(0.1)
+
+
+def timed(address: str, data: bytes, alone: dict[bytes, str]) -> float:
+    """Milliseconds of an answer, which must be the one that was given alone."""
+    started = time.perf_counter()
+    if post(address, data) != alone[data]:
+        raise UserError("an answer under load is not the one given alone")
+    return 1000 * (time.perf_counter() - started)
+
+
+def percentile(values: list[float], share: int) -> float:
+    """The value that so many percent are below, interpolated."""
+    return quantiles(values, n=100, method="inclusive")[share - 1] if len(values) > 1 else values[0]
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """The address of a server of that model, which ends with the block."""
+    running = subprocess.Popen([*COMMAND, "serve", str(folder), "--port", "0"], stdout=subprocess.PIPE, text=True)
+    try:
+        assert running.stdout is not None
+        line = running.stdout.readline()
+        if " answers at " not in line:
+            raise UserError(f"octopi serve {folder}: does not start")
+        yield line.split(" answers at ")[1].split(";")[0]
+    finally:
+        running.send_signal(signal.SIGTERM)
+        running.wait(60)
