@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from functools import partial
 from pathlib import Path
 
@@ -258,6 +257,6 @@ def test_serving_asks_a_fresh_process_and_a_server(tmp_path: Path, monkeypatch: 
     assert rows["a fresh process, first answer"].cost > once.cost
     assert crowded.cost <= rows["a server, 3 clients: 95 % are quicker"].cost
     assert "6 requests, none lost" in crowded.machine
-    monkeypatch.setattr(serving, "post", lambda *_: str(time.perf_counter()))
+    monkeypatch.setattr(serving, "post", lambda *_: "another's")
     with pytest.raises(UserError, match="not the one given alone"):
-        serving.measure(tmp_path, clients=1, each=1)
+        serving.timed("", b"a", {b"a": "mine"})
