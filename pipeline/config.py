@@ -140,6 +140,9 @@ class QuestionsConfig(Section):
     facts: bool = False
     """Begin matching questions with what the named objects are like, for a language model that has never heard of
     them: then touch and reasoning are asked for and no knowledge of the world. Tables say so."""
+    restate: bool = False
+    """Where everything is described (OPD `all`), have answers to PC and PSS name the classes of the one property that
+    is asked for before they conclude, for a language model too small to find and compare them at once. Reports say so."""
 
 
 class EncoderConfig(Section):

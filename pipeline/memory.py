@@ -250,7 +250,8 @@ def _questions(params: Params, catalogue: Catalogue, part: Part) -> list[Questio
     wanted = counts_by_task(params.questions, "train" if part == Part.TRAIN else "evaluation")
     counts = {task: min(number, ASKED) for task, number in wanted.items()}
     pool = pool_of(part, videos, catalogue)
-    return build_questions(pool, counts, seed=params.questions.seed, distinct=False, facts=params.questions.facts)
+    config = params.questions
+    return build_questions(pool, counts, seed=config.seed, distinct=False, facts=config.facts, restate=config.restate)
 
 
 def _tokenizer(folder: Path) -> Callable[[str], int]:

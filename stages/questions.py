@@ -26,6 +26,7 @@ def main() -> None:
                     seed=config.seed,
                     distinct=distinct,
                     facts=config.facts,
+                    restate=config.restate,
                     fold=run.params.split.fold_of(seed),
                 )
                 write_jsonl(DATA / "questions" / str(seed) / f"{name}.jsonl", questions)

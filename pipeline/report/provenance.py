@@ -74,6 +74,7 @@ def provenance(
         "settings": settings_note(params.report_name, params.split.name),
         "intervals": coverage_note(asked),
         "facts_told": params.questions.facts,
+        "restated": params.questions.restate,
         "command": "dvc repro",
         "commit": commit,
         "changed": bool(_git(root, "status", "--porcelain", "--", *CODE)),

@@ -114,6 +114,11 @@ def stands_on(said: dict[str, Any]) -> list[str]:
         facts.append(
             "**Matching questions** say what the named objects are like: they ask for touch, not for knowledge."
         )
+    if said.get("restated"):
+        facts.append(
+            "**Answers to PC and PSS** name the classes of the property asked for before they conclude: the model is too"
+            " small to find and compare them at once, and was trained so. The paper's conclude at once."
+        )
     return facts + [vision_words(source) for source in said.get("vision", ())]
 
 

@@ -6,7 +6,7 @@ import random
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from pipeline.records import Dialogue, Gold, Opd, Part, Prediction, Question, Score, Turn
 from pipeline.videos.catalogue import Catalogue, Property
@@ -50,6 +50,8 @@ class TaskDefinition(ABC):
     """Written out, as tables head it."""
     trained = True
     """Whether its questions may be used for training (PSR's may not)."""
+    listed: tuple[str, ...] = ()
+    """What an answer calls the objects where it restates their classes; none where a question is about no one property."""
     measure = "choice"
     """The measure that says that a whole answer is right; `chance` lists all measures."""
 
@@ -72,6 +74,27 @@ class TaskDefinition(ABC):
     def with_facts(self, draft: Draft, catalogue: Catalogue, rng: random.Random) -> Draft:
         """The question for a language model that knows nothing of the objects: as it is, unless it names objects."""
         return draft
+
+    def restated(self, draft: Draft, catalogue: Catalogue) -> Draft:
+        """The question whose answer, behind descriptions of everything, first names the classes that it is about.
+
+        A small model cannot find the one property among all and conclude in the same token; it can copy first.
+        """
+        if not self.listed:
+            return draft
+        place = catalogue.property_index(draft.gold.properties[0])
+        prop = catalogue.properties[place]
+        each = (
+            f"{name} {prop.levels[labels[place]]}" for name, labels in zip(self.listed, draft.gold.labels, strict=True)
+        )
+        told = f"{prop.spoken.capitalize()}: {', '.join(each)}. Conclusion: "
+        dialogues = []
+        for dialogue in draft.dialogues:
+            *before, last = dialogue.turns
+            if dialogue.opd is Opd.ALL:
+                last = Turn(user=last.user, assistant=last.assistant.replace("Conclusion: ", told, 1))
+            dialogues.append(Dialogue(opd=dialogue.opd, turns=(*before, last)))
+        return replace(draft, dialogues=tuple(dialogues))
 
 
 def draw_videos(pool: Pool, objects: Sequence[str], rng: random.Random) -> tuple[str, ...]:

@@ -50,6 +50,7 @@ class PropertyComparison(TaskDefinition):
 
     name = "PC"
     title = "Property Comparison"
+    listed = ("first object", "second object")
 
     def strata(self, catalogue: Catalogue) -> int:
         return len(CHOICES) * len(catalogue.properties) * 2

@@ -48,6 +48,7 @@ class PropertySuperlativeSelection(TaskDefinition):
 
     name = "PSS"
     title = "Property Superlative Selection"
+    listed = ("a)", "b)", "c)")
 
     def strata(self, catalogue: Catalogue) -> int:
         return 3 * 2 * len(catalogue.properties)

@@ -48,25 +48,32 @@ def counts_by_task(config: QuestionsConfig, section: Literal["train", "evaluatio
 
 
 def build_questions(
-    pool: Pool, counts: Mapping[str, int], *, seed: int, distinct: bool, facts: bool = False, fold: int | None = None
+    pool: Pool,
+    counts: Mapping[str, int],
+    *,
+    seed: int,
+    distinct: bool,
+    facts: bool = False,
+    restate: bool = False,
+    fold: int | None = None,
 ) -> list[Question]:
     """Build up to `counts[task]` questions of each task, in random order.
 
     Fewer come back where the pool has no more to ask (too few objects, a class without objects): strata that yield
     nothing after `ATTEMPTS` draws are left out, and with `distinct` no question is asked twice. With `facts` the same
-    questions come as each task's `with_facts` makes them. The questions of a `fold` carry it in their ids, which are
+    questions come as each task's `with_facts` makes them, with `restate` as its `restated` does. The questions of a `fold` carry it in their ids, which are
     so unique over all folds.
     """
     place = str(pool.part) if fold is None else f"{pool.part}-fold{fold}"
     questions: list[Question] = []
     for task, count in counts.items():
-        questions += _build_task(pool, task, count, seed, distinct, facts, place) if pool.objects else []
+        questions += _build_task(pool, task, count, seed, distinct, facts, restate, place) if pool.objects else []
     random.Random(derive_seed(seed, pool.part, "order")).shuffle(questions)
     return questions
 
 
 def _build_task(
-    pool: Pool, task: str, count: int, seed: int, distinct: bool, facts: bool, place: str
+    pool: Pool, task: str, count: int, seed: int, distinct: bool, facts: bool, restate: bool, place: str
 ) -> list[Question]:
     definition = TASKS[task]
     rng = random.Random(derive_seed(seed, pool.part, task))
@@ -91,6 +98,8 @@ def _build_task(
                 seen.add(key)
                 if facts:
                     draft = definition.with_facts(draft, pool.catalogue, order)
+                if restate:
+                    draft = definition.restated(draft, pool.catalogue)
                 questions.append(
                     Question(
                         question_id=f"{task}-{place}-{len(questions):05d}",

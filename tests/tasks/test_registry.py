@@ -104,3 +104,33 @@ def test_wrong_counts_are_one_line(train: dict[str, int], message: str) -> None:
         counts_by_task(config(train, {}), "train")
     assert "\n" not in str(caught.value)
     assert counts_by_task(config({"psr": 0}, {"psr": 3}), "train")["PSR"] == 0
+
+
+def test_classes_are_restated_before_a_conclusion() -> None:
+    """Where everything was described, of the property that is asked for; nothing else of a question changes."""
+    counts = {"OPD": 4, "PC": 36, "PSS": 36, "POM": 6, "PSR": 6}
+    before, after = (build_questions(POOL, counts, seed=0, distinct=False, restate=r) for r in (False, True))
+    changed = [(q, r) for q, r in zip(before, after, strict=True) if q != r]
+    assert {q.task for q, _ in changed} == {"PC", "PSS"}
+    assert len(changed) == sum(q.task in ("PC", "PSS") for q in before)
+    for question, restated in changed:
+        prop = next(p for p in CATALOGUE.properties if p.name == question.gold.properties[0])
+        place = CATALOGUE.property_index(prop.name)
+        names = ("first object", "second object") if question.task == "PC" else ("a)", "b)", "c)")
+        for old, new in zip(question.dialogues, restated.dialogues, strict=True):
+            described, rest = new.turns[-1].assistant, old.turns[-1].assistant
+            assert [t.user for t in new.turns] == [t.user for t in old.turns]
+            if old.opd is not Opd.ALL:
+                assert new == old
+                continue
+            head, _, tail = described.partition(f" {prop.spoken.capitalize()}: ")
+            said, _, conclusion = tail.rpartition(". Conclusion: ")
+            assert f"{head} Conclusion: {conclusion}" == rest
+            labels = [CATALOGUE.labels(o)[place] for o in question.objects]
+            assert said.split(", ") == [f"{n} {prop.levels[label]}" for n, label in zip(names, labels, strict=True)]
+    right = [
+        Prediction(question_id=q.question_id, task=q.task, outputs=(d.turns[-1].assistant,), truncated=False, tokens=1)
+        for _, q in changed
+        if (d := q.dialogue(Opd.ALL))
+    ]
+    assert all(score.correct and score.strict for score in grade([q for _, q in changed], right, CATALOGUE))
