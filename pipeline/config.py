@@ -142,7 +142,7 @@ class QuestionsConfig(Section):
     them: then touch and reasoning are asked for and no knowledge of the world. Tables say so."""
     restate: bool = False
     """Where everything is described (OPD `all`), have answers to PC and PSS name the classes of the one property that
-    is asked for before they conclude, for a language model too small to find and compare them at once. Reports say so."""
+    is asked for before they conclude, for a language model too small to find and compare at once. Reports say so."""
 
 
 class EncoderConfig(Section):
@@ -272,8 +272,8 @@ class MaxUpdates(Section):
     """The longest that a phase of teaching takes: plain items, several properties, whole descriptions."""
 
     plain: Positive = 300
-    several: Positive = 400
-    whole: Positive = 40
+    several: Positive = 260
+    whole: Positive = 20
 
 
 class TeachConfig(Section):

@@ -116,8 +116,8 @@ def stands_on(said: dict[str, Any]) -> list[str]:
         )
     if said.get("restated"):
         facts.append(
-            "**Answers to PC and PSS** name the classes of the property asked for before they conclude: the model is too"
-            " small to find and compare them at once, and was trained so. The paper's conclude at once."
+            "**Answers to PC and PSS** name the classes of the property asked for before they conclude: the model is "
+            "too small to find and compare at once, and was trained so. The paper's conclude at once."
         )
     return facts + [vision_words(source) for source in said.get("vision", ())]
 

@@ -51,7 +51,7 @@ class TaskDefinition(ABC):
     trained = True
     """Whether its questions may be used for training (PSR's may not)."""
     listed: tuple[str, ...] = ()
-    """What an answer calls the objects where it restates their classes; none where a question is about no one property."""
+    """What an answer calls the objects where it restates their classes; none where it is about several properties."""
     measure = "choice"
     """The measure that says that a whole answer is right; `chance` lists all measures."""
 

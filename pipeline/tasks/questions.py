@@ -61,8 +61,8 @@ def build_questions(
 
     Fewer come back where the pool has no more to ask (too few objects, a class without objects): strata that yield
     nothing after `ATTEMPTS` draws are left out, and with `distinct` no question is asked twice. With `facts` the same
-    questions come as each task's `with_facts` makes them, with `restate` as its `restated` does. The questions of a `fold` carry it in their ids, which are
-    so unique over all folds.
+    questions come as each task's `with_facts` makes them, with `restate` as its `restated` does. The questions of a
+    `fold` carry it in their ids, which are so unique over all folds.
     """
     place = str(pool.part) if fold is None else f"{pool.part}-fold{fold}"
     questions: list[Question] = []
