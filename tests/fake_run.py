@@ -119,7 +119,7 @@ def _classify(a: Assignment, catalogue: Catalogue, skill: float, rng: random.Ran
             property=p.name,
             expected=label,
             predicted=label if rng.random() < skill else rng.randrange(len(p.levels)),
-            probabilities=(0.2, 0.3, 0.5),
+            probabilities=tuple(1 / len(p.levels) for _ in p.levels) if len(p.levels) != 3 else (0.2, 0.3, 0.5),
         )
         for p, label in zip(catalogue.properties, catalogue.labels(a.object_id), strict=True)
     ]

@@ -145,7 +145,8 @@ def test_a_hand_that_only_presses_turns_nothing() -> None:
 def test_published_figures_stand_beside_avocados_only() -> None:
     with (ROOT / "pipeline" / "report" / "published.csv").open(newline="") as stream:
         rows = [r for r in csv.DictReader(stream) if r["dataset"] == CATALOGUE.language.dataset and r["n"]]
-    printed = {(r["task"], r["measure"]): (float(r["value"]), int(r["n"])) for r in rows}
-    assert printed["OPD", "combined"] == (35.5, 200)
-    assert printed["RIPE", "choice"] == (63.0, 100)
+    printed = {(r["model"], r["task"], r["measure"]): (float(r["value"]), int(r["n"])) for r in rows}
+    assert printed["13b", "OPD", "combined"] == (35.5, 200)
+    assert printed["13b", "RIPE", "choice"] == (63.0, 100)
+    assert printed["PG-InstructBLIP", "OPD", "combined"] == (0.0, 200)
     assert all((value * n / 100) % 1 == 0 for value, n in printed.values())
