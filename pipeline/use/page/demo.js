@@ -40,6 +40,7 @@ function strip(title, pictures, captions) {
 
 function bars(touch) {
   const grid = make("div", "bars");
+  grid.append(make("p", "note", "Probabilities of each property alone; bold: the classes that go best together"));
   for (const [property, classes] of Object.entries(touch.probabilities)) {
     grid.append(make("h3", "", property));
     for (const [level, share] of Object.entries(classes)) {
