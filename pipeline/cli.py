@@ -231,10 +231,11 @@ def ask(
 ) -> None:
     """Ask a trained model about touch; without a question, talk to it (/add FILE, /frames, /reset, /quit)."""
     from json import dumps
+    from os.path import isfile
 
     from pipeline.use.ask import Chat, answer_once, lines_of_terminal
 
-    if Path(question).is_file():
+    if isfile(question):  # pathlib's raises where a question is longer than a file's name may be.
         raise UserError(f"{question}: is a file; write the question before it, with {{tactile}} once for each video")
     asked = _load(model, base, device)
 

@@ -51,6 +51,13 @@ def test_progress_is_no_part_of_an_answer(
     assert (said.out, said.err) == ("", "work: piece 1 of 1, 0 s left\n")
 
 
+def test_a_question_may_be_longer_than_a_files_name(made: Made, octopi: Octopi) -> None:
+    question = "Why? " * 60
+    said = CliRunner().invoke(app, ["ask", question, "--model", str(made.folder), "--device", "cpu"])
+    assert said.exit_code == 0, said.output
+    assert said.stdout == octopi.ask(question) + "\n"
+
+
 def test_a_chat_from_standard_input(made: Made, octopi: Octopi, files: list[Path]) -> None:
     typed = f"/add {files[0]}\n{QUESTION}\n/quit\n"
     said = CliRunner().invoke(app, ["ask", "--model", str(made.folder), "--device", "cpu"], input=typed)
