@@ -142,7 +142,11 @@ class QuestionsConfig(Section):
     them: then touch and reasoning are asked for and no knowledge of the world. Tables say so."""
     restate: bool = False
     """Where everything is described (OPD `all`), have answers to PC and PSS name the classes of the one property that
-    is asked for before they conclude, for a language model too small to find and compare at once. Reports say so."""
+    is asked for, and which object has more or less of it, before they conclude: for a language model too small to find
+    and compare at once. Reports say so."""
+    two_turns: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    """Share of the training questions about several videos whose OPD mode `all` takes two turns, as scenarios (PSR) do:
+    describe everything, then answer."""
 
 
 class EncoderConfig(Section):
@@ -255,6 +259,10 @@ class LanguageConfig(Section):
     bos: bool = True
     """Begin each conversation about touch with the begin token, where the tokenizer writes one (the published code
     takes it away). A chat template's own stays."""
+    normalize_touch: bool = False
+    """Scale each projected tactile embedding to the root mean square of the word embeddings. Without, alignment at a
+    high rate makes them a hundred times as long as words, and what attention adds to them, as which video they are of,
+    is lost in them."""
     max_new_tokens: Annotated[int, Field(ge=1, le=4096)] = 256
     """Of an answer; fewer where the language model has no more positions. Longer answers are cut and marked."""
     generation_batch_size: Positive = 32
@@ -337,6 +345,9 @@ class AlignConfig(TrainConfig):
     train_embeddings: TrainedEmbeddings = "new"
     """Word embeddings that are trained, here and in the end-to-end training that follows: `all`, the whole layer
     (paper), or only those of the two `new` tokens. All take another 16 bytes a value, 2 GiB for Vicuna-7b."""
+    begin_with_words: bool = False
+    """First fit the projection to the word embeddings of each object's classes: for a small model, which would take
+    many more questions to read frames of one video apart from those of the next."""
 
 
 class LoraTrainConfig(TrainConfig):
@@ -349,6 +360,12 @@ class LoraTrainConfig(TrainConfig):
     target_modules: Literal["all-linear"] | Annotated[tuple[str, ...], Field(min_length=1)] = ("q_proj", "k_proj")
     """Linear layers that get an adapter (the paper does not say; the published code: q_proj and k_proj); `all-linear`:
     all but the one that gives the logits."""
+    counterfactual: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    """Share of the questions answered with descriptions that come with videos of other objects, to have what is
+    concluded learnt from the description and not from touch; of these the description is not learnt."""
+    conclusion_weight: Annotated[float, Field(gt=0)] = 1.0
+    """How much a token behind a description weighs in the loss. Descriptions are long: what decides an answer is one
+    token among a hundred."""
 
 
 class AblationConfig(Section):

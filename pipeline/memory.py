@@ -251,7 +251,15 @@ def _questions(params: Params, catalogue: Catalogue, part: Part) -> list[Questio
     counts = {task: min(number, ASKED) for task, number in wanted.items()}
     pool = pool_of(part, videos, catalogue)
     config = params.questions
-    return build_questions(pool, counts, seed=config.seed, distinct=False, facts=config.facts, restate=config.restate)
+    return build_questions(
+        pool,
+        counts,
+        seed=config.seed,
+        distinct=False,
+        facts=config.facts,
+        restate=config.restate,
+        two_turns=config.two_turns if part == Part.TRAIN else 0.0,
+    )
 
 
 def _tokenizer(folder: Path) -> Callable[[str], int]:

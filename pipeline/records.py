@@ -200,6 +200,8 @@ class Turn(Record):
 
     user: str
     assistant: str
+    described: int = 0
+    """Characters at the beginning of `assistant` that describe; what stands behind them is concluded from them."""
 
 
 class Dialogue(Record):

@@ -1,10 +1,14 @@
 """Align the projection to the language model."""
 
+from pathlib import Path
+
 from pipeline.io import write_table
 from pipeline.language.training import Job, Material, align, assemble, write_model_card
+from pipeline.language.words import begin_with_words
 from pipeline.records import Encoder, Measurement, Opd
 from pipeline.stage import DATA, matrix_key, stage
 from pipeline.tracking import live
+from pipeline.videos.catalogue import load_catalogue
 
 
 def main() -> None:
@@ -14,6 +18,8 @@ def main() -> None:
         config = run.params.align
         material = Material.load(DATA, run.params, encoder, opd, seed)
         model, data = assemble(material, config.samples, "align")
+        if config.begin_with_words:
+            begin_with_words(model, data, load_catalogue(Path(run.params.data.catalogue)), material.seed)
         if config.train_embeddings == "all":
             model.train_words()
         with live(run) as callbacks:

@@ -8,7 +8,7 @@ a frame and `<tact_end>`; the model puts tactile embeddings in the frames' place
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from jinja2 import TemplateError
@@ -111,6 +111,33 @@ def encode(rendered: Rendered, tokenizer: PreTrainedTokenizerBase, *, bos: bool 
         for token, (a, b) in zip(ids, batch["offset_mapping"], strict=True)
     ]
     return Encoded(tuple(ids), tuple(labels))
+
+
+def encode_turns(
+    turns: Sequence[Turn],
+    tokenizer: PreTrainedTokenizerBase,
+    *,
+    system_prompt: str,
+    frames: int,
+    bos: bool = True,
+    descriptions: bool = True,
+) -> Encoded:
+    """Render and encode a whole conversation.
+
+    Args:
+        descriptions: Label them too. Without, only what is concluded from them has labels, and its end token.
+    """
+    rendered = render(turns, tokenizer, system_prompt=system_prompt, frames=frames, complete=True)
+    if not descriptions:
+        spans = []
+        for (start, stop), turn in zip(rendered.answers, turns, strict=True):
+            if turn.described:
+                # The space before a word belongs to its token.
+                start = rendered.text.index(turn.assistant, start) + turn.described
+            if turn.described < len(turn.assistant):
+                spans.append((start, stop))
+        rendered = replace(rendered, answers=tuple(spans))
+    return encode(rendered, tokenizer, bos=bos)
 
 
 def vicuna(turns: Sequence[Turn], system_prompt: str, eos: str, complete: bool) -> Rendered:

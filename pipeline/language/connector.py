@@ -30,6 +30,8 @@ class OctopiConfig(BaseModel):
     hidden_size: int = Field(ge=1)
     """Length of a word embedding."""
     tactile_tokens: tuple[str, ...] = TACTILE_TOKENS
+    normalized: bool = False
+    """Whether projected embeddings are as long as the language model's words (`language.normalize_touch`)."""
     trained_embeddings: TrainedEmbeddings = "new"
     """Whether words.safetensors holds embeddings of all words, or the language model's own are used."""
 

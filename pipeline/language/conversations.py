@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from typing import TypedDict
 
 import torch
@@ -12,7 +13,7 @@ from transformers import PreTrainedTokenizerBase
 
 from pipeline.embeddings import FLIPS, EmbeddingStore, TactileFeatures
 from pipeline.errors import UserError
-from pipeline.language.chat import IGNORE_INDEX, Encoded, encode, render
+from pipeline.language.chat import IGNORE_INDEX, Encoded, encode_turns
 from pipeline.records import Opd, Question
 from pipeline.runtime import derive_seed
 from pipeline.training.sampling import EpochDataset, sample_evaluation, sample_training
@@ -22,11 +23,12 @@ POOL = 16
 
 
 class Sample(TypedDict):
-    """One conversation: ids and labels of one length, and the embeddings of its frames in reading order."""
+    """One conversation: ids, labels and their weights of one length, its frames' embeddings in reading order."""
 
     input_ids: torch.Tensor
     labels: torch.Tensor
     features: torch.Tensor
+    weights: torch.Tensor
 
 
 class ConversationDataset(EpochDataset[Sample]):
@@ -37,6 +39,10 @@ class ConversationDataset(EpochDataset[Sample]):
 
     Args:
         positions: Tokens that the language model can read at once; None where that is unknown.
+        counterfactual: Share of the described questions that come with videos of other objects. Of these only what
+            follows from the description is learnt. Touch tells the class of every training object, so that a small
+            model would otherwise conclude from touch, past its own description, and fail on objects that are new.
+        conclusion_weight: Of each token behind a description, in the loss; all others weigh 1.
 
     Raises:
         UserError: naming the question that is too long, or has nothing to learn from.
@@ -55,6 +61,8 @@ class ConversationDataset(EpochDataset[Sample]):
         seed: int,
         positions: int | None = None,
         bos: bool = True,
+        counterfactual: float = 0.0,
+        conclusion_weight: float = 1.0,
     ) -> None:
         super().__init__()
         self.questions = [q for q in questions if q.dialogue(opd)]
@@ -62,16 +70,23 @@ class ConversationDataset(EpochDataset[Sample]):
         self.per_video = per_video
         self.flip_probability = flip_probability
         self.seed = seed
+        self.counterfactual, self.conclusion_weight = counterfactual, conclusion_weight
+        self.videos = sorted({video for question in self.questions for video in question.videos})
         self.encoded: list[Encoded] = []
+        self.concluding: list[Encoded | None] = []
         for question in self.questions:
             dialogue = question.dialogue(opd)
             assert dialogue is not None
-            text = render(dialogue.turns, tokenizer, system_prompt=system_prompt, frames=per_video, complete=True)
-            encoded = encode(text, tokenizer, bos=bos)
+            write = partial(
+                encode_turns, dialogue.turns, tokenizer, system_prompt=system_prompt, frames=per_video, bos=bos
+            )
+            encoded = write()
             check_length(question.question_id, len(encoded.input_ids), positions)
             if all(label == IGNORE_INDEX for label in encoded.labels):
                 raise UserError(f"{question.question_id}: has no answer to learn from; run `dvc repro questions -f`")
             self.encoded.append(encoded)
+            described = any(turn.described for turn in dialogue.turns)
+            self.concluding.append(write(descriptions=False) if described else None)
 
     @property
     def lengths(self) -> list[int]:
@@ -84,8 +99,13 @@ class ConversationDataset(EpochDataset[Sample]):
     def __getitem__(self, index: int) -> Sample:
         question, encoded = self.questions[index], self.encoded[index]
         rng = random.Random(derive_seed(self.seed, self.epoch, question.question_id))
-        parts = []
-        for video_id in question.videos:
+        parts, videos, concluding = [], question.videos, self.concluding[index]
+        weights = torch.ones(len(encoded.labels))
+        if concluding is not None:
+            weights[torch.tensor(concluding.labels) != IGNORE_INDEX] = self.conclusion_weight
+            if self.counterfactual and rng.random() < self.counterfactual:
+                encoded, videos = concluding, tuple(rng.choice(self.videos) for _ in videos)
+        for video_id in videos:
             positions = sample_training(self.store.count(video_id), self.per_video, rng)
             horizontal, vertical = (rng.random() < self.flip_probability for _ in range(2))
             parts.append(self.store.features(video_id, positions, FLIPS[horizontal + 2 * vertical]))
@@ -93,6 +113,7 @@ class ConversationDataset(EpochDataset[Sample]):
             "input_ids": torch.tensor(encoded.input_ids),
             "labels": torch.tensor(encoded.labels),
             "features": torch.cat(parts),
+            "weights": weights,
         }
 
 
@@ -126,13 +147,14 @@ class ConversationCollator:
         self.pad_id = pad_id
 
     def __call__(self, samples: Iterable[Sample]) -> dict[str, torch.Tensor]:
-        """Input ids, labels (batch x length) and features (batch x frames x dim)."""
+        """Input ids, labels, weights (batch x length) and features (batch x frames x dim)."""
         samples = list(samples)
         pad = torch.nn.utils.rnn.pad_sequence
         return {
             "input_ids": pad([s["input_ids"] for s in samples], batch_first=True, padding_value=self.pad_id),
             "labels": pad([s["labels"] for s in samples], batch_first=True, padding_value=IGNORE_INDEX),
             "features": pad_features([s["features"] for s in samples]),
+            "weights": pad([s["weights"] for s in samples], batch_first=True),
         }
 
 

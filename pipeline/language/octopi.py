@@ -40,6 +40,7 @@ class OctopiForCausalLM(nn.Module):
         tokenizer: Knows the three tactile tokens.
         tactile_dim: Length of a tactile embedding.
         base: Folder that the language model came from.
+        normalize: As `language.normalize_touch`.
 
     Attributes:
         words: The word embeddings where they are trained (`train_words`), in place of the language model's.
@@ -52,14 +53,22 @@ class OctopiForCausalLM(nn.Module):
     accepts_loss_kwargs = True  # has Trainer count an update's tokens and give them to `forward`
 
     def __init__(
-        self, llm: PreTrainedModel, tokenizer: PreTrainedTokenizerBase, tactile_dim: int, base: str = ""
+        self,
+        llm: PreTrainedModel,
+        tokenizer: PreTrainedTokenizerBase,
+        tactile_dim: int,
+        base: str = "",
+        normalize: bool = False,
     ) -> None:
         super().__init__()
         self.llm = llm
         matrix = llm.get_input_embeddings().weight
         self.connector = Connector(tactile_dim, matrix.shape[1])
         # Not named `config`: what has that name is transformers' own to Trainer, which writes into it.
-        self.octopi_config = OctopiConfig(base_model=base, tactile_dim=tactile_dim, hidden_size=matrix.shape[1])
+        self.octopi_config = OctopiConfig(
+            base_model=base, tactile_dim=tactile_dim, hidden_size=matrix.shape[1], normalized=normalize
+        )
+        self.word_rms = float(matrix.detach().float().square().mean().sqrt()) if normalize else None
         self.words: nn.Embedding | None = None
         with torch.no_grad():
             # The mean of all words is a neutral start for a new one.
@@ -76,12 +85,18 @@ class OctopiForCausalLM(nn.Module):
 
     @classmethod
     def from_base(
-        cls, base: Path | str, tactile_dim: int, *, dtype: DtypeName = "float32", quantization: Quantization = "none"
+        cls,
+        base: Path | str,
+        tactile_dim: int,
+        *,
+        dtype: DtypeName = "float32",
+        quantization: Quantization = "none",
+        normalize: bool = False,
     ) -> Self:
         """A fresh model on the frozen language model in the folder `base`; its connector is drawn from torch's seed."""
         folder = Path(base)
         llm = load_llm(folder, resolve_dtype(dtype), quantization)
-        return cls(llm, load_tokenizer(folder), tactile_dim, str(base))
+        return cls(llm, load_tokenizer(folder), tactile_dim, str(base), normalize)
 
     @classmethod
     def from_pretrained(
@@ -105,7 +120,13 @@ class OctopiForCausalLM(nn.Module):
         """
         folder = Path(folder)
         config = read_config(folder)
-        model = cls.from_base(base or config.base_model, config.tactile_dim, dtype=dtype, quantization=quantization)
+        model = cls.from_base(
+            base or config.base_model,
+            config.tactile_dim,
+            dtype=dtype,
+            quantization=quantization,
+            normalize=config.normalized,
+        )
         if model.octopi_config.hidden_size != config.hidden_size:
             raise UserError(
                 f"{folder / CONFIG_FILE}: made for word embeddings of {config.hidden_size}, but "
@@ -185,6 +206,8 @@ class OctopiForCausalLM(nn.Module):
         frames = input_ids == self.frame_id
         used = torch.arange(features.shape[1], device=features.device) < frames.sum(1, keepdim=True)
         projected = self.connector.projection(features[used].to(self.connector.delimiters.dtype))
+        if self.word_rms is not None:
+            projected = self.word_rms * F.rms_norm(projected, projected.shape[-1:])
         embeddings = embeddings.masked_scatter(frames[..., None], projected.to(embeddings.dtype))
         for token, row in ((self.start_id, 0), (self.end_id, 1)):
             delimiter = self.connector.delimiters[row].to(embeddings.dtype)
@@ -197,6 +220,7 @@ class OctopiForCausalLM(nn.Module):
         features: torch.Tensor,
         attention_mask: torch.Tensor | None = None,
         labels: torch.Tensor | None = None,
+        weights: torch.Tensor | None = None,
         num_items_in_batch: torch.Tensor | int | None = None,
     ) -> CausalLMOutput:
         """Logits, or with labels the cross-entropy over the answers' tokens alone.
@@ -206,6 +230,7 @@ class OctopiForCausalLM(nn.Module):
             features: batch x frames x tactile_dim, as `embed` wants them.
             attention_mask: batch x length. Rows that are padded on the right need none: no token sees a later one.
             labels: batch x length, each token its own label; `IGNORE_INDEX` is left out.
+            weights: batch x length, how much each labelled token counts in the sum; by default 1.
             num_items_in_batch: Labelled tokens of the whole update, so that accumulated batches weigh each token
                 alike; by default those of this batch.
 
@@ -229,7 +254,11 @@ class OctopiForCausalLM(nn.Module):
         output = self.llm(inputs_embeds=embeddings[:, shared:], **call, logits_to_keep=columns)
         logits = output.logits[learned[:, columns]]
         exact = logits.to(torch.promote_types(logits.dtype, torch.float32))
-        loss = F.cross_entropy(exact, targets[learned], reduction="sum")
+        if weights is None:
+            loss = F.cross_entropy(exact, targets[learned], reduction="sum")
+        else:
+            each = F.cross_entropy(exact, targets[learned], reduction="none")
+            loss = each @ weights[:, shared + 1 :][learned].to(each.dtype)
         count = len(logits) if num_items_in_batch is None else num_items_in_batch
         return CausalLMOutput(loss=loss / torch.as_tensor(count, device=loss.device).clamp(min=1))
 

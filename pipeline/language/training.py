@@ -98,7 +98,13 @@ class Material:
 
 
 def assemble(
-    material: Material, samples: int, purpose: str, aligned: Path | None = None
+    material: Material,
+    samples: int,
+    purpose: str,
+    aligned: Path | None = None,
+    *,
+    counterfactual: float = 0.0,
+    conclusion_weight: float = 1.0,
 ) -> tuple[OctopiForCausalLM, ConversationDataset]:
     """A model and its training conversations: `samples` questions, drawn by seed and purpose.
 
@@ -106,12 +112,17 @@ def assemble(
 
     Args:
         aligned: Folder of a model to go on with; by default a fresh one.
+        counterfactual, conclusion_weight: As `ConversationDataset` takes them.
     """
     seed_everything(material.seed)
     language = material.language
     if aligned is None:
         model = OctopiForCausalLM.from_base(
-            language.weights, material.store.dim, dtype=language.dtype, quantization=language.quantization
+            language.weights,
+            material.store.dim,
+            dtype=language.dtype,
+            quantization=language.quantization,
+            normalize=language.normalize_touch,
         )
     else:
         model = OctopiForCausalLM.from_pretrained(
@@ -134,6 +145,8 @@ def assemble(
         seed=material.seed,
         positions=model.positions,
         bos=language.bos,
+        counterfactual=counterfactual,
+        conclusion_weight=conclusion_weight,
     )
     return model, data
 

@@ -75,6 +75,8 @@ def provenance(
         "intervals": coverage_note(asked),
         "facts_told": params.questions.facts,
         "restated": params.questions.restate,
+        "two_turns": params.questions.two_turns,
+        "counterfactual": params.lora.counterfactual,
         "command": "dvc repro",
         "commit": commit,
         "changed": bool(_git(root, "status", "--porcelain", "--", *CODE)),

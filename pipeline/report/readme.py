@@ -119,6 +119,16 @@ def stands_on(said: dict[str, Any]) -> list[str]:
             "**Answers to PC and PSS** name the classes of the property asked for before they conclude: the model is "
             "too small to find and compare at once, and was trained so. The paper's conclude at once."
         )
+    if said.get("two_turns"):
+        facts.append(
+            f"**Two turns:** {said['two_turns']:.0%} of the training questions about several videos describe in one "
+            "turn and conclude in the next, as scenarios do. The paper's have one turn."
+        )
+    if said.get("counterfactual"):
+        facts.append(
+            f"**Conclusions:** {said['counterfactual']:.0%} of LoRA's described questions come with videos of other "
+            "objects, and only what follows from the description is learnt of them. The paper has none of these."
+        )
     return facts + [vision_words(source) for source in said.get("vision", ())]
 
 

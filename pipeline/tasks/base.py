@@ -39,6 +39,8 @@ class Draft:
     objects: tuple[str, ...]
     dialogues: tuple[Dialogue, ...]
     gold: Gold
+    finding: str = ""
+    """What the classes of the property asked for lead to, before it is put as an answer: "Harder: second object."."""
 
 
 class TaskDefinition(ABC):
@@ -78,7 +80,8 @@ class TaskDefinition(ABC):
     def restated(self, draft: Draft, catalogue: Catalogue) -> Draft:
         """The question whose answer, behind descriptions of everything, first names the classes that it is about.
 
-        A small model cannot find the one property among all and conclude in the same token; it can copy first.
+        A small model cannot find the one property among all, recall what was asked and conclude in the same token. It
+        can do so one by one.
         """
         if not self.listed:
             return draft
@@ -87,12 +90,12 @@ class TaskDefinition(ABC):
         each = (
             f"{name} {prop.levels[labels[place]]}" for name, labels in zip(self.listed, draft.gold.labels, strict=True)
         )
-        told = f"{prop.spoken.capitalize()}: {', '.join(each)}. Conclusion: "
+        told = f"{prop.spoken.capitalize()}: {', '.join(each)}. {draft.finding} Conclusion: "
         dialogues = []
         for dialogue in draft.dialogues:
             *before, last = dialogue.turns
             if dialogue.opd is Opd.ALL:
-                last = Turn(user=last.user, assistant=last.assistant.replace("Conclusion: ", told, 1))
+                last = last.model_copy(update={"assistant": last.assistant.replace("Conclusion: ", told, 1)})
             dialogues.append(Dialogue(opd=dialogue.opd, turns=(*before, last)))
         return replace(draft, dialogues=tuple(dialogues))
 
@@ -111,14 +114,52 @@ def draft_single_turn(
     answer: Mapping[Opd, str],
     choice: str,
     properties: Sequence[str],
+    finding: str = "",
 ) -> Draft:
     """A question of one turn about these objects, one dialogue for each OPD mode that `user` names."""
     return Draft(
         videos=draw_videos(pool, objects, rng),
         objects=tuple(objects),
-        dialogues=tuple(Dialogue(opd=m, turns=(Turn(user=user[m], assistant=answer[m]),)) for m in Opd if m in user),
+        dialogues=tuple(Dialogue(opd=m, turns=(_turn(user[m], answer[m]),)) for m in Opd if m in user),
         gold=gold(pool, objects, choice, properties),
+        finding=finding,
     )
+
+
+def _turn(user: str, answer: str) -> Turn:
+    return Turn(user=user, assistant=answer, described=len(answer.rpartition(" Conclusion: ")[0]))
+
+
+def in_two_turns(draft: Draft) -> Draft:
+    """The question whose answer describes everything in a first turn, and concludes in a second.
+
+    A question that has no mode without descriptions, or more turns already, stays as it is.
+    """
+    asked = {d.opd: d.turns for d in draft.dialogues}
+    if set(map(len, asked.values())) != {1} or not {Opd.ALL, Opd.NONE} <= asked.keys():
+        return draft
+    (whole,), (bare,) = asked[Opd.ALL], asked[Opd.NONE]
+    question = bare.user
+    for letter in LETTERS[: len(draft.videos)]:
+        question = question.replace(f"{letter}) {{tactile}}", f"{letter})")
+    for letter in LETTERS[: len(draft.videos)]:
+        question = question.replace("{tactile}", f"{letter})", 1)
+    first = whole.assistant[: whole.described]
+    for ordinal, letter in zip(ORDINALS, LETTERS, strict=False):
+        first = first.replace(f"{ordinal} object:", f"{letter})")
+    turns = (
+        Turn(user=described_first(len(draft.videos)), assistant=first, described=len(first)),
+        Turn(user=question, assistant=whole.assistant[whole.described :].strip()),
+    )
+    return replace(
+        draft,
+        dialogues=tuple(Dialogue(opd=d.opd, turns=turns if d.opd is Opd.ALL else d.turns) for d in draft.dialogues),
+    )
+
+
+def described_first(count: int) -> str:
+    """The first turn of a question in two: everything about two or three videos."""
+    return f"Describe these {('two', 'three')[count - 2]} tactile videos: {lettered(count)}."
 
 
 def gold(pool: Pool, objects: Sequence[str], choice: str, properties: Sequence[str]) -> Gold:

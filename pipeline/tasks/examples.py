@@ -9,7 +9,16 @@ from typing import NamedTuple
 
 from pipeline.records import Assignment, Dialogue, Opd, Part, Prediction, Question, Score, Turn
 from pipeline.runtime import derive_seed
-from pipeline.tasks.base import LETTERS, Pool, choice_score, chosen_letter, descriptions, draw_videos, gold, lettered
+from pipeline.tasks.base import (
+    LETTERS,
+    Pool,
+    choice_score,
+    chosen_letter,
+    described_first,
+    descriptions,
+    draw_videos,
+    gold,
+)
 from pipeline.tasks.opd import TEMPLATES
 from pipeline.videos.catalogue import Catalogue
 
@@ -58,7 +67,7 @@ def build_examples(assignments: Sequence[Assignment], catalogue: Catalogue, *, s
             if options:
                 opening, described = TEMPLATES[0], catalogue.describe(*objects)
             else:
-                opening = f"Describe these two tactile videos: {lettered(2)}."
+                opening = described_first(2)
                 described = descriptions(catalogue, objects, ("a)", "b)"))
             named = " or ".join(f"{x}) {option}" for x, option in zip(LETTERS, options, strict=False))
             request = f"{example.question.format(options=named)} Use the format '{example.answer} x), because xxx'."

@@ -75,7 +75,17 @@ class PropertyComparison(TaskDefinition):
         }[choice]
         prefixes = [f"{o} object:" for o in ORDINALS]
         answer = concluded(pool.catalogue, objects, prefixes, verdict, [prop.name])
-        return draft_single_turn(pool, objects, rng, user=user, answer=answer, choice=choice, properties=[prop.name])
+        found = {"yes": self.listed[0], "no": self.listed[1], "same": "neither"}[choice]
+        return draft_single_turn(
+            pool,
+            objects,
+            rng,
+            user=user,
+            answer=answer,
+            choice=choice,
+            properties=[prop.name],
+            finding=f"{comparative.capitalize()}: {found}.",
+        )
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         predicted = read(prediction.outputs[0])

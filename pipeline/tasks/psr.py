@@ -13,6 +13,7 @@ from pipeline.tasks.base import (
     TaskDefinition,
     choice_score,
     chosen_letter,
+    described_first,
     descriptions,
     draw_videos,
     gold,
@@ -33,13 +34,13 @@ def asked(question: str, aspects: str) -> dict[Opd, tuple[str, ...]]:
     return {
         Opd.NONE: (f"Given two tactile videos: {lettered(2)}. {REQUEST.format(question=question, based='')}",),
         Opd.NEEDED: (f"Describe the {aspects} of these two tactile videos: {lettered(2)}.", second),
-        Opd.ALL: (f"Describe these two tactile videos: {lettered(2)}.", second),
+        Opd.ALL: (described_first(2), second),
     }
 
 
 def read(answer: str) -> str | None:
-    """The letter in "The most suitable object is x)"; two different letters there, or "x) or y)", are none."""
-    return chosen_letter(answer, "most suitable object is")
+    """The letter in "The most suitable object is x)", or "... for this is x)"; "x) or y)", or two letters, are none."""
+    return chosen_letter(answer, r"most suitable object(?: for [^.;]*?)? is")
 
 
 class PropertyScenarioReasoning(TaskDefinition):

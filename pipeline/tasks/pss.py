@@ -70,7 +70,14 @@ class PropertySuperlativeSelection(TaskDefinition):
         prefixes = [f"{letter})" for letter in LETTERS]
         answer = concluded(pool.catalogue, objects, prefixes, verdict, [prop.name])
         return draft_single_turn(
-            pool, objects, rng, user=user, answer=answer, choice=LETTERS[position], properties=[prop.name]
+            pool,
+            objects,
+            rng,
+            user=user,
+            answer=answer,
+            choice=LETTERS[position],
+            properties=[prop.name],
+            finding=f"{superlative.capitalize()}: {LETTERS[position]}).",
         )
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:

@@ -13,7 +13,7 @@ from pipeline.errors import UserError
 from pipeline.records import Assignment, Part, Question
 from pipeline.runtime import derive_seed
 from pipeline.tasks import TASKS
-from pipeline.tasks.base import Pool
+from pipeline.tasks.base import Pool, in_two_turns
 from pipeline.videos.catalogue import Catalogue
 
 ATTEMPTS = 60
@@ -55,30 +55,42 @@ def build_questions(
     distinct: bool,
     facts: bool = False,
     restate: bool = False,
+    two_turns: float = 0.0,
     fold: int | None = None,
 ) -> list[Question]:
     """Build up to `counts[task]` questions of each task, in random order.
 
     Fewer come back where the pool has no more to ask (too few objects, a class without objects): strata that yield
     nothing after `ATTEMPTS` draws are left out, and with `distinct` no question is asked twice. With `facts` the same
-    questions come as each task's `with_facts` makes them, with `restate` as its `restated` does. The questions of a
-    `fold` carry it in their ids, which are so unique over all folds.
+    questions come as each task's `with_facts` makes them, with `restate` as its `restated` does, and a share of
+    `two_turns` as `in_two_turns` does. The questions of a `fold` carry it in their ids, which are so unique over all
+    folds.
     """
     place = str(pool.part) if fold is None else f"{pool.part}-fold{fold}"
     questions: list[Question] = []
     for task, count in counts.items():
-        questions += _build_task(pool, task, count, seed, distinct, facts, restate, place) if pool.objects else []
+        questions += (
+            _build_task(pool, task, count, seed, distinct, facts, restate, two_turns, place) if pool.objects else []
+        )
     random.Random(derive_seed(seed, pool.part, "order")).shuffle(questions)
     return questions
 
 
 def _build_task(
-    pool: Pool, task: str, count: int, seed: int, distinct: bool, facts: bool, restate: bool, place: str
+    pool: Pool,
+    task: str,
+    count: int,
+    seed: int,
+    distinct: bool,
+    facts: bool,
+    restate: bool,
+    two_turns: float,
+    place: str,
 ) -> list[Question]:
     definition = TASKS[task]
     rng = random.Random(derive_seed(seed, pool.part, task))
-    # A stream of its own: with facts and without, the same questions are drawn.
-    order = random.Random(derive_seed(seed, pool.part, task, "facts"))
+    # Streams of their own: however they are worded, the same questions are drawn.
+    order, turns = (random.Random(derive_seed(seed, pool.part, task, purpose)) for purpose in ("facts", "turns"))
     live = list(range(definition.strata(pool.catalogue)))
     rng.shuffle(live)
     seen: set[tuple[object, ...]] = set()
@@ -96,10 +108,12 @@ def _build_task(
                 if distinct and key in seen:
                     continue
                 seen.add(key)
-                if facts:
-                    draft = definition.with_facts(draft, pool.catalogue, order)
                 if restate:
                     draft = definition.restated(draft, pool.catalogue)
+                if turns.random() < two_turns:
+                    draft = in_two_turns(draft)
+                if facts:
+                    draft = definition.with_facts(draft, pool.catalogue, order)
                 questions.append(
                     Question(
                         question_id=f"{task}-{place}-{len(questions):05d}",

@@ -16,6 +16,7 @@ from pipeline.tasks.base import (
     TaskDefinition,
     choice_score,
     chosen_letter,
+    described_first,
     descriptions,
     draw_videos,
     gold,
@@ -63,7 +64,7 @@ class Ripeness(TaskDefinition):
                 assistant=descriptions(catalogue, objects, prefixes, names),
             ),
             Opd.ALL: Turn(
-                user=f"Describe these two tactile videos: {lettered(2)}.",
+                user=described_first(2),
                 assistant=descriptions(catalogue, objects, prefixes),
             ),
         }

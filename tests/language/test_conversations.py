@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 import torch
@@ -126,6 +127,33 @@ def test_same_draws_for_same_epoch_and_others_for_another(
     assert all(torch.equal(a, data[i]["features"]) for i, a in enumerate(first))
     data.follow(lambda: 1)
     assert not all(torch.equal(a, data[i]["features"]) for i, a in enumerate(first))
+
+
+def test_counterfactuals_have_other_videos_and_teach_only_conclusions(
+    language: LanguageConfig, questions: list[Question], store: EmbeddingStore
+) -> None:
+    """Of the described questions the wanted share, and no other; all else is as without."""
+    held = material(language, questions, store)
+    tokenizer = load_tokenizer(Path(language.weights))
+    (_, plain), (_, mixed) = (assemble(held, 14, "test", counterfactual=share) for share in (0.0, 0.5))
+    described = changed = 0
+    for epoch in range(40):
+        for data in (plain, mixed):
+            data.follow(lambda: epoch)  # noqa: B023 - asked in this round alone
+        for index, question in enumerate(mixed.questions):
+            usual, drawn = plain[index], mixed[index]
+            turns = question.dialogue(held.opd).turns  # type: ignore[union-attr]
+            described += any(turn.described for turn in turns)
+            assert torch.equal(usual["input_ids"], drawn["input_ids"])
+            assert usual["features"].shape == drawn["features"].shape
+            if torch.equal(usual["labels"], drawn["labels"]):
+                continue
+            changed += 1
+            learnt = drawn["labels"][drawn["labels"] != IGNORE_INDEX].tolist()
+            said = str(tokenizer.decode(learnt))
+            assert said.replace("</s>", "").strip() == turns[-1].assistant[turns[-1].described :].strip()
+            assert not torch.equal(usual["features"], drawn["features"])
+    assert 0.4 < changed / described < 0.6
 
 
 LENGTHS = st.lists(st.integers(1, 500), max_size=300)

@@ -17,7 +17,7 @@ from pipeline.config import LanguageConfig
 from pipeline.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
 from pipeline.errors import UserError
 from pipeline.io import read_table, save_tensors
-from pipeline.language.chat import IGNORE_INDEX, Encoded, encode
+from pipeline.language.chat import IGNORE_INDEX, Encoded, encode_turns
 from pipeline.language.generate import answer
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import assemble
@@ -84,8 +84,8 @@ def test_a_conversation_without_an_answer_is_named(
     questions: list[Question], store: EmbeddingStore, language: LanguageConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "pipeline.language.conversations.encode",
-        lambda *given, **bos: Encoded((ids := encode(*given, **bos).input_ids), (IGNORE_INDEX,) * len(ids)),
+        "pipeline.language.conversations.encode_turns",
+        lambda *given, **how: Encoded((ids := encode_turns(*given, **how).input_ids), (IGNORE_INDEX,) * len(ids)),
     )
     with pytest.raises(UserError, match=r"^[A-Z]+-train-\d+: has no answer to learn from"):
         assemble(material(language, questions, store), 3, "test")

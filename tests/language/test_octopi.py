@@ -49,16 +49,26 @@ def test_tactile_embeddings_stand_where_the_frames_are(model: OctopiForCausalLM)
     assert torch.equal(output[1], words[ids[1]])
 
 
+@pytest.mark.parametrize("weight", [1.0, 3.0])
 def test_loss_is_over_answers_only(
-    model: OctopiForCausalLM, language: LanguageConfig, questions: list[Question], store: EmbeddingStore
+    weight: float,
+    model: OctopiForCausalLM,
+    language: LanguageConfig,
+    questions: list[Question],
+    store: EmbeddingStore,
 ) -> None:
     """By hand in float64, over rows of unlike lengths whose answers begin at other columns."""
-    _, data = assemble(material(language, questions, store), 4, "test")
+    _, data = assemble(material(language, questions, store), 4, "test", conclusion_weight=weight)
     batch = ConversationCollator(0)([data[i] for i in range(len(data))])
-    labels = batch.pop("labels")
+    labels, weights = batch.pop("labels"), batch["weights"]
+    concluding = ["".join(model.tokenizer.decode(i[w > 1])) for i, w in zip(labels, weights, strict=True)]
+    assert any(concluding) == (weight > 1)
+    for question, said in zip(data.questions, concluding, strict=True):
+        turn = question.dialogue(Opd.ALL).turns[-1]  # type: ignore[union-attr]
+        assert not said or said.removesuffix("</s>").strip() == turn.assistant[turn.described :].strip()
     logits = model(**batch).logits.double()
     losses = [
-        -logits[row, column - 1].log_softmax(-1)[labels[row, column]]
+        -weights[row, column] * logits[row, column - 1].log_softmax(-1)[labels[row, column]]
         for row, column in (labels != IGNORE_INDEX).nonzero().tolist()
     ]
     output = model(**batch, labels=labels)
@@ -75,11 +85,27 @@ def test_padding_changes_no_logit(
     _, data = assemble(material(language, questions, store), 6, "test")
     samples = [data[i] for i in range(len(data))]
     batch = ConversationCollator(0)(samples)
-    del batch["labels"]
+    del batch["labels"], batch["weights"]
     together = model(**batch).logits
     for row, sample in enumerate(samples):
         alone = model(sample["input_ids"][None], sample["features"][None]).logits[0]
         torch.testing.assert_close(together[row, : len(alone)], alone, atol=2e-5, rtol=0)
+
+
+def test_normalized_touch_is_as_long_as_words(language: LanguageConfig, tmp_path: Path) -> None:
+    """However long the projection makes it, and so too in a model that is read back."""
+    model = OctopiForCausalLM.from_base(language.weights, DIM, normalize=True)
+    words = model.llm.get_input_embeddings().weight
+    ids = call(model)["input_ids"]
+    frames = ids[0] == model.frame_id
+    for size in (1e-3, 1.0, 1e4):
+        embedded = model.embed(ids, size * call(model)["features"])[0]
+        lengths = embedded[frames].square().mean(1).sqrt()
+        torch.testing.assert_close(lengths, words.square().mean().sqrt().expand(2), rtol=1e-3, atol=0)
+        assert torch.equal(embedded[0], words[5])
+    model.save_pretrained(tmp_path)
+    again = OctopiForCausalLM.from_pretrained(tmp_path)
+    assert torch.equal(again(**call(again)).logits, model.eval()(**call(model)).logits)
 
 
 def test_unknown_target_module_is_named(model: OctopiForCausalLM) -> None:

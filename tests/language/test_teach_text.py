@@ -148,13 +148,19 @@ def expected(item: Item) -> str | None:
     return alone[0] if item.kind == "odd" else " and ".join(name for name in scores if name != alone[0])
 
 
+def concluded(item: Item) -> str:
+    """What the last answer says behind its description."""
+    last = item.turns[-1]
+    return last.assistant[last.described :].strip()
+
+
 def unformed(item: Item) -> str:
     """What an answer names, whatever form the question wants it in."""
     wanted = re.search(r"'(.+)'", item.turns[-1].user)
     if not wanted:
-        return item.learnt[-1]
+        return concluded(item)
     x, y = (f"(?P<{name}>.+)" for name in "xy")
-    said = re.fullmatch(re.sub(r"\by\b", y, re.sub(r"\bx\b", x, wanted[1]), count=1), item.learnt[-1], re.IGNORECASE)
+    said = re.fullmatch(re.sub(r"\by\b", y, re.sub(r"\bx\b", x, wanted[1]), count=1), concluded(item), re.IGNORECASE)
     assert said, item
     assert "y" not in said.groupdict() or said["y"] in words().properties
     return said["x"]
@@ -186,10 +192,10 @@ def test_plain_items_vary_in_what_they_are_about_alone() -> None:
 def test_answers_are_balanced(form: Form) -> None:
     """A guess that ignores the things must not do well."""
     items = [draw(random.Random(f"balance {i}"), form) for i in range(4000)]
-    compared = [item.learnt[-1] for item in items if item.kind == "compare"]
+    compared = [concluded(item) for item in items if item.kind == "compare"]
     for answer in ("Yes.", "No.", "Both alike."):
         assert 0.28 < compared.count(answer) / len(compared) < 0.39
-    extremes = [plain(item.learnt[-1]) for item in items if item.kind == "extreme"]
+    extremes = [plain(concluded(item)) for item in items if item.kind == "extreme"]
     lettered = [answer for answer in extremes if answer in ("a)", "b)", "c)")]
     assert all(0.25 < lettered.count(x) / len(lettered) < 0.42 for x in ("a)", "b)", "c)"))
 

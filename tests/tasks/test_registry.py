@@ -106,6 +106,32 @@ def test_wrong_counts_are_one_line(train: dict[str, int], message: str) -> None:
     assert counts_by_task(config({"psr": 0}, {"psr": 3}), "train")["PSR"] == 0
 
 
+def test_a_share_of_the_questions_takes_two_turns() -> None:
+    """Those about several videos, where everything is described; what is said stays the same."""
+    counts = {"OPD": 4, "PC": 40, "PSS": 40, "POM": 40, "PSR": 6}
+    before, after = (build_questions(POOL, counts, seed=0, distinct=False, two_turns=s) for s in (0.0, 0.5))
+    changed = [(q, r) for q, r in zip(before, after, strict=True) if q != r]
+    assert {q.task for q, _ in changed} == {"PC", "PSS", "POM"}
+    assert 40 < len(changed) < 80
+    for question, split in changed:
+        assert split.model_copy(update={"dialogues": question.dialogues}) == question
+        for opd in (Opd.NONE, Opd.NEEDED):
+            assert split.dialogue(opd) == question.dialogue(opd)
+        old, new = (q.dialogue(Opd.ALL) for q in (question, split))
+        assert old
+        assert new
+        (whole,), (first, second) = old.turns, new.turns
+        videos = len(question.videos)
+        assert (first.user.count("{tactile}"), second.user.count("{tactile}")) == (videos, 0)
+        assert all(f"{letter})" in first.user and f"{letter})" in second.user for letter in "abc"[:videos])
+        assert first.described == len(first.assistant)
+        assert second.described == 0
+        said = whole.assistant.replace("First object:", "a)").replace("Second object:", "b)")
+        assert f"{first.assistant} {second.assistant}" == said
+        psr = next(d for q in before if q.task == "PSR" and (d := q.dialogue(Opd.ALL)))
+        assert videos == 3 or first.user == psr.turns[0].user
+
+
 def test_classes_are_restated_before_a_conclusion() -> None:
     """Where everything was described, of the property that is asked for; nothing else of a question changes."""
     counts = {"OPD": 4, "PC": 36, "PSS": 36, "POM": 6, "PSR": 6}
@@ -127,7 +153,14 @@ def test_classes_are_restated_before_a_conclusion() -> None:
             said, _, conclusion = tail.rpartition(". Conclusion: ")
             assert f"{head} Conclusion: {conclusion}" == rest
             labels = [CATALOGUE.labels(o)[place] for o in question.objects]
+            said, _, found = said.partition(". ")
             assert said.split(", ") == [f"{n} {prop.levels[label]}" for n, label in zip(names, labels, strict=True)]
+            word, _, named = found.partition(": ")
+            rising = word.lower() in (prop.more, prop.most)
+            assert word.lower() in ((prop.more, prop.most) if rising else (prop.less, prop.least))
+            assert word.lower() in new.turns[-1].user
+            ends = [n for n, x in zip(names, labels, strict=True) if x == (max(labels) if rising else min(labels))]
+            assert named == (ends[0] if len(ends) == 1 else "neither")
     right = [
         Prediction(question_id=q.question_id, task=q.task, outputs=(d.turns[-1].assistant,), truncated=False, tokens=1)
         for _, q in changed

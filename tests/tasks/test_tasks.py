@@ -179,6 +179,7 @@ UNREADABLE = {
             for x in ("a) or b).", "a) and b).", "c).", "x), because xxx", "a hammer")
         ),
         *("The most suitable object is a). The most suitable object is b).", "a)", ""),
+        *("The most suitable object for this is a) or b).", "The most suitable object for a pan. What is b)?"),
     ],
 }
 
@@ -196,6 +197,7 @@ def test_nothing_is_read_from(task: str) -> None:
         ("The most suitable object is a), because of its hardness.", "a"),
         ("The most suitable object is (b), because a) is soft.", "b"),
         ("the most suitable object is B)", "b"),
+        ("The most suitable object for cleaning a pan without scratching it is a).", "a"),
     ],
 )
 def test_what_is_read_of_a_scenario(output: str, predicted: str) -> None:

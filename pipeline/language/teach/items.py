@@ -126,11 +126,10 @@ def held_out(levels: Sequence[int]) -> bool:
 
 @dataclass(frozen=True)
 class Item:
-    """A conversation, and what of each answer is learnt: its end, or nothing where that is empty."""
+    """A conversation, of whose answers only what they conclude is learnt."""
 
     kind: str
     turns: tuple[Turn, ...]
-    learnt: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -177,9 +176,9 @@ def draw(rng: random.Random, form: Form, *, held: bool = False, further: bool = 
             questions, answers = (_numbered(texts) for texts in (more.keys(), more.values()))
             more = {questions: answers}
         first, *later = more.items()
-        turns, learnt = _place(*first, _describe_all(things, form, rng), place, things.words, rng)
+        turns = _place(*first, _describe_all(things, form, rng), place, things.words, rng)
         turns += [Turn(user=question, assistant=answer) for question, answer in later]
-        return Item(kind, tuple(turns), (*learnt, *(answer for _, answer in later)))
+        return Item(kind, tuple(turns))
 
 
 def _things(rng: random.Random, count: int, form: Form, held: bool) -> Things:
@@ -315,18 +314,15 @@ def _joined(parts: Sequence[str]) -> str:
     return " and ".join([", ".join(parts[:-1]), parts[-1]]) if len(parts) > 1 else parts[0]
 
 
-def _place(
-    question: str, answer: str, described: str, place: Place, words: Words, rng: random.Random
-) -> tuple[list[Turn], list[str]]:
-    """The turns of a conversation, and what is learnt of each answer."""
+def _place(question: str, answer: str, described: str, place: Place, words: Words, rng: random.Random) -> list[Turn]:
+    """The turns of a conversation."""
     if place == "told":
-        said = f"{described} {rng.choice(words.therefore)} {answer}"
-        return [Turn(user=f"{question} {rng.choice(words.tell)}", assistant=said)], [answer]
+        before = f"{described} {rng.choice(words.therefore)}"
+        told = Turn(user=f"{question} {rng.choice(words.tell)}", assistant=f"{before} {answer}", described=len(before))
+        return [told]
     if place == "earlier":
-        return [Turn(user=rng.choice(words.tell), assistant=described), Turn(user=question, assistant=answer)], [
-            "",
-            answer,
-        ]
+        told = Turn(user=rng.choice(words.tell), assistant=described, described=len(described))
+        return [told, Turn(user=question, assistant=answer)]
     before = rng.choice(words.before)
     asked = [before, described, question] if place == "behind" else [question, described]
-    return [Turn(user=" ".join(filter(None, asked)), assistant=answer)], [answer]
+    return [Turn(user=" ".join(filter(None, asked)), assistant=answer)]

@@ -9,7 +9,6 @@ from __future__ import annotations
 import random
 import shutil
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,7 @@ from pipeline.card import write_card
 from pipeline.config import LanguageConfig, RuntimeConfig, TeachConfig
 from pipeline.io import fingerprint
 from pipeline.language.base import load_llm
-from pipeline.language.chat import IGNORE_INDEX, Encoded, encode, render
+from pipeline.language.chat import IGNORE_INDEX, Encoded, encode_turns
 from pipeline.language.teach import items
 from pipeline.language.teach.items import Form, Item, draw
 from pipeline.records import Measurement
@@ -58,16 +57,8 @@ def longest(config: TeachConfig) -> int:
 
 
 def encode_item(item: Item, tokenizer: PreTrainedTokenizerBase, system_prompt: str) -> Encoded:
-    """Token ids of an item, with labels on what is learnt of its answers, end tokens included."""
-    rendered = render(item.turns, tokenizer, system_prompt=system_prompt, frames=0, complete=True)
-    spans = []
-    for (start, stop), turn, learnt in zip(rendered.answers, item.turns, item.learnt, strict=True):
-        if learnt and learnt != turn.assistant:
-            # The space before a word belongs to its token.
-            start = rendered.text.index(turn.assistant, start) + len(turn.assistant) - len(learnt) - 1
-        if learnt:
-            spans.append((start, stop))
-    return encode(replace(rendered, answers=tuple(spans)), tokenizer)
+    """Token ids of an item, with labels on what its answers conclude, end tokens included."""
+    return encode_turns(item.turns, tokenizer, system_prompt=system_prompt, frames=0, descriptions=False)
 
 
 class Course(Dataset[Encoded]):

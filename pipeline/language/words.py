@@ -1,0 +1,60 @@
+"""A start of the projection: frames that read like the words of their object's classes."""
+
+from __future__ import annotations
+
+import torch
+from torch.nn import functional as F
+
+from pipeline.language.conversations import ConversationDataset
+from pipeline.language.octopi import OctopiForCausalLM
+from pipeline.videos.catalogue import Catalogue
+
+STEPS, BATCH, RATE = 400, 128, 2e-3
+"""Updates, frames an update and their learning rate: seconds on a processor."""
+NOISE = 0.3
+"""Standard deviation of the noise on an embedding, whose values have a deviation of 1 (`encoder.standardize`)."""
+
+
+def begin_with_words(model: OctopiForCausalLM, data: ConversationDataset, catalogue: Catalogue, seed: int) -> None:
+    """Fit the projection so that a frame is read as the classes of its object are: as their words' mean embedding.
+
+    Frames of a drawn projection mean nothing to the language model. What it learns of them first is by heart, object by
+    object, and not which video of a question they belong to. What reads like words it can find by the label before it,
+    as in a list.
+
+    Args:
+        data: Whose frames, mirrored ones left out, and labels are fitted. Frames get noise, or the few objects would be
+            learnt by heart here.
+    """
+    tokenizer, matrix = model.tokenizer, model.llm.get_input_embeddings().weight.detach().float()
+    classes = [
+        [matrix[tokenizer.encode(f" {level}", add_special_tokens=False)].mean(0) for level in prop.levels]
+        for prop in catalogue.properties
+    ]
+    labels = {v: label for q in data.questions for v, label in zip(q.videos, q.gold.labels, strict=True)}
+    frames, wanted = [], []
+    for video, label in sorted(labels.items()):
+        found = data.store.features(video, range(data.store.count(video))).float()
+        mean = torch.stack([levels[place] for levels, place in zip(classes, label, strict=True)]).mean(0)
+        frames.append(found)
+        wanted.append(mean.expand(len(found), -1))
+    device = model.connector.delimiters.device
+    x, y = torch.cat(frames).to(device), torch.cat(wanted).to(device)
+    # Words are short: a step of the optimizer would be longer than they are.
+    length = y.square().mean().sqrt()
+    projection, drawn = model.connector.projection, torch.Generator().manual_seed(seed)
+    optimizer = torch.optim.AdamW(projection.parameters(), lr=RATE)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, STEPS)
+    for _ in range(STEPS):
+        rows = torch.randint(len(x), (BATCH,), generator=drawn)
+        noise = NOISE * torch.randn(BATCH, x.shape[1], generator=drawn)
+        loss = F.mse_loss(projection(x[rows] + noise.to(device)), y[rows] / length)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+    optimizer.zero_grad()
+    if model.word_rms is None:
+        with torch.no_grad():
+            for parameter in projection[-1].parameters():
+                parameter.mul_(length)
