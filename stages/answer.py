@@ -7,7 +7,7 @@ from pipeline.embeddings import EmbeddingStore
 from pipeline.io import read_jsonl, write_csv, write_jsonl
 from pipeline.language.generate import GenerationSettings, ModelSource, answer
 from pipeline.language.input_ablation import ablate_input
-from pipeline.language.teach.gate import examine, gate_questions
+from pipeline.language.teach.gate import RESTATING, examine, gate_questions
 from pipeline.parallel import device_here
 from pipeline.records import GATE, Described, Encoder, Lora, Opd, Question, Touch, Variant
 from pipeline.runtime import name_dtype
@@ -54,6 +54,7 @@ def main() -> None:
                 model=f"with LoRA, seed {variant.seed}",
                 system_prompt=language.system_prompt,
                 batch_size=language.generation_batch_size,
+                tokens=RESTATING,
             )
             write_csv(DATA / "answers" / variant.key / GATE, Described, scores)
 

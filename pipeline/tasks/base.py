@@ -90,7 +90,9 @@ class TaskDefinition(ABC):
         each = (
             f"{name} {prop.levels[labels[place]]}" for name, labels in zip(self.listed, draft.gold.labels, strict=True)
         )
-        told = f"{prop.spoken.capitalize()}: {', '.join(each)}. {draft.finding} Conclusion: "
+        told = " ".join(
+            filter(None, (f"{prop.spoken.capitalize()}: {', '.join(each)}.", draft.finding, "Conclusion: "))
+        )
         dialogues = []
         for dialogue in draft.dialogues:
             *before, last = dialogue.turns
@@ -133,12 +135,14 @@ def _turn(user: str, answer: str) -> Turn:
 def in_two_turns(draft: Draft) -> Draft:
     """The question whose answer describes everything in a first turn, and concludes in a second.
 
-    A question that has no mode without descriptions, or more turns already, stays as it is.
+    A question about one video, without a description or a mode that has none, or of several turns, stays as it is.
     """
     asked = {d.opd: d.turns for d in draft.dialogues}
     if set(map(len, asked.values())) != {1} or not {Opd.ALL, Opd.NONE} <= asked.keys():
         return draft
     (whole,), (bare,) = asked[Opd.ALL], asked[Opd.NONE]
+    if not whole.described or not 1 < len(draft.videos) <= len(LETTERS):
+        return draft
     question = bare.user
     for letter in LETTERS[: len(draft.videos)]:
         question = question.replace(f"{letter}) {{tactile}}", f"{letter})")

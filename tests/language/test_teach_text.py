@@ -223,6 +223,8 @@ def test_held_out_combinations_are_never_taught() -> None:
         ("PC", "Yes and no.", None),
         ("PC", "Yesterday nobody knew.", None),
         ("PC", "", None),
+        ("PC", "Hardness: a) soft, b) hard. Harder: second object. Conclusion: No, the second object is harder.", "no"),
+        ("PSS", "Hardness: a) soft, b) hard, c) hard. Softest: a). Conclusion: a) is the softest.", "a"),
         ("PSS", "b)", "b"),
         ("PSS", "B", "b"),
         ("PSS", "c) is the hardest.", "c"),

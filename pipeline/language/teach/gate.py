@@ -26,9 +26,10 @@ from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.catalogue.wording import Scenario
 
 LETTERS = "abc"
-NEW_TOKENS = {"POM": 40}
-"""Longest answer; `USUAL` for the other tasks."""
-USUAL = 16
+TOKENS, MATCHING = 16, 40
+"""Of the longest answer, and of one that matches three names."""
+RESTATING = 64
+"""Of the longest answer of a model that learnt to restate before it concludes."""
 VERDICTS = {"yes": "yes", "no": "no", "same": "same", "both": "same", "neither": "same", "alike": "same"}
 
 
@@ -44,7 +45,7 @@ class GateQuestion:
 
     def read(self, answer: str) -> str | None:
         """What an answer chooses; None where it names no choice, or several."""
-        text = answer.lower()
+        text = answer.lower().rpartition("conclusion:")[2]
         if self.task == "POM":
             longest = sorted(self.names, key=len, reverse=True)
             found = list(dict.fromkeys(re.findall("|".join(rf"\b{re.escape(n)}\b" for n in longest), text)))
@@ -89,17 +90,19 @@ def examine(
     model: str,
     system_prompt: str,
     batch_size: int,
+    tokens: int = TOKENS,
 ) -> list[Described]:
     """Ask a loaded language model everything, greedily; one score a task.
 
     Args:
         model: What it is called in the table.
+        tokens: Of the longest answer.
     """
     said: dict[GateQuestion, str] = {}
     by_length = sorted(questions, key=lambda q: (q.task == "POM", len(q.text)))
     for start in track(range(0, len(by_length), batch_size), f"gate of the {model} model", "batch"):
         batch = by_length[start : start + batch_size]
-        for question, text in zip(batch, _answers(llm, tokenizer, batch, system_prompt), strict=True):
+        for question, text in zip(batch, _answers(llm, tokenizer, batch, system_prompt, tokens), strict=True):
             said[question] = text
     scores = []
     for task in dict.fromkeys(q.task for q in questions):
@@ -143,7 +146,11 @@ def gate(
 
 @torch.inference_mode()
 def _answers(
-    llm: PreTrainedModel, tokenizer: PreTrainedTokenizerBase, batch: Sequence[GateQuestion], system_prompt: str
+    llm: PreTrainedModel,
+    tokenizer: PreTrainedTokenizerBase,
+    batch: Sequence[GateQuestion],
+    system_prompt: str,
+    tokens: int,
 ) -> list[str]:
     turns = [[Turn(user=q.text, assistant="")] for q in batch]
     texts = [render(t, tokenizer, system_prompt=system_prompt, frames=0, complete=False) for t in turns]
@@ -156,7 +163,7 @@ def _answers(
     new = llm.generate(
         input_ids=ids,
         attention_mask=mask,
-        max_new_tokens=max(NEW_TOKENS.get(q.task, USUAL) for q in batch),
+        max_new_tokens=max(max(tokens, MATCHING) if q.task == "POM" else tokens for q in batch),
         do_sample=False,
         eos_token_id=ends,
         pad_token_id=pad,
