@@ -40,8 +40,8 @@ class ConversationDataset(EpochDataset[Sample]):
     Args:
         positions: Tokens that the language model can read at once; None where that is unknown.
         counterfactual: Share of the described questions that come with videos of other objects. Of these only what
-            follows from the description is learnt. Touch tells the class of every training object, so that a small
-            model would otherwise conclude from touch, past its own description, and fail on objects that are new.
+            follows from the description is learnt. Touch tells the classes of training objects too, and is not what
+            a conclusion shall be learnt from.
         conclusion_weight: Of each token behind a description, in the loss; all others weigh 1.
 
     Raises:

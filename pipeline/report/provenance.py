@@ -77,6 +77,8 @@ def provenance(
         "restated": params.questions.restate,
         "two_turns": params.questions.two_turns,
         "counterfactual": params.lora.counterfactual,
+        "conclusion_weight": params.lora.conclusion_weight,
+        "begun_with_words": params.align.begin_with_words,
         "command": "dvc repro",
         "commit": commit,
         "changed": bool(_git(root, "status", "--porcelain", "--", *CODE)),

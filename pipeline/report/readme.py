@@ -127,7 +127,13 @@ def stands_on(said: dict[str, Any]) -> list[str]:
     if said.get("counterfactual"):
         facts.append(
             f"**Conclusions:** {said['counterfactual']:.0%} of LoRA's described questions come with videos of other "
-            "objects, and only what follows from the description is learnt of them. The paper has none of these."
+            "objects, and only what follows from the description is learnt of them. What stands behind a description "
+            f"weighs {said['conclusion_weight']:g} times. The paper has neither."
+        )
+    if said.get("begun_with_words"):
+        facts.append(
+            "**Projection:** before alignment it was fitted to the words of each training object's classes. The paper's "
+            "starts at random."
         )
     return facts + [vision_words(source) for source in said.get("vision", ())]
 
