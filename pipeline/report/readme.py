@@ -132,8 +132,8 @@ def stands_on(said: dict[str, Any]) -> list[str]:
         )
     if said.get("begun_with_words"):
         facts.append(
-            "**Projection:** before alignment it was fitted to the words of each training object's classes. The paper's "
-            "starts at random."
+            "**Projection:** before alignment it was fitted to the words of each training object's classes. "
+            "The paper's starts at random."
         )
     return facts + [vision_words(source) for source in said.get("vision", ())]
 
