@@ -36,6 +36,8 @@ class Loaded(NamedTuple):
     store: FrameStore
     device: torch.device
     batch_size: int
+    mirrored: bool = True
+    """Whether training draws mirrored frames."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,8 @@ class EncoderSource:
             encoder = classifier.encoder
         device = resolve_device(self.device)
         store = FrameStore(self.frames, self.config.reference)
-        return Loaded(encoder.to(device).eval(), store, device, self.config.embed_batch_size)
+        mirrored = self.config.flip_probability > 0
+        return Loaded(encoder.to(device).eval(), store, device, self.config.embed_batch_size, mirrored)
 
 
 def embed_videos(
@@ -87,7 +90,7 @@ def embed_videos(
     index: list[Embedding] = []
     for assignment in used:
         frames = [loaded.store.index[row].frame_index for row in loaded.store.rows(assignment.video_id)]
-        for flip in _flips(assignment):
+        for flip in _flips(loaded, assignment):
             for frame in frames:
                 index.append(Embedding(video_id=assignment.video_id, frame_index=frame, flip=flip, row=len(index)))
     embeddings, row = torch.empty(0), 0
@@ -99,15 +102,16 @@ def embed_videos(
     return embeddings, index
 
 
-def _flips(assignment: Assignment) -> Sequence[Flip]:
-    return FLIPS if assignment.part == Part.TRAIN else FLIPS[:1]
+def _flips(loaded: Loaded, assignment: Assignment) -> Sequence[Flip]:
+    return FLIPS if loaded.mirrored and assignment.part == Part.TRAIN else FLIPS[:1]
 
 
 @torch.inference_mode()
 def _embed_video(loaded: Loaded, assignment: Assignment) -> np.ndarray:
     """Embeddings of a video's frames, flip by flip: float32, rows x dim."""
-    encoder, store, device, batch_size = loaded
-    rows, pixels, flips = store.rows(assignment.video_id), store.pictures(assignment.video_id), _flips(assignment)
+    encoder, store, device, batch_size, _ = loaded
+    rows, pixels = store.rows(assignment.video_id), store.pictures(assignment.video_id)
+    flips = _flips(loaded, assignment)
     # All mirrored versions in one tensor: larger batches cost less a frame.
     frames = torch.from_numpy(np.concatenate([np.flip(pixels, AXES[flip]) for flip in flips]))
     frame_indices = torch.tensor([store.index[row].frame_index for row in rows] * len(flips))

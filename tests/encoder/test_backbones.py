@@ -21,7 +21,7 @@ from pipeline.encoder import finetune as training
 from pipeline.encoder import tuned
 from pipeline.encoder.backbones import BACKBONES, check_backbones, load_backbones
 from pipeline.encoder.clips import EncoderData, classify
-from pipeline.encoder.embed import Loaded, embed_videos
+from pipeline.encoder.embed import EncoderSource, Loaded, embed_videos
 from pipeline.encoder.finetune import finetune, tune
 from pipeline.encoder.frame_classifier import JointFrameClassifier
 from pipeline.encoder.model import FrameEncoder, SideBySide, mean_and_deviation
@@ -34,6 +34,7 @@ from pipeline.records import Part
 from pipeline.runtime import seed_everything
 from pipeline.training.trainable import load_trainable, save_trainable, trainable_state
 from pipeline.videos.catalogue import Catalogue
+from tests.closure import ROOT
 from tests.encoders import CPU, PARTS, close, config, encoder_data, float64, write_pretrained, write_timm
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
@@ -317,6 +318,16 @@ def test_what_is_tuned_is_saved_loaded_and_embeds_alike(
         embed_videos(Loaded(m.encoder.eval(), data.store, DEVICE, 4), data.assignments)[0] for m in (model, again)
     )
     assert torch.equal(one, other)
+    source = EncoderSource(
+        setting.model_copy(update={"flip_probability": 0.0}),
+        *("cpu", tmp_path, ROOT / "pipeline" / "physiclear", tmp_path / "model.safetensors"),
+    )
+    alone, index = embed_videos(source(), data.assignments)
+    every, mirrored = embed_videos(source()._replace(mirrored=True), data.assignments)
+    plain = [row for row, entry in enumerate(mirrored) if entry.flip == "none"]
+    assert [e.flip for e in index] == ["none"] * len(plain), "what training never draws is not embedded"
+    assert [e.video_id for e in index] == [mirrored[row].video_id for row in plain]
+    torch.testing.assert_close(alone, every[plain])
     kept = sum(value.numel() for value in trainable_state(model).values())
     assert kept < 0.9 * sum(p.numel() for p in model.parameters())
 
