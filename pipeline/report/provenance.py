@@ -74,11 +74,7 @@ def provenance(
         "settings": settings_note(params.report_name, params.split.name),
         "intervals": coverage_note(asked),
         "facts_told": params.questions.facts,
-        "restated": params.questions.restate,
-        "two_turns": params.questions.two_turns,
-        "counterfactual": params.lora.counterfactual,
-        "conclusion_weight": params.lora.conclusion_weight,
-        "begun_with_words": params.align.begin_with_words,
+        "beyond_paper": beyond_paper(params),
         "command": "dvc repro",
         "commit": commit,
         "changed": bool(_git(root, "status", "--porcelain", "--", *CODE)),
@@ -92,6 +88,26 @@ def provenance(
         "taught_from": params.teach.base,
         "python": platform.python_version(),
         "packages": {name: _version(name) for name in PACKAGES},
+    }
+
+
+BEYOND = {
+    "questions": ("restate", "two_turns"),
+    "language": ("normalize_touch",),
+    "align": ("begin_with_words", "embedding_noise"),
+    "lora": ("target_modules", "counterfactual", "conclusion_weight", "embedding_noise"),
+}
+"""Settings by which a small model is trained otherwise than the paper's."""
+
+
+def beyond_paper(params: Params) -> dict[str, Any]:
+    """Those of `BEYOND` that are not as the paper has them, by their keys in params.yaml."""
+    sections = {name: getattr(params, name) for name in BEYOND}
+    return {
+        f"{name}.{key}": getattr(section, key)
+        for name, section in sections.items()
+        for key in BEYOND[name]
+        if getattr(section, key) != type(section).model_fields[key].default
     }
 
 

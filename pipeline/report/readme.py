@@ -114,27 +114,9 @@ def stands_on(said: dict[str, Any]) -> list[str]:
         facts.append(
             "**Matching questions** say what the named objects are like: they ask for touch, not for knowledge."
         )
-    if said.get("restated"):
-        facts.append(
-            "**Answers to PC and PSS** name the classes of the property asked for before they conclude: the model is "
-            "too small to find and compare at once, and was trained so. The paper's conclude at once."
-        )
-    if said.get("two_turns"):
-        facts.append(
-            f"**Two turns:** {said['two_turns']:.0%} of the training questions about several videos describe in one "
-            "turn and conclude in the next, as scenarios do. The paper's have one turn."
-        )
-    if said.get("counterfactual"):
-        facts.append(
-            f"**Conclusions:** {said['counterfactual']:.0%} of LoRA's described questions come with videos of other "
-            "objects, and only what follows from the description is learnt of them. What stands behind a description "
-            f"weighs {said['conclusion_weight']:g} times. The paper has neither."
-        )
-    if said.get("begun_with_words"):
-        facts.append(
-            "**Projection:** before alignment it was fitted to the words of each training object's classes. "
-            "The paper's starts at random."
-        )
+    if beyond := said.get("beyond_paper"):
+        settings = ", ".join(f"`{key}={value}`" for key, value in beyond.items())
+        facts.append(f"**Trained in ways that the paper has not**, for a small model (docs/language.md): {settings}.")
     return facts + [vision_words(source) for source in said.get("vision", ())]
 
 

@@ -8,7 +8,10 @@ from typing import Any
 import pytest
 
 from pipeline.report.load import Report, published
+from pipeline.report.provenance import beyond_paper
 from pipeline.report.readme import MOST_LINES, finding, render_readme, size_words, stands_on
+from pipeline.scales import compose
+from tests.closure import ROOT
 from tests.report.conftest import effect, effects_of, score, scores_of
 
 
@@ -181,3 +184,13 @@ def test_what_the_figures_stand_on_is_said_in_words() -> None:
     facts = "\n".join(stands_on(report([], settings="", facts_told=True, intervals="Known to be narrow.").provenance))
     for words in ("2 (a, b), 4 videos, split `paper`", "Nothing is noted", "Known to be narrow.", "ask for touch"):
         assert words in facts
+
+
+def test_a_report_names_what_the_paper_does_not_train() -> None:
+    assert beyond_paper(compose("paper-7b", [], ROOT / "conf")) == {}
+    found = beyond_paper(compose("small", ["lora.conclusion_weight=3"], ROOT / "conf"))
+    assert found["questions.restate"] is True
+    assert found["lora.conclusion_weight"] == 3
+    facts = "\n".join(stands_on(report([], beyond_paper=found).provenance))
+    assert all(f"`{key}={value}`" in facts for key, value in found.items())
+    assert "the paper has not" not in "\n".join(stands_on(report([], beyond_paper={}).provenance))
