@@ -55,7 +55,8 @@ class DataConfig(Section):
     """Where the videos come from."""
 
     source: Literal["scenes", "videos"]
-    """`scenes`: synthetic, made by the chain. `videos`: files named `<object>_<number>` in `dir`."""
+    """`scenes`: synthetic, made by the chain. `videos`: files in `dir`, named `<object>_<number>` or listed in its
+    videos.csv."""
     dir: str = Field(min_length=1)
     """Folder of the videos; for scenes, where the chain puts them."""
     catalogue: str = "pipeline/physiclear"
@@ -99,7 +100,7 @@ class FramesConfig(Section):
     tolerance: Annotated[float, Field(ge=0, le=10)] = 0.8
     """`adaptive`: what a further frame must add to be kept, as a share of the strongest contact."""
     size: Annotated[int, Field(ge=16, le=1024)] = 224
-    """Side of the square that frames are stored at; must be the encoder's input size."""
+    """Side of the square that frames are stored at; a CLIP's own or more, as larger frames are averaged."""
     fit: Literal["crop", "squash"] = "crop"
     """`crop`: the centre, then to `size`. `squash`: the whole frame, aspect lost."""
 

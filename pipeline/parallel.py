@@ -46,7 +46,7 @@ def check_backend(name: Backend) -> None:
     for package in NEEDED[name]:
         if find_spec(package) is None:
             raise UserError(
-                f"runtime.parallel: {name} takes the package {package}: pip install 'octopi-pipeline[{name}]'"
+                f"runtime.parallel: {name} takes the package {package}: pip install -e '.[{name}]'"
             )
 
 

@@ -1,4 +1,4 @@
-"""`octopi repro`: says how many stages will run, lets DVC run them, and writes the page where a report changed."""
+"""`octopi repro`: says how many stages will run, lets DVC run them, and says where the results are."""
 
 from __future__ import annotations
 
@@ -50,11 +50,6 @@ def reproduce(root: Path, arguments: list[str]) -> int:
             return status
     else:
         print(f"{name}: all {total} stages are up to date")
-    page = root / "reports" / "index.html"
-    if waiting or not page.is_file():
-        from pipeline.report.page import write_page
-
-        write_page(root)
     print(f"Report: reports/{name}/README.md; all reports on one page: reports/index.html")
     print("Dashboard: make dashboard, then open http://127.0.0.1:5000")
     return 0

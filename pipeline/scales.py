@@ -116,6 +116,11 @@ def check_inputs(params: Params) -> None:
     check_encoder_files(Path(params.encoder.weights), backbone)
     if params.language.weights == TAUGHT and not params.teach.base:
         raise UserError(f"language.weights: {TAUGHT} is what teaching makes; name the model to teach in teach.base")
+    if params.teach.base and params.language.weights != TAUGHT:
+        raise UserError(
+            f"teach.base: {params.teach.base} would be taught and not used, as language.weights is "
+            f"{params.language.weights}; set teach.base= to nothing, or language.weights={TAUGHT}"
+        )
     for key, base in (("teach.base", params.teach.base), ("language.weights", params.language.weights)):
         if base not in ("", TAUGHT):
             weights.check_language(Path(base), key)

@@ -1,13 +1,16 @@
-"""Show the reproduction in MLflow. A dead server is a warning: results do not depend on it."""
+"""Show the reproduction: on the page over all reports, and in MLflow, whose dead server is a warning."""
 
 import logging
+from pathlib import Path
 
+from pipeline.report.page import write_page
 from pipeline.stage import stage
 from pipeline.tracking import TrackingError, publish
 
 
 def main() -> None:
     with stage("publish") as run:
+        write_page(Path())
         try:
             print(publish(run.params), flush=True)
         except TrackingError as error:

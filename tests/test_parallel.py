@@ -139,14 +139,14 @@ def here(tiny_videos: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[st
 def test_two_workers_of_a_cluster_make_the_same_bytes(
     backend: str, package: str, here: dict[str, str], tiny_videos: Path, tmp_path: Path
 ) -> None:
-    pytest.importorskip(package, reason=f"needs {backend}: pip install 'octopi-pipeline[{backend}]'")
+    pytest.importorskip(package, reason=f"needs {backend}: pip install -e '.[{backend}]'")
     assert len(here) == 4
     assert work_on(backend, tmp_path / "there", tiny_videos) == here
 
 
 @pytest.mark.parametrize(("backend", "package"), [("ray", "ray"), ("dask", "distributed")])
 def test_a_cluster_embeds_and_answers_to_the_same_bytes(backend: str, package: str, tmp_path: Path) -> None:
-    pytest.importorskip(package, reason=f"needs {backend}: pip install 'octopi-pipeline[{backend}]'")
+    pytest.importorskip(package, reason=f"needs {backend}: pip install -e '.[{backend}]'")
     (tmp_path / "models.py").write_text(MODELS)
     env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     command = [sys.executable, "models.py", backend]

@@ -94,8 +94,8 @@ def provenance(
 BEYOND = {
     "questions": ("restate", "two_turns"),
     "language": ("normalize_touch",),
-    "align": ("begin_with_words", "embedding_noise"),
-    "lora": ("target_modules", "counterfactual", "conclusion_weight", "embedding_noise"),
+    "align": ("begin_with_words",),
+    "lora": ("target_modules", "counterfactual", "conclusion_weight"),
 }
 """Settings by which a small model is trained otherwise than the paper's."""
 

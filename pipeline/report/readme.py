@@ -207,7 +207,7 @@ def _against_chance(rows: pd.DataFrame) -> list[str]:
     tasks = f"{len(above)} of {_count(len(rows), 'task')}{named}"
     text = f"The full system's interval lies above chance in {tasks}"
     text += f" and below it in {', '.join(below['task'])}" if len(below) else ""
-    return [f"{text}: it is {extremes}." if len(rows) > 1 else f"{text}."]
+    return [f"{text}. Against chance it is {extremes}." if len(rows) > 1 else f"{text}."]
 
 
 def _touch(effects: pd.DataFrame, solved: Collection[str]) -> list[str]:
@@ -221,7 +221,7 @@ def _touch(effects: pd.DataFrame, solved: Collection[str]) -> list[str]:
     *others, last = [change.partition(" - ")[2] for change in dict.fromkeys(rows["change"])]
     span = f"{100 * rows['difference'].min():+.1f} to {100 * rows['difference'].max():+.1f} points"
     instead = f"{', '.join(others)} or {last}" if others else last
-    fact = f"with real touch in place of {instead} accuracy differs by {span}, task by task"
+    fact = f"with real touch, against touch that was {instead}, accuracy differs by {span}, task by task"
     better = rows[(rows["p_holm"] < ALPHA) & (rows["difference"] > 0)]
     sure, likely = better[better["task"].isin(solved)], rows[(rows["low"] > 0) & rows["task"].isin(solved)]
     if len(sure):
@@ -252,8 +252,9 @@ def _parts(effects: pd.DataFrame, solved: Collection[str]) -> list[str]:
         ", ".join(f"{r['part']} in {r['task']} {100 * r['difference']:+.1f}" for r in part.to_dict("records"))
         for part in (sure, formal)
     )
-    all_of_them = f"{len(rows)} effects of encoder, LoRA and OPD"
-    also = f" Significant too, but with it answers are no better than chance: {only} points." if only else ""
+    named = {"lora": "LoRA", "opd": "OPD"}
+    all_of_them = f"{len(rows)} effects of {' and '.join(named.get(p, p) for p in dict.fromkeys(rows['part']))}"
+    also = f" Significant too, but answers are no better than chance even so: {only} points." if only else ""
     if words:
         return [f"Of {all_of_them} these hold up (Holm): {words} points.{also}"]
     if only:

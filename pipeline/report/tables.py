@@ -251,6 +251,16 @@ def _variants(*axes: str, described: bool | None = None, trained: bool | None = 
     return select
 
 
+def _ablated(axis: str, *, described: bool) -> Select:
+    """Variants that differ in an axis; none where nothing was varied in it."""
+
+    def select(frame: pd.DataFrame) -> pd.Series[bool]:
+        rows = _variants(axis, described=described)(frame)
+        return rows & (frame.loc[rows, axis].nunique() > 1)
+
+    return select
+
+
 def _over_seeds(*tasks: str) -> Select:
     return lambda frame: frame["task"].isin(tasks) & (frame["seed"] == ALL_SEEDS)
 
@@ -305,7 +315,7 @@ TABLES: tuple[Table, ...] = (
             f"{axis}_{kind}",
             f"Ablation of {name}: {title}",
             caption,
-            _variants(axis, described=kind == "properties"),
+            _ablated(axis, described=kind == "properties"),
             columns,
             folded=False,
         )

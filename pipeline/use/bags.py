@@ -159,7 +159,7 @@ def shots(bag: Path, topic: str) -> Iterator[Shot]:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise UserError("reading bags takes the package rosbags: pip install 'octopi-pipeline[robot]'") from None
+        raise UserError("reading bags takes the package rosbags: pip install -e '.[robot]'") from None
     if not bag.exists():
         raise UserError(f"{bag}: no such recording; name a .bag, a ROS 2 folder, or an .mcap or .db3 file")
     size = None

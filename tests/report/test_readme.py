@@ -110,10 +110,10 @@ TOUCH = {"part": "touch", "change": "real - swapped"}
         ([], "Whether answers depend on touch was not tested."),
         (
             [effect(**TOUCH, p_holm=0.01, low=0.02)],
-            "Answers use touch in PC: with real touch in place of swapped accuracy differs by +10.0 to +10.0",
+            "Answers use touch in PC: with real touch, against touch that was swapped, accuracy differs by +10.0 to",
         ),
-        ([effect(**TOUCH, low=0.02)], "Answers seem to use touch: with real touch in place of swapped"),
-        ([effect(**TOUCH)], "That answers use touch is not shown: with real touch in place of swapped"),
+        ([effect(**TOUCH, low=0.02)], "Answers seem to use touch: with real touch, against touch that was swapped"),
+        ([effect(**TOUCH)], "That answers use touch is not shown: with real touch, against touch that was swapped"),
         ([effect(**TOUCH, p_holm=0.01, difference=-0.1, low=-0.2)], "That answers use touch is not shown"),
         (
             [effect(**TOUCH, low=0.02, objects=5)],
@@ -137,18 +137,18 @@ def test_a_task_at_chance_shows_no_touch() -> None:
 
 def test_effects_that_hold_are_named_and_those_that_do_not_are_not() -> None:
     none = finding(report([score()], [effect(), effect("opd", "all - none", smallest_effect=0.12)]))[2]
-    assert "None of 2 effects of encoder, LoRA and OPD is significant after Holm's adjustment; the smallest" in none
+    assert "None of 2 effects of LoRA and OPD is significant after Holm's adjustment; the smallest" in none
     assert "could have found is 12 points" in none
     some = finding(report([score()], [effect(p_holm=0.001), effect("opd", "all - none")]))[2]
-    assert "Of 2 effects of encoder, LoRA and OPD these hold up (Holm): lora in PC +10.0 points." in some
+    assert "Of 2 effects of LoRA and OPD these hold up (Holm): lora in PC +10.0 points." in some
     assert "opd in PC" not in some
 
 
 def test_a_gain_that_ends_at_chance_is_one_of_form() -> None:
     guessed, formed = score("PSS", low=0.2), effect(task="PSS", p_holm=0.001, difference=0.3)
     only = finding(report([guessed], [formed]))[2]
-    assert "None of 1 effects of encoder, LoRA and OPD holds up." in only
-    assert "with it answers are no better than chance: lora in PSS +30.0 points." in only
+    assert "None of 1 effects of LoRA holds up." in only
+    assert "answers are no better than chance even so: lora in PSS +30.0 points." in only
     both = finding(report([guessed, score("PC")], [formed, effect(p_holm=0.001)]))[2]
     assert "these hold up (Holm): lora in PC +10.0 points. Significant too, but" in both
     worse = finding(report([guessed], [effect(task="PSS", p_holm=0.001, difference=-0.3)]))[2]

@@ -25,7 +25,7 @@ from pipeline.videos.files import list_videos
 from pipeline.videos.frames.reference import LONGEST
 from pipeline.videos.frames.scan import Scan, scan
 
-pytest.importorskip("rosbags", reason="needs rosbags: pip install 'octopi-pipeline[robot]'")
+pytest.importorskip("rosbags", reason="needs rosbags: pip install -e '.[robot]'")
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
