@@ -356,7 +356,7 @@ class LoraTrainConfig(TrainConfig):
 
     learning_rate: Rate = 2e-4
     rank: Annotated[int, Field(ge=1, le=1024)] = 128
-    alpha: Annotated[float, Field(gt=0)] = 256
+    alpha: Annotated[float, Field(gt=0)] = 256.0
     dropout: Annotated[float, Field(ge=0, lt=1)] = 0.05
     target_modules: Literal["all-linear"] | Annotated[tuple[str, ...], Field(min_length=1)] = ("q_proj", "k_proj")
     """Linear layers that get an adapter (the paper does not say; the published code: q_proj and k_proj); `all-linear`:
