@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from copy import copy
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 
@@ -43,23 +44,6 @@ class Statistics(NamedTuple):
             return cls(tensors["mean"], tensors["scale"], stream.metadata()["frames"])
 
 
-class TactileFeatures(Protocol):
-    """Where conversations take the embeddings of a video's frames from."""
-
-    @property
-    def dim(self) -> int:
-        """Length of an embedding."""
-        ...
-
-    def count(self, video_id: str) -> int:
-        """Frames that a video has embeddings of."""
-        ...
-
-    def features(self, video_id: str, positions: Sequence[int], flip: Flip = "none") -> torch.Tensor:
-        """Embeddings of the frames at these positions: positions x dim."""
-        ...
-
-
 class EmbeddingStore:
     """Embeddings of every salient frame; training videos also in their three mirrored versions.
 
@@ -89,11 +73,21 @@ class EmbeddingStore:
 
     def count(self, video_id: str) -> int:
         """Salient frames of a video; a video without any is a UserError."""
+        return len(self.rows(video_id))
+
+    def rows(self, video_id: str) -> list[int]:
+        """Where the embeddings of a video's salient frames, as they are, stand in the tensor."""
         if (video_id, "none") not in self._rows:
             raise UserError(f"{self.folder / INDEX_FILE}: {video_id} has no embedding; run `dvc repro`")
-        return len(self._rows[video_id, "none"])
+        return self._rows[video_id, "none"]
 
     def features(self, video_id: str, positions: Sequence[int], flip: Flip = "none") -> torch.Tensor:
         """Embeddings of the frames at these positions in the list of salient frames: positions x dim."""
         rows = self._rows[video_id, flip]
         return self.tensor[[rows[p] for p in positions]]
+
+    def with_rows(self, rows: Mapping[str, Sequence[int]], tensor: torch.Tensor) -> EmbeddingStore:
+        """A store that gives, for each of these videos, these rows of a tensor; it has no mirrored ones."""
+        other = copy(self)
+        other.tensor, other._rows = tensor, defaultdict(list, {(v, "none"): list(own) for v, own in rows.items()})
+        return other

@@ -45,9 +45,7 @@ def check_backend(name: Backend) -> None:
     """Raise UserError where a package of the backend is not installed."""
     for package in NEEDED[name]:
         if find_spec(package) is None:
-            raise UserError(
-                f"runtime.parallel: {name} takes the package {package}: pip install -e '.[{name}]'"
-            )
+            raise UserError(f"runtime.parallel: {name} takes the package {package}: pip install -e '.[{name}]'")
 
 
 def end_with_parent(parent: int) -> None:

@@ -11,7 +11,7 @@ import torch
 from torch.utils.data import Sampler
 from transformers import PreTrainedTokenizerBase
 
-from pipeline.embeddings import FLIPS, EmbeddingStore, TactileFeatures
+from pipeline.embeddings import FLIPS, EmbeddingStore
 from pipeline.errors import UserError
 from pipeline.language.chat import IGNORE_INDEX, Encoded, encode_turns
 from pipeline.records import Opd, Question
@@ -126,7 +126,7 @@ def check_length(question_id: str, tokens: int, positions: int | None) -> None:
         )
 
 
-def evaluation_features(question: Question, store: TactileFeatures, per_video: int) -> torch.Tensor:
+def evaluation_features(question: Question, store: EmbeddingStore, per_video: int) -> torch.Tensor:
     """The embeddings of a question's videos at uniform intervals: (videos x per_video) x dim."""
     parts = [store.features(v, sample_evaluation(store.count(v), per_video)) for v in question.videos]
     return torch.cat(parts)

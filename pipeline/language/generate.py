@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from transformers import PreTrainedTokenizerBase
 
-from pipeline.embeddings import TactileFeatures
+from pipeline.embeddings import EmbeddingStore
 from pipeline.errors import UserError
 from pipeline.language.chat import encode, end_ids, render
 from pipeline.language.conversations import check_length, evaluation_features
@@ -72,7 +72,7 @@ class Generated:
 
 def answer(
     model: OctopiForCausalLM,
-    store: TactileFeatures,
+    store: EmbeddingStore,
     questions: Sequence[Question],
     opd: Opd,
     settings: GenerationSettings,

@@ -4,78 +4,34 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import accumulate, chain, pairwise
 
 import torch
 
-from pipeline.embeddings import EmbeddingStore, TactileFeatures
+from pipeline.embeddings import EmbeddingStore
 from pipeline.errors import UserError
-from pipeline.records import Flip, Question, Touch
+from pipeline.records import Question, Touch
 from pipeline.runtime import derive_seed
 
 
-class SwappedTouch:
-    """Each video's embeddings are those of a video of another object.
-
-    The objects of the questions are put in a random ring and each is given the touch of the next, so no object keeps
-    its own. It may have the same classes all the same.
-    """
-
-    def __init__(self, store: EmbeddingStore, questions: Iterable[Question], seed: int) -> None:
-        self._store = store
-        self._instead = _ring(_videos(questions), seed)
-
-    @property
-    def dim(self) -> int:
-        """As the store's."""
-        return self._store.dim
-
-    def count(self, video_id: str) -> int:
-        """Frames of the other video."""
-        return self._store.count(self._instead[video_id])
-
-    def features(self, video_id: str, positions: Sequence[int], flip: Flip = "none") -> torch.Tensor:
-        """Embeddings of the other video: positions x dim."""
-        return self._store.features(self._instead[video_id], positions, flip)
-
-
-class NoisyTouch:
-    """Normal noise with the mean and deviation of each dimension over all embeddings, the same at each call."""
-
-    def __init__(self, store: EmbeddingStore, seed: int) -> None:
-        self._store = store
-        self._seed = seed
-        self._mean = store.tensor.mean(0)
-        self._deviation = store.tensor.std(0, correction=0)
-
-    @property
-    def dim(self) -> int:
-        """As the store's."""
-        return self._store.dim
-
-    def count(self, video_id: str) -> int:
-        """As the store's."""
-        return self._store.count(video_id)
-
-    def features(self, video_id: str, positions: Sequence[int], flip: Flip = "none") -> torch.Tensor:
-        """Noise of this video, frame and mirroring: positions x dim."""
-        rows = [self._row(video_id, position, flip) for position in positions]
-        return torch.stack(rows) if rows else self._store.tensor[:0]
-
-    def _row(self, video_id: str, position: int, flip: Flip) -> torch.Tensor:
-        generator = torch.Generator().manual_seed(derive_seed(self._seed, "noise", video_id, position, flip))
-        return self._mean + self._deviation * torch.randn(self.dim, generator=generator)
-
-
-def ablate_input(store: EmbeddingStore, touch: Touch, questions: Sequence[Question], seed: int) -> TactileFeatures:
+def ablate_input(store: EmbeddingStore, touch: Touch, questions: Sequence[Question], seed: int) -> EmbeddingStore:
     """What a variant is given of the questions' videos.
 
-    `removed` is no matter of the embeddings but of the prompt, which then has no frame to put one at.
+    - `swapped`: the objects of the questions are put in a random ring and each is given the touch of the next, so no
+      object keeps its own. It may have the same classes all the same.
+    - `noise`: normal noise with the mean and deviation of each dimension over all embeddings, the same at each call.
+    - `removed` is no matter of the embeddings but of the prompt, which then has no frame to put one at.
     """
-    match touch:
-        case Touch.SWAPPED:
-            return SwappedTouch(store, questions, seed)
-        case Touch.NOISE:
-            return NoisyTouch(store, seed)
+    videos = _videos(questions)
+    if touch is Touch.SWAPPED:
+        return store.with_rows({v: store.rows(other) for v, other in _ring(videos, seed).items()}, store.tensor)
+    if touch is Touch.NOISE:
+        names = list(chain.from_iterable(videos.values()))
+        ends = list(accumulate(map(store.count, names), initial=0))
+        drawn = torch.Generator().manual_seed(derive_seed(seed, "noise"))
+        noise = torch.randn(ends[-1], store.dim, generator=drawn)
+        tensor = store.tensor.mean(0) + store.tensor.std(0, correction=0) * noise
+        return store.with_rows({v: range(*span) for v, span in zip(names, pairwise(ends), strict=True)}, tensor)
     return store
 
 

@@ -14,7 +14,7 @@ from pipeline.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
 from pipeline.errors import UserError
 from pipeline.io import save_tensors, write_table
 from pipeline.language.conversations import evaluation_features
-from pipeline.language.input_ablation import NoisyTouch, SwappedTouch, _ring, ablate_input
+from pipeline.language.input_ablation import _ring, ablate_input
 from pipeline.records import Dialogue, Embedding, Gold, Opd, Part, Question, Touch, Turn
 
 DIM = 6
@@ -57,7 +57,7 @@ QUESTIONS = [question(0, "ab"), question(1, "cd"), question(2, "ad", video=1)]
 def test_swapped_is_always_another_object(store: EmbeddingStore) -> None:
     names = sorted({v for v, _ in store._rows})
     for seed in range(20):
-        ablated = SwappedTouch(store, QUESTIONS, seed)
+        ablated = ablate_input(store, Touch.SWAPPED, QUESTIONS, seed)
         for asked in QUESTIONS:
             for video, own in zip(asked.videos, asked.objects, strict=True):
                 first = ablated.features(video, range(ablated.count(video)))
@@ -77,13 +77,14 @@ def test_no_object_keeps_its_touch_and_none_is_given_twice(count: int, seed: int
 
 def test_swapping_needs_two_objects(store: EmbeddingStore) -> None:
     with pytest.raises(UserError, match=r"ablation.touch: swapped needs questions about two objects"):
-        SwappedTouch(store, [question(0, "a")], 0)
-    assert SwappedTouch(store, [], 0).dim == store.dim, "no test object has videos: nothing is asked"
+        ablate_input(store, Touch.SWAPPED, [question(0, "a")], 0)
+    for touch in (Touch.SWAPPED, Touch.NOISE):
+        assert ablate_input(store, touch, [], 0).dim == store.dim, "no test object has videos: nothing is asked"
 
 
 def test_noise_has_the_embeddings_moments_and_is_no_ones_touch(tmp_path: Path) -> None:
     store = store_of(tmp_path, {"a_0": 4000, "b_0": 4000})
-    ablated = NoisyTouch(store, seed=3)
+    ablated = ablate_input(store, Touch.NOISE, [question(0, "ab")], 3)
     drawn = torch.cat([ablated.features(v, range(4000)) for v in ("a_0", "b_0")])
     mean, deviation = store.tensor.mean(0), store.tensor.std(0)
     # Five standard errors of a mean and of a deviation over 8000 draws.
@@ -93,12 +94,12 @@ def test_noise_has_the_embeddings_moments_and_is_no_ones_touch(tmp_path: Path) -
 
 
 def test_noise_is_the_same_at_each_call_and_differs_between_frames_videos_and_seeds(store: EmbeddingStore) -> None:
-    ablated = NoisyTouch(store, seed=3)
+    ablated, again, other = (ablate_input(store, Touch.NOISE, QUESTIONS, seed) for seed in (3, 3, 4))
     first = ablated.features("a_1", [0, 1, 4])
-    assert torch.equal(first[[2, 0]], ablated.features("a_1", [4, 0]))
+    assert torch.equal(first[[2, 0]], again.features("a_1", [4, 0]))
     assert not torch.equal(first[0], first[1])
-    assert not torch.equal(first[0], ablated.features("b_1", [0])[0])
-    assert not torch.equal(first[0], NoisyTouch(store, seed=4).features("a_1", [0])[0])
+    assert not torch.equal(first[0], ablated.features("d_1", [0])[0])
+    assert not torch.equal(first[0], other.features("a_1", [0])[0])
     assert ablated.features("a_1", []).shape == (0, DIM)
 
 
