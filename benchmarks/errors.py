@@ -12,8 +12,8 @@ import numpy as np
 from pipeline.encoder.baseline.predictor import Labels
 from pipeline.encoder.baseline.validation import Predict, cross_validate
 from pipeline.evaluation.intervals import accuracy_interval
-from pipeline.evaluation.scores import ScoreRow
 from pipeline.io import read_csv
+from pipeline.records import ScoreRow
 
 WRONG = "share of videos of unseen objects of which not every property is right"
 

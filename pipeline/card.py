@@ -5,7 +5,6 @@ It holds facts alone and no score, as none is known when a model has been traine
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -13,7 +12,7 @@ from typing import Any
 
 import yaml
 
-from pipeline.io import write_text
+from pipeline.io import sha256, write_text
 
 CARD_FILE = "README.md"
 
@@ -52,7 +51,7 @@ def write_card(
     lines = ["---", yaml.safe_dump(front, sort_keys=False).rstrip(), "---", f"# {title}", "", "## Base models", ""]
     for part, path in bases.items():
         lines.append(f"- {part}: `{path.as_posix()}`, licence: {licences[part] or 'not stated beside the weights'}")
-        lines += [f"  - `{file.name}`, sha256 {_sha256(file)}" for file in _weights(path)]
+        lines += [f"  - `{file.name}`, sha256 {sha256(file)}" for file in _weights(path)]
     for heading, values in (("Training data", data), ("Hyper-parameters", settings)):
         lines += ["", f"## {heading}", "", "| | |", "|---|---|"]
         lines += [f"| {name} | {_shown(value)} |" for name, value in values.items()]
@@ -70,11 +69,6 @@ def _row(cells: Iterable[object]) -> str:
 
 def _weights(path: Path) -> list[Path]:
     return sorted(path.glob("*.safetensors")) if path.is_dir() else [path]
-
-
-def _sha256(file: Path) -> str:
-    with file.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def front_matter(folder: Path) -> dict[str, Any]:

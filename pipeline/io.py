@@ -202,6 +202,12 @@ def tensor_shapes(path: Path, mend: str = "get it again") -> dict[str, tuple[int
         raise UserError(f"{path} is cut off or not a safetensors file ({error}); {mend}") from None
 
 
+def sha256(file: Path) -> str:
+    """Of a file's bytes, in hexadecimal digits."""
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
 def fingerprint(*parts: BaseModel | str | int | Path) -> str:
     """A short hash of settings and of input files (or all files of folders), by which unfinished work is known again.
 
@@ -215,8 +221,7 @@ def fingerprint(*parts: BaseModel | str | int | Path) -> str:
             for file in sorted(part.iterdir()) if part.is_dir() else [part]:
                 if file.is_file():
                     digest.update(file.name.encode())
-                    with file.open("rb") as stream:
-                        digest.update(hashlib.file_digest(stream, "sha256").digest())
+                    digest.update(bytes.fromhex(sha256(file)))
         else:
             digest.update(str(part).encode())
         digest.update(b"\0")

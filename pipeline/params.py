@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from pipeline.config import Params
-from pipeline.errors import UserError
+from pipeline.errors import UserError, did_you_mean
 
 PARAMS_FILE = Path("params.yaml")
 
@@ -52,8 +51,7 @@ def explain(error: ValidationError) -> str:
     key = ".".join(str(part) for part in detail["loc"])
     if detail["type"] == "extra_forbidden":
         known = _known_keys(detail["loc"])
-        close = difflib.get_close_matches(str(detail["loc"][-1]), known, n=1)
-        hint = f"did you mean {close[0]}? " if close else ""
+        hint = did_you_mean(str(detail["loc"][-1]), known)
         return f"{key} is not a parameter; {hint}allowed here: {', '.join(known)}"
     message = detail["msg"].removeprefix("Value error, ")
     if detail["type"] == "missing":

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING
 
 from pipeline.config import EncoderConfig
-from pipeline.errors import UserError
+from pipeline.errors import UserError, did_you_mean
 
 if TYPE_CHECKING:
     from pipeline.encoder.model import FrameEncoder
@@ -25,9 +24,9 @@ def check_backbones(names: Sequence[str]) -> None:
     """Raise UserError where a name is no backbone's."""
     for name in names:
         if name not in BACKBONES:
-            close = difflib.get_close_matches(name, BACKBONES, n=1)
-            hint = f"did you mean {close[0]}? " if close else ""
-            raise UserError(f"encoder.backbone: {name} is no backbone; {hint}known: {', '.join(BACKBONES)}")
+            raise UserError(
+                f"encoder.backbone: {name} is no backbone; {did_you_mean(name, BACKBONES)}known: {', '.join(BACKBONES)}"
+            )
 
 
 def load_backbones(config: EncoderConfig, *, tuned: bool = False) -> list[FrameEncoder]:

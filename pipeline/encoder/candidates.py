@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 from pipeline.config import EncoderConfig
-from pipeline.errors import UserError
+from pipeline.errors import UserError, did_you_mean
 from pipeline.weights import CLIP_CONFIG
 
 Kind = Literal["constant", "trees", "frame_heads", "gradient", "tuned"]
@@ -43,8 +42,6 @@ class Candidate:
     """Frames a video, where not `frames.per_video`."""
     objects: int | None = None
     """Training objects, drawn from those of the fold; None takes all."""
-    parent: str = field(default="", kw_only=True)
-    """The model that this one changes in one thing."""
 
     @property
     def settings_of(self) -> str:
@@ -75,20 +72,14 @@ CANDIDATES: dict[str, Candidate] = {
         PAPER, title="the pretrained network's layers, from scratch", backbone=(), recipe="scratch", reference="own"
     ),
     "pretrained": PRETRAINED,
-    "pretrained-untrained": replace(PRETRAINED, title="without pretraining", untrained=True, parent="pretrained"),
-    "pretrained-raw": replace(
-        PRETRAINED, title="without each video's own reference", reference="mean", parent="pretrained"
-    ),
-    "pretrained-independent": replace(PRETRAINED, title="without the joint decision", joint=False, parent="pretrained"),
-    "pretrained-pooled": replace(
-        PRETRAINED, title="features averaged in place of probabilities", pooled=True, parent="pretrained"
-    ),
-    "pretrained-one-frame": replace(PRETRAINED, title="one frame a video", frames=1, parent="pretrained"),
-    "pretrained-ten-frames": replace(PRETRAINED, title="ten frames a video", frames=10, parent="pretrained"),
+    "pretrained-untrained": replace(PRETRAINED, title="without pretraining", untrained=True),
+    "pretrained-raw": replace(PRETRAINED, title="without each video's own reference", reference="mean"),
+    "pretrained-independent": replace(PRETRAINED, title="without the joint decision", joint=False),
+    "pretrained-pooled": replace(PRETRAINED, title="features averaged in place of probabilities", pooled=True),
+    "pretrained-one-frame": replace(PRETRAINED, title="one frame a video", frames=1),
+    "pretrained-ten-frames": replace(PRETRAINED, title="ten frames a video", frames=10),
     **{
-        f"pretrained-{count}-objects": replace(
-            PRETRAINED, title=f"{count} training objects", objects=count, parent="pretrained"
-        )
+        f"pretrained-{count}-objects": replace(PRETRAINED, title=f"{count} training objects", objects=count)
         for count in LEARNING_CURVE
     },
 }
@@ -98,8 +89,7 @@ def check_candidates(names: Sequence[str], config: EncoderConfig) -> None:
     """Raise UserError where a name of `cross_validation.models` is none, or lacks weights or settings in `encoder`."""
     for name in names:
         if name not in CANDIDATES:
-            close = difflib.get_close_matches(name, CANDIDATES, n=1)
-            hint = f"did you mean {close[0]}? " if close else ""
+            hint = did_you_mean(name, CANDIDATES)
             raise UserError(f"cross_validation.models: {name} is no model; {hint}known: {', '.join(CANDIDATES)}")
         candidate = CANDIDATES[name]
         clip = "clip" in config.backbone or (Path(config.weights) / CLIP_CONFIG).is_file()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -83,12 +83,6 @@ class ClipDataset(EpochDataset[dict[str, torch.Tensor]]):
         }
 
 
-def collate_clips(items: Iterable[dict[str, torch.Tensor]]) -> dict[str, torch.Tensor]:
-    """Stack clips of equal length."""
-    items = list(items)
-    return {name: torch.stack([item[name] for item in items]) for name in items[0]}
-
-
 @dataclass(frozen=True)
 class EncoderData:
     """Frames, labels and parts: what an encoder is trained and evaluated on."""
@@ -118,7 +112,7 @@ def describe_clips(
     encoder = encoder.to(device).eval()
     clips = ClipDataset(data.store, videos, per_video=data.per_video)
     features = []
-    for batch in DataLoader(clips, batch_size=max(1, batch_size // data.per_video), collate_fn=collate_clips):
+    for batch in DataLoader(clips, batch_size=max(1, batch_size // data.per_video)):
         frames, frame_indices = batch["frames"].to(device), batch["frame_indices"].to(device)
         described = encoder.describe(frames.flatten(0, 1), frame_indices.flatten())
         features.append(described.view(*frames.shape[:2], -1).float().cpu())
@@ -140,7 +134,7 @@ def classify(
         clips = ClipDataset(data.store, videos, per_video=data.per_video)
         outputs = [
             model(batch["frames"].to(device), batch["frame_indices"].to(device))["logits"].cpu()
-            for batch in DataLoader(clips, batch_size=batch_size, collate_fn=collate_clips)
+            for batch in DataLoader(clips, batch_size=batch_size)
         ]
         if not outputs:
             continue

@@ -18,7 +18,7 @@ from torch.utils.data import default_collate
 
 from pipeline.card import write_card
 from pipeline.config import PRETRAINED, EncoderConfig, RuntimeConfig
-from pipeline.encoder.clips import ClipDataset, EncoderData, LabelledVideo, collate_clips
+from pipeline.encoder.clips import ClipDataset, EncoderData, LabelledVideo
 from pipeline.encoder.frame_classifier import Clips, JointFrameClassifier, choose_strength, fit_frame_heads
 from pipeline.encoder.model import PropertyClassifier, SideBySide
 from pipeline.encoder.recipes import property_classifier
@@ -98,7 +98,6 @@ def tune(
         above,
         learnt,
         TrunkDataset(trunks, validation),
-        default_collate,
         model,
         data,
         config,
@@ -152,7 +151,6 @@ def train_classifier(
         model,
         training,
         ClipDataset(data.store, validation, per_video=data.per_video) if validation else None,
-        collate_clips,
         model,
         data,
         config,
@@ -167,7 +165,6 @@ def _train(
     trained: torch.nn.Module,
     training: EpochDataset[Any],
     validation: EpochDataset[Any] | None,
-    collate: Callable[[Any], Any],
     model: PropertyClassifier,
     data: EncoderData,
     config: EncoderConfig,
@@ -211,10 +208,11 @@ def _train(
         args=arguments,
         train_dataset=training,
         eval_dataset=validation,
-        data_collator=collate,
+        data_collator=default_collate,
         compute_metrics=judged,
         callbacks=[TrainingMonitor(), *callbacks],
-        wave=math.ceil(len(cast(Sized, training)) / config.batch_size) if model.cosine_per_epoch else None,
+        # The published code's cosine is as long as one epoch, so that the rate falls and rises again.
+        wave=math.ceil(len(cast(Sized, training)) / config.batch_size) if config.recipe == "release" else None,
     )
     return train(trainer).history
 

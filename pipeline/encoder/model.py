@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import ClassVar, cast
+from typing import cast
 
 import torch
 from torch import nn
@@ -140,8 +140,6 @@ class PropertyClassifier(nn.Module):
 
     _keys_to_ignore_on_save = None  # read by transformers' Trainer when it reloads a checkpoint
     accepts_loss_kwargs = True  # has Trainer count an update's labels and give them to `forward`
-    cosine_per_epoch: ClassVar[bool] = False
-    """Whether the learning rate falls and rises again by a cosine as long as one epoch, or falls once in all."""
 
     def __init__(self, encoder: FrameEncoder, heads: nn.Module, classes: Sequence[int]) -> None:
         super().__init__()

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING
 
 from pipeline.config import EncoderConfig
-from pipeline.errors import UserError
+from pipeline.errors import UserError, did_you_mean
 
 if TYPE_CHECKING:
     from pipeline.encoder.model import FrameEncoder, PropertyClassifier
@@ -24,9 +23,9 @@ RECIPES = {
 def check_recipe(name: str) -> None:
     """Raise UserError where no recipe has this name."""
     if name not in RECIPES:
-        close = difflib.get_close_matches(name, RECIPES, n=1)
-        hint = f"did you mean {close[0]}? " if close else ""
-        raise UserError(f"encoder.recipe: {name} is no recipe; {hint}known: {', '.join(RECIPES)}")
+        raise UserError(
+            f"encoder.recipe: {name} is no recipe; {did_you_mean(name, RECIPES)}known: {', '.join(RECIPES)}"
+        )
 
 
 def base_encoder(config: EncoderConfig) -> FrameEncoder:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import ClassVar
 
 import torch
 from torch import nn
@@ -70,12 +69,6 @@ class PublishedHeads(nn.Module):
         return logits
 
 
-class PublishedClassifier(PropertyClassifier):
-    """Trained with a cosine as long as one epoch, so that the rate oscillates."""
-
-    cosine_per_epoch: ClassVar[bool] = True
-
-
 def base_encoder(config: EncoderConfig) -> PublishedEncoder:
     """CLIP as it comes, read at its class token."""
     return PublishedEncoder(load_visual_tower(Path(config.weights)))
@@ -85,7 +78,7 @@ def property_classifier(config: EncoderConfig, classes: Sequence[int]) -> Proper
     """CLIP with visual prompts of their own at every layer, a shared hidden layer and one linear head a property."""
     tower = load_visual_tower(Path(config.weights))
     encoder = PublishedEncoder(tower, visual_prompts(config, tower, shared=False))
-    return PublishedClassifier(encoder, PublishedHeads(encoder.dim, classes), classes)
+    return PropertyClassifier(encoder, PublishedHeads(encoder.dim, classes), classes)
 
 
 def sinusoid(frame_indices: torch.Tensor, dim: int) -> torch.Tensor:

@@ -92,8 +92,6 @@ class AboveTrunks(nn.Module):
 
     _keys_to_ignore_on_save = None  # read by transformers' Trainer when it reloads a checkpoint
     accepts_loss_kwargs = True
-    cosine_per_epoch = False
-    """As `PropertyClassifier` has it."""
 
     def __init__(self, classifier: JointFrameClassifier) -> None:
         super().__init__()

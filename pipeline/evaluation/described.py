@@ -7,8 +7,7 @@ from collections.abc import Iterable
 from statsmodels.stats.proportion import proportion_confint
 
 from pipeline.evaluation.intervals import LEVEL
-from pipeline.evaluation.scores import ALL_SEEDS, DESCRIBED, ScoreRow
-from pipeline.records import Described
+from pipeline.records import ALL_SEEDS, DESCRIBED, Described, ScoreRow
 from pipeline.tasks import TASKS
 from pipeline.videos.catalogue import Catalogue
 

@@ -18,82 +18,24 @@ import numpy as np
 from pipeline.evaluation.intervals import Objects, accuracy_interval
 from pipeline.evaluation.paired import Difference, holm, paired
 from pipeline.records import (
+    ALL_SEEDS,
+    CROSS_VALIDATION,
+    HEADS,
+    VALIDATION_HEADS,
     Classification,
+    EffectRow,
     Encoder,
     Graded,
     GradedVision,
     Lora,
     Opd,
-    Optional,
     OutOfFold,
     Part,
-    Record,
-    Share,
+    ScoreRow,
     Touch,
 )
 from pipeline.tasks import TASKS
 from pipeline.videos.catalogue import Catalogue
-
-ALL_SEEDS = "all"
-"""In place of a seed: the mean over seeds, or over the repeats of a cross-validation."""
-HEADS, VALIDATION_HEADS, CROSS_VALIDATION, DESCRIBED = "heads", "heads_validation", "cross_validation", "described"
-"""What stands as the task where no language model with touch answered: the fine-tuned encoder's property heads on test
-videos and on validation videos, encoders on objects that they were not trained on, and base models about objects that
-are described to them in words."""
-
-
-class ScoreRow(Record):
-    """One accuracy; all shares from 0 to 1."""
-
-    task: str
-    measure: str
-    encoder: str
-    """Of a cross-validation, the candidate's name; of described objects, the base model's; of vision alone, the
-    model's."""
-    lora: str = ""
-    opd: str = ""
-    touch: str = ""
-    """Of vision alone, what the model was shown in place of touch."""
-    seed: str
-    """A number or `all`."""
-    n: int
-    """Questions, or videos; not multiplied by seeds."""
-    right: Share
-    """Right answers; over seeds their mean, which need not be whole."""
-    unread: Share
-    """Answers that could not be read, which count as wrong; over seeds their mean."""
-    accuracy: Share
-    low: Optional = None
-    """Of the 95 % interval over objects; None where the questions cannot show that objects differ."""
-    high: Optional = None
-    chance: Optional
-    """None of described objects, where the task is not registered."""
-    strict: Optional = None
-    """Accuracy by the published code's comparison of texts; None where that code has none, or nobody wrote a text."""
-
-
-class EffectRow(Record):
-    """What changing one part does on the same questions, all else as in the full system; shares from -1 to 1."""
-
-    part: str
-    """`encoder`, `lora`, `opd` or `touch`."""
-    change: str
-    """Such as `with - without`."""
-    task: str
-    measure: str
-    difference: Share
-    low: Optional = None
-    """Of the 95 % interval for new objects and, with several seeds, new seeds; None as in scores."""
-    high: Optional = None
-    p: Optional = None
-    """Of the sign-flip test over objects."""
-    p_holm: Optional = None
-    """Holm's adjustment over all rows of the report."""
-    smallest_effect: Optional = None
-    """The smallest true difference that this design finds in four of five repetitions; above 1 there is none."""
-    n: int
-    objects: int
-    seeds: int
 
 
 class Setting(NamedTuple):

@@ -13,13 +13,15 @@ from pipeline.evaluation.calibration import CalibrationRow, calibrated, calibrat
 from pipeline.evaluation.described import described_rows
 from pipeline.evaluation.grading import EXTERNAL, vision_models
 from pipeline.evaluation.ordinal import ErrorRow, error_rows
-from pipeline.evaluation.scores import EffectRow, ScoreRow, candidate_rows, effect_rows, score_rows
+from pipeline.evaluation.scores import candidate_rows, effect_rows, score_rows
 from pipeline.io import read_csv, read_jsonl, read_table, write_csv, write_json, write_text
 from pipeline.params import PARAMS_FILE
 from pipeline.records import (
     GATE,
+    HEADS,
     Classification,
     Described,
+    EffectRow,
     Finding,
     Graded,
     GradedVision,
@@ -28,13 +30,14 @@ from pipeline.records import (
     Part,
     Prediction,
     Question,
+    ScoreRow,
     Touch,
     Variant,
     Video,
 )
 from pipeline.report.dataset import dataset_frame
 from pipeline.report.figures import draw_figures
-from pipeline.report.load import HEADS, load_report
+from pipeline.report.load import load_report
 from pipeline.report.provenance import provenance
 from pipeline.report.readme import render_readme
 from pipeline.report.samples import choose_examples, choose_samples

@@ -11,20 +11,12 @@ from typing import Any
 import pandas as pd
 
 from pipeline.errors import UserError
+from pipeline.records import EffectRow, ScoreRow
 
 KEYS = ("task", "measure", "encoder", "lora", "opd")
 """What a published cell and a measured row share; "" stands for "does not apply"."""
-SCORE_COLUMNS = (*KEYS, "touch", "seed", "n", "right", "unread", "accuracy", "low", "high", "chance", "strict")
-LATER = frozenset({"strict"})
-"""Columns that older reports lack: empty there."""
-EFFECT_COLUMNS = (
-    *("part", "change", "task", "measure", "difference", "low", "high", "p", "p_holm", "smallest_effect"),
-    *("n", "objects", "seeds"),
-)
+SCORE_COLUMNS, EFFECT_COLUMNS = tuple(ScoreRow.model_fields), tuple(EffectRow.model_fields)
 TEXT = frozenset((*KEYS, "touch", "seed", "part", "change", "model", "dataset"))
-ALL_SEEDS = "all"
-HEADS, VALIDATION_HEADS, CROSS_VALIDATION, DESCRIBED = "heads", "heads_validation", "cross_validation", "described"
-"""As in `pipeline.evaluation.scores`, which takes seconds to import; a test holds them equal."""
 DATASET = "PhysiCLeAR"
 """The data set of most of the paper's figures, as properties.yaml names it: beside another's they would mislead."""
 
@@ -77,7 +69,6 @@ def read_frame(file: Path, columns: tuple[str, ...]) -> pd.DataFrame:
     if not file.is_file():
         return pd.DataFrame({name: pd.Series(dtype=object if name in TEXT else float) for name in columns})
     frame = pd.read_csv(file, dtype=dict.fromkeys(TEXT, str))
-    frame[[name for name in columns if name in LATER and name not in frame]] = float("nan")
     missing = [name for name in columns if name not in frame]
     if missing:
         raise UserError(f"{file}: lacks {', '.join(missing)}; `dvc repro report` writes it anew")

@@ -17,7 +17,7 @@ import yaml
 from pipeline.card import front_matter
 from pipeline.config import EncoderConfig, Params
 from pipeline.evaluation.intervals import coverage_note
-from pipeline.io import tensor_shapes
+from pipeline.io import sha256, tensor_shapes
 from pipeline.params import PARAMS_FILE
 from pipeline.records import Assignment, Part, Video
 from pipeline.videos.catalogue import Catalogue
@@ -155,8 +155,7 @@ def digest(folder: Path) -> str:
     files = sorted(name for name in found if not any(part.startswith(".") for part in name.parts))
     total = hashlib.sha256()
     for name in files:
-        with found[name].open("rb") as stream:
-            total.update(f"{name.as_posix()} {hashlib.file_digest(stream, 'sha256').hexdigest()}\n".encode())
+        total.update(f"{name.as_posix()} {sha256(found[name])}\n".encode())
     return total.hexdigest() if files else UNKNOWN
 
 

@@ -11,14 +11,10 @@ from typing import Any
 
 import pandas as pd
 
+from pipeline.records import ALL_SEEDS, CROSS_VALIDATION, DESCRIBED, HEADS, VALIDATION_HEADS
 from pipeline.report.load import (
-    ALL_SEEDS,
-    CROSS_VALIDATION,
     DATASET,
-    DESCRIBED,
-    HEADS,
     KEYS,
-    VALIDATION_HEADS,
     Report,
     cells,
     published,

@@ -5,11 +5,10 @@ from __future__ import annotations
 import random
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from difflib import get_close_matches
 from typing import Literal
 
 from pipeline.config import QuestionsConfig
-from pipeline.errors import UserError
+from pipeline.errors import UserError, did_you_mean
 from pipeline.records import Assignment, Part, Question
 from pipeline.runtime import derive_seed
 from pipeline.tasks import TASKS
@@ -39,8 +38,7 @@ def counts_by_task(config: QuestionsConfig, section: Literal["train", "evaluatio
     keys = {name.lower(): name for name in TASKS}
     for key, count in wanted.items():
         if key not in keys:
-            close = get_close_matches(key, keys, n=1)
-            hint = f"did you mean {close[0]}? " if close else ""
+            hint = did_you_mean(key, keys)
             raise UserError(f"questions.{section}.{key} is not a task; {hint}allowed here: {', '.join(keys)}")
         if section == "train" and count and not TASKS[keys[key]].trained:
             raise UserError(f"questions.train.{key} must be 0: {keys[key]} is for evaluation only")

@@ -13,7 +13,6 @@ language model, which is named by hash.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -24,7 +23,7 @@ from pydantic import BaseModel, ValidationError
 
 from pipeline.config import EncoderConfig, FramesConfig, LanguageConfig
 from pipeline.errors import UserError
-from pipeline.io import fingerprint, read_json
+from pipeline.io import fingerprint, read_json, sha256
 from pipeline.language.chat import render
 from pipeline.records import Encoder, Opd, Record, Turn
 from pipeline.videos.catalogue import Catalogue
@@ -89,22 +88,13 @@ class ModelConfig(Record):
         return f"{self.variant} {fingerprint(self.model_copy(update={'scores': {}, 'versions': {}}))}"
 
 
-def sha256(file: Path) -> str:
-    """Of a file's bytes."""
-    with file.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
 def identify(folder: Path) -> dict[str, str]:
     """sha256 of the files that a base language model is known by."""
     return {file.name: sha256(file) for pattern in IDENTITY for file in sorted(folder.glob(pattern))}
 
 
-def read_folder(folder: Path, *, check: bool = True) -> tuple[ModelConfig, Catalogue]:
-    """What a folder says of itself.
-
-    Args:
-        check: Whether its files are compared with their hashes.
+def read_folder(folder: Path) -> tuple[ModelConfig, Catalogue]:
+    """What a folder says of itself; its files are compared with their hashes.
 
     Raises:
         UserError: for a folder that is none, of another version, or with a file that is missing or was changed.
@@ -119,7 +109,7 @@ def read_folder(folder: Path, *, check: bool = True) -> tuple[ModelConfig, Catal
             "or install the version that made it"
         )
     config = _validate(ModelConfig, values, folder / CONFIG)
-    for name, expected in config.files.items() if check else ():
+    for name, expected in config.files.items():
         file = folder / name
         if not file.is_file():
             raise UserError(f"{file}: is missing; copy the whole folder again")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 import random
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -12,7 +11,7 @@ from typing import Any, Self
 import numpy as np
 import torch
 
-from pipeline.errors import UserError
+from pipeline.errors import UserError, did_you_mean
 from pipeline.language.chat import TACTILE, TACTILE_TOKENS
 from pipeline.language.generate import GenerationSettings, reply, stream, write_prompt
 from pipeline.language.octopi import OctopiForCausalLM
@@ -210,7 +209,8 @@ class Octopi:
         ids = {o.name.lower(): i for i, o in self.catalogue.objects.items()}
         for name in names:
             if name.lower() not in ids:
-                raise UserError(f"{name}: the catalogue has no such object{_hint(name, ids)}")
+                hint = did_you_mean(name.lower(), ids)
+                raise UserError(f"{name}: the catalogue has no such object; {hint}its objects.csv lists all")
         listed = sorted(names, key=str.lower)
         question = pom.asked(pom.OPENINGS[0], listed)[self.config.opd]
         if self.config.facts:
@@ -301,8 +301,8 @@ class Octopi:
         for known in self.catalogue.properties:
             if name.lower() in (known.name, known.spoken):
                 return known
-        hint = _hint(name, self.properties)
-        raise UserError(f"{name}: no property of this model{hint}; it knows {', '.join(self.properties)}")
+        hint = did_you_mean(name.lower(), self.properties)
+        raise UserError(f"{name}: no property of this model; {hint}it knows {', '.join(self.properties)}")
 
 
 def _listed(videos: Video | Sequence[Video]) -> tuple[Video, ...]:
@@ -325,8 +325,3 @@ def check_question(question: str, videos: int) -> None:
             raise UserError(
                 f"the question has {token}, which stands for a touch itself; write {TACTILE} and give a video"
             )
-
-
-def _hint(name: str, known: Iterable[str]) -> str:
-    close = difflib.get_close_matches(name.lower(), list(known), n=1)
-    return f" (did you mean {close[0]}?)" if close else ""

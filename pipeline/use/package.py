@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import csv
 import platform
 import shutil
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
+from typing import NamedTuple
 
 from pydantic import BaseModel
 
@@ -17,11 +16,11 @@ from pipeline.config import PRETRAINED, Params
 from pipeline.embeddings import STATISTICS_FILE, EmbeddingStore, Statistics
 from pipeline.errors import UserError
 from pipeline.evaluation.calibration import calibration_rows, fit_temperature
-from pipeline.io import atomic_folder, read_table, write_json
+from pipeline.io import atomic_folder, read_csv, read_table, sha256, write_json
 from pipeline.language.base import load_tokenizer
 from pipeline.language.connector import CONFIG_FILE
 from pipeline.language.octopi import ADAPTER_DIR
-from pipeline.records import Assignment, Classification, Part, Probe, Touch, Variant
+from pipeline.records import Assignment, Classification, Part, Probe, ScoreRow, Touch, Variant
 from pipeline.tasks import TASKS
 from pipeline.training.sampling import sample_evaluation
 from pipeline.use.folder import (
@@ -41,7 +40,6 @@ from pipeline.use.folder import (
     find_base,
     identify,
     read_folder,
-    sha256,
 )
 from pipeline.videos.audit.files import quiet_level
 from pipeline.videos.catalogue import load_catalogue
@@ -99,7 +97,7 @@ def package(data: Path, params: Params, variant: Variant, base: Base, out: Path)
             quiet=quiet_level(read_table(data / "frames" / PROBES_FILE, Probe)),
             usual=_usual(embeddings, data / "splits" / f"{variant.seed}.parquet", params),
             temperatures=temperatures,
-            scores={score.task: (score.accuracy, score.low, score.high) for score in scores},
+            scores={task: score[1:4] for task, score in scores.items()},
             files={f.relative_to(folder).as_posix(): sha256(f) for f in sorted(folder.rglob("*")) if f.is_file()},
             versions={"python": platform.python_version(), **{name: metadata.version(name) for name in LIBRARIES}},
         )
@@ -128,11 +126,9 @@ def export(folder: Path, to: Path, *, with_base: bool = False, base: Path | None
             shutil.copytree(find_base(folder, config.base, base), made / BASE_DIR)
 
 
-@dataclass(frozen=True)
-class Scored:
-    """A row of scores.csv."""
+class Score(NamedTuple):
+    """Of one task."""
 
-    task: str
     n: int
     accuracy: float
     low: float
@@ -140,24 +136,20 @@ class Scored:
     chance: float
 
 
-def _scores(file: Path, params: Params, variant: Variant) -> list[Scored]:
-    """The variant's scores on test questions; with folds, those of all folds together."""
-    wanted = {
-        "encoder": variant.encoder,
-        "lora": variant.lora,
-        "opd": variant.opd,
-        "touch": Touch.REAL,
-        "seed": str(params.split.replicate_of(variant.seed)),
+def _scores(file: Path, params: Params, variant: Variant) -> dict[str, Score]:
+    """The variant's scores on test questions that have an interval; with folds, those of all folds together."""
+    seed = str(params.split.replicate_of(variant.seed))
+    wanted = (variant.encoder, variant.lora, variant.opd, Touch.REAL, seed)
+    return {
+        row.task: Score(row.n, row.accuracy, row.low, row.high, row.chance)
+        for row in read_csv(file, ScoreRow)
+        if (row.encoder, row.lora, row.opd, row.touch, row.seed) == wanted
+        and row.task in TASKS
+        and row.measure == TASKS[row.task].measure
+        and row.low is not None
+        and row.high is not None
+        and row.chance is not None
     }
-    with file.open(encoding="utf-8", newline="") as stream:
-        rows = [row for row in csv.DictReader(stream) if all(row[name] == value for name, value in wanted.items())]
-    kept = [row for row in rows if row["task"] in TASKS and row["measure"] == TASKS[row["task"]].measure]
-    numbers = ("accuracy", "low", "high", "chance")
-    return [
-        Scored(row["task"], int(float(row["n"])), *(float(row[name]) for name in numbers))
-        for row in kept
-        if all(row[name] for name in ("n", *numbers))
-    ]
 
 
 def _usual(embeddings: Path, split: Path, params: Params) -> float:
@@ -197,7 +189,7 @@ def _write_card(
     folder: Path,
     config: ModelConfig,
     judged: Sequence[Classification],
-    scores: Sequence[Scored],
+    scores: Mapping[str, Score],
     params: Params,
 ) -> None:
     calibrated = calibration_rows([judged])
@@ -209,11 +201,11 @@ def _write_card(
     dataset = f"{params.data.source}, split {params.split.name}, test objects"
     results = [
         {
-            "task": {"type": "visual-question-answering", "name": TASKS[s.task].title},
+            "task": {"type": "visual-question-answering", "name": TASKS[task].title},
             "dataset": {"type": "tactile-videos", "name": dataset},
             "metrics": [{"type": "accuracy", "value": s.accuracy, "args": {"low": s.low, "high": s.high, "n": s.n}}],
         }
-        for s in scores
+        for task, s in scores.items()
     ]
     write_card(
         folder,
@@ -230,12 +222,12 @@ def _write_card(
         tables={
             "Scores": [
                 {
-                    "Task": f"{TASKS[s.task].title} ({s.task})",
+                    "Task": f"{TASKS[task].title} ({task})",
                     "n": s.n,
                     "Accuracy, %": f"{100 * s.accuracy:.1f} [{100 * s.low:.1f}, {100 * s.high:.1f}]",
                     "Chance, %": f"{100 * s.chance:.1f}",
                 }
-                for s in scores
+                for task, s in scores.items()
             ],
             "Calibration of the heads' probabilities": [
                 {

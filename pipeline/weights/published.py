@@ -6,7 +6,6 @@ code of it is run.
 
 from __future__ import annotations
 
-import hashlib
 import shutil
 import zipfile
 from collections.abc import Mapping
@@ -14,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import UserError
-from pipeline.io import atomic_folder, load_tensors, save_tensors, write_json, write_text
+from pipeline.io import atomic_folder, load_tensors, save_tensors, sha256, write_json, write_text
 from pipeline.shapes import LLM_CONFIG, PUBLISHED_LANGUAGE, PUBLISHED_VISION, Llama, Vision, read_form
 from pipeline.weights import CLIP_CONFIG, CLIP_WEIGHTS, DOWNLOADED, check_language, clip_file
 from pipeline.weights.check import (
@@ -88,8 +87,7 @@ def write_sums(folder: Path) -> None:
     lines = []
     for name, file in files.items():
         if name.as_posix() != SUMS and not any(part.startswith(".") for part in name.parts):
-            with file.open("rb") as stream:
-                lines.append(f"{hashlib.file_digest(stream, 'sha256').hexdigest()}  {name.as_posix()}\n")
+            lines.append(f"{sha256(file)}  {name.as_posix()}\n")
     write_text(folder / SUMS, "".join(lines))
 
 

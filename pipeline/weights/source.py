@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 from typing import NamedTuple
 
 from pipeline.errors import UserError
+from pipeline.io import sha256
 from pipeline.weights import installed
 
 
@@ -34,8 +34,7 @@ class Origin(NamedTuple):
         path = Path(str(installed(self.package).locate_file(self.file)))
         if not path.is_file():
             raise UserError(f"{path} does not exist; {mend}")
-        with path.open("rb") as stream:
-            found = hashlib.file_digest(stream, "sha256").hexdigest()
+        found = sha256(path)
         if found != self.sha256:
             raise UserError(f"{path} has the sha256 {found[:12]}..., not {self.sha256[:12]}...; {mend}")
         return path

@@ -18,9 +18,8 @@ from pipeline.encoder.baseline import validation
 from pipeline.encoder.baseline.predictor import PropertyPredictor
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.errors import UserError
-from pipeline.evaluation.scores import ScoreRow
 from pipeline.io import write_csv, write_table
-from pipeline.records import Encoder, Graded, Lora, Opd, Variant
+from pipeline.records import Encoder, Graded, Lora, Opd, ScoreRow, Variant
 from pipeline.scenes.elastic.kernels import half_space_table, make_kernel
 from pipeline.scenes.elastic.solver import solve
 from pipeline.scenes.film import write_film

@@ -17,8 +17,8 @@ from benchmarks.figures import FOLDER, draw
 from benchmarks.table import CSV, Row, cost_ratios, front, make_rows, merge, read_rows
 from benchmarks.timing import counting_ffts, flops_of, interleaved, megabytes
 from pipeline.errors import UserError
-from pipeline.evaluation.scores import ScoreRow
 from pipeline.io import write_csv
+from pipeline.records import ScoreRow
 from tests.conftest import ROOT
 
 POINTS = st.lists(st.tuples(st.integers(1, 6), st.integers(0, 6)), min_size=1, max_size=12)

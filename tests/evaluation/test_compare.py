@@ -18,9 +18,9 @@ from typer.testing import CliRunner
 from pipeline.cli import app
 from pipeline.compare import compare
 from pipeline.errors import UserError
-from pipeline.evaluation.scores import ScoreRow, score_rows
+from pipeline.evaluation.scores import score_rows
 from pipeline.io import write_csv, write_table
-from pipeline.records import Graded
+from pipeline.records import Graded, ScoreRow
 from tests.evaluation.test_scores import CATALOGUE, graded
 
 REPORT = "reports/smoke-scenes"

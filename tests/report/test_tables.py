@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import UserError
-from pipeline.evaluation import scores as evaluation
 from pipeline.report import load
 from pipeline.report.load import KEYS, Report, load_report, published, read_frame
 from pipeline.report.tables import TABLES, Table, headline, side_by_side, task_title
@@ -140,14 +139,6 @@ def test_read_and_compared_answers_stand_side_by_side() -> None:
     assert build("strict", score("PC"), score("PSR")).empty, "nothing was compared"
 
 
-def test_an_older_report_has_no_strict_scores(tmp_path: Path) -> None:
-    scores_of(score("PC")).drop(columns="strict").to_csv(tmp_path / "scores.csv", index=False)
-    frame = read_frame(tmp_path / "scores.csv", load.SCORE_COLUMNS)
-    assert frame["strict"].isna().all()
-    assert len(BY_KEY["understanding"].build(frame, NO_EFFECTS, published())) == 1
-    assert BY_KEY["strict"].build(frame, NO_EFFECTS, published()).empty
-
-
 def test_each_data_set_has_the_papers_figures_about_it() -> None:
     (shown,) = build("reasoning", score("RIPE"), dataset="avocados").to_dict("records")
     assert shown["Published 13b % (n)"] == "63.00 (100)"
@@ -221,11 +212,7 @@ def test_published_keys_are_unique_percentages_of_their_n_and_of_registered_task
     assert published("Other").empty
 
 
-def test_words_of_the_csv_are_those_of_the_evaluation() -> None:
-    same = ("ALL_SEEDS", "HEADS", "VALIDATION_HEADS", "CROSS_VALIDATION", "DESCRIBED")
-    assert [getattr(load, n) for n in same] == [getattr(evaluation, n) for n in same]
-    assert tuple(evaluation.ScoreRow.model_fields) == load.SCORE_COLUMNS
-    assert tuple(evaluation.EffectRow.model_fields) == load.EFFECT_COLUMNS
+def test_what_is_no_task_has_a_title() -> None:
     assert task_title("heads") == "Property heads"
     assert task_title("unheard of") == "unheard of"
 

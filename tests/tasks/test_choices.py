@@ -12,8 +12,8 @@ import yaml
 from pipeline.config import Params
 from pipeline.encoder.release import DROPOUT, HIDDEN
 from pipeline.encoder.vpt import PUBLISHED_DEVIATION, VisualPrompts
-from pipeline.evaluation.scores import ScoreRow
 from pipeline.language.connector import Connector
+from pipeline.records import ScoreRow
 from pipeline.scales import compose
 from pipeline.tasks import TASKS
 from pipeline.videos.catalogue import load_catalogue

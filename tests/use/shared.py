@@ -142,8 +142,8 @@ def make(where: Path, variant: Variant, *overrides: str) -> Made:
     predictions = answer(model.eval(), embeddings, questions, variant.opd, settings)
     write_jsonl(data / "answers" / variant.key / "real.jsonl", predictions)
     rows = [
-        {"task": t, "measure": TASKS[t].measure, **variant._asdict(), "touch": "real", "n": 8.0, "chance": 0.5}
-        | {"accuracy": 0.625, "low": 0.25, "high": 0.875}
+        {"task": t, "measure": TASKS[t].measure, **variant._asdict(), "touch": "real", "n": 8, "chance": 0.5}
+        | {"right": 5, "unread": 0, "accuracy": 0.625, "low": 0.25, "high": 0.875}
         for t in ASKED
     ]
     (where / "reports" / params.report_name).mkdir(parents=True)

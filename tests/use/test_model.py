@@ -262,7 +262,7 @@ def test_arrays_that_are_no_videos_are_refused(array: np.ndarray, octopi: Octopi
 
 
 def test_unknown_words_are_refused(octopi: Octopi, files: list[Path]) -> None:
-    with pytest.raises(UserError, match=r"hardnes: no property of this model \(did you mean hardness\?\)"):
+    with pytest.raises(UserError, match=r"hardnes: no property of this model; did you mean hardness\? it knows"):
         octopi.compare(files[0], files[1], "hardnes")
     with pytest.raises(UserError, match="the catalogue has no such object"):
         octopi.match(files, ["rug", "millet", "a unicorn"])

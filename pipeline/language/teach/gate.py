@@ -11,13 +11,10 @@ import random
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import torch
 from transformers import PreTrainedModel, PreTrainedTokenizerBase
 
-from pipeline.language.base import load_adapter, load_llm, load_tokenizer
 from pipeline.language.chat import encode, end_ids, render
 from pipeline.language.teach.items import held_out
 from pipeline.records import Described, Turn
@@ -117,31 +114,6 @@ def examine(
             )
         )
     return scores
-
-
-def gate(
-    folder: Path,
-    catalogue: Catalogue,
-    *,
-    model: str,
-    count: int,
-    seed: int,
-    system_prompt: str,
-    batch_size: int,
-    dtype: torch.dtype = torch.float32,
-    adapter: Path | None = None,
-) -> list[Described]:
-    """The gate of the language model in a folder, with a PEFT adapter on it where one is named.
-
-    Raises:
-        UserError: where the folder or the adapter cannot be loaded.
-    """
-    llm = load_llm(folder, dtype)
-    if adapter is not None:
-        llm = load_adapter(llm, adapter)
-    questions = gate_questions(catalogue, count, seed)
-    options: dict[str, Any] = {"model": model, "system_prompt": system_prompt, "batch_size": batch_size}
-    return examine(llm.eval(), load_tokenizer(folder), questions, **options)
 
 
 @torch.inference_mode()

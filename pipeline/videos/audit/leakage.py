@@ -50,11 +50,11 @@ def evidence(probes: Sequence[Probe], videos: Sequence[Video], assignments: Sequ
     return Evidence(probes, videos, {a.video_id: a.part for a in assignments})
 
 
-def check_leakage(found: Evidence, catalogue: Catalogue, seed: int = 0) -> Iterator[Finding]:
-    """All checks of this module; `seed` is of the permutations."""
+def check_leakage(found: Evidence, catalogue: Catalogue) -> Iterator[Finding]:
+    """All checks of this module."""
     yield from check_split(found, catalogue)
     if found.probes:
-        yield from _untouched_predictions(found, sessions(found.probes), catalogue, seed)
+        yield from _untouched_predictions(found, sessions(found.probes), catalogue)
 
 
 def check_split(found: Evidence, catalogue: Catalogue) -> Iterator[Finding]:
@@ -255,7 +255,7 @@ def _shares(name: str, place: int, objects: set[str], catalogue: Catalogue) -> s
     return f"{name} {percent} %"
 
 
-def _untouched_predictions(found: Evidence, names: Sequence[str], catalogue: Catalogue, seed: int) -> Iterator[Finding]:
+def _untouched_predictions(found: Evidence, names: Sequence[str], catalogue: Catalogue) -> Iterator[Finding]:
     """Whether the untouched sensor, or the session alone, tells the property of an object never seen."""
     chosen = _sampled(len(found.probes)).tolist()
     objects = [found.probes[i].object_id for i in chosen]
@@ -271,7 +271,7 @@ def _untouched_predictions(found: Evidence, names: Sequence[str], catalogue: Cat
             if len(set(objects)) < FOLDS or len(set(labels)) < 2 or features.shape[1] < 2:
                 yield _finding(check, prop.name, "undefined: too few objects, classes or sessions", "", Severity.INFO)
                 continue
-            share, null = predictability(features, labels, objects, derive_seed(seed, what, prop.name))
+            share, null = predictability(features, labels, objects, derive_seed(0, what, prop.name))
             p = (1 + sum(n >= share - 1e-12 for n in null)) / (1 + len(null))
             expected = f"{100 * fmean(null):.1f} +- {100 * pstdev(null):.1f} % if it told nothing"
             severity = Severity.WARNING if p < ALPHA else Severity.INFO

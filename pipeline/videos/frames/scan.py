@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 from dataclasses import dataclass
 
@@ -10,6 +9,7 @@ import cv2
 import numpy as np
 
 from pipeline.config import FramesConfig
+from pipeline.io import sha256
 from pipeline.records import Finding, Probe, Severity, Video
 from pipeline.videos.decoding import Image
 from pipeline.videos.files import VideoFile
@@ -39,8 +39,7 @@ def scan(file: VideoFile, config: FramesConfig) -> Scan | Finding:
     """
     try:
         size = file.path.stat().st_size
-        with file.path.open("rb") as stream:
-            sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
+        content = sha256(file.path)
     except OSError as problem:
         return _wrong(file, f"unreadable ({problem.strerror}); mend its access, or copy it again")
     if size == 0:
@@ -64,7 +63,7 @@ def scan(file: VideoFile, config: FramesConfig) -> Scan | Finding:
         video_id=file.video_id,
         object_id=file.object_id,
         path=file.relative,
-        sha256=sha256,
+        sha256=content,
         frames=found.frames,
         fps=found.header.fps,
         height=next(iter(found.sizes))[0],
