@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -29,10 +29,11 @@ from benchmarks.errors import WRONG, Error, cross_validated
 from benchmarks.frames import bench_videos
 from benchmarks.table import Row, make_rows
 from benchmarks.timing import flops_of, interleaved, machine, megabytes, one_thread
-from pipeline.config import EncoderConfig, FramesConfig
+from pipeline.config import FramesConfig, RuntimeConfig
 from pipeline.encoder.baseline.predictor import Labels
 from pipeline.encoder.baseline.validation import Fold
 from pipeline.encoder.clips import ClipDataset, LabelledVideo
+from pipeline.encoder.cross_validation import CrossValidationData
 from pipeline.encoder.frame_classifier import choose_strength, fit_frame_heads
 from pipeline.encoder.model import FrameEncoder, base_encoder
 from pipeline.encoder.scene_encoder import SceneEncoder
@@ -41,7 +42,6 @@ from pipeline.params import load_params
 from pipeline.records import Video
 from pipeline.runtime import derive_seed
 from pipeline.training.trainable import load_trainable
-from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import list_videos
 from pipeline.videos.frames.extract import extract_frames
 from pipeline.videos.frames.store import FrameStore
@@ -66,32 +66,12 @@ class Size:
     """Prompts a layer, and layers from the first (0: all); the first is the baseline, the paper's."""
 
 
-@dataclass(frozen=True)
-class Bed:
+@dataclass(frozen=True, kw_only=True)
+class Bed(CrossValidationData):
     """What all encoders of a run share."""
 
-    folder: Path
-    frames: Path
-    videos: Sequence[Video]
-    catalogue: Catalogue
-    config: EncoderConfig
     pretrained: Path
     size: Size
-
-    @property
-    def objects(self) -> list[str]:
-        """Of each video."""
-        return [video.object_id for video in self.videos]
-
-    @property
-    def labels(self) -> Labels:
-        """Videos x properties."""
-        return np.array([self.catalogue.labels(o) for o in self.objects], dtype=np.int64)
-
-    @property
-    def classes(self) -> list[int]:
-        """How many each property has."""
-        return [len(p.levels) for p in self.catalogue.properties]
 
     def timed(self) -> list[Video]:
         """At equal distances in the order of the videos, which is by object."""
@@ -122,7 +102,17 @@ def measure(root: Path, size: Size | None = None) -> list[Row]:
         frames = Path(made) / "frames"
         config = FramesConfig(selection="salient", size=SIDE)
         videos = extract_frames(folder, catalogue, config, frames, Path(made) / "partial").videos
-        bed = Bed(folder, frames, videos, catalogue, params.model_copy(update=changed), pretrained, size)
+        bed = Bed(
+            videos=videos,
+            catalogue=catalogue,
+            frames=frames,
+            recordings=folder,
+            per_video=FRAMES,
+            encoder=params.model_copy(update=changed),
+            runtime=RuntimeConfig(device="cpu", threads=1),
+            pretrained=pretrained,
+            size=size,
+        )
         return [*whole(bed, root / "reports"), *frozen(bed), *prompts(bed)]
 
 
@@ -191,7 +181,7 @@ def frozen(bed: Bed) -> list[Row]:
 
 
 def _encoder(setting: Setting, bed: Bed) -> FrameEncoder:
-    encoder: FrameEncoder = SceneEncoder() if setting.encoder == "pretrained" else base_encoder(bed.config)
+    encoder: FrameEncoder = SceneEncoder() if setting.encoder == "pretrained" else base_encoder(bed.encoder)
     if setting.encoder == "pretrained":
         load_trainable(encoder, bed.pretrained)
     return formatted(encoder.eval(), setting.form)

@@ -13,7 +13,7 @@ import torch
 from benchmarks.errors import WRONG, Error, error_of, reported, share_of
 from benchmarks.table import Row, make_rows
 from benchmarks.timing import flops_of, interleaved, machine, megabytes
-from pipeline.config import EncoderConfig, FramesConfig, RuntimeConfig, SplitConfig
+from pipeline.config import EncoderConfig, FramesConfig, SplitConfig
 from pipeline.encoder.baseline.features import VIDEO_FEATURE_NAMES
 from pipeline.encoder.baseline.predictor import PropertyPredictor
 from pipeline.encoder.baseline.recordings import FRAMES as TREE_FRAMES
@@ -63,7 +63,7 @@ def whole(bed: Bed, reports: Path) -> list[Row]:
         clip = torch.zeros(1, frames, SIDE, SIDE, 3, dtype=torch.uint8), torch.zeros(1, frames, dtype=torch.int64)
         flops = flops_of(partial(model, *clip))
         counts[name] = {"frames": frames, "megabytes": megabytes(model), "flops": flops}
-    files = [VideoFile(bed.folder / v.path, v.path, v.object_id, v.video_id) for v in bed.timed()]
+    files = [VideoFile(bed.recordings / v.path, v.path, v.object_id, v.video_id) for v in bed.timed()]
     judged = reported(reports, task="cross_validation", measure="combined").values()
     # The report that compares most of them, and of such the one over most videos.
     scores = max(judged, key=lambda rows: (len(rows), rows[0].n), default=[])
@@ -84,12 +84,12 @@ def _classifier(candidate: Candidate, bed: Bed) -> PropertyClassifier:
     seed_everything(0)
     if candidate.kind == "frame_heads":
         return JointFrameClassifier(
-            base_encoder(bed.config) if "clip" in candidate.backbone else SceneEncoder(), bed.classes
+            base_encoder(bed.encoder) if "clip" in candidate.backbone else SceneEncoder(), bed.classes
         )
     if candidate.recipe == "scratch":
         encoder = SceneEncoder()
         return PropertyClassifier(encoder, Heads(encoder.dim, bed.classes), bed.classes)
-    return property_classifier(bed.config, bed.classes)
+    return property_classifier(bed.encoder, bed.classes)
 
 
 def _scan(file: VideoFile) -> Scan:
@@ -128,12 +128,11 @@ def prompts(bed: Bed) -> list[Row]:
     for count, layers in bed.size.prompts:
         name = f"{count} at {'the first layer' if layers == 1 else f'{layers} layers' if layers else 'all layers'}"
         changed = {"prompts": count, "prompt_layers": layers, "epochs": bed.size.epochs}
-        config = bed.config.model_copy(update=changed)
+        config = bed.encoder.model_copy(update=changed)
         seed_everything(0)
         model = property_classifier(config, bed.classes)
-        runtime = RuntimeConfig(device="cpu", threads=1)
         inputs = ["bench", *(f"{a.video_id} {a.part}" for a in data.assignments)]
-        train_classifier(model, data, config, runtime, seed=0, inputs=inputs)
+        train_classifier(model, data, config, bed.runtime, seed=0, inputs=inputs)
         errors[name] = _validation_error(model.eval(), data, config)
         timed[name] = partial(features, model.encoder)
         # Not in inference mode: the counter fails there at parameters that are put into a layer, as prompts are.
