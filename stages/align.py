@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from pipeline.io import write_table
-from pipeline.language.training import Job, Material, align, assemble, write_model_card
+from pipeline.language.training import Job, Material, assemble, fit, write_model_card
 from pipeline.language.words import begin_with_words
 from pipeline.records import Encoder, Measurement, Opd
 from pipeline.stage import DATA, matrix_key, stage
@@ -24,7 +24,7 @@ def main() -> None:
             model.train_words()
         with live(run) as callbacks:
             job = Job(run.name, material.fingerprint(config), material.seed, callbacks)
-            trained = align(model, data, config, run.params.runtime, job)
+            trained = fit(model, data, config, run.params.runtime, job)
         run.finish_training(trained.history)
         out = DATA / "models" / "without" / key
         model.save_pretrained(out, trained.state)

@@ -1,7 +1,7 @@
 """Fine-tune the aligned model end to end, the language model through low-rank adapters."""
 
 from pipeline.io import write_table
-from pipeline.language.training import Job, Material, add_lora, assemble, finetune_lora, write_model_card
+from pipeline.language.training import Job, Material, add_lora, assemble, fit, write_model_card
 from pipeline.records import Encoder, Measurement, Opd
 from pipeline.stage import DATA, matrix_key, stage
 from pipeline.tracking import live
@@ -27,7 +27,7 @@ def main() -> None:
             # The connector, and the word embeddings where they were trained.
             inputs = sorted(aligned.glob("*.safetensors"))
             job = Job(run.name, material.fingerprint(config, *inputs), material.seed, callbacks)
-            trained = finetune_lora(model, data, config, run.params.runtime, job)
+            trained = fit(model, data, config, run.params.runtime, job)
         run.finish_training(trained.history)
         out = DATA / "models" / "with" / key
         model.save_pretrained(out, trained.state)

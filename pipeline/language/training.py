@@ -6,7 +6,7 @@ import logging
 import os
 import random
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -161,18 +161,40 @@ class Job:
     callbacks: Sequence[TrainerCallback] = ()
 
 
-def align(
+def fit(
     model: OctopiForCausalLM, data: ConversationDataset, config: TrainConfig, runtime: RuntimeConfig, job: Job
 ) -> Trained:
-    """Train the projection, the two new tokens and the word embeddings, if they are; all else stays frozen."""
-    return _fit(model, data, config, runtime, job, {})
-
-
-def finetune_lora(
-    model: OctopiForCausalLM, data: ConversationDataset, config: LoraTrainConfig, runtime: RuntimeConfig, job: Job
-) -> Trained:
-    """Train the adapters at their own rate, and what alignment trained."""
-    return _fit(model, data, config, runtime, job, {"llm": config.learning_rate})
+    """Train the projection, the two new tokens and the word embeddings, if they are, and adapters at their own rate."""
+    # The new tokens' vectors are word embeddings, wherever they are kept.
+    trained = ("connector.projection", "connector.delimiters", *(("words",) if model.words is not None else ()))
+    adapters = {"llm": config.learning_rate} if isinstance(config, LoraTrainConfig) else {}
+    if runtime.gradient_checkpointing:
+        model.llm.gradient_checkpointing_enable(gradient_checkpointing_kwargs={"use_reentrant": False})
+    seed_everything(job.seed)
+    steps = config.epochs * -(-len(data) // config.batch_size)
+    arguments = training_arguments(
+        checkpoint_dir(job.stage, job.fingerprint),
+        runtime,
+        job.seed,
+        num_train_epochs=config.epochs,
+        per_device_train_batch_size=config.micro_batch_size,
+        gradient_accumulation_steps=_accumulation(config),
+        weight_decay=config.weight_decay,
+        warmup_steps=round(config.warmup_ratio * steps),
+        max_grad_norm=config.max_grad_norm,
+        logging_steps=max(1, steps // 50),
+    )
+    trainer = TrainableTrainer(
+        model=model,
+        args=arguments,
+        train_dataset=data,
+        data_collator=ConversationCollator(int(model.tokenizer.pad_token_id)),
+        callbacks=[TrainingMonitor(), *job.callbacks],
+        rates={**dict.fromkeys(trained, config.projection_learning_rate), **adapters},
+        constant=("connector.projection",) if config.projection_schedule == "constant" else (),
+        sampler=LengthBuckets(data.lengths, config.micro_batch_size, job.seed, lambda: data.epoch),
+    )
+    return train(trainer)
 
 
 def write_model_card(folder: Path, material: Material, data: ConversationDataset, config: TrainConfig) -> None:
@@ -206,45 +228,6 @@ def write_model_card(folder: Path, material: Material, data: ConversationDataset
             "The language model's own weights are not in this folder and have limits of their own.",
         ),
     )
-
-
-def _fit(
-    model: OctopiForCausalLM,
-    data: ConversationDataset,
-    config: TrainConfig,
-    runtime: RuntimeConfig,
-    job: Job,
-    rates: Mapping[str, float],
-) -> Trained:
-    # The new tokens' vectors are word embeddings, wherever they are kept.
-    trained = ("connector.projection", "connector.delimiters", *(("words",) if model.words is not None else ()))
-    if runtime.gradient_checkpointing:
-        model.llm.gradient_checkpointing_enable(gradient_checkpointing_kwargs={"use_reentrant": False})
-    seed_everything(job.seed)
-    steps = config.epochs * -(-len(data) // config.batch_size)
-    arguments = training_arguments(
-        checkpoint_dir(job.stage, job.fingerprint),
-        runtime,
-        job.seed,
-        num_train_epochs=config.epochs,
-        per_device_train_batch_size=config.micro_batch_size,
-        gradient_accumulation_steps=_accumulation(config),
-        weight_decay=config.weight_decay,
-        warmup_steps=round(config.warmup_ratio * steps),
-        max_grad_norm=config.max_grad_norm,
-        logging_steps=max(1, steps // 50),
-    )
-    trainer = TrainableTrainer(
-        model=model,
-        args=arguments,
-        train_dataset=data,
-        data_collator=ConversationCollator(int(model.tokenizer.pad_token_id)),
-        callbacks=[TrainingMonitor(), *job.callbacks],
-        rates={**dict.fromkeys(trained, config.projection_learning_rate), **rates},
-        constant=("connector.projection",) if config.projection_schedule == "constant" else (),
-        sampler=LengthBuckets(data.lengths, config.micro_batch_size, job.seed, lambda: data.epoch),
-    )
-    return train(trainer)
 
 
 def _accumulation(config: TrainConfig) -> int:

@@ -18,7 +18,7 @@ from torch.optim.optimizer import register_optimizer_step_pre_hook
 from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig
 from pipeline.embeddings import EmbeddingStore
 from pipeline.io import read_jsonl, save_tensors, write_json
-from pipeline.language.training import Job, add_lora, align, assemble, finetune_lora
+from pipeline.language.training import Job, add_lora, assemble, fit
 from pipeline.records import Question
 from pipeline.training import trainer as shared
 from pipeline.training.trainer import TrainableTrainer, Trained
@@ -42,10 +42,10 @@ def run(kind: str, weights: str, questions: list[Question], store: EmbeddingStor
     model, data = assemble(material(language, questions, store), CONFIG.samples, "test")
     job, runtime = Job(kind, "x", 0), RuntimeConfig(device="cpu", save_steps=2)
     if kind == "align":
-        return align(model, data, CONFIG, runtime, job)
+        return fit(model, data, CONFIG, runtime, job)
     model.train_words()
     add_lora(model, CONFIG)
-    return finetune_lora(model, data, CONFIG, runtime, job)
+    return fit(model, data, CONFIG, runtime, job)
 
 
 def shard_on_cpus() -> None:

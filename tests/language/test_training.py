@@ -25,9 +25,8 @@ from pipeline.language.training import (
     Job,
     Material,
     add_lora,
-    align,
     assemble,
-    finetune_lora,
+    fit,
     write_model_card,
 )
 from pipeline.records import Question
@@ -106,10 +105,10 @@ def run(
     try:
         model, data = assemble(material(language, questions, store), 10, "test")
         if kind == "align":
-            return align(model, data, CONFIG, RUNTIME, job)
+            return fit(model, data, CONFIG, RUNTIME, job)
         model.train_words()
         add_lora(model, CONFIG)
-        return finetune_lora(model, data, CONFIG, RUNTIME, job)
+        return fit(model, data, CONFIG, RUNTIME, job)
     finally:
         torch.set_num_threads(threads)
 
@@ -171,11 +170,11 @@ def test_a_rate_too_high_ends_finite_or_in_one_line(factor: float, held: Materia
     config = CONFIG.model_copy(update=rates)
     add_lora(model, config)
     if factor == 100:
-        trained = finetune_lora(model, data, config, RUNTIME, Job("lora", "x", 0))
+        trained = fit(model, data, config, RUNTIME, Job("lora", "x", 0))
         assert all(v.isfinite().all() for v in trained.state.values())
     else:
         with pytest.raises(UserError, match=r"^[a-z_]+ is .* at step \d: .*lower the learning rate.*kept\)$"):
-            finetune_lora(model, data, config, RUNTIME, Job("lora", "x", 0))
+            fit(model, data, config, RUNTIME, Job("lora", "x", 0))
 
 
 def test_running_away_late_leaves_the_last_good_checkpoint(held: Material, checkpoints: Path) -> None:
@@ -186,7 +185,7 @@ def test_running_away_late_leaves_the_last_good_checkpoint(held: Material, check
             model.connector.delimiters.fill_(float("inf"))
 
     with pytest.raises(UserError, match="lower the learning rate"):
-        align(model, data, CONFIG, RUNTIME, Job("align", "x", 0, [AtStep(5, spoil)]))
+        fit(model, data, CONFIG, RUNTIME, Job("align", "x", 0, [AtStep(5, spoil)]))
     (kept,) = checkpoints.glob("align/x/checkpoint-*")
     assert kept.name == "checkpoint-4"
     assert all(value.isfinite().all() for value in load_file(kept / "model.safetensors").values())
@@ -202,7 +201,7 @@ def test_each_part_learns_at_its_own_rate_and_in_float32(dtype: str, held: Mater
     before = {n: p.detach().clone() for n, p in model.named_parameters()}
     for name, parameter in model.named_parameters():
         assert parameter.dtype == (torch.float32 if parameter.requires_grad else getattr(torch, dtype)), name
-    finetune_lora(model, data, config, CPU, Job("lora", "x", 0))
+    fit(model, data, config, CPU, Job("lora", "x", 0))
     moved = {n: float((p.detach() - before[n]).abs().max()) for n, p in model.named_parameters()}
     assert max(v for n, v in moved.items() if n.startswith("connector.")) < 1e-6
     assert min(v for n, v in moved.items() if "lora_B" in n) > 1e-3
@@ -234,7 +233,7 @@ def test_accumulated_batches_weigh_every_token_alike(
                 torch.cat([p.grad.flatten() for group in optimizer.param_groups for p in group["params"]])
             )
         )
-        align(model.double(), data, config, CPU, Job("align", f"x{micro}", 0))
+        fit(model.double(), data, config, CPU, Job("align", f"x{micro}", 0))
         kept.remove()
     assert len(gradients) == 3
     for other in gradients[1:]:

@@ -20,7 +20,7 @@ from pipeline.language.chat import IGNORE_INDEX
 from pipeline.language.conversations import ConversationCollator
 from pipeline.language.decoding import greedy
 from pipeline.language.octopi import OctopiForCausalLM
-from pipeline.language.training import Job, add_lora, align, assemble, finetune_lora, write_model_card
+from pipeline.language.training import Job, add_lora, assemble, fit, write_model_card
 from pipeline.records import Question
 from tests.checkpoints import write_llama
 from tests.language.shared import DIM, SMALL, call, material
@@ -83,7 +83,7 @@ def test_a_step_is_that_of_plain_torch(
         assert len(held) == len(found), "nothing else is trained"
 
     handle = register_optimizer_step_pre_hook(note)
-    align(model, data, STEP, CPU, Job("align", "x", 0))
+    fit(model, data, STEP, CPU, Job("align", "x", 0))
     handle.remove()
     assert found.keys() == expected.keys()
     for name, gradient in expected.items():
@@ -107,7 +107,7 @@ def test_without_it_no_old_row_moves_and_none_is_saved(
     model, data = assemble(material(language, questions, store), 4, "test")
     base = {n: p.detach().clone() for n, p in model.llm.named_parameters()}
     start = model.connector.delimiters.detach().clone()
-    trained = align(model, data, STEP, CPU, Job("align", "x", 0))
+    trained = fit(model, data, STEP, CPU, Job("align", "x", 0))
     assert all(torch.equal(p, base[n]) for n, p in model.llm.named_parameters())
     assert (model.connector.delimiters != start).any(1).all()
     model.save_pretrained(checkpoints / "saved", trained.state)
@@ -127,13 +127,13 @@ def test_adapters_go_on_with_what_alignment_trained(
     folder = checkpoints / "aligned"
     model, data = assemble(held, 4, "test")
     model.train_words()
-    model.save_pretrained(folder, align(model, data, STEP, CPU, Job("align", "x", 0)).state)
+    model.save_pretrained(folder, fit(model, data, STEP, CPU, Job("align", "x", 0)).state)
     aligned = load_file(folder / "words.safetensors")["weight"]
     assert aligned.dtype == torch.float32
     model, data = assemble(held, 8, "test", folder)
     assert torch.equal(model.words.weight, aligned)
     add_lora(model, LORA)
-    trained = finetune_lora(model, data, LORA, CPU, Job("lora", "x", 0))
+    trained = fit(model, data, LORA, CPU, Job("lora", "x", 0))
     assert not torch.equal(trained.state["words.weight"], aligned)
     model.save_pretrained(checkpoints / "saved", trained.state)
     again = OctopiForCausalLM.from_pretrained(checkpoints / "saved", dtype=dtype)  # type: ignore[arg-type]
@@ -203,7 +203,7 @@ def test_a_projection_without_schedule_keeps_its_rate(
         used.append({named[id(p)]: group["lr"] for group in optimizer.param_groups for p in group["params"]})
 
     handle = register_optimizer_step_pre_hook(note)
-    finetune_lora(model, data, config, CPU, Job("lora", "x", 0))
+    fit(model, data, config, CPU, Job("lora", "x", 0))
     handle.remove()
     shares = [0, 1 / 2, *((1 + math.cos(math.pi * step / 4)) / 2 for step in range(4))]
     assert len(used) == len(shares)
