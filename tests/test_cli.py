@@ -136,14 +136,6 @@ def test_data_audit_ends_with_status_1_where_parts_share_a_video(folder: Path) -
     assert audited()[0] == 0, "without a split it is a warning"
 
 
-@pytest.mark.parametrize("split", ["nonsense", "Not a name!"])
-def test_an_unknown_split_is_a_finding(folder: Path, split: str) -> None:
-    status, _, rows = audited("--split", split)
-    assert status == 1
-    assert [(row["check"], row["item"]) for row in rows if row["severity"] == "error"] == [("split", split)]
-    assert "allowed: paper, release, development, kfold" in rows[0]["measured"]
-
-
 def test_a_missing_catalogue_is_refused(folder: Path) -> None:
     result = RUNNER.invoke(app, ["data", "audit", str(folder), "--catalogue", "nowhere"])
     assert isinstance(result.exception, UserError)

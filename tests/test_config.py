@@ -39,19 +39,6 @@ def test_committed_params_are_the_default_scale() -> None:
     assert load_params(ROOT / "params.yaml") == compose("smoke", conf=CONF)
 
 
-@pytest.mark.parametrize("scale", ["paper-7b", "paper-13b"])
-def test_paper_scales_have_the_papers_hyper_parameters(scale: str) -> None:
-    p = compose(scale, conf=CONF)
-    assert (p.frames.fraction, p.frames.per_video, p.frames.size) == (0.3, 5, 224)
-    assert (p.encoder.prompts, p.encoder.epochs, p.encoder.batch_size, p.encoder.learning_rate) == (8, 30, 32, 1e-3)
-    assert (p.encoder.weight_decay, p.align.weight_decay, p.lora.weight_decay) == (0, 0, 0)
-    assert (p.align.samples, p.align.projection_learning_rate, p.align.batch_size) == (8000, 2e-5, 16)
-    assert (p.lora.samples, p.lora.projection_learning_rate, p.lora.learning_rate, p.lora.batch_size) == (
-        3000, 2e-5, 2e-4, 16,
-    )  # fmt: skip
-    assert (p.lora.rank, p.lora.alpha, p.lora.dropout) == (128, 256, 0.05)
-
-
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
@@ -233,9 +220,3 @@ def test_a_recipe_brings_its_settings_and_gives_way_to_yours() -> None:
     assert {name: getattr(release, name) for name in RELEASE} == RELEASE, "the candidate is the recipe"
     own = compose("small", ["encoder.recipe=release", clip, "encoder.epochs=3"], conf=CONF).encoder
     assert (own.epochs, own.batch_size) == (3, RELEASE["batch_size"])
-    with pytest.raises(UserError, match=r"scenes was pretrained on differences: set encoder.reference=subtract"):
-        compose("smoke", ["encoder.recipe=tuned", "encoder.backbone=[scenes]", "encoder.reference=none"], conf=CONF)
-    with pytest.raises(
-        UserError, match=r"encoder.recipe=paper is for CLIP alone, but encoder.backbone=\[timm,scenes\]"
-    ):
-        compose("small", ["encoder.recipe=paper"], conf=CONF)

@@ -170,7 +170,9 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
     timm = (
         "cross_validation.models=[trees]",
         "encoder.recipe=tuned",
-        "encoder.backbone=[timm]",
+        "encoder.backbone=[timm,scenes]",
+        "pretrain.objects=16",
+        "pretrain.steps=3",
         "encoder.weights=data/weights/efficientnet-lite0",
     )
     project.run("octopi", "scale", *REDUCED, *few, *timm, "data.catalogue='my catalogue'", "split.name=mine")
@@ -190,6 +192,9 @@ def test_the_chain_runs_on_it(project: Project) -> None:
     heads = load_file(data / "encoder" / "0" / "encoder.safetensors")
     assert [len(heads[f"heads.{i}.bias"]) for i in range(4)] == [3, 3, 3, 4]
     assert "heads.4.bias" not in heads
+    assert "dependence" in heads, "the recipe `tuned` decides the properties together"
+    embeddings = load_file(data / "embeddings" / "finetuned-0" / "embeddings.safetensors")
+    assert all(value.isfinite().all() for value in embeddings.values())
     splits = Counter(a.part for a in read_table(data / "splits" / "0.parquet", Assignment))
     assert splits == {Part.TRAIN: 8, Part.VALIDATION: 2, Part.TEST: 8}
 

@@ -127,7 +127,6 @@ def check_trained(project: Project, scale: str) -> None:
 def test_paper_13b_from_videos_to_the_report(project: Project) -> None:
     table = project.run("octopi", "scale", "paper-13b", *FEW, f"{LAUNCHER} sharded")
     assert "align                   2" in table, "two devices are counted"
-    project.run("dvc", "repro", "align")
     project.run("octopi", "repro")
     noted = launches(project)
     assert noted.keys() == {f"{stage}-{rank}" for stage in ("align", "lora") for rank in (0, 1)}

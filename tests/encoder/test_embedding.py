@@ -9,10 +9,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from pipeline.encoder.recipes import base_encoder, property_classifier
-from pipeline.language.connector import Connector
-from pipeline.scales import compose
-from tests.closure import ROOT
+from pipeline.encoder.recipes import base_encoder
 from tests.encoder.test_recipes import Tower
 from tests.encoders import close, config, write_tower
 
@@ -33,28 +30,8 @@ def test_the_base_encoder_reads_what_is_named(name: str, tmp_path: Path) -> None
     close(found, normalised if name == "class_token" else normalised @ projection)
 
 
-@pytest.mark.parametrize("name", list(WIDTH))
-def test_heads_and_connector_take_it(name: str, tmp_path: Path) -> None:
-    classifier = property_classifier(config(write_tower(tmp_path), "paper", embedding=name), [3, 2]).eval()
-    frames = torch.zeros(2, 5, 32, 32, 3, dtype=torch.uint8)
-    assert classifier(frames, torch.zeros(2, 5, dtype=torch.int64))["logits"].shape == (2, 5)
-    embedded = classifier.encoder(frames[0], torch.zeros(5, dtype=torch.int64))
-    connector = Connector(classifier.encoder.dim, 48)
-    assert connector.projection(embedded).shape == (5, 48)
-
-
 def test_release_reads_the_class_token_whatever_is_named(tmp_path: Path) -> None:
     weights, frames = write_tower(tmp_path), torch.zeros(2, 32, 32, 3, dtype=torch.uint8)
     one, other = (base_encoder(config(weights, "release", embedding=name)) for name in WIDTH)
     assert one.dim == other.dim == WIDTH["class_token"]
     assert torch.equal(one(frames, torch.arange(2)), other(frames, torch.arange(2)))
-
-
-def test_the_papers_scales_give_the_language_model_1024_values() -> None:
-    import open_clip
-
-    vision = open_clip.get_model_config("ViT-L-14-quickgelu")
-    assert (vision["embed_dim"], vision["vision_cfg"]["width"]) == (768, 1024)
-    for scale in ("paper-7b", "paper-13b"):
-        assert compose(scale, [], conf=ROOT / "conf").encoder.embedding == "class_token"
-    assert compose("smoke", [], conf=ROOT / "conf").encoder.embedding == "projected"

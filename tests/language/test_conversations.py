@@ -17,21 +17,14 @@ from transformers import PreTrainedTokenizerBase
 from pipeline.config import LanguageConfig
 from pipeline.embeddings import EmbeddingStore
 from pipeline.language.base import load_tokenizer
-from pipeline.language.chat import IGNORE_INDEX, TACT_END, TACT_FRAME, TACT_START, TACTILE_TOKENS, encode, render
+from pipeline.language.chat import IGNORE_INDEX, encode, render
 from pipeline.language.conversations import POOL, LengthBuckets
 from pipeline.language.generate import write_prompt
 from pipeline.language.training import assemble
-from pipeline.records import Assignment, Part, Question, Turn
-from pipeline.tasks.questions import build_questions, pool_of
-from pipeline.videos.catalogue import load_catalogue
+from pipeline.records import Question, Turn
 from tests.checkpoints import write_llama
-from tests.closure import ROOT
 from tests.language.shared import generation, material
 from tests.models import model_folder
-
-WORDS = st.text(
-    alphabet=st.characters(codec="utf-8", exclude_categories=("Cs",), exclude_characters="<>{}"), max_size=60
-)
 
 
 @pytest.fixture(scope="module", params=["random", "tiny"])
@@ -39,22 +32,6 @@ def tokenizer(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathF
     if request.param == "tiny":
         return load_tokenizer(model_folder("tiny-llama"))
     return load_tokenizer(write_llama(tmp_path_factory.mktemp("llama")))
-
-
-@pytest.fixture(scope="module")
-def all_questions() -> list[Question]:
-    catalogue = load_catalogue(ROOT / "pipeline" / "physiclear")
-    videos = [
-        Assignment(video_id=f"{o}_{n}", object_id=o, part=Part.TEST)
-        for o in list(catalogue.objects)[::3]
-        for n in (0, 1)
-    ]
-    return build_questions(
-        pool_of(Part.TEST, videos, catalogue),
-        dict.fromkeys(("OPD", "PC", "PSS", "POM", "PSR"), 6),
-        seed=1,
-        distinct=True,
-    )
 
 
 def test_without_a_begin_token_all_else_is_the_same(
@@ -75,48 +52,6 @@ def test_without_a_begin_token_all_else_is_the_same(
     assert asked == tuple(
         i for i, label in zip(without.input_ids, without.labels, strict=True) if label == IGNORE_INDEX
     )
-
-
-def test_vicuna_layout(tokenizer: PreTrainedTokenizerBase) -> None:
-    turns = [Turn(user="Feel {tactile}.", assistant="Soft."), Turn(user="Sure?", assistant="Yes.")]
-    rendered = render(turns, tokenizer, system_prompt="Be kind.", frames=2, complete=True)
-    assert rendered.text == (
-        f"Be kind. USER: Feel {TACT_START}{TACT_FRAME}{TACT_FRAME}{TACT_END}. ASSISTANT: Soft.</s>"
-        "USER: Sure? ASSISTANT: Yes.</s>"
-    )
-    assert [rendered.text[a:b] for a, b in rendered.answers] == [" Soft.</s>", " Yes.</s>"]
-
-
-def test_every_question_is_prompted_as_it_was_trained(
-    tokenizer: PreTrainedTokenizerBase, all_questions: list[Question]
-) -> None:
-    marks = tokenizer.convert_tokens_to_ids(list(TACTILE_TOKENS))
-    for question in all_questions:
-        for dialogue in question.dialogues:
-            for last in range(1, len(dialogue.turns) + 1):
-                turns = dialogue.turns[:last]
-                full = encode(render(turns, tokenizer, system_prompt="", frames=5, complete=True), tokenizer)
-                asked = encode(render(turns, tokenizer, system_prompt="", frames=5, complete=False), tokenizer)
-                assert full.input_ids[: len(asked.input_ids)] == asked.input_ids
-                assert set(asked.labels[-3:]) == {IGNORE_INDEX}
-                answer = [i for i, y in zip(full.input_ids, full.labels, strict=True) if y != IGNORE_INDEX]
-                assert answer[-1] == tokenizer.eos_token_id, "the model must learn to stop"
-                said = " ".join(t.assistant for t in turns)
-                heard = tokenizer.decode(answer, skip_special_tokens=True)
-                assert heard.split() == said.split(), "labels are exactly the answers"
-                shown = sum(t.user.count("{tactile}") for t in turns)
-                assert [full.input_ids.count(t) for t in marks] == [shown, 5 * shown, shown]
-
-
-@settings(max_examples=25, deadline=None)
-@given(st.lists(st.tuples(WORDS, WORDS), min_size=1, max_size=3))
-def test_labels_cover_answers_for_any_text(tokenizer: PreTrainedTokenizerBase, talk: list[tuple[str, str]]) -> None:
-    turns = [Turn(user=u, assistant=a) for u, a in talk]
-    encoded = encode(render(turns, tokenizer, system_prompt="", frames=1, complete=True), tokenizer)
-    labelled = [i for i, y in zip(encoded.input_ids, encoded.labels, strict=True) if y != IGNORE_INDEX]
-    assert labelled.count(tokenizer.eos_token_id) == len(turns)
-    assert len(encoded.input_ids) == len(encoded.labels)
-    assert encoded.labels[0] == IGNORE_INDEX
 
 
 def test_same_draws_for_same_epoch_and_others_for_another(

@@ -135,14 +135,6 @@ def test_batch_size_changes_no_answer(
         assert not [p for p in one if p.task == "OPD"], "without descriptions there is nothing to ask"
 
 
-def test_running_into_the_limit_is_said(
-    model: OctopiForCausalLM, questions: list[Question], store: EmbeddingStore
-) -> None:
-    predictions = answer(model, store, questions[:2], Opd.ALL, generation(2, tokens=1))
-    assert all(p.truncated for p in predictions)
-    assert all(p.tokens == len(p.outputs) for p in predictions)
-
-
 def test_frame_token_never_comes_out_as_text(model: OctopiForCausalLM) -> None:
     assert model.frame_id >= model.llm.get_input_embeddings().num_embeddings
     assert TACT_FRAME not in model.tokenizer.decode(range(model.llm.config.vocab_size))

@@ -26,29 +26,6 @@ from tests.language.shared import DIM, call, generation, material
 LORA = LoraTrainConfig(samples=1, rank=4, alpha=8, dropout=0.0)
 
 
-def test_tactile_embeddings_stand_where_the_frames_are(model: OctopiForCausalLM) -> None:
-    words = model.llm.get_input_embeddings().weight
-    ids = torch.tensor([[5, model.start_id, model.frame_id, model.frame_id, model.end_id, 7], [8, 9, 10, 11, 12, 13]])
-    features = torch.randn(2, 2, DIM)
-    features[1] = float("nan")  # padding of a row without frames: must never be read
-    trained = {name for name, p in model.named_parameters() if p.requires_grad}
-    assert all(name.startswith("connector.") for name in trained)
-    assert model.connector.delimiters.shape == (2, 32)
-    output = model.embed(ids, features)
-    expected = torch.stack(
-        [
-            words[5],
-            model.connector.delimiters[0],
-            model.connector.projection(features[0, 0]),
-            model.connector.projection(features[0, 1]),
-            model.connector.delimiters[1],
-            words[7],
-        ]
-    )
-    torch.testing.assert_close(output[0], expected)
-    assert torch.equal(output[1], words[ids[1]])
-
-
 @pytest.mark.parametrize("weight", [1.0, 3.0])
 def test_loss_is_over_answers_only(
     weight: float,

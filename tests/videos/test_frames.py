@@ -93,11 +93,6 @@ def test_differences_are_exact(height: int, width: int, seed: int) -> None:
     assert difference(one, other) == difference(padded, other) == exact, "what stands behind a line's end is not read"
 
 
-@pytest.mark.parametrize(("frames", "fraction", "count"), [(1, 0.3, 1), (2, 0.3, 1), (3, 0.3, 1), (101, 0.3, 30)])
-def test_top_thirty_percent(frames: int, fraction: float, count: int) -> None:
-    assert kept_count(frames, FramesConfig(fraction=fraction)) == count
-
-
 def test_the_fraction_is_taken_as_written() -> None:
     assert math.ceil(0.07 * 100) == 8, "what floating point would say"
     assert kept_count(101, FramesConfig(fraction=0.07)) == 7
