@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
@@ -14,7 +14,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 from torch.nn import functional as F
-from torch.optim.optimizer import register_optimizer_step_pre_hook
 
 from pipeline.config import EncoderConfig
 from pipeline.encoder import finetune as training
@@ -330,21 +329,6 @@ def test_what_is_tuned_is_saved_loaded_and_embeds_alike(
     torch.testing.assert_close(alone, every[plain])
     kept = sum(value.numel() for value in trainable_state(model).values())
     assert kept < 0.9 * sum(p.numel() for p in model.parameters())
-
-
-@pytest.fixture
-def updates() -> Iterator[dict[str, int]]:
-    """Counts the updates of all optimisers; interrupts the one numbered `stop`."""
-    counter = {"made": 0, "stop": -1}
-
-    def count(*_: object) -> None:
-        counter["made"] += 1
-        if counter["made"] == counter["stop"]:
-            raise KeyboardInterrupt
-
-    handle = register_optimizer_step_pre_hook(count)
-    yield counter
-    handle.remove()
 
 
 def test_a_killed_tuning_ends_as_if_it_had_not_been(

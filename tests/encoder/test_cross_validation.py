@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from torch.optim.optimizer import register_optimizer_step_pre_hook
 
 from pipeline.config import CrossValidationConfig, EncoderConfig, RuntimeConfig
 from pipeline.encoder import cross_validation as module
@@ -412,21 +411,6 @@ def test_folds_of_other_inputs_or_settings_are_not_taken_for_these(
     begun = kill_after(99, monkeypatch)
     cross_validate_candidate(candidate, change(data), config)
     assert len(begun) == 6
-
-
-@pytest.fixture
-def updates() -> Iterator[dict[str, int]]:
-    """Counts the updates of all optimisers; interrupts the one numbered `stop`."""
-    counter = {"made": 0, "stop": -1}
-
-    def count(*_: object) -> None:
-        counter["made"] += 1
-        if counter["made"] == counter["stop"]:
-            raise KeyboardInterrupt
-
-    handle = register_optimizer_step_pre_hook(count)
-    yield counter
-    handle.remove()
 
 
 @pytest.mark.parametrize(("seed", "left"), [(4, 1), (5, 2)], ids=["the same", "other folds"])
