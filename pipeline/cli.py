@@ -97,10 +97,10 @@ def page() -> None:
 @app.command()
 def publish() -> None:
     """Show what lies in data/ and reports/ in MLflow, as `dvc repro` does at its end; a second call adds nothing."""
-    from pipeline import tracking
     from pipeline.params import load_params
+    from pipeline.tracking.publish import publish as to_mlflow
 
-    typer.echo(tracking.publish(load_params()))
+    typer.echo(to_mlflow(load_params()))
 
 
 CATALOGUE = typer.Option(help="Folder with objects.csv and properties.yaml.")

@@ -7,7 +7,7 @@ from pipeline.language.training import Job, Material, assemble, fit, write_model
 from pipeline.language.words import begin_with_words
 from pipeline.records import Encoder, Measurement, Opd
 from pipeline.stage import DATA, matrix_key, stage
-from pipeline.tracking import live
+from pipeline.tracking.live import live
 from pipeline.videos.catalogue import load_catalogue
 
 

@@ -9,7 +9,7 @@ from pipeline.io import read_table, write_table
 from pipeline.records import Assignment, Classification, Measurement, Part
 from pipeline.runtime import resolve_device
 from pipeline.stage import DATA, matrix_key, stage
-from pipeline.tracking import live
+from pipeline.tracking.live import live
 from pipeline.training.trainable import save_trainable
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.frames.store import REFERENCES_FILE, TABLE_FILE, FrameStore

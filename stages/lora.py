@@ -4,7 +4,7 @@ from pipeline.io import write_table
 from pipeline.language.training import Job, Material, add_lora, assemble, fit, write_model_card
 from pipeline.records import Encoder, Measurement, Opd
 from pipeline.stage import DATA, matrix_key, stage
-from pipeline.tracking import live
+from pipeline.tracking.live import live
 
 
 def main() -> None:

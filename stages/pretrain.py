@@ -5,7 +5,7 @@ from pipeline.encoder.candidates import needs_pretraining
 from pipeline.io import write_table
 from pipeline.records import Measurement
 from pipeline.stage import DATA, stage
-from pipeline.tracking import live
+from pipeline.tracking.live import live
 
 
 def main() -> None:

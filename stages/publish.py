@@ -5,7 +5,8 @@ from pathlib import Path
 
 from pipeline.report.page import write_page
 from pipeline.stage import stage
-from pipeline.tracking import TrackingError, publish
+from pipeline.tracking.publish import publish
+from pipeline.tracking.store import TrackingError
 
 
 def main() -> None:

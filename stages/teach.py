@@ -6,7 +6,7 @@ from pathlib import Path
 from pipeline.io import write_csv, write_table
 from pipeline.records import GATE, Described, Measurement
 from pipeline.stage import DATA, stage
-from pipeline.tracking import live
+from pipeline.tracking.live import live
 
 OUT = DATA / "taught"
 

@@ -12,7 +12,7 @@ CORE = (
     *("__init__", "errors", "records", "runtime", "io", "config", "params", "progress", "parallel", "card"),
     *("embeddings", "shapes", "weights", "training", "stage"),
 )
-ROOMS = ("videos", "scenes", "tasks", "encoder", "language", "evaluation", "report", "registry", "tracking", "use")
+ROOMS = ("videos", "scenes", "tasks", "encoder", "language", "evaluation", "report", "tracking", "use")
 TOP = ("memory", "scales", "revisions", "compare", "reproduce", "cli")
 ORDER = (*CORE, *ROOMS, *TOP)
 MODULES = sorted((ROOT / "pipeline").rglob("*.py"))
@@ -39,4 +39,4 @@ def test_imports_go_downward(file: Path) -> None:
 
 def test_only_tracking_and_what_is_logged_import_mlflow() -> None:
     found = {room(f) for f in MODULES if "import mlflow" in f.read_text() or "from mlflow" in f.read_text()}
-    assert found <= {"tracking", "registry", "use"}
+    assert found <= {"tracking", "use"}

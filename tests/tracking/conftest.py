@@ -17,7 +17,8 @@ from pipeline.config import Params, TrackingConfig
 from pipeline.io import write_json, write_table
 from pipeline.records import Assignment, Measurement, Part, Video
 from pipeline.scales import compose, write_params
-from pipeline.tracking import _Store, out_of_reach, publish
+from pipeline.tracking.publish import publish
+from pipeline.tracking.store import Store, out_of_reach
 from tests.closure import ROOT
 
 if TYPE_CHECKING:
@@ -126,7 +127,7 @@ def fresh_database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """mlruns/ with an empty experiment: making its tables takes seconds."""
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("database"))
-        _Store(TrackingConfig())
+        Store(TrackingConfig())
         return Path("mlruns").resolve()
 
 

@@ -22,12 +22,15 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from pipeline import tracking
 from pipeline.config import Params
 from pipeline.io import read_table, write_table
 from pipeline.records import Measurement
 from pipeline.stage import Stage
-from pipeline.tracking import TrackingError, live, publish
+from pipeline.tracking import live as live_module
+from pipeline.tracking.chain import settings
+from pipeline.tracking.live import live
+from pipeline.tracking.publish import publish
+from pipeline.tracking.store import TrackingError, out_of_reach
 from pipeline.training.trainer import TrainableTrainer, Trained, TrainingMonitor, train, training_arguments
 from tests.closure import ROOT
 from tests.tracking.conftest import FIRST, FULL, FakeChain, by_name, client, runs
@@ -97,7 +100,7 @@ def minutes_of(stage: Stage) -> float:
 
 def by_params(params: Params) -> set[str]:
     """What a person sets and the stage's axes: not the Trainer's hundred arguments."""
-    return {*tracking.settings(params), "encoder", "opd", "seed"}
+    return {*settings(params), "encoder", "opd", "seed"}
 
 
 @pytest.mark.parametrize(("error", "status"), [(RuntimeError, "FAILED"), (KeyboardInterrupt, "KILLED")])
@@ -148,7 +151,7 @@ def test_without_live_logging_mlflow_is_not_imported(chain: FakeChain) -> None:
     shutil.rmtree("mlruns")
     code = (
         "import sys; from pipeline.params import load_params; from pipeline.stage import Stage\n"
-        f"from pipeline.tracking import live\nwith live(Stage('{ALIGN}', load_params())) as callbacks: pass\n"
+        f"from pipeline.tracking.live import live\nwith live(Stage('{ALIGN}', load_params())) as callbacks: pass\n"
         "assert callbacks == [] and 'mlflow' not in sys.modules"
     )
     assert chain.params.tracking.live is False
@@ -209,7 +212,7 @@ def test_out_of_reach_costs_one_warning_and_one_call(
         params = watched(chain.params, uri=uri)
         with live(Stage(ALIGN, params)) as callbacks:
             trained = fit(params, callbacks)
-        monkeypatch.setattr(tracking, "_Store", lambda _: pytest.fail("calls again"))
+        monkeypatch.setattr(live_module, "Store", lambda _: pytest.fail("calls again"))
         with live(Stage("lora@finetuned-all-0", params)) as callbacks:
             assert callbacks == []
         monkeypatch.undo()
@@ -302,7 +305,7 @@ def test_a_curve_that_broke_off_is_completed(chain: FakeChain, monkeypatch: pyte
     chain.ran([ALIGN], minutes=minutes_of(stage))
     path = Path("data/models/without/finetuned-all-0/history.parquet")
     write_table(path, Measurement, trained.history)
-    tracking.out_of_reach.clear()
+    out_of_reach.clear()
     publish(chain.params)
     run = by_name("stage")[ALIGN]
     history = client().get_metric_history(run.info.run_id, "loss")

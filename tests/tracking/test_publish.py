@@ -19,7 +19,9 @@ from pipeline.errors import UserError
 from pipeline.io import write_table
 from pipeline.records import Graded
 from pipeline.scales import compose, write_params
-from pipeline.tracking import TrackingError, _datasets, accuracies, publish, read_stages
+from pipeline.tracking.chain import accuracies, datasets, read_stages
+from pipeline.tracking.publish import publish
+from pipeline.tracking.store import TrackingError
 from tests.closure import ROOT
 from tests.tracking.conftest import (
     BASE,
@@ -108,7 +110,7 @@ def test_a_run_of_a_fold_has_that_folds_accuracies_and_data(chain: FakeChain) ->
     found = {key: metrics["accuracy/PC"] for key, metrics in accuracies(params).items()}
     assert found == {FULL: 0.25, "finetuned-with-all-1": 0.75}
     shutil.copy("data/splits/0.parquet", "data/splits/1.parquet")
-    assert [d.name for _, d in _datasets(params)] == [
+    assert [d.name for _, d in datasets(params)] == [
         f"{part}-fold{fold}" for fold in (0, 1) for part in ("train", "validation", "test")
     ]
 

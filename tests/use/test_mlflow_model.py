@@ -21,7 +21,7 @@ import pytest
 from mlflow import MlflowClient
 from mlflow.exceptions import MlflowException
 
-from pipeline.registry import NEEDED, log_model, packaged, register
+from pipeline.tracking.registry import NEEDED, log_model, packaged, register
 from pipeline.use.model import Octopi
 from tests.use.shared import Made
 from tests.use.videos import claims_pixels

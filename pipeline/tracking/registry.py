@@ -19,7 +19,7 @@ from pipeline.stage import DATA
 
 MODELS = Path("models")
 NAME, ALIAS = "octopi", "best"
-PACKAGE = Path(__file__).parent
+PACKAGE = Path(__file__).parents[1]
 NEEDED = (
     *("accelerate", "av", "filelock", "joblib", "mlflow", "numpy", "open_clip_torch", "opencv-contrib-python-headless"),
     *("pandas", "peft", "psutil", "pyarrow", "pydantic", "pyyaml", "safetensors", "scipy", "scikit-learn"),
