@@ -106,7 +106,7 @@ def stands_on(said: dict[str, Any]) -> list[str]:
         f"**Seeds:** {len(said['seeds'])} ({', '.join(map(str, said['seeds']))}).{_folds(said)}",
         f"**Chosen on these objects before?** {said['settings'] or 'Nothing is noted in pipeline/report/notes.yaml.'}",
         "**Intervals** are Wilson's with the effective number of questions, since questions share objects. "
-        + said["intervals"],
+        f"{said['intervals']}".rstrip(),
     ]
     if said.get("taught_from"):
         facts.insert(1, f"**The base was taught:** {TAUGHT.format(said['taught_from'])}")
@@ -185,8 +185,8 @@ def _who(report: Report) -> list[str]:
         under = f"each of them in one of {tested} folds that were" if tested > 1 else "all of them in one fold that was"
         under += " not trained on"
         under += f", {said['replicates']} times" if said["replicates"] > 1 else ""
-        if len(folds["tested"]) < folds["of"]:
-            under += f" ({folds['of'] - len(folds['tested'])} of {folds['of']} folds are still to be run)"
+        if left := folds["of"] - len(folds["tested"]):
+            under += f" ({left} of {folds['of']} folds {'is' if left == 1 else 'are'} still to be run)"
     about = f"Its tactile encoder was {encoder}; it answered about {source} videos of {objects}, {under}."
     chance = [CHANCE] if any(is_tiny(model["folder"]) for model in said["base_models"].values()) else []
     return [*chance, f"{maker}.", about, *([said["settings"]] if said["settings"] else [])]
