@@ -252,8 +252,8 @@ def _parts(effects: pd.DataFrame, solved: Collection[str]) -> list[str]:
         ", ".join(f"{r['part']} in {r['task']} {100 * r['difference']:+.1f}" for r in part.to_dict("records"))
         for part in (sure, formal)
     )
-    named = {"lora": "LoRA", "opd": "OPD"}
-    all_of_them = f"{len(rows)} effects of {' and '.join(named.get(p, p) for p in dict.fromkeys(rows['part']))}"
+    *others, last = [{"lora": "LoRA", "opd": "OPD"}.get(part, part) for part in dict.fromkeys(rows["part"])]
+    all_of_them = f"{len(rows)} effects of {', '.join(others)}{' and ' if others else ''}{last}"
     also = f" Significant too, but answers are no better than chance even so: {only} points." if only else ""
     if words:
         return [f"Of {all_of_them} these hold up (Holm): {words} points.{also}"]
