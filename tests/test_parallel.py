@@ -170,7 +170,7 @@ def test_a_worker_that_outlives_a_stage_loads_anew(tmp_path: Path, monkeypatch: 
 def test_a_missing_package_is_one_line_before_anything_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     params = compose("smoke", ["runtime.parallel=dask"])
     monkeypatch.setattr(parallel, "find_spec", lambda name: None if name == "distributed" else True)
-    message = r"\Aruntime\.parallel: dask takes the package distributed: pip install 'octopi-pipeline\[dask\]'\Z"
+    message = r"\Aruntime\.parallel: dask takes the package distributed: pip install -e '\.\[dask\]'\Z"
     with pytest.raises(UserError, match=message):
         check_inputs(params)
     with pytest.raises(UserError, match=message):
