@@ -113,7 +113,7 @@ def _trees(bed: Bed) -> Callable[[VideoFile], object]:
     """Trees that have grown on random features of as many videos; they decode a second time, whole frames."""
     shape = len(bed.videos), len(VIDEO_FEATURE_NAMES)
     features = np.random.default_rng(0).standard_normal(shape, dtype=np.float32)
-    predictor = PropertyPredictor(bed.classes, jobs=1).fit(features, bed.labels, bed.objects)
+    predictor = PropertyPredictor(bed.classes).fit(features, bed.labels, bed.objects)
     return lambda file: predictor.predict(describe(Recording(file.path, _scan(file).probe.starts_touching))[None])
 
 

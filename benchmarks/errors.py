@@ -76,7 +76,7 @@ def cross_validated(
         objects: Each video's object.
         classes: How many classes each property has.
     """
-    predicted = cross_validate(predict, labels, objects, classes, folds=folds, repeats=repeats)
+    predicted = cross_validate(predict, objects, classes, folds=folds, repeats=repeats)
     wrong = (predicted != labels[:, None]).any(axis=2).mean(axis=1)
     return share_of(wrong.tolist(), [(o,) for o in objects])
 

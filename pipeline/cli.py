@@ -68,13 +68,13 @@ def weights(
     from pipeline.runtime import quiet_libraries
     from pipeline.weights import DOWNLOADED, MADE
     from pipeline.weights.make import make
-    from pipeline.weights.published import SUMS, adopt
+    from pipeline.weights.published import SUMS, adopt, new_folder
 
     quiet_libraries()
     if name not in DOWNLOADED:
         if source is not None and name in MADE:
             raise UserError(f"{name} is not downloaded but made; leave {source} out, and name a folder with --to")
-        folder, done = to or Path("weights") / name, "made"
+        folder, done = new_folder(to or Path("weights") / name), "made"
         make(name, folder)
     elif source is None:
         repository = DOWNLOADED[name].repository

@@ -7,6 +7,7 @@ rooms: a GiB or two on a card.
 
 from __future__ import annotations
 
+import argparse
 import shlex
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass, fields
@@ -15,8 +16,9 @@ from pathlib import Path
 import yaml
 
 from pipeline.config import EncoderConfig, LoraTrainConfig, Params, TrainConfig
+from pipeline.errors import UserError
 from pipeline.records import Assignment, Part, Question, Turn
-from pipeline.shapes import FULL, Llama, Vision
+from pipeline.shapes import FULL, LLM_CONFIG, Llama, Vision
 from pipeline.tasks.questions import build_questions, counts_by_task, pool_of
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.weights.check import TOKENIZER, read_tokenizer
@@ -86,14 +88,15 @@ def count(params: Params) -> tuple[list[Use], list[str]]:
     language = Path(params.language.weights)
     if params.teach.base:
         notes.append(f"teach is not counted; what it makes of {params.teach.base} has the same shapes.")
-        language = language if language.is_dir() else Path(params.teach.base)
+        # Where nothing was taught, the folder holds a table alone.
+        language = language if (language / LLM_CONFIG).is_file() else Path(params.teach.base)
     llama = Llama.read(language)
     if llama is None:
         notes.append(f"{language}: no Llama whose shapes are known; the language model's stages are not counted.")
         return uses, notes
     if not language.is_dir():
         notes.append(f"{language} is not there: counted with the shapes that are published for {language.name}.")
-    lengths = longest(params, catalogue)
+    lengths = longest(params, catalogue, language)
     if not (language / TOKENIZER).is_file():
         notes.append(f"Without its tokenizer, a token is taken for {LETTERS} letters.")
     notes.append(
@@ -208,20 +211,27 @@ def language_passing(params: Params, llama: Llama, config: TrainConfig, lengths:
 
 def launched(launcher: str) -> tuple[int, bool]:
     """Devices that a launcher starts a training on, and whether they share the layers among them."""
-    words = shlex.split(launcher)
+    parser = argparse.ArgumentParser(exit_on_error=False, add_help=False, allow_abbrev=False)
+    parser.add_argument("--config_file", "--config-file", type=Path)
+    parser.add_argument("--num_processes", "--num-processes", type=int)
+    try:
+        given, _ = parser.parse_known_args(shlex.split(launcher))
+    except (argparse.ArgumentError, ValueError) as error:
+        raise UserError(f"runtime.launcher: {error}") from None
     settings: dict[str, object] = {}
-    if "--config_file" in words:
-        file = Path(words[words.index("--config_file") + 1])
-        settings = yaml.safe_load(file.read_text(encoding="utf-8")) if file.is_file() else {}
-    devices = int(str(settings.get("num_processes", 1)))
-    if "--num_processes" in words:
-        devices = int(words[words.index("--num_processes") + 1])
+    if given.config_file and given.config_file.is_file():
+        settings = yaml.safe_load(given.config_file.read_text(encoding="utf-8"))
+    devices = given.num_processes or int(str(settings.get("num_processes", 1)))
     return devices, settings.get("distributed_type") == "FSDP"
 
 
-def longest(params: Params, catalogue: Catalogue) -> Lengths:
-    """Look for the longest conversations among questions on all objects of the catalogue."""
-    tokens = _tokenizer(Path(params.language.weights))
+def longest(params: Params, catalogue: Catalogue, language: Path) -> Lengths:
+    """Look for the longest conversations among questions on all objects of the catalogue.
+
+    Args:
+        language: Folder of the language model whose tokens are counted.
+    """
+    tokens = _tokenizer(language)
 
     def length(question: Question, turns: Sequence[Turn]) -> int:
         text = " ".join([params.language.system_prompt, *(f"USER: {t.user} ASSISTANT: {t.assistant}" for t in turns)])

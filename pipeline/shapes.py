@@ -10,10 +10,12 @@ import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 from pipeline.errors import UserError
 
+Targets = Sequence[str] | Literal["all-linear"]
+"""`lora.target_modules`."""
 CLIP_CONFIG, LLM_CONFIG = "open_clip_config.json", "config.json"
 FULL = 4
 """Bytes of a float32 value."""
@@ -210,9 +212,13 @@ class Llama:
         """Of the whole model."""
         return self.words + self.num_hidden_layers * (self.layer_linear + 2 * self.hidden_size)
 
-    def adapters(self, targets: Sequence[str], rank: int) -> int:
+    def _adapted(self, targets: Targets) -> list[str]:
+        """The linear maps of a layer that get an adapter."""
+        return [name for name in self.linear if targets == "all-linear" or name in targets]
+
+    def adapters(self, targets: Targets, rank: int) -> int:
         """Parameters of low-rank adapters on these linear maps of each layer."""
-        return self.num_hidden_layers * rank * sum(sum(self.linear[t]) for t in targets if t in self.linear)
+        return self.num_hidden_layers * rank * sum(sum(self.linear[t]) for t in self._adapted(targets))
 
     def saved_layer(self, size: int) -> int:
         """Bytes a token that one frozen layer keeps of a training forward; `size` is that of a weight's value."""
@@ -221,9 +227,9 @@ class Llama:
         attention = (2 * queries + 2 * keys) * size + self.num_attention_heads * FULL
         return norms + attention + 3 * self.intermediate_size * size
 
-    def saved_adapters(self, targets: Sequence[str], rank: int, size: int, dropout: bool) -> int:
+    def saved_adapters(self, targets: Targets, rank: int, size: int, dropout: bool) -> int:
         """Bytes a token that one layer's adapters, in float32, keep besides."""
-        known = [t for t in targets if t in self.linear]
+        known = self._adapted(targets)
         total = len(known) * rank * FULL
         if dropout:
             return total + sum(self.linear[t][0] * (FULL + DROPPED) for t in known)

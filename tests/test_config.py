@@ -214,7 +214,7 @@ def test_a_recipe_brings_its_settings_and_gives_way_to_yours() -> None:
         assert not needs_pretraining(composed.encoder, composed.cross_validation.models)
     scenes = compose("smoke", ["encoder.recipe=tuned", "encoder.backbone=[scenes]"], conf=CONF)
     assert needs_pretraining(scenes.encoder, ())
-    assert needs_pretraining(smoke.encoder, ("trees", "pretrained-raw"))
+    assert needs_pretraining(smoke.encoder, ("trees", "pretrained"))
     clip = "encoder.backbone=[clip]"
     release = compose("small", ["encoder.recipe=release", clip], conf=CONF).encoder
     assert {name: getattr(release, name) for name in RELEASE} == RELEASE, "the candidate is the recipe"

@@ -17,6 +17,7 @@ from torch import nn
 from transformers import DynamicCache, LlamaConfig, LlamaForCausalLM
 
 from pipeline.encoder.vpt import VisualPrompts
+from pipeline.errors import UserError
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.memory import ADAM, GIB, Lengths, Use, count, language_saved, launched, table
 from pipeline.scales import compose
@@ -238,12 +239,26 @@ def test_a_gpu_takes_what_is_counted(autocast: bool) -> None:
     assert torch.cuda.max_memory_allocated() - before == pytest.approx(expected, rel=0.15)
 
 
+def test_all_linear_maps_are_those_that_peft_adapts() -> None:
+    model, shape = llama(2)
+    adapted = get_peft_model(model, LoraConfig(r=RANK, target_modules="all-linear", task_type="CAUSAL_LM"))
+    assert shape.adapters("all-linear", RANK) == sum(p.numel() for p in adapted.parameters() if p.requires_grad) > 0
+    for dropout in (True, False):
+        assert shape.saved_adapters("all-linear", RANK, 4, dropout) == shape.saved_adapters(LINEAR, RANK, 4, dropout)
+
+
 def test_launchers_are_read() -> None:
     assert launched("python") == (1, False)
     assert launched("accelerate launch --num_processes 1") == (1, False)
     named = f"accelerate launch --config_file {shlex.quote(f'{ROOT}/conf/accelerate/fsdp.yaml')}"
     assert launched(named) == (2, True)
-    assert launched(f"{named} --num_processes 4") == (4, True)
+    assert launched(f"{named} --num_processes 4") == launched(f"{named} --num-processes=4") == (4, True)
+    for wrong, message in (
+        ("accelerate launch --config_file", "expected one argument"),
+        ("a --num_processes b", "int"),
+    ):
+        with pytest.raises(UserError, match=rf"^runtime.launcher: .*{message}"):
+            launched(wrong)
 
 
 @pytest.fixture
@@ -289,6 +304,15 @@ def test_settings_move_what_they_should() -> None:
     projected = uses("encoder.embedding=projected")
     assert usual["finetune_encoder"].optimizer - projected["finetune_encoder"].optimizer == 12 * 256 * 9
     assert usual["align"].optimizer - projected["align"].optimizer == 12 * 256 * 4096
+
+
+def test_where_nothing_was_taught_the_base_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A chain without teaching leaves its folder with a table alone."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "pipeline").symlink_to(ROOT / "pipeline")
+    (tmp_path / "data" / "taught").mkdir(parents=True)
+    (tmp_path / "data" / "taught" / "gate.csv").touch()
+    assert {"align", "lora", "answer"} <= {use.stage for use in count(compose("small", conf=ROOT / "conf"))[0]}
 
 
 @pytest.mark.usefixtures("elsewhere")

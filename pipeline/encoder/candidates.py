@@ -25,23 +25,14 @@ class Candidate:
     `tuned`: that recipe."""
     backbone: tuple[str, ...] = ()
     """Whose features: names in `pipeline.encoder.backbones`; none stands for the chain's own `encoder.backbone`."""
-    untrained: bool = False
-    """`frame_heads`: the network of the backbone `scenes` with random weights in place of a backbone."""
     recipe: Literal["paper", "release", "scratch"] = "paper"
     """`gradient`: which. `scratch` trains the network of the backbone `scenes` end to end from random weights."""
-    reference: Literal["chain", "none", "own", "mean"] = "none"
-    """What is subtracted from a frame: what `encoder.reference` says, nothing, its video's own no-contact picture, or
-    the mean of the training videos' ones."""
-    joint: bool = True
-    """`frame_heads`: whether the properties are decided together."""
-    pooled: bool = False
-    """`frame_heads`: whether features, and not probabilities, are averaged over frames."""
+    reference: Literal["chain", "none", "own"] = "none"
+    """What is subtracted from a frame: as `encoder.reference` says, nothing, or its video's own no-contact picture."""
     settings: Mapping[str, float] = field(default_factory=dict)
     """`gradient`: what differs from the section `encoder`; as the recipe's file in conf/ has it."""
     frames: int | None = None
     """Frames a video, where not `frames.per_video`."""
-    objects: int | None = None
-    """Training objects, drawn from those of the fold; None takes all."""
 
     @property
     def settings_of(self) -> str:
@@ -54,7 +45,6 @@ PRETRAINED = Candidate(
 )
 PAPER = Candidate("CLIP with visual prompts, three heads", "gradient", ("clip",))
 RELEASE = {"epochs": 40, "batch_size": 4, "learning_rate": 1e-3, "weight_decay": 0.01}
-LEARNING_CURVE = (10, 20, 30, 40)
 
 CANDIDATES: dict[str, Candidate] = {
     "constant": Candidate("the training objects' most frequent combination of classes", "constant"),
@@ -72,16 +62,8 @@ CANDIDATES: dict[str, Candidate] = {
         PAPER, title="the pretrained network's layers, from scratch", backbone=(), recipe="scratch", reference="own"
     ),
     "pretrained": PRETRAINED,
-    "pretrained-untrained": replace(PRETRAINED, title="without pretraining", untrained=True),
-    "pretrained-raw": replace(PRETRAINED, title="without each video's own reference", reference="mean"),
-    "pretrained-independent": replace(PRETRAINED, title="without the joint decision", joint=False),
-    "pretrained-pooled": replace(PRETRAINED, title="features averaged in place of probabilities", pooled=True),
     "pretrained-one-frame": replace(PRETRAINED, title="one frame a video", frames=1),
     "pretrained-ten-frames": replace(PRETRAINED, title="ten frames a video", frames=10),
-    **{
-        f"pretrained-{count}-objects": replace(PRETRAINED, title=f"{count} training objects", objects=count)
-        for count in LEARNING_CURVE
-    },
 }
 
 

@@ -102,7 +102,7 @@ def cross_validate_candidate(
     labelled = repr([(v.video_id, data.catalogue.labels(v.object_id)) for v in data.videos])
     key = fingerprint(repr(candidate), config, data.encoder, data.per_video, labelled, *data.files)
     work = CHECKPOINTS / "cross_validation" / key
-    predict = _limited(KINDS[candidate.kind](candidate, data), candidate, data)
+    predict = KINDS[candidate.kind](candidate, data)
     with progress(config.folds * config.repeats, "cross-validation", "fold") as advance:
 
         def resumed(fold: Fold) -> Labels:
@@ -114,7 +114,6 @@ def cross_validate_candidate(
 
         predicted = cross_validate(
             resumed,
-            data.labels,
             data.objects,
             data.classes,
             folds=config.folds,
@@ -133,22 +132,6 @@ def cross_validate_candidate(
         for video, repeats in zip(data.videos, predicted.tolist(), strict=True)
         for repeat, classes in enumerate(repeats)
     ]
-
-
-def _limited(predict: Predict, candidate: Candidate, data: CrossValidationData) -> Predict:
-    """Leave only so many training objects, drawn anew in each fold."""
-    count = candidate.objects
-    if count is None:
-        return predict
-    owners = np.array(data.objects)
-
-    def fewer(fold: Fold) -> Labels:
-        trained = np.unique(owners[fold.trained])
-        rng = np.random.default_rng(derive_seed("objects", fold.repeat, fold.number))
-        kept = rng.permutation(trained)[:count]
-        return predict(Fold(fold.trained & np.isin(owners, kept), fold.tested, fold.repeat, fold.number))
-
-    return fewer
 
 
 def _constant(_: Candidate, data: CrossValidationData) -> Predict:
@@ -177,18 +160,13 @@ def _frame_heads(candidate: Candidate, data: CrossValidationData) -> Predict:
     limit_threads(data.runtime.threads)
     labels, owners = data.labels, np.array(data.objects)
     encoder = frozen_encoder(candidate, data)
-    own = None if candidate.reference == "mean" else _features(encoder, candidate, data, data.store(candidate))
+    clips = _features(encoder, candidate, data, data.store(candidate))
 
     def predict(fold: Fold) -> Labels:
-        clips = own
-        if clips is None:
-            store = FrameStore(data.frames, "subtract")
-            store.share_reference([v.video_id for v, trained in zip(data.videos, fold.trained, strict=True) if trained])
-            clips = _features(encoder, candidate, data, store)
         training = (clips[fold.trained], labels[fold.trained], owners[fold.trained].tolist(), data.classes)
         seed = derive_seed("votes", fold.repeat, fold.number)
-        strength, _ = frame_classifier.choose_strength(*training, seed, joint=candidate.joint)
-        heads = frame_classifier.fit_frame_heads(*training, strength, joint=candidate.joint)
+        strength, _ = frame_classifier.choose_strength(*training, seed)
+        heads = frame_classifier.fit_frame_heads(*training, strength)
         return heads.predict(clips[fold.tested])
 
     return predict
@@ -198,11 +176,7 @@ def frozen_encoder(candidate: Candidate, data: CrossValidationData) -> FrameEnco
     """The encoder that gives a `frame_heads` candidate its features."""
     from pipeline.encoder.backbones import load_backbones
     from pipeline.encoder.model import SideBySide
-    from pipeline.encoder.scene_encoder import SceneEncoder
 
-    if candidate.untrained:
-        seed_everything(0)
-        return SceneEncoder()
     backbone = candidate.backbone or data.encoder.backbone
     return SideBySide(load_backbones(data.encoder.model_copy(update={"backbone": backbone})))
 
@@ -212,8 +186,7 @@ def _features(encoder: FrameEncoder, candidate: Candidate, data: CrossValidation
 
     clips = EncoderData(store, data.catalogue, data.assignments({}), candidate.frames or data.per_video)
     device = resolve_device(data.runtime.device)
-    found = describe_clips(encoder, clips, clips.videos(Part.UNUSED), data.encoder.embed_batch_size, device)
-    return found.mean(axis=1, keepdims=True) if candidate.pooled else found
+    return describe_clips(encoder, clips, clips.videos(Part.UNUSED), data.encoder.embed_batch_size, device)
 
 
 def _gradient(candidate: Candidate, data: CrossValidationData) -> Predict:
@@ -285,7 +258,7 @@ def _training(
         for video, trained, tested in zip(data.videos, fold.trained, fold.tested, strict=True)
         if trained or tested
     }
-    inputs: list[Path | str] = [repr(candidate), repr(data.labels.tolist()), repr(sorted(parts.items())), *data.files]
+    inputs: list[Path | str] = [repr(candidate), *data.files]
     return EncoderData(store, data.catalogue, data.assignments(parts), data.per_video), seed, inputs
 
 

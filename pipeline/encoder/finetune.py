@@ -179,7 +179,9 @@ def _train(
     from pipeline.training.trainer import TrainableTrainer, TrainingMonitor, checkpoint_dir, train, training_arguments
 
     micro = min(config.micro_batch_size or config.batch_size, config.batch_size)
-    folder = checkpoint_dir(f"finetune_encoder-{seed}", fingerprint(config, seed, data.per_video, *inputs))
+    # By video: a label that was corrected must not go on with what was learnt from the wrong one.
+    labelled = repr([(a.video_id, a.part, data.catalogue.labels(a.object_id)) for a in data.assignments])
+    folder = checkpoint_dir(f"finetune_encoder-{seed}", fingerprint(config, seed, data.per_video, labelled, *inputs))
     arguments = training_arguments(
         folder,
         runtime,

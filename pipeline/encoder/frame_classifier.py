@@ -100,7 +100,7 @@ class FittedHeads:
 
 
 def fit_frame_heads(
-    clips: Clips, labels: Labels, objects: Sequence[str], classes: Sequence[int], strength: float, *, joint: bool = True
+    clips: Clips, labels: Labels, objects: Sequence[str], classes: Sequence[int], strength: float
 ) -> FittedHeads:
     """Fit the heads of all properties.
 
@@ -110,7 +110,6 @@ def fit_frame_heads(
         objects: Each video's object.
         classes: How many classes each property has; one that training lacks gets a probability near 0.
         strength: One of `STRENGTHS`.
-        joint: Whether decisions weigh how often classes occur together.
     """
     from sklearn.linear_model import LogisticRegression
     from threadpoolctl import threadpool_limits
@@ -138,11 +137,11 @@ def fit_frame_heads(
         biases.append(bias)
     # Rounded as a model holds it, so that both decide alike.
     dependence = log_dependence(labels, objects, classes).astype(np.float32).astype(np.float64)
-    return FittedHeads(centre, spread, weights, biases, dependence if joint else np.zeros_like(dependence))
+    return FittedHeads(centre, spread, weights, biases, dependence)
 
 
 def choose_strength(
-    clips: Clips, labels: Labels, objects: Sequence[str], classes: Sequence[int], seed: int, *, joint: bool = True
+    clips: Clips, labels: Labels, objects: Sequence[str], classes: Sequence[int], seed: int
 ) -> tuple[float, list[Measurement]]:
     """The strength with the best combined accuracy in a grouped cross-validation over these objects (ties: the first).
 
@@ -159,7 +158,7 @@ def choose_strength(
         for held in folds:
             tested = np.array([o in held for o in objects])
             inner = [o for o in objects if o not in held]
-            heads = fit_frame_heads(clips[~tested], labels[~tested], inner, classes, strength, joint=joint)
+            heads = fit_frame_heads(clips[~tested], labels[~tested], inner, classes, strength)
             right[tested] = (heads.predict(clips[tested]) == labels[tested]).all(axis=1)
         reached.append(float(right.mean()))
     curve = [Measurement(step=i, name="inner_combined", value=value) for i, value in enumerate(reached)]

@@ -47,13 +47,9 @@ def load_tokenizer(folder: Path) -> PreTrainedTokenizerBase:
         tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True, use_fast=True, trust_remote_code=False)
     except Exception as error:  # The library for tokenizers raises nothing narrower.
         reason = " ".join(str(error).split())[:200]
-        raise UserError(
-            f"language.weights: the tokenizer in {folder} cannot be read ({reason}); {again(folder)}"
-        ) from None
+        raise UserError(f"{folder}: its tokenizer cannot be read ({reason}); {again(folder)}") from None
     if tokenizer.eos_token is None:
-        raise UserError(
-            f"language.weights: {folder / 'tokenizer_config.json'} names no eos_token; answers end with it, so add it"
-        )
+        raise UserError(f"{folder / 'tokenizer_config.json'} names no eos_token; answers end with it, so add it")
     add_tactile_tokens(tokenizer)
     render([Turn(user="a", assistant="b")] * 2, tokenizer, system_prompt="", frames=1, complete=True)
     if tokenizer.pad_token is None:

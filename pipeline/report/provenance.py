@@ -124,7 +124,7 @@ def encoder_words(config: EncoderConfig) -> str:
         "paper": "the base CLIP with visual prompt tuning",
         "release": "the base CLIP with visual prompt tuning as the published code has it",
         "tuned": " beside ".join(BACKBONE_WORDS.get(n, n) for n in config.backbone) + ", tuned on the properties",
-    }[config.recipe]
+    }.get(config.recipe, f"an encoder of the recipe `{config.recipe}`")
     return words + (" on pictures of the difference to the untouched gel" if config.reference == "subtract" else "")
 
 

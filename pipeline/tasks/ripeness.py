@@ -6,6 +6,7 @@ Property prediction of the same fruits needs no task of its own: it is OPD, aske
 from __future__ import annotations
 
 import random
+import re
 from collections.abc import Sequence
 
 from pipeline.records import Dialogue, Opd, Prediction, Question, Score, Turn
@@ -84,7 +85,7 @@ class Ripeness(TaskDefinition):
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         """Read from "The riper FRUIT is x)"; two different letters there are no answer."""
-        fruits = "|".join(_fruits(catalogue))
+        fruits = "|".join(map(re.escape, _fruits(catalogue)))
         return choice_score(question, prediction, chosen_letter(prediction.outputs[-1], rf"riper (?:{fruits}|one) is"))
 
     def chance(self, catalogue: Catalogue) -> dict[str, float]:

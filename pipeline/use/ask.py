@@ -196,7 +196,7 @@ def _describe(model: Octopi, folder: Path, files: Sequence[Path]) -> list[dict[s
             model.look(file)
             good.append((file, row))
         except UserError as error:
-            row["error"] = str(error)
+            row["error"] = " ".join(str(error).split())
     for (_, row), found in zip(good, model.describe_all([file for file, _ in good]), strict=True):
         row |= found.levels
         for name, known in found.probabilities.items():
@@ -208,5 +208,5 @@ def _describe(model: Octopi, folder: Path, files: Sequence[Path]) -> list[dict[s
 
 def _row(cells: Iterable[object]) -> str:
     stream = io.StringIO()
-    csv.writer(stream, lineterminator="\n").writerow([" ".join(str(cell).split()) for cell in cells])
+    csv.writer(stream, lineterminator="\n").writerow(cells)
     return stream.getvalue()

@@ -97,7 +97,9 @@ class Room:
         if not file.exists():
             scene = make_scene(self.scenes[object_id], SCENE, SCENE_FRAMES, SCENE.seed)
             sensor = make_sensor(SCENE.width, SCENE.height, SCENE.seed)
-            write_film(file, render(scene, SCENE, sensor, SCENE.seed), SCENE.fps)
+            part = file.with_name("part.mp4")
+            write_film(part, render(scene, SCENE, sensor, SCENE.seed), SCENE.fps)
+            part.replace(file)
         return file
 
     def show(self, name: str, video: Path) -> dict[str, Any]:
@@ -110,7 +112,9 @@ class Room:
         key = uuid4().hex
         self.videos[key] = video
         while len(self.videos) > MOST_TOUCHES:
-            del self.videos[next(iter(self.videos))]
+            old = self.videos.pop(next(iter(self.videos)))
+            if old.parent.parent == self.folder:  # What was dropped has a folder of its own; scenes may come again.
+                shutil.rmtree(old.parent, ignore_errors=True)
         return {
             "id": key,
             "name": name,

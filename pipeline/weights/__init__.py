@@ -37,7 +37,7 @@ MADE = {
     "tiny-clip": Made("clip", None, size=64),
     "tiny-llama": Made("language", None),
 }
-"""By the name of the folder; `pipeline.weights.make.WRITERS` has the code of each."""
+"""By the name of the folder; `pipeline.weights.make.RECIPES` has the code of each."""
 
 
 class Downloaded(NamedTuple):

@@ -48,6 +48,13 @@ TEXTS = (
 """Read with the fast tokenizer and the slow one. Neither begins with a blank, which they read differently."""
 
 
+def new_folder(to: Path) -> Path:
+    """`to`; raises UserError where it is there already, as what lies in it would be lost."""
+    if to.exists():
+        raise UserError(f"{to} is there already; remove it, or name another folder with --to")
+    return to
+
+
 def adopt(name: str, source: Path, to: Path | None = None, *, trust_pickle: bool = False) -> Path:
     """Check a downloaded model, bring it into the form that the chain reads, and list the SHA-256 of its files.
 
@@ -72,9 +79,7 @@ def adopt(name: str, source: Path, to: Path | None = None, *, trust_pickle: bool
         check_clip(source, known, name) if clip else check_vicuna(source, known, name)
         write_sums(source)
         return source
-    to = to or Path("weights") / known
-    if to.exists():
-        raise UserError(f"{to} is there already; remove it, or name another folder with --to")
+    to = new_folder(to or Path("weights") / known)
     with atomic_folder(to) as temporary:
         (write_clip if clip else write_vicuna)(source, temporary, known, name, trust_pickle)
         write_sums(temporary)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +13,7 @@ from benchmarks import contact, describing, encoder, encoder_models, frames, lan
 from benchmarks.table import Row, merge, read_rows
 from benchmarks.timing import counting_ffts, flops_of
 from pipeline.encoder import frame_classifier
-from pipeline.encoder.baseline import validation
-from pipeline.encoder.baseline.predictor import PropertyPredictor
+from pipeline.encoder.baseline import predictor
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.errors import UserError
 from pipeline.io import write_csv, write_table
@@ -62,8 +60,7 @@ def project(catalogue: Catalogue, tmp_path_factory: pytest.TempPathFactory) -> P
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """The project's own videos, and three trees a property in place of two hundred."""
     monkeypatch.delenv("OCTOPI_DATA_DIR", raising=False)
-    for module in (validation, contact):
-        monkeypatch.setattr(module, "PropertyPredictor", partial(PropertyPredictor, trees=3))
+    monkeypatch.setattr(predictor, "TREES", 3)
 
 
 def by_question(rows: list[Row], folder: Path) -> dict[str, dict[str, Row]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ from pipeline.encoder.baseline.features import video_features
 from pipeline.encoder.baseline.predictor import PropertyPredictor
 from pipeline.encoder.baseline.recordings import Recording, describe, recording_features
 from pipeline.encoder.baseline.validation import Fold, Predict, cross_validate, deal
-from pipeline.encoder.candidates import CANDIDATES, LEARNING_CURVE, Candidate, check_candidates
+from pipeline.encoder.candidates import CANDIDATES, Candidate, check_candidates
 from pipeline.encoder.clips import EncoderData
 from pipeline.encoder.cross_validation import CrossValidationData, cross_validate_candidate, frozen_encoder
 from pipeline.encoder.frame_classifier import Clips, FittedHeads, JointFrameClassifier, fit_frame_heads
@@ -29,13 +29,10 @@ from pipeline.encoder.tuned import Trunks
 from pipeline.errors import UserError
 from pipeline.io import write_table
 from pipeline.records import Measurement, Part, Probe
-from pipeline.runtime import derive_seed, seed_everything
-from pipeline.training.trainable import trainable_state
+from pipeline.runtime import derive_seed
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.decoding import decode
 from pipeline.videos.frames.reference import reference_indices
-from pipeline.videos.frames.store import FrameStore
-from pipeline.videos.frames.subtraction import subtract
 from tests.audit_records import probe
 from tests.conftest import encode, fake_videos, moving_square
 from tests.encoders import config, write_frames, write_pretrained, write_timm
@@ -117,21 +114,19 @@ def folds(monkeypatch: pytest.MonkeyPatch) -> list[Fold]:
 # Who learns from what
 
 
-@pytest.mark.parametrize(("joint", "limit"), [(True, None), (False, None), (True, 3)])
 def test_frame_heads_learn_from_no_object_that_they_are_tested_on(
-    joint: bool, limit: int | None, data: CrossValidationData, folds: list[Fold], monkeypatch: pytest.MonkeyPatch
+    data: CrossValidationData, folds: list[Fold], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By the objects' names and by the pictures themselves, in the final fits and in those that choose."""
     monkeypatch.setattr(module, "frozen_encoder", Telling)
     fits: list[int] = []
 
-    def spy(clips: Clips, labels: np.ndarray, objects: Sequence[str], *rest: object, joint: bool) -> FittedHeads:
+    def spy(clips: Clips, labels: np.ndarray, objects: Sequence[str], *rest: object) -> FittedHeads:
         assert shown(clips) == list(objects)
         assert labels.tolist() == [list(data.catalogue.labels(o)) for o in objects]
         assert set(objects) <= objects_of(data, folds[-1].trained) - objects_of(data, folds[-1].tested)
-        assert joint == candidate.joint
         fits.append(len(set(objects)))
-        fitted = fit_frame_heads(clips, labels, objects, *rest, joint=joint)  # type: ignore[arg-type]
+        fitted = fit_frame_heads(clips, labels, objects, *rest)  # type: ignore[arg-type]
 
         class Spied(FittedHeads):
             def predict(self, clips: Clips) -> np.ndarray:
@@ -141,12 +136,11 @@ def test_frame_heads_learn_from_no_object_that_they_are_tested_on(
         return Spied(**vars(fitted))
 
     monkeypatch.setattr(frame_classifier, "fit_frame_heads", spy)
-    candidate = replace(CANDIDATES["probe"], objects=limit, joint=joint)
-    found = cross_validate_candidate(candidate, data, CONFIG)
+    found = cross_validate_candidate(CANDIDATES["probe"], data, CONFIG)
     assert [(r.video_id, r.repeat) for r in found] == [(v.video_id, n) for v in data.videos for n in (0, 1)]
     assert all(r.expected == data.catalogue.labels(r.object_id) for r in found)
     assert len(fits) == 6 * (2 * 2 + 1), "two strengths on two inner folds, and the fit itself"
-    assert fits[4::5] == [min(limit or 99, len(objects_of(data, f.trained))) for f in folds]
+    assert fits[4::5] == [len(objects_of(data, f.trained)) for f in folds]
 
 
 @pytest.mark.parametrize("name", ["paper", "paper-difference", "release", "scratch"])
@@ -206,30 +200,6 @@ def test_tuning_learns_from_no_object_that_it_is_tested_on(
     assert [r.video_id for r in frozen] == [v.video_id for v in data.videos]
 
 
-def test_a_limited_candidate_draws_anew_in_each_fold_and_nests(
-    data: CrossValidationData, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    drawn: dict[int, list[frozenset[str]]] = {}
-
-    def fake(candidate: Candidate, data: CrossValidationData) -> Predict:
-        def predict(fold: Fold) -> np.ndarray:
-            used = objects_of(data, fold.trained)
-            drawn.setdefault(candidate.objects or 99, []).append(frozenset(used))
-            assert not used & objects_of(data, fold.tested)
-            assert all(t == (o in used) for o, t in zip(data.objects, fold.trained, strict=True)), "all their videos"
-            return np.zeros((int(fold.tested.sum()), 3), np.int64)
-
-        return predict
-
-    monkeypatch.setitem(module.KINDS, "frame_heads", fake)
-    for count in (2, 3, None):
-        cross_validate_candidate(replace(CANDIDATES["pretrained"], objects=count), data, CONFIG)
-    assert [{len(s) for s in drawn[n]} for n in (2, 3)] == [{2}, {3}]
-    places = {tuple(sorted(a).index(o) for o in sorted(k)) for k, a in zip(drawn[3], drawn[99], strict=True)}
-    assert len(places) > 3, "folds do not draw alike"
-    assert all(a <= b <= c for a, b, c in zip(drawn[2], drawn[3], drawn[99], strict=True)), "fewer are some of more"
-
-
 def test_all_candidates_share_their_folds(
     data: CrossValidationData, folds: list[Fold], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -265,17 +235,16 @@ def test_what_the_pictures_show_is_found(data: CrossValidationData, monkeypatch:
     paint(data.frames, [100 * data.catalogue.labels(o)[0] for o in data.objects])
     monkeypatch.setattr(module, "frozen_encoder", Telling)
     monkeypatch.setattr(frame_classifier, "STRENGTHS", (10.0,))
-    candidate = replace(CANDIDATES["probe"], joint=False)
-    found = cross_validate_candidate(candidate, data, CrossValidationConfig(folds=7, repeats=1))
+    found = cross_validate_candidate(CANDIDATES["probe"], data, CrossValidationConfig(folds=7, repeats=1))
     shared = [r for r in found if sum(data.catalogue.labels(o)[0] == r.expected[0] for o in OBJECTS) > 1]
     assert len(shared) > 8
     assert all(r.predicted[0] == r.expected[0] for r in shared), "classes that another object has, too"
 
 
-@pytest.mark.parametrize("name", ["probe-difference", "pretrained-untrained", "pretrained-raw"])
+@pytest.mark.parametrize("name", ["probe-difference", "pretrained"])
 def test_results_are_repeatable_and_independent_of_the_order(name: str, data: CrossValidationData) -> None:
     candidate = CANDIDATES[name]
-    candidate = replace(candidate, untrained=True) if "scenes" in candidate.backbone else candidate
+    write_pretrained()
     pixels = np.load(data.frames / "frames.npy")
     pixels += np.random.default_rng(0).integers(0, 20, pixels.shape, dtype=np.uint8)
     np.save(data.frames / "frames.npy", pixels)
@@ -286,56 +255,20 @@ def test_results_are_repeatable_and_independent_of_the_order(name: str, data: Cr
     assert sorted(turned, key=lambda r: r.video_id) == sorted(first, key=lambda r: r.video_id)
 
 
-def test_the_untrained_network_is_always_the_same_and_the_pretrained_one_is_loaded(data: CrossValidationData) -> None:
-    def state(name: str, data: CrossValidationData) -> dict[str, torch.Tensor]:
-        seed_everything(int(torch.randint(100, (1,))))
-        return trainable_state(frozen_encoder(CANDIDATES[name], data))
-
-    one, other = state("pretrained-untrained", data), state("pretrained-untrained", data)
-    assert all(torch.equal(one[n], other[n]) for n in one)
+def test_the_pretrained_network_is_loaded(data: CrossValidationData) -> None:
     with pytest.raises(UserError, match="encoder.safetensors: no such file"):
         frozen_encoder(CANDIDATES["pretrained"], data)
     pretrained = write_pretrained(77).state_dict()
     loaded = frozen_encoder(CANDIDATES["pretrained"], data).get_submodule("backbones.0").state_dict()
     assert all(torch.equal(v, loaded[n]) for n, v in pretrained.items())
-    assert not torch.equal(loaded["layers.0.weight"], one["layers.0.weight"])
 
 
-def test_frames_and_pooling_are_what_their_names_say(
-    data: CrossValidationData, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_as_many_frames_as_the_name_says(data: CrossValidationData, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "frozen_encoder", Telling)
-    expected = {"": 2, "-one-frame": 1, "-ten-frames": 10, "-pooled": 1}
-    for name, frames in expected.items():
+    for name, frames in {"": 2, "-one-frame": 1, "-ten-frames": 10}.items():
         candidate = CANDIDATES[f"pretrained{name}"]
         clips = module._features(Telling(), candidate, data, data.store(candidate))
         assert clips.shape == (15, frames, 3)
-    np.testing.assert_allclose(clips[:, 0, 1], 1.5, err_msg="the mean of frames 0 and 3")
-
-
-def test_the_mean_reference_is_of_training_videos_alone(
-    data: CrossValidationData, folds: list[Fold], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    used = []
-
-    def spy(store: FrameStore, video_ids: Sequence[str]) -> None:
-        assert list(video_ids) == [v.video_id for v, t in zip(data.videos, folds[-1].trained, strict=True) if t]
-        used.append(video_ids)
-
-    monkeypatch.setattr(FrameStore, "share_reference", spy)
-    cross_validate_candidate(replace(CANDIDATES["pretrained-raw"], untrained=True), data, SMALL)
-    assert len(used) == 2
-
-
-def test_a_shared_reference_by_hand(data: CrossValidationData) -> None:
-    store, plain = FrameStore(data.frames, "subtract"), FrameStore(data.frames)
-    references = np.load(data.frames / "references.npy").astype(float)
-    store.share_reference([data.videos[i].video_id for i in (1, 4, 7)])
-    mean = np.floor(references[[1, 4, 7]].sum(axis=0) / 3 + 0.5).astype(np.uint8)  # Of three values none ends in .5.
-    for video in data.videos:
-        expected = subtract(plain.pictures(video.video_id), mean)
-        np.testing.assert_array_equal(store.pictures(video.video_id), expected)
-    assert (np.load(data.frames / "references.npy") == references).all(), "the file stays"
 
 
 # Kills
@@ -395,7 +328,7 @@ def pretrained_anew(data: CrossValidationData) -> CrossValidationData:
     [
         (relabelled, CANDIDATES["pretrained"], CONFIG),
         (pretrained_anew, CANDIDATES["pretrained"], CONFIG),
-        (lambda data: data, replace(CANDIDATES["pretrained"], joint=False), CONFIG),
+        (lambda data: data, replace(CANDIDATES["pretrained"], frames=3), CONFIG),
         (lambda data: data, CANDIDATES["pretrained"], CONFIG.model_copy(update={"seed": 5})),
     ],
 )
@@ -457,8 +390,7 @@ def test_features_of_a_recording_are_those_of_five_frames_at_equal_distances(tmp
 def test_trees_are_the_baseline_on_whole_recordings(
     data: CrossValidationData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    few = lambda *args, **settings: PropertyPredictor(*args, **{**settings, "trees": 10, "jobs": 1})  # noqa: E731
-    monkeypatch.setattr("pipeline.encoder.baseline.validation.PropertyPredictor", few)
+    monkeypatch.setattr("pipeline.encoder.baseline.predictor.TREES", 10)
     videos = [v.model_copy(update={"path": f"{v.video_id}.mkv"}) for v in data.videos[:8]]
     for seed, video in enumerate(videos):
         encode(tmp_path / video.path, moving_square(6, seed))
@@ -475,22 +407,13 @@ def test_trees_are_the_baseline_on_whole_recordings(
     labels = np.array([data.catalogue.labels(v.object_id) for v in videos])
     for number, held in enumerate(deal([v.object_id for v in videos], 2, derive_seed(4, "folds", 0))):
         trained = [i for i, v in enumerate(videos) if v.object_id not in held]
-        model = few((3, 3, 3), seed=derive_seed(0, "trees", 0, number))
+        model = PropertyPredictor((3, 3, 3), seed=derive_seed(0, "trees", 0, number))
         model.fit(features[trained], labels[trained], [videos[i].object_id for i in trained])
         tested = [i for i, v in enumerate(videos) if v.object_id in held]
         assert [found[videos[i].video_id] for i in tested] == list(map(tuple, model.predict(features[tested]).tolist()))
 
 
 # Candidates
-
-
-def test_each_variation_changes_one_thing_of_the_pretrained() -> None:
-    for name, candidate in CANDIDATES.items():
-        if name.startswith("pretrained-"):
-            changed = {k for k, v in asdict(candidate).items() if v != asdict(CANDIDATES["pretrained"])[k]} - {"title"}
-            assert len(changed) == 1, name
-    assert len({c.title for c in CANDIDATES.values()}) == len(CANDIDATES)
-    assert {CANDIDATES[f"pretrained-{n}-objects"].objects for n in LEARNING_CURVE} == set(LEARNING_CURVE)
 
 
 def test_a_candidate_that_cannot_be_trained_is_one_clear_line(weights: Path, tmp_path: Path) -> None:

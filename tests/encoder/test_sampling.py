@@ -53,7 +53,6 @@ def test_the_store_gives_pictures_with_and_without_the_reference(
 ) -> None:
     found = extract_frames(tiny_videos, catalogue, CONFIG, tmp_path, tmp_path / "partial")
     plain, subtracted = FrameStore(tmp_path), FrameStore(tmp_path, "subtract")
-    assert plain.size == subtracted.size == 16
     references = np.load(tmp_path / "references.npy")
     for place, video in enumerate(found.videos):
         rows = [f.row for f in found.frames if f.video_id == video.video_id]

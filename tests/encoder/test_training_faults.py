@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -268,22 +270,9 @@ WRITTEN += ["trainer_state.json"]
 """Files of a checkpoint in the order that the Trainer writes them."""
 
 
-def test_a_checkpoint_that_was_being_written_is_passed_over(
-    weights: Path, catalogue: Catalogue, tmp_path: Path, before_updates: Hook
-) -> None:
-    """However far it had come: some of it, all but the last file."""
-    run = training("release", weights, encoder_data(tmp_path, catalogue, PARTS), epochs=3, batch_size=2)
-    history, whole = run()
-    for first_lacking in ("trainer_state.json", "optimizer.pt", "model.safetensors"):
-        before_updates(killed_at(7, begun=[]))
-        with pytest.raises(KeyboardInterrupt):
-            run()
-        (last,) = tmp_path.glob("checkpoints/*/*/checkpoint-6")
-        for name in WRITTEN[WRITTEN.index(first_lacking) :]:
-            (last / name).unlink(missing_ok=True)
-        resumed, again = run()
-        assert resumed == history, "in the same order, too"
-        same(whole, again)
+def unwritten(file: Path) -> None:
+    for name in WRITTEN[WRITTEN.index(file.name) :]:
+        file.with_name(name).unlink(missing_ok=True)
 
 
 def cut(file: Path) -> None:
@@ -296,24 +285,44 @@ def flip(file: Path) -> None:
     file.write_bytes(content)
 
 
-def test_a_damaged_checkpoint_is_dropped_with_a_warning(
+def test_a_damaged_checkpoint_is_passed_over(
     weights: Path, catalogue: Catalogue, tmp_path: Path, before_updates: Hook, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Cut short, or with a byte changed where a checksum tells."""
+    """One that was being written, however far it had come; or cut short, or with a byte changed: a checksum tells."""
     run = training("release", weights, encoder_data(tmp_path, catalogue, PARTS), epochs=3, batch_size=2)
     history, whole = run()
-    damages = [("optimizer.pt", cut), ("rng_state.pth", flip), ("trainer_state.json", cut), ("model.safetensors", cut)]
-    for name, damage in damages:
-        before_updates(killed_at(7, begun=[]))
-        with pytest.raises(KeyboardInterrupt):
-            run()
+    before_updates(killed_at(7, begun=[]))
+    with pytest.raises(KeyboardInterrupt):
+        run()
+    shutil.copytree(tmp_path / "checkpoints", tmp_path / "kept")
+    half = [(name, unwritten) for name in ("trainer_state.json", "optimizer.pt", "model.safetensors")]
+    bad = [("optimizer.pt", cut), ("rng_state.pth", flip), ("trainer_state.json", cut), ("model.safetensors", cut)]
+    for name, damage in half + bad:
+        shutil.copytree(tmp_path / "kept", tmp_path / "checkpoints", dirs_exist_ok=True)
         (last,) = tmp_path.glob("checkpoints/*/*/checkpoint-6")
         damage(last / name)
         caplog.clear()
         resumed, again = run()
-        assert [f"{name} is damaged" in r.getMessage() for r in caplog.records].count(True) == 1
+        told = [f"{name} is damaged" in r.getMessage() for r in caplog.records].count(True)
+        assert told == (damage is not unwritten)
         assert resumed == history
         same(whole, again)
+
+
+def test_a_corrected_label_begins_anew(
+    weights: Path, catalogue: Catalogue, tmp_path: Path, before_updates: Hook
+) -> None:
+    data = encoder_data(tmp_path, catalogue, PARTS)
+    begun: list[int] = []
+    before_updates(killed_at(4, begun=begun))
+    with pytest.raises(KeyboardInterrupt):
+        training("paper", weights, data, epochs=2, batch_size=2)()
+    rated = data.assignments[0].object_id
+    other = catalogue.objects[rated].model_copy(update={"ratings": ((1, 1, 1),) * 3})
+    assert other.labels != catalogue.labels(rated)
+    corrected = catalogue.model_copy(update={"objects": {**catalogue.objects, rated: other}})
+    training("paper", weights, replace(data, catalogue=corrected), epochs=2, batch_size=2)()
+    assert len(begun) == 5 + 6
 
 
 # Synthetic pretraining

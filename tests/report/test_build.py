@@ -16,6 +16,7 @@ import yaml
 from safetensors.numpy import save_file
 from safetensors.torch import load_file
 
+from pipeline.config import EncoderConfig
 from pipeline.errors import UserError
 from pipeline.evaluation.calibration import fit_temperature
 from pipeline.io import read_jsonl, read_table, write_table
@@ -181,6 +182,7 @@ def test_provenance_counts_and_hashes_the_models(written: Path, tmp_path: Path) 
     ],
 )
 def test_the_encoder_is_called_what_it_is(recipe: str, words: str) -> None:
+    assert "the recipe `mine`" in encoder_words(EncoderConfig.model_construct(recipe="mine", reference="none"))
     backbone, reference = ("scenes", "subtract") if recipe == "tuned" else ("clip", "none")
     changes = [f"encoder.recipe={recipe}", f"encoder.backbone=[{backbone}]", f"encoder.reference={reference}"]
     assert words in encoder_words(fake_params(*changes).encoder)

@@ -95,6 +95,14 @@ def test_what_is_read(said: str, letter: str | None) -> None:
         assert read(question, "Hardness.", "descriptions", said) == (letter is not None, letter == question.gold.choice)
 
 
+def test_fruits_are_read_by_their_letters() -> None:
+    avocados = [o.model_copy(update={"ripeness": {"plum (c++)": 1.0}}) for o in CATALOGUE.objects.values()]
+    catalogue = CATALOGUE.model_copy(update={"objects": dict(zip(CATALOGUE.objects, avocados, strict=True))})
+    said = Prediction(question_id="q", task="RIPE", outputs=("The riper plum (c++) is a)",), truncated=False, tokens=1)
+    (question,) = asked(CATALOGUE, TESTED, 1)
+    assert TASKS["RIPE"].grade(question, said, catalogue)[0].predicted == "a"
+
+
 @pytest.mark.parametrize("value", ["ripe", "-1", "1,5", "nan"])
 def test_a_rank_that_is_no_number_is_one_line(tmp_path: Path, value: str) -> None:
     (tmp_path / "properties.yaml").write_text((EXAMPLE / "properties.yaml").read_text())

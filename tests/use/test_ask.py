@@ -121,7 +121,7 @@ def test_a_stopped_answer_is_forgotten(octopi: Octopi, monkeypatch: pytest.Monke
 
 @pytest.fixture
 def folder(files: list[Path], tmp_path: Path) -> Path:
-    place = tmp_path / "videos" / "a, b"
+    place = tmp_path / "videos" / "a,  b"
     place.mkdir(parents=True)
     for file in files:
         shutil.copy(file, place)
@@ -138,10 +138,10 @@ def rows(file: Path) -> list[dict[str, str]]:
 def test_a_folder_is_described(octopi: Octopi, folder: Path, files: list[Path], tmp_path: Path) -> None:
     assert describe_folder(octopi, folder, tmp_path / "out.csv") == (4, 1)
     found = {row["file"]: row for row in rows(tmp_path / "out.csv")}
-    assert set(found) == {f"a, b/{name}" for name in ("broken.avi", *(f.name for f in files))}
-    assert "no frame decodes" in found["a, b/broken.avi"]["error"]
+    assert set(found) == {f"a,  b/{name}" for name in ("broken.avi", *(f.name for f in files))}
+    assert "no frame decodes" in found["a,  b/broken.avi"]["error"]
     for file in files:
-        row, expected = found[f"a, b/{file.name}"], octopi.describe(file)
+        row, expected = found[f"a,  b/{file.name}"], octopi.describe(file)
         assert {name: row[name] for name in octopi.properties} == expected.levels
         for name, known in expected.probabilities.items():
             assert {level: float(row[f"{name}: {level}"]) for level in known} == pytest.approx(known, abs=1e-4)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -187,11 +188,19 @@ def test_other_sites_are_not_let_in(site: str) -> None:
 
 def test_old_touches_are_forgotten(tmp_path: Path) -> None:
     model: Any = FakeOctopi()
-    room, video = Room(model), press(tmp_path / "rug.mp4")
-    ids = [room.show("rug", video)["id"] for _ in range(MOST_TOUCHES + 1)]
+    room = Room(model)
+    dropped = [room.folder / str(i) / "rug.mp4" for i in range(MOST_TOUCHES)]
+    videos = [press(tmp_path / "rug.mp4"), *dropped]
+    for video in dropped:
+        video.parent.mkdir()
+        shutil.copy(videos[0], video)
+    ids = [room.show("rug", video)["id"] for video in videos]
     with pytest.raises(UserError, match="forgotten"):
         room.stream(Asked(question="{tactile}", touches=ids[:1]))
     assert "".join(room.stream(Asked(question="{tactile}", touches=ids[1:2])))
+    assert all(video.exists() for video in videos), "a file that the page was not given is not its own"
+    room.show("rug", videos[0])
+    assert [video.exists() for video in dropped] == [False] + [True] * (MOST_TOUCHES - 1)
     room.close()
 
 

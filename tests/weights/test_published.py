@@ -356,6 +356,8 @@ def test_the_command_refuses_what_it_cannot_do(vicuna: Path) -> None:
     before = contents(vicuna)
     with refused("download is there already; remove it, or name another folder with --to"):
         octopi("vicuna-7b", str(vicuna), "--to", str(vicuna), "--trust-pickle")
+    with refused("download is there already; remove it, or name another folder with --to"):
+        octopi("tiny-clip", "--to", str(vicuna))
     assert contents(vicuna) == before
 
 

@@ -8,19 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.encoder.baseline.predictor import Features, Labels, PropertyPredictor, check_labels
+from pipeline.encoder.baseline.predictor import Features, Labels, PropertyPredictor
 from pipeline.runtime import derive_seed
 
 
 def deal(objects: Sequence[str], folds: int, seed: int) -> list[frozenset[str]]:
-    """Deal the distinct objects, shuffled, into folds whose numbers of objects differ by at most one.
-
-    Raises:
-        ValueError: for fewer than two folds, or fewer objects than folds.
-    """
+    """Deal the distinct objects, shuffled, into folds whose numbers of objects differ by at most one."""
     names = sorted(set(objects))
-    if not 2 <= folds <= len(names):
-        raise ValueError(f"{len(names)} objects cannot be dealt into {folds} folds; 2 to {len(names)} can")
     order = np.random.default_rng(seed).permutation(len(names))
     return [frozenset(names[i] for i in order[fold::folds]) for fold in range(folds)]
 
@@ -39,33 +33,18 @@ Predict = Callable[[Fold], Labels]
 """Learns from the trained videos of a fold and predicts the tested ones, in their order: tested x properties."""
 
 
-def forest(
-    features: Features,
-    labels: Labels,
-    objects: Sequence[str],
-    classes: Sequence[int],
-    *,
-    seed: int = 0,
-    jobs: int | None = None,
-) -> Predict:
-    """What cross-validates the baseline predictor.
+def forest(features: Features, labels: Labels, objects: Sequence[str], classes: Sequence[int]) -> Predict:
+    """Predict by the baseline predictor, grown anew in each fold.
 
     Args:
         features: Videos x features, finite.
         labels: Videos x properties, equal for all videos of an object.
         objects: Each video's object.
         classes: How many classes each property has.
-        seed: Of the trees.
-        jobs: Cores that grow trees; None takes all that this process may use.
-
-    Raises:
-        ValueError: if the arguments do not fit each other.
     """
-    if len(features) != len(objects):
-        raise ValueError(f"{len(features)} rows of features for {len(objects)} videos")
 
     def predict(fold: Fold) -> Labels:
-        model = PropertyPredictor(classes, seed=derive_seed(seed, "trees", fold.repeat, fold.number), jobs=jobs)
+        model = PropertyPredictor(classes, seed=derive_seed(0, "trees", fold.repeat, fold.number))
         model.fit(features[fold.trained], labels[fold.trained], np.asarray(objects)[fold.trained].tolist())
         return model.predict(features[fold.tested])
 
@@ -74,7 +53,6 @@ def forest(
 
 def cross_validate(
     predict: Predict,
-    labels: Labels,
     objects: Sequence[str],
     classes: Sequence[int],
     *,
@@ -88,22 +66,15 @@ def cross_validate(
 
     Args:
         predict: Called once a fold.
-        labels: Videos x properties, equal for all videos of an object.
-        objects: Each video's object.
+        objects: Each video's object; at least as many different ones as folds.
         classes: How many classes each property has.
         folds: Groups of objects, each predicted from all others.
         repeats: How often the folds are dealt anew.
         seed: Of the folds.
 
     Returns:
-        Predicted classes, videos x repeats x properties, in the order of `labels`.
-
-    Raises:
-        ValueError: if the arguments do not fit each other.
+        Predicted classes, videos x repeats x properties, in the order of `objects`.
     """
-    check_labels(labels, objects, classes)
-    if repeats < 1:
-        raise ValueError(f"{repeats} repeats")
     predicted = np.empty((len(objects), repeats, len(classes)), np.int64)
     for repeat in range(repeats):
         for number, held_out in enumerate(deal(objects, folds, derive_seed(seed, "folds", repeat))):

@@ -17,18 +17,18 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 from torch.utils.data import Dataset, SequentialSampler
-from transformers import AutoTokenizer, PreTrainedModel, PreTrainedTokenizerBase, TrainerCallback
+from transformers import PreTrainedModel, PreTrainedTokenizerBase, TrainerCallback
 from transformers.modeling_outputs import CausalLMOutput
 
 from pipeline.card import write_card
 from pipeline.config import LanguageConfig, RuntimeConfig, TeachConfig
 from pipeline.io import fingerprint
-from pipeline.language.base import load_llm
+from pipeline.language.base import load_llm, load_tokenizer
 from pipeline.language.chat import IGNORE_INDEX, Encoded, encode_turns
 from pipeline.language.teach import items
 from pipeline.language.teach.items import Form, Item, draw
 from pipeline.records import Measurement
-from pipeline.runtime import derive_seed, resolve_dtype, seed_everything
+from pipeline.runtime import derive_seed, name_dtype, resolve_dtype, seed_everything
 from pipeline.training.trainer import (
     TrainableTrainer,
     Trained,
@@ -227,15 +227,14 @@ def teach(
 
     folder = Path(config.base)
     seed_everything(seed)
-    dtype = resolve_dtype(language.dtype)
-    base = load_llm(folder, dtype)
-    tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True, use_fast=True, trust_remote_code=False)
+    dtype = name_dtype(language.dtype, runtime.device)
+    base, tokenizer = load_llm(folder, resolve_dtype(dtype)), load_tokenizer(folder)
     lora = LoraConfig(
         r=config.rank, lora_alpha=config.alpha, target_modules="all-linear", task_type="CAUSAL_LM", lora_dropout=0.0
     )
     course = Course(config, tokenizer, language.system_prompt, seed)
     text = Path(items.__file__).parent
-    key = fingerprint(config, language.system_prompt, language.dtype, seed, folder, text)
+    key = fingerprint(config, language.system_prompt, dtype, seed, folder, text)
     arguments = training_arguments(
         checkpoint_dir(stage, key),
         runtime,
@@ -249,7 +248,7 @@ def teach(
         eval_strategy="steps",
         eval_steps=config.check_every,
         # The adapters stay in float32 and are multiplied in the base's format, which took a fifth less time.
-        bf16=dtype == torch.bfloat16,
+        bf16=dtype == "bfloat16",
     )
     trainer = Teacher(
         course,

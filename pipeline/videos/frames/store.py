@@ -44,17 +44,6 @@ class FrameStore:
         if len(self.index) != len(self.pixels) or len(self._place) != expected:
             raise UserError(f"{folder}: {TABLE_FILE} and its pictures differ in length; run `dvc repro extract_frames`")
 
-    def share_reference(self, video_ids: Sequence[str]) -> None:
-        """From now on, subtract the mean of these videos' references from every video's frames."""
-        assert self.references is not None, "a store of differences"
-        mean = np.mean(self.references[[self._place[v] for v in video_ids]], axis=0, dtype=np.float64)
-        self.references = np.broadcast_to(np.rint(mean).astype(np.uint8), self.references.shape)
-
-    @property
-    def size(self) -> int:
-        """Side of a frame in pixels."""
-        return int(self.pixels.shape[1])
-
     def rows(self, video_id: str) -> list[int]:
         """Rows of a video's kept frames in the index, in time order."""
         return self._rows[video_id]
