@@ -119,8 +119,8 @@ def _trees(bed: Bed) -> Callable[[VideoFile], object]:
 
 def prompts(bed: Bed) -> list[Row]:
     """The paper's recipe with other prompts."""
-    split = assign(bed.catalogue, bed.videos, SplitConfig(name="development"))
-    data = EncoderData(FrameStore(bed.frames), bed.catalogue, split.assignments, FRAMES)
+    assignments = assign(bed.catalogue, bed.videos, SplitConfig(name="development"))
+    data = EncoderData(FrameStore(bed.frames), bed.catalogue, assignments, FRAMES)
     shown = ClipDataset(data.store, [LabelledVideo(v.video_id, ()) for v in bed.timed()], per_video=FRAMES)
     clips = [shown[i] for i in range(len(shown))]
     timed: dict[str, Callable[[Mapping[str, torch.Tensor]], object]] = {}

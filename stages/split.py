@@ -15,10 +15,10 @@ def main() -> None:
         videos = read_table(DATA / "videos.parquet", Video)
         for seed in run.params.ablation.seeds:
             split = assign(catalogue, videos, run.params.split, seed)
-            write_table(DATA / "splits" / f"{seed}.parquet", Assignment, split.assignments)
+            write_table(DATA / "splits" / f"{seed}.parquet", Assignment, split)
             for part in Part:
-                run.metrics[f"{seed}.{part}_videos"] = sum(a.part == part for a in split.assignments)
-                run.metrics[f"{seed}.{part}_objects"] = len({a.object_id for a in split.assignments if a.part == part})
+                run.metrics[f"{seed}.{part}_videos"] = sum(a.part == part for a in split)
+                run.metrics[f"{seed}.{part}_objects"] = len({a.object_id for a in split if a.part == part})
 
 
 if __name__ == "__main__":

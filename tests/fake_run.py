@@ -65,7 +65,7 @@ def write_run(root: Path, params: Params, *, objects: Sequence[str] = (), skill:
     write_table(data / "videos.parquet", Video, videos)
     splits = dict.fromkeys(params.ablation.seeds, assignments)
     if params.split.name == "kfold":
-        splits = {seed: list(assign(catalogue, videos, params.split, seed).assignments) for seed in splits}
+        splits = {seed: assign(catalogue, videos, params.split, seed) for seed in splits}
     found = [("agreement, ICC(3,k)", name, "0.893 (0.843 to 0.929)") for name in catalogue.property_names]
     audit = [Finding(check=c, item=i, measured=m, severity=Severity.INFO) for c, i, m in found]
     write_csv(data / "audit" / "audit.csv", Finding, audit)

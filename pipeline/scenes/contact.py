@@ -16,7 +16,7 @@ import itertools
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal, get_args
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -30,7 +30,6 @@ from pipeline.scenes.elastic.solver import solve
 from pipeline.scenes.elastic.winkler import Heights, hang_skin, press_springs, series
 
 Tier = Literal["winkler", "layer", "half_space"]
-TIERS: tuple[str, ...] = get_args(Tier)
 GEL = Gel()
 LEVELS = 6
 """Forces at which a body is pressed. Between them slopes were off by .13 on average at a tenth of the largest force, by

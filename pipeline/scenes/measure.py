@@ -15,9 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.errors import UserError
 from pipeline.scenes.grid import Heights
-from pipeline.videos.catalogue import Catalogue
 
 SOFT_BELOW_MPA = 0.12
 """Reduced modulus under which an object yields with little force: half the gel's, so that it is the object that gives
@@ -128,26 +126,6 @@ def bump_share(skin: Heights, pitch: float) -> float:
     half = np.searchsorted(np.cumsum(np.asarray(areas)[order]), sum(areas) / 2)
     typical = float(np.asarray(widths)[order][half])
     return typical / float(height)
-
-
-def check_recipe(object_id: str, measured: Measured, catalogue: Catalogue) -> None:
-    """Hold what a scene shows against the catalogue's labels.
-
-    Raises:
-        UserError: naming the object, the property, and the measured and expected classes.
-    """
-    borders = {
-        "hardness": f"modulus {measured.modulus:.3g} MPa, borders {SOFT_BELOW_MPA:g} and {HARD_ABOVE_MPA:g}",
-        "roughness": f"texture of {measured.texture:.2g} mm rms, borders {ROUGH_MM[0]:g} and {ROUGH_MM[1]:g}",
-        "bumpiness": f"protrusions of {measured.bump:.2f} of the image's height, borders 0 and {BIG_SHARE:g}",
-    }
-    for p, label in zip(catalogue.properties, catalogue.labels(object_id), strict=True):
-        found = getattr(measured, p.name) if p.name in borders else label
-        if found != label:
-            raise UserError(
-                f"scenes.yaml: {object_id}: its scenes measure as {p.name} {found} ({p.levels[found]}; "
-                f"{borders[p.name]}) but objects.csv says {label} ({p.levels[label]}); correct the recipe"
-            )
 
 
 def _paraboloid(skin: Heights, where: npt.NDArray[np.bool_]) -> Heights:

@@ -82,12 +82,19 @@ def synthesize(recipes: Mapping[str, Recipe], config: ScenesConfig, folder: Path
     return sorted(rows, key=lambda row: row.video)
 
 
+MEASURED = ("hardness", "roughness", "bumpiness")
+"""Properties that a scene shows; a catalogue's others may have the name of another column."""
+
+
 def share_as_labelled(rows: Sequence[SceneRow], catalogue: Catalogue) -> float:
     """The share of the videos whose scene measures in all classes as the catalogue labels its object."""
 
     def measured(row: SceneRow) -> tuple[int, ...]:
         own = catalogue.labels(row.object_id)
-        return tuple(getattr(row, p.name, label) for p, label in zip(catalogue.properties, own, strict=True))
+        return tuple(
+            getattr(row, p.name) if p.name in MEASURED else label
+            for p, label in zip(catalogue.properties, own, strict=True)
+        )
 
     return round(fmean(measured(row) == catalogue.labels(row.object_id) for row in rows), 4)
 

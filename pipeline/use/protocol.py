@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import time
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, Literal, NamedTuple, Protocol
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from pipeline.use.media import Refused, from_base64
 
@@ -17,53 +17,35 @@ MESSAGES, CHARACTERS = 64, 20_000
 Json = dict[str, Any]
 
 
-class Model(Protocol):
-    """What of `pipeline.Octopi` is served."""
-
-    @property
-    def card(self) -> Mapping[str, Any]:
-        """What its folder says of it."""
-
-    def stream(
-        self,
-        question: str,
-        videos: Sequence[Any] = (),
-        *,
-        history: Sequence[Any] = (),
-        max_new_tokens: int | None = None,
-    ) -> Iterator[str]:
-        """Pieces of the answer."""
+Said = tuple[str, tuple[bytes, ...], str]
+"""A question, its videos, and the answer."""
 
 
 # ---- requests ----
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="ignore")
-
-
 Text = Annotated[str, Field(max_length=CHARACTERS)]
 
 
-class _Url(_Part):
+class _Url(BaseModel):
     url: str
 
 
-class TextPart(_Part):
+class TextPart(BaseModel):
     """A piece of text."""
 
     type: Literal["text"]
     text: Text
 
 
-class VideoPart(_Part):
+class VideoPart(BaseModel):
     """A touch."""
 
     type: Literal["video_url"]
     video_url: _Url
 
 
-class ImagePart(_Part):
+class ImagePart(BaseModel):
     """A touch, sent by a client that knows pictures only."""
 
     type: Literal["image_url"]
@@ -73,15 +55,11 @@ class ImagePart(_Part):
 Part = Annotated[TextPart | VideoPart | ImagePart, Field(discriminator="type")]
 
 
-class Message(_Part):
+class Message(BaseModel):
     """One turn."""
 
     role: Literal["system", "developer", "user", "assistant"]
     content: Text | Annotated[list[Part], Field(min_length=1, max_length=MESSAGES)]
-
-
-class _StreamOptions(_Part):
-    include_usage: bool = False
 
 
 class ChatRequest(BaseModel):
@@ -91,12 +69,9 @@ class ChatRequest(BaseModel):
     says about itself. What would change the answer and cannot be kept (`n`, `tools`, ...) is refused.
     """
 
-    model_config = ConfigDict(extra="ignore")
-
     model: str = Field(max_length=200)
     messages: Annotated[list[Message], Field(min_length=1, max_length=MESSAGES)]
     stream: bool = False
-    stream_options: _StreamOptions | None = None
     max_tokens: int | None = Field(default=None, ge=1)
     max_completion_tokens: int | None = Field(default=None, ge=1)
     n: Literal[1] | None = None
@@ -105,22 +80,6 @@ class ChatRequest(BaseModel):
     functions: Annotated[list[Any], Field(max_length=0)] | None = None
     logprobs: Literal[False] | None = None
     response_format: dict[Literal["type"], Literal["text"]] | None = None
-
-
-class Earlier(NamedTuple):
-    """An exchange before the question; videos as bytes."""
-
-    question: str
-    videos: tuple[bytes, ...]
-    answer: str
-
-
-class Asked(NamedTuple):
-    """A question with its conversation; videos as bytes."""
-
-    question: str
-    videos: tuple[bytes, ...]
-    history: tuple[Earlier, ...]
 
 
 def read_request(body: bytes) -> ChatRequest:
@@ -137,8 +96,8 @@ def read_request(body: bytes) -> ChatRequest:
         raise Refused(f"{place}: {first['msg'][:300]}") from None
 
 
-def read_conversation(messages: Sequence[Message], most: int) -> Asked:
-    """Turn messages into a question and what was said before it.
+def read_conversation(messages: Sequence[Message], most: int) -> list[Said]:
+    """Turn messages into exchanges; the last is the question, whose answer is "".
 
     A video stands where its part stands, or, where the texts of a message say `{tactile}`, at those marks in order.
     System messages are left out: the model was trained under its own and knows no other.
@@ -157,11 +116,10 @@ def read_conversation(messages: Sequence[Message], most: int) -> Asked:
     if count > most:
         raise Refused(f"messages: {count} videos; a request may bring at most {most}, earlier turns included", 413)
     said = [_read(message, f"messages.{i}") for i, message in turns]
-    pairs = zip(said[:-1:2], said[1::2], strict=True)
     if any(videos for _, videos in said[1::2]):
         raise Refused("messages: an assistant's message brings a video; only the user's may")
-    history = tuple(Earlier(text, videos, answer) for (text, videos), (answer, _) in pairs)
-    return Asked(*said[-1], history)
+    answers = [*(text for text, _ in said[1::2]), ""]
+    return [(text, videos, answer) for (text, videos), answer in zip(said[::2], answers, strict=True)]
 
 
 def _read(message: Message, place: str) -> tuple[str, tuple[bytes, ...]]:

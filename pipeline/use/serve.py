@@ -14,7 +14,7 @@ import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack, asynccontextmanager, suppress
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import HTTPException
@@ -25,9 +25,12 @@ from starlette.types import Message, Receive, Scope, Send
 
 from pipeline.errors import UserError
 from pipeline.use.media import PLACE, Gate, Limits, Refused
-from pipeline.use.protocol import Model, Reply, error_body, model_entry, read_conversation, read_request
+from pipeline.use.protocol import Reply, error_body, model_entry, read_conversation, read_request
 from pipeline.use.results import Exchange
 from pipeline.use.worker import Failed, Job, Metrics, Worker
+
+if TYPE_CHECKING:
+    from pipeline.use.model import Octopi
 
 UPLOAD_SECONDS, DRAIN_SECONDS = 30.0, 5.0
 """How long a client may take for a body, and for the rest of one that is not wanted."""
@@ -37,7 +40,7 @@ HOME = ("127.0.0.1", "localhost", "::1", "[::1]")
 class Service:
     """What the routes share."""
 
-    def __init__(self, model: Model, name: str, *, token: str, limits: Limits, places: int, most_tokens: int) -> None:
+    def __init__(self, model: Octopi, name: str, *, token: str, limits: Limits, places: int, most_tokens: int) -> None:
         self.model, self.name, self.token, self.limits = model, name, token, limits
         self.places, self.most_tokens = places, most_tokens
         self.created = int(time.time())
@@ -94,14 +97,13 @@ class Service:
         wanted = read_request(body)
         if wanted.model != self.name:
             raise HTTPException(404, f"model {wanted.model[:80]!r} is not served here; ask for {self.name!r}")
-        asked = read_conversation(wanted.messages, self.limits.videos)
-        every = [*(video for turn in asked.history for video in turn.videos), *asked.videos]
+        said = read_conversation(wanted.messages, self.limits.videos)
+        every = [video for _, videos, _ in said for video in videos]
         files = iter(stack.enter_context(self.gate.files(every)))
-        history = [Exchange(q, tuple(next(files) for _ in videos), a) for q, videos, a in asked.history]
-        videos = tuple(files)
+        *history, last = [Exchange(q, tuple(next(files) for _ in videos), a) for q, videos, a in said]
         most = wanted.max_completion_tokens or wanted.max_tokens
         most = min(most, self.most_tokens) if most else None
-        ask = partial(self.model.stream, asked.question, videos, history=history, max_new_tokens=most)
+        ask = partial(self.model.stream, last.question, last.videos, history=history, max_new_tokens=most)
         return wanted, ask, len(every)
 
 
@@ -201,7 +203,13 @@ def _said(error: Exception) -> tuple[str, int]:
 
 
 def make_app(
-    model: Model, name: str, *, token: str = "", limits: Limits | None = None, places: int = 32, most_tokens: int = 1024
+    model: Octopi,
+    name: str,
+    *,
+    token: str = "",
+    limits: Limits | None = None,
+    places: int = 32,
+    most_tokens: int = 1024,
 ) -> FastAPI:
     """The web application.
 

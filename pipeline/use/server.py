@@ -9,6 +9,7 @@ import socket
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import h11
 import uvicorn
@@ -16,7 +17,9 @@ from fastapi import FastAPI
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from pipeline.errors import UserError
-from pipeline.use.protocol import Model
+
+if TYPE_CHECKING:
+    from pipeline.use.model import Octopi
 
 SHORTEST_TOKEN = 16
 HEADER_SECONDS = 10.0
@@ -84,7 +87,7 @@ def checked(token: str) -> str:
     return token
 
 
-def serve(load: Callable[[], Model], name: str, host: str, port: int, token_file: Path | None, places: int) -> None:
+def serve(load: Callable[[], Octopi], name: str, host: str, port: int, token_file: Path | None, places: int) -> None:
     """Serve a model until a signal comes; answers in flight are finished then.
 
     Raises:

@@ -10,7 +10,7 @@ from pathlib import Path
 from pipeline.config import SplitConfig
 from pipeline.errors import UserError
 from pipeline.io import read_table
-from pipeline.records import Assignment, Part, Record, Video
+from pipeline.records import Assignment, Part, Video
 from pipeline.runtime import derive_seed
 from pipeline.videos.catalogue import RULED_SPLITS, Catalogue
 
@@ -24,15 +24,7 @@ ORIGIN = "paper"
 """The split of the catalogue that the development split is made from."""
 
 
-class Split(Record):
-    """The part of every video, and the objects that a part should have but has no video of."""
-
-    assignments: tuple[Assignment, ...]
-    missing: dict[Part, tuple[str, ...]]
-    """Validation and test only; an empty tuple where nothing is missing."""
-
-
-def assign(catalogue: Catalogue, videos: Sequence[Video], config: SplitConfig, seed: int = 0) -> Split:
+def assign(catalogue: Catalogue, videos: Sequence[Video], config: SplitConfig, seed: int = 0) -> list[Assignment]:
     """Put every video into a part of the split of one seed, by its object.
 
     `development` tests on some of the paper's training objects and leaves the paper's test objects unused. `kfold`
@@ -47,16 +39,10 @@ def assign(catalogue: Catalogue, videos: Sequence[Video], config: SplitConfig, s
         UserError: if there is no such split, no training video remains, there are too few objects for the test
             objects or folds asked for, or (with `missing: error`) a validation or test object has no video.
     """
-    present = {video.object_id for video in videos}
-    parts = assign_objects(catalogue, present, config, seed)
-    missing = {
-        part: tuple(sorted(o for o, where in parts.items() if where == part and o not in present))
-        for part in (Part.VALIDATION, Part.TEST)
-    }
-    assignments = tuple(
+    parts = assign_objects(catalogue, {video.object_id for video in videos}, config, seed)
+    return [
         Assignment(video_id=v.video_id, object_id=v.object_id, part=parts.get(v.object_id, Part.UNUSED)) for v in videos
-    )
-    return Split(assignments=assignments, missing=missing)
+    ]
 
 
 def assign_objects(

@@ -17,7 +17,7 @@ from tests.conftest import ROOT, fake_videos
 
 CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear").asking("published")
 VIDEOS = fake_videos(sorted(CATALOGUE.objects), 5)
-ASSIGNMENTS = assign(CATALOGUE, VIDEOS, SplitConfig(name="paper")).assignments
+ASSIGNMENTS = assign(CATALOGUE, VIDEOS, SplitConfig(name="paper"))
 COUNTS = {"OPD": 40, "PC": 36, "PSS": 36, "POM": 36, "PSR": 12}
 POOLS = {part: pool_of(part, ASSIGNMENTS, CATALOGUE) for part in (Part.TRAIN, Part.VALIDATION, Part.TEST)}
 
@@ -58,7 +58,7 @@ def test_equal_seeds_give_equal_questions() -> None:
 def test_questions_of_two_folds_share_no_id_and_no_object() -> None:
     config, asked = SplitConfig(name="kfold", folds=3), []
     for seed in (0, 1, 3):
-        pool = pool_of(Part.TEST, assign(CATALOGUE, VIDEOS, config, seed).assignments, CATALOGUE)
+        pool = pool_of(Part.TEST, assign(CATALOGUE, VIDEOS, config, seed), CATALOGUE)
         asked.append(build_questions(pool, COUNTS, seed=1, distinct=True, fold=config.fold_of(seed)))
     first, other, again = asked
     assert first == again, "seeds of one fold answer the same questions"

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from pipeline.config import SplitConfig
 from pipeline.errors import UserError
-from pipeline.records import Part
+from pipeline.records import Assignment, Part
 from pipeline.videos.catalogue import Catalogue, load_catalogue
-from pipeline.videos.split import VALIDATION, Split, assign, check_split
+from pipeline.videos.split import VALIDATION, assign, check_split
 from tests.conftest import ROOT, fake_videos
 
 CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")
@@ -22,8 +22,8 @@ NAMES = ["paper", "release", "development", "kfold"]
 TRAIN = {o for o in OBJECTS if CATALOGUE.objects[o].splits["paper"] == Part.TRAIN}
 
 
-def objects_of(split: Split, part: Part) -> set[str]:
-    return {a.object_id for a in split.assignments if a.part == part}
+def objects_of(split: list[Assignment], part: Part) -> set[str]:
+    return {a.object_id for a in split if a.part == part}
 
 
 @settings(max_examples=16)
@@ -35,16 +35,11 @@ def test_every_video_has_one_part_and_every_object_too(name: str, seed: int, obj
     videos = fake_videos(sorted(objects), 2)
     config = SplitConfig(name=name, seed=seed)
     split = assign(CATALOGUE, videos, config, trained)
-    assert [a.video_id for a in split.assignments] == [v.video_id for v in videos]
-    parts = {o: {a.part for a in split.assignments if a.object_id == o} for o in objects}
+    assert [a.video_id for a in split] == [v.video_id for v in videos]
+    parts = {o: {a.part for a in split if a.object_id == o} for o in objects}
     assert all(len(where) == 1 for where in parts.values())
     again = trained + config.folds if name == "kfold" else trained + 1
     assert split == assign(CATALOGUE, videos, config, again), "a seed of the same fold has the same split"
-    present = {v.object_id for v in videos}
-    for part, missing in split.missing.items():
-        assert part in (Part.VALIDATION, Part.TEST)
-        assert not present & set(missing)
-    assert set(split.missing) == {Part.VALIDATION, Part.TEST}
 
 
 @settings(max_examples=25)
@@ -82,7 +77,6 @@ def test_published_splits_follow_the_catalogue(name: str) -> None:
     split = assign(CATALOGUE, fake_videos(OBJECTS), SplitConfig(name=name))
     for part in Part:
         assert objects_of(split, part) == {o for o in OBJECTS if CATALOGUE.objects[o].splits[name] == part}
-    assert split.missing == {Part.VALIDATION: (), Part.TEST: ()}
 
 
 @settings(max_examples=8)
@@ -122,8 +116,6 @@ def test_development_draws_from_objects_that_have_videos() -> None:
 def test_missing_objects_are_reported_or_refused() -> None:
     present = [o for o in OBJECTS if CATALOGUE.objects[o].splits["paper"] != Part.TEST and o != "denim"]
     split = assign(CATALOGUE, fake_videos(present), SplitConfig(name="paper"))
-    assert split.missing[Part.VALIDATION] == ("denim",)
-    assert len(split.missing[Part.TEST]) == 7
     assert not objects_of(split, Part.TEST)
     with pytest.raises(UserError) as caught:
         assign(CATALOGUE, fake_videos(present), SplitConfig(name="paper", missing="error"))
@@ -164,7 +156,7 @@ def test_a_split_that_is_not_there_is_refused(columns: dict[str, str], name: str
             attempt()
         assert words in str(caught.value)
     check_split(other, "kfold")
-    assert assign(other, fake_videos(OBJECTS), SplitConfig(name="kfold")).assignments
+    assert assign(other, fake_videos(OBJECTS), SplitConfig(name="kfold"))
 
 
 @pytest.mark.parametrize("name", ["paper", "development"])

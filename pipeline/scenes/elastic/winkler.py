@@ -34,8 +34,6 @@ class Springs:
     """How far the bodies come together after first touch, in mm."""
     overlap: Heights
     """Shared out between gel and object, in mm; 0 outside the contact."""
-    force: float
-    """In N, from the pressure over the grid."""
 
 
 def series(first: float, second: float) -> float:
@@ -54,7 +52,7 @@ def press_springs(gap: Heights, force: float, modulus: float, pitch: float, gel:
         gel: The sensor's.
     """
     if force <= 0:
-        return Springs(0.0, np.zeros_like(gap), 0.0)
+        return Springs(0.0, np.zeros_like(gap))
     # Force a millimetre of overlap and pixel: (E* / t) dA.
     stiffness = series(gel.modulus, modulus) / gel.thickness * pitch * pitch
     low, high = 0.0, float(gap.max()) + force / (stiffness * gap.size)
@@ -65,7 +63,7 @@ def press_springs(gap: Heights, force: float, modulus: float, pitch: float, gel:
         if abs(reached - force) <= TOLERANCE * force:
             break
         low, high = (approach, high) if reached < force else (low, approach)
-    return Springs(approach, overlap, reached)
+    return Springs(approach, overlap)
 
 
 def hang_skin(springs: Springs, modulus: float, pitch: float, gel: Gel) -> Heights:

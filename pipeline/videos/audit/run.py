@@ -40,7 +40,7 @@ def audit_folder(folder: Path, catalogue: Catalogue, split: SplitConfig | None =
         if split is not None:
             try:
                 folds = range(split.folds if split.fold_of(0) is not None else 1)
-                splits = [assign(catalogue, videos, split, fold).assignments for fold in folds]
+                splits = [assign(catalogue, videos, split, fold) for fold in folds]
             except UserError as error:
                 message = str(error)
                 findings.append(Finding(check="split", item=split.name, measured=message, severity=Severity.ERROR))
