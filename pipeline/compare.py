@@ -14,8 +14,8 @@ import pandas as pd
 import pyarrow.parquet as pq
 
 from pipeline.errors import UserError
-from pipeline.evaluation.scores import difference, effect_row, grouped, with_holm
-from pipeline.records import Graded
+from pipeline.evaluation.scores import difference, grouped, with_holm
+from pipeline.records import EffectRow, Graded
 from pipeline.revisions import State, find_state
 from pipeline.tasks import TASKS
 
@@ -103,7 +103,8 @@ def _tested(one: State, two: State) -> tuple[Rows, list[str]]:
         for setting, runs in settings.items() if task in TASKS and measure == TASKS[task].measure else ():
             earlier = before.get((task, measure), {}).get(setting, {})
             if runs != earlier and (gap := difference(runs, earlier)):
-                rows.append(effect_row(gap, part=" ".join(setting), change="new - old", task=task, measure=measure))
+                part = " ".join(setting)
+                rows.append(EffectRow(part=part, change="new - old", task=task, measure=measure, **vars(gap)))
     other = len(meant[0].keys() | meant[1].keys()) - len(same)
     notes = [f"{len(same)} questions are compared; {other} were asked by one side only, or differ."] if other else []
     return [row.model_dump(mode="json") for row in with_holm(rows)], notes

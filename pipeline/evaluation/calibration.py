@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
+import pandas as pd
 
 from pipeline.records import Classification, Optional, Part, Record, Share
 from pipeline.runtime import derive_seed
@@ -41,17 +42,6 @@ class CalibrationRow(Record):
     high: Optional = None
     without_temperature: Optional = None
     """The expected calibration error of the probabilities as the heads give them."""
-
-
-class Bin(Record):
-    """Answers of like confidence: above `low`, up to `high`."""
-
-    low: float
-    high: float
-    n: int
-    confidence: float
-    """Mean of the largest probabilities."""
-    accuracy: float
 
 
 def rescale(probabilities: npt.ArrayLike, temperature: float) -> Floats:
@@ -89,20 +79,19 @@ def fit_temperature(classified: Sequence[Classification]) -> float:
     return float(np.exp(found.x))
 
 
-def reliability(classified: Sequence[Classification], temperature: float = 1.0) -> list[Bin]:
-    """`BINS` bins of equal width by confidence, of which empty ones are left out; right is the likeliest class."""
-    confidence, right = _confidence(classified, temperature)
-    places = np.clip(np.ceil(confidence * BINS).astype(int) - 1, 0, BINS - 1)
-    return [
-        Bin(
-            low=place / BINS,
-            high=(place + 1) / BINS,
-            n=int((places == place).sum()),
-            confidence=float(confidence[places == place].mean()),
-            accuracy=float(right[places == place].mean()),
-        )
-        for place in np.unique(places).tolist()
-    ]
+def reliability(classified: Sequence[Classification]) -> pd.DataFrame:
+    """Answers of like confidence: `BINS` bins of equal width, by number from 0, of which empty ones are left out.
+
+    Returns:
+        Columns `n`, `mean_probability` of the likeliest class, and `right`, the share where it is the rated one.
+    """
+    probabilities = np.array([c.probabilities for c in classified])
+    right = probabilities.argmax(axis=1) == [c.expected for c in classified]
+    table = pd.DataFrame({"mean_probability": probabilities.max(axis=1), "right": right.astype(float)})
+    # A border belongs to the bin below it.
+    places = np.clip(np.ceil(table["mean_probability"] * BINS).astype(int) - 1, 0, BINS - 1)
+    bins = table.groupby(places).mean()
+    return bins.assign(n=places.value_counts())
 
 
 def calibrated(said: Sequence[Classification]) -> Iterator[tuple[Classification, Classification]]:
@@ -136,8 +125,8 @@ def calibration_rows(encoders: Sequence[Sequence[Classification]]) -> list[Calib
                 property=name,
                 probability="all",
                 n=len(answers),
-                mean_probability=sum(b.n * b.confidence for b in bins) / len(answers),
-                right=sum(b.n * b.accuracy for b in bins) / len(answers),
+                mean_probability=np.average(bins["mean_probability"], weights=bins["n"]),
+                right=np.average(bins["right"], weights=bins["n"]),
                 error=calibration_error(answers),
                 low=low,
                 high=high,
@@ -147,24 +136,21 @@ def calibration_rows(encoders: Sequence[Sequence[Classification]]) -> list[Calib
         rows += [
             CalibrationRow(
                 property=name,
-                probability=f"{b.low:.1f} to {b.high:.1f}",
-                n=b.n,
-                mean_probability=b.confidence,
-                right=b.accuracy,
-                error=abs(b.accuracy - b.confidence),
+                probability=f"{place / BINS:.1f} to {(place + 1) / BINS:.1f}",
+                error=abs(b["right"] - b["mean_probability"]),
+                **b,
             )
-            for b in bins
+            for place, b in zip(bins.index, bins.to_dict("records"), strict=True)
         ]
     return rows
 
 
-def calibration_error(classified: Sequence[Classification], temperature: float = 1.0) -> float:
-    """Expected calibration error: the bins' mean |accuracy - confidence|, each weighing as many answers as it has."""
-    bins = reliability(classified, temperature)
-    return sum(b.n * abs(b.accuracy - b.confidence) for b in bins) / len(classified)
+def calibration_error(classified: Sequence[Classification]) -> float:
+    """Expected calibration error: the bins' mean |right - mean probability|, each weighing as many as its answers."""
+    return float(np.abs(_gaps(classified)).sum()) / len(classified)
 
 
-def error_interval(classified: Sequence[Classification], temperature: float = 1.0) -> tuple[float, float]:
+def error_interval(classified: Sequence[Classification]) -> tuple[float, float]:
     """95 % of the calibration errors of objects drawn anew (percentile bootstrap over objects).
 
     The error of few answers is biased upwards, since chance alone parts accuracy from confidence; so is this interval.
@@ -172,16 +158,18 @@ def error_interval(classified: Sequence[Classification], temperature: float = 1.
     by_object: dict[str, list[Classification]] = {}
     for c in classified:
         by_object.setdefault(c.object_id, []).append(c)
-    groups = list(by_object.values())
-    rng = np.random.default_rng(derive_seed("calibration"))
-    errors = [
-        calibration_error([c for g in rng.integers(len(groups), size=len(groups)) for c in groups[g]], temperature)
-        for _ in range(DRAWS)
-    ]
+    gaps = np.stack([_gaps(group) for group in by_object.values()])
+    sizes = np.array([len(group) for group in by_object.values()])
+    drawn = np.random.default_rng(derive_seed("calibration")).integers(len(sizes), size=(DRAWS, len(sizes)))
+    errors = np.abs(gaps[drawn].sum(axis=1)).sum(axis=1) / sizes[drawn].sum(axis=1)
     low, high = np.quantile(errors, [0.025, 0.975]).tolist()
     return low, high
 
 
-def _confidence(classified: Sequence[Classification], temperature: float) -> tuple[Floats, npt.NDArray[np.bool_]]:
-    scaled = rescale([c.probabilities for c in classified], temperature)
-    return scaled.max(axis=1), scaled.argmax(axis=1) == np.array([c.expected for c in classified])
+def _gaps(classified: Sequence[Classification]) -> Floats:
+    """By how many answers each of the `BINS` bins is right more often than its probabilities say."""
+    bins = reliability(classified)
+    gaps: Floats = (
+        (bins["n"] * (bins["right"] - bins["mean_probability"])).reindex(range(BINS), fill_value=0).to_numpy()
+    )
+    return gaps

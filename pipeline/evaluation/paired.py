@@ -32,11 +32,11 @@ POWER, SIZE = 0.8, 0.05
 class Difference:
     """How much more often one setting is right than another; shares from -1 to 1.
 
-    All but the value is None where the questions cannot show that objects differ.
+    All but the difference is None where the questions cannot show that objects differ.
     """
 
-    value: float
-    questions: int
+    difference: float
+    n: int
     objects: int
     seeds: int
     low: float | None = None
@@ -70,8 +70,8 @@ def paired(values: Values, objects: Sequence[Objects]) -> Difference:
     error, centre, freedom = (float(x) for x in standard_error(values, design))
     half = float(stats.t.ppf((1 + LEVEL) / 2, freedom)) * error
     return Difference(
-        value=mean,
-        questions=questions,
+        difference=mean,
+        n=questions,
         objects=design.objects,
         seeds=seeds,
         low=max(-1.0, min(centre - half, mean)),

@@ -129,7 +129,7 @@ def effect_rows(graded: Iterable[Graded], catalogue: Catalogue) -> list[EffectRo
         for (task, measure), settings in table.items():
             if measure == TASKS[task].measure and (gap := difference(settings.get(full, {}), settings.get(less, {}))):
                 change = f"{getattr(full, part)} - {getattr(less, part)}"
-                rows.append(effect_row(gap, part=part, change=change, task=task, measure=measure))
+                rows.append(EffectRow(part=part, change=change, task=task, measure=measure, **vars(gap)))
     return with_holm(rows)
 
 
@@ -140,29 +140,17 @@ def candidate_rows(out_of_fold: Mapping[str, Iterable[OutOfFold]], reference: st
     """
     runs = {name: repeats(records) for name, records in out_of_fold.items()}
     rows = [
-        effect_row(gap, part="encoder", change=f"{name} - {reference}", task=CROSS_VALIDATION, measure="combined")
+        EffectRow(
+            part="encoder",
+            change=f"{name} - {reference}",
+            task=CROSS_VALIDATION,
+            measure="combined",
+            **vars(gap),
+        )
         for name, videos in runs.items()
         if name != reference and (gap := difference(videos, runs.get(reference, {})))
     ]
     return with_holm(rows)
-
-
-def effect_row(gap: Difference, *, part: str, change: str, task: str, measure: str) -> EffectRow:
-    """A row from what `paired` found, not yet adjusted."""
-    return EffectRow(
-        part=part,
-        change=change,
-        task=task,
-        measure=measure,
-        difference=gap.value,
-        low=gap.low,
-        high=gap.high,
-        p=gap.p,
-        smallest_effect=gap.smallest_effect,
-        n=gap.questions,
-        objects=gap.objects,
-        seeds=gap.seeds,
-    )
 
 
 def with_holm(rows: Sequence[EffectRow]) -> list[EffectRow]:

@@ -54,6 +54,8 @@ class TaskDefinition(ABC):
     """Whether its questions may be used for training (PSR's may not)."""
     listed: tuple[str, ...] = ()
     """What an answer calls the objects where it restates their classes; none where it is about several properties."""
+    choices = 2
+    """How many answers there are to choose from."""
     measure = "choice"
     """The measure that says that a whole answer is right; `chance` lists all measures."""
 
@@ -69,9 +71,9 @@ class TaskDefinition(ABC):
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         """One score for each measure; an answer that cannot be read is wrong and not `parsed`."""
 
-    @abstractmethod
     def chance(self, catalogue: Catalogue) -> dict[str, float]:
         """Accuracy of a uniform guess, 0 to 1, by measure."""
+        return {"choice": 1 / self.choices}
 
     def with_facts(self, draft: Draft, catalogue: Catalogue, rng: random.Random) -> Draft:
         """The question for a language model that knows nothing of the objects: as it is, unless it names objects."""
@@ -235,27 +237,37 @@ def begins_as_published(question: Question, prediction: Prediction) -> bool:
     return said.startswith(right)
 
 
+def scored(
+    question: Question,
+    prediction: Prediction,
+    measure: str,
+    expected: str,
+    predicted: str | None,
+    strict: bool | None = None,
+) -> Score:
+    """The score of one measure.
+
+    Args:
+        predicted: None where nothing could be read.
+        strict: as `Score.strict`.
+    """
+    return Score(
+        question_id=question.question_id,
+        task=question.task,
+        measure=measure,
+        correct=predicted == expected,
+        parsed=predicted is not None,
+        truncated=prediction.truncated,
+        expected=expected,
+        predicted=predicted or "",
+        objects=question.objects,
+        tokens=prediction.tokens,
+        strict=strict,
+    )
+
+
 def choice_score(
     question: Question, prediction: Prediction, predicted: str | None, strict: bool | None = None
 ) -> list[Score]:
-    """The score of a question with one right choice.
-
-    Args:
-        predicted: None where no choice could be read.
-        strict: as `Score.strict`.
-    """
-    return [
-        Score(
-            question_id=question.question_id,
-            task=question.task,
-            measure="choice",
-            correct=predicted == question.gold.choice,
-            parsed=predicted is not None,
-            truncated=prediction.truncated,
-            expected=question.gold.choice,
-            predicted=predicted or "",
-            objects=question.objects,
-            tokens=prediction.tokens,
-            strict=strict,
-        )
-    ]
+    """The score of a question with one right choice, as `scored` has it."""
+    return [scored(question, prediction, "choice", question.gold.choice, predicted, strict)]

@@ -8,7 +8,7 @@ import re
 from string import Formatter
 
 from pipeline.records import Opd, Prediction, Question, Score
-from pipeline.tasks.base import Draft, Pool, TaskDefinition, draft_single_turn, find_level
+from pipeline.tasks.base import Draft, Pool, TaskDefinition, draft_single_turn, find_level, scored
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.catalogue.wording import OPENING
 
@@ -50,17 +50,17 @@ class ObjectPropertyDescription(TaskDefinition):
         predicted = [find_level(closing, p) for p in catalogue.properties]
         strict = as_published(prediction.outputs[0], expected, catalogue)
         scores = [
-            self._score(question, prediction, p.name, p.levels[e], "" if g is None else p.levels[g], strict[p.name])
+            scored(question, prediction, p.name, p.levels[e], None if g is None else p.levels[g], strict[p.name])
             for p, e, g in zip(catalogue.properties, expected, predicted, strict=True)
         ]
         complete = all(s.parsed for s in scores)
         scores.append(
-            self._score(
+            scored(
                 question,
                 prediction,
                 "combined",
                 ", ".join(s.expected for s in scores),
-                ", ".join(s.predicted for s in scores) if complete else "",
+                ", ".join(s.predicted for s in scores) if complete else None,
                 strict["combined"],
             )
         )
@@ -69,24 +69,6 @@ class ObjectPropertyDescription(TaskDefinition):
     def chance(self, catalogue: Catalogue) -> dict[str, float]:
         single = {p.name: 1 / len(p.levels) for p in catalogue.properties}
         return {**single, "combined": math.prod(single.values())}
-
-    @staticmethod
-    def _score(
-        question: Question, prediction: Prediction, measure: str, expected: str, predicted: str, strict: bool
-    ) -> Score:
-        return Score(
-            question_id=question.question_id,
-            task=question.task,
-            measure=measure,
-            correct=predicted == expected,
-            parsed=bool(predicted),
-            truncated=prediction.truncated,
-            expected=expected,
-            predicted=predicted,
-            objects=question.objects,
-            tokens=prediction.tokens,
-            strict=strict,
-        )
 
 
 def as_published(said: str, labels: tuple[int, ...], catalogue: Catalogue) -> dict[str, bool]:

@@ -51,6 +51,7 @@ class PropertyComparison(TaskDefinition):
     name = "PC"
     title = "Property Comparison"
     listed = ("first object", "second object")
+    choices = 3
 
     def strata(self, catalogue: Catalogue) -> int:
         return len(CHOICES) * len(catalogue.properties) * 2
@@ -90,9 +91,6 @@ class PropertyComparison(TaskDefinition):
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         predicted = read(prediction.outputs[0])
         return choice_score(question, prediction, predicted, begins_as_published(question, prediction))
-
-    def chance(self, catalogue: Catalogue) -> dict[str, float]:
-        return {"choice": 1 / 3}
 
 
 TASK = PropertyComparison()

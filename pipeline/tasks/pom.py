@@ -64,6 +64,7 @@ class PropertyObjectMatching(TaskDefinition):
 
     name = "POM"
     title = "Property-object Matching"
+    choices = 6
 
     def strata(self, catalogue: Catalogue) -> int:
         return len(ORDERS)
@@ -103,9 +104,6 @@ class PropertyObjectMatching(TaskDefinition):
         found = read(prediction.outputs[0], names)
         predicted = "".join(str(found[x] + 1) for x in LETTERS) if found else None
         return choice_score(question, prediction, predicted, begins_as_published(question, prediction))
-
-    def chance(self, catalogue: Catalogue) -> dict[str, float]:
-        return {"choice": 1 / 6}
 
 
 TASK = PropertyObjectMatching()

@@ -90,9 +90,6 @@ class PropertyScenarioReasoning(TaskDefinition):
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         return choice_score(question, prediction, read(prediction.outputs[-1]))
 
-    def chance(self, catalogue: Catalogue) -> dict[str, float]:
-        return {"choice": 1 / 2}
-
 
 def _candidates(pool: Pool, scenario: Scenario) -> tuple[list[str], list[str]]:
     """Objects that suit the scenario, and objects that do not."""

@@ -49,6 +49,7 @@ class PropertySuperlativeSelection(TaskDefinition):
     name = "PSS"
     title = "Property Superlative Selection"
     listed = ("a)", "b)", "c)")
+    choices = 3
 
     def strata(self, catalogue: Catalogue) -> int:
         return 3 * 2 * len(catalogue.properties)
@@ -83,9 +84,6 @@ class PropertySuperlativeSelection(TaskDefinition):
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         predicted = read(prediction.outputs[0])
         return choice_score(question, prediction, predicted, begins_as_published(question, prediction))
-
-    def chance(self, catalogue: Catalogue) -> dict[str, float]:
-        return {"choice": 1 / 3}
 
 
 TASK = PropertySuperlativeSelection()

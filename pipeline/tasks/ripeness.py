@@ -88,9 +88,6 @@ class Ripeness(TaskDefinition):
         fruits = "|".join(map(re.escape, _fruits(catalogue)))
         return choice_score(question, prediction, chosen_letter(prediction.outputs[-1], rf"riper (?:{fruits}|one) is"))
 
-    def chance(self, catalogue: Catalogue) -> dict[str, float]:
-        return {"choice": 1 / 2}
-
 
 def _fruits(catalogue: Catalogue) -> list[str]:
     return sorted({fruit for o in catalogue.objects.values() for fruit in o.ripeness})

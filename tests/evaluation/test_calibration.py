@@ -45,8 +45,8 @@ def test_error_by_hand() -> None:
     """Confidences .95 and .91 in one bin (one right), .6 and .55 in two; .1 steps belong to the bin below them."""
     answers = [said(0, 0.95, 0.05), said(1, 0.91, 0.09), said(0, 0.6, 0.4), said(0, 0.45, 0.55)]
     bins = reliability(answers)
-    assert [(round(b.low, 1), b.n, b.accuracy) for b in bins] == [(0.5, 2, 0.5), (0.9, 2, 0.5)]
-    assert [b.confidence for b in bins] == pytest.approx([0.575, 0.93])
+    assert [*zip(bins.index, bins["n"], bins["right"], strict=True)] == [(5, 2, 0.5), (9, 2, 0.5)]
+    assert bins["mean_probability"].tolist() == pytest.approx([0.575, 0.93])
     assert calibration_error(answers) == pytest.approx(0.5 * 0.075 + 0.5 * 0.43)
 
 
@@ -60,7 +60,9 @@ def test_certain_and_right_has_no_error_and_certain_and_wrong_has_all() -> None:
 def test_finds_the_temperature_that_answers_were_made_by(temperature: float) -> None:
     answers = drawn(4000, temperature)
     assert fit_temperature(answers) == pytest.approx(temperature, rel=0.08)
-    assert calibration_error(answers, fit_temperature(answers)) < 0.03
+    scaled = rescale([c.probabilities for c in answers], fit_temperature(answers)).tolist()
+    tempered = [c.model_copy(update={"probabilities": tuple(p)}) for c, p in zip(answers, scaled, strict=True)]
+    assert calibration_error(tempered) < 0.03
 
 
 def test_minimum_is_where_the_slope_vanishes() -> None:

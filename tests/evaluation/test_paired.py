@@ -30,10 +30,10 @@ def test_by_hand() -> None:
     assert n < 12
     centre = n * d / (n + 2)
     half = 3.1824463053 * math.sqrt(((n * square + 2) / (n + 2) - centre**2) / (n + 2))
-    assert (gap.value, gap.low, gap.high) == pytest.approx((d, centre - half, min(1, centre + half)), abs=1e-9)
+    assert (gap.difference, gap.low, gap.high) == pytest.approx((d, centre - half, min(1, centre + half)), abs=1e-9)
     ways = [abs(sum(s * x for s, x in zip(signs, (2, 1, -1, 3), strict=True))) for signs in signs_of(4)]
     assert gap.p == fmean(way >= 5 for way in ways)
-    assert (gap.questions, gap.objects, gap.seeds) == (12, 4, 1)
+    assert (gap.n, gap.objects, gap.seeds) == (12, 4, 1)
 
 
 def signs_of(count: int) -> list[tuple[int, ...]]:
@@ -51,19 +51,19 @@ def test_independent_questions_have_bonett_and_prices_interval(better: int, wors
     one, other = (better + 1) / (n + 2), (worse + 1) / (n + 2)
     half = stats.t.ppf(0.975, n - 1) * math.sqrt((one + other - (one - other) ** 2) / (n + 2))
     # It must hold the difference itself, which the two more questions pull towards nothing.
-    low, high = min(one - other - half, gap.value), max(one - other + half, gap.value)
+    low, high = min(one - other - half, gap.difference), max(one - other + half, gap.difference)
     assert (gap.low, gap.high) == pytest.approx((max(-1.0, low), min(1.0, high)), abs=1e-12)
 
 
 def test_without_difference_with_one_object_and_with_none() -> None:
     gap = paired(np.zeros((1, 3)), single(3, 1))
-    assert (gap.value, gap.p) == (0, 1)
+    assert (gap.difference, gap.p) == (0, 1)
     assert gap.low is not None
     assert gap.low == -gap.high < 0, "that nothing was seen is no proof that nothing is there"  # type: ignore[operator]
     alone = paired(np.array([[1.0, 0.0]]), (("a",), ("a",)))
-    assert (alone.value, alone.low, alone.high, alone.p, alone.smallest_effect) == (0.5, None, None, None, None)
+    assert (alone.difference, alone.low, alone.high, alone.p, alone.smallest_effect) == (0.5, None, None, None, None)
     every = paired(np.ones((1, 35)), single(7, 5))
-    assert (every.value, every.high, every.p) == (1, 1, 2 / 128)
+    assert (every.difference, every.high, every.p) == (1, 1, 2 / 128)
     with pytest.raises(ValueError, match="there must be questions"):
         paired(np.ones((1, 0)), ())
 
@@ -75,9 +75,9 @@ def test_properties(about: About, gains: list[int], more: list[int], seed: int) 
     gap, mirrored = paired(values, about), paired(-values, about)
     order = random.Random(seed).sample(range(len(about)), len(about))
     assert paired(values[:, order], [about[i] for i in order]) == gap
-    assert mirrored.value == pytest.approx(-gap.value)
+    assert mirrored.difference == pytest.approx(-gap.difference)
     if gap.low is not None and gap.high is not None and gap.p is not None and gap.smallest_effect is not None:
-        assert -1 <= gap.low <= gap.value <= gap.high <= 1
+        assert -1 <= gap.low <= gap.difference <= gap.high <= 1
         assert (-mirrored.high, -mirrored.low) == pytest.approx((gap.low, gap.high))  # type: ignore[operator]
         assert mirrored.p == gap.p
         assert gap.smallest_effect > 0
@@ -165,7 +165,7 @@ def test_several_seeds_are_one_comparison_of_their_means() -> None:
     rng = np.random.default_rng(5)
     table, about = rng.integers(-1, 2, (4, 35)).astype(float), single(7, 5)
     several, means = paired(table, about), paired(table.mean(axis=0, keepdims=True), about)
-    assert (several.value, several.p) == (pytest.approx(table.mean()), means.p)
+    assert (several.difference, several.p) == (pytest.approx(table.mean()), means.p)
     again = paired(np.tile(table[:1], (3, 1)), about)
     one = paired(table[:1], about)
     assert (again.low, again.high, again.p) == pytest.approx((one.low, one.high, one.p)), "the same answers add nothing"

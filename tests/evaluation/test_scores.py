@@ -163,7 +163,7 @@ def test_effects_are_the_full_system_less_one_part() -> None:
         gains = np.array([np.subtract(full[s], less[r.part, r.change][s], dtype=float) for s in full])
         gap = paired(gains, PAIRS)
         assert (r.n, r.objects, r.seeds, r.task, r.measure) == (15, 6, 2, "PC", "choice")
-        expected = (gap.value, gap.low, gap.high, gap.p, gap.smallest_effect)
+        expected = (gap.difference, gap.low, gap.high, gap.p, gap.smallest_effect)
         assert (r.difference, r.low, r.high, r.p, r.smallest_effect) == pytest.approx(expected, abs=1e-6)
     least = min(r.p for r in rows if r.p is not None)
     assert min(r.p_holm for r in rows if r.p_holm is not None) == pytest.approx(min(1, 6 * least), abs=1e-5)
@@ -236,7 +236,7 @@ def test_encoders_are_compared_video_by_video() -> None:
     gains = np.array([[-1, 0, 0, 0], [0, -1, -1, 0]], dtype=float)
     gap = paired(gains, [("a",), ("a",), ("b",), ("c",)])
     assert (found.difference, found.low, found.high, found.p) == pytest.approx(
-        (gap.value, gap.low, gap.high, gap.p), abs=1e-6
+        (gap.difference, gap.low, gap.high, gap.p), abs=1e-6
     )
     assert found.p_holm == found.p
     assert candidate_rows({"probe": PROBE}, "trees") == []
