@@ -116,7 +116,7 @@ def make_bed(root: Path, size: Size, folder: Path) -> Bed:
         build_questions(pool, {t: -(-n // len(ASKED)) for t in ASKED}, seed=seed, distinct=False)[:n]
         for seed, n in enumerate((max(size.aligned, size.trained), size.asked))
     )
-    rng, shape = np.random.default_rng(0), (FRAMES, encoder.image.size, encoder.image.size, 3)
+    rng, shape = np.random.default_rng(0), (FRAMES, *encoder.visual.image_size, 3)
     names = [video.video_id for video in videos]
     pictures = {name: torch.from_numpy(rng.integers(0, 256, shape, dtype=np.uint8)) for name in names}
     rows = [(v, x, f) for v in names for x in FLIPS for f in range(FRAMES)]

@@ -3,47 +3,18 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
-
-import torch
-from torch import nn
+from typing import TYPE_CHECKING, Literal
 
 from pipeline.errors import UserError
 from pipeline.weights import CLIP_CONFIG, GET_CLIP, check_finite
 
-
-@dataclass(frozen=True)
-class ImageFormat:
-    """How the tower wants its input: side in pixels, and mean and deviation of RGB in [0, 1]."""
-
-    size: int
-    mean: tuple[float, float, float]
-    std: tuple[float, float, float]
+if TYPE_CHECKING:
+    from open_clip.transformer import VisionTransformer
 
 
-@dataclass(frozen=True)
-class VisualTower:
-    """CLIP's visual tower and its input format; `dim` is the length of an output embedding."""
-
-    module: nn.Module
-    image: ImageFormat
-    dim: int
-    width: int
-    """Length of a token inside the transformer."""
-    layers: int
-    """Depth of the transformer."""
-    patch_area: int
-    """Values in a patch: pixels times channels."""
-    averages: bool
-    """Whether an embedding comes from the mean over patches, and not from the class token."""
-
-
-def load_visual_tower(folder: Path, embedding: Literal["projected", "class_token"] = "projected") -> VisualTower:
+def load_visual_tower(folder: Path, embedding: Literal["projected", "class_token"] = "projected") -> VisionTransformer:
     """Load the visual tower in float32, frozen and in evaluation mode; the text tower is dropped.
-
-    `weights.check_encoder` has seen that the files are there and are no pickles.
 
     Args:
         folder: In open_clip's format.
@@ -71,22 +42,4 @@ def load_visual_tower(folder: Path, embedding: Literal["projected", "class_token
     visual.requires_grad_(False).eval()
     if embedding == "class_token":
         visual.proj = None
-    preprocess = visual.preprocess_cfg
-    size = preprocess["size"]
-    image = ImageFormat(
-        size=size[0] if isinstance(size, (tuple, list)) else int(size),
-        mean=tuple(preprocess["mean"]),
-        std=tuple(preprocess["std"]),
-    )
-    with torch.inference_mode():
-        dim = visual(torch.zeros(1, 3, image.size, image.size)).shape[-1]
-    transformer, patch = visual.transformer, visual.patch_size
-    return VisualTower(
-        module=visual,
-        image=image,
-        dim=dim,
-        width=transformer.width,
-        layers=len(transformer.resblocks),
-        patch_area=3 * patch[0] * patch[1],
-        averages=visual.pool_type == "avg",
-    )
+    return visual

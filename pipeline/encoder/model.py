@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import prod
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import torch
 from torch import nn
 from torch.nn import functional as F
 
 from pipeline.config import EncoderConfig
-from pipeline.encoder.clip import ImageFormat, VisualTower, load_visual_tower
+from pipeline.encoder.clip import load_visual_tower
 from pipeline.encoder.vpt import VisualPrompts
+
+if TYPE_CHECKING:
+    from open_clip.transformer import VisionTransformer
 
 
 class FrameEncoder(nn.Module):
@@ -64,14 +68,14 @@ class TactileEncoder(FrameEncoder):
         prompts: Prompts for it, not yet attached.
     """
 
-    def __init__(self, tower: VisualTower, prompts: VisualPrompts | None = None) -> None:
-        super().__init__(tower.dim)
-        self.visual = tower.module
-        self.image: ImageFormat = tower.image
+    def __init__(self, tower: VisionTransformer, prompts: VisualPrompts | None = None) -> None:
+        super().__init__(tower.transformer.width if tower.proj is None else tower.proj.shape[1])
+        self.visual = tower
         self.mean: torch.Tensor
         self.std: torch.Tensor
-        self.register_buffer("mean", torch.tensor(tower.image.mean).view(1, 3, 1, 1), persistent=False)
-        self.register_buffer("std", torch.tensor(tower.image.std).view(1, 3, 1, 1), persistent=False)
+        for name in ("mean", "std"):
+            value = torch.tensor(tower.preprocess_cfg[name]).view(1, 3, 1, 1)
+            self.register_buffer(name, value, persistent=False)
         self.prompts = prompts
         if prompts is not None:
             prompts.attach(self.visual)
@@ -89,8 +93,8 @@ class TactileEncoder(FrameEncoder):
     def pixels(self, frames: torch.Tensor) -> torch.Tensor:
         """Frames as the tower takes them: batch x 3 x side x side, normalised."""
         pixels = frames.permute(0, 3, 1, 2).to(self.mean.dtype) / 255
-        if pixels.shape[-1] != self.image.size:
-            pixels = F.interpolate(pixels, self.image.size, mode="area")
+        if pixels.shape[-1] != self.visual.image_size[0]:
+            pixels = F.interpolate(pixels, self.visual.image_size, mode="area")
         return (pixels - self.mean) / self.std
 
 
@@ -227,7 +231,9 @@ def property_classifier(config: EncoderConfig, classes: Sequence[int]) -> Proper
     return PropertyClassifier(encoder, Heads(encoder.dim, classes), classes)
 
 
-def visual_prompts(config: EncoderConfig, tower: VisualTower, *, shared: bool) -> VisualPrompts:
+def visual_prompts(config: EncoderConfig, tower: VisionTransformer, *, shared: bool) -> VisualPrompts:
     """Fresh prompts that fit the tower, at as many of its layers as `encoder.prompt_layers` says (0: all)."""
-    layers = min(tower.layers, config.prompt_layers or tower.layers)
-    return VisualPrompts(layers, config.prompts, tower.width, tower.patch_area, shared=shared)
+    deep = len(tower.transformer.resblocks)
+    layers = min(deep, config.prompt_layers or deep)
+    # A patch has its pixels times three channels.
+    return VisualPrompts(layers, config.prompts, tower.transformer.width, 3 * prod(tower.patch_size), shared=shared)

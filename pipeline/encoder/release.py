@@ -10,15 +10,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 from torch import nn
 from torch.nn import functional as F
 
 from pipeline.config import EncoderConfig
-from pipeline.encoder.clip import VisualTower, load_visual_tower
+from pipeline.encoder.clip import load_visual_tower
 from pipeline.encoder.model import Heads, PropertyClassifier, TactileEncoder, visual_prompts
 from pipeline.encoder.vpt import VisualPrompts
+
+if TYPE_CHECKING:
+    from open_clip.transformer import VisionTransformer
 
 HIDDEN = 512
 DROPOUT = 0.5
@@ -31,15 +35,14 @@ SHORTEST_FEATURE = 1e-6
 class PublishedEncoder(TactileEncoder):
     """The class token before the last normalisation and CLIP's projection; `dim` is the transformer's width."""
 
-    def __init__(self, tower: VisualTower, prompts: VisualPrompts | None = None) -> None:
+    def __init__(self, tower: VisionTransformer, prompts: VisualPrompts | None = None) -> None:
         super().__init__(tower, prompts)
-        self.dim = tower.width
-        self.averages = tower.averages
+        self.dim = tower.transformer.width
         self._token: torch.Tensor
         self.visual.get_submodule("transformer").register_forward_hook(self._keep)
 
     def _keep(self, _: nn.Module, __: tuple[torch.Tensor, ...], tokens: torch.Tensor) -> None:
-        self._token = tokens[:, 1:].mean(1) if self.averages else tokens[:, 0]
+        self._token = tokens[:, 1:].mean(1) if self.visual.pool_type == "avg" else tokens[:, 0]
 
     def forward(self, frames: torch.Tensor, frame_indices: torch.Tensor) -> torch.Tensor:
         """The class token, and the frame's number: float32, batch x width."""

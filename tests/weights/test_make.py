@@ -161,8 +161,8 @@ def test_tiny_models_are_what_the_checks_and_loaders_want() -> None:
     check_encoder(model_folder("tiny-clip"), 64, ("clip",))
     check_language(model_folder("tiny-llama"), exists=True)
     tower = load_visual_tower(model_folder("tiny-clip"))
-    assert (tower.dim, tower.layers, tower.image.size) == (64, 4, 64)
-    spread = tower.module(torch.randn(8, 3, 64, 64, generator=torch.Generator().manual_seed(0))).std(0)
+    assert (tower.output_dim, len(tower.transformer.resblocks), tower.image_size) == (64, 4, (64, 64))
+    spread = tower(torch.randn(8, 3, 64, 64, generator=torch.Generator().manual_seed(0))).std(0)
     assert spread.mean() > 1e-3, "pictures differ"
 
 
