@@ -11,7 +11,7 @@ from pipeline.use.model import Octopi
 from tests.use.shared import Made, make
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="session")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     where = tmp_path_factory.mktemp("use")
     with pytest.MonkeyPatch.context() as patch:
@@ -19,7 +19,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
         return make(where, Variant(Encoder.FINETUNED, Lora.WITH, Opd.ALL, 0))
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="session")
 def octopi(made: Made) -> Octopi:
     return Octopi.from_pretrained(made.folder, device="cpu")
 
