@@ -170,6 +170,17 @@ def test_encoders_are_the_tower_with_prompts(
         assert torch.equal(encoder(frames[:, 1], indices), encoder.describe(frames[:, 1], FRAME_INDICES[:, 2]))
 
 
+def test_the_class_token_is_read_where_it_is_named(frames: torch.Tensor, tmp_path: Path) -> None:
+    """By `paper`, normalised; `release` reads it whatever is named."""
+    weights, pictures, indices = write_tower(tmp_path), frames[:, 0], FRAME_INDICES[:, 0]
+    tower, encoder = Tower(weights), base_encoder(config(weights, "paper", embedding="class_token"))
+    assert encoder.dim == 32
+    close(encoder(pictures, indices), tower.norm(tower.token(pictures.numpy()), "ln_post"))
+    names = ("projected", "class_token")
+    one, other = (base_encoder(config(weights, "release", embedding=name))(pictures, indices) for name in names)
+    assert torch.equal(one, other)
+
+
 @pytest.mark.parametrize("side", [32, 64, 96, 33, 60])
 @pytest.mark.parametrize("recipe", ["paper", "release"])
 def test_larger_frames_are_means_over_areas(side: int, recipe: str, weights: Path) -> None:

@@ -105,19 +105,6 @@ def test_by_hand() -> None:
     assert found == pytest.approx((centre - half, centre + half), abs=1e-9)
 
 
-@pytest.mark.parametrize("value", [0.0, 1.0])
-def test_all_alike_counts_objects(value: float) -> None:
-    found = accuracy_interval(np.full(35, value), single(7, 5))
-    c = 2.4469118511**2 / 7
-    assert found == pytest.approx((0, c / (1 + c)) if value == 0 else (1 / (1 + c), 1), abs=1e-9)
-
-
-def test_with_many_objects_of_one_question_it_is_wilsons() -> None:
-    values = (np.arange(400) % 3 == 0).astype(float)
-    found = accuracy_interval(values, single(400, 1))
-    assert found == pytest.approx(proportion_confint(values.sum(), 400, method="wilson"), abs=5e-4)
-
-
 @given(about=designs(), right=RIGHT, seed=st.integers(0, 9))
 @settings(deadline=None, max_examples=60)
 def test_it_holds_the_accuracy_and_wilsons_and_depends_on_no_order_or_name(
