@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from pipeline.errors import UserError
-from pipeline.weights import CLIP_CONFIG, GET_CLIP, check_finite
+from pipeline.weights import CLIP_CONFIG, GET_CLIP, check_finite, clip_file
 
 if TYPE_CHECKING:
     from open_clip.transformer import VisionTransformer
@@ -21,12 +21,14 @@ def load_visual_tower(folder: Path, embedding: Literal["projected", "class_token
         embedding: As `EncoderConfig.embedding`; a class token has the transformer's width.
 
     Raises:
-        UserError: for a checkpoint that does not fit its configuration, or a
+        UserError: where there are no safetensors, for a checkpoint that does not fit its configuration, or a
             tower that is not a vision transformer (visual prompts need one).
     """
     import open_clip
     from safetensors import SafetensorError
 
+    if not clip_file(folder).is_file():  # Of another's folder open_clip would read a pickle, too.
+        raise UserError(f"encoder.weights: {clip_file(folder)} does not exist; {GET_CLIP.format(folder=folder)}")
     logging.getLogger().setLevel(logging.WARNING)
     try:
         model = open_clip.create_model(f"local-dir:{folder}", precision="fp32", require_pretrained=True)

@@ -341,6 +341,14 @@ def test_a_tower_with_a_nan_is_named_at_loading() -> None:
         load_visual_tower(folder)
 
 
+def test_a_tower_in_a_pickle_is_not_loaded() -> None:
+    folder = write_clip(Path("clip"))
+    torch.save(load_file(folder / CLIP_FILE), folder / "open_clip_pytorch_model.bin")
+    (folder / CLIP_FILE).unlink()
+    with pytest.raises(UserError, match=rf"\Aencoder.weights: clip/{CLIP_FILE} does not exist; [^\n]*\Z"):
+        load_visual_tower(folder)
+
+
 def test_a_timm_network_with_a_nan_in_its_statistics_is_named_at_loading() -> None:
     folder = write_timm(Path("timm"))
     name = next(n for n in load_file(folder / ONE) if n.endswith("running_var"))
