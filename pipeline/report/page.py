@@ -147,6 +147,7 @@ def inline(text: str, folder: str = "") -> Markup:
         folder: what its links are relative to.
     """
     html = re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", str(escape(text)))
+    html = re.sub(r"\*(\w[^*]*)\*", r"<em>\1</em>", html)
     html = re.sub(r"`(.+?)`", r"<code>\1</code>", html)
     return Markup(re.sub(r"\[([^]]+)\]\(([\w./-]+)\)", rf'<a href="{escape(folder)}\2">\1</a>', html))
 

@@ -29,6 +29,7 @@ from pipeline.encoder.baseline.features import (
 )
 from pipeline.encoder.baseline.predictor import SMOOTHING, PropertyPredictor, decode_jointly, log_dependence
 from pipeline.encoder.baseline.validation import cross_validate, deal, forest
+from pipeline.errors import UserError
 
 GREY = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
 
@@ -202,6 +203,11 @@ def test_joint_decoding_against_brute_force(seed: int, classes: list[int]) -> No
         assert tuple(decoded[video]) == best
 
 
+def test_too_many_combinations_are_one_line() -> None:
+    with pytest.raises(UserError, match=r"\A1000000 combinations of classes are too many to decide[^\n]*\Z"):
+        log_dependence(np.zeros((1, 2), np.int64), ["a"], (1000, 1000))
+
+
 def test_dependence_overrules_weak_evidence() -> None:
     tables = [np.log([[0.45, 0.55]]), np.log([[0.9, 0.1]])]
     together = log_dependence(np.array([[0, 0], [0, 0], [1, 1], [1, 1]]), list("abcd"), (2, 2))
@@ -225,7 +231,7 @@ def planted(seed: int, objects: int = 24, videos: int = 3, strength: float = 4) 
 
 @pytest.fixture
 def few_trees(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(predictor, "TREES", 12)
+    monkeypatch.setattr(predictor, "TREES", 20)
 
 
 @pytest.mark.usefixtures("few_trees")
@@ -252,8 +258,8 @@ def test_a_class_that_training_lacks_stays_possible() -> None:
     model = PropertyPredictor((4, 2, 1))
     model.fit(features, np.column_stack([labels, 0 * labels[:, 0]]), objects)
     first, second, third = model.probabilities(features)
-    assert first[:, [1, 3]] == pytest.approx(1 / 4 / 13)
-    assert second[:, 0] == pytest.approx(1 / 2 / 13)
+    assert first[:, [1, 3]] == pytest.approx(1 / 4 / 21)
+    assert second[:, 0] == pytest.approx(1 / 2 / 21)
     assert third == pytest.approx(1)
     assert set(model.predict(features)[:, 0].tolist()) <= {0, 2}
     one = PropertyPredictor((3, 3)).fit(features[:1], np.array([[2, 1]]), ["a"])
@@ -307,7 +313,7 @@ def test_cross_validation_finds_a_signal_and_tells_noise_at_chance() -> None:
         return (predicted[:, 0] == labels).all(axis=1)
 
     signal = planted(5, objects=30, strength=8)
-    assert right(*signal, 7).mean() > 0.6, "a sixth is chance"
+    assert right(*signal, 7).mean() > 0.8
     # Classes are drawn, not balanced: of balanced ones a fold that has more leaves fewer to train on.
     noise_right = []
     for seed in range(4):

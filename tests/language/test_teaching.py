@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
 import torch
 
 from pipeline.config import LanguageConfig, MaxUpdates, PassMarks, RuntimeConfig, TeachConfig
+from pipeline.errors import UserError
 from pipeline.language.base import load_tokenizer
 from pipeline.language.teach.training import COURSE, PHASES, Course, teach
 from pipeline.training.trainer import Trained
@@ -104,3 +106,10 @@ def test_bfloat16_on_a_processor_that_was_not_named(language: LanguageConfig, ch
     assert {value.dtype for value in trained.state.values()} == {torch.float32}
     assert next(p.dtype for n, p in llm.named_parameters() if "base_layer" in n) == torch.bfloat16
     assert all(value.isfinite().all() for value in trained.state.values())
+
+
+def test_a_broken_tokenizer_of_the_base_is_named_by_its_key(language: LanguageConfig, tmp_path: Path) -> None:
+    shutil.copytree(language.weights, tmp_path / "base")
+    (tmp_path / "base" / "tokenizer.json").write_text("{}")
+    with pytest.raises(UserError, match=r"\Ateach.base: the tokenizer in [^\n]*\Z"):
+        run(language.model_copy(update={"weights": str(tmp_path / "base")}))

@@ -7,12 +7,14 @@ share one class often share others, so the combination of classes is chosen with
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.errors import UserError
 from pipeline.runtime import cores, derive_seed
 
 Features = npt.NDArray[np.float32]
@@ -23,6 +25,8 @@ Probabilities = npt.NDArray[np.float64]
 
 SMOOTHING = 1 / 6
 """Objects added to each combination of classes, so that none is impossible."""
+MOST_COMBINATIONS = 100_000
+"""More would be tables too large to decode with."""
 TREES = 200
 """A property."""
 
@@ -80,7 +84,15 @@ def log_dependence(labels: Labels, objects: Sequence[str], classes: Sequence[int
     """log[P(a, b, ...) / (P(a) P(b) ...)] of each combination: an array with one axis a property.
 
     The joint distribution counts every object once, plus `SMOOTHING` a cell; the single ones are its margins.
+
+    Raises:
+        UserError: for more than `MOST_COMBINATIONS`.
     """
+    if (number := math.prod(classes)) > MOST_COMBINATIONS:
+        raise UserError(
+            f"{number} combinations of classes are too many to decide jointly ({MOST_COMBINATIONS} at most); name "
+            "fewer properties in properties.yaml, or set encoder.recipe=paper and cross_validation.models=[constant]"
+        )
     joint = np.full(tuple(classes), SMOOTHING)
     for row in dict(zip(objects, map(tuple, labels.tolist()), strict=True)).values():
         joint[row] += 1

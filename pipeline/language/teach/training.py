@@ -228,7 +228,7 @@ def teach(
     folder = Path(config.base)
     seed_everything(seed)
     dtype = name_dtype(language.dtype, runtime.device)
-    base, tokenizer = load_llm(folder, resolve_dtype(dtype)), load_tokenizer(folder)
+    base, tokenizer = load_llm(folder, resolve_dtype(dtype), key="teach.base"), load_tokenizer(folder, "teach.base")
     lora = LoraConfig(
         r=config.rank, lora_alpha=config.alpha, target_modules="all-linear", task_type="CAUSAL_LM", lora_dropout=0.0
     )
