@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import itertools
 import logging
 import os
 import shutil
@@ -12,7 +11,9 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import psutil
@@ -26,7 +27,6 @@ from pipeline.records import Finding, Frame, Probe
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import VideoFile
 from pipeline.videos.frames import extract
-from pipeline.videos.frames.extract import HEADER_BYTES, _header, _PixelFiles
 from pipeline.videos.frames.fit import fit
 from pipeline.videos.frames.reference import reference_indices
 from pipeline.videos.frames.scan import Scan, scan
@@ -92,16 +92,18 @@ def test_the_number_of_processes_changes_nothing(
 
 
 def kill_after(count: int, place: Place, config: FramesConfig = CONFIG) -> None:
-    """Interrupt an extraction when it appends the next video after `count`."""
-    add, added = _PixelFiles.add, []
+    """Interrupt an extraction when one process has scanned the next `count` videos."""
+    scanned: list[str] = []
 
-    def until(self: _PixelFiles, *args: object) -> None:
-        if len(added) == count:
-            raise KeyboardInterrupt
-        added.append(add(self, *args))  # type: ignore[arg-type, func-returns-value]
+    def until(work: Callable[[Any], Any], jobs: Sequence[Any], *_: str) -> Iterator[Any]:
+        for job in jobs:
+            if len(scanned) == count:
+                raise KeyboardInterrupt
+            scanned.append(str(job))
+            yield work(job)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_PixelFiles, "add", until)
+        patch.setattr(extract, "run_parallel", until)
         with pytest.raises(KeyboardInterrupt):
             place.extract(config)
 
@@ -115,25 +117,21 @@ def whole(tiny_videos: Path, tmp_path_factory: pytest.TempPathFactory, catalogue
 
 
 @pytest.mark.parametrize(
-    ("count", "rest"),
-    [(0, "as it was"), *((6, rest) for rest in ("as it was", "pixels", "half a line", "a line without its end"))],
+    ("count", "rest"), [(0, "as it was"), (6, "as it was"), (6, "cut off"), (6, "empty"), (6, "half written")]
 )
 def test_a_killed_extraction_goes_on_where_it_was(place: Place, whole: list[bytes], count: int, rest: str) -> None:
     kill_after(count, place)
     assert not place.out.exists()
     (work,) = place.partial.iterdir()
-    lines = (work / "done.jsonl").read_bytes().splitlines(keepends=True)
-    assert len(lines) == count
-    if rest == "pixels":
-        for name in ("frames.npy", "references.npy"):
-            with (work / name).open("ab") as stream:
-                stream.write(b"more than is listed")
-    elif "line" in rest:
-        cut = len(lines[-1]) // 2 if rest == "half a line" else len(lines[-1]) - 1
-        (work / "done.jsonl").write_bytes(b"".join(lines[:-1]) + lines[-1][:cut])
+    assert len([*work.iterdir()]) == count
+    last = work / f"{NAMES[count - 1]}.safetensors"
+    if rest == "half written":
+        last.rename(work / f".{last.name}.1.part")
+    elif rest != "as it was":
+        last.write_bytes(last.read_bytes()[:-1] if rest == "cut off" else b"")
     place.decoded()
     place.extract()
-    assert place.decoded() == sorted(NAMES[count - ("line" in rest) :])
+    assert place.decoded() == sorted(NAMES[count - (rest != "as it was") :])
     assert place.bytes() == whole
     assert list(place.partial.iterdir()) == []
 
@@ -146,7 +144,7 @@ def test_twice_killed(place: Place, whole: list[bytes]) -> None:
     assert (place.decoded(), place.bytes()) == (sorted(NAMES[4:]), whole)
 
 
-def test_a_kill_after_the_pixels_have_moved_leaves_no_black_pictures(place: Place, whole: list[bytes]) -> None:
+def test_a_kill_while_tables_are_written_decodes_nothing_again(place: Place, whole: list[bytes]) -> None:
     def full(*_: object) -> None:
         raise OSError("disk full")
 
@@ -154,8 +152,9 @@ def test_a_kill_after_the_pixels_have_moved_leaves_no_black_pictures(place: Plac
         patch.setattr(extract, "write_table", full)
         with pytest.raises(OSError, match="disk full"):
             place.extract()
+    place.decoded()
     place.extract()
-    assert place.bytes() == whole
+    assert (place.decoded(), place.bytes()) == ([], whole)
 
 
 def test_what_changed_after_a_kill_is_read_anew(place: Place) -> None:
@@ -163,7 +162,7 @@ def test_what_changed_after_a_kill_is_read_anew(place: Place) -> None:
     place.decoded()
     write_video(place.folder / "potato_0.avi", moving_square(15, 77))
     found = place.extract()
-    assert place.decoded() == sorted(NAMES[3:]), "the changed video and all behind it"
+    assert place.decoded() == sorted(["potato_0", *NAMES[5:]]), "the changed video, and those that were not finished"
     assert found.videos[3].frames == 15
     resumed = place.bytes()
     place.extract()
@@ -208,7 +207,7 @@ def test_an_error_names_its_video_and_keeps_what_is_finished(place: Place) -> No
     (place.folder / "potato_1.mov").unlink()
     place.decoded()
     assert len(place.extract().videos) == 7
-    assert place.decoded() == NAMES[4:]
+    assert not {*NAMES[:4]} & {*place.decoded()}, "what stands before it is finished, and perhaps more"
 
 
 def test_a_process_that_dies_is_an_error_that_names_the_place(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -257,14 +256,13 @@ def test_no_worker_outlives_its_parent(tmp_path: Path, signal_number: int) -> No
 
 
 def test_a_full_disk_leaves_no_half_of_a_file(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    def half(source: object, target: Path) -> None:
-        Path(target).write_bytes(b"half")
-        raise OSError(errno.ENOSPC, "No space left on device", str(target))
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(extract.shutil, "move", half)
+    monkeypatch.setattr(extract.np.lib.format, "write_array_header_1_0", full)
     with pytest.raises(OSError, match="No space left"):
         place.extract()
-    assert not [f for f in place.out.iterdir() if f.suffix != ".parquet"], "nothing half-written stays"
+    assert [*place.out.iterdir()] == []
 
 
 def test_short_videos_are_left_out_by_the_published_rule(place: Place, caplog: pytest.LogCaptureFixture) -> None:
@@ -286,15 +284,6 @@ def test_nothing_to_keep_is_an_error(tmp_path: Path, catalogue: Catalogue) -> No
     with pytest.raises(UserError, match=r"no video has a frame to keep; choose another frames\.selection"):
         place.extract(FramesConfig(size=16, selection="release"))
     assert not place.out.exists()
-
-
-def test_headers_are_of_one_length(tmp_path: Path) -> None:
-    for size, count in itertools.product((16, 99, 100, 224, 999, 1000, 1024), (0, 1, 999, 10**9)):
-        header = _header((count, size, size, 3))
-        assert len(header) == HEADER_BYTES
-        if count < 1000 and size == 16:
-            (tmp_path / "x.npy").write_bytes(header + bytes(count * size * size * 3))
-            assert np.load(tmp_path / "x.npy").shape == (count, size, size, 3)
 
 
 def test_objects_outside_the_catalogue_cost_one_line(place: Place, caplog: pytest.LogCaptureFixture) -> None:

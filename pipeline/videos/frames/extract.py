@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import io
 import json
 import logging
 import shutil
-from collections.abc import Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 from pydantic import ValidationError
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
 
 from pipeline.config import FramesConfig
 from pipeline.errors import UserError
@@ -41,7 +40,7 @@ class Extraction:
 
 
 class _Done(Record):
-    """A finished video: a line of `done.jsonl`, whose pixels stand in the files at this line's place."""
+    """A finished video, as it stands in the header of the file with its pixels."""
 
     stamp: tuple[str, str, str, str, int, int]
     """What the file was listed as, its size and time of change."""
@@ -62,8 +61,17 @@ class _Job:
 
     @property
     def pixels(self) -> Path:
-        """Where the process that scans leaves the reference and the kept frames."""
-        return self.work / f"{self.file.video_id}.bin"
+        """Where the process that scans leaves what it found: `reference`, `frames` and a `_Done`."""
+        return self.work / f"{self.file.video_id}.safetensors"
+
+    def finished(self) -> _Done | None:
+        """What an earlier extraction found; None where there was none, or the video has changed since."""
+        try:
+            with safe_open(self.pixels, "np") as stored:
+                done = _Done.model_validate_json(stored.metadata()["done"])
+        except (OSError, SafetensorError, ValidationError):  # Not there, or cut off when the machine lost its power.
+            return None
+        return done if done.stamp == self.stamp() else None
 
     def stamp(self) -> tuple[str, str, str, str, int, int]:
         """What tells whether the file, or what videos.csv says of it, has changed; a file that is gone has size -1."""
@@ -92,102 +100,35 @@ def extract_frames(folder: Path, catalogue: Catalogue, config: FramesConfig, out
     for finding in listing.findings:
         log.warning("%s: %s", finding.item, finding.measured)
     work = partial / _fingerprint(folder, config)
+    work.mkdir(parents=True, exist_ok=True)
     jobs = [_Job(file, config, work) for file in listing.files]
-    with _PixelFiles(work, config.size) as files:
-        done = files.resume(jobs)
-        rest = jobs[len(done) :]
-        for job, result in zip(rest, run_parallel(_work, rest, "videos", "video"), strict=True):
-            if isinstance(result, Finding):
-                raise_errors(folder, [result])
-            else:
-                files.add(job, result)
-                done.append(result)
-                _warn(job.file, result.probe)
-        used = [d for d in done if d.places]
-        if not used:
-            raise UserError(f"{folder}: no video has a frame to keep; choose another frames.selection")
-        frames: list[Frame] = []
-        for d in used:
-            for index, score in d.places:
-                frames.append(Frame(video_id=d.video.video_id, frame_index=index, score=score, row=len(frames)))
-        files.finish(out, frames=len(frames), references=len(used))
+    found = [job.finished() for job in jobs]
+    rest = [place for place, earlier in enumerate(found) if earlier is None]
+    for place, result in zip(rest, run_parallel(_work, [jobs[p] for p in rest], "videos", "video"), strict=True):
+        if isinstance(result, Finding):
+            raise_errors(folder, [result])
+        else:
+            found[place] = result
+            _warn(jobs[place].file, result.probe)
+    done = [each for each in found if each is not None]
+    used = [(job, each) for job, each in zip(jobs, done, strict=True) if each.places]
+    if not used:
+        raise UserError(f"{folder}: no video has a frame to keep; choose another frames.selection")
+    frames: list[Frame] = []
+    for _, each in used:
+        for index, score in each.places:
+            frames.append(Frame(video_id=each.video.video_id, frame_index=index, score=score, row=len(frames)))
+    for file, name, count in ((FRAMES_FILE, "frames", len(frames)), (REFERENCES_FILE, "reference", len(used))):
+        with atomic(out / file) as temporary, temporary.open("wb") as stream:
+            shape = (count, config.size, config.size, 3)
+            np.lib.format.write_array_header_1_0(stream, {"descr": "|u1", "fortran_order": False, "shape": shape})
+            for job, _ in used:
+                with safe_open(job.pixels, "np") as stored:
+                    stream.write(stored.get_tensor(name).data)
     write_table(out / TABLE_FILE, Frame, frames)
-    write_table(out / PROBES_FILE, Probe, [d.probe for d in done])
+    write_table(out / PROBES_FILE, Probe, [each.probe for each in done])
     shutil.rmtree(work)
-    return Extraction(tuple(d.video for d in used), tuple(d.probe for d in done), tuple(frames))
-
-
-class _PixelFiles:
-    """The pixels of finished videos, one behind the other, and the list of what they are.
-
-    The list is written after the pixels: what a kill left over behind the last line is cut off when it is resumed.
-    """
-
-    def __init__(self, work: Path, size: int) -> None:
-        work.mkdir(parents=True, exist_ok=True)
-        self.size = size
-        self.files = (work / FRAMES_FILE, work / REFERENCES_FILE)
-        self.list_file = work / "done.jsonl"
-        for file in (*self.files, self.list_file):
-            file.touch()
-        self.frames, self.references = (file.open("r+b") for file in self.files)
-        self.list = self.list_file.open("r+", encoding="utf-8")
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for stream in (self.frames, self.references, self.list):
-            stream.close()
-
-    def resume(self, jobs: Sequence[_Job]) -> list[_Done]:
-        """Take over what is finished of the first jobs, as far as their files are unchanged; drop everything else."""
-        done: list[_Done] = []
-        lines = 0
-        for job, line in zip(jobs, self.list_file.read_bytes().splitlines(keepends=True), strict=False):
-            try:
-                entry = _Done.model_validate_json(line)
-            except ValidationError:  # A line that was being written when the process died.
-                break
-            if entry.stamp != job.stamp() or not line.endswith(b"\n"):
-                break
-            done.append(entry)
-            lines += len(line)
-        kept = sum(len(d.places) for d in done), sum(bool(d.places) for d in done)
-        ends = [HEADER_BYTES + count * self.size * self.size * 3 for count in kept]
-        streams = (self.frames, self.references)
-        if done and any(stream.seek(0, io.SEEK_END) < end for stream, end in zip(streams, ends, strict=True)):
-            # The pixels are gone: moved to their place already, or lost with the machine's power.
-            done, lines, ends = [], 0, [HEADER_BYTES] * 2
-        for stream, end in zip(streams, ends, strict=True):
-            stream.truncate(end)
-            stream.seek(end)
-        self.list.truncate(lines)
-        self.list.seek(0, io.SEEK_END)
-        return done
-
-    def add(self, job: _Job, done: _Done) -> None:
-        """Append a video, and remove the file that it came in."""
-        with job.pixels.open("rb") as pixels:
-            reference = pixels.read(self.size * self.size * 3)
-            if done.places:
-                self.references.write(reference)
-                shutil.copyfileobj(pixels, self.frames, 1 << 20)
-        for stream in (self.references, self.frames):
-            stream.flush()
-        self.list.write(done.model_dump_json() + "\n")
-        self.list.flush()
-        job.pixels.unlink()
-
-    def finish(self, out: Path, frames: int, references: int) -> None:
-        """Write the headers, which need the counts, and move both files to their place."""
-        out.mkdir(parents=True, exist_ok=True)
-        for stream, file, count in zip((self.frames, self.references), self.files, (frames, references), strict=True):
-            stream.seek(0)
-            stream.write(_header((count, self.size, self.size, 3)))
-            stream.flush()
-            with atomic(out / file.name) as temporary:
-                shutil.move(file, temporary)  # Which may be on another, and a full, disk.
+    return Extraction(tuple(each.video for _, each in used), tuple(each.probe for each in done), tuple(frames))
 
 
 def _work(job: _Job) -> _Done | Finding:
@@ -196,25 +137,18 @@ def _work(job: _Job) -> _Done | Finding:
     result = scan(job.file, job.config)
     if isinstance(result, Finding):
         return result
-    with job.pixels.open("wb") as stream:
-        stream.write(result.reference.data)
-        stream.writelines(kept.image.data for kept in result.kept)
-    return _Done(
+    done = _Done(
         stamp=stamp,
         video=result.video,
         probe=result.probe,
         places=tuple((kept.index, kept.score) for kept in result.kept),
     )
-
-
-def _header(shape: tuple[int, ...]) -> bytes:
-    """A .npy header; NumPy pads it so that the first dimension may grow without making it longer."""
-    stream = io.BytesIO()
-    np.lib.format.write_array_header_1_0(stream, {"descr": "|u1", "fortran_order": False, "shape": shape})
-    return stream.getvalue()
-
-
-HEADER_BYTES = len(_header((0, 64, 64, 3)))
+    pixels = {"reference": result.reference}
+    if result.kept:
+        pixels["frames"] = np.stack([kept.image for kept in result.kept])
+    with atomic(job.pixels) as temporary:
+        save_file(pixels, temporary, {"done": done.model_dump_json()})
+    return done
 
 
 def _warn(file: VideoFile, probe: Probe) -> None:
