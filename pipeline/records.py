@@ -146,9 +146,6 @@ class Probe(Record):
     """Contact strength in the last frame."""
     starts_touching: bool
     """Whether the reference had to be taken from the end."""
-    texture_start: float
-    """Deviation of the detail in the first frames' picture: contact adds detail."""
-    texture_end: float
     thumbnail: tuple[float, ...]
     """The reference, 6 x 8 x (brightness, two colour differences), flattened."""
     signature: tuple[float, ...]

@@ -55,8 +55,6 @@ def probe(video_id: str = "rug_0", **changes: object) -> Probe:
         "quiet": 0.25,
         "contact_end": 0.3,
         "starts_touching": False,
-        "texture_start": 2.0,
-        "texture_end": 2.0,
         "thumbnail": tuple(rng.normal(90, 1, 6 * 8 * 3)),
         "signature": tuple(contact / np.linalg.norm(contact)),
     }

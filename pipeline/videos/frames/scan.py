@@ -13,7 +13,7 @@ from pipeline.io import sha256
 from pipeline.records import Finding, Probe, Severity, Video
 from pipeline.videos.decoding import Image
 from pipeline.videos.files import VideoFile
-from pipeline.videos.frames.reference import contact_strength, detail, starts_touching
+from pipeline.videos.frames.reference import contact_strength, starts_touching
 from pipeline.videos.frames.selection import Kept
 from pipeline.videos.frames.video_pass import VideoPass, reference_from_end, run_pass
 
@@ -74,7 +74,6 @@ def scan(file: VideoFile, config: FramesConfig) -> Scan | Finding:
 
 def _probe(file: VideoFile, video: Video, found: VideoPass, touching: bool) -> Probe:
     assert found.reference is not None, "set where there are frames"
-    assert found.first is not None, "set where there are frames"
     assert found.last is not None, "set where there are frames"
     shown = found.last if found.strongest is None else found.strongest
     untouched = found.reference.thumb
@@ -98,8 +97,6 @@ def _probe(file: VideoFile, video: Video, found: VideoPass, touching: bool) -> P
         quiet=min(found.strengths, default=0.0),
         contact_end=contact_strength(found.last, untouched),
         starts_touching=touching,
-        texture_start=detail(found.first),
-        texture_end=detail(found.last),
         thumbnail=_flat(cv2.resize(untouched, THUMBNAIL_SIZE, interpolation=cv2.INTER_AREA)),
         signature=_signature(found.brightness_thumbnails, untouched),
     )
