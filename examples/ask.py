@@ -7,6 +7,8 @@ from pipeline import Octopi
 
 scenes = sorted(Path("data/scenes/videos").rglob("*.*"))
 folder = sys.argv[1] if len(sys.argv) > 1 else "models/finetuned-with-all-0"
+if len(sys.argv) == 3:
+    sys.exit("name two videos")
 first, second = sys.argv[2:4] if len(sys.argv) > 3 else (scenes[0], scenes[-1])
 
 model = Octopi.from_pretrained(folder)

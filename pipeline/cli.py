@@ -104,12 +104,13 @@ def publish() -> None:
 
 
 CATALOGUE = typer.Option(help="Folder with objects.csv and properties.yaml.")
+PHYSICLEAR = Path(__file__).parent / "physiclear"
 
 
 @data_app.command()
 def check(
     folder: Annotated[Path, typer.Argument(help="Folder with the videos.")],
-    catalogue: Annotated[Path, CATALOGUE] = Path("pipeline/physiclear"),
+    catalogue: Annotated[Path, CATALOGUE] = PHYSICLEAR,
 ) -> None:
     """List every file of a folder that is wrong or odd; status 1 where something must be mended."""
     from pipeline.videos.audit.run import check_folder
@@ -121,7 +122,7 @@ def check(
 @data_app.command()
 def audit(
     folder: Annotated[Path, typer.Argument(help="Folder with the videos.")],
-    catalogue: Annotated[Path, CATALOGUE] = Path("pipeline/physiclear"),
+    catalogue: Annotated[Path, CATALOGUE] = PHYSICLEAR,
     split: Annotated[str, typer.Option(help="Also look for leaks between the parts of this split.")] = "",
     out: Annotated[Path, typer.Option(help="Where all findings go.")] = Path("audit.csv"),
 ) -> None:
@@ -237,6 +238,8 @@ def ask(
 
     if isfile(question):  # pathlib's raises where a question is longer than a file's name may be.
         raise UserError(f"{question}: is a file; write the question before it, with {{tactile}} once for each video")
+    if json and not question:
+        raise UserError("--json takes a question")
     asked = _load(model, base, device)
 
     def say(text: str) -> None:
@@ -264,7 +267,8 @@ def describe(
     from pipeline.use.ask import describe_folder
 
     rows, failed = describe_folder(_load(model, base, device), folder, csv)
-    typer.echo(f"{csv}: {rows} videos{f', {failed} of them not described (column error)' if failed else ''}")
+    lacking = f", {failed} of them not described (column error; delete their rows to try them again)" if failed else ""
+    typer.echo(f"{csv}: {rows} videos{lacking}")
 
 
 @app.command()
@@ -304,7 +308,7 @@ def demo(
     folder: Annotated[Path | None, typer.Argument(help="A trained model; by default the full system's.")] = None,
     base: Annotated[Path | None, BASE] = None,
     device: Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")] = "auto",
-    catalogue: Annotated[Path, CATALOGUE] = Path(__file__).parent / "physiclear",
+    catalogue: Annotated[Path, CATALOGUE] = PHYSICLEAR,
     port: Annotated[int, typer.Option(help="Of 127.0.0.1.")] = 7860,
 ) -> None:
     """Show a page to drop videos on: what the model sees, what it takes them for, and a chat. Nothing leaves."""
@@ -335,6 +339,10 @@ def main() -> None:
     except UserError as error:
         typer.echo(f"octopi: {error}", err=True)
         raise SystemExit(1) from None
-    except OSError as error:
-        typer.echo(f"octopi: {error.filename or 'a file'}: {error.strerror}; choose another place", err=True)
+    except Exception as error:
+        from pipeline.stage import disk_error
+
+        if (refused := disk_error(error)) is None:
+            raise
+        typer.echo(f"octopi: {refused}", err=True)
         raise SystemExit(1) from None

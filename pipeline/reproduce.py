@@ -21,19 +21,21 @@ def outdated(root: Path) -> tuple[int, int]:
     import networkx as nx
     from dvc.exceptions import DvcException
     from dvc.repo import Repo
+    from dvc.scm import SCMError
 
-    with Repo(str(root)) as repo:
-        try:
-            changed = set(repo.status(targets=[CHAIN]))
-        except DvcException as error:
-            back = "`git checkout dvc.lock` brings back the last one of Git; without one, delete it"
-            mend = back if LOCK in str(error) else "mend it"
-            raise UserError(f"{' '.join(str(error).split())}; {mend}") from None
-        graph = repo.index.graph
-        waiting = {stage for stage in graph if stage.addressing in changed}
-        for stage in tuple(waiting):
-            waiting |= nx.ancestors(graph, stage)
-        return len(waiting), sum(stage.path_in_repo == CHAIN for stage in graph)
+    try:
+        with Repo(str(root)) as repo:
+            changed, graph = set(repo.status(targets=[CHAIN])), repo.index.graph
+    except SCMError:
+        raise UserError(f"{root.resolve()}: no Git repository, which DVC needs; clone it, or `git init`") from None
+    except DvcException as error:
+        back = "`git checkout dvc.lock` brings back the last one of Git; without one, delete it"
+        mend = back if LOCK in str(error) else "mend it"
+        raise UserError(f"{' '.join(str(error).split())}; {mend}") from None
+    waiting = {stage for stage in graph if stage.addressing in changed}
+    for stage in tuple(waiting):
+        waiting |= nx.ancestors(graph, stage)
+    return len(waiting), sum(stage.path_in_repo == CHAIN for stage in graph)
 
 
 def reproduce(root: Path, arguments: list[str]) -> int:

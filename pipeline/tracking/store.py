@@ -80,7 +80,7 @@ class Store:
         database = MLRUNS.resolve() / "mlflow.db"
         self.uri = tracking.uri or f"sqlite:///{database}"
         # Several folders may share a server; the local database moves with its folder.
-        self.mine = {FOLDER: f"{socket.gethostname()}:{Path.cwd()}"} if tracking.uri else {}
+        self.mine = {FOLDER: f"{socket.gethostname()}:{Path.cwd()}".replace("'", "_")} if tracking.uri else {}
         MLRUNS.mkdir(exist_ok=True)
         self.lock = FileLock(MLRUNS / ".lock", timeout=LOCK_SECONDS)
         # Several first starts at once on a new database break it.

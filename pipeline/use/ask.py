@@ -99,7 +99,7 @@ class Chat:
         touch = self.model.look(file)
         self.waiting.append(file)
         self.say("".join(f"{file}: {note}\n" for note in touch.notes))
-        self.say(f"{len(self.waiting)} for the next question: write {{tactile}} once for each\n")
+        self.say(f"{len(self.waiting)} for the next question: {{tactile}} once for each, or they stand in front\n")
 
     def _command(self, name: str, rest: str) -> None:
         match name:
@@ -115,6 +115,8 @@ class Chat:
 
     def _ask(self, question: str) -> None:
         said = ""
+        if "{tactile}" not in question:
+            question = "{tactile} " * len(self.waiting) + question
         for piece in self.model.stream(question, self.waiting, history=self.history):
             self.say(piece)
             said += piece
@@ -175,11 +177,11 @@ def _done(out: Path, columns: Sequence[str], name: str) -> dict[str, str]:
     """Files that a CSV has already, each with its error; what a kill left of a last line is cut off."""
     if not out.is_file():
         return {}
-    text = out.read_text(encoding="utf-8")
-    whole = text[: text.rfind("\n") + 1]
+    # A kill may have cut a character in two; a stranger's file may have others.
+    text = out.read_text(encoding="utf-8", errors="replace")
+    whole, begun = text[: text.rfind("\n") + 1], _row(columns)
     rows = list(csv.DictReader(io.StringIO(whole)))
-    header = next(csv.reader(io.StringIO(whole)), [])
-    if (whole and header != columns) or any(row["model"] != name for row in rows):
+    if not (text.startswith(begun) or begun.startswith(text)) or any(row["model"] != name for row in rows):
         raise UserError(f"{out}: is no description by {name}; name another file with --csv")
     if whole != text:
         write_text(out, whole)

@@ -6,16 +6,13 @@ Everything comes from this machine: the page asks for nothing elsewhere, and its
 from __future__ import annotations
 
 import base64
-import queue
 import re
 import shutil
 import tempfile
-import threading
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 import cv2
@@ -24,7 +21,6 @@ from fastapi import FastAPI, Request
 from fastapi.responses import JSONResponse, Response, StreamingResponse
 from fastapi.staticfiles import StaticFiles
 from pydantic import BaseModel, Field
-from starlette.concurrency import run_in_threadpool
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from pipeline.config import ScenesConfig
@@ -36,12 +32,12 @@ from pipeline.scenes.render import make_scene, render
 from pipeline.tasks.opd import TEMPLATES
 from pipeline.use.results import Exchange, Pictures, Touch
 from pipeline.use.server import listen, make_server
+from pipeline.use.worker import Failed, Job, Metrics, Worker
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 
 if TYPE_CHECKING:
     from pipeline.use.model import Octopi
 
-T = TypeVar("T")
 PAGE = Path(__file__).with_name("page")
 HOSTS = ["127.0.0.1", "localhost"]
 """Names that the page answers to, so that no other site's name can be pointed at it."""
@@ -66,7 +62,7 @@ class Asked(BaseModel):
 
     question: str = Field(max_length=4000)
     touches: list[str] = Field(default=[], max_length=3)
-    history: list[Turn] = Field(default=[], max_length=50)
+    history: list[Turn] = []
 
 
 class Room:
@@ -80,16 +76,22 @@ class Room:
         self.names = {o: catalogue.objects[o].name for o in self.scenes} if catalogue else {}
         self.folder = Path(tempfile.mkdtemp(prefix="octopi-demo-"))
         self.videos: dict[str, Path] = {}
-        self._worker = ThreadPoolExecutor(1, "model")
+        self.worker = Worker(Metrics())
 
     def close(self) -> None:
         """Forget everything that was shown."""
-        self._worker.shutdown(cancel_futures=True)
+        self.worker.stop()
         shutil.rmtree(self.folder, ignore_errors=True)
 
-    def work(self, task: Callable[[], T]) -> T:
+    def run(self, ask: Callable[[], Iterator[Any]]) -> Job:
+        """Have the model's thread do something; its pieces come from the job."""
+        job = Job(ask, lambda: None)
+        self.worker.add(job)
+        return job
+
+    async def work(self, task: Callable[[], Any]) -> Any:
         """Wait for the model's thread to do something."""
-        return self._worker.submit(task).result()
+        return await anext(self.run(lambda: iter([task()])).pieces())
 
     def scene(self, object_id: str) -> Path:
         """A synthetic press of an object, rendered once."""
@@ -129,41 +131,31 @@ class Room:
             "probabilities": said.probabilities,
         }
 
-    def stream(self, asked: Asked) -> Iterator[str]:
-        """The answer in pieces. The model's thread makes them; it stops where nobody listens any more.
+    async def stream(self, asked: Asked) -> AsyncIterator[str]:
+        """The answer in pieces; it stops where nobody listens any more.
 
         Raises:
             UserError: if the question does not fit, before the first piece.
         """
         turns = [Exchange(t.question, self._find(t.touches), t.answer) for t in asked.history]
-        videos, pieces, gone = self._find(asked.touches), queue.Queue[str](), threading.Event()
+        videos = self._find(asked.touches)
+        job = self.run(lambda: self.model.stream(asked.question, videos, history=turns))
+        pieces = job.pieces()
+        return self._rest(await anext(pieces, ""), pieces, job)
 
-        def generate() -> None:
-            for piece in self.model.stream(asked.question, videos, history=turns):
-                if gone.is_set():
-                    return
-                pieces.put(piece)
-
-        done = self._worker.submit(generate)
-        done.add_done_callback(lambda _: pieces.put(""))
-        first = pieces.get()
-        if not first:
-            done.result()
-        return self._rest(first, pieces, gone, done)
-
-    def _rest(self, piece: str, pieces: queue.Queue[str], gone: threading.Event, done: Future[None]) -> Iterator[str]:
+    async def _rest(self, first: str, pieces: AsyncIterator[str], job: Job) -> AsyncIterator[str]:
         try:
-            while piece or not done.done():
+            yield first
+            async for piece in pieces:
                 yield piece
-                piece = pieces.get()
-            if (error := done.exception()) is not None:
-                yield f"\n[{error}]" if isinstance(error, UserError) else "\n[the answer broke off; see the terminal]"
+        except (UserError, Failed) as error:
+            yield f"\n[{error}]"
         finally:
-            gone.set()
+            job.left.set()
 
     def _find(self, keys: Sequence[str]) -> tuple[Path, ...]:
         if unknown := [key for key in keys if key not in self.videos]:
-            raise UserError(f"{len(unknown)} touches are forgotten; drop them on the page again")
+            raise UserError(f"{len(unknown)} touches are forgotten; begin a new conversation, and drop them again")
         return tuple(self.videos[key] for key in keys)
 
 
@@ -213,7 +205,7 @@ def make_app(room: Room) -> FastAPI:
         return {"variant": room.model.card.get("variant", ""), "example": TEMPLATES[0], "scenes": named}
 
     @app.put("/api/touches/{name}")
-    async def drop(name: str, request: Request) -> dict[str, Any]:
+    async def drop(name: str, request: Request) -> Any:
         """The body is the file itself."""
         file = room.folder / uuid4().hex / (Path(name).name or "video")
         file.parent.mkdir()
@@ -223,20 +215,20 @@ def make_app(room: Room) -> FastAPI:
                     if stream.tell() + len(chunk) > MOST_BYTES:
                         raise UserError(f"{name}: more than {MOST_BYTES // 1_000_000} MB; drop a shorter video")
                     stream.write(chunk)
-            return await run_in_threadpool(room.work, lambda: room.show(file.name, file))
+            return await room.work(lambda: room.show(file.name, file))
         except BaseException:
             shutil.rmtree(file.parent)
             raise
 
     @app.put("/api/scenes/{object_id}")
-    def scene(object_id: str) -> dict[str, Any]:
+    async def scene(object_id: str) -> Any:
         if object_id not in room.scenes:
             raise UserError(f"{object_id}: no such scene")
-        return room.work(lambda: room.show(f"{room.names[object_id]} (synthetic)", room.scene(object_id)))
+        return await room.work(lambda: room.show(f"{room.names[object_id]} (synthetic)", room.scene(object_id)))
 
     @app.post("/api/ask")
-    def ask(asked: Asked) -> StreamingResponse:
-        return StreamingResponse(room.stream(asked), media_type="text/plain; charset=utf-8")
+    async def ask(asked: Asked) -> StreamingResponse:
+        return StreamingResponse(await room.stream(asked), media_type="text/plain; charset=utf-8")
 
     app.mount("/", StaticFiles(directory=PAGE, html=True))
     return app

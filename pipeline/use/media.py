@@ -81,7 +81,9 @@ def from_base64(text: str, place: str = "video") -> bytes:
     try:
         data = base64.b64decode(text[head.end() :] if head else text, validate=True)
     except (binascii.Error, ValueError):
-        raise Refused(f"{place}: broken base64; encode the file's bytes with the standard alphabet") from None
+        raise Refused(
+            f"{place}: broken base64; encode the file's bytes with the standard alphabet, in one line"
+        ) from None
     if not data:
         raise Refused(f"{place}: empty; send the video's bytes")
     return data

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import os
+import threading
 from typing import Any
 
 import mlflow.models
@@ -38,6 +39,7 @@ class TouchModel(PythonModel):
         settings["base"] = settings.get("base") or os.environ.get("OCTOPI_BASE") or None
         self.model = Octopi.from_pretrained(context.artifacts["folder"], **settings)
         self.gate = Gate(Limits())
+        self.lock = threading.Lock()  # MLflow serves each request in a thread, and a model takes one at a time.
 
     def predict(self, context: Any, model_input: pd.DataFrame, params: dict[str, Any] | None = None) -> pd.DataFrame:
         """Answer each row.
@@ -71,7 +73,7 @@ class TouchModel(PythonModel):
         if sum(map(len, videos)) > limits.body_bytes:
             raise Refused(f"its videos are larger than {limits.body_bytes} bytes; send fewer or shorter ones", 413)
         data = [from_base64(text, f"video {i}") for i, text in enumerate(videos, 1)]
-        with self.gate.files(data) as files:
+        with self.gate.files(data) as files, self.lock:
             return str(self.model.ask(question, files))
 
 

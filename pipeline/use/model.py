@@ -11,9 +11,10 @@ from typing import Any, Self
 import numpy as np
 import torch
 
+from pipeline.config import LanguageConfig
 from pipeline.errors import UserError, did_you_mean
 from pipeline.language.chat import TACTILE, TACTILE_TOKENS
-from pipeline.language.generate import GenerationSettings, reply, stream, write_prompt
+from pipeline.language.generate import reply, stream, write_prompt
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.records import Opd, Turn
 from pipeline.runtime import (
@@ -124,7 +125,7 @@ class Octopi:
     ) -> Iterator[str]:
         """As `ask`, in pieces of text as they come. Bad input is refused here, before the first piece is asked for."""
         prompt, features = self._prompt((*history, Exchange(question, _listed(videos), "")))
-        return stream(self.llm, prompt, features, self._settings(max_new_tokens))
+        return stream(self.llm, prompt, features, self._language(max_new_tokens))
 
     def ask_all(
         self, asked: Sequence[tuple[str, Video | Sequence[Video]]], *, max_new_tokens: int | None = None
@@ -237,22 +238,16 @@ class Octopi:
 
     # ---- within ----
 
-    def _settings(self, max_new_tokens: int | None) -> GenerationSettings:
+    def _language(self, max_new_tokens: int | None) -> LanguageConfig:
         language = self.config.language
-        return GenerationSettings(
-            system_prompt=language.system_prompt,
-            per_video=self.config.frames.per_video,
-            max_new_tokens=max_new_tokens or language.max_new_tokens,
-            batch_size=language.generation_batch_size,
-            bos=language.bos,
-        )
+        return language.model_copy(update={"max_new_tokens": max_new_tokens or language.max_new_tokens})
 
     def _reply(
         self, conversations: Iterable[Sequence[Exchange]], max_new_tokens: int | None, *, untouched: bool = False
     ) -> list[str]:
         asked = [self._prompt(conversation, untouched=untouched) for conversation in conversations]
         prompts, features = [prompt for prompt, _ in asked], [found for _, found in asked]
-        return [said.text for said in reply(self.llm, prompts, features, self._settings(max_new_tokens), label="")]
+        return [said.text for said in reply(self.llm, prompts, features, self._language(max_new_tokens), label="")]
 
     def _prompt(
         self, conversation: Sequence[Exchange], *, untouched: bool = False
@@ -261,7 +256,7 @@ class Octopi:
         for exchange in conversation:
             check_question(exchange.question, len(exchange.videos))
         turns = [Turn(user=exchange.question, assistant=exchange.answer) for exchange in conversation]
-        prompt = write_prompt(turns, self.llm.tokenizer, self._settings(None))
+        prompt = write_prompt(turns, self.llm.tokenizer, self.config.language, self.config.frames.per_video)
         positions = self.llm.positions
         if positions is not None and len(prompt) >= positions:
             raise UserError(

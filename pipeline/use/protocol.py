@@ -7,7 +7,7 @@ import uuid
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 
 from pipeline.use.media import Refused, from_base64
 
@@ -55,11 +55,19 @@ class ImagePart(BaseModel):
 Part = Annotated[TextPart | VideoPart | ImagePart, Field(discriminator="type")]
 
 
+def _parts(content: object) -> object:
+    """A text alone is one part."""
+    return [{"type": "text", "text": content}] if isinstance(content, str) else content
+
+
+Content = Annotated[list[Part], Field(min_length=1, max_length=MESSAGES), BeforeValidator(_parts)]
+
+
 class Message(BaseModel):
     """One turn."""
 
     role: Literal["system", "developer", "user", "assistant"]
-    content: Text | Annotated[list[Part], Field(min_length=1, max_length=MESSAGES)]
+    content: Content
 
 
 class ChatRequest(BaseModel):
@@ -112,7 +120,7 @@ def read_conversation(messages: Sequence[Message], most: int) -> list[Said]:
     turns = [(i, m) for i, m in enumerate(messages) if m.role in ("user", "assistant")]
     if len(turns) % 2 == 0 or any(m.role != ("user", "assistant")[place % 2] for place, (_, m) in enumerate(turns)):
         raise Refused("messages: user and assistant must take turns, the user first and last")
-    count = sum(not isinstance(p, TextPart) for m in messages if not isinstance(m.content, str) for p in m.content)
+    count = sum(not isinstance(part, TextPart) for message in messages for part in message.content)
     if count > most:
         raise Refused(f"messages: {count} videos; a request may bring at most {most}, earlier turns included", 413)
     said = [_read(message, f"messages.{i}") for i, message in turns]
@@ -123,8 +131,6 @@ def read_conversation(messages: Sequence[Message], most: int) -> list[Said]:
 
 
 def _read(message: Message, place: str) -> tuple[str, tuple[bytes, ...]]:
-    if isinstance(message.content, str):
-        return message.content, ()
     marked = any(isinstance(p, TextPart) and MARK in p.text for p in message.content)
     text, videos = "", []
     for i, part in enumerate(message.content):

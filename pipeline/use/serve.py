@@ -11,6 +11,7 @@ import hmac
 import math
 import threading
 import time
+from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack, asynccontextmanager, suppress
 from functools import partial
@@ -230,7 +231,7 @@ def make_app(
         service.gate.close()
 
     app = FastAPI(title="octopi serve", lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url=None)
-    app.state.service = service
+    app.state.service, counts = service, service.metrics.requests
 
     @app.post("/v1/chat/completions")
     async def chat(request: Request) -> Response:
@@ -264,6 +265,7 @@ def make_app(
         return JSONResponse(error_body(message, status), status, getattr(error, "headers", None))
 
     async def fail(_: Request, __: Exception) -> Response:
+        counts[500] += 1  # It answers outside of `_Count`.
         return JSONResponse(error_body(str(Failed()), 500), 500)
 
     app.add_exception_handler(AnyHTTPException, refuse)
@@ -271,20 +273,20 @@ def make_app(
     app.add_exception_handler(Failed, refuse)
     app.add_exception_handler(ClientDisconnect, refuse)
     app.add_exception_handler(Exception, fail)
-    app.add_middleware(_Count, counts=service.metrics.requests)
+    app.add_middleware(_Count, counts=counts)
     return app
 
 
 class _Count:
     """Counts answers by status."""
 
-    def __init__(self, app: Any, counts: dict[int, int]) -> None:
+    def __init__(self, app: Any, counts: Counter[int]) -> None:
         self.app, self.counts = app, counts
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         async def counting(message: Message) -> None:
             if message["type"] == "http.response.start":
-                self.counts[message["status"]] = self.counts.get(message["status"], 0) + 1
+                self.counts[message["status"]] += 1
             await send(message)
 
         await self.app(scope, receive, counting)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -57,8 +56,8 @@ def see(video: Video, frames: FramesConfig, *, subtracts: bool, quiet: float) ->
         found = scan(VideoFile(path, name, object_id="", video_id=path.stem), frames)
     if isinstance(found, Finding):
         raise UserError(f"{name}: {found.measured}")
-    if found.video.frames < FEWEST or not found.kept:
-        raise UserError(f"{name}: {found.video.frames} frames show no touch; record from before the contact to its end")
+    if found.probe.frames < FEWEST or not found.kept:
+        raise UserError(f"{name}: {found.probe.frames} frames show no touch; record from before the contact to its end")
     return _shown(name, found, frames, subtracts, quiet)
 
 
@@ -95,7 +94,7 @@ def _as_file(video: Video) -> Iterator[Path]:
             raise UserError(f"a {type(video).__name__} is no video; give a file, or an array of uint8")
         path = Path(video)
         # A pipe or a device is not opened: reading it may never end.
-        if not path.exists() or not stat.S_ISREG(path.stat().st_mode):
+        if not os.path.isfile(path):  # pathlib's raises where a name is too long.
             raise UserError(f"{path}: no such file; name a video")
         yield path
         return

@@ -7,6 +7,7 @@ import logging
 import queue
 import threading
 import time
+from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -29,7 +30,7 @@ class Failed(Exception):
 class Metrics:
     """What happened since the start, in Prometheus' text format."""
 
-    requests: dict[int, int] = field(default_factory=dict)
+    requests: Counter[int] = field(default_factory=Counter)
     """By status."""
     answers: list[float] = field(default_factory=lambda: [0.0] * (len(BUCKETS) + 1))
     """How many took as long as each bucket and not less; the last has no end."""

@@ -16,7 +16,7 @@ from pipeline.encoder.clips import EncoderData, classify
 from pipeline.encoder.embed import Loaded, embed_videos, standardize, statistics
 from pipeline.encoder.recipes import base_encoder, property_classifier
 from pipeline.io import fingerprint, save_tensors, write_jsonl, write_table
-from pipeline.language.generate import GenerationSettings, answer
+from pipeline.language.generate import answer
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import add_lora
 from pipeline.records import (
@@ -132,14 +132,7 @@ def make(where: Path, variant: Variant, *overrides: str) -> Made:
     trained = data / "models" / variant.lora / f"{variant.encoder}-{variant.opd}-0"
     model.save_pretrained(trained)
     questions = build_questions(pool_of(Part.TEST, parts, catalogue), ASKED, seed=0, distinct=False, facts=True)
-    settings = GenerationSettings(
-        system_prompt=params.language.system_prompt,
-        per_video=params.frames.per_video,
-        max_new_tokens=params.language.max_new_tokens,
-        batch_size=params.language.generation_batch_size,
-        bos=params.language.bos,
-    )
-    predictions = answer(model.eval(), embeddings, questions, variant.opd, settings)
+    predictions = answer(model.eval(), embeddings, questions, variant.opd, params.language, params.frames.per_video)
     write_jsonl(data / "answers" / variant.key / "real.jsonl", predictions)
     rows = [
         {"task": t, "measure": TASKS[t].measure, **variant._asdict(), "touch": "real", "n": 8, "chance": 0.5}

@@ -22,12 +22,6 @@ from tests.use.shared import Made
 QUESTION = "Describe {tactile}."
 
 
-def test_one_question(made: Made, octopi: Octopi, files: list[Path]) -> None:
-    said = CliRunner().invoke(app, ["ask", QUESTION, str(files[0]), "--model", str(made.folder), "--device", "cpu"])
-    assert said.exit_code == 0, said.output
-    assert said.stdout == octopi.ask(QUESTION, files[:1]) + "\n"
-
-
 def test_one_question_for_machines(made: Made, octopi: Octopi, files: list[Path]) -> None:
     said = CliRunner().invoke(app, ["ask", QUESTION, str(files[0]), "--model", str(made.folder), "--json"])
     found = json.loads(said.stdout)
@@ -65,24 +59,6 @@ def test_a_chat_from_standard_input(made: Made, octopi: Octopi, files: list[Path
     assert octopi.ask(QUESTION, files[:1]) in said.stdout
 
 
-def test_what_is_wrong_is_one_line(
-    made: Made, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for arguments, message in (
-        (["--model", str(made.folder / "nothing")], "holds no config.json"),
-        (["--model", str(made.folder), "--device", "gpu"], "allowed: auto, cpu, cuda, mps"),
-        (["--model", str(made.folder), QUESTION, "none.avi"], "none.avi: no such file"),
-        ([str(made.folder / "config.json")], "is a file; write the question before it"),
-    ):
-        monkeypatch.setattr(sys, "argv", ["octopi", "ask", *arguments])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        error = capsys.readouterr().err.strip().splitlines()[-1]
-        assert ended.value.code == 1
-        assert error.startswith("octopi: ")
-        assert message in error
-
-
 def test_a_chat(octopi: Octopi, files: list[Path]) -> None:
     said: list[str] = []
     chat = Chat(octopi, said.append)
@@ -95,9 +71,9 @@ def test_a_chat(octopi: Octopi, files: list[Path]) -> None:
     assert "no video yet" in type_("/frames")
     assert "1 for the next question" in type_(f"/add {files[0]}")
     assert "nothing.avi: no such file" in type_("/add nothing.avi")
-    assert "0 {tactile} for 1 videos" in type_("Is it soft?"), "the chat goes on"
-    first = octopi.ask(QUESTION, files[:1])
-    assert type_(QUESTION) == first + "\n"
+    assert "2 {tactile} for 1 videos" in type_("Is {tactile} softer than {tactile}?"), "the chat goes on"
+    first = octopi.ask("{tactile} How soft is it?", files[:1])
+    assert type_("How soft is it?") == first + "\n", "without marks they stand in front"
     assert type_("And now?") == octopi.ask("And now?", history=chat.history[:1]) + "\n"
     assert [len(e.videos) for e in chat.history] == [1, 0]
     numbers = ", ".join(map(str, octopi.look(files[0]).numbers))
@@ -207,3 +183,12 @@ def test_the_full_system_is_asked_by_default(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
         (tmp_path / name / "config.json").touch()
     assert default_model(tmp_path).name == "finetuned-with-all-0"
+
+
+@pytest.mark.parametrize("content", [b"my only notes", b"file,object\n", "file;größe\n".encode("utf-16")])
+def test_what_somebody_else_wrote_stays(content: bytes, octopi: Octopi, folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "notes.txt"
+    out.write_bytes(content)
+    with pytest.raises(UserError, match="is no description by"):
+        describe_folder(octopi, folder, out)
+    assert out.read_bytes() == content

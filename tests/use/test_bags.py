@@ -134,7 +134,7 @@ def test_each_press_becomes_a_video_that_the_chain_takes(
         assert min(inside) > 3 * max(r.contact for r in rows if begin + r.frame not in touched)
         seen = scan(file, FramesConfig(size=32, per_video=3, selection="contact"))
         assert isinstance(seen, Scan)
-        assert (seen.video.frames, seen.video.fps, seen.probe.starts_touching) == (len(rows), 25.0, False)
+        assert (seen.probe.frames, seen.probe.fps, seen.probe.starts_touching) == (len(rows), 25.0, False)
         assert all(begin + kept.index in touched for kept in seen.kept), "what is kept shows contact"
         # The film is lossy; a frame's neighbours in it must not be what it shows.
         shown = list(decode(file.path))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import json
 import os
@@ -29,6 +30,7 @@ from pipeline.scenes.recipe import load_recipes
 from pipeline.use.demo import MOST_TOUCHES, Asked, Room, Turn, make_app, where
 from pipeline.use.model import Octopi
 from pipeline.use.results import Exchange
+from pipeline.use.worker import Failed
 from pipeline.videos.catalogue import Catalogue
 from tests.conftest import ROOT, encode
 from tests.use.browser import tab
@@ -133,19 +135,32 @@ def test_an_answer_streams_with_its_history(site: str, room: Room, tmp_path: Pat
     assert len(model.threads - {threading.get_ident()}) == 1, "one thread does all that the model does"
 
 
+def said(room: Room, **asked: Any) -> str:
+    """A whole answer."""
+
+    async def whole() -> str:
+        return "".join([piece async for piece in await room.stream(Asked(**asked))])
+
+    return asyncio.run(whole())
+
+
 def test_an_answer_that_nobody_hears_ends(room: Room) -> None:
     model: Any = room.model
-    model.paused.clear()
-    pieces = room.stream(Asked(question="wait " + "on " * 50))
-    next(pieces)
-    pieces.close()  # type: ignore[attr-defined]
-    before = model.made
-    model.paused.set()
-    assert room.work(lambda: model.made) <= before + 1
+
+    async def leave() -> None:
+        model.paused.clear()
+        pieces: Any = await room.stream(Asked(question="wait " + "on " * 50))
+        await anext(pieces)
+        await pieces.aclose()
+        before = model.made
+        model.paused.set()
+        assert await room.work(lambda: model.made) <= before + 1
+
+    asyncio.run(leave())
 
 
 def test_an_answer_that_breaks_off_says_so(room: Room) -> None:
-    assert "".join(room.stream(Asked(question="break"))) == "break <b>0</b> \n[the answer broke off; see the terminal]"
+    assert said(room, question="break") == f"break <b>0</b> \n[{Failed()}]"
 
 
 def test_what_is_wrong_comes_back_as_one_line(site: str, tmp_path: Path) -> None:
@@ -157,7 +172,7 @@ def test_what_is_wrong_comes_back_as_one_line(site: str, tmp_path: Path) -> None
         (text, "touches/notes.txt", "notes.txt: no frame decodes; copy it again, convert it, or remove it"),
         (text, "touches/..%5C..%5Ca.mp4", "no frame decodes"),
         (ask, "ask", "the question has 1 {tactile} for 0 videos"),
-        (lost, "ask", "1 touches are forgotten; drop them on the page again"),
+        (lost, "ask", "1 touches are forgotten; begin a new conversation, and drop them again"),
         (("PUT", None), "scenes/nothing", "nothing: no such scene"),
     ):
         status, answer = call(f"{site}/api/{place}", method, body)
@@ -196,8 +211,8 @@ def test_old_touches_are_forgotten(tmp_path: Path) -> None:
         shutil.copy(videos[0], video)
     ids = [room.show("rug", video)["id"] for video in videos]
     with pytest.raises(UserError, match="forgotten"):
-        room.stream(Asked(question="{tactile}", touches=ids[:1]))
-    assert "".join(room.stream(Asked(question="{tactile}", touches=ids[1:2])))
+        said(room, question="{tactile}", touches=ids[:1])
+    assert said(room, question="{tactile}", touches=ids[1:2])
     assert all(video.exists() for video in videos), "a file that the page was not given is not its own"
     room.show("rug", videos[0])
     assert [video.exists() for video in dropped] == [False] + [True] * (MOST_TOUCHES - 1)
@@ -207,14 +222,14 @@ def test_old_touches_are_forgotten(tmp_path: Path) -> None:
 def test_a_trained_model_is_shown_and_asked(octopi: Octopi, files: list[Path]) -> None:
     """The class itself, of random weights: what the page is given is what it says by itself."""
     room = Room(octopi)
-    shown = room.work(lambda: room.show("ice block", files[0]))
-    said = octopi.describe(files[0])
-    assert (shown["levels"], shown["probabilities"]) == (said.levels, said.probabilities)
-    assert len(shown["frames"]) == len(shown["touched"]) == len(said.frames)
-    first = "".join(room.stream(Asked(question="Soft? {tactile}", touches=[shown["id"]])))
+    shown = asyncio.run(room.work(lambda: room.show("ice block", files[0])))
+    described = octopi.describe(files[0])
+    assert (shown["levels"], shown["probabilities"]) == (described.levels, described.probabilities)
+    assert len(shown["frames"]) == len(shown["touched"]) == len(described.frames)
+    first = said(room, question="Soft? {tactile}", touches=[shown["id"]])
     assert first == octopi.ask("Soft? {tactile}", files[:1])
     turn = Turn(question="Soft? {tactile}", touches=[shown["id"]], answer=first)
-    again = "".join(room.stream(Asked(question="Why?", history=[turn])))
+    again = said(room, question="Why?", history=[turn])
     assert again == octopi.ask("Why?", history=[Exchange("Soft? {tactile}", tuple(files[:1]), first)])
     room.close()
 

@@ -191,14 +191,6 @@ def test_over_http_as_mlflow_serves_it(loaded: Any, octopi: Octopi, files: list[
     assert client.post("/invocations", json={"dataframe_records": [question]}).status_code == 200
 
 
-def test_the_same_model_is_registered_once(logged: Logged, made: Made) -> None:
-    assert register(logged.client, made.params, [(made.variant, logged.run)]) == logged.address
-    name = logged.address.removeprefix("models:/").partition("@")[0]
-    assert [m.version for m in logged.client.search_model_versions(f"name = '{name}'")] in (["1"], [1])
-    assert logged.client.get_model_version_by_alias(name, "best").run_id == logged.run
-    assert register(logged.client, made.params, []) == ""
-
-
 def test_a_folder_counts_when_it_is_whole(made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert packaged(made.variant) is None
