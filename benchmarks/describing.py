@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from statistics import fmean
 
-from benchmarks.errors import Error, error_of, reported
+from benchmarks.errors import Error, error_of
 from benchmarks.table import Row, make_rows
-from pipeline.io import read_table
+from pipeline.io import read_csv, read_table
 from pipeline.params import load_params
-from pipeline.records import Graded
+from pipeline.records import Graded, ScoreRow
 
 DESCRIBED = ("PC", "PSS", "POM")
 """Tasks that can be answered without describing, over which errors are averaged."""
@@ -22,11 +22,15 @@ def describing(root: Path) -> list[Row]:
     ends: as wide as if all tasks erred together.
     """
     graded, report = root / "data" / "graded.parquet", root / "reports" / load_params(root / "params.yaml").report_name
-    full = {"encoder": "finetuned", "lora": "with", "touch": "real"}
-    scores = reported(root / "reports", **full, measure="choice", seed="all").get(report, [])
-    if not graded.is_file():
+    full = ("finetuned", "with", "real")
+    if not (graded.is_file() and (report / "scores.csv").is_file()):
         return []
-    answers = [a for a in read_table(graded, Graded) if (a.encoder, a.lora, a.touch) == tuple(full.values())]
+    scores = [
+        row
+        for row in read_csv(report / "scores.csv", ScoreRow)
+        if (row.encoder, row.lora, row.touch, row.measure, row.seed) == (*full, "choice", "all")
+    ]
+    answers = [a for a in read_table(graded, Graded) if (a.encoder, a.lora, a.touch) == full]
     costs: dict[str, list[float]] = {}
     errors = {}
     for opd in ("all", "needed", "none"):

@@ -114,7 +114,12 @@ def _trees(bed: Bed) -> Callable[[VideoFile], object]:
     shape = len(bed.videos), len(VIDEO_FEATURE_NAMES)
     features = np.random.default_rng(0).standard_normal(shape, dtype=np.float32)
     predictor = PropertyPredictor(bed.classes).fit(features, bed.labels, bed.objects)
-    return lambda file: predictor.predict(describe(Recording(file.path, _scan(file).probe.starts_touching))[None])
+
+    def said(file: VideoFile) -> object:
+        probe = _scan(file).probe
+        return predictor.predict(describe(Recording(file.path, probe.frames, probe.starts_touching))[None])
+
+    return said
 
 
 def prompts(bed: Bed) -> list[Row]:

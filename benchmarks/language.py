@@ -24,13 +24,13 @@ from benchmarks.describing import describing
 from benchmarks.errors import share_of
 from benchmarks.table import Row, make_rows
 from benchmarks.timing import flops_of, interleaved, machine, one_thread
-from pipeline.config import EncoderConfig
+from pipeline.config import EncoderConfig, LanguageConfig
 from pipeline.embeddings import FLIPS, INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
 from pipeline.encoder.model import FrameEncoder, base_encoder
 from pipeline.io import save_tensors, write_table
 from pipeline.language.chat import IGNORE_INDEX
-from pipeline.language.conversations import ConversationCollator, ConversationDataset, LengthBuckets, Sample
-from pipeline.language.generate import GenerationSettings, answer
+from pipeline.language.conversations import ConversationDataset, LengthBuckets, collate
+from pipeline.language.generate import answer
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.params import load_params
 from pipeline.records import Assignment, Embedding, Opd, Part, Question
@@ -92,11 +92,12 @@ class Bed:
 
 def measure(root: Path, size: Size | None = None) -> list[Row]:
     """All questions; how much to describe only where answers were graded and their report written."""
+    described = describing(root)  # First, as it may be refused.
     with one_thread(), TemporaryDirectory() as folder:
         bed = make_bed(root, size := size or Size(), Path(folder))
         optimiser = torch.optim.AdamW(bed.model.connector.parameters(), lr=3e-3)
         train(bed, WAYS["4 at a time, of like length"], bed.training, optimiser)
-        return [*training(bed, size), *answering(bed, size), *formats(bed, size), *describing(root)]
+        return [*training(bed, size), *answering(bed, size), *formats(bed, size), *described]
 
 
 def make_bed(root: Path, size: Size, folder: Path) -> Bed:
@@ -191,9 +192,11 @@ def train(bed: Bed, way: Way, questions: Sequence[Question], optimiser: torch.op
         optimiser.zero_grad()
 
 
-def loss(bed: Bed, way: Way, questions: Sequence[Question], samples: Sequence[Sample], labelled: int) -> torch.Tensor:
+def loss(
+    bed: Bed, way: Way, questions: Sequence[Question], samples: Sequence[dict[str, torch.Tensor]], labelled: int
+) -> torch.Tensor:
     """A batch's share of the loss of an update with so many labelled tokens."""
-    batch = ConversationCollator(0)(samples)
+    batch = collate(samples)
     if way.encodes:
         batch["features"] = torch.stack([bed.encode(q) for q in questions])
     if not way.all_logits:
@@ -268,8 +271,8 @@ def _asked(question: str, ways: Mapping[str, Callable[[object], list[str]]], bed
 
 def _texts(bed: Bed, model: OctopiForCausalLM, limit: int, batch: int, _: object) -> list[str]:
     """The pipeline's own way."""
-    settings = GenerationSettings(system_prompt="", per_video=FRAMES, max_new_tokens=limit, batch_size=batch)
-    return [prediction.outputs[0] for prediction in answer(model, bed.store, bed.asked, Opd.ALL, settings)]
+    language = LanguageConfig(weights="", max_new_tokens=limit, generation_batch_size=batch)
+    return [prediction.outputs[0] for prediction in answer(model, bed.store, bed.asked, Opd.ALL, language, FRAMES)]
 
 
 @torch.no_grad()

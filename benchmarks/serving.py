@@ -13,8 +13,10 @@ import urllib.request
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from statistics import quantiles
+
+import numpy as np
 
 from benchmarks.table import Row, make_rows
 from benchmarks.timing import machine, milliseconds
@@ -41,24 +43,28 @@ def measure(root: Path, clients: int = CLIENTS, each: int = EACH) -> list[Row]:
     if not videos:
         raise UserError(f"{place}: holds no video to ask about; `dvc repro` makes or finds some")
     ask = [*COMMAND, "ask", QUESTION, str(videos[0]), "--model", str(folder)]
-    first = milliseconds(lambda: subprocess.run(ask, check=True, capture_output=True))
+    done: list[subprocess.CompletedProcess[str]] = []
+    first = milliseconds(lambda: done.append(subprocess.run(ask, capture_output=True, text=True, check=False)))
+    if done[0].returncode:
+        raise UserError(done[0].stderr.strip() or "octopi ask failed")
     with served(folder) as address:
         bodies = [body(folder.name, video) for video in videos]
         alone = {b: post(address, b) for b in bodies}
-        once = [milliseconds(lambda b=b: post(address, b)) for b in bodies]  # type: ignore[misc]
+        once = [milliseconds(partial(post, address, b)) for b in bodies]
+
+        def again(data: bytes) -> None:
+            if post(address, data) != alone[data]:
+                raise UserError("an answer under load is not the one given alone")
 
         def client(number: int) -> list[float]:
-            return [timed(address, bodies[(number + i) % len(bodies)], alone) for i in range(each)]
+            return [milliseconds(partial(again, bodies[(number + i) % len(bodies)])) for i in range(each)]
 
         with ThreadPoolExecutor(clients) as pool:
             loaded = [spent for found in pool.map(client, range(clients)) for spent in found]
-    costs = {
-        "a fresh process, first answer": first,
-        "a server, one client: median": percentile(once, 50),
-        "a server, one client: 95 % are quicker": percentile(once, 95),
-        f"a server, {clients} clients: median": percentile(loaded, 50),
-        f"a server, {clients} clients: 95 % are quicker": percentile(loaded, 95),
-    }
+    costs = {"a fresh process, first answer": first}
+    for who, spent in (("one client", once), (f"{clients} clients", loaded)):
+        for what, share in (("median", 50), ("95 % are quicker", 95)):
+            costs[f"a server, {who}: {what}"] = float(np.percentile(spent, share))
     return make_rows(
         "serving",
         {name: [spent] for name, spent in costs.items()},
@@ -91,19 +97,6 @@ def post(address: str, data: bytes) -> str:
             if error.code != 429:
                 raise UserError(f"the server answers {error.code}: {error.read().decode()[:200]}") from None
             time.sleep(0.1)
-
-
-def timed(address: str, data: bytes, alone: dict[bytes, str]) -> float:
-    """Milliseconds of an answer, which must be the one that was given alone."""
-    started = time.perf_counter()
-    if post(address, data) != alone[data]:
-        raise UserError("an answer under load is not the one given alone")
-    return 1000 * (time.perf_counter() - started)
-
-
-def percentile(values: list[float], share: int) -> float:
-    """The value that so many percent are below, interpolated."""
-    return quantiles(values, n=100, method="inclusive")[share - 1] if len(values) > 1 else values[0]
 
 
 @contextmanager

@@ -64,16 +64,6 @@ def front(costs: Sequence[float], errors: Sequence[float]) -> list[bool]:
     return [not any(c <= cost and e <= error and (c, e) != (cost, error) for c, e in points) for cost, error in points]
 
 
-def cost_ratios(costs: Mapping[str, Sequence[float]], baseline: str) -> dict[str, float]:
-    """Median over the repeats of each setting's cost over the baseline's in the same repeat.
-
-    Raises:
-        KeyError: where the baseline was not measured.
-    """
-    base = costs[baseline]
-    return {name: median(c / b for c, b in zip(own, base, strict=True)) for name, own in costs.items()}
-
-
 def make_rows(
     question: str,
     costs: Mapping[str, Sequence[float]],
@@ -93,11 +83,12 @@ def make_rows(
         errors: Of settings; those without have none, and are not on the front.
         counts: Of settings, by the names of the counting columns.
     """
-    ratios, errors, counts = cost_ratios(costs, baseline), errors or {}, counts or {}
+    errors, counts = errors or {}, counts or {}
     rows = []
     for name, own in costs.items():
         error = errors.get(name)
-        values = {"cost": median(own), "cost_ratio": ratios[name], **counts.get(name, {})}
+        ratio = median(c / b for c, b in zip(own, costs[baseline], strict=True))
+        values = {"cost": median(own), "cost_ratio": ratio, **counts.get(name, {})}
         if error is not None:
             values |= error.columns
         rounded = {column: float(f"{value:.4g}") for column, value in values.items()}

@@ -5,6 +5,7 @@ It holds facts alone and no score, as none is known when a model has been traine
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -74,8 +75,12 @@ def _weights(path: Path) -> list[Path]:
 def front_matter(folder: Path) -> dict[str, Any]:
     """What the card in a folder says in its front matter; empty where there is none."""
     card = folder / CARD_FILE
-    text = card.read_text(encoding="utf-8") if card.is_file() else ""
-    front: Any = yaml.safe_load(text.split("---\n")[1]) if text.startswith("---\n") else None
+    text = card.read_text(encoding="utf-8", errors="replace") if card.is_file() else ""
+    found = re.match(r"---\n(.*?)^---\s*$", text, re.DOTALL | re.MULTILINE)
+    try:
+        front: Any = yaml.safe_load(found[1]) if found else None
+    except yaml.YAMLError:  # Of another's model: it is then as good as none.
+        front = None
     return front if isinstance(front, dict) else {}
 
 

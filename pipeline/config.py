@@ -46,7 +46,10 @@ class Section(BaseModel):
         """Python counts `true` as 1, and so `epochs: true` would train for one epoch."""
         for name, value in values.items() if isinstance(values, dict) else ():
             field = cls.model_fields.get(name)
-            if isinstance(value, bool) and field is not None and field.annotation is not bool:
+            if field is None or field.annotation is bool or isinstance(field.annotation, type(BaseModel)):
+                continue
+            inner = value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else [value]
+            if any(isinstance(each, bool) for each in inner):
                 raise ValueError(f"{name} is {str(value).lower()}, but no switch")
         return values
 

@@ -84,7 +84,7 @@ def read_json(path: Path) -> Any:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise UserError(f"{path}: no such file; `dvc repro` makes it") from None
-    except json.JSONDecodeError as error:
+    except ValueError as error:  # Or not UTF-8.
         raise UserError(f"{path}: not JSON ({error}); delete it and run `dvc repro`") from None
 
 

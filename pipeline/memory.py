@@ -218,11 +218,15 @@ def launched(launcher: str) -> tuple[int, bool]:
         given, _ = parser.parse_known_args(shlex.split(launcher))
     except (argparse.ArgumentError, ValueError) as error:
         raise UserError(f"runtime.launcher: {error}") from None
-    settings: dict[str, object] = {}
-    if given.config_file and given.config_file.is_file():
+    if given.config_file is None:
+        return given.num_processes or 1, False
+    try:
         settings = yaml.safe_load(given.config_file.read_text(encoding="utf-8"))
-    devices = given.num_processes or int(str(settings.get("num_processes", 1)))
-    return devices, settings.get("distributed_type") == "FSDP"
+        return given.num_processes or int(settings.get("num_processes", 1)), settings.get("distributed_type") == "FSDP"
+    except (OSError, yaml.YAMLError, AttributeError, TypeError, ValueError):
+        raise UserError(
+            f"runtime.launcher: {given.config_file} is no configuration of accelerate's; name one that is"
+        ) from None
 
 
 def longest(params: Params, catalogue: Catalogue, language: Path) -> Lengths:

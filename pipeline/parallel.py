@@ -213,7 +213,4 @@ def _there(folder: str, work: Callable[[J], R], job: J) -> R:
 
 
 def _died(label: str, job: object) -> UserError:
-    return UserError(
-        f"{label}: a process died at or soon after {job}; was it killed for want of memory? Run again: what is "
-        "finished is kept"
-    )
+    return UserError(f"{label}: a process died at or soon after {job}; was it killed for want of memory? Run again")

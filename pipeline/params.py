@@ -18,7 +18,7 @@ PARAMS_FILE = Path("params.yaml")
 def load_params(path: Path = PARAMS_FILE) -> Params:
     """Read and check params.yaml."""
     try:
-        values = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
+        values = yaml.load(path.read_text(encoding="utf-8"), Loader=OneKeyLoader)
     except UnicodeDecodeError:
         raise UserError(f"{path}: not UTF-8; save it as such, or `octopi scale smoke` rewrites it") from None
     except FileNotFoundError:
@@ -32,10 +32,11 @@ def load_params(path: Path = PARAMS_FILE) -> Params:
     return validate(values, str(path))
 
 
-class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+class OneKeyLoader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
     """Refuses a key that stands twice, of which YAML readers take the last one silently."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """As PyYAML's."""
         seen = set()
         for key, _ in node.value:
             if key.value in seen:

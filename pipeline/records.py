@@ -112,20 +112,13 @@ class Video(Record):
     """Pixels."""
 
 
-class Probe(Record):
+class Probe(Video):
     """What one decode of a video measured on the side, for the audit. Brightness is in 8-bit steps."""
 
-    video_id: str
-    object_id: str
-    path: str
     session: str
     """The recording session as videos.csv names it; empty where it does not."""
     header_frames: int
     """Frames that the file's header promises."""
-    frames: int
-    fps: float
-    width: int
-    height: int
     rotation: int
     """Degrees against the clock by which the metadata turn the picture; done already in what is kept."""
     irregular: float

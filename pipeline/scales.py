@@ -19,6 +19,7 @@ from pipeline.encoder.candidates import check_candidates
 from pipeline.encoder.recipes import check_recipe
 from pipeline.errors import UserError
 from pipeline.io import write_text
+from pipeline.memory import launched
 from pipeline.parallel import check_backend
 from pipeline.params import PARAMS_FILE, validate
 from pipeline.records import Part, Touch
@@ -67,10 +68,15 @@ def compose(name: str, overrides: Sequence[str] = (), conf: Path = CONF) -> Para
     try:
         with initialize_config_dir(str(conf.resolve()), version_base=None):
             values = OmegaConf.to_container(hydra_compose(name, overrides=forced), resolve=True)
-    except (HydraException, OmegaConfBaseException) as error:
+    except (HydraException, OmegaConfBaseException, yaml.YAMLError, UnicodeDecodeError) as error:
         raise UserError(f"scale {name}: {' '.join(str(error).split())}") from None
     assert isinstance(values, dict)
-    return validate({str(k): v for k, v in values.items()}, f"scale {name}")
+    params = validate({str(k): v for k, v in values.items()}, f"scale {name}")
+    if params.scale != name:
+        raise UserError(
+            f"{conf / name}.yaml: it calls itself {params.scale}, and would replace its reports; write scale: {name}"
+        )
+    return params
 
 
 def _literal(override: str) -> str:
@@ -92,12 +98,13 @@ def check_inputs(params: Params) -> None:
     catalogue = load_catalogue(Path(params.data.catalogue))
     check_recipe(params.encoder.recipe)
     check_backbones(params.encoder.backbone)
-    check_candidates(params.cross_validation.models, params.encoder)
+    check_candidates(params.cross_validation.models, params.encoder, params.frames.size)
     counts_by_task(params.questions, "train")
     counts_by_task(params.questions, "evaluation")
     launcher = shlex.split(params.runtime.launcher)
     if not launcher or shutil.which(launcher[0]) is None:
         raise UserError(f"runtime.launcher: no program {params.runtime.launcher!r}; set it to python, or install it")
+    launched(params.runtime.launcher)
     check_backend(params.runtime.parallel)
     folder = Path(params.data.dir)
     if params.data.source == "videos" and folder.exists() and not folder.is_dir():
@@ -205,5 +212,5 @@ def prune(params: Params, data: Path) -> None:
     }
     for folder, keys in keep.items():
         for entry in (data / folder).glob("*"):
-            if entry.name not in keys:
+            if entry.is_dir() and entry.name not in keys:
                 shutil.rmtree(entry)

@@ -99,19 +99,22 @@ def stage(name: str, key: str | None = None) -> Iterator[Stage]:
                 )
             if _main_process():
                 _write_run(running, started)
+                shutil.rmtree(CHECKPOINTS / full, ignore_errors=True)
                 said = ", ".join(f"{k} {v:g}" for k, v in list(running.metrics.items())[:4])
                 print(f"{full}: done in {time.time() - started:.1f} s{': ' if said else ''}{said}", flush=True)
     except UserError as error:
         sys.exit(f"{full}: {error}")
-    except MemoryError:
-        sys.exit(f"{full}: out of memory; lower the batch sizes in params.yaml")
     except Exception as error:
+        if isinstance(error, MemoryError) or any(words in str(error) for words in NO_MEMORY):
+            sys.exit(f"{full}: out of memory; lower the batch sizes in params.yaml")
         refused = disk_error(error)
         if refused is None:
             raise
         sys.exit(f"{full}: {refused}")
 
 
+NO_MEMORY = ("out of memory", "can't allocate memory", "CUBLAS_STATUS_ALLOC_FAILED")
+"""How torch says it, on a GPU and on a processor: by a RuntimeError."""
 OS_ERROR = re.compile(r"\(os error (\d+)\)")
 """How safetensors ends what the operating system said."""
 TORCH_WRITES = ("iostream error", "PytorchStreamWriter failed")

@@ -17,7 +17,7 @@ def main() -> None:
     with stage("align", key) as run:
         config = run.params.align
         material = Material.load(DATA, run.params, encoder, opd, seed)
-        model, data = assemble(material, config.samples, "align")
+        model, data = assemble(material, config, "align")
         if config.begin_with_words:
             begin_with_words(model, data, load_catalogue(Path(run.params.data.catalogue)), material.seed)
         if config.train_embeddings == "all":

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from pipeline.embeddings import EmbeddingStore
 from pipeline.io import read_jsonl, write_csv, write_jsonl
-from pipeline.language.generate import GenerationSettings, ModelSource, answer
+from pipeline.language.generate import ModelSource, answer
 from pipeline.language.input_ablation import ablate_input
 from pipeline.language.teach.gate import RESTATING, examine, gate_questions
 from pipeline.parallel import device_here
@@ -28,25 +28,22 @@ def main() -> None:
         asked = DATA / "questions" / str(variant.seed)
         questions = read_jsonl(asked / "evaluation.jsonl", Question)
         for touch in (Touch.REAL, *(params.ablation.touch if variant.full else ())):
-            settings = GenerationSettings(
-                system_prompt=language.system_prompt,
-                per_video=0 if touch is Touch.REMOVED else params.frames.per_video,
-                max_new_tokens=language.max_new_tokens,
-                batch_size=language.generation_batch_size,
-                bos=language.bos,
-            )
+            per_video = 0 if touch is Touch.REMOVED else params.frames.per_video
             given = ablate_input(store, touch, questions, variant.seed)
-            predictions = answer(model, given, questions, variant.opd, settings, source)
+            predictions = answer(model, given, questions, variant.opd, language, per_video, source)
             write_jsonl(DATA / "answers" / variant.key / f"{touch}.jsonl", predictions)
             run.metrics[f"{touch}.answers"] = len(predictions)
             run.metrics[f"{touch}.tokens"] = sum(p.tokens for p in predictions)
             run.metrics[f"{touch}.truncated"] = sum(p.truncated for p in predictions)
             if variant.full and touch is Touch.REAL:
                 examples = read_jsonl(asked / "examples.jsonl", Question)
-                shown = answer(model, store, examples, variant.opd, settings, source)
+                shown = answer(model, store, examples, variant.opd, language, per_video, source)
                 write_jsonl(DATA / "answers" / variant.key / "examples.jsonl", shown)
         if variant.full and params.teach.base:
             # What its adapter left of the reasoning that the base was taught.
+            if model.words is not None:
+                read = model.llm.get_input_embeddings().weight
+                model.llm.set_input_embeddings(model.words.to(read.dtype))
             scores = examine(
                 model.llm,
                 model.tokenizer,

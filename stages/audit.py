@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from pipeline.io import read_table, write_csv, write_text
-from pipeline.records import Finding, Probe, Video
+from pipeline.records import Finding, Probe
 from pipeline.stage import DATA, stage
 from pipeline.videos.audit.run import AUDIT_FILE, audit_chain, stop_on_errors, summary
 from pipeline.videos.catalogue import load_catalogue
@@ -16,7 +16,6 @@ def main() -> None:
         findings = audit_chain(
             Path(run.params.data.dir),
             read_table(DATA / "frames" / PROBES_FILE, Probe),
-            read_table(DATA / "videos.parquet", Video),
             list(read_splits(DATA, run.params.split, run.params.ablation.seeds).values()),
             load_catalogue(Path(run.params.data.catalogue)),
         )

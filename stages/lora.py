@@ -14,14 +14,7 @@ def main() -> None:
         config = run.params.lora
         material = Material.load(DATA, run.params, encoder, opd, seed)
         aligned = DATA / "models" / "without" / key
-        model, data = assemble(
-            material,
-            config.samples,
-            "lora",
-            aligned,
-            counterfactual=config.counterfactual,
-            conclusion_weight=config.conclusion_weight,
-        )
+        model, data = assemble(material, config, "lora", aligned)
         add_lora(model, config)
         with live(run) as callbacks:
             # The connector, and the word embeddings where they were trained.

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.config import FramesConfig, ScenesConfig
-from pipeline.records import Assignment, Finding, Part, Probe, Severity, Video
+from pipeline.records import Assignment, Finding, Part, Probe, Severity
 from pipeline.runtime import derive_seed
 from pipeline.scenes.light import make_sensor
 from pipeline.scenes.recipe import recipe_of
@@ -39,6 +39,7 @@ def probe(video_id: str = "rug_0", **changes: object) -> Probe:
         "video_id": video_id,
         "object_id": video_id.rpartition("_")[0],
         "path": f"{video_id}.mov",
+        "sha256": f"sha of {video_id}",
         "session": "",
         "header_frames": 126,
         "frames": 126,
@@ -65,19 +66,6 @@ def probes(videos: int = 3, objects: Sequence[str] = OBJECTS) -> list[Probe]:
     return [probe(f"{o}_{i}") for o in objects for i in range(videos)]
 
 
-def video(of: Probe, sha256: str = "") -> Video:
-    return Video(
-        video_id=of.video_id,
-        object_id=of.object_id,
-        path=of.path,
-        sha256=sha256 or f"sha of {of.path}",
-        frames=of.frames,
-        fps=of.fps,
-        width=of.width,
-        height=of.height,
-    )
-
-
 def assigned(found: Sequence[Probe], parts: dict[str, Part]) -> list[Assignment]:
     """Parts by video id, else by object."""
     return [
@@ -99,8 +87,8 @@ def of(findings: Sequence[Finding] | Iterator[Finding], check: str) -> list[Find
 
 
 def leaks(found: Sequence[Probe], parts: dict[str, Part], catalogue: Catalogue, **sha256: str) -> list[Finding]:
-    videos = [video(p, sha256.get(p.video_id, "")) for p in found]
-    return list(check_leakage(evidence(found, videos, assigned(found, parts)), catalogue))
+    found = [p.model_copy(update={"sha256": sha256.get(p.video_id, p.sha256)}) for p in found]
+    return list(check_leakage(evidence(found, assigned(found, parts)), catalogue))
 
 
 def relabelled(catalogue: Catalogue, **changes: object) -> Catalogue:
@@ -116,7 +104,7 @@ def recorded(object_id: str, seed: int, sensor: int = 0) -> list[np.ndarray]:
     return list(render(scene, SCENE, look, seed))
 
 
-def look_at(path: Path, video_id: str) -> tuple[Probe, Video]:
+def look_at(path: Path, video_id: str) -> Probe:
     found = scan(VideoFile(path, path.name, video_id.rpartition("_")[0], video_id), FramesConfig(size=16))
     assert isinstance(found, Scan)
-    return found.probe, found.video
+    return found.probe

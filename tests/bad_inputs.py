@@ -164,6 +164,9 @@ def bad_inputs() -> Iterator[BadInput]:
     # Stages: their command line, and what the stages before them left.
     for arguments, words in (
         ("align.py nonsense all 0", "encoder is 'nonsense'; allowed: finetuned, base"),
+        ("align.py finetuned All 0", "opd is 'All'"),
+        ("align.py finetuned all ²", "seed is '²'"),
+        ("align.py finetuned all 00", "seed is '00'"),
         ("align.py finetuned all", "2 values instead of 3"),
         ("lora.py finetuned al 0", "opd is 'al'; allowed: none, needed, all"),
         ("lora.py", "0 values instead of 3"),
@@ -190,6 +193,7 @@ def bad_inputs() -> Iterator[BadInput]:
     for text in ("{", "stages: 3\n", "- a\n", "<<<<<<< HEAD\na: 1\n", b"\xff\xfe", "a: 1\na: 1\n"):
         locked = partial(put, "dvc.lock", text)
         yield BadInput("repro", ["dvc.lock", "git checkout dvc.lock"], locked)
+    yield BadInput("publish", ["dvc.lock: no such file"])
     for text in ("{", "stages: 3\n", "stages: {split: 3}\n", "<<<<<<< HEAD\na: 1\n", b"\xff\xfe"):
         yield BadInput("publish", ["dvc.lock: .*restore it from Git"], partial(put, "dvc.lock", text))
     # A trained model, and what is done with it.
@@ -198,6 +202,8 @@ def bad_inputs() -> Iterator[BadInput]:
         yield BadInput(f"{command}{where}", ["nothing: .*|holds no"])
     yield BadInput("ask", ["models.*trained model"])
     yield BadInput("ask --model nothing --device gpu", ["allowed: auto, cpu, cuda, mps"])
+    yield BadInput("ask params.yaml", ["is a file; write the question"])
+    yield BadInput("ask --json", ["--json takes a question"])
     yield BadInput("serve nothing --host 0.0.0.0", ["token"])
     yield BadInput("import bag none.bag --topic /a --out out", ["none.bag"])
     yield BadInput("compare nowhere", ["nowhere: no commit"])

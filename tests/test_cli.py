@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import csv
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 from pipeline.cli import app
-from pipeline.errors import UserError
 from pipeline.params import load_params
 from tests.closure import ROOT
 from tests.conftest import moving_square, write_video
@@ -34,27 +31,6 @@ def test_scale_writes_what_it_says(project: Path) -> None:
     assert "reports/smoke-scenes/" in result.output
     assert load_params().ablation.seeds == (3,)
     assert "unchanged" in RUNNER.invoke(app, ["scale", "smoke", "ablation.seeds=[3]"]).output
-
-
-def test_refused_scale_leaves_the_old_params(project: Path) -> None:
-    RUNNER.invoke(app, ["scale", "smoke"])
-    before = Path("params.yaml").read_bytes()
-    result = RUNNER.invoke(app, ["scale", "small", "data.source=videos", "data.dir=nowhere"])
-    assert isinstance(result.exception, UserError)
-    assert Path("params.yaml").read_bytes() == before
-
-
-def test_bad_input_is_one_line_on_stderr_with_status_1(project: Path) -> None:
-    done = subprocess.run(
-        [Path(sys.executable).parent / "octopi", "scale", "smoke", "frames.sise=3"],
-        text=True,
-        capture_output=True,
-        check=False,
-    )
-    assert done.returncode == 1
-    assert done.stdout == ""
-    assert done.stderr.count("\n") == 1
-    assert "did you mean size" in done.stderr
 
 
 def lines(output: str, severity: str) -> list[str]:
@@ -91,15 +67,6 @@ def test_data_check_lists_every_error_first(folder: Path) -> None:
     assert "decodes: rug_0.avi: empty (0 bytes); copy it again, or remove it" in errors[2]
 
 
-@pytest.mark.parametrize("command", ["check", "audit"])
-def test_an_empty_folder_is_an_error(project: Path, command: str) -> None:
-    (project / "videos").mkdir()
-    result = RUNNER.invoke(app, ["data", command, "videos"])
-    assert result.exit_code == 1
-    assert len(lines(result.output, "error")) == 1
-    assert "holds no video" in result.output
-
-
 def audited(*arguments: str) -> tuple[int, str, list[dict[str, str]]]:
     """Status, what was printed, and audit.csv."""
     result = RUNNER.invoke(app, ["data", "audit", "videos", *arguments, "--out", "found/audit.csv"])
@@ -134,16 +101,3 @@ def test_data_audit_ends_with_status_1_where_parts_share_a_video(folder: Path) -
     ]
     assert len(lines(output, "error")) == 1
     assert audited()[0] == 0, "without a split it is a warning"
-
-
-def test_a_missing_catalogue_is_refused(folder: Path) -> None:
-    result = RUNNER.invoke(app, ["data", "audit", str(folder), "--catalogue", "nowhere"])
-    assert isinstance(result.exception, UserError)
-    assert "properties.yaml" in str(result.exception)
-
-
-@pytest.mark.real
-def test_data_check_passes_the_public_videos(real_data: Path) -> None:
-    result = RUNNER.invoke(app, ["data", "check", str(real_data), "--catalogue", str(ROOT / "pipeline/physiclear")])
-    assert result.exit_code == 0, result.output
-    assert "hairbrush_bristles_side_4" in result.output, "three frames are worth a warning"

@@ -74,11 +74,6 @@ def test_wrong_override_is_one_line_with_key_and_mend(overrides: list[str], word
         assert word in message
 
 
-def test_unknown_scale_names_the_known() -> None:
-    with pytest.raises(UserError, match="paper-7b, small, smoke"):
-        compose("huge", conf=CONF)
-
-
 @pytest.mark.parametrize(
     ("text", "word"),
     [
@@ -120,6 +115,8 @@ def test_any_folder_may_hold_the_videos(name: str, tmp_path: Path) -> None:
         ("small data.source=videos data.dir=nowhere", "data.dir: nowhere does not exist"),
         ("small data.source=videos data.dir=params.yaml", "data.dir: params.yaml is a file"),
         ("smoke runtime.launcher=acelerate", "runtime.launcher.*acelerate"),
+        ("smoke questions.train={opd:true}", "train is .*true.*, but no switch"),
+        ("smoke ablation.seeds=[true]", "seeds is .true., but no switch"),
         ("smoke encoder.weights=nowhere", "hf download timm"),
         ("smoke language.weights=nowhere", "hf download lmsys"),
         ("small teach.base=", "language.weights: data/taught is what teaching makes.*teach.base"),
@@ -192,13 +189,32 @@ def test_prune_keeps_what_params_name_and_removes_the_rest(tmp_path: Path) -> No
     )
     for name in (*names, "cross_validation/trees", "cross_validation/paper"):
         (tmp_path / name).mkdir(parents=True)
+    (tmp_path / "answers" / ".DS_Store").touch()
     prune(params, tmp_path)
+    assert (tmp_path / "answers" / ".DS_Store").is_file(), "it is no variant's"
     left = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_dir() and not list(p.iterdir())}
     assert left == {
         "models/with/base-all-0", "models/without", "answers/finetuned-with-all-0", "encoder", "cross_validation/trees",
     }  # fmt: skip
     shutil.rmtree(tmp_path)
     prune(params, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("defaults: [small, _self_]\n", "it calls itself small, and would replace its reports; write scale: mine"),
+        ("defaults: [small\n", "scale mine: "),
+        ("scale: mine\nscale: other\n", "scale mine: "),
+        ("scale: größer\n".encode("latin-1"), "scale mine: "),
+    ],
+)
+def test_a_scale_of_ones_own_is_checked(text: str | bytes, words: str, tmp_path: Path) -> None:
+    conf = Path(shutil.copytree(CONF, tmp_path / "conf"))
+    (conf / "mine.yaml").write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(UserError, match=words) as caught:
+        compose("mine", conf=conf)
+    assert "\n" not in str(caught.value)
 
 
 def test_a_recipe_brings_its_settings_and_gives_way_to_yours() -> None:

@@ -37,9 +37,3 @@ def test_on_a_card_it_follows_the_card(capable: bool, monkeypatch: pytest.Monkey
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: capable)
     assert name_dtype("auto") == name_dtype("auto", "cuda") == ("bfloat16" if capable else "float32")
     assert resolve_dtype("auto") is getattr(torch, name_dtype("auto"))
-
-
-@pytest.mark.parametrize("name", ["float32", "bfloat16", "float16"])
-def test_other_names_stay(name: str) -> None:
-    assert name_dtype(name) == name  # type: ignore[arg-type]
-    assert resolve_dtype(name) is getattr(torch, name)  # type: ignore[arg-type]

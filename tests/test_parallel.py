@@ -89,15 +89,15 @@ def main():
     parts = read_table(data / "splits" / "0.parquet", Assignment)
     here = embed_videos(encoder(), parts, encoder)
     source = generate.ModelSource(data / "models" / "with" / "finetuned-all-0", "llama", "float32", "none", "cpu")
-    settings = generate.GenerationSettings("", params.frames.per_video, 12, 8)
+    language = params.language.model_copy(update={"max_new_tokens": 12, "generation_batch_size": 8})
     store, model = EmbeddingStore(data / "embeddings" / "finetuned-0"), source()
-    said = generate.answer(model, store, made.questions, Opd.ALL, settings, source)
+    said = generate.answer(model, store, made.questions, Opd.ALL, language, params.frames.per_video, source)
 
     use_backend(sys.argv[1])
     generate.greedy = None  # Not in this process.
     there = embed_videos(encoder()._replace(encoder=None), parts, encoder)
     assert torch.equal(here[0], there[0]) and here[1] == there[1]
-    assert generate.answer(model, store, made.questions, Opd.ALL, settings, source) == said
+    assert generate.answer(model, store, made.questions, Opd.ALL, language, params.frames.per_video, source) == said
     assert len(said) > 40 and len({p.outputs for p in said}) > 10
 
 if __name__ == "__main__":
@@ -123,7 +123,7 @@ def work_on(backend: str, folder: Path, videos: Path) -> dict[str, str]:
     refused, died = (folder / "said").read_text().splitlines()
     assert refused == "file 7 is broken; mend it"
     assert died.startswith("numbers: a process died at or soon after "), died
-    assert died.endswith("Run again: what is finished is kept")
+    assert died.endswith("Run again")
     alive = [int(f.stem) for f in folder.glob("*.pid") if psutil.pid_exists(int(f.stem))]
     _, alive_still = psutil.wait_procs([psutil.Process(pid) for pid in alive], timeout=20)
     assert not alive_still, "a worker outlives the work"

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 from filelock import FileLock
 from hypothesis import given
 from hypothesis import strategies as st
@@ -41,6 +42,8 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_stage_says_when_it_starts_and_ends_and_what_it_cost(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (here / "checkpoints/align@x/1").mkdir(parents=True)
+    (here / "checkpoints/lora@x/1").mkdir(parents=True)
     with stage("align", "x") as run:
         run.finish_training([Measurement(step=1, name="loss", value=2.0), Measurement(step=5, name="loss", value=1.5)])
     written = json.loads((here / "runs/align@x.json").read_text())
@@ -51,6 +54,7 @@ def test_a_stage_says_when_it_starts_and_ends_and_what_it_cost(here: Path, capsy
     assert first == "align@x: starts (smoke-scenes)"
     assert last.startswith("align@x: done in ")
     assert "loss 1.5" in last
+    assert [f.name for f in (here / "checkpoints").iterdir()] == ["lora@x"], "its own are needed no more"
 
 
 @pytest.mark.parametrize(
@@ -58,6 +62,8 @@ def test_a_stage_says_when_it_starts_and_ends_and_what_it_cost(here: Path, capsy
     [
         (UserError("x.mov: does not decode; export it again"), "split: x.mov: does not decode"),
         (MemoryError(), "lower the batch sizes"),
+        (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate"), "lower the batch sizes"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory"), "lower the batch sizes"),
         (OSError(errno.ENOSPC, "No space left on device", "data/frames"), "no space left on the disk (data/frames)"),
         (PermissionError(errno.EACCES, "Permission denied", "data/x"), "data/x: Permission denied; make it readable"),
         (OSError(errno.EROFS, "Read-only file system", "data/x"), "data/x: Read-only file system; make it"),
@@ -115,36 +121,6 @@ def called_with(monkeypatch: pytest.MonkeyPatch, words: str) -> list[object]:
     return matrix_key(encoder=Encoder, opd=Opd, seed=None)
 
 
-def test_a_stage_of_a_matrix_is_named_by_its_command_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert called_with(monkeypatch, "base needed 12") == [Encoder.BASE, Opd.NEEDED, 12]
-
-
-@pytest.mark.parametrize(
-    ("words", "line"),
-    [
-        ("nonsense all 0", "align: encoder is 'nonsense'; allowed: finetuned, base; call it as "),
-        ("finetuned All 0", "align: opd is 'All'; allowed: none, needed, all; call it as "),
-        ("finetuned all -1", "align: seed is '-1'; allowed: 0, 1, 2, ...; call it as "),
-        ("finetuned all x", "align: seed is 'x'; allowed: 0, 1, 2, ...; call it as "),
-        ("finetuned all ²", "align: seed is '²'; allowed: 0, 1, 2, ...; call it as "),
-        ("finetuned all 00", "align: seed is '00'; allowed: 0; call it as "),
-        ("finetuned all", "align: 2 values instead of 3; call it as "),
-        ("", "align: 0 values instead of 3; call it as "),
-        ("finetuned all 0 1", "align: 4 values instead of 3; call it as "),
-    ],
-)
-def test_a_command_line_that_names_no_stage_is_one_line(monkeypatch: pytest.MonkeyPatch, words: str, line: str) -> None:
-    with pytest.raises(SystemExit) as ended:
-        called_with(monkeypatch, words)
-    assert ended.value.code == f"{line}python stages/align.py <encoder> <opd> <seed>"
-
-
-def test_missing_params_name_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit, match="octopi scale smoke"), stage("split"):
-        pass
-
-
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
     target = tmp_path / "a.json"
     write_json(target, {"old": 1})
@@ -195,12 +171,6 @@ def test_floats_survive_exactly(tmp_path_factory: pytest.TempPathFactory, values
     records = [Measurement(step=i, name="x", value=v) for i, v in enumerate(values)]
     write_table(path, Measurement, records)
     assert read_table(path, Measurement) == records
-
-
-def test_same_records_same_bytes(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        write_table(tmp_path / name, Score, [SCORE] * 3)
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
 def test_bad_files_are_named_with_the_mend(tmp_path: Path) -> None:

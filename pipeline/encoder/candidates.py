@@ -9,7 +9,7 @@ from typing import Literal
 
 from pipeline.config import EncoderConfig
 from pipeline.errors import UserError, did_you_mean
-from pipeline.weights import CLIP_CONFIG
+from pipeline.weights import check_encoder
 
 Kind = Literal["constant", "trees", "frame_heads", "gradient", "tuned"]
 
@@ -67,19 +67,18 @@ CANDIDATES: dict[str, Candidate] = {
 }
 
 
-def check_candidates(names: Sequence[str], config: EncoderConfig) -> None:
+def check_candidates(names: Sequence[str], config: EncoderConfig, size: int) -> None:
     """Raise UserError where a name of `cross_validation.models` is none, or lacks weights or settings in `encoder`."""
     for name in names:
         if name not in CANDIDATES:
             hint = did_you_mean(name, CANDIDATES)
             raise UserError(f"cross_validation.models: {name} is no model; {hint}known: {', '.join(CANDIDATES)}")
         candidate = CANDIDATES[name]
-        clip = "clip" in config.backbone or (Path(config.weights) / CLIP_CONFIG).is_file()
-        if "clip" in candidate.backbone and not clip:
-            raise UserError(
-                f"cross_validation.models: {name} needs a CLIP, but encoder.weights={config.weights} has no "
-                f"{CLIP_CONFIG}; leave it out, or name a CLIP's folder"
-            )
+        if "clip" in candidate.backbone:
+            try:
+                check_encoder(Path(config.weights), size, ("clip",))
+            except UserError as error:
+                raise UserError(f"cross_validation.models: {name} needs a CLIP; leave it out, or: {error}") from None
         if candidate.settings_of not in ("", config.recipe):
             raise UserError(
                 f"cross_validation.models: {name} would be trained with the settings of "

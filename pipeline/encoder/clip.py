@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from pipeline.errors import UserError
+from pipeline.io import read_json
 from pipeline.weights import CLIP_CONFIG, GET_CLIP, check_finite, clip_file
 
 if TYPE_CHECKING:
@@ -29,10 +29,15 @@ def load_visual_tower(folder: Path, embedding: Literal["projected", "class_token
 
     if not clip_file(folder).is_file():  # Of another's folder open_clip would read a pickle, too.
         raise UserError(f"encoder.weights: {clip_file(folder)} does not exist; {GET_CLIP.format(folder=folder)}")
-    logging.getLogger().setLevel(logging.WARNING)
     try:
+        text = read_json(folder / CLIP_CONFIG)["model_cfg"]["text_cfg"]
+        if "hf_model_name" in text:
+            raise UserError(
+                f"encoder.weights: open_clip would ask a hub for the text tower of {folder} ({text['hf_model_name']}); "
+                "name a CLIP with a text tower of its own"
+            )
         model = open_clip.create_model(f"local-dir:{folder}", precision="fp32", require_pretrained=True)
-    except (RuntimeError, ValueError, OSError, SafetensorError) as error:
+    except (RuntimeError, ValueError, LookupError, TypeError, AttributeError, OSError, SafetensorError) as error:
         reason = " ".join(str(error).split())[:200]
         raise UserError(
             f"encoder.weights: {folder} does not fit its {CLIP_CONFIG} ({reason}); {GET_CLIP.format(folder=folder)}"

@@ -100,7 +100,9 @@ def cross_validate_candidate(
             f"cross_validation.folds is {config.folds} but only {objects} objects have videos; lower it, to 2 at least"
         )
     labelled = repr([(v.video_id, data.catalogue.labels(v.object_id)) for v in data.videos])
-    key = fingerprint(repr(candidate), config, data.encoder, data.per_video, labelled, *data.files)
+    code = sorted(Path(__file__).parent.rglob("*.py"))  # No table of folds of two versions.
+    folds = config.model_copy(update={"models": ()})
+    key = fingerprint(repr(candidate), folds, data.encoder, data.per_video, labelled, *data.files, *code)
     work = CHECKPOINTS / "cross_validation" / key
     predict = KINDS[candidate.kind](candidate, data)
     with progress(config.folds * config.repeats, "cross-validation", "fold") as advance:
@@ -148,7 +150,7 @@ def _trees(_: Candidate, data: CrossValidationData) -> Predict:
 
     touching = {p.video_id for p in read_table(data.frames / PROBES_FILE, Probe) if p.starts_touching}
     features = recording_features(
-        [Recording(data.recordings / video.path, video.video_id in touching) for video in data.videos]
+        [Recording(data.recordings / v.path, v.frames, v.video_id in touching) for v in data.videos]
     )
     return forest(features, data.labels, data.objects, data.classes)
 
@@ -198,7 +200,8 @@ def _gradient(candidate: Candidate, data: CrossValidationData) -> Predict:
 
     limit_threads(data.runtime.threads)
     named = {"recipe": "release" if candidate.recipe == "release" else "paper", "backbone": ("clip",)}
-    config = data.encoder.model_copy(update={**named, **candidate.settings})
+    own = {"micro_batch_size": 0, **candidate.settings} if candidate.settings else {}  # Of its own batch size.
+    config = data.encoder.model_copy(update={**named, **own})
     store, device = data.store(candidate), resolve_device(data.runtime.device)
 
     def predict(fold: Fold) -> Labels:

@@ -7,7 +7,9 @@ fits heads to frozen backbones and then tunes both (`pipeline.encoder.tuned`).
 from __future__ import annotations
 
 import math
+import shutil
 from collections.abc import Callable, Sequence, Sized
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -93,18 +95,8 @@ def tune(
     logits = above.logits(trunks, validation, device).numpy()
     reached = accuracies(logits, np.array([v.labels for v in validation]), model.decide, data.catalogue)
     curve += [Measurement(step=0, name=name, value=value) for name, value in sorted(reached.items())]
-    learnt = TrunkDataset(trunks, training, seed=seed, flip_probability=config.flip_probability)
-    history = _train(
-        above,
-        learnt,
-        TrunkDataset(trunks, validation),
-        model,
-        data,
-        config,
-        runtime,
-        seed=seed,
-        inputs=inputs,
-        callbacks=callbacks,
+    history = train_classifier(
+        model, data, config, runtime, seed=seed, inputs=inputs, callbacks=callbacks, trunks=trunks
     )
     if max(m.value for m in history if m.name == COMBINED) <= reached[COMBINED]:
         with torch.no_grad():
@@ -134,47 +126,24 @@ def train_classifier(
     seed: int,
     inputs: Sequence[Path | str],
     callbacks: Sequence[TrainerCallback] = (),
+    trunks: Trunks | None = None,
 ) -> list[Measurement]:
     """Train what is not frozen; the epoch of best combined validation accuracy is kept (ties: the first).
 
     Without validation videos there is nothing to choose by, and the last epoch is kept.
+
+    Args:
+        trunks: As `tune` takes them: what lies above them is trained on them, and not the whole on pictures.
     """
-    training = ClipDataset(
-        data.store,
-        data.videos(Part.TRAIN),
-        per_video=data.per_video,
-        seed=seed,
-        flip_probability=config.flip_probability,
-    )
-    validation = data.videos(Part.VALIDATION)
-    return _train(
-        model,
-        training,
-        ClipDataset(data.store, validation, per_video=data.per_video) if validation else None,
-        model,
-        data,
-        config,
-        runtime,
-        seed=seed,
-        inputs=inputs,
-        callbacks=callbacks,
-    )
-
-
-def _train(
-    trained: torch.nn.Module,
-    training: EpochDataset[Any],
-    validation: EpochDataset[Any] | None,
-    model: PropertyClassifier,
-    data: EncoderData,
-    config: EncoderConfig,
-    runtime: RuntimeConfig,
-    *,
-    seed: int,
-    inputs: Sequence[Path | str],
-    callbacks: Sequence[TrainerCallback],
-) -> list[Measurement]:
-    """Train a module, which is `model` or a part of it, by the settings of the section `encoder`."""
+    trained: torch.nn.Module = model
+    show: Callable[..., EpochDataset[Any]]
+    if trunks is None:
+        show = partial(ClipDataset, data.store, per_video=data.per_video)
+    else:
+        assert isinstance(model, JointFrameClassifier)
+        trained, show = AboveTrunks(model), partial(TrunkDataset, trunks)
+    training = show(data.videos(Part.TRAIN), seed=seed, flip_probability=config.flip_probability)
+    chosen = data.videos(Part.VALIDATION)
     # Imported here, since fitted heads need no Trainer, and importing it takes seconds.
     from pipeline.training.trainer import TrainableTrainer, TrainingMonitor, checkpoint_dir, train, training_arguments
 
@@ -193,11 +162,11 @@ def _train(
         bf16=config.autocast == "bfloat16",
         learning_rate=config.learning_rate,
         weight_decay=config.weight_decay,
-        eval_strategy="epoch" if validation else "no",
+        eval_strategy="epoch" if chosen else "no",
         save_strategy="epoch",
         save_total_limit=2,
-        load_best_model_at_end=bool(validation),
-        metric_for_best_model=COMBINED if validation else None,
+        load_best_model_at_end=bool(chosen),
+        metric_for_best_model=COMBINED if chosen else None,
         logging_strategy="epoch",
     )
 
@@ -209,14 +178,16 @@ def _train(
         model=trained,
         args=arguments,
         train_dataset=training,
-        eval_dataset=validation,
+        eval_dataset=show(chosen) if chosen else None,
         data_collator=default_collate,
         compute_metrics=judged,
         callbacks=[TrainingMonitor(), *callbacks],
         # The published code's cosine is as long as one epoch, so that the rate falls and rises again.
         wave=math.ceil(len(cast(Sized, training)) / config.batch_size) if config.recipe == "release" else None,
     )
-    return train(trainer).history
+    history = train(trainer).history
+    shutil.rmtree(folder, ignore_errors=True)
+    return history
 
 
 def write_encoder_card(folder: Path, data: EncoderData, config: EncoderConfig, seed: int, source: str) -> None:

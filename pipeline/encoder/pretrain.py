@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import cast
@@ -132,8 +131,8 @@ def pretrain(
     frames = frames.model_copy(update={"size": min(frames.size, SIDE)})
     # What decides how pictures look, so that half of them are never drawn by one version and half by another.
     code = [*sorted(Path(invent.__file__).parent.rglob("*.py")), Path(synthetic.__file__), Path(subtraction.__file__)]
-    key = fingerprint(config, frames.fit, frames.size, *code)
-    work = CHECKPOINTS / "synthetic_pictures" / key
+    shown = repr((config.objects, config.presses, config.seed))
+    work = CHECKPOINTS / "pretrain" / f"pictures-{fingerprint(shown, frames.fit, frames.size, *code)}"
     drawn = draw_pictures(config, frames, work)
     border = len(drawn.pictures) - max(1, round(HELD_OUT * len(drawn.pictures)))
     training, held = (
@@ -142,7 +141,7 @@ def pretrain(
     )
     model = pretraining_model(SceneEncoder(), training)
     arguments = training_arguments(
-        checkpoint_dir("pretrain", key),
+        checkpoint_dir("pretrain", fingerprint(config, frames.fit, frames.size, *code)),
         runtime,
         config.seed,
         max_steps=config.steps,
@@ -161,7 +160,6 @@ def pretrain(
     )
     history = train(trainer).history
     measured = held_out(model.cpu(), PretrainingDataset(held, augment=False, seed=0))
-    shutil.rmtree(work, ignore_errors=True)
     return model.encoder, [*history, *(Measurement(step=config.steps, name=n, value=v) for n, v in measured.items())]
 
 

@@ -26,6 +26,8 @@ from pipeline.scenes.geometry import IMAGE_MM, Heights, heights
 from pipeline.scenes.invent import LAYERS, invent
 from pipeline.scenes.light import Image, Sensor, make_sensor, shade
 from pipeline.scenes.measure import CUTOFF, bump_share, texture
+from pipeline.scenes.motion import CENTRE_MM
+from pipeline.scenes.render import place
 from pipeline.videos.frames.subtraction import subtract
 
 WIDTH, HEIGHT = 160, 120
@@ -37,8 +39,6 @@ METHOD = Method("layer", 64)
 """A third of the time of 128 cells, for slopes that are off by .34 in place of .19 (reports/speed_error.csv)."""
 FORCES = (0.1, 8.0)
 """In N, drawn evenly on a logarithmic axis: wider than the real videos' range."""
-OFF_CENTRE_MM = ((-1.2, 1.6), (0.2, 1.1))
-"""Mean and deviation of the contact's place, across and down, as in the development split's training objects."""
 SENSORS = 24
 QUALITY = (60, 96)
 """JPEG quality between which a picture is coded: real frames went through a lossy codec too."""
@@ -98,24 +98,26 @@ def draw_pictures(config: PretrainConfig, frames: FramesConfig, folder: Path) ->
     jobs = [_Job(i, min(i + CHUNK, config.objects), config, frames, folder / f"{i:06d}.npz") for i in borders]
     for _ in run_parallel(_draw, [job for job in jobs if not job.file.is_file()], "synthetic pictures", "chunk"):
         pass
-    parts = [np.load(job.file) for job in jobs]
-    return SyntheticPictures(
-        *(np.concatenate([part[name] for part in parts]) for name in SyntheticPictures.__dataclass_fields__)
-    )
+    names, parts = SyntheticPictures.__dataclass_fields__, []
+    for job in jobs:
+        with np.load(job.file) as part:  # Closed one by one: a process may hold a thousand files open.
+            parts.append([part[name] for name in names])
+    return SyntheticPictures(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def draw_object(number: int, config: PretrainConfig, frames: FramesConfig) -> SyntheticPictures:
     """One object, in arrays of one row."""
     rng = np.random.default_rng(derive_seed(config.seed, "lesson", number))
     recipe = invent(rng)
-    surface = heights(recipe.surface, SIDE, PITCH, rng)
+    surface = heights(recipe.body, recipe.relief, SIDE, PITCH, rng)
     forces = np.sort(np.exp(rng.uniform(math.log(FORCES[0]), math.log(FORCES[1]), config.presses)))
     pressed = Body(surface, recipe.modulus, PITCH).press(METHOD, forces)
     rough = texture(surface, PITCH)
     pictures, quantities = [], []
     for force, whole, area in zip(forces.tolist(), pressed.skins, pressed.areas.tolist(), strict=True):
-        place = _place(rng)
-        skin, shown = _view(whole, place), _view(surface, place)
+        angle = rng.uniform(0, 360)
+        centre = [(n - 1) / 2 + rng.normal(*at) / PITCH for n, at in zip((WIDTH, HEIGHT), CENTRE_MM, strict=True)]
+        skin, shown = (place(field, angle, centre, (WIDTH, HEIGHT)) for field in (whole, surface))
         touched = skin > 0.15 * max(float(skin.max()), 1e-6)
         known = [np.log10(recipe.modulus), np.log10(force), np.log10(area / np.pi + 0.05) / 2, np.log10(rough + 5e-4)]
         known += [
@@ -147,21 +149,6 @@ def _draw(job: _Job) -> None:
     with atomic(job.file) as temporary, temporary.open("wb") as stream:
         rows: dict[str, Any] = {name: np.concatenate([getattr(d, name) for d in drawn]) for name in names}
         np.savez(stream, **rows)
-
-
-def _place(rng: np.random.Generator) -> npt.NDArray[np.float64]:
-    """Where the patch's middle comes to lie in the picture, and how it is turned: an affine map."""
-    middle = (SIDE - 1) / 2
-    turn: npt.NDArray[np.float64] = cv2.getRotationMatrix2D((middle, middle), rng.uniform(0, 360), 1.0)
-    for axis, (size, (mean, deviation)) in enumerate(zip((WIDTH, HEIGHT), OFF_CENTRE_MM, strict=True)):
-        turn[axis, 2] += (size - 1) / 2 - middle + rng.normal(mean, deviation) / PITCH
-    return turn
-
-
-def _view(patch: Heights, place: npt.NDArray[np.float64]) -> Heights:
-    size = (WIDTH, HEIGHT)
-    shown: Heights = cv2.warpAffine(patch, place, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return shown
 
 
 def _bands(field: Heights, where: npt.NDArray[np.bool_]) -> list[float]:

@@ -332,7 +332,11 @@ def _read_cache(file: Path) -> dict[str, Reply]:
         # A run that was killed while it wrote: that reply is asked for again.
         with file.open("rb+") as stream:
             stream.truncate(whole)
-    return {reply.request: reply for reply in read_jsonl(file, Reply)}
+    try:
+        return {reply.request: reply for reply in read_jsonl(file, Reply)}
+    except UserError as error:  # Its advice, to delete the file, would throw away what was paid for.
+        where = str(error).rpartition("; ")[0]
+        raise UserError(f"{where}; remove that line: its question alone is asked again") from None
 
 
 def _check(endpoint: Endpoint) -> None:

@@ -22,7 +22,7 @@ from transformers import (
 )
 
 from pipeline.errors import UserError
-from pipeline.io import read_json, write_json
+from pipeline.io import read_json, tensor_shapes, write_json
 from pipeline.language.chat import add_tactile_tokens, render
 from pipeline.records import Turn
 from pipeline.runtime import Quantization
@@ -86,7 +86,7 @@ def load_llm(
             output_loading_info=True,
             **own,
         )
-    except (OSError, ValueError, RuntimeError, KeyError, SafetensorError) as error:
+    except Exception as error:  # transformers and what it asks for raise nearly any of them.
         reason = " ".join(str(error).split())[:200]
         raise UserError(f"{key}: {folder} cannot be loaded ({reason}); {GET_LLM.format(folder=folder)}") from None
     wrong = sorted(map(str, [*info["missing_keys"], *info["mismatched_keys"]]))
@@ -141,15 +141,20 @@ def load_adapter(llm: PreTrainedModel, folder: Path) -> PreTrainedModel:
     Raises:
         UserError: for a missing file, a pickle, or an adapter of another language model.
     """
-    from peft import PeftModel
+    from peft import PeftModel, get_peft_model_state_dict
 
     for name in (ADAPTER_CONFIG, ADAPTER_WEIGHTS):
         if not (folder / name).is_file():
             raise UserError(f"{folder / name}: no such file (pickled adapters are refused); `dvc repro` makes it")
     try:
-        return PeftModel.from_pretrained(llm, str(folder))
+        model = PeftModel.from_pretrained(llm, str(folder))
     except (OSError, RuntimeError, ValueError, KeyError, TypeError, SafetensorError) as error:
         reason = " ".join(str(error).split())[:200]
         raise UserError(
             f"{folder}: its adapter is broken or of another language model ({reason}); run `dvc repro`"
         ) from None
+    # PEFT only warns of tensors that are missing, and says nothing of those that are too many.
+    own = get_peft_model_state_dict(model, save_embedding_layers=False).keys()
+    if wrong := sorted(own ^ tensor_shapes(folder / ADAPTER_WEIGHTS).keys()):
+        raise UserError(f"{folder}: its adapter is broken or of another language model ({wrong[0]}); run `dvc repro`")
+    return model

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
-from typing import TypedDict
 
 import torch
+from torch.nn.utils.rnn import pad_sequence
 from torch.utils.data import Sampler
 from transformers import PreTrainedTokenizerBase
 
@@ -22,17 +22,8 @@ POOL = 16
 """Batches that are drawn together and dealt by length: more of them pad less, fewer mix lengths more freely."""
 
 
-class Sample(TypedDict):
-    """One conversation: ids, labels and their weights of one length, its frames' embeddings in reading order."""
-
-    input_ids: torch.Tensor
-    labels: torch.Tensor
-    features: torch.Tensor
-    weights: torch.Tensor
-
-
-class ConversationDataset(EpochDataset[Sample]):
-    """Training conversations under one OPD mode.
+class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
+    """Training conversations under one OPD mode: ids, labels and their weights, frames' embeddings in reading order.
 
     Which frames and which mirroring a video gets depends on seed, epoch, question and place alone, so that a resumed
     training sees what an uninterrupted one does.
@@ -96,7 +87,7 @@ class ConversationDataset(EpochDataset[Sample]):
     def __len__(self) -> int:
         return len(self.questions)
 
-    def __getitem__(self, index: int) -> Sample:
+    def __getitem__(self, index: int) -> dict[str, torch.Tensor]:
         question, encoded = self.questions[index], self.encoded[index]
         rng = random.Random(derive_seed(self.seed, self.epoch, question.question_id))
         parts, videos, concluding = [], question.videos, self.concluding[index]
@@ -132,30 +123,13 @@ def evaluation_features(question: Question, store: EmbeddingStore, per_video: in
     return torch.cat(parts)
 
 
-def pad_features(features: Sequence[torch.Tensor]) -> torch.Tensor:
-    """Stack rows of unequal numbers of frames: batch x (most frames) x dim, zeros behind."""
-    return torch.nn.utils.rnn.pad_sequence(list(features), batch_first=True)
+def collate(samples: Sequence[Mapping[str, torch.Tensor]]) -> dict[str, torch.Tensor]:
+    """Stack what is of unequal length, padded on the right: with zeros, and labels left out of the loss.
 
-
-class ConversationCollator:
-    """Pads on the right with the padding token to the longest of the batch, left out of the loss.
-
-    There is no attention mask: no token of a causal model sees what comes behind it.
+    There is no attention mask: no token of a causal model sees what comes behind it, whichever it is.
     """
-
-    def __init__(self, pad_id: int) -> None:
-        self.pad_id = pad_id
-
-    def __call__(self, samples: Iterable[Sample]) -> dict[str, torch.Tensor]:
-        """Input ids, labels, weights (batch x length) and features (batch x frames x dim)."""
-        samples = list(samples)
-        pad = torch.nn.utils.rnn.pad_sequence
-        return {
-            "input_ids": pad([s["input_ids"] for s in samples], batch_first=True, padding_value=self.pad_id),
-            "labels": pad([s["labels"] for s in samples], batch_first=True, padding_value=IGNORE_INDEX),
-            "features": pad_features([s["features"] for s in samples]),
-            "weights": pad([s["weights"] for s in samples], batch_first=True),
-        }
+    padding = {name: IGNORE_INDEX if name == "labels" else 0 for name in samples[0]}
+    return {name: pad_sequence([s[name] for s in samples], True, value) for name, value in padding.items()}
 
 
 class LengthBuckets(Sampler[int]):

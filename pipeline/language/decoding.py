@@ -111,8 +111,8 @@ def _read(
         parts.append((logits, mask, cache))
     width = max(mask.shape[1] for _, mask, _ in parts)
     whole = roomy_cache(config)
-    for number, layer in enumerate(whole.layers):
-        own = [part[2].layers[number] for part in parts]
+    for layer in whole.layers:
+        own = [part[2].layers.pop(0) for part in parts]  # Or all would be held twice.
         layer.update(*(torch.cat([_widen(getattr(x, kind), width) for x in own]) for kind in ("keys", "values")))
     masks = [F.pad(mask, (width - mask.shape[1], 0)) for _, mask, _ in parts]
     return torch.cat([logits for logits, _, _ in parts]), whole, torch.cat(masks)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import torch
 from transformers import PreTrainedTokenizerBase
 
+from pipeline.config import LanguageConfig
 from pipeline.embeddings import EmbeddingStore
 from pipeline.errors import UserError
 from pipeline.language.chat import encode, end_ids, render
@@ -19,18 +20,6 @@ from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.parallel import run_with
 from pipeline.records import Opd, Prediction, Question, Turn
 from pipeline.runtime import DeviceName, DtypeName, Quantization, resolve_device
-
-
-@dataclass(frozen=True)
-class GenerationSettings:
-    """How questions are put: the same for every variant."""
-
-    system_prompt: str
-    per_video: int
-    """Frames a video; 0 asks without touch."""
-    max_new_tokens: int
-    batch_size: int
-    bos: bool = True
 
 
 @dataclass(frozen=True)
@@ -75,7 +64,8 @@ def answer(
     store: EmbeddingStore,
     questions: Sequence[Question],
     opd: Opd,
-    settings: GenerationSettings,
+    language: LanguageConfig,
+    per_video: int,
     source: ModelSource | None = None,
 ) -> list[Prediction]:
     """Answer every question that has a dialogue in this OPD mode; later turns see the model's own earlier answers.
@@ -84,6 +74,7 @@ def answer(
     end token, or is cut (and marked so) after `max_new_tokens` or where the language model has no more positions.
 
     Args:
+        per_video: Frames a video; 0 asks without touch.
         source: Of the model, for the workers of a cluster.
 
     Raises:
@@ -104,11 +95,11 @@ def answer(
             if number < len(dialogue.turns):
                 before = [s.text for s in said[question.question_id]]
                 turns = [Turn(user=t.user, assistant=a) for t, a in zip(dialogue.turns, [*before, ""], strict=False)]
-                prompt = write_prompt(turns, tokenizer, settings)
+                prompt = write_prompt(turns, tokenizer, language, per_video)
                 check_length(question.question_id, len(prompt) + 1, model.positions)
                 waiting.append((question, prompt))
-        features = [evaluation_features(q, store, settings.per_video) for q, _ in waiting]
-        texts = reply(model, [ids for _, ids in waiting], features, settings, f"answers, turn {number + 1}", source)
+        features = [evaluation_features(q, store, per_video) for q, _ in waiting]
+        texts = reply(model, [ids for _, ids in waiting], features, language, f"answers, turn {number + 1}", source)
         for (question, _), text in zip(waiting, texts, strict=True):
             said[question.question_id].append(text)
     return [
@@ -124,18 +115,18 @@ def answer(
 
 
 def write_prompt(
-    turns: Sequence[Turn], tokenizer: PreTrainedTokenizerBase, settings: GenerationSettings
+    turns: Sequence[Turn], tokenizer: PreTrainedTokenizerBase, language: LanguageConfig, per_video: int
 ) -> tuple[int, ...]:
     """Token ids of a conversation up to where its last answer is to be said."""
-    rendered = render(turns, tokenizer, system_prompt=settings.system_prompt, frames=settings.per_video, complete=False)
-    return encode(rendered, tokenizer, bos=settings.bos).input_ids
+    rendered = render(turns, tokenizer, system_prompt=language.system_prompt, frames=per_video, complete=False)
+    return encode(rendered, tokenizer, bos=language.bos).input_ids
 
 
 def reply(
     model: OctopiForCausalLM,
     prompts: Sequence[Sequence[int]],
     features: Sequence[torch.Tensor],
-    settings: GenerationSettings,
+    language: LanguageConfig,
     label: str = "answers",
     source: ModelSource | None = None,
 ) -> list[Generated]:
@@ -150,10 +141,10 @@ def reply(
     # Neighbours of like length share a batch, so little is spent on padding.
     order = sorted(range(len(prompts)), key=lambda place: len(prompts[place]))
     batches = []
-    for start in range(0, len(order), settings.batch_size):
-        places = order[start : start + settings.batch_size]
+    for start in range(0, len(order), language.generation_batch_size):
+        places = order[start : start + language.generation_batch_size]
         chosen = [prompts[place] for place in places]
-        batches.append(Batch(chosen, [features[place] for place in places], _room(model, chosen, settings)))
+        batches.append(Batch(chosen, [features[place] for place in places], _room(model, chosen, language)))
     said = [row for rows in run_with(model, source, _reply_batch, batches, label, "batch") for row in rows]
     return [text for _, text in sorted(zip(order, said, strict=True), key=lambda pair: pair[0])]
 
@@ -165,11 +156,11 @@ def _reply_batch(model: OctopiForCausalLM, batch: Batch) -> list[Generated]:
 
 
 def stream(
-    model: OctopiForCausalLM, prompt: Sequence[int], features: torch.Tensor, settings: GenerationSettings
+    model: OctopiForCausalLM, prompt: Sequence[int], features: torch.Tensor, language: LanguageConfig
 ) -> Iterator[str]:
     """What `reply` says to one prompt, in pieces as they come; together they are the same text."""
     ends, tokens, given = end_ids(model.tokenizer), [], ""
-    for _, token in greedy_tokens(model, [prompt], [features], ends, _room(model, [prompt], settings)):
+    for _, token in greedy_tokens(model, [prompt], [features], ends, _room(model, [prompt], language)):
         tokens.append(token)
         text = _said(tokens, ends, model.tokenizer).text
         # A character may be spread over tokens; until it is whole it is shown as the replacement character.
@@ -181,9 +172,9 @@ def stream(
         yield rest
 
 
-def _room(model: OctopiForCausalLM, prompts: Sequence[Sequence[int]], settings: GenerationSettings) -> list[int]:
+def _room(model: OctopiForCausalLM, prompts: Sequence[Sequence[int]], language: LanguageConfig) -> list[int]:
     """Most tokens that each answer may have."""
-    most = settings.max_new_tokens
+    most = language.max_new_tokens
     return [most if model.positions is None else min(most, model.positions - len(p)) for p in prompts]
 
 

@@ -19,7 +19,7 @@ from pipeline.embeddings import TENSOR_FILE, EmbeddingStore
 from pipeline.errors import UserError
 from pipeline.io import fingerprint, read_jsonl
 from pipeline.language.connector import read_config
-from pipeline.language.conversations import ConversationCollator, ConversationDataset, LengthBuckets
+from pipeline.language.conversations import ConversationDataset, LengthBuckets, collate
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.records import Encoder, Opd, Question
 from pipeline.runtime import derive_seed, name_dtype, seed_everything
@@ -98,21 +98,14 @@ class Material:
 
 
 def assemble(
-    material: Material,
-    samples: int,
-    purpose: str,
-    aligned: Path | None = None,
-    *,
-    counterfactual: float = 0.0,
-    conclusion_weight: float = 1.0,
+    material: Material, config: TrainConfig, purpose: str, aligned: Path | None = None
 ) -> tuple[OctopiForCausalLM, ConversationDataset]:
-    """A model and its training conversations: `samples` questions, drawn by seed and purpose.
+    """A model and its training conversations: `config.samples` questions, drawn by seed and purpose.
 
     Each OPD mode draws as many, from the questions that have a dialogue in it.
 
     Args:
         aligned: Folder of a model to go on with; by default a fresh one.
-        counterfactual, conclusion_weight: As `ConversationDataset` takes them.
     """
     seed_everything(material.seed)
     language = material.language
@@ -132,10 +125,11 @@ def assemble(
     random.Random(derive_seed(material.seed, purpose)).shuffle(usable)
     if not usable:
         raise UserError(f"no training question has OPD mode {material.opd}; raise questions.train in params.yaml")
-    if len(usable) < samples:
-        logger.warning("%s: only %d training questions for %d samples", purpose, len(usable), samples)
+    if len(usable) < config.samples:
+        logger.warning("%s: only %d training questions for %d samples", purpose, len(usable), config.samples)
+    own = config.model_dump(include={"counterfactual", "conclusion_weight"})  # Only fine-tuning has them.
     data = ConversationDataset(
-        usable[:samples],
+        usable[: config.samples],
         material.opd,
         material.store,
         model.tokenizer,
@@ -145,8 +139,7 @@ def assemble(
         seed=material.seed,
         positions=model.positions,
         bos=language.bos,
-        counterfactual=counterfactual,
-        conclusion_weight=conclusion_weight,
+        **own,
     )
     return model, data
 
@@ -188,7 +181,7 @@ def fit(
         model=model,
         args=arguments,
         train_dataset=data,
-        data_collator=ConversationCollator(int(model.tokenizer.pad_token_id)),
+        data_collator=collate,
         callbacks=[TrainingMonitor(), *job.callbacks],
         rates={**dict.fromkeys(trained, config.projection_learning_rate), **adapters},
         constant=("connector.projection",) if config.projection_schedule == "constant" else (),

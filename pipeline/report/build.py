@@ -114,15 +114,18 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
 
 
 def without_places(text: str) -> str:
-    """params.yaml with the last part alone of paths of this machine: a report is for others too."""
-    return re.sub(r"(?m)^(  \w+: )['\"]?(?:/|~|[A-Za-z]:\\).*?([^/\\'\"\n]+)['\"]?$", r"\1\2", text)
+    """params.yaml with the last part alone of paths of this machine, and no tracking server: a report is for others."""
+    text = re.sub(r"(?m)^(  uri: ).*$", r"\1''", text)
+    return re.sub(r"(?m)^(  \w+: )['\"]?(?:/|~|[A-Za-z]:\\).*?([^/\\'\"\n]+)[/\\]*['\"]?$", r"\1\2", text)
 
 
 def finish_report(folder: Path) -> dict[str, float]:
     """Write metrics.json, figures/ and README.md from the other files of a report; return the metrics."""
     report = load_report(folder)
     metrics = summary(report.scores)
-    confusion, curves = (pd.read_csv(folder / name) for name in ("confusion.csv", "curves.csv"))
+    # Classes are words, even where they read like numbers or like nothing.
+    confusion = pd.read_csv(folder / "confusion.csv", dtype=str, keep_default_na=False)
+    curves = pd.read_csv(folder / "curves.csv")
     figures = draw_figures(folder / "figures", report.effects, confusion, curves, report.provenance["properties"])
     write_json(folder / "metrics.json", metrics)
     write_text(folder / "README.md", render_readme(report, figures))

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean, median
 from typing import Any
@@ -14,6 +13,7 @@ from pipeline.records import Assignment, Part, Video
 from pipeline.report.load import published
 from pipeline.videos.catalogue import Catalogue
 
+PARTS = (Part.TRAIN, Part.VALIDATION, Part.TEST)
 COLUMNS = ("table", "row", "objects", "with_videos", "train", "validation", "test", "frames", "published")
 AGREEMENT = "agreement, ICC(3,k)"
 """What the audit calls its check of the annotators."""
@@ -36,38 +36,39 @@ def dataset_frame(
     """
     printed = published(catalogue.language.dataset)
     values = {(row["task"], row["measure"]): row["value"] for row in printed.to_dict("records") if not row["model"]}
-    rows = [
-        _counted("property_counts", f"{p.name}: {level}", members, videos, splits)
-        | {"published": values.get(("property_counts", level))}
+    classes = {o: catalogue.labels(o) for o in catalogue.objects}
+    groups = [
+        ("property_counts", f"{p.name}: {level}", level, {o for o, own in classes.items() if own[index] == number})
         for index, p in enumerate(catalogue.properties)
         for number, level in enumerate(p.levels)
-        for members in [{o for o in catalogue.objects if catalogue.labels(o)[index] == number}]
     ]
-    combined = Counter(map(catalogue.labels, catalogue.objects))
-    for labels in sorted(combined):
+    for labels in sorted({*classes.values()}):
         words = ", ".join(p.levels[level] for p, level in zip(catalogue.properties, labels, strict=True))
-        members = {o for o in catalogue.objects if catalogue.labels(o) == labels}
-        rows.append(
-            _counted("property_combinations", words, members, videos, splits)
-            | {"published": values.get(("property_combinations", words))}
-        )
-    lengths = [v.frames for v in videos]
-    figures: dict[str, Callable[[list[int]], float]] = {
-        "average": fmean,
-        "median": median,
-        "minimum": min,
-        "maximum": max,
-    }
-    rows += [
+        groups.append(("property_combinations", words, words, {o for o, own in classes.items() if own == labels}))
+    filmed = {v.object_id for v in videos}
+    parts = {(a.object_id, a.part) for assignments in splits for a in assignments}
+    rows: list[dict[str, Any]] = [
         {
-            "table": "video_lengths",
+            "table": table,
             "row": row,
-            "frames": figure(lengths),
-            "published": values.get(("video_lengths", row)),
+            "objects": len(members),
+            "with_videos": len(members & filmed),
+            **{str(part): sum((o, part) in parts for o in members) for part in PARTS},
+            "published": values.get((table, printed_as)),
         }
-        for row, figure in figures.items()
-        if lengths
+        for table, row, printed_as, members in groups
     ]
+    if lengths := [v.frames for v in videos]:
+        figures = (("average", fmean), ("median", median), ("minimum", min), ("maximum", max))
+        rows += [
+            {
+                "table": "video_lengths",
+                "row": row,
+                "frames": f(lengths),
+                "published": values.get(("video_lengths", row)),
+            }
+            for row, f in figures
+        ]
     frame = pd.DataFrame(rows, columns=list(COLUMNS))
     whole = list(COLUMNS[2:7])
     return frame.astype(dict.fromkeys(whole, "Int64"))
@@ -97,17 +98,3 @@ def dataset_tables(folder: Path, dataset: str) -> dict[str, pd.DataFrame]:
                 columns["Published"] = rows["item"].map(values).map("{:.3f}".format)
             tables[TITLES["annotator_agreement"]] = pd.DataFrame(columns)
     return tables
-
-
-def _counted(
-    table: str, row: str, members: set[str], videos: Sequence[Video], splits: Sequence[Sequence[Assignment]]
-) -> dict[str, Any]:
-    pairs = {(a.object_id, a.part) for assignments in splits for a in assignments if a.object_id in members}
-    parts = Counter(part for _, part in pairs)
-    return {
-        "table": table,
-        "row": row,
-        "objects": len(members),
-        "with_videos": len(members & {v.object_id for v in videos}),
-        **{str(part): parts[part] for part in (Part.TRAIN, Part.VALIDATION, Part.TEST)},
-    }

@@ -71,7 +71,7 @@ def read_frame(file: Path, columns: tuple[str, ...]) -> pd.DataFrame:
     frame = pd.read_csv(file, dtype=dict.fromkeys(TEXT, str))
     missing = [name for name in columns if name not in frame]
     if missing:
-        raise UserError(f"{file}: lacks {', '.join(missing)}; `dvc repro report` writes it anew")
+        raise UserError(f"{file}: lacks {', '.join(missing)}; write it anew")
     text = [name for name in frame if name in TEXT]
     frame[text] = frame[text].fillna("")
     return frame

@@ -292,25 +292,26 @@ def _block(
 
 def _speed(folder: Path, gaps: list[Gap]) -> Iterator[dict[str, Any]]:
     """Each question of speed_error.csv: its figure, as `make bench` drew it, its front in words, its table."""
-    rows = read_frame(folder / "speed_error.csv", SPEED)
+    rows = _measured(folder / "speed_error.csv", SPEED, gaps)
     if rows.empty:
         gaps.append(("speed", "speed_error.csv", "nothing was measured yet: `make bench` measures it"))
     rows["front"] = rows["front"].astype(str).eq("True")
     for question, group in rows.groupby("question", sort=False):
         figure = f"speed_error/{re.sub(r'[^a-z0-9]+', '-', str(question).lower()).strip('-')}.png"
+        shown = group.drop(columns="question").assign(front=group["front"].where(group["error"].notna()))
         yield {
             "question": question,
             "costs": "; ".join(group["unit"].dropna().unique()),
             "errors": "; ".join(group["error_of"].dropna().unique()),
             "figure": figure if (folder / figure).is_file() else "",
             "front": group[group["front"]].sort_values("cost_ratio").map(_said).to_dict("records"),
-            "html": draw_table(_shown(group.drop(columns="question")), str(question), "speed_error.csv"),
+            "html": draw_table(_shown(shown), str(question), "speed_error.csv"),
         }
 
 
 def _stability(folder: Path, gaps: list[Gap]) -> dict[str, Any]:
     """How many cases passed by part and number format, and the cases that failed."""
-    rows = read_frame(folder / "stability.csv", STABILITY)
+    rows = _measured(folder / "stability.csv", STABILITY, gaps)
     if rows.empty:
         gaps.append(("stability", "stability.csv", "nothing was measured yet: `make stability` measures it"))
         return {"cases": 0}
@@ -324,6 +325,14 @@ def _stability(folder: Path, gaps: list[Gap]) -> dict[str, Any]:
         "failures": draw_table(_shown(failed), "Cases that failed", "stability.csv") if len(failed) else "",
         "table": draw_table(cells, "Cases that passed, by part and number format", "stability.csv", at_lines=False),
     }
+
+
+def _measured(file: Path, columns: tuple[str, ...], gaps: list[Gap]) -> pd.DataFrame:
+    try:
+        return read_frame(file, columns)
+    except UserError as error:
+        gaps.append((file.stem, file.name, str(error)))
+        return pd.DataFrame(columns=list(columns))
 
 
 def _shown(rows: pd.DataFrame) -> pd.DataFrame:

@@ -83,9 +83,9 @@ def provenance(
         "encoder": encoder_words(params.encoder),
         "base_models": {
             "encoder": base_model(root, params.encoder.weights),
-            "language": base_model(root, params.language.weights) | taught_words(params.teach.base),
+            "language": base_model(root, params.language.weights) | taught_words(_shown(params.teach.base)),
         },
-        "taught_from": params.teach.base,
+        "taught_from": _shown(params.teach.base),
         "python": platform.python_version(),
         "packages": {name: _version(name) for name in PACKAGES},
     }
@@ -136,12 +136,17 @@ def base_model(root: Path, folder: str) -> dict[str, Any]:
     """
     where = root / folder
     return {
-        "folder": folder,
+        "folder": _shown(folder),
         "kind": _kind(where),
         "parameters": sum(parameters(file) for file in sorted(where.glob("*.safetensors"))),
         "sha256": digest(where),
         "taught": str(front_matter(where).get("taught", "")),
     }
+
+
+def _shown(folder: str) -> str:
+    """A folder as a report names it: of a place of this machine the last part alone."""
+    return Path(folder).name if folder.startswith("~") or Path(folder).is_absolute() else folder
 
 
 def parameters(file: Path) -> int:

@@ -238,7 +238,7 @@ def _touch(effects: pd.DataFrame, solved: Collection[str]) -> list[str]:
 def _impossible(effects: pd.DataFrame) -> str:
     """Whether so few objects could show anything at all: a sign flip's p is at least 2 / 2**objects."""
     objects = int(effects["objects"].max())
-    return f" ({objects} objects are too few for that)" if len(effects) * 2.0 ** (1 - objects) >= ALPHA else ""
+    return f" ({objects} objects are too few for that)" if effects["p"].count() * 2.0 ** (1 - objects) >= ALPHA else ""
 
 
 def _parts(effects: pd.DataFrame, solved: Collection[str]) -> list[str]:
@@ -260,7 +260,9 @@ def _parts(effects: pd.DataFrame, solved: Collection[str]) -> list[str]:
     if only:
         return [f"None of {all_of_them} holds up.{also}"]
     smallest = rows["smallest_effect"].min()
-    found = f"; the smallest that this design could have found is {100 * smallest:.0f} points" if smallest <= 1 else ""
+    found = ""
+    if smallest <= 1:
+        found = f"; even before it the smallest that this design could have found is {100 * smallest:.0f} points"
     return [f"None of {all_of_them} is significant after Holm's adjustment{_impossible(effects) or found}."]
 
 

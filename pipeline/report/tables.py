@@ -175,7 +175,7 @@ COLUMNS: dict[str, tuple[str, Cell]] = {
     **{name: (name.capitalize(), _text(name)) for name in ("part", "change")},
     "difference": ("Difference, points [95 %]", difference),
     **{name: (title, _count(name, 3)) for name, title in (("p", "p"), ("p_holm", "p, Holm"))},
-    "smallest": ("Smallest that could be found", lambda row: number(row["smallest_effect"], scale=100)),
+    "smallest": ("Smallest that could be found, before Holm", lambda row: number(row["smallest_effect"], scale=100)),
     **{name: (title, _count(name)) for name, title in (("n", "n"), ("objects", "Objects"), ("seeds", "Seeds"))},
 }
 """Heading of a column, and how its cell is written."""

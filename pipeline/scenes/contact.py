@@ -102,7 +102,6 @@ def press(
     method: Method | None = None,
     *,
     tolerance: float = 0.25,
-    gel: Gel = GEL,
     device: str | None = None,
 ) -> Imprint:
     """Press a body with forces from 0 to `force`.
@@ -114,16 +113,14 @@ def press(
         pitch: In mm a pixel.
         method: None takes the cheapest whose estimated error is below the tolerance.
         tolerance: Relative error of the skin's slopes, which are what the light shows.
-        gel: The sensor's.
         device: Where torch solves; None is NumPy.
     """
-    body = Body(heights, modulus, pitch, gel, device)
+    body = Body(heights, modulus, pitch, device)
     forces = force * (np.arange(1, LEVELS + 1) / LEVELS) ** 1.5
     error = None
     if method is None:
-        choice = choose(body, force, tolerance)
-        method, error = choice.method, choice.error
-        pressed = [body.press(method, forces[:-1]), choice.pressed]
+        method, error, last = choose(body, force, tolerance)
+        pressed = [body.press(method, forces[:-1]), last]
     else:
         pressed = [body.press(method, forces)]
     flat = np.zeros((1, *heights.shape), np.float32)
@@ -137,27 +134,21 @@ def press(
     )
 
 
-@dataclass(frozen=True)
-class Choice:
-    """What `auto` takes."""
-
-    method: Method
-    error: float
-    """Estimated."""
-    pressed: Pressed
-    """By this method under the largest force."""
-
-
-def choose(body: Body, force: float, tolerance: float) -> Choice:
+def choose(body: Body, force: float, tolerance: float) -> tuple[Method, float, Pressed]:
     """The cheapest method whose slopes under the largest force are near enough to those of the next finer one.
 
     An error is estimated as the distance to the next finer grid, which is larger than that to the truth as long as
     grids converge; springs are held against the finest grid that had to be solved. Nothing finer than a method whose
     estimate is good enough is computed but the one that it is held against; the finest, which is held against nothing,
     is given half the error of the one before.
+
+    Returns:
+        The method, its error as estimated, and the body by it under the largest force.
     """
-    rungs = [m for m in LADDER if m.cells < body.side]
-    if len(rungs) < len(LADDER):
+    # A layer's influence is smooth on cells of half its thickness only.
+    ladder = [m for m in LADDER if body.side * body.pitch <= m.cells * GEL.thickness / 2]
+    rungs = [m for m in ladder if m.cells < body.side]
+    if len(rungs) < len(ladder):
         rungs.append(Method("layer"))
     top = np.array([force])
     springs, coarse = body.press(Method("winkler"), top), body.press(rungs[0], top)
@@ -167,9 +158,9 @@ def choose(body: Body, force: float, tolerance: float) -> Choice:
         for candidate, pressed in ((Method("winkler"), springs), (method, coarse)):
             error = slope_error(pressed.skins[0], fine.skins[0], body.pitch)
             if error <= tolerance:
-                return Choice(candidate, error, pressed)
+                return candidate, error, pressed
         coarse = fine
-    return Choice(rungs[-1], error / 2, coarse)
+    return rungs[-1], error / 2, coarse
 
 
 def slope_error(skin: Heights, reference: Heights, pitch: float) -> float:
@@ -190,12 +181,10 @@ class Pressed:
 class Body:
     """An object over the gel, with what its coarser grids share."""
 
-    def __init__(
-        self, heights: Heights, modulus: float, pitch: float, gel: Gel = GEL, device: str | None = None
-    ) -> None:
-        self.heights, self.modulus, self.pitch, self.gel, self.device = heights, modulus, pitch, gel, device
+    def __init__(self, heights: Heights, modulus: float, pitch: float, device: str | None = None) -> None:
+        self.heights, self.modulus, self.pitch, self.device = heights, modulus, pitch, device
         self.side = heights.shape[0]
-        self.together = series(gel.modulus, modulus)
+        self.together = series(GEL.modulus, modulus)
 
     def press(self, method: Method, forces: npt.NDArray[np.float64]) -> Pressed:
         """Under each force, in N."""
@@ -203,8 +192,8 @@ class Body:
 
     def _springs(self, forces: npt.NDArray[np.float64]) -> Pressed:
         gap = self.heights.max() - self.heights
-        found = [press_springs(gap, force, self.modulus, self.pitch, self.gel) for force in forces.tolist()]
-        skins = [hang_skin(springs, self.modulus, self.pitch, self.gel) for springs in found]
+        found = [press_springs(gap, force, self.modulus, self.pitch, GEL) for force in forces.tolist()]
+        skins = [hang_skin(springs, self.modulus, self.pitch, GEL) for springs in found]
         areas = [np.count_nonzero(springs.overlap) * self.pitch**2 for springs in found]
         return Pressed(np.stack(skins), np.array(areas), 0.0)
 
@@ -213,7 +202,9 @@ class Body:
         coarse = cv2.resize(self.heights, (cells, cells), interpolation=cv2.INTER_AREA)
         pitch = self.side * self.pitch / cells
         gap = on(coarse.max() - coarse, self.device)
-        gel, both = _kernels(cells, pitch, self.gel, self.modulus, method.tier, self.device)
+        gel, unit = _bodies(cells, pitch, method.tier, self.device)
+        # Compliances of gel and object add.
+        both = gel.plus(unit, 1 / self.modulus)
         solution = solve(gap, forces, both, pitch, tolerance=RESIDUAL / cells)
         sinks, pressures = back(gel.sink(solution.pressure)), back(solution.pressure)
         areas = np.count_nonzero(pressures > 0, axis=(1, 2)) * pitch**2
@@ -222,7 +213,7 @@ class Body:
         fine = self.heights - _enlarge(coarse, self.side)
         # The share of the fine part that the pressure flattens, of that what the gel and not the object gives way.
         flattened = math.sqrt(2) / (self.together * max(_rms_slope(fine, self.pitch), 1e-9))
-        share = np.float32(self.together / self.gel.modulus) * fine
+        share = np.float32(self.together / GEL.modulus) * fine
         skins = [
             _enlarge(sink, self.side) + share * erf(np.float32(flattened) * _enlarge(pressure, self.side))
             for sink, pressure in zip(sinks, pressures, strict=True)
@@ -231,20 +222,12 @@ class Body:
 
 
 @lru_cache(maxsize=16)
-def _bodies(cells: int, pitch: float, gel: Gel, tier: Tier, device: str | None) -> tuple[Kernel, Kernel]:
+def _bodies(cells: int, pitch: float, tier: Tier, device: str | None) -> tuple[Kernel, Kernel]:
     """Of the gel, and of a half-space of modulus 1."""
     shape = (cells, cells)
     field = on(np.zeros(shape, np.float32), device)
-    own = layer_table(shape, pitch, gel) if tier == "layer" else half_space_table(shape, pitch, gel.modulus)
+    own = layer_table(shape, pitch, GEL) if tier == "layer" else half_space_table(shape, pitch, GEL.modulus)
     return make_kernel(own, field), make_kernel(half_space_table(shape, pitch, 1.0), field)
-
-
-def _kernels(
-    cells: int, pitch: float, gel: Gel, modulus: float, tier: Tier, device: str | None
-) -> tuple[Kernel, Kernel]:
-    """Of the gel alone, and of gel and object together: compliances add."""
-    own, unit = _bodies(cells, pitch, gel, tier, device)
-    return own, own.plus(unit, 1 / modulus)
 
 
 def _enlarge(field: Heights, side: int) -> Heights:

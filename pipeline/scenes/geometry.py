@@ -7,15 +7,16 @@ lies along y.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from pipeline.scenes.grid import Grid, Heights, Length
 from pipeline.scenes.relief import AnyLayer
 
-__all__ = ["IMAGE_MM", "Bar", "Body", "Flat", "Heights", "Round", "Surface", "Wedge", "heights"]
+__all__ = ["IMAGE_MM", "Bar", "Body", "Flat", "Heights", "Round", "Wedge", "heights"]
 
 IMAGE_MM = (18.6, 14.3)
 """Width and height of what the camera sees (data sheet of the GelSight Mini)."""
@@ -58,6 +59,12 @@ class Bar(_Part):
     edge: Length
     """Radius of the edges."""
 
+    @model_validator(mode="after")
+    def _has_a_top(self) -> Bar:
+        if 2 * self.edge > self.width:
+            raise ValueError("edge is more than half the width, so that nothing of it is flat")
+        return self
+
     def sample(self, grid: Grid) -> Heights:
         """Heights below the flat top, in mm."""
         x, y = grid.axes()
@@ -85,19 +92,12 @@ class Wedge(_Part):
 Body = Annotated[Flat | Round | Bar | Wedge, Field(discriminator="kind")]
 
 
-class Surface(_Part):
-    """A body and what stands out of it."""
-
-    body: Body
-    relief: tuple[AnyLayer, ...] = ()
-    """Layers that add up."""
-
-
-def heights(surface: Surface, side: int, pitch: float, rng: np.random.Generator) -> Heights:
-    """A random patch of the surface around the body's highest point.
+def heights(body: Body, relief: Sequence[AnyLayer], side: int, pitch: float, rng: np.random.Generator) -> Heights:
+    """A random patch around a body's highest point, with layers of relief that add up.
 
     Args:
-        surface: Which body and relief.
+        body: What is pressed.
+        relief: What stands out of it.
         side: Of the patch, in pixels.
         pitch: In mm a pixel.
         rng: All that is random in the patch follows from it.
@@ -106,7 +106,7 @@ def heights(surface: Surface, side: int, pitch: float, rng: np.random.Generator)
         side x side, mm, pointing towards the sensor.
     """
     grid = Grid(side, pitch)
-    total = surface.body.sample(grid)
-    for layer in surface.relief:
+    total = body.sample(grid)
+    for layer in relief:
         total = total + layer.sample(grid, rng)
     return total.astype(np.float32, copy=False)

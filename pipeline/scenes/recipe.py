@@ -9,15 +9,16 @@ from __future__ import annotations
 import math
 import random
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from pipeline.errors import UserError
+from pipeline.params import OneKeyLoader
 from pipeline.runtime import derive_seed
 from pipeline.scenes.bumps import Domes, Ridges
-from pipeline.scenes.geometry import IMAGE_MM, Body, Flat, Round, Surface
+from pipeline.scenes.geometry import IMAGE_MM, Body, Flat, Round
 from pipeline.scenes.relief import AnyLayer, Rough
 from pipeline.videos.catalogue import Catalogue, Object
 
@@ -57,11 +58,6 @@ class Recipe(BaseModel):
     relief: tuple[AnyLayer, ...] = ()
     twist: bool = True
     """Whether the hand turns it under pressure, as in the public videos, or only presses."""
-
-    @property
-    def surface(self) -> Surface:
-        """Its shape."""
-        return Surface(body=self.body, relief=self.relief)
 
 
 def load_recipes(folder: Path, catalogue: Catalogue, seed: int) -> dict[str, Recipe]:
@@ -113,8 +109,7 @@ def recipe_of(object_id: str, catalogue: Catalogue, seed: int) -> Recipe:
 
 def _read(file: Path, catalogue: Catalogue) -> dict[str, Recipe]:
     try:
-        loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-        entries = yaml.load(file.read_text(encoding="utf-8"), Loader=loader) or {}
+        entries = yaml.load(file.read_text(encoding="utf-8"), Loader=OneKeyLoader) or {}
     except (UnicodeDecodeError, yaml.YAMLError) as error:
         raise UserError(f"{file}: {' '.join(str(error).split())[:300]}; correct it, or remove it to draw") from None
     if not isinstance(entries, dict):

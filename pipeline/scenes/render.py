@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from pipeline.config import ScenesConfig
+from pipeline.errors import UserError
 from pipeline.runtime import derive_seed
 from pipeline.scenes.contact import GEL, Imprint, Method, press
 from pipeline.scenes.elastic.torsion import slip_turn, twist
@@ -42,7 +43,10 @@ def make_scene(recipe: Recipe, config: ScenesConfig, frames: int, seed: int) -> 
     motion = make_motion(frames, rng, twist=recipe.twist)
     # An odd side has a pixel in the middle, which is what turns.
     side = int(np.hypot(config.width, config.height) + 2 * MARGIN_MM / pitch) | 1
-    patch = heights(recipe.surface, side, pitch, rng)
+    patch = heights(recipe.body, recipe.relief, side, pitch, rng)
+    needed = math.ceil(2 * side * pitch / GEL.thickness)
+    if config.tier == "layer" and config.cells < min(needed, side):
+        raise UserError(f"scenes.cells is {config.cells}, but pictures of this shape need {needed} or more")
     method = None if config.tier == "auto" else Method(config.tier, 0 if config.tier == "winkler" else config.cells)
     force = float(motion.force.max())
     imprint = press(patch, force, recipe.modulus, pitch, method, tolerance=config.tolerance)
@@ -70,7 +74,7 @@ def render(scene: Scene, config: ScenesConfig, sensor: Sensor, seed: int) -> Ite
             (config.width - 1) / 2 + float(motion.x[number]) / scene.pitch,
             (config.height - 1) / 2 + float(motion.y[number]) / scene.pitch,
         )
-        skin = _place(scene.imprint.at(force), angle, centre, config)
+        skin = place(scene.imprint.at(force), angle, centre, (config.width, config.height))
         drift = None
         if angle != start:
             # The motion's angle is against the clock; with y downwards, from x to y is with the clock.
@@ -81,12 +85,11 @@ def render(scene: Scene, config: ScenesConfig, sensor: Sensor, seed: int) -> Ite
         yield shade(skin, sensor, scene.pitch, noise, drift)
 
 
-def _place(patch: Heights, angle: float, centre: tuple[float, float], config: ScenesConfig) -> Heights:
-    """Cut the view out of the object's patch, turned by `angle` degrees and with its middle at `centre` (pixels)."""
+def place(patch: Heights, angle: float, centre: Sequence[float], size: tuple[int, int]) -> Heights:
+    """Cut a view, width x height, out of a patch turned by `angle` degrees and with its middle at `centre` (pixels)."""
     middle = (patch.shape[0] - 1) / 2
     turn = cv2.getRotationMatrix2D((middle, middle), angle, 1.0)
     turn[:, 2] += (centre[0] - middle, centre[1] - middle)
-    size = (config.width, config.height)
     # Cubic would ripple on slopes; the skin is smooth on the scale of a pixel where it is far from one.
     shown: Heights = cv2.warpAffine(patch, turn, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return shown

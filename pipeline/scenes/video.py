@@ -110,6 +110,9 @@ class _Job:
     name: str
     staging: Path
 
+    def __str__(self) -> str:
+        return self.name
+
 
 def _write(job: _Job) -> SceneRow:
     config, path = job.config, job.staging / job.name

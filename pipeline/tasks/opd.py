@@ -71,15 +71,17 @@ class ObjectPropertyDescription(TaskDefinition):
         return {**single, "combined": math.prod(single.values())}
 
 
-def as_published(said: str, labels: tuple[int, ...], catalogue: Catalogue) -> dict[str, bool]:
+def as_published(said: str, labels: tuple[int, ...], catalogue: Catalogue) -> dict[str, bool | None]:
     """By property, and `combined`, whether a description is right as the published code compares it.
 
     That code cuts the closing sentence at its fixed words and compares what stands between them letter by letter; the
     last class with its full stop, and the whole sentence, may be followed by anything. A sentence that lacks a fixed
-    word is all wrong.
+    word is all wrong. Where no word stands between two classes it cannot cut, and all is None.
     """
     right = catalogue.structured(labels)
     fields = [(before, name) for before, name, *_ in Formatter().parse(catalogue.language.structured) if name]
+    if not all(before.strip() for before, _ in fields):  # Nothing stands between two classes to cut at.
+        return dict.fromkeys((*catalogue.property_names, "combined"))
     opening, (ending, last) = fields[0][0], fields[-1]
     rest, values = said.split(opening)[-1], []
     for before, _ in fields[1:]:

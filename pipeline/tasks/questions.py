@@ -102,7 +102,9 @@ def _build_task(
                 if draft is None:
                     continue
                 # A template or a video more does not make a new question about the same videos and property.
-                key = (draft.videos, draft.gold.properties, draft.dialogues[-1].turns[-1].assistant)
+                last = draft.dialogues[-1].turns[-1]
+                situation = last.user if "{tactile}" not in last.user else ""
+                key = (draft.videos, draft.gold.properties, last.assistant, situation)
                 if distinct and key in seen:
                     continue
                 seen.add(key)

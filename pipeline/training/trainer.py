@@ -223,7 +223,7 @@ def training_arguments(folder: Path, runtime: RuntimeConfig, seed: int, **own: A
 
 
 def train(trainer: Trainer) -> Trained:
-    """Train to the end, from the last checkpoint where there is one, and tidy up."""
+    """Train to the end, from the last checkpoint where there is one; the stage removes them when all is written."""
     folder = Path(str(trainer.args.output_dir))
     if trainer.is_world_process_zero():
         _drop_damaged(folder)
@@ -243,8 +243,6 @@ def train(trainer: Trainer) -> Trained:
     ]
     state = whole_state(trainer.accelerator.unwrap_model(trainer.model))
     check_finite(state, trainer.state.global_step)
-    if trainer.is_world_process_zero():
-        shutil.rmtree(folder, ignore_errors=True)
     return Trained(history, state)
 
 

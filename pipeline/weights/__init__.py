@@ -211,5 +211,5 @@ def _check_timm(folder: Path, size: int) -> None:
         )
     try:
         json.loads((folder / TIMM_CONFIG).read_text(encoding="utf-8"))["architecture"]
-    except (json.JSONDecodeError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError):
         raise UserError(f"encoder.weights: {folder / TIMM_CONFIG} names no timm architecture; {mend}") from None

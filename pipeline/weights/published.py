@@ -161,7 +161,11 @@ def write_tokenizer(source: Path, target: Path, key: str) -> None:
     if not (source / PIECES).is_file():
         raise UserError(f"{key}: {source} has neither {TOKENIZER} nor {PIECES}; download them again")
     pieces(source / PIECES, key)
-    tokenizer = AutoTokenizer.from_pretrained(source, local_files_only=True, trust_remote_code=False)
+    try:
+        tokenizer = AutoTokenizer.from_pretrained(source, local_files_only=True, trust_remote_code=False)
+    except Exception as error:  # transformers raises nearly anything for a file that is cut off.
+        reason = " ".join(str(error).split())[:200]
+        raise UserError(f"{key}: the tokenizer in {source} cannot be read ({reason}); download it again") from None
     tokenizer.save_pretrained(target)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -11,15 +13,12 @@ import yaml
 
 from benchmarks import contact, describing, encoder, encoder_models, frames, language, serving
 from benchmarks.table import Row, merge, read_rows
-from benchmarks.timing import counting_ffts, flops_of
 from pipeline.encoder import frame_classifier
 from pipeline.encoder.baseline import predictor
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.errors import UserError
 from pipeline.io import write_csv, write_table
 from pipeline.records import Encoder, Graded, Lora, Opd, ScoreRow, Variant
-from pipeline.scenes.elastic.kernels import half_space_table, make_kernel
-from pipeline.scenes.elastic.solver import solve
 from pipeline.scenes.film import write_film
 from pipeline.scenes.light import make_sensor, shade
 from pipeline.training.trainable import save_trainable
@@ -164,19 +163,6 @@ def test_all_ways_of_training_compute_one_loss(bed: language.Bed) -> None:
     assert losses == pytest.approx(dict.fromkeys(losses, expected), rel=1e-5)
 
 
-def test_operations_of_a_pass_follow_from_the_shapes(bed: language.Bed) -> None:
-    llm, length = bed.model.llm, 40
-    shapes = llm.config
-    with torch.no_grad():
-        embeddings = torch.zeros(2, length, shapes.hidden_size)
-        found = flops_of(lambda: llm(inputs_embeds=embeddings, use_cache=False))
-    keys = shapes.num_key_value_heads * shapes.hidden_size // shapes.num_attention_heads
-    layer = shapes.hidden_size * (2 * shapes.hidden_size + 2 * keys + 3 * shapes.intermediate_size)
-    linear = 2 * length * (shapes.num_hidden_layers * layer + shapes.hidden_size * shapes.vocab_size)
-    attention = 4 * shapes.num_hidden_layers * shapes.hidden_size * length**2
-    assert found == pytest.approx(2 * (linear + attention), rel=0.01)
-
-
 def test_describing_takes_tokens_from_answers_and_errors_from_the_report(project: Path, tmp_path: Path) -> None:
     root = tmp_path / "root"
     (root / "reports" / "smoke-videos").mkdir(parents=True)
@@ -231,15 +217,6 @@ def test_contact(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert fine < rough < 0.01 * springs
 
 
-def test_transforms_of_the_solver_follow_from_its_iterations() -> None:
-    gap = np.add.outer(np.linspace(-1, 1, 32) ** 2, np.linspace(-1, 1, 32) ** 2)
-    kernel = make_kernel(half_space_table(gap.shape, 0.1, 1.0), gap)
-    with counting_ffts() as count:
-        solution = solve(gap, 0.5, kernel, 0.1, tolerance=1e-4)
-    # Forth and back for the surface; in all steps but the last also for the direction and what it moves.
-    assert count.value == 6 * int(solution.iterations[0]) - 4
-
-
 def test_serving_asks_a_fresh_process_and_a_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     made = make(tmp_path, Variant(Encoder.FINETUNED, Lora.WITH, Opd.ALL, 0))
@@ -253,6 +230,12 @@ def test_serving_asks_a_fresh_process_and_a_server(tmp_path: Path, monkeypatch: 
     assert "a fresh process, first answer" in rows
     assert crowded.cost <= rows["a server, 3 clients: 95 % are quicker"].cost
     assert "6 requests, none lost" in crowded.machine
-    monkeypatch.setattr(serving, "post", lambda *_: "another's")
+    monkeypatch.setattr(serving, "served", nullcontext)
+    monkeypatch.setattr(serving, "COMMAND", ["true"])
+    said = itertools.count()
+    monkeypatch.setattr(serving, "post", lambda *_: str(next(said)))
     with pytest.raises(UserError, match="not the one given alone"):
-        serving.timed("", b"a", {b"a": "mine"})
+        serving.measure(tmp_path, clients=3, each=2)
+    monkeypatch.setattr(serving, "COMMAND", ["sh", "-c", "echo octopi: no such model >&2; exit 1"])
+    with pytest.raises(UserError, match="octopi: no such model"):
+        serving.measure(tmp_path)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter
-from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -208,14 +207,6 @@ def test_too_many_combinations_are_one_line() -> None:
         log_dependence(np.zeros((1, 2), np.int64), ["a"], (1000, 1000))
 
 
-def test_dependence_overrules_weak_evidence() -> None:
-    tables = [np.log([[0.45, 0.55]]), np.log([[0.9, 0.1]])]
-    together = log_dependence(np.array([[0, 0], [0, 0], [1, 1], [1, 1]]), list("abcd"), (2, 2))
-    assert decode_jointly(tables, together).tolist() == [[0, 0]]
-    assert decode_jointly(tables, np.zeros((2, 2))).tolist() == [[1, 0]]
-    assert decode_jointly([np.full((1, 2), 0.5)] * 2, np.zeros((2, 2))).tolist() == [[0, 0]]
-
-
 Data = tuple[np.ndarray, np.ndarray, list[str]]
 
 
@@ -277,30 +268,6 @@ def test_folds_hold_whole_objects_and_are_even(numbers: list[int], folds: int, s
     assert sorted(itertools.chain.from_iterable(dealt)) == sorted(set(objects))
     assert max(map(len, dealt)) - min(map(len, dealt)) <= 1
     assert dealt == deal(objects[::-1], folds, seed)
-
-
-def test_no_video_is_predicted_from_its_object(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first feature names the object: a model tells from it which objects it has seen."""
-    features, labels, objects = planted(4, objects=11)
-    features[:, 0] = [int(o[1:]) for o in objects]
-    predicted: Counter[int] = Counter()
-
-    class Spy(PropertyPredictor):
-        def fit(self, features: np.ndarray, labels: np.ndarray, objects: Sequence[str]) -> Spy:
-            self.seen = {int(o[1:]) for o in objects}
-            assert self.seen == set(features[:, 0].astype(int))
-            return self
-
-        def predict(self, features: np.ndarray) -> np.ndarray:
-            tested = features[:, 0].astype(int).tolist()
-            assert not self.seen & set(tested)
-            assert len(self.seen | set(tested)) == 11
-            predicted.update(tested)
-            return np.zeros((len(features), 2), np.int64)
-
-    monkeypatch.setattr("pipeline.encoder.baseline.validation.PropertyPredictor", Spy)
-    cross_validate(forest(features, labels, objects, (3, 2)), objects, (3, 2), folds=3, repeats=2)
-    assert set(predicted.values()) == {3 * 2}  # Videos an object, repeats.
 
 
 @pytest.mark.usefixtures("few_trees")

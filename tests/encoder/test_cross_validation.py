@@ -306,7 +306,8 @@ def test_finished_folds_survive_a_kill(
     whole = cross_validate_candidate(CANDIDATES["constant"], data, CONFIG)
     killed(count, CANDIDATES["constant"], data, monkeypatch)
     begun = kill_after(99, monkeypatch)
-    assert cross_validate_candidate(CANDIDATES["constant"], data, CONFIG) == whole
+    fewer = CONFIG.model_copy(update={"models": ("constant",)})
+    assert cross_validate_candidate(CANDIDATES["constant"], data, fewer) == whole, "other models are no matter"
     assert begun == [(r, n) for r in range(2) for n in range(3)][count:]
     assert not any(tmp_path.glob("checkpoints/cross_validation/*")), "kept no longer than needed"
 
@@ -380,18 +381,18 @@ def test_features_of_a_recording_are_those_of_five_frames_at_equal_distances(tmp
         reference = np.mean([frames[i] for i in reference_indices(count)], axis=0, dtype=np.float64)
         inner = [frames[round(k * (count - 1) / 6)] for k in range(1, 6)]
         expected = video_features(inner, reference.astype(np.float32))
-        np.testing.assert_allclose(describe(Recording(path, False)), expected, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(describe(Recording(path, count, False)), expected, rtol=1e-4, atol=1e-5)
     back = encode(tmp_path / "back.mkv", moving_square(13, 13)[::-1])
-    turned = describe(Recording(back, True))
+    turned = describe(Recording(back, 13, True))
     np.testing.assert_allclose(turned, expected, rtol=1e-4, atol=1e-5, err_msg="one that starts touching, from its end")
-    assert not np.allclose(describe(Recording(back, False)), turned)
+    assert not np.allclose(describe(Recording(back, 13, False)), turned)
 
 
 def test_trees_are_the_baseline_on_whole_recordings(
     data: CrossValidationData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("pipeline.encoder.baseline.predictor.TREES", 10)
-    videos = [v.model_copy(update={"path": f"{v.video_id}.mkv"}) for v in data.videos[:8]]
+    videos = [v.model_copy(update={"path": f"{v.video_id}.mkv", "frames": 6}) for v in data.videos[:8]]
     for seed, video in enumerate(videos):
         encode(tmp_path / video.path, moving_square(6, seed))
     touching = {videos[1].video_id, videos[4].video_id}
@@ -401,7 +402,7 @@ def test_trees_are_the_baseline_on_whole_recordings(
         r.video_id: r.predicted
         for r in cross_validate_candidate(CANDIDATES["trees"], replace(data, videos=videos), SMALL)
     }
-    recordings = [Recording(tmp_path / v.path, v.video_id in touching) for v in videos]
+    recordings = [Recording(tmp_path / v.path, 6, v.video_id in touching) for v in videos]
     features = np.stack([describe(recording) for recording in recordings])
     np.testing.assert_array_equal(recording_features(recordings), features)
     labels = np.array([data.catalogue.labels(v.object_id) for v in videos])
@@ -418,22 +419,24 @@ def test_trees_are_the_baseline_on_whole_recordings(
 
 def test_a_candidate_that_cannot_be_trained_is_one_clear_line(weights: Path, tmp_path: Path) -> None:
     paper, other = config(weights, "paper"), config(weights, "tuned")
-    check_candidates([name for name in CANDIDATES if name != "backbone-tuned"], paper)
-    check_candidates([n for n in CANDIDATES if n not in ("paper", "paper-difference", "scratch")], other)
+    check_candidates([name for name in CANDIDATES if name != "backbone-tuned"], paper, 32)
+    check_candidates([n for n in CANDIDATES if n not in ("paper", "paper-difference", "scratch")], other, 32)
     with pytest.raises(UserError, match=r"^cross_validation.models: pretraind is no model; did you mean pretrained\?"):
-        check_candidates(("paper", "pretraind"), paper)
+        check_candidates(("paper", "pretraind"), paper, 32)
     for names, setting in ((("constant", "paper"), "release"), (("scratch",), "tuned"), (("backbone-tuned",), "paper")):
         with pytest.raises(
             UserError, match=rf"{names[-1]} would be trained with the settings of encoder.recipe={setting}"
         ):
-            check_candidates(names, config(weights, setting))
+            check_candidates(names, config(weights, setting), 32)
     folder = write_timm(tmp_path / "timm")
-    check_candidates(("trees", "backbone", "backbone-tuned"), config(folder, "tuned"))
+    check_candidates(("trees", "backbone", "backbone-tuned"), config(folder, "tuned"), 32)
     for name in ("probe", "release"):
         with pytest.raises(
-            UserError, match=rf"{name} needs a CLIP, but encoder.weights=.*timm has no open_clip_config"
+            UserError, match=rf"{name} needs a CLIP; leave it out, or: .*timm.open_clip_config.json does not exist"
         ):
-            check_candidates((name,), config(folder, "tuned"))
+            check_candidates((name,), config(folder, "tuned"), 32)
+    with pytest.raises(UserError, match=r"probe needs a CLIP; leave it out, or: .*frames\.size is 24"):
+        check_candidates(("probe",), other, 24)
 
 
 def test_more_folds_than_objects_are_refused(data: CrossValidationData) -> None:

@@ -95,15 +95,6 @@ def test_pictures_differ_by_number_and_by_seed(drawn: SyntheticPictures) -> None
     assert (elsewhere.quantities[0, 0, 0] != drawn.quantities[:, 0, 0]).all()
 
 
-@pytest.mark.parametrize(("processes", "chunk"), [(3, 1)])
-def test_the_number_of_processes_and_chunks_changes_nothing(
-    processes: int, chunk: int, drawn: SyntheticPictures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(pipeline.parallel, "cores", lambda: processes)
-    monkeypatch.setattr(module, "CHUNK", chunk)
-    assert equal(draw_pictures(CONFIG, FRAMES, tmp_path), drawn)
-
-
 def interrupt() -> None:
     raise KeyboardInterrupt
 
@@ -339,7 +330,7 @@ def test_what_is_invented_can_be_made(seed: int) -> None:
     kinds = [layer.kind for layer in recipe.relief]
     assert len(kinds) == len(set(kinds)) <= 3
     assert {*kinds, recipe.body.kind} <= set(KINDS)
-    surface = heights(recipe.surface, 65, 0.25, np.random.default_rng(seed))
+    surface = heights(recipe.body, recipe.relief, 65, 0.25, np.random.default_rng(seed))
     assert (surface.shape, surface.dtype) == ((65, 65), np.float32)
     assert np.isfinite(surface).all()
     assert surface.max() < 20, "in mm: nothing stands out farther than the sensor is wide"

@@ -329,6 +329,8 @@ def test_each_recipe_saves_what_is_its_own_and_reloads_exactly(
         ("disguised pickle", "does not fit"),
         ("small frames", r"frames\.size is 24 .* frames\.size=32$"),
         ("another model", "does not fit its open_clip_config.json"),
+        ("a key of another release", "does not fit its open_clip_config.json"),
+        ("a text tower on a hub", "open_clip would ask a hub"),
         ("language pickle", "only pickles"),
     ],
 )
@@ -345,6 +347,12 @@ def test_bad_weights_are_one_line(broken: str, message: str, tmp_path: Path) -> 
             torch.save({"a": torch.zeros(1)}, file)
         case "another model":
             form.write_text(form.read_text().replace('"layers": 2', '"layers": 3'))
+        case "a key of another release":
+            form.write_text(form.read_text().replace('"layers": 2', '"layers": 2, "unheard_of": 1', 1))
+        case "a text tower on a hub":
+            form.write_text(
+                form.read_text().replace('"text_cfg": {', '"text_cfg": {"hf_model_name": "xlm-roberta-base", ')
+            )
         case "language pickle":
             folder = write_llama(tmp_path / "llama")
             (folder / "model.safetensors").rename(folder / "pytorch_model.bin")

@@ -39,7 +39,7 @@ def run(kind: str, weights: str, questions: list[Question], store: EmbeddingStor
     """One training with its checkpoints below the folder."""
     shared.CHECKPOINTS = folder
     language = LanguageConfig(weights=weights, dtype=KINDS[kind])  # type: ignore[arg-type]
-    model, data = assemble(material(language, questions, store), CONFIG.samples, "test")
+    model, data = assemble(material(language, questions, store), CONFIG, "test")
     job, runtime = Job(kind, "x", 0), RuntimeConfig(device="cpu", save_steps=2)
     if kind == "align":
         return fit(model, data, CONFIG, runtime, job)

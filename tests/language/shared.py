@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import torch
 
-from pipeline.config import LanguageConfig, TrainConfig
+from pipeline.config import LanguageConfig, LoraTrainConfig, TrainConfig
 from pipeline.embeddings import EmbeddingStore
 from pipeline.language.chat import encode, render
-from pipeline.language.generate import GenerationSettings
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import Material
 from pipeline.records import Opd, Question
@@ -20,8 +19,13 @@ def material(language: LanguageConfig, questions: list[Question], store: Embeddi
     return Material(trained, store, Opd.ALL, language, per_video=FRAMES, flip_probability=0.5, seed=3)
 
 
-def generation(batch_size: int, tokens: int = 12) -> GenerationSettings:
-    return GenerationSettings(system_prompt="", per_video=FRAMES, max_new_tokens=tokens, batch_size=batch_size)
+def generation(batch_size: int, tokens: int = 12) -> LanguageConfig:
+    return LanguageConfig(weights="", max_new_tokens=tokens, generation_batch_size=batch_size)
+
+
+def taking(samples: int, **own: float) -> LoraTrainConfig:
+    """Settings that take so many questions."""
+    return LoraTrainConfig(samples=samples, **own)
 
 
 SMALL = TrainConfig(samples=8, epochs=2, batch_size=4, micro_batch_size=2, projection_learning_rate=1e-3)

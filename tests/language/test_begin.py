@@ -17,7 +17,7 @@ from pipeline.language.words import begin_with_words
 from pipeline.records import Embedding, Question
 from pipeline.videos.catalogue import load_catalogue
 from tests.closure import ROOT
-from tests.language.shared import DIM, material
+from tests.language.shared import DIM, material, taking
 
 CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")
 
@@ -40,8 +40,8 @@ def test_frames_read_like_the_words_of_their_classes(
     write_table(tmp_path / INDEX_FILE, Embedding, index)
     save_tensors(tmp_path / TENSOR_FILE, {TENSOR: torch.stack([felt(labels[e.video_id], drawn) for e in index])})
     own = language.model_copy(update={"normalize_touch": normalize})
-    model, data = assemble(material(own, questions, EmbeddingStore(tmp_path)), 14, "test")
-    twin, _ = assemble(material(own, questions, EmbeddingStore(tmp_path)), 14, "test")
+    model, data = assemble(material(own, questions, EmbeddingStore(tmp_path)), taking(14), "test")
+    twin, _ = assemble(material(own, questions, EmbeddingStore(tmp_path)), taking(14), "test")
     for each in (model, twin):
         begin_with_words(each, data, CATALOGUE, seed=1)
         assert all(p.grad is None for p in each.parameters())

@@ -23,7 +23,7 @@ from pipeline.language.generate import write_prompt
 from pipeline.language.training import assemble
 from pipeline.records import Question, Turn
 from tests.checkpoints import write_llama
-from tests.language.shared import generation, material
+from tests.language.shared import FRAMES, generation, material, taking
 from tests.models import model_folder
 
 
@@ -45,10 +45,10 @@ def test_without_a_begin_token_all_else_is_the_same(
     own = replace(rendered, text="<s>" + rendered.text, answers=(), templated=True)
     assert encode(own, tokenizer, bos=False) == encode(own, tokenizer)
     held = material(language, questions, store)
-    _, theirs = assemble(replace(held, language=language.model_copy(update={"bos": False})), 6, "test")
-    _, ours = assemble(held, 6, "test")
+    _, theirs = assemble(replace(held, language=language.model_copy(update={"bos": False})), taking(6), "test")
+    _, ours = assemble(held, taking(6), "test")
     assert [(1, *e.input_ids) for e in theirs.encoded] == [e.input_ids for e in ours.encoded]
-    asked = write_prompt(turns, tokenizer, replace(generation(1), bos=False))
+    asked = write_prompt(turns, tokenizer, generation(1).model_copy(update={"bos": False}), FRAMES)
     assert asked == tuple(
         i for i, label in zip(without.input_ids, without.labels, strict=True) if label == IGNORE_INDEX
     )
@@ -57,7 +57,7 @@ def test_without_a_begin_token_all_else_is_the_same(
 def test_same_draws_for_same_epoch_and_others_for_another(
     language: LanguageConfig, questions: list[Question], store: EmbeddingStore
 ) -> None:
-    _, data = assemble(material(language, questions, store), 6, "test")
+    _, data = assemble(material(language, questions, store), taking(6), "test")
     first = [data[i]["features"] for i in range(len(data))]
     assert all(torch.equal(a, data[i]["features"]) for i, a in enumerate(first))
     data.follow(lambda: 1)
@@ -70,7 +70,7 @@ def test_counterfactuals_have_other_videos_and_teach_only_conclusions(
     """Of the described questions the wanted share, and no other; all else is as without."""
     held = material(language, questions, store)
     tokenizer = load_tokenizer(Path(language.weights))
-    (_, plain), (_, mixed) = (assemble(held, 14, "test", counterfactual=share) for share in (0.0, 0.5))
+    (_, plain), (_, mixed) = (assemble(held, taking(14, counterfactual=share), "test") for share in (0.0, 0.5))
     described = changed = 0
     for epoch in range(40):
         for data in (plain, mixed):

@@ -22,7 +22,7 @@ from pipeline.language.generate import answer
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import assemble
 from pipeline.records import Embedding, Opd, Question
-from tests.language.shared import DIM, generation, material
+from tests.language.shared import DIM, FRAMES, generation, material, taking
 
 
 def plainly(model: OctopiForCausalLM, ids: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
@@ -71,15 +71,6 @@ def test_embedding_equals_a_plain_one(steady: OctopiForCausalLM, rows: list[list
         torch.testing.assert_close(steady.embed(ids, features), plainly(steady, ids, features), atol=2e-6, rtol=0)
 
 
-def test_frames_of_one_row_give_gradients_to_no_other(model: OctopiForCausalLM) -> None:
-    ids = torch.tensor([[model.frame_id] * 7, [5] * 7])
-    features = torch.randn(2, 7, DIM, requires_grad=True)
-    model.embed(ids, features).square().sum().backward()
-    assert features.grad is not None
-    assert (features.grad[0].abs().sum(1) > 0).all()
-    assert (features.grad[1] == 0).all()
-
-
 def test_a_conversation_without_an_answer_is_named(
     questions: list[Question], store: EmbeddingStore, language: LanguageConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -88,7 +79,7 @@ def test_a_conversation_without_an_answer_is_named(
         lambda *given, **how: Encoded((ids := encode_turns(*given, **how).input_ids), (IGNORE_INDEX,) * len(ids)),
     )
     with pytest.raises(UserError, match=r"^[A-Z]+-train-\d+: has no answer to learn from"):
-        assemble(material(language, questions, store), 3, "test")
+        assemble(material(language, questions, store), taking(3), "test")
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
@@ -111,7 +102,7 @@ def test_a_video_without_embeddings_is_named(
 ) -> None:
     question = questions[0].model_copy(update={"videos": ("nowhere_3",) * len(questions[0].videos)})
     with pytest.raises(UserError, match="nowhere_3 has no embedding; run `dvc repro`"):
-        answer(model, store, [question], Opd.ALL, generation(1))
-    _, data = assemble(material(language, [question], store), 1, "test")
+        answer(model, store, [question], Opd.ALL, generation(1), FRAMES)
+    _, data = assemble(material(language, [question], store), taking(1), "test")
     with pytest.raises(UserError, match="nowhere_3"):
         data[0]

@@ -20,7 +20,7 @@ from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import assemble
 from pipeline.records import Opd, Question
 from tests.checkpoints import write_llama
-from tests.language.shared import DIM, FRAMES, generation, material, prompt
+from tests.language.shared import DIM, FRAMES, generation, material, prompt, taking
 
 
 def by_hand(model: OctopiForCausalLM, question: Question, store: EmbeddingStore, opd: Opd, count: int) -> list[int]:
@@ -47,7 +47,7 @@ def test_one_row_answers_as_transformers_own_generation_does(
             eos_token_id=end,
             pad_token_id=0,
         )[0].tolist()
-        (prediction,) = answer(model, store, [question], Opd.NEEDED, generation(1, limit))
+        (prediction,) = answer(model, store, [question], Opd.NEEDED, generation(1, limit), FRAMES)
         assert prediction.outputs == (model.tokenizer.decode(new, skip_special_tokens=True).strip(),)
         assert prediction.tokens == len(new)
         first = by_hand(model, question, store, Opd.NEEDED, 12)
@@ -75,7 +75,7 @@ def test_an_answer_at_the_limit_is_whole_and_one_beyond_is_cut(
 ) -> None:
     """A token that the model says after some others is made the end token."""
     asked = [q for q in questions if q.task == "OPD"][:3]
-    assert all(p.truncated and p.tokens == 8 for p in answer(model, store, asked, Opd.ALL, generation(4, 8)))
+    assert all(p.truncated and p.tokens == 8 for p in answer(model, store, asked, Opd.ALL, generation(4, 8), FRAMES))
     said = {q.question_id: by_hand(model, q, store, Opd.ALL, 8) for q in asked}
     question = next(q for q in asked if len(set(said[q.question_id])) > 1)
     new = said[question.question_id]
@@ -83,7 +83,7 @@ def test_an_answer_at_the_limit_is_whole_and_one_beyond_is_cut(
     other = copy.copy(model)
     other.tokenizer = copy.deepcopy(model.tokenizer)
     other.tokenizer.eos_token = other.tokenizer.convert_ids_to_tokens(new[place])
-    whole, cut = (answer(other, store, [question], Opd.ALL, generation(1, n))[0] for n in (place + 1, place))
+    whole, cut = (answer(other, store, [question], Opd.ALL, generation(1, n), FRAMES)[0] for n in (place + 1, place))
     assert (whole.truncated, whole.tokens) == (False, place + 1)
     assert (cut.truncated, cut.tokens) == (True, place)
     assert whole.outputs == cut.outputs, "the end token says nothing"
@@ -100,7 +100,7 @@ def test_an_answer_ends_where_the_positions_do_whatever_its_neighbours(
     torch.manual_seed(0)
     folder = write_llama(tmp_path / "tight", pad="</s>", max_position_embeddings=most)
     tight = OctopiForCausalLM.from_base(folder, DIM)
-    alone, together = (answer(tight, store, asked, Opd.ALL, generation(size, 40)) for size in (1, 50))
+    alone, together = (answer(tight, store, asked, Opd.ALL, generation(size, 40), FRAMES) for size in (1, 50))
     assert alone == together
     room = {name: min(40, most - length) for name, length in lengths.items()}
     assert len(set(room.values())) > 2
@@ -115,19 +115,19 @@ def test_a_question_longer_than_the_positions_is_named_with_the_key(
 ) -> None:
     setting = LanguageConfig(weights=str(write_llama(tmp_path, max_position_embeddings=60)))
     with pytest.raises(UserError, match=r"^[A-Z]+-train-\d+: takes \d+ tokens, .* 60 at once; lower frames.per_video"):
-        assemble(material(setting, questions, store), 4, "test")
+        assemble(material(setting, questions, store), taking(4), "test")
     model = OctopiForCausalLM.from_base(setting.weights, DIM)
     with pytest.raises(UserError, match=r"^[A-Z]+-train-\d+: .*language.system_prompt.*language.weights$"):
-        answer(model, store, questions, Opd.ALL, generation(2))
+        answer(model, store, questions, Opd.ALL, generation(2), FRAMES)
 
 
 @pytest.mark.parametrize("opd", [Opd.ALL, Opd.NONE])
 def test_batch_size_changes_no_answer(
     model: OctopiForCausalLM, questions: list[Question], store: EmbeddingStore, opd: Opd
 ) -> None:
-    one = answer(model, store, questions, opd, generation(1))
-    assert answer(model, store, questions, opd, generation(5)) == one
-    mixed = answer(model, store, questions[::-1], opd, generation(len(questions)))
+    one = answer(model, store, questions, opd, generation(1), FRAMES)
+    assert answer(model, store, questions, opd, generation(5), FRAMES) == one
+    mixed = answer(model, store, questions[::-1], opd, generation(len(questions)), FRAMES)
     assert sorted(mixed, key=lambda p: p.question_id) == sorted(one, key=lambda p: p.question_id)
     turns = {q.question_id: len(d.turns) for q in questions if (d := q.dialogue(opd))}
     assert {p.question_id: len(p.outputs) for p in one} == turns
@@ -145,4 +145,4 @@ def test_embeddings_of_another_length_are_refused(
 ) -> None:
     model = OctopiForCausalLM.from_base(language.weights, DIM + 1)
     with pytest.raises(UserError, match=f"embeddings of {DIM}, but the model reads {DIM + 1}"):
-        answer(model, store, [], Opd.ALL, generation(1))
+        answer(model, store, [], Opd.ALL, generation(1), FRAMES)

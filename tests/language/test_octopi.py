@@ -15,13 +15,13 @@ from pipeline.embeddings import EmbeddingStore
 from pipeline.errors import UserError
 from pipeline.language.base import load_llm, load_tokenizer
 from pipeline.language.chat import IGNORE_INDEX
-from pipeline.language.conversations import ConversationCollator
+from pipeline.language.conversations import collate
 from pipeline.language.generate import answer
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import add_lora, assemble
 from pipeline.records import Opd, Question
 from tests.checkpoints import write_llama
-from tests.language.shared import DIM, call, generation, material
+from tests.language.shared import DIM, FRAMES, call, generation, material, taking
 
 LORA = LoraTrainConfig(samples=1, rank=4, alpha=8, dropout=0.0)
 
@@ -35,8 +35,8 @@ def test_loss_is_over_answers_only(
     store: EmbeddingStore,
 ) -> None:
     """By hand in float64, over rows of unlike lengths whose answers begin at other columns."""
-    _, data = assemble(material(language, questions, store), 4, "test", conclusion_weight=weight)
-    batch = ConversationCollator(0)([data[i] for i in range(len(data))])
+    _, data = assemble(material(language, questions, store), taking(4, conclusion_weight=weight), "test")
+    batch = collate([data[i] for i in range(len(data))])
     labels, weights = batch.pop("labels"), batch["weights"]
     concluding = ["".join(model.tokenizer.decode(i[w > 1])) for i, w in zip(labels, weights, strict=True)]
     assert any(concluding) == (weight > 1)
@@ -54,19 +54,6 @@ def test_loss_is_over_answers_only(
     torch.testing.assert_close(share.double(), torch.stack(losses).sum() / 1000, atol=1e-5, rtol=0)
     frames = batch["input_ids"] == model.frame_id
     assert (labels[frames] == IGNORE_INDEX).all()
-
-
-def test_padding_changes_no_logit(
-    model: OctopiForCausalLM, language: LanguageConfig, questions: list[Question], store: EmbeddingStore
-) -> None:
-    _, data = assemble(material(language, questions, store), 6, "test")
-    samples = [data[i] for i in range(len(data))]
-    batch = ConversationCollator(0)(samples)
-    del batch["labels"], batch["weights"]
-    together = model(**batch).logits
-    for row, sample in enumerate(samples):
-        alone = model(sample["input_ids"][None], sample["features"][None]).logits[0]
-        torch.testing.assert_close(together[row, : len(alone)], alone, atol=2e-5, rtol=0)
 
 
 def test_normalized_touch_is_as_long_as_words(language: LanguageConfig, tmp_path: Path) -> None:
@@ -167,31 +154,16 @@ def test_tied_or_not_grouped_or_not(tied: bool, heads: int, tmp_path: Path) -> N
     assert torch.equal(again(**call(model)).logits, model(**call(model)).logits)
 
 
-def test_sharded_weights_are_read_and_a_missing_shard_is_named(language: LanguageConfig, tmp_path: Path) -> None:
-    folder = write_llama(tmp_path, shard="20KB")
-    shards = sorted(folder.glob("model-*.safetensors"))
-    assert len(shards) > 2
-    whole, parts = (load_llm(Path(f), torch.float32).state_dict() for f in (language.weights, folder))
-    assert all(torch.equal(value, parts[name]) for name, value in whole.items())
-    shards[1].unlink()
-    with pytest.raises(UserError, match=r"language.weights: .*model-00002-of"):
-        load_llm(folder, torch.float32)
-    write_llama(tmp_path, shard="20KB")
-    shards[0].write_bytes(shards[0].read_bytes()[:-100])
-    with pytest.raises(UserError, match=r"language.weights: .* cannot be loaded"):
-        load_llm(folder, torch.float32)
-
-
 @pytest.mark.parametrize(("pad", "bos"), [("<pad>", True), ("</s>", False), ("<unk>", True), (None, False)])
 def test_any_padding_token_leaves_the_end_to_be_learnt(
     pad: str | None, bos: bool, questions: list[Question], store: EmbeddingStore, tmp_path: Path
 ) -> None:
     folder = write_llama(tmp_path, bos=bos, pad=pad)
     setting = LanguageConfig(weights=str(folder))
-    model, data = assemble(material(setting, questions, store), 6, "test")
+    model, data = assemble(material(setting, questions, store), taking(6), "test")
     assert model.tokenizer.pad_token == (pad or "<unk>")
     samples = [data[i] for i in range(len(data))]
-    batch = ConversationCollator(int(model.tokenizer.pad_token_id))(samples)
+    batch = collate(samples)
     end = model.tokenizer.eos_token_id
     for row, sample in zip(batch["labels"], samples, strict=True):
         kept = row[row != IGNORE_INDEX]
@@ -199,7 +171,7 @@ def test_any_padding_token_leaves_the_end_to_be_learnt(
         assert torch.equal(kept, sample["labels"][sample["labels"] != IGNORE_INDEX])
         opening = model.tokenizer.convert_ids_to_tokens(sample["input_ids"][:1].tolist())
         assert (opening[0] == "<s>") == bos
-    one, many = (answer(model, store, questions, Opd.NEEDED, generation(size, 6)) for size in (1, 7))
+    one, many = (answer(model, store, questions, Opd.NEEDED, generation(size, 6), FRAMES) for size in (1, 7))
     assert one == many
     assert all(p.tokens <= 6 * len(p.outputs) for p in one)
 
@@ -261,6 +233,11 @@ def broken(folder: Path, what: str) -> str:
         file = adapter / "adapter_model.safetensors"
         file.write_bytes(file.read_bytes()[:300])
         return "adapter: its adapter is broken or of another language model"
+    if what == "adapter that lacks a tensor":
+        file = adapter / "adapter_model.safetensors"
+        first, *rest = sorted(load_file(file).items())
+        save_file(dict(rest), file, {"format": "pt"})
+        return f"adapter: its adapter is broken or of another language model .{first[0]}"
     if what == "pickled connector":
         torch.save({}, folder / "connector.safetensors")
         return "not a safetensors file"
@@ -278,6 +255,7 @@ BROKEN = (
     "foreign config",
     "pickled adapter",
     "cut adapter",
+    "adapter that lacks a tensor",
     "pickled connector",
     "foreign connector",
     "NaN",

@@ -90,6 +90,8 @@ def test_a_killed_teaching_goes_on_with_the_same_phase(language: LanguageConfig,
     def die() -> None:
         raise KeyboardInterrupt
 
+    for folder in checkpoints.iterdir():
+        shutil.rmtree(folder)
     with pytest.raises(KeyboardInterrupt):
         run(language, AtStep(3, die))
     assert list(checkpoints.rglob("trainer_state.json"))

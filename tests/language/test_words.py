@@ -17,13 +17,13 @@ from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig
 from pipeline.embeddings import EmbeddingStore
 from pipeline.errors import UserError
 from pipeline.language.chat import IGNORE_INDEX
-from pipeline.language.conversations import ConversationCollator
+from pipeline.language.conversations import collate
 from pipeline.language.decoding import greedy
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import Job, add_lora, assemble, fit, write_model_card
 from pipeline.records import Question
 from tests.checkpoints import write_llama
-from tests.language.shared import DIM, SMALL, call, material
+from tests.language.shared import DIM, SMALL, call, material, taking
 from tests.language.test_octopi import digests
 
 CPU = RuntimeConfig(device="cpu")
@@ -66,10 +66,10 @@ def test_a_step_is_that_of_plain_torch(
     folder = write_llama(tmp_path / "base", tie_word_embeddings=tied, pad_token_id=1)
     before = digests(folder)
     setting = LanguageConfig(weights=str(folder), system_prompt="You feel.")
-    model, data = assemble(material(setting, questions, store), 4, "test")
+    model, data = assemble(material(setting, questions, store), taking(4), "test")
     model.train_words()
     model.double()
-    batch = ConversationCollator(0)([data[i] for i in range(4)])
+    batch = collate([data[i] for i in range(4)])
     assert model.train()._shared(batch["input_ids"], batch["labels"]) > 9
     expected = reference(model, folder, batch)
     base = {n: p.detach().clone() for n, p in model.llm.named_parameters()}
@@ -104,7 +104,7 @@ def test_a_step_is_that_of_plain_torch(
 def test_without_it_no_old_row_moves_and_none_is_saved(
     language: LanguageConfig, questions: list[Question], store: EmbeddingStore, checkpoints: Path
 ) -> None:
-    model, data = assemble(material(language, questions, store), 4, "test")
+    model, data = assemble(material(language, questions, store), taking(4), "test")
     base = {n: p.detach().clone() for n, p in model.llm.named_parameters()}
     start = model.connector.delimiters.detach().clone()
     trained = fit(model, data, STEP, CPU, Job("align", "x", 0))
@@ -125,12 +125,12 @@ def test_adapters_go_on_with_what_alignment_trained(
 ) -> None:
     held = material(language.model_copy(update={"dtype": dtype}), questions, store)
     folder = checkpoints / "aligned"
-    model, data = assemble(held, 4, "test")
+    model, data = assemble(held, taking(4), "test")
     model.train_words()
     model.save_pretrained(folder, fit(model, data, STEP, CPU, Job("align", "x", 0)).state)
     aligned = load_file(folder / "words.safetensors")["weight"]
     assert aligned.dtype == torch.float32
-    model, data = assemble(held, 8, "test", folder)
+    model, data = assemble(held, taking(8), "test", folder)
     assert torch.equal(model.words.weight, aligned)
     add_lora(model, LORA)
     trained = fit(model, data, LORA, CPU, Job("lora", "x", 0))
@@ -193,7 +193,7 @@ def test_a_projection_without_schedule_keeps_its_rate(
 ) -> None:
     """Eight questions make two updates an epoch; the rest of what is trained warms up for two of six, then falls."""
     config = LORA.model_copy(update={"epochs": 3, "projection_schedule": "constant", "warmup_ratio": 1 / 3})
-    model, data = assemble(material(language, questions, store), 8, "test")
+    model, data = assemble(material(language, questions, store), taking(8), "test")
     model.train_words()
     add_lora(model, config)
     named = {id(p): n for n, p in model.named_parameters()}

@@ -46,7 +46,7 @@ def test_effects_are_written_in_points_and_what_is_unknown_is_empty() -> None:
     shown = BY_KEY["effects"].build(scores_of(), rows, published())
     assert list(shown["Difference, points [95 %]"]) == ["-12.5 [-30.0, +5.0]", "+10.0"]
     assert list(shown["p"]) == ["0.200", ""]
-    assert list(shown["Smallest that could be found"]) == ["25.0", "25.0"]
+    assert list(shown["Smallest that could be found, before Holm"]) == ["25.0", "25.0"]
     assert BY_KEY["touch_effects"].build(scores_of(), rows, published()).empty
 
 
@@ -96,10 +96,6 @@ def test_tasks_stand_where_they_belong_whole_answers_first() -> None:
 
 def test_the_heads_have_no_unread_answers_where_it_was_not_counted() -> None:
     assert list(build("touch", score(touch="removed", unread=None))["Unread %"]) == [""]
-
-
-def test_another_data_set_has_nothing_published_beside_it() -> None:
-    assert not [c for c in build("understanding", score("PC"), dataset="Other").columns if "Published" in c]
 
 
 @pytest.mark.parametrize("table", TABLES, ids=lambda t: t.key)
@@ -210,11 +206,6 @@ def test_published_keys_are_unique_percentages_of_their_n_and_of_registered_task
     for row in cells[cells["model"] == "chance"].to_dict("records"):
         assert row["value"] == pytest.approx(100 * TASKS[row["task"]].chance(catalogue)[row["measure"]], abs=0.005)
     assert published("Other").empty
-
-
-def test_what_is_no_task_has_a_title() -> None:
-    assert task_title("heads") == "Property heads"
-    assert task_title("unheard of") == "unheard of"
 
 
 def test_a_folder_that_is_no_report_or_lacks_a_column_is_one_line(tmp_path: Path) -> None:

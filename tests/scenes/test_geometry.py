@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from pipeline.scenes.geometry import IMAGE_MM, Bar, Flat, Round, Surface, Wedge, heights
+from pipeline.scenes.geometry import IMAGE_MM, Bar, Flat, Round, Wedge, heights
 from pipeline.scenes.grid import Grid
 from pipeline.scenes.relief import Rough
 
@@ -21,7 +21,7 @@ FLAT = Flat(kind="flat")
 @given(st.floats(1, 1e4), st.floats(1, 1e4), st.integers(1, 40), st.floats(0.01, 1))
 def test_a_round_body_is_its_paraboloid(across: float, along: float, half: int, pitch: float) -> None:
     side = 2 * half + 1
-    found = heights(Surface(body=Round(kind="round", radii=(across, along))), side, pitch, np.random.default_rng(0))
+    found = heights(Round(kind="round", radii=(across, along)), (), side, pitch, np.random.default_rng(0))
     for row, column in ((half, half), (0, half), (half, 0), (side - 1, 0)):
         x, y = (column - half) * pitch, (row - half) * pitch
         assert found[row, column] == pytest.approx(-x * x / 2 / across - y * y / 2 / along, rel=1e-4, abs=1e-7)
@@ -58,14 +58,14 @@ def test_a_wedge_is_round_on_top_and_straight_far_from_it() -> None:
 def test_layers_add_up_in_order() -> None:
     coarse, fine = Rough(kind="rough", rms=0.05, longest=3), Rough(kind="rough", rms=0.01, longest=0.8)
     ball = Round(kind="round", radii=(20, 30))
-    whole = heights(Surface(body=ball, relief=(coarse, fine)), 90, PITCH, np.random.default_rng(5))
+    whole = heights(ball, (coarse, fine), 90, PITCH, np.random.default_rng(5))
     rng, grid = np.random.default_rng(5), Grid(90, PITCH)
     np.testing.assert_allclose(whole, ball.sample(grid) + coarse.sample(grid, rng) + fine.sample(grid, rng), atol=1e-6)
 
 
 def test_a_patch_follows_from_its_generator() -> None:
-    surface = Surface(body=FLAT, relief=(Rough(kind="rough", rms=0.05, longest=3),))
-    first, again, other = (heights(surface, 64, PITCH, np.random.default_rng(s)) for s in (1, 1, 2))
+    rough = (Rough(kind="rough", rms=0.05, longest=3),)
+    first, again, other = (heights(FLAT, rough, 64, PITCH, np.random.default_rng(s)) for s in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     assert (first != other).any()
 

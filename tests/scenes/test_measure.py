@@ -25,7 +25,7 @@ RECIPES = "pipeline/physiclear"
 def look(recipe: Recipe, seed: int) -> Measured:
     """The measures of one press onto the middle of a patch."""
     cv2.setNumThreads(1)
-    patch = heights(recipe.surface, SIDE, PITCH, np.random.default_rng(seed))
+    patch = heights(recipe.body, recipe.relief, SIDE, PITCH, np.random.default_rng(seed))
     skin = Body(patch, recipe.modulus, PITCH).press(Method("layer", 128), np.array([FORCE_N])).skins[0]
     top, left = (SIDE - HEIGHT) // 2, (SIDE - WIDTH) // 2
     view = (slice(top, top + HEIGHT), slice(left, left + WIDTH))
@@ -68,7 +68,7 @@ def test_texture_passes_short_waves_and_stops_long_ones() -> None:
 @given(st.floats(5, 1e3), st.floats(5, 1e3))
 def test_curvature_is_no_texture(across: float, along: float) -> None:
     recipe = Recipe.model_validate({"modulus": 1, "body": {"kind": "round", "radii": [across, along]}})
-    assert texture(heights(recipe.surface, WIDTH, PITCH, np.random.default_rng(0)), PITCH) < 2e-4
+    assert texture(heights(recipe.body, recipe.relief, WIDTH, PITCH, np.random.default_rng(0)), PITCH) < 2e-4
 
 
 @pytest.mark.parametrize("radius", [3.0, 5.0, 8.0])

@@ -81,6 +81,14 @@ def test_a_scene_is_the_same_at_other_resolutions(recipes: dict[str, Recipe]) ->
     np.testing.assert_allclose(depths, depths[-1], rtol=0.02)
 
 
+@pytest.mark.parametrize("tier", ["auto", "layer"])
+def test_pictures_may_be_upright(tier: str) -> None:
+    config = SMALL.model_copy(update={"width": 48, "height": 64, "tier": tier, "cells": 64})
+    assert film(PLAIN, config, 1)[1][0].shape == (64, 48, 3)
+    with pytest.raises(UserError, match=r"scenes.cells is 32, but pictures of this shape need \d+ or more"):
+        make_scene(PLAIN, config.model_copy(update={"width": 120, "height": 160, "tier": "layer", "cells": 32}), 8, 1)
+
+
 def test_two_frames_are_enough(recipes: dict[str, Recipe]) -> None:
     _, frames = film(recipes["rice"], SMALL.model_copy(update={"frames": 2}), 1)
     assert len(frames) == 2
@@ -97,7 +105,7 @@ def test_files_are_equal_for_equal_seeds(recipes: dict[str, Recipe], catalogue: 
     for file in list_videos(folders[0], catalogue).files:
         found = scan(file, FramesConfig(size=16))
         assert isinstance(found, Scan)
-        video = found.video
+        video = found.probe
         assert (video.frames, video.width, video.height, video.fps) == (8, 64, 48, 25.0)
 
 

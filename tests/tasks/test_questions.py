@@ -11,7 +11,7 @@ from pipeline.records import Part, Question
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool
 from pipeline.tasks.questions import build_questions, pool_of
-from pipeline.videos.catalogue import load_catalogue
+from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.split import assign
 from tests.conftest import ROOT, fake_videos
 
@@ -23,7 +23,9 @@ POOLS = {part: pool_of(part, ASSIGNMENTS, CATALOGUE) for part in (Part.TRAIN, Pa
 
 
 def key(question: Question) -> tuple[object, ...]:
-    return question.task, question.videos, question.gold.properties, question.dialogues[-1].turns[-1].assistant
+    last = question.dialogues[-1].turns[-1]
+    situation = "" if "{tactile}" in last.user else last.user
+    return question.task, question.videos, question.gold.properties, last.assistant, situation
 
 
 def by_task(questions: list[Question]) -> Counter[str]:
@@ -77,6 +79,16 @@ def test_distinct_questions_differ_in_more_than_wording(part: Part) -> None:
     many = dict.fromkeys(TASKS, 100)
     questions = build_questions(POOLS[part], many, seed=3, distinct=True)
     assert len({key(q) for q in questions}) == len(questions)
+
+
+def test_another_situation_makes_another_question() -> None:
+    """Two scenarios about the same classes may ask about the same videos."""
+    first = next(s for s in CATALOGUE.language.scenarios if len(s.target) == 1)
+    scenarios = tuple(first.model_copy(update={"name": n, "question": f"Which suits {n}?"}) for n in ("one", "two"))
+    language = CATALOGUE.language.model_copy(update={"scenarios": scenarios})
+    pool = pool_of(Part.TEST, ASSIGNMENTS, Catalogue(language=language, objects=CATALOGUE.objects))
+    asked = build_questions(pool, {"PSR": 10_000}, seed=0, distinct=True)
+    assert len({key(q)[:-1] for q in asked}) < len({key(q) for q in asked}) == len(asked)
 
 
 def test_tasks_are_mixed() -> None:

@@ -54,19 +54,6 @@ def config(train: dict[str, int], evaluation: dict[str, int]) -> QuestionsConfig
     return QuestionsConfig(train=train, evaluation=evaluation)
 
 
-def test_the_papers_tasks_are_registered_in_its_order() -> None:
-    assert {name: task.title for name, task in TASKS.items()} == {
-        "OPD": "Object Property Description",
-        "PC": "Property Comparison",
-        "PSS": "Property Superlative Selection",
-        "POM": "Property-object Matching",
-        "PSR": "Property Scenario Reasoning",
-        "RIPE": "Ripeness Classification",
-    }
-    assert [name for name, task in TASKS.items() if not task.trained] == ["PSR", "RIPE"]
-    assert all(task.measure in task.chance(CATALOGUE) for task in TASKS.values())
-
-
 def test_a_registered_task_is_counted_built_stored_and_graded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(TASKS, "HARD", Hardest())
     counts = counts_by_task(config({}, {"hard": 6, "pc": 2}), "evaluation")

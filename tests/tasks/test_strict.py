@@ -13,7 +13,7 @@ from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool
 from pipeline.tasks.opd import as_published
 from pipeline.tasks.questions import build_questions
-from pipeline.videos.catalogue import load_catalogue
+from pipeline.videos.catalogue import Catalogue, load_catalogue
 from tests.conftest import ROOT
 
 CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear").asking("published")
@@ -97,3 +97,10 @@ def test_a_matching_in_another_order_is_read_but_not_compared() -> None:
     a, b, c = (CATALOGUE.objects[o].name for o in question.objects)
     score = grade(question, f"Conclusion: b) is {b}, a) is {a} and c) is {c}.")["choice"]
     assert (score.correct, score.strict) == (True, False)
+
+
+def test_what_cannot_be_cut_is_not_compared() -> None:
+    """No word stands between two classes, at which the published code would cut."""
+    bare = CATALOGUE.language.model_copy(update={"structured": "Overall, {hardness} {roughness} thing, {bumpiness}."})
+    found = as_published("It is a hard rough thing.", (0, 0, 0), Catalogue(language=bare, objects=CATALOGUE.objects))
+    assert found == dict.fromkeys((*CATALOGUE.property_names, "combined"))

@@ -15,7 +15,6 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from pipeline.errors import UserError
 from pipeline.io import write_table
 from pipeline.records import Graded
 from pipeline.scales import compose, write_params
@@ -220,24 +219,6 @@ def test_a_moved_folder_keeps_its_artifacts(again: FakeChain, monkeypatch: pytes
     assert not run.info.artifact_uri.startswith(("/", "file:"))
     assert {a.path for a in client().list_artifacts(run.info.run_id, "model")} >= {"model/connector.safetensors"}
     assert "nothing new" in publish(again.params)
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (None, "no such file"),
-        (b"{", "not YAML"),
-        (b"\xff\xfe", "not YAML"),
-        (b"stages: 3", "not as DVC writes it"),
-        (b"stages: {split: 3}", "not as DVC writes it"),
-    ],
-)
-def test_a_broken_lock_is_one_line(chain: FakeChain, content: bytes | None, message: str) -> None:
-    Path("dvc.lock").unlink()
-    if content:
-        Path("dvc.lock").write_bytes(content)
-    with pytest.raises(UserError, match=rf"dvc\.lock: {message}"):
-        publish(chain.params)
 
 
 def test_the_command_says_in_one_line_why_it_could_not(chain: FakeChain, monkeypatch: pytest.MonkeyPatch) -> None:

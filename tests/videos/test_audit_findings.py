@@ -26,7 +26,7 @@ def with_one(**changes: object) -> list[Finding]:
 def test_flawless_videos_no_videos_and_a_single_one_give_no_warning(catalogue: Catalogue) -> None:
     assert odd(check_files(probes(), OTHER)) == []
     assert list(check_files([], OTHER)) == []
-    assert list(check_leakage(evidence([], [], []), OTHER)) == []
+    assert list(check_leakage(evidence([], []), OTHER)) == []
     alone = Catalogue(language=catalogue.language, objects={"rug": catalogue.objects["rug"]})
     assert odd(check_files([probe()], alone)) == odd(leaks([probe()], {}, alone)) == []
 

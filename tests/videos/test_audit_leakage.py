@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.records import Part, Probe, Severity, Video
+from pipeline.records import Part, Probe, Severity
 from pipeline.videos.audit import leakage
 from pipeline.videos.audit.leakage import evidence, sessions
 from tests import audit_records as made
@@ -59,7 +59,7 @@ def test_videos_without_any_contact_are_not_compared() -> None:
 
 
 @pytest.fixture(scope="module")
-def presses(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Probe, Video]]:
+def presses(tmp_path_factory: pytest.TempPathFactory) -> list[Probe]:
     """Sixteen synthetic presses of eight objects."""
     folder = tmp_path_factory.mktemp("presses")
     names = [f"{o}_{i}" for o in sorted(made.PHYSICLEAR.objects)[::10] for i in range(2)]
@@ -69,9 +69,9 @@ def presses(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Probe, Video
     ]
 
 
-def test_different_presses_have_no_near_duplicates(presses: list[tuple[Probe, Video]]) -> None:
+def test_different_presses_have_no_near_duplicates(presses: list[Probe]) -> None:
     assert len(presses) == 16
-    found = evidence([p for p, _ in presses], [v for _, v in presses], [])
+    found = evidence(presses, [])
     touched = [f for f in leakage._near_copies(found) if f.item == "all"]
     assert int(re.findall(r"of (\d+) videos", touched[0].measured)[0]) >= 10, "most show contact, so most are compared"
     assert {f.severity for f in leakage._near_copies(found)} == {INFO}, "an object pressed twice alike is no warning"
@@ -79,7 +79,7 @@ def test_different_presses_have_no_near_duplicates(presses: list[tuple[Probe, Vi
 
 @pytest.mark.parametrize("start", [0, 2], ids=["whole", "shortened"])
 @pytest.mark.parametrize("steps", [0, 12], ids=["recoded", "brighter"])
-def test_a_changed_copy_is_found(tmp_path: Path, presses: list[tuple[Probe, Video]], start: int, steps: int) -> None:
+def test_a_changed_copy_is_found(tmp_path: Path, presses: list[Probe], start: int, steps: int) -> None:
     frames = made.recorded("baseball", 5)
     changed = [cv2.add(frame, np.full_like(frame, steps)) for frame in frames[start:]]
     original = look_at(write_video(tmp_path / "baseball_0.avi", frames), "baseball_0")
@@ -94,11 +94,11 @@ def test_a_changed_copy_is_found(tmp_path: Path, presses: list[tuple[Probe, Vide
         (twice, Part.TRAIN, Part.TRAIN, INFO),
     ):
         pairs = [*presses, original, others]
-        parts = {original[0].video_id: one, others[0].video_id: two}
-        found = evidence([p for p, _ in pairs], [v for _, v in pairs], made.assigned([p for p, _ in pairs], parts))
-        known = {p.path for p, _ in presses} | {"all"}
+        parts = {original.video_id: one, others.video_id: two}
+        found = evidence(pairs, made.assigned(pairs, parts))
+        known = {p.path for p in presses} | {"all"}
         near = [f for f in leakage._near_copies(found) if f.item not in known]
-        assert [(f.item, f.severity) for f in near] == [(others[0].path, severity)]
+        assert [(f.item, f.severity) for f in near] == [(others.path, severity)]
         assert "baseball_0.avi" in near[0].measured
 
 
@@ -135,11 +135,13 @@ def test_more_videos_than_are_clustered_go_with_the_nearest(monkeypatch: pytest.
 
 @pytest.mark.parametrize("block", [1, 2, 5])
 def test_copies_are_found_whatever_is_compared_at_a_time(
-    presses: list[tuple[Probe, Video]], monkeypatch: pytest.MonkeyPatch, block: int
+    presses: list[Probe], monkeypatch: pytest.MonkeyPatch, block: int
 ) -> None:
-    (first, _), *others = presses
-    twin = first.model_copy(update={"video_id": "lemon_9", "object_id": "lemon", "path": "lemon_9.avi"})
-    found = evidence([*(p for p, _ in others), twin, first], [v for _, v in presses], [])
+    first, *others = presses
+    twin = first.model_copy(
+        update={"video_id": "lemon_9", "object_id": "lemon", "path": "lemon_9.avi", "sha256": "its own"}
+    )
+    found = evidence([*others, twin, first], [])
     whole = list(leakage._near_copies(found))
     assert [f.item for f in whole[:-1]] == [first.path]
     monkeypatch.setattr(leakage, "BLOCK", block)

@@ -136,14 +136,6 @@ def test_a_killed_extraction_goes_on_where_it_was(place: Place, whole: list[byte
     assert list(place.partial.iterdir()) == []
 
 
-def test_twice_killed(place: Place, whole: list[bytes]) -> None:
-    for _ in range(2):
-        kill_after(2, place)
-    place.decoded()
-    place.extract()
-    assert (place.decoded(), place.bytes()) == (sorted(NAMES[4:]), whole)
-
-
 def test_a_kill_while_tables_are_written_decodes_nothing_again(place: Place, whole: list[bytes]) -> None:
     def full(*_: object) -> None:
         raise OSError("disk full")
@@ -188,15 +180,6 @@ def test_other_parameters_start_anew(place: Place) -> None:
     assert place.bytes() == expected
     place.extract()
     assert place.decoded() == NAMES[4:], "and what was killed waits"
-
-
-def test_a_file_that_went_away_after_a_kill_is_named(place: Place) -> None:
-    kill_after(3, place)
-    path = place.folder / "baseball_1.avi"
-    path.unlink()
-    path.symlink_to(place.folder / "gone.avi")
-    with pytest.raises(UserError, match=r"baseball_1\.avi: unreadable"):
-        place.extract()
 
 
 def test_an_error_names_its_video_and_keeps_what_is_finished(place: Place) -> None:

@@ -15,13 +15,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.config import FramesConfig
-from pipeline.videos.decoding import Decoder, Header, picture
+from pipeline.videos.decoding import Decoder, picture
 from pipeline.videos.frames import selection
 from pipeline.videos.frames.fit import fit
 from pipeline.videos.frames.reference import contact_strength, reference_indices, thumbnail
 from pipeline.videos.frames.selection import TOUCHING, BestFrames, Kept, difference, kept_count, thin, uniform_indices
 from pipeline.videos.frames.video_pass import VideoPass, run_pass
-from tests.conftest import encode, moving_square, write_video
+from tests.conftest import moving_square, write_video
 from tests.frame_rules import CONFIG, constant, frames_of, luma, pillow, pressing, published, salience
 
 
@@ -233,14 +233,6 @@ def test_without_contact_something_is_kept(tmp_path: Path, frames: list[np.ndarr
         kept = run_pass(path, config).kept
         assert 1 <= len(kept) <= (1 if name == "adaptive" else kept_count(len(frames), config))
         assert all(k.score == 0 for k in kept)
-
-
-def test_a_header_without_a_number_of_frames(tmp_path: Path) -> None:
-    path = encode(tmp_path / "v.mkv", pressing(12))
-    assert Decoder(path).header == Header(0, 25.0)
-    for name in ("salient", "uniform", "contact", "adaptive"):
-        assert len(run_pass(path, FramesConfig(size=16, selection=name)).kept) == 1
-    assert run_pass(path, FramesConfig(size=16, selection="release")).kept == []
 
 
 @pytest.mark.real

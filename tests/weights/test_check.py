@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.errors import UserError
 from pipeline.language.base import load_llm, load_tokenizer
-from pipeline.weights import MADE, MADE_DIR, check_encoder, check_language, is_tiny
+from pipeline.weights import MADE, MADE_DIR, check_encoder, check_language
 from pipeline.weights.make import RECIPES
 from tests.checkpoints import write_clip, write_llama
 
@@ -94,17 +94,3 @@ def test_backbones_that_read_one_folder_must_both_find_it(tmp_path: Path) -> Non
     check_encoder(folder, 32, ("clip",))
     with refused("config.json does not exist"):
         check_encoder(folder, 32, ("clip", "timm"))
-
-
-@pytest.mark.parametrize(
-    ("folder", "expected"),
-    [
-        ("data/weights/tiny-llama", True),
-        ("data/weights/smollm2", False),
-        ("weights/tiny-llama", False),
-        ("elsewhere/data/weights/tiny-clip", False),
-        ("data/taught", False),
-    ],
-)
-def test_which_models_are_random(folder: str, expected: bool) -> None:
-    assert is_tiny(folder) == expected

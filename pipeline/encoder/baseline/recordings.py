@@ -22,6 +22,8 @@ class Recording:
     """A video to describe."""
 
     path: Path
+    frames: int
+    """That decode (`Video.frames`)."""
     starts_touching: bool
     """Whether its no-contact reference has to come from its end (`Probe.starts_touching`)."""
 
@@ -36,14 +38,19 @@ def recording_features(recordings: Sequence[Recording]) -> Features:
 
 def describe(recording: Recording) -> Features:
     """Features of one recording."""
-    frames = list(decode(recording.path))
-    inner = np.linspace(0, len(frames) - 1, FRAMES + 2).round().astype(int)[1:-1]
-    return video_features([frames[i] for i in inner], mean_reference(frames, recording.starts_touching))
+    inner = np.linspace(0, recording.frames - 1, FRAMES + 2).round().astype(int)[1:-1].tolist()
+    untouched = untouched_frames(recording.frames, recording.starts_touching)
+    wanted = {*inner, *untouched}  # A whole recording may be gigabytes.
+    kept = {i: frame for i, frame in enumerate(decode(recording.path)) if i in wanted}
+    return video_features([kept[i] for i in inner], mean([kept[i] for i in untouched]))
 
 
-def mean_reference(frames: Sequence[Image], starts_touching: bool) -> Plane:
-    """The mean of a video's no-contact frames: float32, height x width x BGR."""
-    last = len(frames) - 1
-    order = [last - i if starts_touching else i for i in reference_indices(len(frames))]
-    mean: Plane = np.mean(np.stack([frames[i] for i in order]), axis=0, dtype=np.float32)
-    return mean
+def untouched_frames(frames: int, starts_touching: bool) -> list[int]:
+    """Numbers of the frames without contact, of so many."""
+    return [frames - 1 - i if starts_touching else i for i in reference_indices(frames)]
+
+
+def mean(frames: Sequence[Image]) -> Plane:
+    """The mean of frames: float32, height x width x BGR."""
+    whole: Plane = np.mean(np.stack(frames), axis=0, dtype=np.float32)
+    return whole

@@ -132,15 +132,17 @@ def _answers(
     pad, longest = ends[0], max(map(len, prompts))
     ids = torch.tensor([[pad] * (longest - len(p)) + p for p in prompts], device=device)
     mask = torch.tensor([[0] * (longest - len(p)) + [1] * len(p) for p in prompts], device=device)
+    limits = [max(tokens, MATCHING) if q.task == "POM" else tokens for q in batch]
     new = llm.generate(
         input_ids=ids,
         attention_mask=mask,
-        max_new_tokens=max(max(tokens, MATCHING) if q.task == "POM" else tokens for q in batch),
+        max_new_tokens=max(limits),
         do_sample=False,
         eos_token_id=ends,
         pad_token_id=pad,
     )[:, longest:]
-    return [str(text).strip() for text in tokenizer.batch_decode(new, skip_special_tokens=True)]
+    said = [row[:limit] for row, limit in zip(new, limits, strict=True)]
+    return [str(text).strip() for text in tokenizer.batch_decode(said, skip_special_tokens=True)]
 
 
 def _objects(catalogue: Catalogue) -> list[tuple[int, ...]]:

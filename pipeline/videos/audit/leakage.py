@@ -9,7 +9,7 @@ from statistics import fmean, pstdev
 
 import numpy as np
 
-from pipeline.records import Assignment, Finding, Part, Probe, Severity, Video
+from pipeline.records import Assignment, Finding, Part, Probe, Severity
 from pipeline.runtime import derive_seed
 from pipeline.videos.audit.files import quiet_level, touches
 from pipeline.videos.catalogue import Catalogue
@@ -40,14 +40,13 @@ class Evidence:
     """What was measured of the videos; `parts` is empty where no split was asked for."""
 
     probes: Sequence[Probe]
-    videos: Sequence[Video]
     parts: Mapping[str, Part]
     """By video id."""
 
 
-def evidence(probes: Sequence[Probe], videos: Sequence[Video], assignments: Sequence[Assignment]) -> Evidence:
+def evidence(probes: Sequence[Probe], assignments: Sequence[Assignment]) -> Evidence:
     """Put together what the checks need."""
-    return Evidence(probes, videos, {a.video_id: a.part for a in assignments})
+    return Evidence(probes, {a.video_id: a.part for a in assignments})
 
 
 def check_leakage(found: Evidence, catalogue: Catalogue) -> Iterator[Finding]:
@@ -173,9 +172,9 @@ def _objects(found: Evidence) -> Iterator[Finding]:
 
 
 def _copies(found: Evidence) -> Iterator[Finding]:
-    earlier: dict[str, list[Video]] = defaultdict(list)
+    earlier: dict[str, list[Probe]] = defaultdict(list)
     copies = 0
-    for video in found.videos:
+    for video in found.probes:
         twins = earlier[video.sha256]
         if twins:
             copies += 1
@@ -183,7 +182,7 @@ def _copies(found: Evidence) -> Iterator[Finding]:
             twin = (crossing or twins)[0]
             yield _pair("same content", video.path, twin.path, "equal bytes", bool(crossing))
         twins.append(video)
-    yield _finding("same content", "all", f"{copies} of {len(found.videos)} files", "0", Severity.INFO)
+    yield _finding("same content", "all", f"{copies} of {len(found.probes)} files", "0", Severity.INFO)
 
 
 def _near_copies(found: Evidence) -> Iterator[Finding]:
@@ -194,19 +193,18 @@ def _near_copies(found: Evidence) -> Iterator[Finding]:
         yield _finding("near-duplicate", "all", nothing, f"at most {DUPLICATE}", Severity.INFO)
         return
     signatures = np.array([p.signature for p in shown])
-    same = {v.video_id: v.sha256 for v in found.videos}
     closest = 0.0
     for start in range(0, len(shown), BLOCK):
         alike = np.triu(signatures[start : start + BLOCK] @ signatures[start:].T, 1)
         closest = max(closest, float(alike.max()))
         for i, j in np.argwhere(alike > DUPLICATE).tolist():
-            yield from _near_copy(found, shown[start + i], shown[start + j], alike[i, j], same)
+            yield from _near_copy(found, shown[start + i], shown[start + j], alike[i, j])
     measured = f"closest pair of {len(shown)} videos in contact correlates at {closest:.3f}"
     yield _finding("near-duplicate", "all", measured, f"at most {DUPLICATE}", Severity.INFO)
 
 
-def _near_copy(found: Evidence, one: Probe, other: Probe, alike: float, same: Mapping[str, str]) -> Iterator[Finding]:
-    if same.get(one.video_id) == same.get(other.video_id):
+def _near_copy(found: Evidence, one: Probe, other: Probe, alike: float) -> Iterator[Finding]:
+    if one.sha256 == other.sha256:
         return  # `_copies` names them.
     crosses = _crosses(found, one.video_id, other.video_id)
     measured = f"contact correlates at {alike:.3f}"

@@ -9,7 +9,7 @@ from pathlib import Path
 from pipeline.config import FramesConfig, SplitConfig
 from pipeline.errors import UserError
 from pipeline.parallel import run_parallel
-from pipeline.records import Assignment, Finding, Probe, Severity, Video
+from pipeline.records import Assignment, Finding, Probe, Severity
 from pipeline.videos.audit.files import check_files
 from pipeline.videos.audit.labels import check_labels, similar_names
 from pipeline.videos.audit.leakage import check_leakage, check_split, evidence
@@ -33,18 +33,17 @@ def audit_folder(folder: Path, catalogue: Catalogue, split: SplitConfig | None =
     scans, broken = _scan_all(listing.files)
     findings += broken
     probes = [s.probe for s in scans]
-    videos = [s.video for s in scans]
     findings += check_labels(catalogue)
-    if videos:
+    if probes:
         splits: list[Sequence[Assignment]] = []
         if split is not None:
             try:
                 folds = range(split.folds if split.fold_of(0) is not None else 1)
-                splits = [assign(catalogue, videos, split, fold) for fold in folds]
+                splits = [assign(catalogue, probes, split, fold) for fold in folds]
             except UserError as error:
                 message = str(error)
                 findings.append(Finding(check="split", item=split.name, measured=message, severity=Severity.ERROR))
-        findings += _measured(probes, videos, splits, catalogue)
+        findings += _measured(probes, splits, catalogue)
     return by_severity(findings)
 
 
@@ -57,11 +56,7 @@ def check_folder(folder: Path, catalogue: Catalogue) -> list[Finding]:
 
 
 def audit_chain(
-    folder: Path,
-    probes: Sequence[Probe],
-    videos: Sequence[Video],
-    splits: Sequence[Sequence[Assignment]],
-    catalogue: Catalogue,
+    folder: Path, probes: Sequence[Probe], splits: Sequence[Sequence[Assignment]], catalogue: Catalogue
 ) -> list[Finding]:
     """The audit of what the chain has decoded and split, once a fold with kfold, errors first; opens no video."""
     listing = list_videos(folder, catalogue)
@@ -70,7 +65,7 @@ def audit_chain(
             *listing.findings,
             *similar_names(listing.unknown_objects, catalogue),
             *check_labels(catalogue),
-            *_measured(probes, videos, splits, catalogue),
+            *_measured(probes, splits, catalogue),
         ]
     )
 
@@ -95,13 +90,8 @@ def summary(findings: Sequence[Finding]) -> dict[str, float]:
     return {f"{severity}s": counts[severity] for severity in (Severity.ERROR, Severity.WARNING)}
 
 
-def _measured(
-    probes: Sequence[Probe],
-    videos: Sequence[Video],
-    splits: Sequence[Sequence[Assignment]],
-    catalogue: Catalogue,
-) -> list[Finding]:
-    first, *others = [evidence(probes, videos, assignments) for assignments in splits or [()]]
+def _measured(probes: Sequence[Probe], splits: Sequence[Sequence[Assignment]], catalogue: Catalogue) -> list[Finding]:
+    first, *others = [evidence(probes, assignments) for assignments in splits or [()]]
     found = [*check_files(probes, catalogue), *check_leakage(first, catalogue)]
     found += [finding for other in others for finding in check_split(other, catalogue)]
     # Most findings are the same under every split.

@@ -44,7 +44,6 @@ class _Done(Record):
 
     stamp: tuple[str, str, str, str, int, int]
     """What the file was listed as, its size and time of change."""
-    video: Video
     probe: Probe
     places: tuple[tuple[int, float], ...]
     """Index and score of each kept frame."""
@@ -117,7 +116,7 @@ def extract_frames(folder: Path, catalogue: Catalogue, config: FramesConfig, out
     frames: list[Frame] = []
     for _, each in used:
         for index, score in each.places:
-            frames.append(Frame(video_id=each.video.video_id, frame_index=index, score=score, row=len(frames)))
+            frames.append(Frame(video_id=each.probe.video_id, frame_index=index, score=score, row=len(frames)))
     for file, name, count in ((FRAMES_FILE, "frames", len(frames)), (REFERENCES_FILE, "reference", len(used))):
         with atomic(out / file) as temporary, temporary.open("wb") as stream:
             shape = (count, config.size, config.size, 3)
@@ -128,7 +127,7 @@ def extract_frames(folder: Path, catalogue: Catalogue, config: FramesConfig, out
     write_table(out / TABLE_FILE, Frame, frames)
     write_table(out / PROBES_FILE, Probe, [each.probe for each in done])
     shutil.rmtree(work)
-    return Extraction(tuple(each.video for _, each in used), tuple(each.probe for each in done), tuple(frames))
+    return Extraction(tuple(each.probe for _, each in used), tuple(each.probe for each in done), tuple(frames))
 
 
 def _work(job: _Job) -> _Done | Finding:
@@ -139,7 +138,6 @@ def _work(job: _Job) -> _Done | Finding:
         return result
     done = _Done(
         stamp=stamp,
-        video=result.video,
         probe=result.probe,
         places=tuple((kept.index, kept.score) for kept in result.kept),
     )

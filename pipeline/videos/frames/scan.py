@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.config import FramesConfig
 from pipeline.io import sha256
-from pipeline.records import Finding, Probe, Severity, Video
+from pipeline.records import Finding, Probe, Severity
 from pipeline.videos.decoding import Image
 from pipeline.videos.files import VideoFile
 from pipeline.videos.frames.reference import contact_strength, starts_touching
@@ -25,7 +25,6 @@ SIGNATURE_SIZE = (24, 18)
 class Scan:
     """What was found. `kept` is empty only where the published rule leaves the video out."""
 
-    video: Video
     probe: Probe
     kept: tuple[Kept, ...]
     reference: Image
@@ -59,34 +58,26 @@ def scan(file: VideoFile, config: FramesConfig) -> Scan | Finding:
     if touching:
         found = run_pass(file.path, config, count, reference_from_end(file.path, found.frames, config))
     assert found.reference is not None, "set where there are frames"
-    video = Video(
+    return Scan(_probe(file, content, found, touching), tuple(found.kept), found.reference.picture)
+
+
+def _probe(file: VideoFile, content: str, found: VideoPass, touching: bool) -> Probe:
+    assert found.reference is not None, "set where there are frames"
+    assert found.last is not None, "set where there are frames"
+    shown = found.last if found.strongest is None else found.strongest
+    untouched = found.reference.thumb
+    ((height, width),) = found.sizes
+    return Probe(
         video_id=file.video_id,
         object_id=file.object_id,
         path=file.relative,
         sha256=content,
         frames=found.frames,
         fps=found.header.fps,
-        height=next(iter(found.sizes))[0],
-        width=next(iter(found.sizes))[1],
-    )
-    return Scan(video, _probe(file, video, found, touching), tuple(found.kept), found.reference.picture)
-
-
-def _probe(file: VideoFile, video: Video, found: VideoPass, touching: bool) -> Probe:
-    assert found.reference is not None, "set where there are frames"
-    assert found.last is not None, "set where there are frames"
-    shown = found.last if found.strongest is None else found.strongest
-    untouched = found.reference.thumb
-    return Probe(
-        video_id=file.video_id,
-        object_id=file.object_id,
-        path=file.relative,
+        width=width,
+        height=height,
         session=file.session,
         header_frames=found.header.frames,
-        frames=found.frames,
-        fps=video.fps,
-        width=video.width,
-        height=video.height,
         rotation=found.rotation,
         irregular=_irregular(found.times),
         kept=len(found.kept),
