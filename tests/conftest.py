@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import av
 import cv2
@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
+from pipeline.errors import UserError
 from pipeline.records import Video
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 
@@ -27,6 +28,11 @@ NO_DATA = f"needs real videos: set {DATA_VARIABLE} to a folder of the PhysiCLeAR
 # A loaded machine is no reason to fail, and a test that passes today passes tomorrow.
 settings.register_profile("house", deadline=None, derandomize=True, database=None, max_examples=60)
 settings.load_profile("house")
+
+
+def refused(words: str) -> Any:
+    """A context in which bad input is refused: by one line, in which these words (a regular expression) are found."""
+    return pytest.raises(UserError, match=words, check=lambda error: "\n" not in str(error))
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

@@ -25,7 +25,7 @@ BATCH = 8
 """Videos that are described at once; a killed description loses no more."""
 PROMPT = "> "
 HELP = """\
-/add FILE  take a video for the next question, which names it {tactile}
+/add FILE  take a video for the next question; {tactile} says where, or it stands in front
 /frames    what the model sees of the videos
 /reset     begin a new conversation
 /quit      end"""

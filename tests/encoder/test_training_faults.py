@@ -32,7 +32,7 @@ from pipeline.runtime import seed_everything
 from pipeline.training.trainable import trainable_state
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
-from tests.conftest import fake_videos
+from tests.conftest import fake_videos, refused
 from tests.encoders import CPU, OBJECTS, PARTS, config, encoder_data, write_frames
 
 CLASSES = [3, 3, 3]
@@ -229,9 +229,8 @@ def test_a_loss_that_is_no_number_stops_the_training_and_leaves_the_last_checkpo
             torch.nn.init.constant_(next(iter(model.heads.parameters())), float("inf"))
 
     before_updates(poison)
-    with pytest.raises(UserError, match=f"loss is nan at step 9: .*{TOO_HIGH}") as caught:
+    with refused(f"loss is nan at step 9: .*{TOO_HIGH}"):
         run(model=model)
-    assert "\n" not in str(caught.value)
     assert "checkpoint-6" in {f.name for f in tmp_path.glob("checkpoints/*/*/*")}
     same(run()[1], smooth)
 

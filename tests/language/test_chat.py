@@ -21,6 +21,7 @@ from pipeline.language.base import load_llm, load_tokenizer
 from pipeline.language.chat import IGNORE_INDEX, TACTILE, add_tactile_tokens, encode, end_ids, render
 from pipeline.records import Turn
 from tests.checkpoints import edit, write_llama
+from tests.conftest import refused
 
 VICUNA = (
     "{% for m in messages %}{% if m.role == 'system' %}{{ m.content }} "
@@ -171,9 +172,8 @@ REFUSED = {
 def test_a_template_that_cannot_be_trained_on_is_one_line(template: str, tmp_path: Path) -> None:
     folder = write_llama(tmp_path)
     (folder / "chat_template.jinja").write_text(template)
-    with pytest.raises(UserError, match=rf"^language.weights: the chat template in .* {REFUSED[template]}") as caught:
+    with refused(rf"^language.weights: the chat template in .* {REFUSED[template]}"):
         load_tokenizer(folder)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("answer", ["y", "n"])

@@ -21,6 +21,7 @@ from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import add_lora, assemble
 from pipeline.records import Opd, Question
 from tests.checkpoints import write_llama
+from tests.conftest import refused
 from tests.language.shared import DIM, FRAMES, call, generation, material, taking
 
 LORA = LoraTrainConfig(samples=1, rank=4, alpha=8, dropout=0.0)
@@ -266,9 +267,8 @@ BROKEN = (
 def test_a_broken_model_is_one_line(what: str, model: OctopiForCausalLM, tmp_path: Path) -> None:
     trained(model).save_pretrained(tmp_path)
     message = broken(tmp_path, what)
-    with pytest.raises(UserError, match=message) as caught:
+    with refused(message):
         OctopiForCausalLM.from_pretrained(tmp_path)
-    assert "\n" not in str(caught.value)
 
 
 def test_another_base_is_refused(model: OctopiForCausalLM, tmp_path: Path) -> None:

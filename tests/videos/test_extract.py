@@ -31,7 +31,7 @@ from pipeline.videos.frames.fit import fit
 from pipeline.videos.frames.reference import reference_indices
 from pipeline.videos.frames.scan import Scan, scan
 from tests.closure import ROOT
-from tests.conftest import moving_square, write_video
+from tests.conftest import moving_square, refused, write_video
 from tests.frame_rules import CONFIG, FILES, Place, frames_of, luma, published, salience
 
 NAMES = ["baseball_0", "baseball_1", "baseball_10", "potato_0", "potato_2", "rug_0", "rug_1"]
@@ -201,9 +201,8 @@ def test_a_process_that_dies_is_an_error_that_names_the_place(place: Place, monk
 
     monkeypatch.setattr(extract, "scan", dying)
     monkeypatch.setattr(pipeline.parallel, "cores", lambda: 1)
-    with pytest.raises(UserError, match=r"a process died at or soon after [a-z_0-9]+\.avi; .*Run again") as caught:
+    with refused(r"a process died at or soon after [a-z_0-9]+\.avi; .*Run again"):
         place.extract()
-    assert "\n" not in str(caught.value)
     monkeypatch.setattr(extract, "scan", scan)
     assert len(place.extract().videos) == 7
 

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from pipeline.errors import UserError
 from pipeline.language.base import load_llm, load_tokenizer
 from pipeline.weights import MADE, MADE_DIR, check_encoder, check_language
 from pipeline.weights.make import RECIPES
 from tests.checkpoints import write_clip, write_llama
+from tests.conftest import refused
 
 
 @pytest.fixture(autouse=True)
@@ -25,10 +24,6 @@ def timm_folder(folder: Path, config: str = '{"architecture": "x"}') -> Path:
     (folder / "config.json").write_text(config)
     (folder / "model.safetensors").write_bytes(b"")
     return folder
-
-
-def refused(message: str) -> Any:
-    return pytest.raises(UserError, match=rf"\A[^\n]*{message}[^\n]*\Z")
 
 
 def test_what_can_be_made_need_not_be_there() -> None:

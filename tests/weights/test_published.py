@@ -18,7 +18,6 @@ from typer.testing import CliRunner
 
 from pipeline.cli import app
 from pipeline.encoder.clip import load_visual_tower
-from pipeline.errors import UserError
 from pipeline.language.base import load_llm, load_tokenizer
 from pipeline.scales import compose
 from pipeline.shapes import PUBLISHED_LANGUAGE, PUBLISHED_VISION
@@ -28,6 +27,7 @@ from pipeline.weights.make import CATALOGUE
 from pipeline.weights.published import PICTURES
 from tests.checkpoints import CLIP_CONFIG, cut, edit, write_clip
 from tests.closure import ROOT
+from tests.conftest import refused
 
 REAL_CLIP = PUBLISHED_VISION["clip-vit-large-patch14"]
 WORDS = 600
@@ -178,10 +178,6 @@ def octopi(*arguments: str) -> str:
 
 def contents(folder: Path) -> dict[str, bytes]:
     return {f.relative_to(folder).as_posix(): f.read_bytes() for f in sorted(folder.rglob("*")) if f.is_file()}
-
-
-def refused(words: str) -> Any:
-    return pytest.raises(UserError, match=rf"\A[^\n]*{words}[^\n]*\Z")
 
 
 # ---- language models ----
