@@ -257,7 +257,10 @@ def test_launchers_are_read() -> None:
         ("accelerate launch --config_file", "expected one argument"),
         ("a --num_processes b", "int"),
         ("accelerate launch --config_file nowhere.yaml", "nowhere.yaml is no configuration of accelerate's"),
-        (f"accelerate launch --config_file {ROOT}/Makefile", "Makefile is no configuration of accelerate's"),
+        (
+            f"accelerate launch --config_file {shlex.quote(f'{ROOT}/Makefile')}",
+            "Makefile is no configuration of accelerate's",
+        ),
     ):
         with pytest.raises(UserError, match=rf"^runtime.launcher: .*{message}"):
             launched(wrong)
