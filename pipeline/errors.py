@@ -5,6 +5,8 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+from pydantic import ValidationError
+
 
 class UserError(Exception):
     """Bad input: one line that names the file or key and how to mend it.
@@ -17,3 +19,10 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     """A question about the closest known name, with a blank behind it; empty where none is close."""
     close = difflib.get_close_matches(name, list(known), n=1)
     return f"did you mean {close[0]}? " if close else ""
+
+
+def first_problem(error: ValidationError) -> str:
+    """The first problem of a validation in one line: the key, where there is one, and what is wrong with it."""
+    detail = error.errors(include_url=False)[0]
+    key, message = ".".join(map(str, detail["loc"])), " ".join(detail["msg"].removeprefix("Value error, ").split())
+    return f"{key}: {message}" if key else message

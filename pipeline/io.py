@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from pipeline.errors import UserError
+from pipeline.errors import UserError, first_problem
 from pipeline.records import Record
 
 if TYPE_CHECKING:
@@ -105,7 +105,7 @@ def read_jsonl(path: Path, model: type[R]) -> list[R]:
                     records.append(model.model_validate_json(line))
                 except ValidationError as error:
                     raise UserError(
-                        f"{path}, line {number}: not a {model.__name__} ({_first(error)}); "
+                        f"{path}, line {number}: not a {model.__name__} ({first_problem(error)}); "
                         "delete the file and run `dvc repro`"
                     ) from None
     except FileNotFoundError:
@@ -158,7 +158,7 @@ def read_csv(path: Path, model: type[R]) -> list[R]:
     except FileNotFoundError:
         raise UserError(f"{path}: no such file; `dvc repro` makes it") from None
     except ValidationError as error:
-        raise UserError(f"{path}: not a table of {model.__name__} ({_first(error)}); run `dvc repro`") from None
+        raise UserError(f"{path}: not a table of {model.__name__} ({first_problem(error)}); run `dvc repro`") from None
 
 
 def save_tensors(path: Path, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, str] | None = None) -> None:
@@ -247,8 +247,3 @@ def _arrow(hint: Any) -> pa.DataType:
         return _arrow(next(a for a in typing.get_args(hint) if a is not type(None)))
     simple: dict[Any, pa.DataType] = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
     return simple[hint]
-
-
-def _first(error: ValidationError) -> str:
-    detail = error.errors(include_url=False)[0]
-    return f"{'.'.join(map(str, detail['loc']))}: {detail['msg']}"

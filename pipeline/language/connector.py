@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import nn
 
 from pipeline.config import TrainedEmbeddings
-from pipeline.errors import UserError
+from pipeline.errors import UserError, first_problem
 from pipeline.io import read_json
 from pipeline.language.chat import TACTILE_TOKENS
 
@@ -54,7 +54,4 @@ def read_config(folder: Path) -> OctopiConfig:
     try:
         return OctopiConfig.model_validate(read_json(folder / CONFIG_FILE))
     except ValidationError as error:
-        found = error.errors(include_url=False)[0]
-        raise UserError(
-            f"{folder / CONFIG_FILE}: {'.'.join(map(str, found['loc']))}: {found['msg']}; run `dvc repro`"
-        ) from None
+        raise UserError(f"{folder / CONFIG_FILE}: {first_problem(error)}; run `dvc repro`") from None

@@ -22,7 +22,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ValidationError
 
 from pipeline.config import EncoderConfig, FramesConfig, LanguageConfig
-from pipeline.errors import UserError
+from pipeline.errors import UserError, first_problem
 from pipeline.io import fingerprint, read_json, sha256
 from pipeline.language.chat import render
 from pipeline.records import Encoder, Opd, Record, Turn
@@ -180,7 +180,4 @@ def _validate(model: type[M], values: Mapping[str, Any], file: Path) -> M:
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        found = error.errors(include_url=False)[0]
-        raise UserError(
-            f"{file}: {'.'.join(map(str, found['loc']))}: {found['msg']}; copy the whole folder again"
-        ) from None
+        raise UserError(f"{file}: {first_problem(error)}; copy the whole folder again") from None

@@ -16,7 +16,7 @@ from pathlib import Path
 import yaml
 from pydantic import ValidationError
 
-from pipeline.errors import UserError
+from pipeline.errors import UserError, first_problem
 from pipeline.records import Part
 from pipeline.runtime import derive_seed
 from pipeline.videos.catalogue.csv_reader import Row, read_rows
@@ -153,10 +153,7 @@ def _read_language(file: Path) -> Language:
     try:
         return Language.model_validate(yaml.safe_load(file.read_text(encoding="utf-8")))
     except ValidationError as error:
-        detail = error.errors(include_url=False)[0]
-        key = ".".join(str(part) for part in detail["loc"])
-        message = detail["msg"].removeprefix("Value error, ")
-        raise UserError(f"{file}: {f'{key}: ' if key else ''}{' '.join(message.split())}") from None
+        raise UserError(f"{file}: {first_problem(error)}") from None
     except (UnicodeDecodeError, yaml.YAMLError) as error:
         raise UserError(f"{file}: {' '.join(str(error).split())[:300]}") from None
 
