@@ -370,6 +370,9 @@ class LoraTrainConfig(TrainConfig):
     conclusion_weight: Annotated[float, Field(gt=0)] = 1.0
     """How much a token behind a description weighs in the loss. Descriptions are long: what decides an answer is one
     token among a hundred."""
+    replay: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    """Share of the stage `teach`'s text among what is trained on, beside the questions, so that a base which was taught
+    keeps what it learnt there."""
 
 
 class AblationConfig(Section):

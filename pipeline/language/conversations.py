@@ -34,6 +34,8 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
             follows from the description is learnt. Touch tells the classes of training objects too, and is not what
             a conclusion shall be learnt from.
         conclusion_weight: Of each token behind a description, in the loss; all others weigh 1.
+        replayed: Conversations without touch, all of whose labels weigh as conclusions do; they stand behind the
+            questions.
 
     Raises:
         UserError: naming the question that is too long, or has nothing to learn from.
@@ -54,6 +56,7 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
         bos: bool = True,
         counterfactual: float = 0.0,
         conclusion_weight: float = 1.0,
+        replayed: Sequence[Encoded] = (),
     ) -> None:
         super().__init__()
         self.questions = [q for q in questions if q.dialogue(opd)]
@@ -78,6 +81,7 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
             self.encoded.append(encoded)
             described = any(turn.described for turn in dialogue.turns)
             self.concluding.append(write(descriptions=False) if described else None)
+        self.encoded += replayed
 
     @property
     def lengths(self) -> list[int]:
@@ -85,10 +89,14 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
         return [len(e.input_ids) for e in self.encoded]
 
     def __len__(self) -> int:
-        return len(self.questions)
+        return len(self.encoded)
 
     def __getitem__(self, index: int) -> dict[str, torch.Tensor]:
-        question, encoded = self.questions[index], self.encoded[index]
+        encoded = self.encoded[index]
+        if index >= len(self.questions):
+            weights = torch.full((len(encoded.labels),), self.conclusion_weight)
+            return _tensors(encoded, torch.zeros(0, self.store.dim), weights)
+        question = self.questions[index]
         rng = random.Random(derive_seed(self.seed, self.epoch, question.question_id))
         parts, videos, concluding = [], question.videos, self.concluding[index]
         weights = torch.ones(len(encoded.labels))
@@ -100,12 +108,16 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
             positions = sample_training(self.store.count(video_id), self.per_video, rng)
             horizontal, vertical = (rng.random() < self.flip_probability for _ in range(2))
             parts.append(self.store.features(video_id, positions, FLIPS[horizontal + 2 * vertical]))
-        return {
-            "input_ids": torch.tensor(encoded.input_ids),
-            "labels": torch.tensor(encoded.labels),
-            "features": torch.cat(parts),
-            "weights": weights,
-        }
+        return _tensors(encoded, torch.cat(parts), weights)
+
+
+def _tensors(encoded: Encoded, features: torch.Tensor, weights: torch.Tensor) -> dict[str, torch.Tensor]:
+    return {
+        "input_ids": torch.tensor(encoded.input_ids),
+        "labels": torch.tensor(encoded.labels),
+        "features": features,
+        "weights": weights,
+    }
 
 
 def check_length(question_id: str, tokens: int, positions: int | None) -> None:

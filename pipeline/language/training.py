@@ -21,6 +21,7 @@ from pipeline.io import fingerprint, read_jsonl
 from pipeline.language.connector import read_config
 from pipeline.language.conversations import ConversationDataset, LengthBuckets, collate
 from pipeline.language.octopi import OctopiForCausalLM
+from pipeline.language.teach.training import replay
 from pipeline.records import Encoder, Opd, Question
 from pipeline.runtime import derive_seed, name_dtype, seed_everything
 from pipeline.training.trainer import (
@@ -128,8 +129,12 @@ def assemble(
     if len(usable) < config.samples:
         logger.warning("%s: only %d training questions for %d samples", purpose, len(usable), config.samples)
     own = config.model_dump(include={"counterfactual", "conclusion_weight"})  # Only fine-tuning has them.
+    asked = usable[: config.samples]
+    if isinstance(config, LoraTrainConfig) and config.replay:
+        count = round(len(asked) * config.replay / (1 - config.replay))
+        own["replayed"] = replay(count, model.tokenizer, language.system_prompt, material.seed)
     data = ConversationDataset(
-        usable[: config.samples],
+        asked,
         material.opd,
         material.store,
         model.tokenizer,
@@ -204,6 +209,7 @@ def write_model_card(folder: Path, material: Material, data: ConversationDataset
             "objects": len({o for q in data.questions for o in q.objects}),
             f"videos ({material.source})": len({v for q in data.questions for v in q.videos}),
             "OPD": material.opd,
+            "replayed conversations in text": len(data) - len(data.questions),
         },
         settings={
             **config.model_dump(),

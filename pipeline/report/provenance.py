@@ -95,7 +95,7 @@ BEYOND = {
     "questions": ("restate", "two_turns"),
     "language": ("normalize_touch",),
     "align": ("begin_with_words",),
-    "lora": ("target_modules", "counterfactual", "conclusion_weight"),
+    "lora": ("target_modules", "dropout", "counterfactual", "conclusion_weight", "replay"),
 }
 """Settings by which a small model is trained otherwise than the paper's."""
 

@@ -61,6 +61,18 @@ def encode_item(item: Item, tokenizer: PreTrainedTokenizerBase, system_prompt: s
     return encode_turns(item.turns, tokenizer, system_prompt=system_prompt, frames=0, descriptions=False)
 
 
+def draw_of(phase: Form, rng: random.Random) -> Item:
+    """An item of a phase."""
+    form = rng.choices(list(COURSE[phase]), list(COURSE[phase].values()))[0]
+    return draw(rng, form, further=True)
+
+
+def replay(count: int, tokenizer: PreTrainedTokenizerBase, system_prompt: str, seed: int) -> list[Encoded]:
+    """Items of the last phase, for a training that comes later and shall not undo this one."""
+    rngs = (random.Random(derive_seed(seed, "replay", i)) for i in range(count))
+    return [encode_item(draw_of(PHASES[-1], rng), tokenizer, system_prompt) for rng in rngs]
+
+
 class Course(Dataset[Encoded]):
     """The teaching's items, an update's worth sorted by length, drawn from seed and index.
 
@@ -112,8 +124,7 @@ class Course(Dataset[Encoded]):
         drawn = []
         for place in range(self.config.batch_size):
             rng = random.Random(derive_seed(self.seed, "teach", update, place))
-            form = rng.choices(list(COURSE[phase]), list(COURSE[phase].values()))[0]
-            drawn.append(draw(rng, form, further=True))
+            drawn.append(draw_of(phase, rng))
         return sorted(self._encoded(drawn), key=lambda e: len(e.input_ids))
 
     def _encoded(self, drawn: Iterable[Item]) -> list[Encoded]:
