@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import median
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from benchmarks.errors import Error
-from pipeline.errors import UserError
+from pipeline.errors import UserError, first_problem
 from pipeline.io import write_csv
 from pipeline.records import Record
 
@@ -117,7 +117,8 @@ def read_rows(path: Path) -> list[Row]:
         with path.open(encoding="utf-8", newline="") as stream:
             return [Row.model_validate({k: v for k, v in line.items() if v}) for line in csv.DictReader(stream)]
     except ValueError as error:
-        raise UserError(f"{path}: not a table of costs and errors ({error}); restore it from Git") from None
+        what = first_problem(error) if isinstance(error, ValidationError) else error
+        raise UserError(f"{path}: not a table of costs and errors ({what}); restore it from Git") from None
 
 
 def merge(path: Path, rows: Sequence[Row]) -> list[Row]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 
 CLIP_CONFIG: dict[str, dict[str, Any]] = {
     "model_cfg": {
@@ -29,6 +29,16 @@ def edit(file: Path, **changes: Any) -> None:
 def cut(file: Path, by: int = 1) -> None:
     """Take the last bytes of a file away."""
     file.write_bytes(file.read_bytes()[:-by])
+
+
+def replace(file: Path, name: str, value: torch.Tensor) -> None:
+    """Put another tensor into a safetensors file."""
+    save_file(load_file(file) | {name: value}, file)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Every file of a folder and its subfolders, by its path within."""
+    return {f.relative_to(folder).as_posix(): f.read_bytes() for f in sorted(folder.rglob("*")) if f.is_file()}
 
 
 def write_clip(folder: Path, seed: int = 0, config: dict[str, dict[str, Any]] = CLIP_CONFIG) -> Path:

@@ -66,8 +66,8 @@ def write_run(root: Path, params: Params, *, objects: Sequence[str] = (), skill:
     splits = dict.fromkeys(params.ablation.seeds, assignments)
     if params.split.name == "kfold":
         splits = {seed: assign(catalogue, videos, params.split, seed) for seed in splits}
-    found = [("agreement, ICC(3,k)", name, "0.893 (0.843 to 0.929)") for name in catalogue.property_names]
-    audit = [Finding(check=c, item=i, measured=m, severity=Severity.INFO) for c, i, m in found]
+    agreed = {"check": "agreement, ICC(3,k)", "measured": "0.893 (0.843 to 0.929)", "severity": Severity.INFO}
+    audit = [Finding(item=name, **agreed) for name in catalogue.property_names]
     write_csv(data / "audit" / "audit.csv", Finding, audit)
     counts, asked = counts_by_task(params.questions, "evaluation"), {}
     for seed, split in splits.items():

@@ -105,21 +105,19 @@ if __name__ == "__main__":
 """
 
 
+def run_script(text: str, folder: Path, *arguments: str) -> None:
+    (folder / "work.py").write_text(text)
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    env = {**os.environ, "PYTHONPATH": path, "PYTHONWARNINGS": "ignore"}
+    command = [sys.executable, "work.py", *arguments]
+    done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+
+
 def work_on(backend: str, folder: Path, videos: Path) -> dict[str, str]:
     """The sha256 of each file that two workers make of the videos; what is said of bad jobs is checked here."""
     folder.mkdir()
-    (folder / "work.py").write_text(SCRIPT)
-    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    done = subprocess.run(
-        [sys.executable, "work.py", backend, str(videos), str(ROOT / "pipeline" / "physiclear")],
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": path, "PYTHONWARNINGS": "ignore"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
+    run_script(SCRIPT, folder, backend, str(videos), str(ROOT / "pipeline" / "physiclear"))
     refused, died = (folder / "said").read_text().splitlines()
     assert refused == "file 7 is broken; mend it"
     assert died.startswith("numbers: a process died at or soon after "), died
@@ -135,23 +133,22 @@ def here(tiny_videos: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[st
     return work_on("loky", tmp_path_factory.mktemp("work") / "here", tiny_videos)
 
 
-@pytest.mark.parametrize(("backend", "package"), [("ray", "ray"), ("dask", "distributed")])
+@pytest.fixture(scope="module", params=["ray", "dask"])
+def backend(request: pytest.FixtureRequest) -> str:
+    package = {"ray": "ray", "dask": "distributed"}[request.param]
+    pytest.importorskip(package, reason=f"needs {request.param}: pip install -e '.[{request.param}]'")
+    return str(request.param)
+
+
 def test_two_workers_of_a_cluster_make_the_same_bytes(
-    backend: str, package: str, here: dict[str, str], tiny_videos: Path, tmp_path: Path
+    backend: str, here: dict[str, str], tiny_videos: Path, tmp_path: Path
 ) -> None:
-    pytest.importorskip(package, reason=f"needs {backend}: pip install -e '.[{backend}]'")
     assert len(here) == 4
     assert work_on(backend, tmp_path / "there", tiny_videos) == here
 
 
-@pytest.mark.parametrize(("backend", "package"), [("ray", "ray"), ("dask", "distributed")])
-def test_a_cluster_embeds_and_answers_to_the_same_bytes(backend: str, package: str, tmp_path: Path) -> None:
-    pytest.importorskip(package, reason=f"needs {backend}: pip install -e '.[{backend}]'")
-    (tmp_path / "models.py").write_text(MODELS)
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
-    command = [sys.executable, "models.py", backend]
-    done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=300, check=False)
-    assert done.returncode == 0, done.stderr[-3000:]
+def test_a_cluster_embeds_and_answers_to_the_same_bytes(backend: str, tmp_path: Path) -> None:
+    run_script(MODELS, tmp_path, backend)
 
 
 def test_a_worker_that_outlives_a_stage_loads_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,19 +18,10 @@ from typer.testing import CliRunner
 
 from pipeline.cli import app
 from pipeline.errors import UserError
-from pipeline.io import (
-    atomic,
-    load_tensors,
-    read_json,
-    read_jsonl,
-    read_table,
-    write_json,
-    write_jsonl,
-    write_table,
-)
-from pipeline.records import Assignment, Encoder, Measurement, Opd, Part, Score, Video
+from pipeline.io import atomic, load_tensors, read_json, read_jsonl, read_table, write_json, write_jsonl, write_table
+from pipeline.records import Assignment, Measurement, Part, Score, Video
 from pipeline.scales import compose, write_params
-from pipeline.stage import matrix_key, running_stages, stage
+from pipeline.stage import running_stages, stage
 from tests.closure import ROOT
 
 
@@ -114,11 +105,6 @@ def test_no_scale_is_chosen_while_a_stage_runs(here: Path) -> None:
     assert "split is running" in str(result.exception)
     assert (here / "params.yaml").read_bytes() == before
     assert running_stages() == []
-
-
-def called_with(monkeypatch: pytest.MonkeyPatch, words: str) -> list[object]:
-    monkeypatch.setattr("sys.argv", ["stages/align.py", *words.split()])
-    return matrix_key(encoder=Encoder, opd=Opd, seed=None)
 
 
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:

@@ -16,7 +16,6 @@ from benchmarks.table import Row, merge, read_rows
 from pipeline.encoder import frame_classifier
 from pipeline.encoder.baseline import predictor
 from pipeline.encoder.scene_encoder import SceneEncoder
-from pipeline.errors import UserError
 from pipeline.io import write_csv, write_table
 from pipeline.records import Encoder, Graded, Lora, Opd, ScoreRow, Variant
 from pipeline.scenes.film import write_film
@@ -24,7 +23,7 @@ from pipeline.scenes.light import make_sensor, shade
 from pipeline.training.trainable import save_trainable
 from pipeline.videos.catalogue import Catalogue
 from tests.checkpoints import write_clip, write_llama
-from tests.conftest import ROOT
+from tests.conftest import ROOT, refused
 from tests.use.shared import make
 
 LENGTH = 20
@@ -94,14 +93,14 @@ def test_frames(project: Path, tmp_path: Path) -> None:
 
 
 def test_frames_need_objects(project: Path) -> None:
-    with pytest.raises(UserError, match="videos of 40 objects"):
+    with refused("videos of 40 objects"):
         frames.measure(project, repeats=1, folds=20)
 
 
 def test_encoder(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)  # Trainings leave their checkpoints there.
     size = encoder.Size(videos=1, repeats=1, folds=2, deals=1, epochs=1, prompts=((2, 0), (1, 1)))
-    with pytest.raises(UserError, match="repro pretrain"):
+    with refused("repro pretrain"):
         encoder.measure(project, size)
     for name, value in (("STRENGTHS", (1e-3,)), ("FOLDS", 2), ("ROUNDS", 5)):
         monkeypatch.setattr(frame_classifier, name, value)
@@ -118,19 +117,12 @@ def test_encoder(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert (whole["pretrained"].error, whole["pretrained"].front, whole["paper"].error) == (0.6, True, None)
     assert list(found["prompts"]) == ["2 at all layers", "1 at the first layer"]
     counted = found["encoder frames"]
-    single, ten = counted["1 frame"].flops, counted["10 frames"].flops
-    assert single is not None
-    assert ten == pytest.approx(10 * single, rel=1e-3)
+    assert counted["10 frames"].flops == pytest.approx(10 * counted["1 frame"].flops, rel=1e-3)
     sides = found["frame size"]
-    assert sides["60 pixels"].flops == pytest.approx((sides["120 pixels"].flops or 0) / 4, rel=0.05)
+    assert sides["60 pixels"].flops == pytest.approx(sides["120 pixels"].flops / 4, rel=0.05)
     clip = found["number format, CLIP"]
-    assert clip["bfloat16"].megabytes == pytest.approx((clip["float32"].megabytes or 0) / 2, rel=0.01)
+    assert clip["bfloat16"].megabytes == pytest.approx(clip["float32"].megabytes / 2, rel=0.01)
     assert clip["int8"].flops is None
-
-
-@pytest.fixture(scope="module")
-def bed(project: Path, tmp_path_factory: pytest.TempPathFactory) -> language.Bed:
-    return language.make_bed(project, TINY, tmp_path_factory.mktemp("embeddings"))
 
 
 def test_language(project: Path, tmp_path: Path) -> None:
@@ -140,15 +132,14 @@ def test_language(project: Path, tmp_path: Path) -> None:
     ways = found["answering"]
     assert all(row.error == 0 for row in ways.values()), "all ways say the same"
     published, lean = ways["published way"].flops, ways["the pipeline's way, 1 at a time"].flops
-    assert published is not None
-    assert lean is not None
-    assert lean < ways["without the published loop's forward pass"].flops < published  # type: ignore[operator]
-    assert ways["and without a cache of keys and values"].flops > lean  # type: ignore[operator]
+    assert lean < ways["without the published loop's forward pass"].flops < published
+    assert ways["and without a cache of keys and values"].flops > lean
     assert found["number format, language model"]["float32"].error == 0
     assert "describing" not in found
 
 
-def test_all_ways_of_training_compute_one_loss(bed: language.Bed) -> None:
+def test_all_ways_of_training_compute_one_loss(project: Path, tmp_path: Path) -> None:
+    bed = language.make_bed(project, TINY, tmp_path)
     questions = bed.training[:4]
     data = bed.conversations(questions)
     losses = {}
@@ -195,26 +186,14 @@ def test_contact(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     for question in ("contact", "contact, slopes"):
         finest, springs, _ = (found[question][name] for name in small)
         assert finest.error == 0
-        assert finest.ffts is not None
-        assert springs.ffts is not None
         # Springs need none; the surface's relief takes some.
         assert 10 * springs.ffts < finest.ffts
-        assert springs.error is not None
         assert springs.error > 0.1
     assert all(row.n == 6 for row in found["contact, for a classifier"].values())
     ball = found["contact, Hertz's ball"]
-    springs, rough, fine = (
-        ball[name].error
-        for name in (
-            "springs, 256 cells",
-            "half-space, 32 cells, tolerance 1e-02",
-            "half-space, 64 cells, tolerance 1e-04",
-        )
-    )
-    assert springs is not None
-    assert rough is not None
-    assert fine is not None
-    assert fine < rough < 0.01 * springs
+    rough = ball["half-space, 32 cells, tolerance 1e-02"].error
+    fine = ball["half-space, 64 cells, tolerance 1e-04"].error
+    assert fine < rough < 0.01 * ball["springs, 256 cells"].error
 
 
 def test_serving_asks_a_fresh_process_and_a_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -234,8 +213,8 @@ def test_serving_asks_a_fresh_process_and_a_server(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(serving, "COMMAND", ["true"])
     said = itertools.count()
     monkeypatch.setattr(serving, "post", lambda *_: str(next(said)))
-    with pytest.raises(UserError, match="not the one given alone"):
+    with refused("not the one given alone"):
         serving.measure(tmp_path, clients=3, each=2)
     monkeypatch.setattr(serving, "COMMAND", ["sh", "-c", "echo octopi: no such model >&2; exit 1"])
-    with pytest.raises(UserError, match="octopi: no such model"):
+    with refused("octopi: no such model"):
         serving.measure(tmp_path)

@@ -29,7 +29,7 @@ from pipeline.errors import UserError
 from pipeline.evaluation.answer_with import instruction
 from pipeline.io import read_jsonl, read_table, write_jsonl, write_table
 from pipeline.records import Assignment, Frame, GradedVision, Opd, Part, Prediction, Question, Shown, Turn
-from pipeline.report.load import load_report
+from pipeline.report.load import Report, load_report
 from pipeline.stage import alone
 from pipeline.tasks.questions import build_questions, pool_of
 from pipeline.videos.catalogue import Catalogue
@@ -42,7 +42,8 @@ KEPT = (7, 3, 1)
 """Frames that were kept of the first, second and third video, and so on."""
 DRAWN = {7: [0, 1, 2, 4, 5], 3: [0, 1, 2], 1: [0]}
 """Of so many, five at uniform intervals from the first, each once."""
-Step = Callable[[int], tuple[int, dict[str, str], bytes]]
+Response = tuple[int, dict[str, str], bytes]
+Step = Callable[[int], Response]
 
 
 class Server:
@@ -88,27 +89,27 @@ def server() -> Iterator[Server]:
     server.http.server_close()
 
 
-def answered(message: Any, ended: Any = "stop", **more: Any) -> dict[str, Any]:
-    return {
+def as_json(content: Any, status: int = 200, **headers: str) -> Response:
+    return status, {"Content-Type": "application/json", **headers}, json.dumps(content).encode()
+
+
+def answered(message: Any, ended: Any = "stop", **more: Any) -> Response:
+    whole = {
         "id": "1",
         "object": "chat.completion",
         "created": 1,
         "model": "sees-1-of-may",
         "choices": [{"index": 0, "message": message, "finish_reason": ended}],
         "usage": {"prompt_tokens": 9, "completion_tokens": 5, "total_tokens": 14},
-        **more,
     }
+    return as_json({**whole, **more})
 
 
-def as_json(content: Any, status: int = 200, **headers: str) -> tuple[int, dict[str, str], bytes]:
-    return status, {"Content-Type": "application/json", **headers}, json.dumps(content).encode()
+def reply(content: Any, ended: Any = "stop", **more: Any) -> Response:
+    return answered({"role": "assistant", "content": content}, ended, **more)
 
 
-def reply(text: str) -> tuple[int, dict[str, str], bytes]:
-    return as_json(answered({"role": "assistant", "content": text}))
-
-
-def soon(status: int, message: str = "not now") -> tuple[int, dict[str, str], bytes]:
+def soon(status: int, message: str = "not now") -> Response:
     """An error after which the client need not wait long before it asks again."""
     return as_json({"error": {"message": message, "code": None}}, status, **{"retry-after-ms": "1"})
 
@@ -158,7 +159,7 @@ def turns() -> list[tuple[Question, int, Turn]]:
     return [(q, n, t) for q in asked() for d in q.dialogues if d.opd is Opd.ALL for n, t in enumerate(d.turns)]
 
 
-def right(n: int) -> tuple[int, dict[str, str], bytes]:
+def right(n: int) -> Response:
     return reply(turns()[n][2].assistant)
 
 
@@ -197,6 +198,11 @@ def shown_in(content: list[dict[str, Any]]) -> tuple[str, list[list[Image.Image]
 def graded() -> list[GradedVision]:
     runpy.run_path(str(ROOT / "stages" / "grade.py"), run_name="__main__")
     return read_table(Path("data/graded_vision.parquet"), GradedVision)
+
+
+def reported() -> Report:
+    runpy.run_path(str(ROOT / "stages" / "report.py"), run_name="__main__")
+    return load_report(Path("reports/smoke-scenes"))
 
 
 def nobody_wrote_the_key(project: Path) -> bool:
@@ -278,7 +284,7 @@ def test_a_killed_run_loses_nothing(project: Path, server: Server) -> None:
     """Killed while the sixth reply is on its way; then half of the fifth's line is lost, too."""
     process: list[subprocess.Popen[bytes]] = []
 
-    def step(n: int) -> tuple[int, dict[str, str], bytes]:
+    def step(n: int) -> Response:
         if n == 5:
             process[0].send_signal(signal.SIGKILL)
         return right(n)
@@ -311,7 +317,7 @@ FAILURES: dict[str, tuple[Step, str]] = {
     "null": (lambda n: as_json(None), "no choices"),
     "nothing in it": (lambda n: as_json({}), "no choices"),
     "error with status 200": (lambda n: as_json({"error": {"message": "upstream is down"}}), "upstream is down"),
-    "choices are null": (lambda n: as_json(answered(None, choices=None)), "no choices"),
+    "choices are null": (lambda n: answered(None, choices=None), "no choices"),
 }
 
 
@@ -351,7 +357,7 @@ def test_a_server_that_is_silent_or_gone(
     monkeypatch.setattr("openai._base_client.INITIAL_RETRY_DELAY", 0.01)
     asleep = threading.Event()
 
-    def step(n: int) -> tuple[int, dict[str, str], bytes]:
+    def step(n: int) -> Response:
         if n >= 2:
             asleep.wait(30)
         return right(n)
@@ -369,34 +375,29 @@ def test_a_server_that_is_silent_or_gone(
     assert "http://127.0.0.1:9/v1: cannot be reached" in said
 
 
-SAYS_NOTHING: dict[str, tuple[Any, str]] = {
+SAYS_NOTHING: dict[str, tuple[Response, str]] = {
     "no choice": (answered(None, choices=[]), "nothing"),
     "null for a choice": (answered(None, choices=[None]), "nothing"),
     "no message": (answered(None), "nothing"),
-    "null": (answered({"role": "assistant", "content": None}), "nothing"),
-    "empty": (answered({"role": "assistant", "content": " \n"}), "nothing"),
-    "another type": (answered({"role": "assistant", "content": [{"type": "text", "text": "Yes."}]}), "nothing"),
+    "null": (reply(None), "nothing"),
+    "empty": (reply(" \n"), "nothing"),
+    "another type": (reply([{"type": "text", "text": "Yes."}]), "nothing"),
     "refused": (answered({"role": "assistant", "content": None, "refusal": "I will not."}), "refusal"),
-    "filtered": (answered({"role": "assistant", "content": ""}, "content_filter"), "content_filter"),
-    "thought too long": (answered({"role": "assistant", "content": None}, "length", usage=None), "length"),
+    "filtered": (reply("", "content_filter"), "content_filter"),
+    "thought too long": (reply(None, "length", usage=None), "length"),
+    "status 400": (as_json({"error": {"message": "no", "code": "content_filter"}}, 400), "content_filter"),
 }
 
 
-@pytest.mark.parametrize("name", [*SAYS_NOTHING, "status 400"])
+@pytest.mark.parametrize("name", SAYS_NOTHING)
 def test_no_answer_is_counted_and_not_asked_for_again(project: Path, server: Server, name: str) -> None:
-    if name == "status 400":
-        bad, ended = as_json({"error": {"message": "filtered", "code": "content_filter"}}, 400), "content_filter"
-    else:
-        content, ended = SAYS_NOTHING[name]
-        bad = as_json(content)
+    bad, ended = SAYS_NOTHING[name]
     # A question of one turn, and the first of two turns: nobody asks the second.
-    spoilt = [
-        next(i for i, (q, _, _) in enumerate(turns()) if q.task == "PC"),
-        next(i for i, (q, _, _) in enumerate(turns()) if q.task == "PSR"),
-    ]
+    tasks = [question.task for question, _, _ in turns()]
+    spoilt = [tasks.index("PC"), tasks.index("PSR")]
     order = iter([i for i in range(12) if i != spoilt[1] + 1])
 
-    def step(n: int) -> tuple[int, dict[str, str], bytes]:
+    def step(n: int) -> Response:
         i = next(order)
         return bad if i in spoilt else right(i)
 
@@ -415,10 +416,9 @@ def test_no_answer_is_counted_and_not_asked_for_again(project: Path, server: Ser
 def test_odd_texts_survive(project: Path, server: Server) -> None:
     """Line separators of Unicode, half a character, and an answer that was cut; the first two end for no reason."""
     texts = ["No.\u2028Conclusion: Yes\x85and so", "Half \ud800 of one", "Both"]
-    bodies = [answered({"role": "assistant", "content": t}, "length" if t == "Both" else None) for t in texts]
     one_turn = [q for q in asked() if q.task != "PSR"]
     write_jsonl(Path("data/questions/0/evaluation.jsonl"), one_turn)
-    server.step = lambda n: as_json(bodies[n])
+    server.step = lambda n: reply(texts[n], "length" if texts[n] == "Both" else None)
     assert "3 requests; 1 ended with length; 2 ended with unsaid; 3 of 8" in run(server, "--limit", "3")
     assert "0 requests; 1 ended with length; 2 ended with unsaid; 3 of 8" in run(server, "--limit", "0")
     said = read_jsonl(PLACE / "0.jsonl", Prediction)
@@ -520,12 +520,11 @@ def empty_frames() -> Path:
 
 def test_it_is_a_row_of_the_report_with_where_it_comes_from(project: Path, server: Server) -> None:
     """Of the two comparisons one is right and one cannot be read; all else is right."""
-    wrong = next(i for i, (q, _, _) in enumerate(turns()) if q.task == "PC")
+    wrong = [question.task for question, _, _ in turns()].index("PC")
     server.step = lambda n: reply("Perhaps.") if n == wrong else right(n)
     run(server)
     graded()
-    runpy.run_path(str(ROOT / "stages" / "report.py"), run_name="__main__")
-    report = load_report(Path("reports/smoke-scenes"))
+    report = reported()
     rows = report.scores[report.scores["encoder"].eq("some-maker/sees-1") & report.scores["seed"].eq("all")]
     found = {(r["task"], r["measure"]): (r["n"], r["accuracy"], r["unread"]) for r in rows.to_dict("records")}
     whole = dict.fromkeys((("PSS", "choice"), ("POM", "choice"), ("PSR", "choice"), ("OPD", "combined")), (2, 1.0, 0))
@@ -540,8 +539,7 @@ def test_it_is_a_row_of_the_report_with_where_it_comes_from(project: Path, serve
     assert pd.read_csv("reports/smoke-scenes/effects.csv").empty, "what parts bring is about our own system alone"
     write_jsonl(Path("data/questions/0/evaluation.jsonl"), asked()[::-1])
     assert graded() == []
-    runpy.run_path(str(ROOT / "stages" / "report.py"), run_name="__main__")
-    report = load_report(Path("reports/smoke-scenes"))
+    report = reported()
     assert "some-maker/sees-1" not in set(report.scores["encoder"])
     assert report.provenance["vision"] == []
 

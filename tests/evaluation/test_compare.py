@@ -181,20 +181,20 @@ def test_the_working_tree_is_what_lies_on_disk(copy: History) -> None:
     assert found["stages"] == found["scores"] == found["tested"] == []
 
 
-@pytest.mark.parametrize("stages", ["3", "[align]", "{align: 3}"])
-def test_a_lock_without_stages_is_named(copy: History, stages: str) -> None:
-    copy.write("dvc.lock", f"stages: {stages}\n")
-    with pytest.raises(UserError, match=re.escape("dvc.lock of working tree: its stages are no mapping")):
-        compare(copy.folder, "HEAD")
-
-
 @pytest.mark.parametrize(
-    ("file", "text"),
-    [("params.yaml", "{"), ("params.yaml", "- 1\n"), ("dvc.lock", "{"), (f"{REPORT}/metrics.json", "{")],
+    ("file", "text", "words"),
+    [
+        ("params.yaml", "{", "not a mapping"),
+        ("params.yaml", "- 1\n", "not a mapping"),
+        ("dvc.lock", "{", "not a mapping"),
+        ("dvc.lock", "stages: [align]\n", "its stages are no mapping"),
+        ("dvc.lock", "stages: {align: 3}\n", "its stages are no mapping"),
+        (f"{REPORT}/metrics.json", "{", "not a mapping"),
+    ],
 )
-def test_a_broken_file_is_named(copy: History, file: str, text: str) -> None:
+def test_a_broken_file_is_named(copy: History, file: str, text: str, words: str) -> None:
     copy.write(file, text)
-    with pytest.raises(UserError, match=re.escape(f"{Path(file).name} of working tree: not a mapping")):
+    with pytest.raises(UserError, match=re.escape(f"{Path(file).name} of working tree: {words}")):
         compare(copy.folder, "HEAD")
 
 

@@ -64,12 +64,6 @@ def test_single_objects_have_the_ordinary_cluster_robust_variance(seed: int) -> 
         assert found >= independent * (1 - 1e-12)
 
 
-def test_one_question_an_object_has_the_variance_of_independent_questions() -> None:
-    values, design = np.array([0.0, 1, 1, 0, 1, 1]), design_of(single(6, 1))
-    assert len(design.factors) == 1, "objects and questions are the same"
-    assert float(variance(values, design)) == pytest.approx(values.var(ddof=1) / 6, rel=1e-12)
-
-
 @given(about=designs())
 @settings(deadline=None, max_examples=40)
 def test_moments_are_what_the_model_expects(about: About) -> None:

@@ -197,7 +197,7 @@ def test_property_heads_on_test_and_on_validation_videos() -> None:
     assert [found[name].accuracy for name in names] == [0.75, 0.5, 1, 0.5]
     assert {(r.n, r.encoder, r.lora, r.opd, r.touch) for r in found.values()} == {(4, "finetuned", "", "", "real")}
     assert found["combined"].chance == pytest.approx(1 / 27, abs=1e-6)
-    interval = accuracy_interval(np.array([1.0, 0, 0, 1]), [("a",), ("a",), ("b",), ("c",)])
+    interval = accuracy_interval(np.array([1.0, 0, 0, 1]), ABOUT)
     assert (found["combined"].low, found["combined"].high) == pytest.approx(interval, abs=1e-6)
     assert row(rows, task="heads_validation", measure="combined", seed="all").n == 1
 
@@ -212,6 +212,7 @@ def out_of_fold(predicted: list[tuple[tuple[int, ...], ...]]) -> list[OutOfFold]
     ]
 
 
+ABOUT = [("a",), ("a",), ("b",), ("c",)]
 RIGHT, WRONG, HALF = (0, 0, 0), (2, 1, 1), (0, 0, 1)
 TREES = out_of_fold([(RIGHT, HALF, WRONG, RIGHT), (HALF, RIGHT, RIGHT, RIGHT)])
 PROBE = out_of_fold([(WRONG, HALF, WRONG, RIGHT), (HALF, HALF, WRONG, RIGHT)])
@@ -225,8 +226,7 @@ def test_cross_validation_is_the_mean_over_repeats() -> None:
     combined = row(rows, measure="combined")
     shares = np.array([0.5, 0.5, 0.5, 1])
     assert (combined.accuracy, combined.right) == (shares.mean(), shares.sum())
-    about = [("a",), ("a",), ("b",), ("c",)]
-    assert (combined.low, combined.high) == pytest.approx(accuracy_interval(shares, about), abs=1e-6)
+    assert (combined.low, combined.high) == pytest.approx(accuracy_interval(shares, ABOUT), abs=1e-6)
     assert row(rows, measure="hardness").accuracy == pytest.approx(7 / 8)
 
 
@@ -234,10 +234,9 @@ def test_encoders_are_compared_video_by_video() -> None:
     (found,) = candidate_rows({"trees": TREES, "probe": PROBE}, "trees")
     assert (found.part, found.change, found.n, found.objects, found.seeds) == ("encoder", "probe - trees", 4, 3, 2)
     gains = np.array([[-1, 0, 0, 0], [0, -1, -1, 0]], dtype=float)
-    gap = paired(gains, [("a",), ("a",), ("b",), ("c",)])
-    assert (found.difference, found.low, found.high, found.p) == pytest.approx(
-        (gap.difference, gap.low, gap.high, gap.p), abs=1e-6
-    )
+    gap = paired(gains, ABOUT)
+    expected = (gap.difference, gap.low, gap.high, gap.p)
+    assert (found.difference, found.low, found.high, found.p) == pytest.approx(expected, abs=1e-6)
     assert found.p_holm == found.p
     assert candidate_rows({"probe": PROBE}, "trees") == []
 

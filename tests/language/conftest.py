@@ -8,16 +8,16 @@ import pytest
 import torch
 
 from pipeline.config import LanguageConfig
-from pipeline.embeddings import FLIPS, INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
-from pipeline.io import save_tensors, write_table
+from pipeline.embeddings import FLIPS, EmbeddingStore
 from pipeline.language.octopi import OctopiForCausalLM
-from pipeline.records import Assignment, Embedding, Part, Question
+from pipeline.language.training import Material
+from pipeline.records import Assignment, Part, Question
 from pipeline.runtime import seed_everything
 from pipeline.tasks.questions import build_questions, pool_of
 from pipeline.videos.catalogue import load_catalogue
 from tests.checkpoints import write_llama
 from tests.closure import ROOT
-from tests.language.shared import DIM
+from tests.language.shared import DIM, material, write_store
 
 
 @pytest.fixture(scope="session")
@@ -38,11 +38,14 @@ def questions() -> list[Question]:
 def store(tmp_path_factory: pytest.TempPathFactory, questions: list[Question]) -> EmbeddingStore:
     folder = tmp_path_factory.mktemp("embeddings")
     videos = sorted({v for q in questions for v in q.videos})
-    index = [Embedding(video_id=v, frame_index=f, flip=flip, row=0) for v in videos for flip in FLIPS for f in range(3)]
-    index = [entry.model_copy(update={"row": row}) for row, entry in enumerate(index)]
-    write_table(folder / INDEX_FILE, Embedding, index)
-    save_tensors(folder / TENSOR_FILE, {TENSOR: torch.randn(len(index), DIM, generator=torch.manual_seed(0))})
-    return EmbeddingStore(folder)
+    frames = [(v, f, flip) for v in videos for flip in FLIPS for f in range(3)]
+    return write_store(folder, frames, torch.randn(len(frames), DIM, generator=torch.manual_seed(0)))
+
+
+@pytest.fixture(scope="session")
+def held(language: LanguageConfig, questions: list[Question], store: EmbeddingStore) -> Material:
+    """All of it, to train with."""
+    return material(language, questions, store)
 
 
 @pytest.fixture

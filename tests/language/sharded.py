@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +16,13 @@ from torch.distributed.tensor import DTensor
 from torch.nn import Module
 from torch.optim.optimizer import register_optimizer_step_pre_hook
 
-from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig
+from pipeline.config import LanguageConfig, LoraTrainConfig
 from pipeline.embeddings import EmbeddingStore
 from pipeline.io import read_jsonl, save_tensors, write_json
-from pipeline.language.training import Job, add_lora, assemble, fit
+from pipeline.language.training import Job, Material
 from pipeline.records import Question
-from pipeline.training import trainer as shared
 from pipeline.training.trainer import TrainableTrainer, Trained
-from tests.language.shared import SMALL, material
+from tests.language.shared import SMALL, material, train
 
 CONFIG = LoraTrainConfig(
     **{**SMALL.model_dump(), "samples": 8, "epochs": 3}, rank=4, alpha=8, learning_rate=1e-3, dropout=0.0
@@ -35,17 +35,9 @@ DIES = 5
 """Update in which a process is killed; checkpoints are written after each second one."""
 
 
-def run(kind: str, weights: str, questions: list[Question], store: EmbeddingStore, folder: Path) -> Trained:
-    """One training with its checkpoints below the folder."""
-    shared.CHECKPOINTS = folder
-    language = LanguageConfig(weights=weights, dtype=KINDS[kind])  # type: ignore[arg-type]
-    model, data = assemble(material(language, questions, store), CONFIG, "test")
-    job, runtime = Job(kind, "x", 0), RuntimeConfig(device="cpu", save_steps=2)
-    if kind == "align":
-        return fit(model, data, CONFIG, runtime, job)
-    model.train_words()
-    add_lora(model, CONFIG)
-    return fit(model, data, CONFIG, runtime, job)
+def run(kind: str, held: Material, folder: Path) -> Trained:
+    language = LanguageConfig(weights=held.language.weights, dtype=KINDS[kind])  # type: ignore[arg-type]
+    return train(Job(kind, "x", 0), replace(held, language=language), CONFIG, folder)
 
 
 def shard_on_cpus() -> None:
@@ -92,13 +84,14 @@ def main() -> None:
     folder, weights, embeddings, what = Path(sys.argv[1]), sys.argv[2], Path(sys.argv[3]), sys.argv[4]
     shard_on_cpus()
     torch.set_num_threads(1)
-    questions, store = read_jsonl(folder / "questions.jsonl", Question), EmbeddingStore(embeddings)
+    questions = read_jsonl(folder / "questions.jsonl", Question)
+    held = material(LanguageConfig(weights=weights), questions, EmbeddingStore(embeddings))
     rank = os.environ["RANK"]
     if what == "killed":
         for kind in KINDS:
             said: dict[str, Any] = {}
             watch(said)
-            trained = run(kind, weights, questions, store, folder / "whole")
+            trained = run(kind, held, folder / "whole")
             write_json(folder / f"{kind}-{rank}.json", said)
             save_tensors(folder / f"{kind}-whole-{rank}.safetensors", trained.state)
         counter = iter(range(1, 100))
@@ -108,9 +101,9 @@ def main() -> None:
                 os.kill(os.getpid(), signal.SIGKILL)
 
         register_optimizer_step_pre_hook(die)
-        run("lora", weights, questions, store, folder / "killed")
+        run("lora", held, folder / "killed")
     else:
-        trained = run("lora", weights, questions, store, folder / "killed")
+        trained = run("lora", held, folder / "killed")
         save_tensors(folder / f"lora-resumed-{rank}.safetensors", trained.state)
 
 

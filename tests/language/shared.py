@@ -1,17 +1,36 @@
-"""What the tests of the language side share: training material, generation settings, prompts."""
+"""What the tests of the language side share: training material, settings, models, and what they are held against."""
 
 from __future__ import annotations
 
-import torch
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
-from pipeline.config import LanguageConfig, LoraTrainConfig, TrainConfig
-from pipeline.embeddings import EmbeddingStore
+import torch
+from torch.nn import functional as F
+from transformers import MistralConfig, MistralForCausalLM
+
+from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig, TrainConfig
+from pipeline.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
+from pipeline.io import save_tensors, write_table
 from pipeline.language.chat import encode, render
 from pipeline.language.octopi import OctopiForCausalLM
-from pipeline.language.training import Material
-from pipeline.records import Opd, Question
+from pipeline.language.training import Job, Material, add_lora, assemble, fit
+from pipeline.records import Embedding, Opd, Question
+from pipeline.training import trainer
+from pipeline.training.trainer import Trained
 
 FRAMES, DIM = 2, 6
+
+
+def write_store(folder: Path, frames: Sequence[tuple[str, int, str]], tensor: torch.Tensor) -> EmbeddingStore:
+    """Embeddings of these frames: their videos, their places and how they are flipped."""
+    index = [
+        Embedding(video_id=video, frame_index=frame, flip=flip, row=row)
+        for row, (video, frame, flip) in enumerate(frames)
+    ]
+    write_table(folder / INDEX_FILE, Embedding, index)
+    save_tensors(folder / TENSOR_FILE, {TENSOR: tensor})
+    return EmbeddingStore(folder)
 
 
 def material(language: LanguageConfig, questions: list[Question], store: EmbeddingStore) -> Material:
@@ -29,6 +48,35 @@ def taking(samples: int, **own: float) -> LoraTrainConfig:
 
 
 SMALL = TrainConfig(samples=8, epochs=2, batch_size=4, micro_batch_size=2, projection_learning_rate=1e-3)
+LORA = LoraTrainConfig(samples=1, rank=4, alpha=8, dropout=0.0)
+
+
+def train(job: Job, held: Material, config: LoraTrainConfig, folder: Path) -> Trained:
+    """Alignment, or LoRA with trained word embeddings; checkpoints below the folder, after each second update."""
+    trainer.CHECKPOINTS = folder
+    model, data = assemble(held, config, "test")
+    if job.stage == "lora":
+        model.train_words()
+        add_lora(model, config)
+    return fit(model, data, config, RuntimeConfig(device="cpu", save_steps=2), job)
+
+
+def adapted(model: OctopiForCausalLM, config: LoraTrainConfig = LORA) -> OctopiForCausalLM:
+    """With an adapter that changes something."""
+    if not hasattr(model.llm, "peft_config"):
+        add_lora(model, config)
+    for name, parameter in model.named_parameters():
+        if "lora_B" in name:
+            torch.nn.init.normal_(parameter, std=0.1)
+    return model.eval()
+
+
+def mistral(vocab_size: int, window: int | None) -> MistralForCausalLM:
+    """Its layers see the last `window` tokens alone."""
+    shapes = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 4}
+    return MistralForCausalLM(
+        MistralConfig(vocab_size=vocab_size, num_key_value_heads=2, sliding_window=window, **shapes)
+    )
 
 
 def prompt(question: Question, opd: Opd, model: OctopiForCausalLM) -> list[int]:
@@ -43,3 +91,52 @@ def call(model: OctopiForCausalLM) -> dict[str, torch.Tensor]:
     """A question about two frames."""
     ids = torch.tensor([[5, model.start_id, model.frame_id, model.frame_id, model.end_id, 7, 9]])
     return {"input_ids": ids, "features": torch.randn(1, 2, DIM, generator=torch.manual_seed(3))}
+
+
+def assert_comes_back(model: OctopiForCausalLM, folder: Path, **how: str) -> OctopiForCausalLM:
+    """The model that was saved in the folder, which says the same to the bit."""
+    again = OctopiForCausalLM.from_pretrained(folder, **how)  # type: ignore[arg-type]
+    assert not again.training
+    assert torch.equal(again(**call(again)).logits, model.eval()(**call(model)).logits)
+    return again
+
+
+def by_transformers(
+    model: OctopiForCausalLM, ids: list[int], features: torch.Tensor, ends: Sequence[int], limit: int
+) -> list[int]:
+    """What follows one prompt, alone and without padding, by `generate` and its own cache."""
+    row = torch.tensor([ids])
+    new = model.llm.generate(
+        inputs_embeds=model.embed(row, features[None]),
+        attention_mask=torch.ones_like(row),
+        max_new_tokens=limit,
+        do_sample=False,
+        eos_token_id=list(ends),
+        pad_token_id=0,
+    )
+    return [int(token) for token in new[0]]
+
+
+def embedded(
+    model: OctopiForCausalLM,
+    ids: list[int],
+    features: torch.Tensor,
+    words: torch.Tensor,
+    own: Mapping[str, torch.Tensor],
+) -> torch.Tensor:
+    """`embed` of one row by the letter: token for token, with a counter of frames.
+
+    Args:
+        words: The word embeddings.
+        own: The connector's parameters.
+    """
+    frames, rows = iter(features), []
+    for token in ids:
+        if token == model.frame_id:
+            hidden = F.gelu(own["projection.0.weight"] @ next(frames) + own["projection.0.bias"])
+            rows.append(own["projection.2.weight"] @ hidden + own["projection.2.bias"])
+        elif token in (model.start_id, model.end_id):
+            rows.append(own["delimiters"][int(token == model.end_id)])
+        else:
+            rows.append(words[token])
+    return torch.stack(rows)

@@ -10,14 +10,12 @@ import torch
 from torch.nn import functional as F
 
 from pipeline.config import LanguageConfig
-from pipeline.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
-from pipeline.io import save_tensors, write_table
 from pipeline.language.training import assemble
 from pipeline.language.words import begin_with_words
-from pipeline.records import Embedding, Question
+from pipeline.records import Question
 from pipeline.videos.catalogue import load_catalogue
 from tests.closure import ROOT
-from tests.language.shared import DIM, material, taking
+from tests.language.shared import DIM, material, taking, write_store
 
 CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")
 
@@ -35,13 +33,10 @@ def test_frames_read_like_the_words_of_their_classes(
 ) -> None:
     labels = {v: label for q in questions for v, label in zip(q.videos, q.gold.labels, strict=True)}
     drawn = torch.Generator().manual_seed(0)
-    index = [Embedding(video_id=v, frame_index=f, flip="none", row=0) for v in sorted(labels) for f in range(3)]
-    index = [entry.model_copy(update={"row": row}) for row, entry in enumerate(index)]
-    write_table(tmp_path / INDEX_FILE, Embedding, index)
-    save_tensors(tmp_path / TENSOR_FILE, {TENSOR: torch.stack([felt(labels[e.video_id], drawn) for e in index])})
-    own = language.model_copy(update={"normalize_touch": normalize})
-    model, data = assemble(material(own, questions, EmbeddingStore(tmp_path)), taking(14), "test")
-    twin, _ = assemble(material(own, questions, EmbeddingStore(tmp_path)), taking(14), "test")
+    frames = [(v, f, "none") for v in sorted(labels) for f in range(3)]
+    store = write_store(tmp_path, frames, torch.stack([felt(labels[v], drawn) for v, _, _ in frames]))
+    held = material(language.model_copy(update={"normalize_touch": normalize}), questions, store)
+    (model, data), (twin, _) = (assemble(held, taking(14), "test") for _ in range(2))
     for each in (model, twin):
         begin_with_words(each, data, CATALOGUE, seed=1)
         assert all(p.grad is None for p in each.parameters())

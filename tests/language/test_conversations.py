@@ -14,16 +14,14 @@ from hypothesis import strategies as st
 from torch.utils.data import BatchSampler
 from transformers import PreTrainedTokenizerBase
 
-from pipeline.config import LanguageConfig
-from pipeline.embeddings import EmbeddingStore
 from pipeline.language.base import load_tokenizer
 from pipeline.language.chat import IGNORE_INDEX, TACTILE_TOKENS, encode, render
 from pipeline.language.conversations import POOL, LengthBuckets, collate
 from pipeline.language.generate import write_prompt
-from pipeline.language.training import assemble
-from pipeline.records import Question, Turn
+from pipeline.language.training import Material, assemble
+from pipeline.records import Turn
 from tests.checkpoints import write_llama
-from tests.language.shared import DIM, FRAMES, generation, material, taking
+from tests.language.shared import DIM, FRAMES, generation, taking
 from tests.models import model_folder
 
 
@@ -34,9 +32,7 @@ def tokenizer(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathF
     return load_tokenizer(write_llama(tmp_path_factory.mktemp("llama")))
 
 
-def test_without_a_begin_token_all_else_is_the_same(
-    tokenizer: PreTrainedTokenizerBase, language: LanguageConfig, questions: list[Question], store: EmbeddingStore
-) -> None:
+def test_without_a_begin_token_all_else_is_the_same(tokenizer: PreTrainedTokenizerBase, held: Material) -> None:
     """As the published code trains and asks; what a chat template writes is its own."""
     turns = [Turn(user="Feel {tactile}.", assistant="Soft.")]
     rendered = render(turns, tokenizer, system_prompt="", frames=2, complete=True)
@@ -44,8 +40,7 @@ def test_without_a_begin_token_all_else_is_the_same(
     assert (without.input_ids, without.labels) == (usual.input_ids[1:], usual.labels[1:])
     own = replace(rendered, text="<s>" + rendered.text, answers=(), templated=True)
     assert encode(own, tokenizer, bos=False) == encode(own, tokenizer)
-    held = material(language, questions, store)
-    _, theirs = assemble(replace(held, language=language.model_copy(update={"bos": False})), taking(6), "test")
+    _, theirs = assemble(replace(held, language=held.language.model_copy(update={"bos": False})), taking(6), "test")
     _, ours = assemble(held, taking(6), "test")
     assert [(1, *e.input_ids) for e in theirs.encoded] == [e.input_ids for e in ours.encoded]
     asked = write_prompt(turns, tokenizer, generation(1).model_copy(update={"bos": False}), FRAMES)
@@ -54,22 +49,17 @@ def test_without_a_begin_token_all_else_is_the_same(
     )
 
 
-def test_same_draws_for_same_epoch_and_others_for_another(
-    language: LanguageConfig, questions: list[Question], store: EmbeddingStore
-) -> None:
-    _, data = assemble(material(language, questions, store), taking(6), "test")
+def test_same_draws_for_same_epoch_and_others_for_another(held: Material) -> None:
+    _, data = assemble(held, taking(6), "test")
     first = [data[i]["features"] for i in range(len(data))]
     assert all(torch.equal(a, data[i]["features"]) for i, a in enumerate(first))
     data.follow(lambda: 1)
     assert not all(torch.equal(a, data[i]["features"]) for i, a in enumerate(first))
 
 
-def test_counterfactuals_have_other_videos_and_teach_only_conclusions(
-    language: LanguageConfig, questions: list[Question], store: EmbeddingStore
-) -> None:
+def test_counterfactuals_have_other_videos_and_teach_only_conclusions(held: Material) -> None:
     """Of the described questions the wanted share, and no other; all else is as without."""
-    held = material(language, questions, store)
-    tokenizer = load_tokenizer(Path(language.weights))
+    tokenizer = load_tokenizer(Path(held.language.weights))
     (_, plain), (_, mixed) = (assemble(held, taking(14, counterfactual=share), "test") for share in (0.0, 0.5))
     described = changed = 0
     for epoch in range(40):
@@ -91,17 +81,14 @@ def test_counterfactuals_have_other_videos_and_teach_only_conclusions(
     assert 0.4 < changed / described < 0.6
 
 
-def test_replayed_text_has_no_touch_and_weighs_as_conclusions_do(
-    language: LanguageConfig, questions: list[Question], store: EmbeddingStore
-) -> None:
-    held = material(language, questions, store)
+def test_replayed_text_has_no_touch_and_weighs_as_conclusions_do(held: Material) -> None:
     (_, plain), (_, mixed) = (
         assemble(held, taking(9, conclusion_weight=4.0, replay=share), "test") for share in (0.0, 0.25)
     )
     assert (len(plain), len(mixed), len(mixed.lengths)) == (9, 12, 12)
     assert mixed.questions == plain.questions
     assert all(torch.equal(plain[i]["weights"], mixed[i]["weights"]) for i in range(9))
-    tokenizer = load_tokenizer(Path(language.weights))
+    tokenizer = load_tokenizer(Path(held.language.weights))
     tactile = set(tokenizer.convert_tokens_to_ids(list(TACTILE_TOKENS)))
     for sample in (mixed[i] for i in range(9, 12)):
         assert not tactile & set(sample["input_ids"].tolist())

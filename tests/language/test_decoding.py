@@ -7,16 +7,14 @@ from pathlib import Path
 import pytest
 import torch
 from torch.nn import functional as F
-from transformers import MistralConfig, MistralForCausalLM
 
-from pipeline.config import LanguageConfig, LoraTrainConfig
+from pipeline.config import LanguageConfig
 from pipeline.language import decoding
 from pipeline.language.chat import IGNORE_INDEX
 from pipeline.language.decoding import greedy
 from pipeline.language.octopi import OctopiForCausalLM
-from pipeline.language.training import add_lora
 from tests.checkpoints import write_llama
-from tests.language.shared import DIM
+from tests.language.shared import DIM, LORA, adapted, by_transformers, mistral
 
 MANY = (5, 9, 13, 40, 41)
 """Tokens that end an answer: so many that rows end at different places."""
@@ -36,32 +34,13 @@ def asked(model: OctopiForCausalLM, shared: int) -> tuple[list[list[int]], list[
     return prompts, features
 
 
-def by_transformers(
-    model: OctopiForCausalLM, ids: list[int], features: torch.Tensor, ends: tuple[int, ...], limit: int
-) -> list[int]:
-    """One row alone, without padding, by `generate` and its own cache."""
-    prompt = torch.tensor([ids])
-    new = model.llm.generate(
-        inputs_embeds=model.embed(prompt, features[None]),
-        attention_mask=torch.ones_like(prompt),
-        max_new_tokens=limit,
-        do_sample=False,
-        eos_token_id=list(ends),
-        pad_token_id=0,
-    )
-    return [int(token) for token in new[0]]
-
-
 @pytest.fixture(scope="module", params=["llama", "window"])
 def steady(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> OctopiForCausalLM:
     """A Llama, and a model whose layers see the last eight tokens alone."""
     folder = write_llama(tmp_path_factory.mktemp("llama"), seed=4)
     if request.param == "window":
         torch.manual_seed(2)
-        shapes = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 4}
-        MistralForCausalLM(
-            MistralConfig(vocab_size=260, num_key_value_heads=2, sliding_window=8, **shapes)
-        ).save_pretrained(folder)
+        mistral(260, window=8).save_pretrained(folder)
     torch.manual_seed(1)
     return OctopiForCausalLM.from_base(folder, DIM).eval()
 
@@ -93,16 +72,13 @@ def test_equal_prompts_and_a_prompt_that_begins_another(steady: OctopiForCausalL
     assert greedy(steady, prompts[:3], none[:3], (), [6] * 3) == alone[:3]
 
 
-@pytest.mark.parametrize("adapted", [False, True])
+@pytest.mark.parametrize("lora", [False, True])
 @pytest.mark.parametrize("kind", ["shared", "one row", "nothing shared", "no frames"])
-def test_loss_and_gradients_are_those_of_all_at_once(language: LanguageConfig, adapted: bool, kind: str) -> None:
+def test_loss_and_gradients_are_those_of_all_at_once(language: LanguageConfig, lora: bool, kind: str) -> None:
     torch.manual_seed(3)
     model = OctopiForCausalLM.from_base(language.weights, DIM).eval()
-    if adapted:
-        add_lora(model, LoraTrainConfig(samples=1, rank=4, alpha=8, dropout=0.0, target_modules="all-linear"))
-        for name, parameter in model.named_parameters():
-            if "lora_B" in name:
-                torch.nn.init.normal_(parameter, std=0.1)
+    if lora:
+        adapted(model, LORA.model_copy(update={"target_modules": "all-linear"}))
     model.double()
     ids = torch.randint(4, 250, (3, 24))
     ids[:, :10] = ids[0, :10]
@@ -125,7 +101,7 @@ def test_loss_and_gradients_are_those_of_all_at_once(language: LanguageConfig, a
     logits = model(ids, features).logits
     expected = F.cross_entropy(logits[:, :-1].flatten(0, 1), labels[:, 1:].flatten())
     torch.testing.assert_close(loss, expected, atol=1e-6, rtol=0)
-    if kind == "no frames" and not adapted:
+    if kind == "no frames" and not lora:
         assert not loss.requires_grad or max(float(g.abs().max()) for g in gradients(loss)) == 0
         return
     for found, whole in zip(gradients(loss), gradients(expected), strict=True):

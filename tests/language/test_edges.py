@@ -11,7 +11,6 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from torch.nn import functional as F
 
 from pipeline.config import LanguageConfig
 from pipeline.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
@@ -20,27 +19,9 @@ from pipeline.io import read_table, save_tensors
 from pipeline.language.chat import IGNORE_INDEX, Encoded, encode_turns
 from pipeline.language.generate import answer
 from pipeline.language.octopi import OctopiForCausalLM
-from pipeline.language.training import assemble
+from pipeline.language.training import Material, assemble
 from pipeline.records import Embedding, Opd, Question
-from tests.language.shared import DIM, FRAMES, generation, material, taking
-
-
-def plainly(model: OctopiForCausalLM, ids: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
-    """`embed` by the letter: token for token, with a counter of frames."""
-    words, connector = model.llm.get_input_embeddings().weight, model.connector
-    first, last = connector.projection[0], connector.projection[2]
-    rows = []
-    for row, given_features in zip(ids.tolist(), features, strict=True):
-        frames, found = iter(given_features), []
-        for token in row:
-            if token == model.frame_id:
-                found.append(last.weight @ F.gelu(first.weight @ next(frames) + first.bias) + last.bias)
-            elif token in (model.start_id, model.end_id):
-                found.append(connector.delimiters[int(token == model.end_id)])
-            else:
-                found.append(words[token])
-        rows.append(torch.stack(found))
-    return torch.stack(rows)
+from tests.language.shared import DIM, FRAMES, embedded, generation, material, taking
 
 
 @pytest.fixture(scope="module")
@@ -67,19 +48,19 @@ def test_embedding_equals_a_plain_one(steady: OctopiForCausalLM, rows: list[list
     features = torch.full((len(rows), int(counts.max()) + spare, DIM), float("nan"))
     for row, count in enumerate(counts.tolist()):
         features[row, :count] = torch.randn(count, DIM, generator=torch.manual_seed(row))
+    words, own = steady.llm.get_input_embeddings().weight, dict(steady.connector.named_parameters())
     with torch.no_grad():
-        torch.testing.assert_close(steady.embed(ids, features), plainly(steady, ids, features), atol=2e-6, rtol=0)
+        expected = [embedded(steady, row, f, words, own) for row, f in zip(ids.tolist(), features, strict=True)]
+        torch.testing.assert_close(steady.embed(ids, features), torch.stack(expected), atol=2e-6, rtol=0)
 
 
-def test_a_conversation_without_an_answer_is_named(
-    questions: list[Question], store: EmbeddingStore, language: LanguageConfig, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_conversation_without_an_answer_is_named(held: Material, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         "pipeline.language.conversations.encode_turns",
         lambda *given, **how: Encoded((ids := encode_turns(*given, **how).input_ids), (IGNORE_INDEX,) * len(ids)),
     )
     with pytest.raises(UserError, match=r"^[A-Z]+-train-\d+: has no answer to learn from"):
-        assemble(material(language, questions, store), taking(3), "test")
+        assemble(held, taking(3), "test")
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from transformers import DynamicCache, MistralConfig, MistralForCausalLM
+from transformers import DynamicCache
 
 from pipeline.config import LanguageConfig
 from pipeline.embeddings import EmbeddingStore
@@ -20,7 +20,7 @@ from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import assemble
 from pipeline.records import Opd, Question
 from tests.checkpoints import write_llama
-from tests.language.shared import DIM, FRAMES, generation, material, prompt, taking
+from tests.language.shared import DIM, FRAMES, by_transformers, generation, material, mistral, prompt, taking
 
 
 def by_hand(model: OctopiForCausalLM, question: Question, store: EmbeddingStore, opd: Opd, count: int) -> list[int]:
@@ -38,15 +38,8 @@ def test_one_row_answers_as_transformers_own_generation_does(
     """By its own cache, without padding, over more tokens than room is made for at a time."""
     limit, end = 2 * AHEAD + 20, model.tokenizer.eos_token_id
     for question in [q for q in questions if q.task in ("PC", "PSS")][:2]:
-        ids = torch.tensor([prompt(question, Opd.NEEDED, model)])
-        new = model.llm.generate(
-            inputs_embeds=model.embed(ids, evaluation_features(question, store, FRAMES)[None]),
-            attention_mask=torch.ones_like(ids),
-            max_new_tokens=limit,
-            do_sample=False,
-            eos_token_id=end,
-            pad_token_id=0,
-        )[0].tolist()
+        features = evaluation_features(question, store, FRAMES)
+        new = by_transformers(model, prompt(question, Opd.NEEDED, model), features, [end], limit)
         (prediction,) = answer(model, store, [question], Opd.NEEDED, generation(1, limit), FRAMES)
         assert prediction.outputs == (model.tokenizer.decode(new, skip_special_tokens=True).strip(),)
         assert prediction.tokens == len(new)
@@ -57,10 +50,7 @@ def test_one_row_answers_as_transformers_own_generation_does(
 @pytest.mark.parametrize("window", [None, 8])
 def test_the_cache_gives_back_what_transformers_own_does(window: int | None) -> None:
     torch.manual_seed(0)
-    shapes = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 4}
-    llm = MistralForCausalLM(
-        MistralConfig(vocab_size=50, num_key_value_heads=2, sliding_window=window, **shapes)
-    ).eval()
+    llm = mistral(50, window).eval()
     own, other = roomy_cache(llm.config), DynamicCache(config=llm.config)
     for start, stop in ((0, 5), (5, 6), (6, 7), (7, 7 + AHEAD), (7 + AHEAD, 8 + AHEAD)):
         ids = torch.randint(0, 50, (3, stop - start), generator=torch.manual_seed(stop))

@@ -10,14 +10,12 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
+from pipeline.embeddings import EmbeddingStore
 from pipeline.errors import UserError
-from pipeline.io import save_tensors, write_table
 from pipeline.language.conversations import evaluation_features
 from pipeline.language.input_ablation import _ring, ablate_input
-from pipeline.records import Dialogue, Embedding, Gold, Opd, Part, Question, Touch, Turn
-
-DIM = 6
+from pipeline.records import Dialogue, Gold, Opd, Part, Question, Touch, Turn
+from tests.language.shared import DIM, write_store
 
 
 def question(number: int, objects: Sequence[str], video: int = 0) -> Question:
@@ -35,15 +33,10 @@ def question(number: int, objects: Sequence[str], video: int = 0) -> Question:
 
 def store_of(folder: Path, videos: dict[str, int]) -> EmbeddingStore:
     """An embedding of video v's frame f begins with v's number and f."""
-    index, rows = [], []
-    generator = torch.Generator().manual_seed(0)
-    for number, (video, frames) in enumerate(videos.items()):
-        for frame in range(frames):
-            index.append(Embedding(video_id=video, frame_index=frame, flip="none", row=len(rows)))
-            rows.append(torch.cat([torch.tensor([number, frame]).float(), torch.randn(DIM - 2, generator=generator)]))
-    save_tensors(folder / TENSOR_FILE, {TENSOR: torch.stack(rows)})
-    write_table(folder / INDEX_FILE, Embedding, index)
-    return EmbeddingStore(folder)
+    frames = [(video, frame, "none") for video, count in videos.items() for frame in range(count)]
+    tensor = torch.randn(len(frames), DIM, generator=torch.Generator().manual_seed(0))
+    tensor[:, :2] = torch.tensor([(list(videos).index(video), frame) for video, frame, _ in frames])
+    return write_store(folder, frames, tensor)
 
 
 @pytest.fixture

@@ -22,12 +22,10 @@ import torch
 import yaml
 from safetensors.torch import load_file
 
-from pipeline.config import LanguageConfig
-from pipeline.embeddings import EmbeddingStore
 from pipeline.errors import UserError
 from pipeline.io import write_jsonl
 from pipeline.language.octopi import OctopiForCausalLM
-from pipeline.records import Question
+from pipeline.language.training import Material
 from tests.closure import ROOT
 from tests.language.sharded import CONFIG, KINDS, run
 
@@ -66,13 +64,11 @@ def free_port() -> int:
 
 
 @pytest.fixture(scope="module")
-def trained(
-    tmp_path_factory: pytest.TempPathFactory, language: LanguageConfig, questions: list[Question], store: EmbeddingStore
-) -> Path:
+def trained(tmp_path_factory: pytest.TempPathFactory, held: Material) -> Path:
     """Every kind once to its end, and LoRA killed in its fifth update."""
     folder = tmp_path_factory.mktemp("sharded")
-    write_jsonl(folder / "questions.jsonl", questions)
-    with launched(folder, language.weights, str(store.folder), "killed") as process:
+    write_jsonl(folder / "questions.jsonl", held.questions)
+    with launched(folder, held.language.weights, str(held.store.folder), "killed") as process:
         output, _ = process.communicate(timeout=300)
     assert "SIGKILL" in output, output[-3000:]
     return folder
@@ -80,18 +76,12 @@ def trained(
 
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_two_processes_that_share_the_layers_train_like_one(
-    kind: str,
-    trained: Path,
-    language: LanguageConfig,
-    questions: list[Question],
-    store: EmbeddingStore,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    kind: str, trained: Path, held: Material, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # A sharded model reads the beginnings of questions anew for each row; a base in bfloat16 rounds otherwise then.
     monkeypatch.setattr(OctopiForCausalLM, "_shared", lambda *_: 0)
     monkeypatch.setattr("pipeline.training.trainer.CHECKPOINTS", tmp_path)  # As `run` sets it for good.
-    one = run(kind, language.weights, questions, store, tmp_path).state
+    one = run(kind, held, tmp_path).state
     both = [load_file(trained / f"{kind}-whole-{rank}.safetensors") for rank in range(2)]
     said = [json.loads((trained / f"{kind}-{rank}.json").read_text()) for rank in range(2)]
     assert all(s["sharded"] for s in said)
@@ -117,20 +107,16 @@ def test_a_checkpoint_holds_what_is_trained_alone(trained: Path) -> None:
     assert optimizer["state"].keys() == names
 
 
-def test_one_process_does_not_go_on_with_what_two_began(
-    trained: Path, language: LanguageConfig, questions: list[Question], store: EmbeddingStore, tmp_path: Path
-) -> None:
+def test_one_process_does_not_go_on_with_what_two_began(trained: Path, held: Material, tmp_path: Path) -> None:
     shutil.copytree(trained / "killed", tmp_path / "killed")
     with pytest.raises(UserError, match=r"checkpoint-4: was written sharded.*runtime\.launcher"):
-        run("lora", language.weights, questions, store, tmp_path / "killed")
+        run("lora", held, tmp_path / "killed")
 
 
-def test_two_machines_go_on_where_two_processes_were_killed(
-    trained: Path, language: LanguageConfig, store: EmbeddingStore
-) -> None:
+def test_two_machines_go_on_where_two_processes_were_killed(trained: Path, held: Material) -> None:
     """Each machine is launched by itself, as docs/scale.md says; here both are this one."""
     shared = {"num_machines": 2, "main_process_ip": "127.0.0.1", "main_process_port": free_port()}
-    arguments = (language.weights, str(store.folder), "resumed")
+    arguments = (held.language.weights, str(held.store.folder), "resumed")
     with (
         launched(trained, *arguments, **shared, machine_rank=0) as first,
         launched(trained, *arguments, **shared, machine_rank=1) as second,

@@ -21,14 +21,7 @@ def atmost(updates: int) -> MaxUpdates:
 
 
 SMALL = TeachConfig(
-    rank=2,
-    alpha=4,
-    warmup=1,
-    batch_size=4,
-    micro_batch_size=2,
-    max_updates=atmost(2),
-    check_every=1,
-    check_items=4,
+    rank=2, alpha=4, warmup=1, batch_size=4, micro_batch_size=2, max_updates=atmost(2), check_every=1, check_items=4
 )
 RUNTIME = RuntimeConfig(device="cpu", save_steps=1)
 
@@ -41,9 +34,7 @@ def run(language: LanguageConfig, *callbacks: AtStep) -> Trained:
 @pytest.fixture
 def course(language: LanguageConfig) -> Course:
     marks = PassMarks(plain=0.9, several=0.8, whole=0.95)
-    config = SMALL.model_copy(
-        update={"max_updates": MaxUpdates(plain=100, several=100, whole=100), "batch_size": 40, "pass_marks": marks}
-    )
+    config = SMALL.model_copy(update={"max_updates": atmost(100), "batch_size": 40, "pass_marks": marks})
     return Course(config, load_tokenizer(Path(language.weights)), "", seed=3)
 
 

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,25 +16,14 @@ from torch.optim.optimizer import register_optimizer_step_pre_hook
 from torch.utils.data import SequentialSampler
 from transformers import TrainerCallback, TrainerState
 
-from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig
-from pipeline.embeddings import EmbeddingStore
+from pipeline.config import LoraTrainConfig, RuntimeConfig
 from pipeline.errors import UserError
 from pipeline.io import write_jsonl
 from pipeline.language.chat import IGNORE_INDEX
-from pipeline.language.octopi import OctopiForCausalLM
-from pipeline.language.training import (
-    Job,
-    Material,
-    add_lora,
-    assemble,
-    fit,
-    write_model_card,
-)
-from pipeline.records import Question
-from pipeline.training import trainer as shared
+from pipeline.language.training import Job, Material, add_lora, assemble, fit, write_model_card
 from pipeline.training.trainer import Trained
 from tests.closure import ROOT
-from tests.language.shared import SMALL, call, material, taking
+from tests.language.shared import SMALL, assert_comes_back, taking, train
 
 CPU = RuntimeConfig(device="cpu")
 RUNTIME = RuntimeConfig(device="cpu", save_steps=2)
@@ -50,6 +40,7 @@ from pipeline.io import read_jsonl
 from pipeline.embeddings import EmbeddingStore
 from pipeline.records import Question
 from pipeline.config import LanguageConfig
+from tests.language.shared import material
 from tests.language.test_training import run
 folder, weights, embeddings, kind, when = sys.argv[1:]
 def die(*_):
@@ -68,7 +59,8 @@ else:
     count = iter(range(1000))
     register_optimizer_step_pre_hook(lambda *_: die() if next(count) == int(when) else None)
 questions = read_jsonl(Path(folder) / "questions.jsonl", Question)
-run(kind, LanguageConfig(weights=weights), questions, EmbeddingStore(Path(embeddings)), Path(folder) / "killed")
+held = material(LanguageConfig(weights=weights), questions, EmbeddingStore(Path(embeddings)))
+run(kind, held, Path(folder) / "killed")
 """
 
 
@@ -83,32 +75,12 @@ class AtStep(TrainerCallback):
             self.act()  # type: ignore[operator]
 
 
-@pytest.fixture
-def held(language: LanguageConfig, questions: list[Question], store: EmbeddingStore) -> Material:
-    return material(language, questions, store)
-
-
-def run(
-    kind: str,
-    language: LanguageConfig,
-    questions: list[Question],
-    store: EmbeddingStore,
-    folder: Path,
-    *callbacks: TrainerCallback,
-) -> Trained:
-    """One training with its checkpoints below the folder."""
-    shared.CHECKPOINTS = folder
+def run(kind: str, held: Material, folder: Path, *callbacks: TrainerCallback) -> Trained:
     # Sums depend on the number of threads in their last bits, and each process would take its own.
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    job = Job(kind, "x", 0, callbacks)
     try:
-        model, data = assemble(material(language, questions, store), taking(10), "test")
-        if kind == "align":
-            return fit(model, data, CONFIG, RUNTIME, job)
-        model.train_words()
-        add_lora(model, CONFIG)
-        return fit(model, data, CONFIG, RUNTIME, job)
+        return train(Job(kind, "x", 0, callbacks), held, CONFIG, folder)
     finally:
         torch.set_num_threads(threads)
 
@@ -116,15 +88,7 @@ def run(
 @pytest.mark.parametrize(
     ("kind", "when", "left"), [("align", "logged 5", 4), ("lora", "5", 4), ("lora", "writing optimizer.pt", 2)]
 )
-def test_killed_and_resumed_ends_the_same(
-    kind: str,
-    when: str,
-    left: int,
-    language: LanguageConfig,
-    questions: list[Question],
-    store: EmbeddingStore,
-    checkpoints: Path,
-) -> None:
+def test_killed_and_resumed_ends_the_same(kind: str, when: str, left: int, held: Material, checkpoints: Path) -> None:
     """Interrupted; by SIGKILL in a process of its own between two checkpoints, and while one is being written."""
     if when == "logged 5":
 
@@ -132,11 +96,11 @@ def test_killed_and_resumed_ends_the_same(
             raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):
-            run(kind, language, questions, store, checkpoints / "killed", AtStep(5, die))
+            run(kind, held, checkpoints / "killed", AtStep(5, die))
     else:
-        write_jsonl(checkpoints / "questions.jsonl", questions)
+        write_jsonl(checkpoints / "questions.jsonl", held.questions)
         done = subprocess.run(
-            [sys.executable, "-c", CHILD, str(checkpoints), language.weights, str(store.folder), kind, when],
+            [sys.executable, "-c", CHILD, str(checkpoints), held.language.weights, str(held.store.folder), kind, when],
             env={**os.environ, "PYTHONPATH": str(ROOT)},
             capture_output=True,
             text=True,
@@ -144,13 +108,13 @@ def test_killed_and_resumed_ends_the_same(
         assert done.returncode == -signal.SIGKILL, done.stderr[-2000:]
     kept = {int(f.parent.name.split("-")[1]) for f in checkpoints.glob(f"killed/{kind}/x/*/trainer_state.json")}
     assert kept == {left}
-    whole = run(kind, language, questions, store, checkpoints / "whole")
-    again = run(kind, language, questions, store, checkpoints / "killed")
+    whole = run(kind, held, checkpoints / "whole")
+    again = run(kind, held, checkpoints / "killed")
     assert again.history == whole.history
     assert again.state.keys() == whole.state.keys()
     assert all(torch.equal(again.state[name], value) for name, value in whole.state.items())
     if kind == "align":
-        ended = run(kind, language, questions, store, checkpoints / "killed", AtStep(1, die))
+        ended = run(kind, held, checkpoints / "killed", AtStep(1, die))
         assert ended.history == whole.history, "what is trained waits for the stage to write it"
 
 
@@ -160,7 +124,7 @@ def test_another_language_model_under_the_same_name_begins_anew(held: Material, 
     for content in (b"one", b"one", b"two"):
         (tmp_path / "model.safetensors").write_bytes(content)
         language = held.language.model_copy(update={"weights": str(tmp_path)})
-        marks.append(Material(**{**vars(held), "language": language}).fingerprint(SMALL))
+        marks.append(replace(held, language=language).fingerprint(SMALL))
     assert marks[0] == marks[1] != marks[2]
 
 
@@ -198,7 +162,7 @@ def test_each_part_learns_at_its_own_rate_and_in_float32(dtype: str, held: Mater
     rates = {"projection_learning_rate": 1e-9, "learning_rate": 1e-2}
     config = CONFIG.model_copy(update={**rates, "epochs": 1})
     language = held.language.model_copy(update={"dtype": dtype})
-    model, data = assemble(Material(**{**vars(held), "language": language}), taking(8), "test")
+    model, data = assemble(replace(held, language=language), taking(8), "test")
     add_lora(model, config)
     before = {n: p.detach().clone() for n, p in model.named_parameters()}
     for name, parameter in model.named_parameters():
@@ -211,8 +175,7 @@ def test_each_part_learns_at_its_own_rate_and_in_float32(dtype: str, held: Mater
     model.save_pretrained(checkpoints / "saved")
     saved = load_file(checkpoints / "saved" / "adapter" / "adapter_model.safetensors")
     assert {v.dtype for v in saved.values()} == {torch.float32}
-    again = OctopiForCausalLM.from_pretrained(checkpoints / "saved", dtype=dtype)  # type: ignore[arg-type]
-    assert torch.equal(again(**call(model)).logits, model.eval()(**call(model)).logits)
+    assert_comes_back(model, checkpoints / "saved", dtype=dtype)
     write_model_card(checkpoints / "saved", held, data, config)
     card = (checkpoints / "saved" / "README.md").read_text()
     assert all(line in card for line in ("fine-tuned with LoRA", "| rank | 4 |", f"base_model:\n- {language.weights}"))

@@ -4,26 +4,23 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
-from torch.nn import functional as F
+from safetensors.torch import load_file
 from torch.optim.optimizer import Optimizer, register_optimizer_step_pre_hook
 from transformers import LlamaForCausalLM
 
 from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig
-from pipeline.embeddings import EmbeddingStore
-from pipeline.errors import UserError
 from pipeline.language.chat import IGNORE_INDEX
 from pipeline.language.conversations import collate
 from pipeline.language.decoding import greedy
 from pipeline.language.octopi import OctopiForCausalLM
-from pipeline.language.training import Job, add_lora, assemble, fit, write_model_card
-from pipeline.records import Question
+from pipeline.language.training import Job, Material, add_lora, assemble, fit, write_model_card
 from tests.checkpoints import write_llama
-from tests.language.shared import DIM, SMALL, call, material, taking
+from tests.language.shared import DIM, SMALL, assert_comes_back, embedded, taking
 from tests.language.test_octopi import digests
 
 CPU = RuntimeConfig(device="cpu")
@@ -40,17 +37,8 @@ def reference(model: OctopiForCausalLM, folder: Path, batch: dict[str, torch.Ten
     total = torch.zeros((), dtype=torch.float64)
     count = 0
     for ids, labels, features in zip(batch["input_ids"], batch["labels"], batch["features"], strict=True):
-        frames = iter(features.double())
-        rows = []
-        for token in ids.tolist():
-            if token == model.frame_id:
-                hidden = F.gelu(own["projection.0.weight"] @ next(frames) + own["projection.0.bias"])
-                rows.append(own["projection.2.weight"] @ hidden + own["projection.2.bias"])
-            elif token in (model.start_id, model.end_id):
-                rows.append(own["delimiters"][int(token == model.end_id)])
-            else:
-                rows.append(words[token])
-        said = plain(inputs_embeds=torch.stack(rows)[None]).logits[0].log_softmax(-1)
+        row = embedded(model, ids.tolist(), features.double(), words, own)
+        said = plain(inputs_embeds=row[None]).logits[0].log_softmax(-1)
         for column in (labels != IGNORE_INDEX).nonzero().flatten().tolist():
             total = total - said[column - 1, labels[column]]
             count += 1
@@ -59,14 +47,12 @@ def reference(model: OctopiForCausalLM, folder: Path, batch: dict[str, torch.Ten
 
 
 @pytest.mark.parametrize("tied", [False, True])
-def test_a_step_is_that_of_plain_torch(
-    tied: bool, questions: list[Question], store: EmbeddingStore, tmp_path: Path, checkpoints: Path
-) -> None:
+def test_a_step_is_that_of_plain_torch(tied: bool, held: Material, tmp_path: Path, checkpoints: Path) -> None:
     """In float64, of questions that begin alike; the base pads with a word, and its matrix may be its head too."""
     folder = write_llama(tmp_path / "base", tie_word_embeddings=tied, pad_token_id=1)
     before = digests(folder)
     setting = LanguageConfig(weights=str(folder), system_prompt="You feel.")
-    model, data = assemble(material(setting, questions, store), taking(4), "test")
+    model, data = assemble(replace(held, language=setting), taking(4), "test")
     model.train_words()
     model.double()
     batch = collate([data[i] for i in range(4)])
@@ -101,10 +87,8 @@ def test_a_step_is_that_of_plain_torch(
     assert digests(folder) == before
 
 
-def test_without_it_no_old_row_moves_and_none_is_saved(
-    language: LanguageConfig, questions: list[Question], store: EmbeddingStore, checkpoints: Path
-) -> None:
-    model, data = assemble(material(language, questions, store), taking(4), "test")
+def test_without_it_no_old_row_moves_and_none_is_saved(held: Material, checkpoints: Path) -> None:
+    model, data = assemble(held, taking(4), "test")
     base = {n: p.detach().clone() for n, p in model.llm.named_parameters()}
     start = model.connector.delimiters.detach().clone()
     trained = fit(model, data, STEP, CPU, Job("align", "x", 0))
@@ -120,10 +104,8 @@ def test_without_it_no_old_row_moves_and_none_is_saved(
 
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
-def test_adapters_go_on_with_what_alignment_trained(
-    dtype: str, language: LanguageConfig, questions: list[Question], store: EmbeddingStore, checkpoints: Path
-) -> None:
-    held = material(language.model_copy(update={"dtype": dtype}), questions, store)
+def test_adapters_go_on_with_what_alignment_trained(dtype: str, held: Material, checkpoints: Path) -> None:
+    held = replace(held, language=held.language.model_copy(update={"dtype": dtype}))
     folder = checkpoints / "aligned"
     model, data = assemble(held, taking(4), "test")
     model.train_words()
@@ -136,8 +118,7 @@ def test_adapters_go_on_with_what_alignment_trained(
     trained = fit(model, data, LORA, CPU, Job("lora", "x", 0))
     assert not torch.equal(trained.state["words.weight"], aligned)
     model.save_pretrained(checkpoints / "saved", trained.state)
-    again = OctopiForCausalLM.from_pretrained(checkpoints / "saved", dtype=dtype)  # type: ignore[arg-type]
-    assert torch.equal(again(**call(again)).logits, model.eval()(**call(model)).logits)
+    again = assert_comes_back(model, checkpoints / "saved", dtype=dtype)
     again.save_pretrained(checkpoints / "once more")
     assert digests(checkpoints / "once more") == digests(checkpoints / "saved")
     assert {"words.safetensors", "adapter/adapter_model.safetensors"} < digests(checkpoints / "saved").keys()
@@ -166,34 +147,10 @@ def test_answers_are_those_of_a_llama_with_these_embeddings(tied: bool, tmp_path
     assert len({tuple(tokens) for tokens in said}) == 2
 
 
-@pytest.mark.parametrize(
-    ("what", "message"),
-    [
-        ("gone", "words.safetensors: no such file"),
-        ("of another model", "words.safetensors: does not fit the model .*run `dvc repro`"),
-        ("NaN", "words.weight is not finite; lower the learning rate"),
-    ],
-)
-def test_broken_embeddings_are_one_line(what: str, message: str, model: OctopiForCausalLM, tmp_path: Path) -> None:
-    model.train_words()
-    model.save_pretrained(tmp_path)
-    file = tmp_path / "words.safetensors"
-    weight = load_file(file)["weight"]
-    if what == "gone":
-        file.unlink()
-    else:
-        weight[3, 3] = math.nan
-        save_file({"weight": weight if what == "NaN" else torch.zeros(3, 32)}, file)
-    with pytest.raises(UserError, match=message):
-        OctopiForCausalLM.from_pretrained(tmp_path)
-
-
-def test_a_projection_without_schedule_keeps_its_rate(
-    language: LanguageConfig, questions: list[Question], store: EmbeddingStore, checkpoints: Path
-) -> None:
+def test_a_projection_without_schedule_keeps_its_rate(held: Material, checkpoints: Path) -> None:
     """Eight questions make two updates an epoch; the rest of what is trained warms up for two of six, then falls."""
     config = LORA.model_copy(update={"epochs": 3, "projection_schedule": "constant", "warmup_ratio": 1 / 3})
-    model, data = assemble(material(language, questions, store), taking(8), "test")
+    model, data = assemble(held, taking(8), "test")
     model.train_words()
     add_lora(model, config)
     named = {id(p): n for n, p in model.named_parameters()}

@@ -42,6 +42,11 @@ def write_reports(root: Path, *names: str) -> Path:
     return root
 
 
+def files_of(folder: Path) -> dict[str, bytes]:
+    """What every file of a folder and its subfolders holds."""
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
 def edit(file: Path, **changed: Any) -> None:
     """Change values of a JSON file."""
     file.write_text(json.dumps({**json.loads(file.read_text()), **changed}))

@@ -33,28 +33,15 @@ from pipeline.videos.catalogue import load_catalogue
 from tests.closure import ROOT
 from tests.fake_run import fake_params, write_run
 from tests.models import model_folder
+from tests.report.shared import edit, files_of
 
 FILES = {
-    *(
-        "README.md",
-        "scores.csv",
-        "effects.csv",
-        "metrics.json",
-        "curves.csv",
-        "confusion.csv",
-        "described.csv",
-        "dataset.csv",
-        "audit.csv",
-    ),
-    *("samples.json", "params.yaml", "provenance.json", "encoder_effects.csv", "encoder_errors.csv", "calibration.csv"),
+    *("README.md", "params.yaml", "provenance.json", "metrics.json", "samples.json", "scores.csv", "effects.csv"),
+    *("encoder_effects.csv", "encoder_errors.csv", "calibration.csv", "curves.csv", "confusion.csv"),
+    *("described.csv", "dataset.csv", "audit.csv"),
     *(f"figures/{name}.png" for name in ("effects", "confusion", "curves")),
 }
-FEW = ("questions.evaluation={opd:4,pc:4,pss:4,pom:4,psr:4}",)
-REAL_PICTURES = {".png", ".jpg", ".webp", ".npy", ".avi", ".mp4"}
-
-
-def files_of(folder: Path) -> dict[str, bytes]:
-    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+ONE = ("ablation.encoders=[finetuned]", "ablation.lora=[with]", "ablation.opd=[all]", "ablation.touch=[]")
 
 
 def test_everything_that_was_promised_is_there_and_dvc_knows_of_it(written: Path) -> None:
@@ -70,23 +57,15 @@ def test_everything_that_was_promised_is_there_and_dvc_knows_of_it(written: Path
 def test_a_report_names_no_place_of_the_machine(path: str) -> None:
     text = "# By hand\ndata:\n  dir: {}\n  catalogue: pipeline/physiclear\ntracking:\n  uri: {}\n"
     assert without_places(text.format(path, "http://me:secret@host")) == text.format("my videos", "''")
-
-
-def test_a_base_model_is_named_without_its_place(tmp_path: Path) -> None:
-    folder = tmp_path / "my llama"
-    folder.mkdir()
-    assert base_model(Path(), str(folder))["folder"] == "my llama"
-    assert base_model(tmp_path, "my llama")["folder"] == "my llama"
+    shown = base_model(Path(), path.strip("'"))["folder"]
+    assert shown == base_model(Path("/home/me"), "my videos")["folder"] == "my videos"
 
 
 def test_classes_may_read_like_nothing_or_like_numbers(written: Path, tmp_path: Path) -> None:
     report = Path(shutil.copytree(written, tmp_path / "report"))
-    rows = [("0", f"v{i}", "roughness", rated, said) for i, (rated, said) in enumerate([("None", "1"), ("1", "None")])]
-    lines = ["seed,video_id,property,rated,predicted", *(",".join(row) for row in rows)]
+    lines = ("seed,video_id,property,rated,predicted", "0,v0,roughness,None,1", "0,v1,roughness,1,None")
     (report / "confusion.csv").write_text("\n".join(lines) + "\n")
-    provenance = json.loads((report / "provenance.json").read_text())
-    provenance["properties"] = {"roughness": ["None", "1"]}
-    (report / "provenance.json").write_text(json.dumps(provenance))
+    edit(report / "provenance.json", properties={"roughness": ["None", "1"]})
     finish_report(report)
     assert (report / "figures" / "confusion.png").is_file()
 
@@ -96,14 +75,10 @@ def test_accuracies_are_those_of_the_graded_answers(written: Path) -> None:
     rows = load_report(written).scores
     answered = rows[~rows["task"].isin(["heads", "heads_validation", "cross_validation", "described"])]
     assert len(answered)
+    keys = ("task", "measure", "encoder", "lora", "opd", "touch")
     for row in answered.to_dict("records"):
-        mine = [
-            g
-            for g in graded
-            if (g.task, g.measure, g.encoder, g.lora, g.opd, g.touch)
-            == tuple(row[k] for k in ("task", "measure", "encoder", "lora", "opd", "touch"))
-            and row["seed"] in ("all", str(g.seed))
-        ]
+        over = [g for g in graded if row["seed"] in ("all", str(g.seed))]
+        mine = [g for g in over if all(getattr(g, key) == row[key] for key in keys)]
         assert row["accuracy"] == pytest.approx(np.mean([g.correct for g in mine]))
         assert row["unread"] / row["n"] == pytest.approx(np.mean([not g.parsed for g in mine]))
         assert row["n"] == len({g.question_id for g in mine})
@@ -209,12 +184,9 @@ def test_the_encoder_is_called_what_it_is(recipe: str, words: str) -> None:
 
 def test_samples_are_the_first_right_and_wrong_answer_of_each_task(written: Path) -> None:
     data, said = written.parents[1] / "data", load_report(written).samples
-    graded = [
-        g
-        for g in read_table(data / "graded.parquet", Graded)
-        if (g.variant.key, g.touch, g.measure)
-        == ("finetuned-with-all-0", "real", "combined" if g.task == "OPD" else "choice")
-    ]
+    every = read_table(data / "graded.parquet", Graded)
+    full = [g for g in every if (g.variant.key, g.touch) == ("finetuned-with-all-0", "real")]
+    graded = [g for g in full if g.measure == ("combined" if g.task == "OPD" else "choice")]
     for task in ("OPD", "PC", "PSS", "POM", "PSR"):
         for right in (True, False):
             wanted = sorted(g.question_id for g in graded if g.task == task and g.correct is right)[:1]
@@ -230,12 +202,10 @@ def test_samples_are_the_first_right_and_wrong_answer_of_each_task(written: Path
 
 
 def test_the_papers_examples_come_with_their_answers(written: Path, tmp_path: Path) -> None:
-    assert load_report(written).samples["not_asked"] == {
-        "rice": ["rice"],
-        "toothbrush": ["toothbrush_handle", "toothbrush_bristles"],
-    }
-    one = ("ablation.encoders=[finetuned]", "ablation.lora=[with]", "ablation.opd=[all]", "ablation.touch=[]")
-    params = write_run(tmp_path, fake_params(*FEW, *one), objects=["rice", "rug", "bath_towel", "ice_block"])
+    lacking = {"rice": ["rice"], "toothbrush": ["toothbrush_handle", "toothbrush_bristles"]}
+    assert load_report(written).samples["not_asked"] == lacking
+    few = "questions.evaluation={opd:4,pc:4,pss:4,pom:4,psr:4}"
+    params = write_run(tmp_path, fake_params(few, *ONE), objects=["rice", "rug", "bath_towel", "ice_block"])
     before = set(pd.read_csv(written / "scores.csv")["task"])
     write_report(params, tmp_path)
     report = load_report(tmp_path / "reports" / params.report_name)
@@ -257,66 +227,44 @@ def test_the_data_sets_tables_count_objects_and_set_the_papers_beside(written: P
     assert "Published" not in dataset_tables(written, "Other").popitem()[1]
 
 
-def test_two_writes_are_equal_to_the_byte_and_leave_no_figure_of_another_run(written: Path) -> None:
-    before, root = files_of(written), written.parents[1]
-    (written / "figures" / "of_last_year.png").write_bytes(b"")
-    write_report(load_params(root / "params.yaml"), root)
-    assert files_of(written) == before
-
-
-def test_what_a_wider_ablation_left_in_data_is_in_no_report(written: Path) -> None:
+def test_two_writes_are_equal_to_the_byte_whatever_another_run_left(written: Path) -> None:
     """DVC removes no output of a seed that params.yaml names no more."""
     before, root = files_of(written), written.parents[1]
-    for place in ("encoder/0", "models/with/finetuned-all-0", "models/without/finetuned-all-0"):
-        shutil.copytree(root / "data" / place, root / "data" / f"{place[:-1]}9")
+    (written / "figures" / "of_last_year.png").write_bytes(b"")
+    places = ("encoder/9", "models/with/finetuned-all-9", "models/without/finetuned-all-9")
+    left = [root / "data" / place for place in places]
+    for folder in left:
+        shutil.copytree(folder.with_name(f"{folder.name[:-1]}0"), folder)
     try:
         write_report(load_params(root / "params.yaml"), root)
         assert files_of(written) == before
     finally:
-        for place in ("encoder/9", "models/with/finetuned-all-9", "models/without/finetuned-all-9"):
-            shutil.rmtree(root / "data" / place)
+        for folder in left:
+            shutil.rmtree(folder)
 
 
-@pytest.fixture(scope="module")
-def lean(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The report of a run on real videos with one variant, no test object, and nothing that a run may lack."""
-    root = tmp_path_factory.mktemp("lean")
+def test_a_run_that_measured_nothing_says_so_and_shows_no_picture_of_its_videos(tmp_path: Path) -> None:
+    """On real videos, with one variant, no test object, and nothing that a run may lack."""
     objects = "scenes.objects=[baseball,rug,pillow]"
-    one = ("ablation.encoders=[finetuned]", "ablation.lora=[with]", "ablation.opd=[all]", "ablation.touch=[]")
-    params = write_run(root, fake_params(objects, *one, "data.source=videos", "data.dir=elsewhere"))
-    for gone in (
-        "audit/audit.csv",
-        "encoder/0/classifications.parquet",
-        "questions/0/evaluation.jsonl",
-        "taught/gate.csv",
-    ):
-        (root / "data" / gone).unlink()
-    write_report(params, root)
-    return root / "reports" / params.report_name
-
-
-def test_a_run_that_measured_nothing_says_so(lean: Path) -> None:
-    report = load_report(lean)
+    params = write_run(tmp_path, fake_params(objects, *ONE, "data.source=videos", "data.dir=elsewhere"))
+    lost = ("audit/audit.csv", "encoder/0/classifications.parquet", "questions/0/evaluation.jsonl", "taught/gate.csv")
+    for file in lost:
+        (tmp_path / "data" / file).unlink()
+    write_report(params, tmp_path)
+    report = load_report(tmp_path / "reports" / params.report_name)
     assert set(report.scores["task"]) == {"cross_validation"}
     assert report.effects.empty
-    text = (lean / "README.md").read_text()
+    text = (report.folder / "README.md").read_text()
     assert "No answer of the full system was graded." in text
     assert "Whether answers depend on touch was not tested." in text
     assert "0, 0 videos" in text
-    assert json.loads((lean / "metrics.json").read_text()) == {}
-    assert {p.name for p in (lean / "figures").iterdir()} == {"curves.png"}
-
-
-def test_a_report_on_real_videos_has_no_picture_of_them(lean: Path, written: Path) -> None:
-    for folder in (lean, written):
-        pictures = [name for name in files_of(folder) if Path(name).suffix in REAL_PICTURES]
-        assert set(pictures) <= {f"figures/{name}.png" for name in ("effects", "confusion", "curves")}
+    assert json.loads((report.folder / "metrics.json").read_text()) == {}
+    assert set(files_of(report.folder)) == FILES - {"figures/effects.png", "figures/confusion.png"}
 
 
 def test_one_seed_of_one_variant_has_answers_but_no_effects(tmp_path: Path) -> None:
-    one = ("ablation.encoders=[finetuned]", "ablation.lora=[with]", "ablation.opd=[all]", "ablation.touch=[]")
     no_pom = "questions.evaluation={opd:4,pc:4,pss:4,pom:0,psr:4}"
-    params = write_run(tmp_path, fake_params(*one, no_pom))
+    params = write_run(tmp_path, fake_params(*ONE, no_pom))
     metrics = write_report(params, tmp_path)
     assert set(metrics) >= {"OPD", "PC", "PSS", "PSR"}
     assert "POM" not in metrics

@@ -10,14 +10,15 @@ import pandas as pd
 import pytest
 
 from pipeline.evaluation.described import described_rows
-from pipeline.evaluation.scores import effect_rows, score_rows
+from pipeline.evaluation.scores import effect_rows
 from pipeline.io import read_table
 from pipeline.records import Assignment, Described, Graded, Part
 from pipeline.report.build import write_report
 from pipeline.report.load import load_report
 from pipeline.report.provenance import settings_note, taught_words
 from pipeline.report.readme import render_readme
-from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.tasks import TASKS
+from pipeline.videos.catalogue import load_catalogue
 from tests.closure import ROOT
 from tests.fake_run import fake_params, write_run
 from tests.report.conftest import score
@@ -34,10 +35,8 @@ def run(root: Path, seeds: str) -> Path:
 
 
 def rows(report_folder: Path, **named: str) -> list[dict[str, float]]:
-    frame = pd.read_csv(report_folder / "scores.csv", dtype={"seed": str})
-    for column, value in named.items():
-        frame = frame[frame[column] == value]
-    return frame.to_dict("records")
+    every = pd.read_csv(report_folder / "scores.csv", dtype={"seed": str}).to_dict("records")
+    return [row for row in every if all(row[column] == value for column, value in named.items())]
 
 
 def test_two_replicates_of_three_folds_test_each_object_twice(tmp_path: Path) -> None:
@@ -121,21 +120,13 @@ def test_described_objects_stand_in_a_table_with_wilsons_interval() -> None:
     middle, half = p + z**2 / (2 * n), z * (p * (1 - p) / n + z**2 / (4 * n**2)) ** 0.5
     assert rows[0].low == pytest.approx((middle - half) / (1 + z**2 / n), abs=1e-6)
     assert rows[0].high == pytest.approx((middle + half) / (1 + z**2 / n), abs=1e-6)
-    assert rows[0].chance == pytest.approx(score_rows_chance(CATALOGUE), abs=1e-6)
+    assert rows[0].chance == pytest.approx(TASKS["PSS"].chance(CATALOGUE)["choice"], abs=1e-6)
     unknown = described_rows([Described(model="taught", task="WEIGHT", n=2, right=2, unread=0)], CATALOGUE)
     assert unknown[0].chance is None
     text = render_readme(report([score(), *(row.model_dump() for row in (*rows, *unknown))]), [])
     table = text.partition("## Reasoning about described objects")[2].splitlines()
     assert "| PSS | untaught | 40.0 [27.6, 53.8] | 50 | 33.3 | 10.0 |" in table
     assert any(line.startswith("| WEIGHT | taught | 100.0 [") for line in table)
-
-
-def score_rows_chance(catalogue: Catalogue) -> float:
-    """Chance as the chain's own PSS has it."""
-    answer = {"measure": "choice", "parsed": True, "truncated": False, "expected": "a", "predicted": "a"}
-    answer |= {"encoder": "base", "lora": "with", "opd": "all", "seed": 0, "trained": 0, "touch": "real"}
-    one = Graded(question_id="x", task="PSS", correct=True, objects=("a", "b", "c"), **answer)
-    return float(score_rows([one], catalogue)[0].chance or 0)
 
 
 def test_a_taught_base_is_said_in_every_report() -> None:

@@ -94,9 +94,8 @@ def test_no_table_holds_a_figure_without_its_file(page: Page) -> None:
 @pytest.mark.parametrize(("file", "value"), [("scores", "accuracy"), ("effects", "difference")])
 def test_lines_are_drawn_where_the_figures_are(page: Page, made: Path, file: str, value: str) -> None:
     rows = rows_of(made / "reports" / "small-videos" / f"{file}.csv")
-    drawn = [
-        r for r in page.all("tr") if f"small-videos/{file}.csv" in r.get("data-source", "") and r.findall(".//svg")
-    ]
+    told = [row for row in page.all("tr") if f"small-videos/{file}.csv" in row.get("data-source", "")]
+    drawn = [row for row in told if row.findall(".//svg")]
     sources = [rows[int(row.attrib["data-source"].rsplit(":", 1)[1]) - 2] for row in drawn]
     half = span(max(100 * abs(float(source[end])) for source in sources for end in ("low", "high")))
     for row, source in zip(drawn, sources, strict=True):
@@ -123,10 +122,8 @@ def test_the_finding_comes_first_and_real_videos_before_smoke(page: Page) -> Non
     assert chapters == ["together", "small-videos", "smoke-scenes", "speed", "stability", "missing"]
     parts = [e.attrib["id"].removeprefix("small-videos-") for e in page.named("small-videos").iter("h3")]
     assert parts == ["tasks", "parts", "stands-on", "origin", "examples", "tables", "files"]
-    assert [words(e).startswith("The base models are tiny and random") for e in page.all(kind="finding")] == [
-        False,
-        True,
-    ]
+    random = [words(e).startswith("The base models are tiny and random") for e in page.all(kind="finding")]
+    assert random == [False, True]
 
 
 def test_nothing_is_fetched_and_nothing_runs(page: Page) -> None:
@@ -160,9 +157,8 @@ def test_it_can_be_read_aloud_and_links_lead_somewhere(page: Page, made: Path) -
 
 def test_colours_have_contrast() -> None:
     style = (ROOT / "pipeline" / "report" / "templates" / "style.css").read_text()
-    themes = [
-        dict(re.findall(r"--([\w-]+): (#\w{6});", block)) for block in re.findall(r":root \{(.*?)\}", style, re.S)
-    ]
+    blocks = re.findall(r":root \{(.*?)\}", style, re.S)
+    themes = [dict(re.findall(r"--([\w-]+): (#\w{6});", block)) for block in blocks]
     assert len(themes) == 2
     inks = ("text", "muted", "measured", "published")
     for theme, ground, ink in itertools.product(themes, ("bg", "surface", "tint"), inks):
@@ -190,11 +186,8 @@ def test_hostile_text_stays_text(changed: Path) -> None:
         rows = rows_of(folder / file)
         write_rows(folder / file, [*rows, *({**row, **dict.fromkeys(names, HOSTILE)} for row in rows[:40])])
     sample = json.loads((folder / "samples.json").read_text())["samples"][0]
-    told = dict.fromkeys(("question_id", "predicted", "expected"), HOSTILE) | {
-        "asked": [HOSTILE],
-        "answered": [HOSTILE],
-    }
-    edit(folder / "samples.json", samples=[{**sample, **told}])
+    told = dict.fromkeys(("question_id", "predicted", "expected"), HOSTILE)
+    edit(folder / "samples.json", samples=[{**sample, **told, "asked": [HOSTILE], "answered": [HOSTILE]}])
     edit(folder / "provenance.json", split=HOSTILE, settings=f"{HOSTILE} [a](javascript:alert(1)) **bold**")
     page = Page(write_page(changed))
     test_nothing_is_fetched_and_nothing_runs(page)
@@ -203,20 +196,13 @@ def test_hostile_text_stays_text(changed: Path) -> None:
 
 
 def test_what_is_missing_is_said_with_the_reason(changed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    reports = write_reports(changed / "more", "small-scenes", "smoke-scenes").joinpath("reports")
+    reports, more = changed / "reports", write_reports(changed / "more", "small-scenes", "smoke-scenes") / "reports"
     for name in ("small-scenes", "smoke-scenes"):
-        (reports / name).rename(changed / "reports" / name)
-    reports = changed / "reports"
-    lost = (
-        "effects.csv",
-        "samples.json",
-        "audit.csv",
-        "../small-scenes/scores.csv",
-        "../speed_error.csv",
-        "../stability.csv",
-    )
-    for file in lost:
+        (more / name).rename(reports / name)
+    for file in ("effects.csv", "samples.json", "audit.csv"):
         (reports / "small-videos" / file).unlink()
+    for file in ("small-scenes/scores.csv", "speed_error.csv", "stability.csv"):
+        (reports / file).unlink()
     (reports / "smoke-scenes" / "provenance.json").write_text('{"scale": "smoke", "source": "scenes"}')
     scores = reports / "small-videos" / "scores.csv"
     write_rows(scores, [row for row in rows_of(scores) if row["task"] not in ("PSR", "cross_validation")])
@@ -271,11 +257,9 @@ def test_the_papers_examples_are_shown_right_and_wrong(page: Page, changed: Path
     examples = [{**sample, **asked, "right": right} for right in (True, False)]
     edit(folder / "samples.json", samples=[], examples=examples, not_asked={"toothbrush": ["handle", "bristles"]})
     page = Page(write_page(changed))
-    shown = page.all("article")
-    assert [(e.get("class"), words(e[0])) for e in shown] == [
-        ("sample good", "rice (train): right"),
-        ("sample bad", "rice (train): wrong"),
-    ]
+    shown, heads = page.all("article"), ["rice (train): right", "rice (train): wrong"]
+    assert [words(e[0]) for e in shown] == heads
+    assert [e.get("class") for e in shown] == ["sample good", "sample bad"]
     assert words(shown[0][1]).startswith("Asked Describe. Answered Rough. Asked Cooked? Answered Uncooked. Read as")
     assert "for want of videos: toothbrush (of handle and bristles)." in words(page.named("small-videos"))
 
@@ -288,10 +272,8 @@ def test_a_task_is_on_the_page_once_its_scores_are_there(changed: Path, monkeypa
     monkeypatch.chdir(changed)
     assert CliRunner().invoke(app, ["page"]).output.startswith(f"{PAGE}: ")
     page = Page(changed / PAGE)
-    for table in (
-        next(page.named("small-videos").iter("table")),
-        *(page.named(f"small-videos-{key}") for key in ("understanding", "variants")),
-    ):
+    named = [page.named(f"small-videos-{key}") for key in ("understanding", "variants")]
+    for table in (next(page.named("small-videos").iter("table")), *named):
         assert "Telling toys apart" in words(table)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -14,10 +13,8 @@ import pytest
 
 from pipeline.report.page import write_page
 from tests.report.shared import write_reports
+from tests.use.browser import BROWSER
 
-BROWSER = next(
-    (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), ""
-)
 pytestmark = pytest.mark.skipif(not BROWSER, reason="needs a browser: install chromium")
 PROBE = """<script>addEventListener("load", () => {
   const wide = e => !e.closest(".scroll, svg, caption, .skip") && e.getBoundingClientRect().right > innerWidth + 1;
@@ -45,9 +42,8 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def browse(folder: Path, page: Path, *options: str) -> subprocess.CompletedProcess[str]:
-    quiet = ("--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run")
     log = ("--enable-logging=stderr", "--virtual-time-budget=3000", f"--user-data-dir={folder / 'profile'}")
-    command = [BROWSER, *quiet, *log, *options, page.as_uri()]
+    command = [*BROWSER, *log, *options, page.as_uri()]
     environment = {**os.environ, "HOME": str(folder)}
     return subprocess.run(command, capture_output=True, text=True, timeout=120, check=True, env=environment)
 
@@ -88,13 +84,8 @@ def test_it_fits_the_window_folded_and_unfolded(
     (tmp_path / "probe.html").write_text(text.replace("</body>", f"{PROBE}</body>"), encoding="utf-8")
     frame = tmp_path / "frame.html"
     frame.write_text(FRAME.format(width=width), encoding="utf-8")
-    options = (
-        "--window-size=1500,1000",
-        "--hide-scrollbars",
-        f"--blink-settings=preferredColorScheme={scheme}",
-        "--dump-dom",
-    )
-    title = re.search(r"<title>(.*?)</title>", browse(tmp_path, frame, *options).stdout)
+    look = ("--window-size=1500,1000", "--hide-scrollbars", f"--blink-settings=preferredColorScheme={scheme}")
+    title = re.search(r"<title>(.*?)</title>", browse(tmp_path, frame, *look, "--dump-dom").stdout)
     assert title is not None
     seen: dict[str, Any] = json.loads(title[1])
     assert seen["ground"] == ground

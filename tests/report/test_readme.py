@@ -16,43 +16,19 @@ from tests.report.conftest import effect, effects_of, score, scores_of
 
 
 def model(**other: Any) -> dict[str, Any]:
-    facts = {
-        "folder": "weights/x",
-        "kind": "Llama",
-        "parameters": 2_200_000,
-        "sha256": "ab" * 32,
-        "taught": "taught by hand",
-    }
-    return {**facts, **other}
+    facts = {"folder": "weights/x", "kind": "Llama", "parameters": 2_200_000, "taught": "taught by hand"}
+    return {**facts, "sha256": "ab" * 32, **other}
 
 
 def report(scores: list[dict[str, Any]], effects: list[dict[str, Any]] | None = None, **said: Any) -> Report:
-    language = said.pop("language", {})
-    facts = {
-        "scale": "small",
-        "source": "videos",
-        "dataset": "PhysiCLeAR",
-        "split": "paper",
-        "command": "dvc repro",
-        "test_objects": ["a", "b"],
-        "test_videos": 4,
-        "videos": 9,
-        "seeds": [0],
-        "settings": "",
-        "facts_told": False,
-        "commit": "c" * 40,
-        "changed": False,
-        "data_sha256": "d" * 64,
-        "python": "3",
-        "packages": {"torch": "2"},
-        "encoder": "the base CLIP with visual prompt tuning",
-        "intervals": "",
-        "properties": {},
-        "base_models": {"language": model(**language), "encoder": model(kind="CLIP", parameters=1_100_000)},
-    }
-    return Report(
-        Path("reports/small-videos"), scores_of(*scores), effects_of(*effects or []), published(), {**facts, **said}, {}
-    )
+    models = {"language": model(**said.pop("language", {})), "encoder": model(kind="CLIP", parameters=1_100_000)}
+    data = {"source": "videos", "dataset": "PhysiCLeAR", "videos": 9, "data_sha256": "d" * 64}
+    tested = {"split": "paper", "test_objects": ["a", "b"], "test_videos": 4, "seeds": [0], "settings": ""}
+    run = {"scale": "small", "command": "dvc repro", "commit": "c" * 40, "changed": False, "python": "3"}
+    system = {"encoder": "the base CLIP with visual prompt tuning", "base_models": models, "facts_told": False}
+    facts = {**data, **tested, **run, **system, "packages": {"torch": "2"}, "intervals": "", "properties": {}, **said}
+    frames = scores_of(*scores), effects_of(*effects or []), published()
+    return Report(Path("reports/small-videos"), *frames, facts, {})
 
 
 def test_who_made_the_figures_comes_first_with_size_and_teaching() -> None:

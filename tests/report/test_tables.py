@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import pandas as pd
@@ -9,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import UserError
 from pipeline.report import load
 from pipeline.report.load import KEYS, Report, load_report, published, read_frame
 from pipeline.report.tables import TABLES, Table, headline, side_by_side, task_title
 from pipeline.tasks import TASKS
 from pipeline.videos.catalogue import Catalogue
+from tests.conftest import refused
 from tests.report.conftest import effect, effects_of, score, scores_of
 
 BY_KEY = {table.key: table for table in TABLES}
@@ -59,13 +60,8 @@ def test_effects_are_written_in_points_and_what_is_unknown_is_empty() -> None:
     ],
 )
 def test_each_of_the_papers_tables_changes_one_part_only(key: str, systems: list[str]) -> None:
-    names = [
-        f"{e} {lora} {opd}"
-        for e in ("base", "finetuned")
-        for lora in ("without", "with")
-        for opd in ("none", "needed", "all")
-    ]
-    shown = build(key, *(score(variant=name) for name in names), score(seed="0"), score(touch="swapped"))
+    axes = itertools.product(("base", "finetuned"), ("without", "with"), ("none", "needed", "all"))
+    shown = build(key, *(score(variant=" ".join(v)) for v in axes), score(seed="0"), score(touch="swapped"))
     assert list(shown["System"]) == systems
     assert all(shown["Published 7b % (n)"])
 
@@ -74,21 +70,15 @@ def test_tasks_stand_where_they_belong_whole_answers_first() -> None:
     heads = {"variant": "finetuned  ", "measure": "combined"}
     rows = [score(task, variant="finetuned with all") for task in ("PSR", "POM", "PC")]
     rows += [score("OPD", m) for m in ("hardness", "combined")]
-    rows += [
-        score("heads", **heads),
-        score("heads_validation", **heads),
-        score("cross_validation", "combined", variant="trees  "),
-    ]
-    tasks = {
-        key: list(dict.fromkeys(table.select(scores_of(*rows), NO_EFFECTS).get("task", [])))
-        for key, table in BY_KEY.items()
-    }
+    rows += [score("heads", **heads), score("heads_validation", **heads)]
+    rows += [score("cross_validation", "combined", variant="trees  ")]
+    scores = scores_of(*rows)
+    tasks = {key: list(dict.fromkeys(t.select(scores, NO_EFFECTS).get("task", []))) for key, t in BY_KEY.items()}
     assert tasks["understanding"] == ["PC", "POM"]
     assert tasks["reasoning"] == ["PSR"]
     assert tasks["description"] == ["OPD", "heads"]
-    assert (
-        tasks["variants"] == tasks["touch"] == list(headline(scores_of(*rows))["task"]) == ["OPD", "PC", "POM", "PSR"]
-    )
+    whole = ["OPD", "PC", "POM", "PSR"]
+    assert tasks["variants"] == tasks["touch"] == list(headline(scores)["task"]) == whole
     assert (tasks["heads"], tasks["cross_validation"]) == (["heads", "heads_validation"], ["cross_validation"])
     assert list(build("description", *rows)["Measure"])[:2] == ["all properties right", "hardness"]
     assert list(build("description", *rows)["Published CLIP % (n)"]) == ["", "", "57.89 (38)"]
@@ -209,8 +199,8 @@ def test_published_keys_are_unique_percentages_of_their_n_and_of_registered_task
 
 
 def test_a_folder_that_is_no_report_or_lacks_a_column_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="no report"):
+    with refused("no report"):
         load_report(tmp_path)
     (tmp_path / "scores.csv").write_text("task,measure\nPC,choice\n")
-    with pytest.raises(UserError, match=r"scores.csv: lacks encoder, lora"):
+    with refused(r"scores.csv: lacks encoder, lora"):
         read_frame(tmp_path / "scores.csv", load.SCORE_COLUMNS)

@@ -136,12 +136,6 @@ def test_torch_gives_what_numpy_gives() -> None:
         np.testing.assert_allclose(one.skins, other.skins, atol=1e-4 * float(one.skins.max()))
 
 
-def test_the_same_twice() -> None:
-    one, other = (press(rough(0.02), 5.0, 1.0, PITCH) for _ in range(2))
-    np.testing.assert_array_equal(one.skins, other.skins)
-    assert one.method == other.method
-
-
 # --- Hard cases
 
 

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pydantic import ValidationError
 
-from pipeline.scenes.geometry import IMAGE_MM, Bar, Flat, Round, Wedge, heights
+from pipeline.scenes.geometry import IMAGE_MM, Bar, Round, Wedge, heights
 from pipeline.scenes.grid import Grid
 from pipeline.scenes.relief import Rough
 
 PITCH = IMAGE_MM[0] / 160
-FLAT = Flat(kind="flat")
 
 
 @given(st.floats(1, 1e4), st.floats(1, 1e4), st.integers(1, 40), st.floats(0.01, 1))
@@ -61,16 +57,3 @@ def test_layers_add_up_in_order() -> None:
     whole = heights(ball, (coarse, fine), 90, PITCH, np.random.default_rng(5))
     rng, grid = np.random.default_rng(5), Grid(90, PITCH)
     np.testing.assert_allclose(whole, ball.sample(grid) + coarse.sample(grid, rng) + fine.sample(grid, rng), atol=1e-6)
-
-
-def test_a_patch_follows_from_its_generator() -> None:
-    rough = (Rough(kind="rough", rms=0.05, longest=3),)
-    first, again, other = (heights(FLAT, rough, 64, PITCH, np.random.default_rng(s)) for s in (1, 1, 2))
-    np.testing.assert_array_equal(first, again)
-    assert (first != other).any()
-
-
-@pytest.mark.parametrize("radius", [0, -3, math.inf, math.nan])
-def test_impossible_radii_are_refused(radius: float) -> None:
-    with pytest.raises(ValidationError):
-        Round(kind="round", radii=(20, radius))

@@ -30,17 +30,14 @@ LAYERS: tuple[Layer, ...] = (
     Grains(kind="grains", length=4, width=2, thickness=1.5),
     Digits(kind="digits", height=-0.3, size=4, stroke=0.8, spacing=(4, 6)),
 )
+every_layer = pytest.mark.parametrize("layer", LAYERS, ids=lambda layer: layer.kind)
 
 
 def patch(layer: Layer, seed: int = 0, grid: Grid = GRID) -> np.ndarray:
     return layer.sample(grid, np.random.default_rng(seed))
 
 
-def names(layer: Layer) -> str:
-    return layer.kind  # type: ignore[attr-defined]
-
-
-@pytest.mark.parametrize("layer", LAYERS, ids=names)
+@every_layer
 def test_a_patch_is_finite_and_follows_from_its_generator(layer: Layer) -> None:
     first, again, other = patch(layer, 1), patch(layer, 1), patch(layer, 2)
     assert (first.shape, first.dtype) == ((320, 320), np.float32)
@@ -51,7 +48,7 @@ def test_a_patch_is_finite_and_follows_from_its_generator(layer: Layer) -> None:
     assert TypeAdapter(AnyLayer).validate_python(layer.model_dump()) == layer
 
 
-@pytest.mark.parametrize("layer", LAYERS, ids=names)
+@every_layer
 def test_statistics_do_not_depend_on_the_pitch(layer: Layer) -> None:
     spreads = [
         np.mean([patch(layer, seed, Grid(round(32 / pitch), pitch)).std() for seed in range(6)])

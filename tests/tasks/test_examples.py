@@ -8,10 +8,7 @@ from pipeline.records import Assignment, Part, Prediction, Question
 from pipeline.report.samples import choose_examples
 from pipeline.tasks import TASKS
 from pipeline.tasks.examples import build_examples, grade_example
-from pipeline.videos.catalogue import load_catalogue
-from tests.closure import ROOT
-
-CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")
+from tests.tasks.shared import CATALOGUE, predicted
 
 
 def asked(**parts: Part) -> dict[str, Question]:
@@ -20,8 +17,7 @@ def asked(**parts: Part) -> dict[str, Question]:
 
 
 def said(question: Question, text: str) -> Prediction:
-    outputs = ("It is rough.", text)
-    return Prediction(question_id=question.question_id, task=question.task, outputs=outputs, truncated=False, tokens=9)
+    return predicted(question, "It is rough.", text)
 
 
 def test_each_is_asked_in_both_orders_about_its_own_objects() -> None:
@@ -51,7 +47,7 @@ def test_without_videos_of_all_its_objects_an_example_is_not_asked() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "predicted"),
+    ("text", "letter"),
     [
         ("The rice is a), because it is rough.", "a"),
         ("the rice is  (b).", "b"),
@@ -62,12 +58,11 @@ def test_without_videos_of_all_its_objects_an_example_is_not_asked() -> None:
         ("", ""),
     ],
 )
-def test_answers_are_read_by_their_letter(text: str, predicted: str) -> None:
-    found = asked(rice=Part.TEST)
-    for letter in "ab":
-        score = grade_example(found[f"rice-{letter}"], said(found[f"rice-{letter}"], text))
-        assert (score.predicted, score.correct) == (predicted, predicted == letter)
-        assert score.parsed == bool(predicted)
+def test_answers_are_read_by_their_letter(text: str, letter: str) -> None:
+    for question in asked(rice=Part.TEST).values():
+        score = grade_example(question, said(question, text))
+        assert (score.predicted, score.correct) == (letter, letter == question.gold.choice)
+        assert score.parsed == bool(letter)
 
 
 def test_the_answer_about_the_least_known_objects_is_shown() -> None:

@@ -11,11 +11,11 @@ from pipeline.records import Part, Question
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool
 from pipeline.tasks.questions import build_questions, pool_of
-from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.split import assign
-from tests.conftest import ROOT, fake_videos
+from tests.conftest import fake_videos
+from tests.tasks.shared import CATALOGUE
 
-CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear").asking("published")
 VIDEOS = fake_videos(sorted(CATALOGUE.objects), 5)
 ASSIGNMENTS = assign(CATALOGUE, VIDEOS, SplitConfig(name="paper"))
 COUNTS = {"OPD": 40, "PC": 36, "PSS": 36, "POM": 36, "PSR": 12}
@@ -44,8 +44,10 @@ def test_questions_stay_in_their_part(part: Part) -> None:
     assert len({q.question_id for q in questions}) == len(questions)
 
 
-def test_counts_are_met_where_there_is_enough_to_ask() -> None:
-    assert by_task(build_questions(POOLS[Part.TRAIN], COUNTS, seed=1, distinct=False)) == COUNTS
+def test_counts_are_met_where_there_is_enough_to_ask_and_tasks_are_mixed() -> None:
+    train = build_questions(POOLS[Part.TRAIN], COUNTS, seed=1, distinct=False)
+    assert by_task(train) == COUNTS
+    assert len({q.task for q in train[:20]}) > 2
     test = by_task(build_questions(POOLS[Part.TEST], COUNTS, seed=1, distinct=True))
     assert test["OPD"] == 35, "each of the 35 videos is described once"
     assert all(test[task] == COUNTS[task] for task in ("PC", "POM", "PSR"))
@@ -91,11 +93,6 @@ def test_another_situation_makes_another_question() -> None:
     assert len({key(q)[:-1] for q in asked}) < len({key(q) for q in asked}) == len(asked)
 
 
-def test_tasks_are_mixed() -> None:
-    questions = build_questions(POOLS[Part.TRAIN], COUNTS, seed=1, distinct=False)
-    assert len({q.task for q in questions[:20]}) > 2
-
-
 def test_strata_are_balanced() -> None:
     counts = {"OPD": 120, "PC": 180, "PSS": 180, "POM": 180, "PSR": 60}
     questions = build_questions(POOLS[Part.TRAIN], counts, seed=5, distinct=False)
@@ -133,11 +130,8 @@ def test_facts_stand_before_the_same_matching_questions() -> None:
     assert len(orders) == 6, "the order of the facts gives nothing away"
 
 
-def test_an_empty_part_has_no_questions() -> None:
+def test_few_objects_give_few_questions_and_none_give_none() -> None:
     assert build_questions(Pool(Part.TEST, CATALOGUE, {}), COUNTS, seed=0, distinct=True) == []
-
-
-def test_few_objects_give_few_questions() -> None:
     pool = Pool(Part.TEST, CATALOGUE, {"rug": ["rug_0"], "potato": ["potato_0"]})
     questions = build_questions(pool, COUNTS, seed=0, distinct=True)
     assert by_task(questions)["OPD"] == 2

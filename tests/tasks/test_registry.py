@@ -10,15 +10,13 @@ import pytest
 from pipeline.config import QuestionsConfig
 from pipeline.evaluation.grading import grade
 from pipeline.io import read_jsonl, write_jsonl
-from pipeline.records import Opd, Part, Prediction, Question, Score
+from pipeline.records import Opd, Prediction, Question, Score
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Draft, Pool, TaskDefinition, choice_score, draft_single_turn
 from pipeline.tasks.questions import build_questions, counts_by_task
-from pipeline.videos.catalogue import Catalogue, load_catalogue
-from tests.conftest import ROOT, refused
-
-CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear").asking("published")
-POOL = Pool(Part.TEST, CATALOGUE, {o: [f"{o}_0"] for o in CATALOGUE.objects})
+from pipeline.videos.catalogue import Catalogue
+from tests.conftest import refused
+from tests.tasks.shared import CATALOGUE, POOL, predicted
 
 
 class Hardest(TaskDefinition):
@@ -61,11 +59,7 @@ def test_a_registered_task_is_counted_built_stored_and_graded(monkeypatch: pytes
     write_jsonl(tmp_path / "q.jsonl", built)
     questions = [q for q in read_jsonl(tmp_path / "q.jsonl", Question) if q.task == "HARD"]
     assert sorted(q.question_id for q in questions) == [f"HARD-test-{i:05d}" for i in range(6)]
-    answers = [
-        Prediction(question_id=q.question_id, task="HARD", outputs=("yes",), truncated=False, tokens=1)
-        for q in questions
-    ]
-    scores = grade(questions, answers, CATALOGUE)
+    scores = grade(questions, [predicted(q, "yes") for q in questions], CATALOGUE)
     assert [s.correct for s in scores] == [CATALOGUE.labels(s.objects[0])[0] == 2 for s in scores]
     assert sum(s.correct for s in scores) == 3
 
@@ -146,9 +140,5 @@ def test_classes_are_restated_before_a_conclusion() -> None:
             assert word.lower() in new.turns[-1].user
             ends = [n for n, x in zip(names, labels, strict=True) if x == (max(labels) if rising else min(labels))]
             assert named == (ends[0] if len(ends) == 1 else "neither")
-    right = [
-        Prediction(question_id=q.question_id, task=q.task, outputs=(d.turns[-1].assistant,), truncated=False, tokens=1)
-        for _, q in changed
-        if (d := q.dialogue(Opd.ALL))
-    ]
+    right = [predicted(q, d.turns[-1].assistant) for _, q in changed if (d := q.dialogue(Opd.ALL))]
     assert all(score.correct and score.strict for score in grade([q for _, q in changed], right, CATALOGUE))

@@ -8,24 +8,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.records import Opd, Part, Prediction, Question, Score
+from pipeline.records import Opd, Question, Score
 from pipeline.tasks import TASKS
-from pipeline.tasks.base import Pool
 from pipeline.tasks.opd import as_published
 from pipeline.tasks.questions import build_questions
-from pipeline.videos.catalogue import Catalogue, load_catalogue
-from tests.conftest import ROOT
+from pipeline.videos.catalogue import Catalogue
+from tests.tasks import shared
+from tests.tasks.shared import CATALOGUE, POOL
 
-CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear").asking("published")
-POOL = Pool(Part.TEST, CATALOGUE, {o: [f"{o}_0"] for o in CATALOGUE.objects})
 ASKED = {task: build_questions(POOL, {task: 12}, seed=0, distinct=True) for task in TASKS}
 LABELS = st.tuples(*(st.integers(0, len(p.levels) - 1) for p in CATALOGUE.properties))
 TAILS = ("", " Conclusion: yes", " The object is hard.", "\n", " USER: and more")
 
 
 def grade(question: Question, *outputs: str) -> dict[str, Score]:
-    said = Prediction(question_id=question.question_id, task=question.task, outputs=outputs, truncated=False, tokens=1)
-    return {s.measure: s for s in TASKS[question.task].grade(question, said, CATALOGUE)}
+    return {s.measure: s for s in shared.grade(question, *outputs)}
 
 
 def cut_at_words(said: str, right: str) -> list[bool]:

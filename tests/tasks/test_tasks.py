@@ -12,13 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.language.chat import TACTILE
-from pipeline.records import Opd, Part, Prediction, Question, Score
+from pipeline.records import Opd, Part, Question, Score
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool, conclusion, find_level
-from pipeline.videos.catalogue import load_catalogue
-from tests.conftest import ROOT
+from tests.tasks.shared import CATALOGUE, grade
 
-CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear").asking("published")
 POOL = Pool(Part.TRAIN, CATALOGUE, {o: [f"{o}_{i}" for i in range(3)] for o in CATALOGUE.objects})
 HARDNESS = CATALOGUE.properties[0]
 EACH = 2
@@ -42,11 +40,6 @@ QUESTIONS = {task: drafted(task) for task in TASKS}
 def answers(question: Question) -> Iterator[tuple[Opd, tuple[str, ...]]]:
     for dialogue in question.dialogues:
         yield dialogue.opd, tuple(turn.assistant for turn in dialogue.turns)
-
-
-def grade(question: Question, *outputs: str, truncated: bool = False) -> list[Score]:
-    said = {"question_id": question.question_id, "task": question.task, "outputs": outputs, "tokens": 1}
-    return TASKS[question.task].grade(question, Prediction(**said, truncated=truncated), CATALOGUE)
 
 
 def choice(question: Question, *outputs: str) -> Score:

@@ -23,7 +23,7 @@ from tests.closure import ROOT
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
-    from mlflow.entities import Run
+    from mlflow.entities import Metric, Run
 
 SYSTEM = "{encoder: '${ablation.encoders}', opd: '${ablation.opd}', seed: '${ablation.seeds}'}"
 CHAIN = f"""
@@ -188,6 +188,10 @@ def by_name(kind: str) -> dict[str, Any]:
     found = runs(kind)
     assert len({run.info.run_name for run in found}) == len(found)
     return {run.info.run_name: run for run in found}
+
+
+def losses(run: Run) -> list[Metric]:
+    return list(client().get_metric_history(run.info.run_id, "loss"))
 
 
 def seconds(run: Run) -> float:

@@ -11,7 +11,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.request import urlopen
@@ -33,7 +34,7 @@ from pipeline.tracking.publish import publish
 from pipeline.tracking.store import TrackingError, out_of_reach
 from pipeline.training.trainer import TrainableTrainer, Trained, TrainingMonitor, train, training_arguments
 from tests.closure import ROOT
-from tests.tracking.conftest import FIRST, FULL, FakeChain, by_name, client, runs
+from tests.tracking.conftest import FIRST, FULL, FakeChain, by_name, client, losses, runs
 
 ALIGN = "align@finetuned-all-0"
 STEPS = 6
@@ -78,9 +79,10 @@ def test_a_training_and_publishing_share_one_run(chain: FakeChain, monkeypatch: 
     assert run.info.start_time == int(stage.started * 1000)
     logged = {name for name in run.data.metrics if not name.startswith("system/")}
     assert logged == {m.name for m in trained.history}
-    history = client().get_metric_history(run.info.run_id, "loss")
-    assert {(m.step, m.value) for m in history} == {(m.step, m.value) for m in trained.history if m.name == "loss"}
-    assert run.data.params.keys() == by_params(chain.params)
+    curve = [(m.step, m.value) for m in trained.history if m.name == "loss"]
+    assert sorted((m.step, m.value) for m in losses(run)) == curve
+    # What a person sets and the stage's axes: not the Trainer's hundred arguments.
+    assert run.data.params.keys() == {*settings(chain.params), "encoder", "opd", "seed"}
 
     chain.ran([ALIGN], minutes=minutes_of(stage))
     write_table(Path("data/models/without/finetuned-all-0/history.parquet"), Measurement, trained.history)
@@ -88,7 +90,7 @@ def test_a_training_and_publishing_share_one_run(chain: FakeChain, monkeypatch: 
     complete = by_name("stage")[ALIGN]
     assert complete.info.run_id == run.info.run_id
     assert complete.data.metrics["system/peak_memory_mb"] == 100
-    assert len(client().get_metric_history(run.info.run_id, "loss")) == STEPS
+    assert len(losses(run)) == STEPS
     assert [r.info.run_id for r in runs("reproduction")] == [parent.info.run_id]
     assert runs("reproduction")[0].info.status == "FINISHED"
 
@@ -96,11 +98,6 @@ def test_a_training_and_publishing_share_one_run(chain: FakeChain, monkeypatch: 
 def minutes_of(stage: Stage) -> float:
     """When the stage began, a second early: its run is the one that began within."""
     return (stage.started - 1 - FIRST.timestamp()) / 60
-
-
-def by_params(params: Params) -> set[str]:
-    """What a person sets and the stage's axes: not the Trainer's hundred arguments."""
-    return {*settings(params), "encoder", "opd", "seed"}
 
 
 @pytest.mark.parametrize(("error", "status"), [(RuntimeError, "FAILED"), (KeyboardInterrupt, "KILLED")])
@@ -185,24 +182,21 @@ def closed_port() -> Iterator[str]:
 
 
 @contextmanager
-def garbage() -> Iterator[str]:
-    """The local database is no database."""
-    Path("mlruns/mlflow.db").write_bytes(b"garbage " * 1000)
-    yield ""
+def broken_file(uri: str, file: str, content: bytes) -> Iterator[str]:
+    Path(file).write_bytes(content)
+    yield uri
 
 
-@contextmanager
-def nonsense() -> Iterator[str]:
-    yield "htp:/nowhere"
-
-
-@contextmanager
-def no_such_folder() -> Iterator[str]:
-    Path("file").write_text("")
-    yield "sqlite:///file/mlflow.db"
-
-
-@pytest.mark.parametrize("dead", [silent_server, closed_port, garbage, nonsense, no_such_folder])
+@pytest.mark.parametrize(
+    "dead",
+    [
+        silent_server,
+        closed_port,
+        partial(broken_file, "", "mlruns/mlflow.db", b"garbage " * 1000),
+        partial(broken_file, "sqlite:///file/mlflow.db", "file", b""),
+        partial(nullcontext, "htp:/nowhere"),
+    ],
+)
 def test_out_of_reach_costs_one_warning_and_one_call(
     chain: FakeChain, dead: Any, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -234,28 +228,12 @@ def test_a_server_that_dies_while_a_training_goes_on(
         port = uri.rsplit(":", 1)[1]
     Path("mlruns").rename(tmp_path / "server")
     store = ["--backend-store-uri", f"sqlite:///{tmp_path / 'server' / 'mlflow.db'}"]
-    command = [
-        sys.executable,
-        "-m",
-        "mlflow",
-        "server",
-        "--host",
-        "127.0.0.1",
-        "--port",
-        port,
-        *store,
-        "--workers",
-        "1",
-    ]
+    place = ["--host", "127.0.0.1", "--port", port, "--workers", "1"]
+    command = [sys.executable, "-m", "mlflow", "server", *place, *store]
+    command += ["--artifacts-destination", str(tmp_path / "artifacts")]
     environment = {**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false", "MLFLOW_DISABLE_TELEMETRY": "true"}
     with (tmp_path / "server.log").open("w") as log:
-        server = subprocess.Popen(
-            [*command, "--artifacts-destination", str(tmp_path / "artifacts")],
-            stdout=log,
-            stderr=log,
-            start_new_session=True,
-            env=environment,
-        )
+        server = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True, env=environment)
     try:
         wait_for(f"{uri}/health")
         params = watched(chain.params, uri=uri, experiment="remote", timeout_seconds=60)
@@ -308,7 +286,6 @@ def test_a_curve_that_broke_off_is_completed(chain: FakeChain, monkeypatch: pyte
     out_of_reach.clear()
     publish(chain.params)
     run = by_name("stage")[ALIGN]
-    history = client().get_metric_history(run.info.run_id, "loss")
     expected = [(m.step, m.value) for m in read_table(path, Measurement) if m.name == "loss"]
-    assert sorted((m.step, m.value) for m in history) == expected
+    assert sorted((m.step, m.value) for m in losses(run)) == expected
     assert run.info.status == "FINISHED"

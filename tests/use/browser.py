@@ -16,9 +16,11 @@ from typing import Any
 
 import pytest
 
+QUIET = ("--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run")
 BROWSER = next(
-    (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), ""
+    ([found, *QUIET] for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), []
 )
+"""The command that starts it; empty where there is none."""
 
 
 class Tab:
@@ -91,9 +93,8 @@ def tab(folder: Path, width: int = 1280, height: int = 900) -> Iterator[Tab]:
         pytest.skip("needs a browser: install chromium")
     from websockets.sync.client import connect
 
-    quiet = ("--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run")
     profile = folder / "profile"
-    command = [BROWSER, *quiet, f"--window-size={width},{height}", "--remote-debugging-port=0"]
+    command = [*BROWSER, f"--window-size={width},{height}", "--remote-debugging-port=0"]
     process = subprocess.Popen(
         [*command, f"--user-data-dir={profile}", "about:blank"],
         env={**os.environ, "HOME": str(folder)},

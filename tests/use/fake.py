@@ -1,4 +1,4 @@
-"""A model of the contract's shape that needs no weights: it says what it was asked and what it was given."""
+"""A model of the contract's shape that needs no weights, and a server in a thread."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ import hashlib
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import UserError
+from pipeline.use.server import listen, make_server
 
 
 def digest(data: bytes) -> str:
@@ -51,9 +53,25 @@ class FakeOctopi:
             yield f"{word} "
             if word == "late":
                 raise UserError("the touch ended; send another")
+            if word == "crash":
+                raise RuntimeError("a secret of /home/somebody")
 
     def words(self, question: str, videos: Sequence[bytes], history: Sequence[Any] = ()) -> str:
-        before = [
-            f"{h.question}>{h.answer}:{','.join(digest(Path(v).read_bytes()) for v in h.videos)}" for h in history
-        ]
+        shown = [",".join(digest(Path(v).read_bytes()) for v in h.videos) for h in history]
+        before = [f"{h.question}>{h.answer}:{seen}" for h, seen in zip(history, shown, strict=True)]
         return " | ".join([question, *before, *map(digest, videos)])
+
+
+@contextmanager
+def running(app: Any) -> Iterator[int]:
+    """A server of an application in a thread; its port."""
+    with listen("127.0.0.1", 0, "") as listening:
+        there = make_server(app)
+        thread = threading.Thread(target=there.run, kwargs={"sockets": [listening]})
+        thread.start()
+        try:
+            yield listening.getsockname()[1]
+        finally:
+            there.should_exit = True
+            thread.join(30)
+            assert not thread.is_alive()

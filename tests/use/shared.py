@@ -33,7 +33,6 @@ from pipeline.records import (
     Variant,
 )
 from pipeline.runtime import seed_everything
-from pipeline.scales import compose
 from pipeline.tasks import TASKS
 from pipeline.tasks.questions import build_questions, pool_of
 from pipeline.training.trainable import save_trainable
@@ -44,9 +43,9 @@ from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.frames.extract import extract_frames
 from pipeline.videos.frames.store import PROBES_FILE, FrameStore
 from tests.checkpoints import write_llama
-from tests.closure import ROOT
 from tests.conftest import moving_square, write_video
 from tests.encoders import write_pretrained, write_timm, write_tower
+from tests.fake_run import fake_params
 
 PARTS = {
     **dict.fromkeys(("baseball", "rug", "pillow", "potato"), Part.TRAIN),
@@ -71,18 +70,11 @@ class Made(NamedTuple):
 
 def make(where: Path, variant: Variant, *overrides: str) -> Made:
     """Run what the stages run, in `where` as the working directory, down to `package`."""
-    params = compose(
-        "smoke",
-        [
-            *("frames.size=32", "frames.per_video=3", "language.max_new_tokens=12", "language.generation_batch_size=8"),
-            *("encoder.weights=clip", "language.weights=llama", "encoder.prompts=3", *overrides),
-        ],
-        ROOT / "conf",
+    params = fake_params(
+        *("frames.size=32", "frames.per_video=3", "language.max_new_tokens=12", "language.generation_batch_size=8"),
+        *("encoder.weights=clip", "language.weights=llama", "encoder.prompts=3", *overrides),
     )
-    catalogue = load_catalogue(ROOT / "pipeline" / "physiclear")
-    params = params.model_copy(
-        update={"data": params.data.model_copy(update={"catalogue": str(ROOT / "pipeline" / "physiclear")})}
-    )
+    catalogue = load_catalogue(Path(params.data.catalogue))
     videos, data = where / "videos", where / "data"
     for seed, object_id in enumerate(PARTS):
         for number in range(2):

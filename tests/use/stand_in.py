@@ -1,4 +1,4 @@
-"""A stand-in for the trained model, which answers at once with what it was asked."""
+"""A stand-in for the trained model in the demo, which answers at once with what it was asked."""
 
 from __future__ import annotations
 
@@ -24,18 +24,12 @@ class FakeOctopi:
     """`threads` are those that its work was done in; `heard` is every question with its files and history."""
 
     card = {"variant": "finetuned-with-all-0"}  # noqa: RUF012
-    properties = tuple(LEVELS)
-    names = ("a baseball", "a rug")
 
     def __init__(self) -> None:
         self.threads: set[int] = set()
         self.heard: list[tuple[str, list[str], list[Exchange]]] = []
         self.paused = threading.Event()
         self.made = 0
-
-    @classmethod
-    def from_pretrained(cls, folder: Path | str, **_: Any) -> FakeOctopi:
-        return cls()
 
     def look(self, video: Video) -> Touch:
         self.threads.add(threading.get_ident())
@@ -53,7 +47,7 @@ class FakeOctopi:
             difference=np.clip(difference, 0, 255).astype(np.uint8),
             contact=0.25,
             strength=found.probe.contact,
-            notes=() if found.probe.contact > 0.5 else ("Nothing touches the sensor in this video.",),
+            notes=(),
         )
 
     def describe(self, video: Video, *, sentence: bool = True) -> Description:
@@ -75,14 +69,3 @@ class FakeOctopi:
                 self.paused.wait(30)
         if "break" in question:
             raise ValueError("within")
-
-    def ask(self, question: str, videos: Sequence[Video] = (), **more: Any) -> str:
-        return "".join(self.stream(question, videos, **more)).strip()
-
-    def rank(self, videos: Sequence[Video], property: str) -> Any:
-        from pipeline.use.results import Ranking
-
-        places = tuple(range(len(videos)))
-        return Ranking(
-            property=property, order=places, expected=tuple(map(float, places)), answer="", most=None, notes=()
-        )

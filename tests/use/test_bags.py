@@ -42,14 +42,11 @@ def recording(height: int = 48, width: int = 64) -> list[np.ndarray]:
     y, x = np.mgrid[:height, :width]
     ground = np.stack([90 + x / 3, 110 + y / 3, 100 + (x + y) / 5], axis=2)
     bump = 40 * np.sign(x - width / 2) * (np.hypot(x - width / 2, y - height / 2) < height / 4)
-    return [
-        np.clip(
-            ground + bump[:, :, None] * any(i in touched for touched in TOUCHED) + rng.normal(0, 1, (height, width, 3)),
-            0,
-            255,
-        ).astype(np.uint8)
-        for i in range(LENGTH)
-    ]
+    pictures = []
+    for index in range(LENGTH):
+        pressed = bump[:, :, None] * any(index in touched for touched in TOUCHED)
+        pictures.append(np.clip(ground + pressed + rng.normal(0, 1, ground.shape), 0, 255).astype(np.uint8))
+    return pictures
 
 
 def message(store: Any, picture: np.ndarray, encoding: str, index: int) -> tuple[Any, str]:
@@ -66,16 +63,8 @@ def message(store: Any, picture: np.ndarray, encoding: str, index: int) -> tuple
     height, width = picture.shape[:2]
     pixels = {"rgb8": picture[:, :, ::-1], "mono8": picture[:, :, :1]}.get(encoding, picture).reshape(height, -1)
     padded = np.pad(pixels, ((0, 0), (0, 5)), constant_values=255)
-    kind = "sensor_msgs/msg/Image"
-    return types[kind](
-        header=header,
-        height=height,
-        width=width,
-        encoding=encoding,
-        is_bigendian=0,
-        step=padded.shape[1],
-        data=padded.ravel(),
-    ), kind
+    kind, shape = "sensor_msgs/msg/Image", {"height": height, "width": width, "step": padded.shape[1]}
+    return types[kind](header=header, encoding=encoding, is_bigendian=0, data=padded.ravel(), **shape), kind
 
 
 def write_bag(folder: Path, kind: str, pictures: Sequence[np.ndarray], encoding: str = "bgr8") -> Path:

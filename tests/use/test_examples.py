@@ -74,14 +74,12 @@ def test_the_notebook_runs(made: Made) -> None:
         assert sum(ours in cell.source for cell in cells) == 1
         for cell in cells:
             cell.source = cell.source.replace(ours, theirs)
-    client = nbclient.NotebookClient(
-        notebook, timeout=240, resources={"metadata": {"path": str(made.folder.parents[1])}}
-    )
-    done = [cell for cell in client.execute().cells if cell.cell_type == "code"]
-    shown = [
-        "".join(o.get("text", "") or o.data["text/plain"] for o in cell.outputs if o.get("name") != "stderr")
-        for cell in done
-    ]
+    place = {"metadata": {"path": str(made.folder.parents[1])}}
+    done = nbclient.NotebookClient(notebook, timeout=240, resources=place).execute()
+    shown = []
+    for outputs in (cell.outputs for cell in done.cells if cell.cell_type == "code"):
+        said = [o for o in outputs if o.get("name") != "stderr"]
+        shown.append("".join(o.get("text", "") or o.data["text/plain"] for o in said))
     assert shown[1] == "('hardness', 'roughness', 'bumpiness')"
     assert "'hardness'" in shown[2]
     assert shown[3].strip(), "an answer"

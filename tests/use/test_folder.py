@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 import yaml
 
-from pipeline.errors import UserError
 from pipeline.use.folder import FORMAT, read_folder
 from pipeline.use.model import Octopi
-from pipeline.use.package import export
+from pipeline.use.package import describe_base, export, package
 from tests.checkpoints import write_llama
 from tests.conftest import refused
+from tests.report.shared import files_of
 from tests.use.shared import Made
 
 
@@ -30,8 +30,7 @@ def llama(made: Made) -> Path:
 
 
 def test_holds_safetensors_and_text_alone(made: Made) -> None:
-    kinds = {f.suffix for f in made.folder.rglob("*") if f.is_file()}
-    assert kinds <= {".json", ".safetensors", ".md"}
+    assert {Path(name).suffix for name in files_of(made.folder)} <= {".json", ".safetensors", ".md"}
 
 
 def test_the_card_says_what_it_stands_on(made: Made) -> None:
@@ -47,32 +46,26 @@ def test_the_card_says_what_it_stands_on(made: Made) -> None:
 
 
 def test_equal_inputs_give_equal_bytes(made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from pipeline.use.package import describe_base, package
-
     monkeypatch.chdir(made.folder.parents[1])
     package(Path("data"), made.params, made.variant, describe_base(Path("llama")), tmp_path / "again")
-    first, second = (
-        {f.relative_to(d): f.read_bytes() for d in [folder] for f in d.rglob("*") if f.is_file()}
-        for folder in (made.folder, tmp_path / "again")
-    )
-    assert first == second
+    assert files_of(tmp_path / "again") == files_of(made.folder)
 
 
 def test_export_with_its_base_needs_nothing_else(made: Made, copy: Path, files: list[Path], tmp_path: Path) -> None:
     question = ("Describe {tactile}.", files[:1])
     expected = Octopi.from_pretrained(made.folder).ask(*question)
-    with pytest.raises(UserError, match=r"language model llama is not there .*--base"):
+    with refused(r"language model llama is not there .*--base"):
         Octopi.from_pretrained(copy)
     export(made.folder, tmp_path / "whole", with_base=True)
     assert Octopi.from_pretrained(tmp_path / "whole").ask(*question) == expected
-    with pytest.raises(UserError, match="is there already"):
+    with refused("is there already"):
         export(made.folder, tmp_path / "whole")
 
 
 def test_a_base_by_name(copy: Path, llama: Path, tmp_path: Path) -> None:
     assert Octopi.from_pretrained(copy, base=llama).card["base"]["folder"] == "llama"
     other = write_llama(tmp_path / "other", seed=5)
-    with pytest.raises(UserError, match=r"other: is another language model .*model.safetensors differs"):
+    with refused(r"other: is another language model .*model.safetensors differs"):
         Octopi.from_pretrained(copy, base=other)
 
 
@@ -87,7 +80,7 @@ def test_another_chat_format_is_refused(copy: Path, llama: Path, tmp_path: Path)
     template = "{% for m in messages %}<{{ m.role }}>{{ m.content }}</s>{% endfor %}"
     template += "{% if add_generation_prompt %}<assistant>{% endif %}"
     (other / "chat_template.jinja").write_text(template)
-    with pytest.raises(UserError, match="chat format is another"):
+    with refused("chat format is another"):
         Octopi.from_pretrained(copy, base=other)
 
 
@@ -95,27 +88,24 @@ def change(file: Path, **values: object) -> None:
     file.write_text(json.dumps(json.loads(file.read_text()) | values))
 
 
-def test_another_version_is_refused(copy: Path) -> None:
-    change(copy / "config.json", format=FORMAT + 1)
-    with pytest.raises(UserError, match=f"of format {FORMAT + 1}, but this version reads {FORMAT}"):
-        Octopi.from_pretrained(copy)
-
-
-def test_other_frames_are_refused(copy: Path, llama: Path) -> None:
+def test_another_version_and_other_frames_are_refused(copy: Path, llama: Path) -> None:
     frames = json.loads((copy / "config.json").read_text())["frames"]
     change(copy / "config.json", frames=frames | {"per_video": 4})
-    with pytest.raises(UserError, match="frame settings are not those of training"):
+    with refused("frame settings are not those of training"):
         Octopi.from_pretrained(copy, base=llama)
+    change(copy / "config.json", format=FORMAT + 1)
+    with refused(f"of format {FORMAT + 1}, but this version reads {FORMAT}"):
+        Octopi.from_pretrained(copy)
 
 
 @pytest.mark.parametrize("name", ["encoder/encoder.safetensors", "language/connector.safetensors", "catalogue.json"])
 def test_a_changed_or_missing_file_is_named(name: str, copy: Path) -> None:
     with (copy / name).open("ab") as stream:
         stream.write(b" ")
-    with pytest.raises(UserError, match=f"{name}: differs"):
+    with refused(f"{name}: differs"):
         read_folder(copy)
     (copy / name).unlink()
-    with pytest.raises(UserError, match=f"{name}: is missing"):
+    with refused(f"{name}: is missing"):
         read_folder(copy)
 
 

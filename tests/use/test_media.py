@@ -54,9 +54,6 @@ def test_good_videos_come_as_files_that_go(gate: Gate, suffix: str, codec: str) 
     assert not any(p.parent.exists() for p in paths)
 
 
-PLAYLIST = b"#EXTM3U\n#EXT-X-TARGETDURATION:10\n#EXTINF:10,\n%s\n#EXT-X-ENDLIST\n"
-
-
 @pytest.mark.parametrize(
     ("data", "status", "words"),
     [
@@ -69,8 +66,6 @@ PLAYLIST = b"#EXTM3U\n#EXT-X-TARGETDURATION:10\n#EXTINF:10,\n%s\n#EXT-X-ENDLIST\
         (lambda: b"hello", 422, "no video"),
         (lambda: video()[:300], 422, "no video"),
         (lambda: b"\x89PNG\r\n\x1a\n" + bytes(100), 422, "no video"),
-        (lambda: PLAYLIST % b"file:///etc/passwd", 422, "no video"),
-        (lambda: b"ffconcat version 1.0\nfile /etc/passwd\n", 422, "no video"),
         (lambda: bytes(1000), 422, "no video"),
     ],
 )
@@ -93,9 +88,11 @@ def test_a_playlist_cannot_read_another_file(gate: Gate, tmp_path: Path) -> None
     # FFmpeg alone would play the other file.
     other = tmp_path / "secret.mp4"
     other.write_bytes(video())
-    for data in (PLAYLIST % str(other).encode(), b"ffconcat version 1.0\nfile %s\n" % str(other).encode()):
-        with pytest.raises(Refused, match="no video"), gate.files([data]):
-            pass
+    playlist = "#EXTM3U\n#EXT-X-TARGETDURATION:10\n#EXTINF:10,\n{}\n#EXT-X-ENDLIST\n"
+    for text in (playlist, "ffconcat version 1.0\nfile {}\n"):
+        for place in (other, "/etc/passwd"):
+            with pytest.raises(Refused, match="no video"), gate.files([text.format(place).encode()]):
+                pass
 
 
 def test_too_many_videos_cost_no_check() -> None:

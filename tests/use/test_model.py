@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,12 @@ from hypothesis import strategies as st
 from pydantic import BaseModel
 
 from pipeline.errors import UserError
-from pipeline.records import Encoder, Lora, Opd, Part, Question, Variant
+from pipeline.records import Encoder, Lora, Opd, Part, Variant
 from pipeline.use.model import Octopi, check_question
 from pipeline.use.results import Exchange
 from pipeline.use.touch import TactileSense
 from pipeline.videos.decoding import decode
-from tests.conftest import moving_square, write_video
+from tests.conftest import moving_square, refused, write_video
 from tests.use.shared import Made, make, replay
 
 FULL = Variant(Encoder.FINETUNED, Lora.WITH, Opd.ALL, 0)
@@ -32,12 +33,6 @@ def answers_as_stored(made: Made) -> int:
 
 def test_its_answers_equal_the_stored_predictions(made: Made) -> None:
     assert answers_as_stored(made) >= 50
-
-
-def _user(question: Question) -> str:
-    dialogue = question.dialogue(Opd.ALL)
-    assert dialogue is not None
-    return dialogue.turns[0].user
 
 
 @pytest.mark.parametrize(
@@ -84,7 +79,7 @@ def test_one_video_needs_no_list(octopi: Octopi, files: list[Path]) -> None:
     assert octopi.ask("Describe {tactile}.", files[0]) == octopi.ask("Describe {tactile}.", str(files[0])) == said
     assert octopi.ask("Describe {tactile}.", array) == octopi.ask("Describe {tactile}.", [array])
     for nothing in (None, 3, [files[0]]):
-        with pytest.raises(UserError, match="is no video; give a file"):
+        with refused("is no video; give a file"):
             octopi.ask("Describe {tactile}.", [nothing])  # type: ignore[list-item]
 
 
@@ -119,9 +114,9 @@ def test_look_shows_where_it_touches(octopi: Octopi) -> None:
     touch = octopi.look(touched)
     assert touch.frames.shape == (3, 32, 32, 3)
     assert touch.contact == pytest.approx(1 / 16, rel=0.5)
-    inside = np.abs(touch.difference[-1, 13:19, 13:19].astype(int) - 128).min()
-    assert np.abs(touch.difference[-1, :8].astype(int) - 128).max() <= 4
-    assert inside > 50
+    change = np.abs(touch.difference[-1].astype(int) - 128)
+    assert change[:8].max() <= 4
+    assert change[13:19, 13:19].min() > 50
     assert np.abs(touch.reference.astype(int) - 90).max() <= 2
 
 
@@ -167,22 +162,23 @@ def test_tasks_ask_in_the_wording_of_training(made: Made, octopi: Octopi, files:
     assert any(known.split("than")[1] in user for user in asked if "rougher" in user)
 
 
-REFUSED = {
-    "no mark": (("Which is softer?", 1), r"0 \{tactile\} for 1 videos"),
-    "too many marks": (("{tactile} {tactile}", 1), r"2 \{tactile\} for 1 videos"),
-    "a mark without a video": (("{tactile}?", 0), r"1 \{tactile\} for 0 videos"),
-    "empty": (("  ", 0), "question is empty"),
-    "its own tokens": (("Is <tact_frame> soft?", 0), "<tact_frame>, which stands for a touch"),
-}
-
-
-@pytest.mark.parametrize("case", REFUSED)
-def test_questions_that_do_not_fit_are_refused(case: str, octopi: Octopi, files: list[Path]) -> None:
-    (question, count), message = REFUSED[case]
-    with pytest.raises(UserError, match=message) as caught:
+@pytest.mark.parametrize(
+    ("question", "count", "words"),
+    [
+        ("Which is softer?", 1, r"0 \{tactile\} for 1 videos"),
+        ("{tactile} {tactile}", 1, r"2 \{tactile\} for 1 videos"),
+        ("{tactile}?", 0, r"1 \{tactile\} for 0 videos"),
+        ("  ", 0, "question is empty"),
+        ("Is <tact_frame> soft?", 0, "<tact_frame>, which stands for a touch"),
+        ("long " * 1000, 0, "begin a new conversation"),
+    ],
+)
+def test_questions_that_do_not_fit_are_refused(
+    question: str, count: int, words: str, octopi: Octopi, files: list[Path]
+) -> None:
+    with refused(words):
         octopi.ask(question, files[:count])
-    assert "\n" not in str(caught.value)
-    with pytest.raises(UserError, match=message):
+    with refused(words):
         octopi.stream(question, files[:count])  # before the first piece is asked for
 
 
@@ -195,11 +191,6 @@ def test_a_question_is_taken_only_with_as_many_videos_as_it_names(text: str, vid
         check_question(marked + "{tactile}", videos)
 
 
-def test_too_long_a_conversation_is_refused(octopi: Octopi) -> None:
-    with pytest.raises(UserError, match="begin a new conversation"):
-        octopi.ask("long " * 1000)
-
-
 def test_videos_that_cannot_be_used_are_refused(octopi: Octopi, tmp_path: Path, files: list[Path]) -> None:
     (tmp_path / "empty.avi").touch()
     (tmp_path / "text.avi").write_text("no video")
@@ -207,7 +198,7 @@ def test_videos_that_cannot_be_used_are_refused(octopi: Octopi, tmp_path: Path, 
     (tmp_path / "cut.avi").write_bytes(whole[: len(whole) // 20])
     one = write_video(tmp_path / "one.avi", moving_square(1))
     still = write_video(tmp_path / "still.avi", [np.full((36, 48, 3), 90, np.uint8)] * 12)
-    refused = {
+    bad = {
         tmp_path / "nothing.avi": "no such file",
         tmp_path: "no such file",
         tmp_path / "empty.avi": "empty",
@@ -216,16 +207,13 @@ def test_videos_that_cannot_be_used_are_refused(octopi: Octopi, tmp_path: Path, 
         one: "show no touch",
         still: "nothing touches the sensor",
     }
-    for video, message in refused.items():
-        with pytest.raises(UserError, match=message) as caught:
+    for video, words in bad.items():
+        with refused(f"^{re.escape(str(video))}.*({words})"):
             octopi.ask("Describe {tactile}.", [video])
-        assert str(video) in str(caught.value)
-        assert "\n" not in str(caught.value)
         if video != tmp_path:
-            with pytest.raises(UserError, match=message):
+            with refused(words):
                 octopi.rank([*files, video], "hardness")
-    described = octopi.describe(still)
-    assert any("nothing touches the sensor" in note for note in described.notes)
+    assert any("nothing touches the sensor" in note for note in octopi.describe(still).notes)
 
 
 @pytest.mark.parametrize(
@@ -238,22 +226,22 @@ def test_videos_that_cannot_be_used_are_refused(octopi: Octopi, tmp_path: Path, 
     ],
 )
 def test_arrays_that_are_no_videos_are_refused(array: np.ndarray, octopi: Octopi) -> None:
-    with pytest.raises(UserError, match="is no video; give uint8"):
+    with refused("is no video; give uint8"):
         octopi.look(array)
 
 
 def test_unknown_words_are_refused(octopi: Octopi, files: list[Path]) -> None:
-    with pytest.raises(UserError, match=r"hardnes: no property of this model; did you mean hardness\? it knows"):
+    with refused(r"hardnes: no property of this model; did you mean hardness\? it knows"):
         octopi.compare(files[0], files[1], "hardnes")
-    with pytest.raises(UserError, match="the catalogue has no such object"):
+    with refused("the catalogue has no such object"):
         octopi.match(files, ["rug", "millet", "a unicorn"])
-    with pytest.raises(UserError, match="three of each"):
+    with refused("three of each"):
         octopi.match(files[:2], ["rug", "millet"])
-    with pytest.raises(UserError, match="a name is given twice"):
+    with refused("a name is given twice"):
         octopi.match(files, ["a rug", "A rug", "millet"])
-    with pytest.raises(UserError, match="1 videos: two or more can be ranked"):
+    with refused("1 videos: two or more can be ranked"):
         octopi.rank(files[:1], "hardness")
-    with pytest.raises(UserError, match="chooses between two"):
+    with refused("chooses between two"):
         octopi.scenario("I must sleep.", files)
 
 

@@ -179,11 +179,9 @@ def test_a_conversation_and_what_is_let_through(client: TestClient, fake: FakeOc
 
 
 @pytest.mark.parametrize("path", ["/v1/models", "/v1/models/octopi", "/metrics", CHAT])
-@pytest.mark.parametrize(
-    "header", [None, "", "Bearer", "Bearer wrong", f"Basic {TOKEN}x", f"Bearer {TOKEN}x", "Bearer \xe9"]
-)
-def test_401(client: TestClient, path: str, header: str | None) -> None:
-    headers = {"Authorization": header.encode("latin-1")} if header is not None else {"Authorization": ""}
+@pytest.mark.parametrize("header", ["", "Bearer", "Bearer wrong", f"Basic {TOKEN}x", f"Bearer {TOKEN}x", "Bearer \xe9"])
+def test_401(client: TestClient, path: str, header: str) -> None:
+    headers = {"Authorization": header.encode("latin-1")}
     response = client.request("POST" if path == CHAT else "GET", path, headers=headers)
     assert "token" in error(response, 401)
     assert response.headers["www-authenticate"] == "Bearer"
@@ -267,9 +265,8 @@ def test_422(client: TestClient, bad: bytes | dict[str, Any], words: str) -> Non
 
 
 def test_a_thousand_bad_requests_and_a_good_one(client: TestClient) -> None:
-    cheap = [bad for bad, _ in BAD]
     for i in range(1000):
-        error(send(client, cheap[i % len(cheap)]), 422)
+        error(send(client, BAD[i % len(BAD)][0]), 422)
     assert client.get("/health").json()["waiting"] == 0
     answer = client.post(CHAT, json=body(user(text("good"), part(video(3))))).json()
     assert answer["choices"][0]["message"]["content"] == f"good {{tactile}} | {digest(video(3))} "

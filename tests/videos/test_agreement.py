@@ -5,14 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pingouin import intraclass_corr
 from scipy.special import betaincinv
 
 from pipeline.videos.audit.labels import icc3k
-from pipeline.videos.catalogue import load_catalogue
-from tests.closure import ROOT
 
 SHROUT_FLEISS = [[9, 2, 5, 8], [6, 1, 3, 2], [8, 4, 6, 8], [7, 1, 2, 6], [10, 5, 6, 9], [6, 2, 4, 7]]
 """The example of Shrout and Fleiss 1979: six targets, four judges."""
@@ -43,13 +41,10 @@ def test_it_is_pingouins(ratings: list[list[float]]) -> None:
     assert icc3k(ratings) == pytest.approx((value, low, high), abs=1e-9)
 
 
-def test_published_examples() -> None:
+def test_the_published_example() -> None:
     found = icc3k(SHROUT_FLEISS)
     assert found is not None
     assert [round(x, 2) for x in found] == [0.91, 0.68, 0.99]
-    catalogue = load_catalogue(ROOT / "pipeline" / "physiclear")
-    values = [icc3k([o.ratings[i] for o in catalogue.objects.values()]) for i in range(3)]
-    assert [round(v[0], 3) for v in values if v is not None] == [0.893, 0.979, 0.773]
 
 
 @pytest.mark.parametrize("ratings", [[], [[1, 2, 3]], [[1], [2]], [[1, 2], [1, 2], [1, 2]], [[2, 2], [2, 2]]])
@@ -66,7 +61,6 @@ def test_perfect_agreement_whatever_the_severity_has_no_width(severity: tuple[fl
     ratings=st.lists(st.lists(st.integers(0, 4), min_size=3, max_size=3), min_size=2, max_size=9),
     strict=st.lists(st.integers(-9, 9), min_size=3, max_size=3),
 )
-@settings(deadline=None)
 def test_it_is_of_consistency_and_lies_in_its_interval(ratings: list[list[int]], strict: list[int]) -> None:
     found = icc3k(ratings)
     shifted = icc3k([[r + s for r, s in zip(row, strict, strict=True)] for row in ratings])

@@ -102,14 +102,14 @@ def test_a_changed_copy_is_found(tmp_path: Path, presses: list[Probe], start: in
         assert "baseball_0.avi" in near[0].measured
 
 
-def three_sensors(noise: float = 1.0, videos: int = 12) -> tuple[list[Probe], list[int]]:
+def three_sensors(videos: int = 12) -> tuple[list[Probe], list[int]]:
     rng = np.random.default_rng(5)
     looks = rng.normal(90, 8, (3, 144))
     found_videos, truth = [], []
     for number in range(videos):
         own = number % 3 if number < videos - 1 else 0
         drift = rng.normal(0, 6)
-        picture = looks[own] + rng.normal(0, noise, 144) + drift
+        picture = looks[own] + rng.normal(0, 1, 144) + drift
         found_videos.append(probe(f"{OBJECTS[number % 8]}_{number}", thumbnail=tuple(picture), brightness=90 + drift))
         truth.append(own)
     return found_videos, truth

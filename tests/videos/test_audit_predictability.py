@@ -72,15 +72,6 @@ def test_predictability_is_ridge_regression_fold_by_fold(monkeypatch: pytest.Mon
     assert [share, *null] == pytest.approx(slow_shares(data, seed, 5), abs=1e-12)
 
 
-def test_a_planted_leak_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(leakage, "PERMUTATIONS", 200)
-    for seed in range(3):
-        data = planted(seed, leak=1.5)
-        share, null = predictability(*data, seed)
-        assert p_value(share, null) < 0.01
-        assert share > 0.6 > float(np.mean(null)) + 0.1
-
-
 @pytest.mark.parametrize("own", [0.0, 3.0])
 def test_noise_gives_uniform_p_values(monkeypatch: pytest.MonkeyPatch, own: float) -> None:
     """Also where videos of one object look alike: labels are permuted among objects, not among videos."""
@@ -92,13 +83,6 @@ def test_noise_gives_uniform_p_values(monkeypatch: pytest.MonkeyPatch, own: floa
     assert np.mean(np.array(values) <= 0.05) <= 0.15
     assert 0.35 <= np.mean(np.array(values) <= 0.5) <= 0.65
     assert 0.4 < np.mean(values) < 0.6
-
-
-def test_predictability_follows_from_its_seed() -> None:
-    data = planted(1, leak=0.5)
-    first = predictability(*data, 3)
-    assert first == predictability(*data, 3)
-    assert first != predictability(*data, 4)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -251,19 +251,6 @@ def test_one_colour_fills_every_square(pixels: str, mode: str) -> None:
             assert np.abs(image - np.array(expected)).max() <= 1
 
 
-@pytest.mark.parametrize("pixels", ["yuv420p", "yuv422p", "yuv444p", "yuv411p"])
-def test_crop_takes_the_centre_and_squash_takes_all(tmp_path: Path, pixels: str) -> None:
-    """In colour as in brightness, also where colour is halved one way only."""
-    image = np.zeros((32, 96, 3), np.uint8)
-    image[:, 32:64] = (30, 40, 250)
-    (frame,) = frames_of(encode(tmp_path / "v.mkv", [image], "ffv1", pixels))
-    cropped = fit(frame, FramesConfig(size=32, fit="crop"))
-    assert np.abs(cropped[:, 4:-4].astype(int) - (250, 40, 30)).max() <= 8
-    squashed = fit(frame, FramesConfig(size=24, fit="squash"))
-    assert squashed[..., 0].mean() == pytest.approx(250 / 3, abs=4)
-    assert squashed[12, 12, 0] > 230 > 20 > squashed[12, 2, 0]
-
-
 @pytest.mark.real
 def test_real_pictures_are_opencvs_bit_for_bit(real_data: Path) -> None:
     for name in ("hairbrush_bristles_side_4", "tv_remote_back_3"):

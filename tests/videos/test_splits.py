@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections import Counter
 
 import pytest
@@ -14,7 +15,7 @@ from pipeline.errors import UserError
 from pipeline.records import Assignment, Part
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.split import VALIDATION, assign, check_split
-from tests.conftest import ROOT, fake_videos
+from tests.conftest import ROOT, fake_videos, refused
 
 CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")
 OBJECTS = sorted(CATALOGUE.objects)
@@ -117,10 +118,8 @@ def test_missing_objects_are_reported_or_refused() -> None:
     present = [o for o in OBJECTS if CATALOGUE.objects[o].splits["paper"] != Part.TEST and o != "denim"]
     split = assign(CATALOGUE, fake_videos(present), SplitConfig(name="paper"))
     assert not objects_of(split, Part.TEST)
-    with pytest.raises(UserError) as caught:
+    with refused(r"denim.*ice_block.*split\.missing"):
         assign(CATALOGUE, fake_videos(present), SplitConfig(name="paper", missing="error"))
-    for words in ("denim", "ice_block", "split.missing"):
-        assert words in str(caught.value)
 
 
 def renamed(**columns: str) -> Catalogue:
@@ -148,13 +147,10 @@ def test_a_column_of_any_name_is_a_split() -> None:
 )
 def test_a_split_that_is_not_there_is_refused(columns: dict[str, str], name: str, words: str) -> None:
     other = renamed(**columns)
-    for attempt in (
-        lambda: check_split(other, name),
-        lambda: assign(other, fake_videos(OBJECTS), SplitConfig(name=name)),
-    ):
-        with pytest.raises(UserError) as caught:
-            attempt()
-        assert words in str(caught.value)
+    with refused(re.escape(words)):
+        check_split(other, name)
+    with refused(re.escape(words)):
+        assign(other, fake_videos(OBJECTS), SplitConfig(name=name))
     check_split(other, "kfold")
     assert assign(other, fake_videos(OBJECTS), SplitConfig(name="kfold"))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import shutil
 import unicodedata
 from collections.abc import Callable
@@ -15,6 +16,7 @@ from pipeline.errors import UserError
 from pipeline.records import Severity
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import LIST_FILE, Listing, list_videos, raise_errors
+from tests.conftest import refused
 
 
 def touch(folder: Path, *names: str) -> Path:
@@ -88,13 +90,14 @@ Make = Callable[[Path], object]
     ("make", "words"),
     [
         (lambda folder: folder.rmdir(), ["no such folder", "data.dir"]),
+        (lambda folder: (folder.rmdir(), folder.touch()), ["a file and no folder", "data.dir"]),
         (lambda folder: touch(folder, "notes.txt"), ["no video", ".mov", "data.dir"]),
         (lambda folder: touch(folder, "yoyo_0.mov"), ["no video of an object", "yoyo", "objects.csv"]),
         (lambda folder: touch(folder, "rug.avi"), ["rug.avi", "<object>_<number>", "rename", "videos.csv"]),
         (lambda folder: touch(folder, "rug_٣.avi"), ["<object>_<number>"]),
         (lambda folder: touch(folder, "rug_0.avi", "sub/rug_00.mp4"), ["rug_0.avi", "sub/rug_00.mp4", "keep one"]),
     ],
-    ids=["no folder", "no video", "unknown object", "no number", "digits of another script", "one id twice"],
+    ids=["no folder", "a file", "no video", "unknown object", "no number", "digits of another script", "one id twice"],
 )
 def test_bad_names_are_one_line_with_their_mend(
     tmp_path: Path, catalogue: Catalogue, make: Make, words: list[str]
@@ -103,12 +106,9 @@ def test_bad_names_are_one_line_with_their_mend(
     folder.mkdir()
     make(folder)
     listing = list_videos(folder, catalogue)
-    with pytest.raises(UserError) as caught:
+    with refused(f"^{re.escape(str(folder))}") as caught:
         raise_errors(folder, listing.findings)
-    message = str(caught.value)
-    assert "\n" not in message
-    assert message.startswith(str(folder))
-    assert all(word in message for word in words), message
+    assert all(word in str(caught.value) for word in words), caught.value
     assert len(errors(listing)) == 1
 
 
@@ -132,11 +132,6 @@ def test_pipes_and_closed_folders_are_findings_and_no_hang(
         "closed": "cannot be read ",
         "rug_0.mov": "is no file but a pipe, socket or device; move it",
     }
-
-
-def test_a_file_in_the_folders_place(tmp_path: Path, catalogue: Catalogue) -> None:
-    (tmp_path / "x.mov").touch()
-    assert "a file and no folder" in errors(list_videos(tmp_path / "x.mov", catalogue))[0][1]
 
 
 def test_all_errors_are_listed_and_the_first_is_raised(tmp_path: Path, catalogue: Catalogue) -> None:
@@ -229,11 +224,9 @@ def test_bad_lists_are_one_line_with_their_mend(tmp_path: Path, catalogue: Catal
     ((item, message),) = errors(listing)
     assert item == (str(tmp_path) if "catalogue" in words else LIST_FILE)
     assert message.startswith(words) or "catalogue" in words
-    assert words in message
-    with pytest.raises(UserError) as caught:
+    with refused(re.escape(words)) as caught:
         raise_errors(tmp_path, listing.findings)
     assert str(caught.value).count(str(tmp_path)) == 1
-    assert "\n" not in str(caught.value)
 
 
 def test_all_bad_lines_of_a_list_are_found_at_once(tmp_path: Path, catalogue: Catalogue) -> None:

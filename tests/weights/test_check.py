@@ -13,10 +13,7 @@ from pipeline.weights.make import RECIPES
 from tests.checkpoints import write_clip, write_llama
 from tests.conftest import refused
 
-
-@pytest.fixture(autouse=True)
-def nothing_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("elsewhere")
 
 
 def timm_folder(folder: Path, config: str = '{"architecture": "x"}') -> Path:

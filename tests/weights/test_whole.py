@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable
 from math import prod
 from pathlib import Path
+from shutil import copyfile
 from typing import Any
 
 import pytest
@@ -26,19 +27,9 @@ from pipeline.language.base import load_llm, load_tokenizer
 from pipeline.shapes import Llama, Vision
 from pipeline.weights import check_encoder, check_finite, check_language
 from pipeline.weights.check import check_encoder_files, check_language_files
-from tests.checkpoints import cut, edit, write_clip, write_llama
+from tests.checkpoints import cut, edit, replace, write_clip, write_llama
 from tests.closure import ROOT
 from tests.encoders import config, write_timm
-
-
-def copy(file: Path, other: Path) -> None:
-    other.write_bytes(file.read_bytes())
-
-
-def header_beyond(file: Path) -> None:
-    """A header that would be longer than its file."""
-    content = file.read_bytes()
-    file.write_bytes(len(content).to_bytes(8, "little") + content[8:])
 
 
 def renamed(file: Path, old: str, new: str) -> None:
@@ -46,16 +37,11 @@ def renamed(file: Path, old: str, new: str) -> None:
     save_file({new if name == old else name: value for name, value in tensors.items()}, file)
 
 
-def replaced(file: Path, name: str, value: torch.Tensor) -> None:
-    save_file(load_file(file) | {name: value}, file)
-
-
 ONE = "model.safetensors"
 INDEX = "model.safetensors.index.json"
 LANGUAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "cut by a byte": (lambda f: cut(f / ONE), "model.safetensors is cut off or not a safetensors file .*; download it"),
     "a byte too many": (lambda f: (f / ONE).write_bytes((f / ONE).read_bytes() + b"x"), "model.safetensors is cut off"),
-    "header beyond the file": (lambda f: header_beyond(f / ONE), "model.safetensors is cut off"),
     "nothing in the weights": (lambda f: (f / ONE).write_bytes(b""), "model.safetensors is cut off"),
     "a pointer of Git LFS": (lambda f: (f / ONE).write_text("version https://git-lfs"), "model.safetensors is cut off"),
     "no tokenizer": (lambda f: (f / "tokenizer.json").unlink(), "tokenizer.json does not exist"),
@@ -87,10 +73,7 @@ LANGUAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "fewer words than the tokenizer": (
         lambda f: (
             edit(f / "config.json", vocab_size=259),
-            *(
-                replaced(f / ONE, name, torch.zeros(259, 32))
-                for name in ("lm_head.weight", "model.embed_tokens.weight")
-            ),
+            *(replace(f / ONE, name, torch.zeros(259, 32)) for name in ("lm_head.weight", "model.embed_tokens.weight")),
         ),
         "tokenizer.json has words up to number 259, but vocab_size of .*/config.json is 259",
     ),
@@ -102,12 +85,11 @@ LANGUAGE: dict[str, tuple[Callable[[Path], object], str]] = {
 SHARDS: dict[str, tuple[Callable[[Path], object], str]] = {
     "no shard": (lambda f: (f / "model-00002-of-00007.safetensors").unlink(), "model-00002-of-00007.safetensors does"),
     "a shard cut by a byte": (lambda f: cut(f / "model-00003-of-00007.safetensors"), "model-00003-of-00007.* is cut"),
-    "no index": (lambda f: (f / INDEX).unlink(), "has neither model.safetensors nor model.safetensors.index.json"),
     "a broken index": (lambda f: cut(f / INDEX, 9), "index.json is not a JSON object"),
     "an empty index": (lambda f: edit(f / INDEX, weight_map={}), "index.json maps no tensors to files"),
     "an index of numbers": (lambda f: edit(f / INDEX, weight_map={"a": 1}), "index.json maps no tensors to files"),
     "a shard twice": (
-        lambda f: copy(f / "model-00003-of-00007.safetensors", f / "model-00004-of-00007.safetensors"),
+        lambda f: copyfile(f / "model-00003-of-00007.safetensors", f / "model-00004-of-00007.safetensors"),
         "has no tensor model.layers",
     ),
 }
@@ -123,7 +105,6 @@ def vision(folder: Path, **changes: Any) -> None:
 
 CLIP: dict[str, tuple[Callable[[Path], object], str]] = {
     "cut by a byte": (lambda f: cut(f / CLIP_FILE), "open_clip_model.safetensors is cut off"),
-    "header beyond the file": (lambda f: header_beyond(f / CLIP_FILE), "open_clip_model.safetensors is cut off"),
     "deeper": (lambda f: vision(f, layers=3), "has no tensor visual.transformer.resblocks.2"),
     "wider": (lambda f: vision(f, width=48), "visual.class_embedding in .* is 32, but .*config.json makes it 48"),
     "other patches": (lambda f: vision(f, patch_size=8), "visual.positional_embedding .* is 5 x 32, but .* 17 x 32"),
@@ -303,14 +284,13 @@ def test_a_broken_tokenizer_is_one_line_at_loading_too(name: str) -> None:
         load_tokenizer(folder)
 
 
-@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
-def test_values_that_are_not_finite_are_named_at_loading(bad: float) -> None:
+def test_values_that_are_not_finite_are_named_at_loading() -> None:
     folder = write_llama(Path("llama"), shard="20KB")
     name = "model.layers.1.mlp.down_proj.weight"
     file = folder / json.loads((folder / INDEX).read_text())["weight_map"][name]
     value = load_file(file)[name]
-    value[3, 5] = bad
-    replaced(file, name, value)
+    value[3, 5] = torch.nan
+    replace(file, name, value)
     check_language_files(folder)
     with pytest.raises(UserError, match=rf"\Alanguage.weights: {name} in {file} holds values that are not finite; d"):
         load_llm(folder, torch.float32)
@@ -335,7 +315,7 @@ def test_one_value_that_is_not_finite_is_found_wherever_it_stands(bad: float, dt
 def test_a_tower_with_a_nan_is_named_at_loading() -> None:
     folder = write_clip(Path("clip"))
     name = "visual.transformer.resblocks.1.mlp.c_fc.bias"
-    replaced(folder / CLIP_FILE, name, torch.full((128,), float("nan")))
+    replace(folder / CLIP_FILE, name, torch.full((128,), float("nan")))
     check_encoder_files(folder, ("clip",))
     with pytest.raises(UserError, match=rf"{name.removeprefix('visual.')} in clip/{CLIP_FILE} holds .* not finite"):
         load_visual_tower(folder)
@@ -352,6 +332,6 @@ def test_a_tower_in_a_pickle_is_not_loaded() -> None:
 def test_a_timm_network_with_a_nan_in_its_statistics_is_named_at_loading() -> None:
     folder = write_timm(Path("timm"))
     name = next(n for n in load_file(folder / ONE) if n.endswith("running_var"))
-    replaced(folder / ONE, name, torch.full_like(load_file(folder / ONE)[name], float("nan")))
+    replace(folder / ONE, name, torch.full_like(load_file(folder / ONE)[name], float("nan")))
     with pytest.raises(UserError, match=rf"{name} in timm/{ONE} holds values that are not finite"):
         load_backbone(config(folder, "tuned", backbone=("timm",)), tuned=False)

@@ -1,0 +1,22 @@
+"""What the tests of the tasks share: PhysiCLeAR's objects, and what grades an answer."""
+
+from __future__ import annotations
+
+from pipeline.records import Part, Prediction, Question, Score
+from pipeline.tasks import TASKS
+from pipeline.tasks.base import Pool
+from pipeline.videos.catalogue import Catalogue, load_catalogue
+from tests.closure import ROOT
+
+CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear").asking("published")
+POOL = Pool(Part.TEST, CATALOGUE, {o: [f"{o}_0"] for o in CATALOGUE.objects})
+
+
+def predicted(question: Question, *outputs: str, truncated: bool = False) -> Prediction:
+    return Prediction(
+        question_id=question.question_id, task=question.task, outputs=outputs, truncated=truncated, tokens=1
+    )
+
+
+def grade(question: Question, *outputs: str, truncated: bool = False, catalogue: Catalogue = CATALOGUE) -> list[Score]:
+    return TASKS[question.task].grade(question, predicted(question, *outputs, truncated=truncated), catalogue)
