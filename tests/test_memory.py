@@ -31,6 +31,12 @@ M_MMAP_THRESHOLD = -3
 """glibc's malloc.h."""
 
 
+@pytest.fixture(autouse=True)
+def at_home(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the catalogue lies that scales name."""
+    monkeypatch.chdir(ROOT)
+
+
 def kept(run: Callable[[], torch.Tensor], modules: Iterable[nn.Module]) -> int:
     """Bytes that autograd keeps of a computation, the modules' own aside; each storage once."""
     own = {t.untyped_storage().data_ptr() for m in modules for t in (*m.parameters(), *m.buffers())}
@@ -56,6 +62,21 @@ def llama(keys: int) -> tuple[LlamaForCausalLM, Llama]:
         vocab_size=100,
     )
     return LlamaForCausalLM(form).requires_grad_(False), Llama(64, 160, 3, 4, 100, keys, 16)
+
+
+def tower_of(shape: Vision) -> open_clip.transformer.VisionTransformer:
+    """Frozen, with fresh weights."""
+    tower = open_clip.transformer.VisionTransformer(
+        image_size=shape.image_size,
+        patch_size=shape.patch_size,
+        width=shape.width,
+        layers=shape.layers,
+        heads=shape.width // shape.head_width,
+        mlp_ratio=4.0,
+        output_dim=shape.embed_dim,
+        act_layer=open_clip.transformer.QuickGELU if shape.quick_gelu else nn.GELU,
+    )
+    return tower.requires_grad_(False).eval()
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
@@ -87,18 +108,8 @@ def test_a_llama_keeps_what_is_counted(keys: int, targets: tuple[str, ...], drop
 @pytest.mark.parametrize("autocast", [False, True])
 def test_a_tower_with_prompts_keeps_what_is_counted(autocast: bool, quick: bool) -> None:
     shape = Vision(3, 64, patch_size=4, image_size=32, embed_dim=24, head_width=16, quick_gelu=quick)
-    tower = open_clip.transformer.VisionTransformer(
-        image_size=32,
-        patch_size=4,
-        width=64,
-        layers=3,
-        heads=4,
-        mlp_ratio=4.0,
-        output_dim=24,
-        act_layer=open_clip.transformer.QuickGELU if quick else nn.GELU,
-    )
+    tower = tower_of(shape)
     assert shape.parameters == sum(p.numel() for p in tower.parameters())
-    tower.requires_grad_(False).eval()
     prompts = VisualPrompts(3, 5, 64, 48)
     prompts.attach(tower)
 
@@ -175,17 +186,7 @@ def test_published_models_have_their_published_sizes() -> None:
 def test_a_process_takes_what_is_counted() -> None:
     """Forward and backward through a tower that holds far more than what the process moves beside it."""
     shape = Vision(8, 256, patch_size=16, image_size=224, embed_dim=64, head_width=64, quick_gelu=True)
-    tower = open_clip.transformer.VisionTransformer(
-        image_size=224,
-        patch_size=16,
-        width=256,
-        layers=8,
-        heads=4,
-        mlp_ratio=4.0,
-        output_dim=64,
-        act_layer=open_clip.transformer.QuickGELU,
-    )
-    tower.requires_grad_(False).eval()
+    tower = tower_of(shape)
     VisualPrompts(8, 8, 256, 768).attach(tower)
 
     def run(frames: int) -> None:
@@ -214,27 +215,17 @@ def resident(name: str) -> int:
 @pytest.mark.parametrize("autocast", [False, True])
 def test_a_gpu_takes_what_is_counted(autocast: bool) -> None:
     """CLIP ViT-L/14 at its true shapes, four videos of five frames."""
+    shape, size = Vision(**PUBLISHED_VISION["clip-vit-large-patch14"]), 2 if autocast else 4
     with torch.device("cuda"):
-        tower = open_clip.transformer.VisionTransformer(
-            image_size=224,
-            patch_size=14,
-            width=1024,
-            layers=24,
-            heads=16,
-            mlp_ratio=4.0,
-            output_dim=768,
-            act_layer=open_clip.transformer.QuickGELU,
-        )
+        tower = tower_of(shape)
         prompts = VisualPrompts(24, 8, 1024, 588)
         frames = torch.zeros(20, 3, 224, 224)
-    tower.requires_grad_(False).eval()
     prompts.attach(tower)
     before = torch.cuda.memory_allocated()
     torch.cuda.reset_peak_memory_stats()
     with torch.autocast("cuda", torch.bfloat16, enabled=autocast):
         loss = tower(frames).sum()
     loss.backward()
-    shape, size = Vision(**PUBLISHED_VISION["clip-vit-large-patch14"]), 2 if autocast else 4
     expected = shape.saved(20, 8, size) + shape.passing(20, 8, size)
     assert torch.cuda.max_memory_allocated() - before == pytest.approx(expected, rel=0.15)
 
@@ -266,12 +257,6 @@ def test_launchers_are_read() -> None:
             launched(wrong)
 
 
-@pytest.fixture
-def elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(ROOT)
-
-
-@pytest.mark.usefixtures("elsewhere")
 def test_the_papers_scales_fit_the_cards_they_name() -> None:
     """7b on one card of 48 GB, or of 24 GB, and 13b on two of 48 GB, with room left for what is not counted."""
     less = ("runtime.gradient_checkpointing=true",)
@@ -283,7 +268,6 @@ def test_the_papers_scales_fit_the_cards_they_name() -> None:
         assert table(uses).count("\n") == len(uses)
 
 
-@pytest.mark.usefixtures("elsewhere")
 def test_settings_move_what_they_should() -> None:
     def uses(*overrides: str) -> dict[str, Use]:
         return {use.stage: use for use in count(compose("paper-7b", overrides))[0]}
@@ -320,13 +304,8 @@ def test_where_nothing_was_taught_the_base_is_counted(tmp_path: Path, monkeypatc
     assert {"align", "lora", "answer"} <= {use.stage for use in count(compose("small", conf=ROOT / "conf"))[0]}
 
 
-@pytest.mark.usefixtures("elsewhere")
 def test_folders_are_read_and_unknown_ones_named(tmp_path: Path) -> None:
     clip = write_clip(tmp_path / "clip")
     uses, notes = count(compose("smoke", [f"encoder.weights={clip}", f"language.weights={tmp_path / 'model'}"]))
     assert [use.stage for use in uses] == ["finetune_encoder", "embed"]
     assert any(str(tmp_path / "model") in note and "not counted" in note for note in notes)
-    tower = Vision.read(clip)
-    assert tower is not None
-    model = open_clip.create_model(f"local-dir:{clip}", require_pretrained=True)
-    assert tower.parameters == sum(p.numel() for p in model.visual.parameters())

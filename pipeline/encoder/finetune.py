@@ -6,9 +6,8 @@ fits heads to frozen backbones and then tunes both (`pipeline.encoder.tuned`).
 
 from __future__ import annotations
 
-import math
 import shutil
-from collections.abc import Callable, Sequence, Sized
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -151,6 +150,11 @@ def train_classifier(
     # By video: a label that was corrected must not go on with what was learnt from the wrong one.
     labelled = repr([(a.video_id, a.part, data.catalogue.labels(a.object_id)) for a in data.assignments])
     folder = checkpoint_dir(f"finetune_encoder-{seed}", fingerprint(config, seed, data.per_video, labelled, *inputs))
+    # The published code's cosine is as long as one epoch, so that the rate falls to a hundredth and rises again.
+    waves = {
+        "lr_scheduler_type": "cosine_with_min_lr",
+        "lr_scheduler_kwargs": {"min_lr_rate": 0.01, "num_cycles": config.epochs / 2},
+    }
     arguments = training_arguments(
         folder,
         runtime,
@@ -168,6 +172,7 @@ def train_classifier(
         load_best_model_at_end=bool(chosen),
         metric_for_best_model=COMBINED if chosen else None,
         logging_strategy="epoch",
+        **(waves if config.recipe == "release" else {}),
     )
 
     def judged(prediction: EvalPrediction) -> dict[str, float]:
@@ -182,8 +187,6 @@ def train_classifier(
         data_collator=default_collate,
         compute_metrics=judged,
         callbacks=[TrainingMonitor(), *callbacks],
-        # The published code's cosine is as long as one epoch, so that the rate falls and rises again.
-        wave=math.ceil(len(cast(Sized, training)) / config.batch_size) if config.recipe == "release" else None,
     )
     history = train(trainer).history
     shutil.rmtree(folder, ignore_errors=True)

@@ -32,9 +32,6 @@ from pipeline.training.trainable import load_trainable, whole_state
 
 logger = logging.getLogger(__name__)
 
-LOWEST = 0.01
-"""Share of the rate at the bottom of a wave."""
-
 
 class TrainableTrainer(Trainer):
     """A Trainer whose checkpoints hold only what is trained, and whose parts may learn at rates of their own.
@@ -44,8 +41,6 @@ class TrainableTrainer(Trainer):
     Args:
         rates: Learning rate of the parameters under each name.
         constant: Of those names, the ones whose rate stays as it is throughout.
-        wave: Updates after which the rate has fallen to a hundredth, to rise again in as many, for ever: the published
-            code gives its cosine the length of one epoch. By default one cosine spans the training.
         sampler: The order of the training set, where it is not simply random.
     """
 
@@ -54,7 +49,6 @@ class TrainableTrainer(Trainer):
         *args: Any,
         rates: Mapping[str, float] | None = None,
         constant: Collection[str] = (),
-        wave: int | None = None,
         sampler: Sampler[int] | None = None,
         **kwargs: Any,
     ) -> None:
@@ -62,7 +56,6 @@ class TrainableTrainer(Trainer):
         self.remove_callback(PrinterCallback)
         self._rates = rates
         self._constant = constant
-        self._wave = wave
         self._sampler = sampler
         if isinstance(self.train_dataset, EpochDataset):
             # The state's epoch has a fraction for the steps within one.
@@ -89,22 +82,14 @@ class TrainableTrainer(Trainer):
     def create_scheduler(
         self, num_training_steps: int, optimizer: torch.optim.Optimizer | None = None
     ) -> torch.optim.lr_scheduler.LRScheduler:
-        """The Trainer's own, but for what stays constant, or the wave."""
-        wave, stepped = self._wave, optimizer or self.optimizer
-        if wave is None or stepped is None:
-            scheduler = cast(torch.optim.lr_scheduler.LambdaLR, super().create_scheduler(num_training_steps, optimizer))
-            for place, name in enumerate(self._rates or ()):
-                if name in self._constant:
-                    scheduler.lr_lambdas[place] = lambda _: 1.0
-                    # What it begins with was set when the scheduler was made, in a warm-up to nothing.
-                    scheduler.optimizer.param_groups[place]["lr"] = scheduler.base_lrs[place]
-            return scheduler
-
-        def rate(step: int) -> float:
-            return LOWEST + (1 - LOWEST) * (1 + math.cos(math.pi * step / wave)) / 2
-
-        self.lr_scheduler = torch.optim.lr_scheduler.LambdaLR(stepped, rate)
-        return self.lr_scheduler
+        """The Trainer's own, but for what stays constant."""
+        scheduler = cast(torch.optim.lr_scheduler.LambdaLR, super().create_scheduler(num_training_steps, optimizer))
+        for place, name in enumerate(self._rates or ()):
+            if name in self._constant:
+                scheduler.lr_lambdas[place] = lambda _: 1.0
+                # What it begins with was set when the scheduler was made, in a warm-up to nothing.
+                scheduler.optimizer.param_groups[place]["lr"] = scheduler.base_lrs[place]
+        return scheduler
 
     def save_model(self, output_dir: str | None = None, _internal_call: bool = False) -> None:
         """Write what is trained; all processes must call it, the first one writes."""

@@ -2,22 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterator
+from pathlib import Path
 
 import pytest
+import torch
 from torch.optim.optimizer import register_optimizer_step_pre_hook
+
+from pipeline.encoder.clips import EncoderData
+from pipeline.videos.catalogue import Catalogue
+from tests.encoders import PARTS, encoder_data
+
+Hook = Callable[[Callable[[int, torch.optim.Optimizer], None]], None]
 
 
 @pytest.fixture
-def updates() -> Iterator[dict[str, int]]:
-    """Counts the updates of all optimisers; interrupts the one numbered `stop`."""
-    counter = {"made": 0, "stop": -1}
+def before_updates() -> Iterator[Hook]:
+    """Has something called before each update of any optimiser, with the number of updates made and the optimiser."""
+    handles = []
 
-    def count(*_: object) -> None:
-        counter["made"] += 1
-        if counter["made"] == counter["stop"]:
+    def register(call: Callable[[int, torch.optim.Optimizer], None]) -> None:
+        made = iter(range(10**6))
+        handles.append(register_optimizer_step_pre_hook(lambda optimizer, *_: call(next(made), optimizer)))
+
+    yield register
+    for handle in handles:
+        handle.remove()
+
+
+def killed_at(updates: Collection[int], begun: list[int]) -> Callable[[int, torch.optim.Optimizer], None]:
+    """Dies at these updates; keeps all that were begun."""
+
+    def kill(number: int, _: torch.optim.Optimizer) -> None:
+        begun.append(number)
+        if number in updates:
             raise KeyboardInterrupt
 
-    handle = register_optimizer_step_pre_hook(count)
-    yield counter
-    handle.remove()
+    return kill
+
+
+@pytest.fixture
+def data(catalogue: Catalogue, tmp_path: Path) -> EncoderData:
+    """Five videos to train on, two to choose by."""
+    return encoder_data(tmp_path, catalogue, PARTS)

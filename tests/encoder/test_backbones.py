@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -32,10 +32,10 @@ from pipeline.errors import UserError
 from pipeline.records import Part
 from pipeline.runtime import seed_everything
 from pipeline.training.trainable import load_trainable, save_trainable, trainable_state
-from pipeline.videos.catalogue import Catalogue
+from tests.checkpoints import edit
 from tests.closure import ROOT
 from tests.conftest import refused
-from tests.encoders import CPU, PARTS, close, config, encoder_data, float64, write_pretrained, write_timm
+from tests.encoders import CPU, close, config, float64, write_pretrained, write_timm
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
 
@@ -53,6 +53,13 @@ def network(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
 @pytest.fixture(scope="module")
 def timm_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_timm(tmp_path_factory.mktemp("timm"))
+
+
+def side_by_side(timm_folder: Path) -> SideBySide:
+    """The backbone `timm` alone."""
+    encoder = base_encoder(config(timm_folder, "tuned", backbone=("timm",), feature_stage=2))
+    assert isinstance(encoder, SideBySide)
+    return encoder
 
 
 def loaded(folder: Path, stage: int, *, tuned: bool = False) -> TimmBackbone:
@@ -161,18 +168,10 @@ def test_gradients_reach_the_last_stage_alone(network: tuple[str, Path]) -> None
     assert all(key.startswith(prefix) for key in trainable_state(backbone))
 
 
-def test_statistics_of_batch_normalisation_stay(timm_folder: Path, catalogue: Catalogue, tmp_path: Path) -> None:
-    model, _ = tuned_model(timm_folder, catalogue, tmp_path, epochs=2)
-    fresh = loaded(timm_folder, 2).state_dict()
-    running = {n: b for n, b in model.encoder.get_submodule("backbones.0").state_dict().items() if "running" in n}
-    assert running
-    assert all(torch.equal(b, fresh[n]) for n, b in running.items())
-
-
-def test_a_clip_among_several_backbones_gets_prompts(weights: Path, catalogue: Catalogue, tmp_path: Path) -> None:
+def test_a_clip_among_several_backbones_gets_prompts(weights: Path, data: EncoderData) -> None:
     write_pretrained()
     setting = config(weights, "tuned", backbone=("clip", "scenes"), epochs=1)
-    model, history = finetune(encoder_data(tmp_path, catalogue, PARTS), setting, CPU, seed=0, inputs=[])
+    model, history = finetune(data, setting, CPU, seed=0, inputs=[])
     names = set(trainable_state(model))
     assert "encoder.backbones.0.prompts.prompts" in names
     assert not any(".visual." in name for name in names)
@@ -183,25 +182,17 @@ def test_a_clip_among_several_backbones_gets_prompts(weights: Path, catalogue: C
 # Training above cached trunks
 
 
-def tuned_model(
-    folder: Path, catalogue: Catalogue, frames: Path, **changes: object
-) -> tuple[JointFrameClassifier, EncoderData]:
-    data = encoder_data(frames, catalogue, PARTS)
-    setting = config(folder, "tuned", backbone=("timm",), feature_stage=2, **changes)
-    model, _ = finetune(data, setting, CPU, seed=0, inputs=[])
-    assert isinstance(model, JointFrameClassifier)
-    return model, data
+def test_training_above_trunks_is_training_through_the_whole_network(timm_folder: Path, data: EncoderData) -> None:
+    """Two epochs of AdamW on mirrored clips, against the classifier on the frames themselves.
 
-
-def test_training_above_trunks_is_training_through_the_whole_network(
-    timm_folder: Path, catalogue: Catalogue, tmp_path: Path
-) -> None:
-    """Two steps of AdamW on mirrored clips, against the classifier on the frames themselves."""
+    Statistics of batch normalisation stay those of the pretraining.
+    """
     write_pretrained()
-    data = encoder_data(tmp_path, catalogue, PARTS)
     setting = config(timm_folder, "tuned", backbone=("timm", "scenes"), feature_stage=2)
     videos = data.videos(Part.TRAIN)
-    states = []
+    states, fresh = [], base_encoder(setting).state_dict()
+    running = [name for name in fresh if "running" in name]
+    assert {name[:11] for name in running} == {"backbones.0", "backbones.1"}
     for cached in (True, False):
         seed_everything(0)
         model = property_classifier(setting, CLASSES).train()
@@ -227,6 +218,7 @@ def test_training_above_trunks_is_training_through_the_whole_network(
                 output["loss"].backward()
                 optimiser.step()
         states.append(trainable_state(model))
+        assert all(torch.equal(model.encoder.state_dict()[name], fresh[name]) for name in running)
     torch.testing.assert_close(states[0], states[1], rtol=1e-4, atol=1e-5)
 
 
@@ -234,13 +226,10 @@ def flip_of(of: Callable[[str, int], list[torch.Tensor]], video_id: str, outputs
     return next(f for f in range(4) if all(map(torch.equal, of(video_id, f), outputs)))
 
 
-def test_flips_are_drawn_by_seed_epoch_and_video(timm_folder: Path, catalogue: Catalogue, tmp_path: Path) -> None:
+def test_flips_are_drawn_by_seed_epoch_and_video(timm_folder: Path, data: EncoderData) -> None:
     """Each of the four a quarter of the time; without a seed none."""
-    data = encoder_data(tmp_path, catalogue, PARTS)
-    encoder = base_encoder(config(timm_folder, "tuned", backbone=("timm",), feature_stage=2))
-    assert isinstance(encoder, SideBySide)
     videos = data.videos(Part.TRAIN)
-    trunks = run_trunks(encoder, data, videos, DEVICE)
+    trunks = run_trunks(side_by_side(timm_folder), data, videos, DEVICE)
     items = TrunkDataset(trunks, videos, seed=3, flip_probability=0.5)
     drawn = []
     for epoch in range(80):
@@ -254,12 +243,9 @@ def test_flips_are_drawn_by_seed_epoch_and_video(timm_folder: Path, catalogue: C
 
 
 def test_trunks_too_large_for_memory_are_kept_in_float16(
-    timm_folder: Path, catalogue: Catalogue, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    timm_folder: Path, data: EncoderData, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    data = encoder_data(tmp_path, catalogue, PARTS)
-    encoder = base_encoder(config(timm_folder, "tuned", backbone=("timm",), feature_stage=2))
-    assert isinstance(encoder, SideBySide)
-    videos = data.videos(Part.TRAIN)
+    encoder, videos = side_by_side(timm_folder), data.videos(Part.TRAIN)
     model = JointFrameClassifier(encoder, CLASSES)
     exact = run_trunks(encoder, data, videos, DEVICE, flips=1)
     monkeypatch.setattr(tuned, "MEMORY", 0)
@@ -269,25 +255,16 @@ def test_trunks_too_large_for_memory_are_kept_in_float16(
     np.testing.assert_allclose(found, expected, atol=2e-3 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize(
-    ("start", "reached", "kept"), [(0.5, (0.5, 0.5), 0), (0.2, (0.1, 0.3), 2), (0.2, (0.4, 0.3), 1)]
-)
+@pytest.mark.parametrize(("reached", "kept"), [((0.5, 0.5, 0.5), 0), ((0.2, 0.1, 0.3), 2), ((0.2, 0.4, 0.3), 1)])
 def test_the_probe_is_epoch_0_and_wins_where_it_is_as_good(
-    start: float,
-    reached: tuple[float, ...],
-    kept: int,
-    timm_folder: Path,
-    catalogue: Catalogue,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    reached: tuple[float, ...], kept: int, timm_folder: Path, data: EncoderData, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    data = encoder_data(tmp_path, catalogue, PARTS)
     setting = config(timm_folder, "tuned", backbone=("timm",), feature_stage=2, epochs=2, batch_size=8)
     seed_everything(0)
     model = property_classifier(setting, data.classes)
     assert isinstance(model, JointFrameClassifier)
     seen: list[dict[str, torch.Tensor]] = []
-    script = iter((start, *reached))
+    script = iter(reached)
 
     def scripted(*_: object) -> dict[str, float]:
         seen.append({n: v.clone() for n, v in trainable_state(model).items()})
@@ -298,15 +275,12 @@ def test_the_probe_is_epoch_0_and_wins_where_it_is_as_good(
     history = tune(model, trunks, data, setting, CPU, seed=0, inputs=[])
     found = trainable_state(model)
     assert [all(torch.equal(v, found[n]) for n, v in epoch.items()) for epoch in seen] == [i == kept for i in range(3)]
-    assert [m.value for m in history if m.name == "validation_combined"] == [start, *reached]
+    assert [m.value for m in history if m.name == "validation_combined"] == list(reached)
 
 
-def test_what_is_tuned_is_saved_loaded_and_embeds_alike(
-    timm_folder: Path, catalogue: Catalogue, tmp_path: Path
-) -> None:
+def test_what_is_tuned_is_saved_loaded_and_embeds_alike(timm_folder: Path, data: EncoderData, tmp_path: Path) -> None:
     """The file holds less than the network; a model that is built anew says the same of every video."""
     write_pretrained()
-    data = encoder_data(tmp_path, catalogue, PARTS)
     setting = config(timm_folder, "tuned", backbone=("timm", "scenes"), feature_stage=2, epochs=2, learning_rate=1e-2)
     model, _ = finetune(data, setting, CPU, seed=0, inputs=[])
     save_trainable(model, tmp_path / "model.safetensors")
@@ -332,28 +306,11 @@ def test_what_is_tuned_is_saved_loaded_and_embeds_alike(
     assert kept < 0.9 * sum(p.numel() for p in model.parameters())
 
 
-def test_a_killed_tuning_ends_as_if_it_had_not_been(
-    timm_folder: Path, catalogue: Catalogue, tmp_path: Path, updates: dict[str, int]
-) -> None:
-    data = encoder_data(tmp_path, catalogue, PARTS)
-    setting = config(timm_folder, "tuned", backbone=("timm",), feature_stage=2, epochs=3, batch_size=2)
-    model, history = finetune(data, setting, CPU, seed=0, inputs=[])
-    assert updates["made"] == 9
-    updates.update(made=0, stop=5)
-    with pytest.raises(KeyboardInterrupt):
-        finetune(data, setting, CPU, seed=0, inputs=[])
-    updates.update(made=0, stop=-1)
-    resumed, again = finetune(data, setting, CPU, seed=0, inputs=[])
-    assert updates["made"] == 6, "the first epoch was done"
-    assert sorted((m.step, m.name, m.value) for m in again) == sorted((m.step, m.name, m.value) for m in history)
-    torch.testing.assert_close(trainable_state(resumed), trainable_state(model), rtol=0, atol=0)
-
-
 # The registry
 
 
 def test_a_new_backbone_is_a_module_and_a_line(
-    catalogue: Catalogue, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    data: EncoderData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Without a trunk of its own it trains, is saved and loaded, and embeds, beside another."""
     write_pretrained()
@@ -367,11 +324,9 @@ def test_a_new_backbone_is_a_module_and_a_line(
             embedded: torch.Tensor = self.layer(frames.float().mean((1, 2)) / 255)
             return F.relu(embedded)
 
-    module = ModuleType("toy_backbone")
-    module.load_backbone = lambda _, *, tuned: Toy().requires_grad_(tuned)  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "toy_backbone", module)
+    module = SimpleNamespace(load_backbone=lambda _, *, tuned: Toy().requires_grad_(tuned))
+    monkeypatch.setitem(sys.modules, "toy_backbone", module)  # type: ignore[misc]
     monkeypatch.setitem(BACKBONES, "toy", "toy_backbone")
-    data = encoder_data(tmp_path, catalogue, PARTS)
     setting = config(Path("none"), "tuned", backbone=("toy", "scenes"), epochs=1)
     model, history = finetune(data, setting, CPU, seed=0, inputs=[])
     assert "validation_combined" in {m.name for m in history}
@@ -402,30 +357,27 @@ def test_an_unknown_backbone_is_one_line() -> None:
         check_backbones(("scenes", "tim"))
 
 
+WEIGHTS, FORM = "model.safetensors", "config.json"
+
+
 @pytest.mark.parametrize(
-    ("broken", "message"),
+    ("damage", "message"),
     [
-        ("missing", "config.json does not exist"),
-        ("pickle", "model.safetensors does not exist; .*pickles are refused"),
-        ("disguised pickle", "does not fit its config.json"),
-        ("another network", "does not fit its config.json"),
-        ("stage", "feature_stage is 9, but the network in .* has stages 0 to"),
-        ("windows", "neither a CNN nor a plain vision transformer"),
+        (lambda f: (f / FORM).unlink(), "config.json does not exist"),
+        (lambda f: (f / WEIGHTS).rename(f / "x.bin"), "model.safetensors does not exist; .*pickles are refused"),
+        (lambda f: torch.save({"a": torch.zeros(1)}, f / WEIGHTS), "does not fit its config.json"),
+        (lambda f: edit(f / FORM, architecture="test_resnet"), "does not fit its config.json"),
     ],
+    ids=["no configuration", "pickle", "disguised pickle", "another network"],
 )
-def test_bad_weights_are_one_line(broken: str, message: str, tmp_path: Path) -> None:
-    folder, stage = tmp_path / "timm", 2
-    if broken != "missing":
-        write_timm(folder, "swin_s3_tiny_224" if broken == "windows" else "test_efficientnet")
-    match broken:
-        case "pickle":
-            (folder / "model.safetensors").rename(folder / "pytorch_model.bin")
-        case "disguised pickle":
-            torch.save({"a": torch.zeros(1)}, folder / "model.safetensors")
-        case "another network":
-            form = folder / "config.json"
-            form.write_text(form.read_text().replace("test_efficientnet", "test_resnet"))
-        case "stage":
-            stage = 9
+def test_bad_weights_are_one_line(damage: Callable[[Path], object], message: str, tmp_path: Path) -> None:
+    damage(write_timm(tmp_path / "timm"))
     with refused(message):
-        loaded(folder, stage)
+        loaded(tmp_path / "timm", 2)
+
+
+def test_a_stage_that_cannot_be_read_is_one_line(timm_folder: Path, tmp_path: Path) -> None:
+    with refused("feature_stage is 9, but the network in .* has stages 0 to"):
+        loaded(timm_folder, 9)
+    with refused("neither a CNN nor a plain vision transformer"):
+        loaded(write_timm(tmp_path / "windows", "swin_s3_tiny_224"), 2)

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-import math
+import hashlib
+import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from torch.optim.optimizer import register_optimizer_step_pre_hook
-from transformers import TrainerCallback, TrainingArguments
+import yaml
+from transformers import TrainerCallback
 
 from pipeline.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
 from pipeline.encoder import finetune as training
 from pipeline.encoder.clip import load_visual_tower
-from pipeline.encoder.clips import ClipDataset, LabelledVideo
+from pipeline.encoder.clips import ClipDataset, EncoderData, LabelledVideo
 from pipeline.encoder.embed import standardize, statistics, union
 from pipeline.encoder.finetune import accuracies, finetune, train_classifier, write_encoder_card
 from pipeline.encoder.frame_classifier import JointFrameClassifier
@@ -29,23 +31,13 @@ from pipeline.io import save_tensors, write_table
 from pipeline.records import Assignment, Embedding, Part
 from pipeline.runtime import seed_everything
 from pipeline.training.trainable import load_trainable, save_trainable, trainable_state
-from pipeline.training.trainer import TrainableTrainer
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
 from pipeline.weights import check_encoder, check_language
-from tests.checkpoints import write_clip, write_llama
+from tests.checkpoints import edit, write_clip, write_llama
 from tests.conftest import refused
-from tests.encoders import (
-    CPU,
-    FRAME_INDICES,
-    PARTS,
-    config,
-    encoder_data,
-    float64,
-    random_heads,
-    write_frames,
-    write_pretrained,
-)
+from tests.encoder.conftest import Hook
+from tests.encoders import CPU, FRAME_INDICES, PARTS, config, float64, random_heads, write_frames, write_pretrained
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
 
@@ -53,41 +45,30 @@ pytestmark = pytest.mark.usefixtures("elsewhere")
 # Training
 
 
-@pytest.mark.parametrize("wave", [1, 3])
-def test_the_wave_is_torchs_cosine_annealing_over_and_over(wave: int, tmp_path: Path) -> None:
-    def optimiser() -> torch.optim.Optimizer:
-        return torch.optim.AdamW([torch.nn.Parameter(torch.zeros(1))], lr=3e-3)
-
-    arguments = TrainingArguments(output_dir=str(tmp_path), use_cpu=True, report_to="none")
-    trainer = TrainableTrainer(model=torch.nn.Linear(1, 1), args=arguments, wave=wave)
-    mine, theirs = optimiser(), optimiser()
-    schedule = trainer.create_scheduler(1000, mine)
-    reference = torch.optim.lr_scheduler.CosineAnnealingLR(theirs, T_max=wave, eta_min=3e-5)
-    for _ in range(6 * wave + 1):
-        assert schedule.get_last_lr() == pytest.approx(reference.get_last_lr(), rel=1e-9)
-        for stepped in (mine, theirs, schedule, reference):
-            stepped.step()
-
-
-@pytest.fixture
-def rates() -> Iterator[list[float]]:
-    """The rate of each update of any optimiser."""
-    used: list[float] = []
-    handle = register_optimizer_step_pre_hook(lambda optimiser, *_: used.append(optimiser.param_groups[0]["lr"]))
-    yield used
-    handle.remove()
-
-
-@pytest.mark.parametrize("recipe", ["paper", "release"])
+@pytest.mark.parametrize(("recipe", "batch", "epoch"), [("paper", 2, 3), ("release", 2, 3), ("release", 8, 1)])
 def test_training_follows_its_recipe_and_leaves_the_backbone(
     recipe: str,
+    batch: int,
+    epoch: int,
     weights: Path,
-    catalogue: Catalogue,
-    tmp_path: Path,
-    rates: list[float],
+    data: EncoderData,
+    before_updates: Hook,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Batches of 2 of 5 videos make three updates an epoch; each epoch draws its own clips."""
+    """Rates are those of torch's cosine annealing, which in `release` goes on and on: down in an epoch, up in the next.
+
+    Batches of 2 of 5 videos make three updates an epoch, those of 8 one; each epoch draws its own clips.
+    """
+    theirs = torch.optim.AdamW([torch.nn.Parameter(torch.zeros(1))], lr=1e-3)
+    length, lowest = (epoch, 1e-5) if recipe == "release" else (4 * epoch, 0.0)
+    annealing = torch.optim.lr_scheduler.CosineAnnealingLR(theirs, T_max=length, eta_min=lowest)
+    expected: list[float] = []
+    for _ in range(4 * epoch):
+        expected += annealing.get_last_lr()
+        theirs.step()
+        annealing.step()
+    rates: list[float] = []
+    before_updates(lambda _, optimizer: rates.append(optimizer.param_groups[0]["lr"]))
     drawn: list[tuple[int, str]] = []
     draw = ClipDataset.__getitem__
 
@@ -97,17 +78,13 @@ def test_training_follows_its_recipe_and_leaves_the_backbone(
         return draw(self, index)
 
     monkeypatch.setattr(ClipDataset, "__getitem__", spy)
-    data, setting = encoder_data(tmp_path, catalogue, PARTS), config(weights, recipe, epochs=4, batch_size=2)
+    setting = config(weights, recipe, epochs=4, batch_size=batch)
     seed_everything(0)
     model = property_classifier(setting, data.classes)
     backbone = {n: v.clone() for n, v in model.encoder.visual.state_dict().items()}
     before = {n: v.clone() for n, v in trainable_state(model).items()}
     assert not model.train().encoder.visual.training
     train_classifier(model, data, setting, CPU, seed=1, inputs=[])
-    if recipe == "release":
-        expected = [1e-3 * (0.01 + 0.99 * (1 + math.cos(math.pi * s / 3)) / 2) for s in range(12)]
-    else:
-        expected = [1e-3 * (1 + math.cos(math.pi * s / 12)) / 2 for s in range(12)]
     assert rates == pytest.approx(expected, rel=1e-9)
     after = trainable_state(model)
     moved = (after["encoder.prompts.prompts"] - before["encoder.prompts.prompts"]).flatten(1).abs().amax(dim=1)
@@ -120,11 +97,11 @@ def test_training_follows_its_recipe_and_leaves_the_backbone(
 
 
 @pytest.mark.parametrize("recipe", ["paper", "release"])
-def test_accumulated_videos_weigh_alike(recipe: str, weights: Path, catalogue: Catalogue, tmp_path: Path) -> None:
+def test_accumulated_videos_weigh_alike(recipe: str, weights: Path, data: EncoderData, before_updates: Hook) -> None:
     """The gradient of five videos in an update is that of all at once, however they are divided; some parts are odd."""
-    data, gradients = encoder_data(tmp_path, catalogue, PARTS), list[torch.Tensor]()
-    kept = register_optimizer_step_pre_hook(
-        lambda optimizer, *_: gradients.append(
+    gradients: list[torch.Tensor] = []
+    before_updates(
+        lambda _, optimizer: gradients.append(
             torch.cat([p.grad.flatten() for p in optimizer.param_groups[0]["params"]])
         )
     )
@@ -136,17 +113,14 @@ def test_accumulated_videos_weigh_alike(recipe: str, weights: Path, catalogue: C
             if isinstance(module, torch.nn.Dropout):
                 module.p = 0.0
         train_classifier(model, data, setting, CPU, seed=1, inputs=[])
-    kept.remove()
     assert len(gradients) == 3
     for other in gradients[1:]:
         # The number of labels that the Trainer gives is float32's.
         torch.testing.assert_close(other, gradients[0], atol=1e-6 * float(gradients[0].abs().max()), rtol=0)
 
 
-def test_autocast_computes_in_bfloat16_and_learns_in_float32(
-    weights: Path, catalogue: Catalogue, tmp_path: Path
-) -> None:
-    data, formats = encoder_data(tmp_path, catalogue, PARTS), list[set[torch.dtype]]()
+def test_autocast_computes_in_bfloat16_and_learns_in_float32(weights: Path, data: EncoderData) -> None:
+    formats: list[set[torch.dtype]] = []
     for autocast in ("none", "bfloat16"):
         setting = config(weights, "paper", epochs=1, autocast=autocast)
         model = property_classifier(setting, data.classes)
@@ -163,16 +137,12 @@ def test_autocast_computes_in_bfloat16_and_learns_in_float32(
     ("reached", "kept"), [((0.1, 0.5, 0.5), 1), ((0.0, 0.0, 0.0), 0), ((0.1, 0.2, 0.3), 2), ((), 2)]
 )
 def test_the_first_of_the_best_epochs_is_kept(
-    reached: tuple[float, ...],
-    kept: int,
-    weights: Path,
-    catalogue: Catalogue,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    reached: tuple[float, ...], kept: int, weights: Path, data: EncoderData, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Without validation videos it is the last."""
-    parts = PARTS if reached else dict.fromkeys(PARTS, Part.TRAIN)
-    data, setting = encoder_data(tmp_path, catalogue, parts), config(weights, "paper", epochs=3)
+    setting = config(weights, "paper", epochs=3)
+    if not reached:
+        data = replace(data, assignments=[a.model_copy(update={"part": Part.TRAIN}) for a in data.assignments])
     model = property_classifier(setting, data.classes)
     seen: list[dict[str, torch.Tensor]] = []
 
@@ -187,7 +157,7 @@ def test_the_first_of_the_best_epochs_is_kept(
     found = trainable_state(model)
     assert [all(torch.equal(v, found[n]) for n, v in epoch.items()) for epoch in seen] == [i == kept for i in range(3)]
     assert [m.value for m in history if m.name == "validation_combined"] == list(reached)
-    assert not any(tmp_path.glob("checkpoints/*/*")), "a finished training leaves no checkpoint"
+    assert not any(Path("checkpoints").glob("*/*")), "a finished training leaves no checkpoint"
 
 
 def test_a_clip_depends_on_seed_epoch_and_video_alone(tmp_path: Path) -> None:
@@ -217,18 +187,17 @@ def test_validation_counts_videos_that_are_right_in_everything(catalogue: Catalo
 
 
 def test_a_new_recipe_is_a_module_and_a_line(
-    weights: Path, catalogue: Catalogue, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    weights: Path, data: EncoderData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It trains, is saved and loaded, and embeds, without another change."""
-    module = ModuleType("toy_recipe")
-    module.base_encoder = lambda _: SceneEncoder()  # type: ignore[attr-defined]
-    module.property_classifier = lambda _, classes: PropertyClassifier(  # type: ignore[attr-defined]
-        SceneEncoder(), Heads(256, classes), classes
+    module = SimpleNamespace(
+        base_encoder=lambda _: SceneEncoder(),
+        property_classifier=lambda _, classes: PropertyClassifier(SceneEncoder(), Heads(256, classes), classes),
     )
-    monkeypatch.setitem(sys.modules, "toy_recipe", module)
+    monkeypatch.setitem(sys.modules, "toy_recipe", module)  # type: ignore[misc]
     monkeypatch.setitem(RECIPES, "toy", "toy_recipe")
     check_recipe("toy")
-    data, setting = encoder_data(tmp_path, catalogue, PARTS), config(weights, "toy", epochs=1)
+    setting = config(weights, "toy", epochs=1)
     model, history = finetune(data, setting, CPU, seed=0, inputs=[])
     assert "validation_combined" in {m.name for m in history}
     save_trainable(model, tmp_path / "toy.safetensors")
@@ -242,13 +211,9 @@ def test_an_unknown_recipe_is_one_line() -> None:
 
 
 def test_the_card_names_weights_by_hash_data_and_settings_and_is_the_same_again(
-    weights: Path, catalogue: Catalogue, tmp_path: Path
+    weights: Path, data: EncoderData, tmp_path: Path
 ) -> None:
-    import hashlib
-
-    import yaml
-
-    data, setting = encoder_data(tmp_path, catalogue, PARTS), config(weights, "paper")
+    setting = config(weights, "paper")
     (weights / "README.md").write_text("---\nlicense: mit\n---\n")
     texts = []
     for folder in (tmp_path / "a", tmp_path / "b"):
@@ -322,51 +287,40 @@ def test_each_recipe_saves_what_is_its_own_and_reloads_exactly(
             load_trainable(property_classifier(*wrong), tmp_path / "model.safetensors")
 
 
+WEIGHTS, FORM = "open_clip_model.safetensors", "open_clip_config.json"
+
+
 @pytest.mark.parametrize(
-    ("broken", "message"),
+    ("damage", "message"),
     [
-        ("missing", "hf download timm"),
-        ("pickle", "pickles are refused"),
-        ("disguised pickle", "does not fit"),
-        ("small frames", r"frames\.size is 24 .* frames\.size=32$"),
-        ("another model", "does not fit its open_clip_config.json"),
-        ("a key of another release", "does not fit its open_clip_config.json"),
-        ("a text tower on a hub", "open_clip would ask a hub"),
-        ("language pickle", "only pickles"),
+        (lambda f: (f / WEIGHTS).rename(f / "open_clip_pytorch_model.bin"), "pickles are refused"),
+        (lambda f: torch.save({"a": torch.zeros(1)}, f / WEIGHTS), "does not fit"),
+        (lambda f: edit_clip(f, "vision_cfg", layers=3), "does not fit its open_clip_config.json"),
+        (lambda f: edit_clip(f, "vision_cfg", unheard_of=1), "does not fit its open_clip_config.json"),
+        (lambda f: edit_clip(f, "text_cfg", hf_model_name="xlm-roberta-base"), "open_clip would ask a hub"),
     ],
+    ids=["pickle", "disguised pickle", "another model", "a key of another release", "a text tower on a hub"],
 )
-def test_bad_weights_are_one_line(broken: str, message: str, tmp_path: Path) -> None:
-    folder = write_clip(tmp_path / "clip")
-    file, form = folder / "open_clip_model.safetensors", folder / "open_clip_config.json"
-    check_encoder(folder, 32, ("clip",))
-    match broken:
-        case "missing":
-            folder = tmp_path / "nothing"
-        case "pickle":
-            file.rename(folder / "open_clip_pytorch_model.bin")
-        case "disguised pickle":
-            torch.save({"a": torch.zeros(1)}, file)
-        case "another model":
-            form.write_text(form.read_text().replace('"layers": 2', '"layers": 3'))
-        case "a key of another release":
-            form.write_text(form.read_text().replace('"layers": 2', '"layers": 2, "unheard_of": 1', 1))
-        case "a text tower on a hub":
-            form.write_text(
-                form.read_text().replace('"text_cfg": {', '"text_cfg": {"hf_model_name": "xlm-roberta-base", ')
-            )
-        case "language pickle":
-            folder = write_llama(tmp_path / "llama")
-            (folder / "model.safetensors").rename(folder / "pytorch_model.bin")
-
-    def load() -> None:
-        if broken == "language pickle":
-            check_language(folder)
-        else:
-            check_encoder(folder, 24 if broken == "small frames" else 32, ("clip",))
-            load_visual_tower(folder)
-
+def test_bad_weights_are_one_line(damage: Callable[[Path], object], message: str, tmp_path: Path) -> None:
+    check_encoder(write_clip(tmp_path), 32, ("clip",))
+    damage(tmp_path)
     with refused(message):
-        load()
+        check_encoder(tmp_path, 32, ("clip",))
+        load_visual_tower(tmp_path)
+
+
+def edit_clip(folder: Path, part: str, **changes: object) -> None:
+    model = json.loads((folder / FORM).read_text())["model_cfg"]
+    edit(folder / FORM, model_cfg=model | {part: model[part] | changes})
+
+
+def test_small_frames_and_a_language_model_of_pickles_are_one_line(tmp_path: Path) -> None:
+    with refused(r"frames\.size is 24 .* frames\.size=32$"):
+        check_encoder(write_clip(tmp_path / "clip"), 24, ("clip",))
+    folder = write_llama(tmp_path / "llama")
+    (folder / "model.safetensors").rename(folder / "pytorch_model.bin")
+    with refused("only pickles"):
+        check_language(folder)
 
 
 # Embeddings

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,16 +11,13 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
-from torch.optim.optimizer import register_optimizer_step_pre_hook
 
-from pipeline.config import CrossValidationConfig, EncoderConfig, FramesConfig, PretrainConfig, RuntimeConfig
+from pipeline.config import EncoderConfig, FramesConfig, PretrainConfig, RuntimeConfig
 from pipeline.encoder import pretrain as pretraining
-from pipeline.encoder.candidates import CANDIDATES
 from pipeline.encoder.clips import EncoderData, classify, describe_clips
-from pipeline.encoder.cross_validation import CrossValidationData, cross_validate_candidate
 from pipeline.encoder.embed import Loaded, embed_videos
-from pipeline.encoder.finetune import fit_heads, train_classifier
-from pipeline.encoder.frame_classifier import STRENGTHS, JointFrameClassifier, fit_frame_heads
+from pipeline.encoder.finetune import finetune, train_classifier
+from pipeline.encoder.frame_classifier import JointFrameClassifier
 from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
 from pipeline.encoder.pretrain import WEIGHTS, PretrainingModel, pretrain
 from pipeline.encoder.recipes import property_classifier
@@ -32,8 +29,9 @@ from pipeline.runtime import seed_everything
 from pipeline.training.trainable import trainable_state
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
-from tests.conftest import fake_videos, refused
-from tests.encoders import CPU, OBJECTS, PARTS, config, encoder_data, write_frames
+from tests.conftest import refused
+from tests.encoder.conftest import Hook, killed_at
+from tests.encoders import CPU, PARTS, config, encoder_data, write_timm
 
 CLASSES = [3, 3, 3]
 DEVICE = torch.device("cpu")
@@ -65,6 +63,10 @@ def training(kind: str, weights: Path, data: EncoderData, **changes: object) -> 
         factor: float = 1.0, model: PropertyClassifier | None = None
     ) -> tuple[list[Measurement], dict[str, torch.Tensor]]:
         """With the learning rate times `factor`."""
+        if kind == "tuned":
+            tuned = config(write_timm(Path("timm")), "tuned", backbone=("timm",), feature_stage=2, **changes)
+            model, history = finetune(data, tuned, CPU, seed=0, inputs=[])
+            return history, trainable_state(model)
         setting = settings(kind, weights, **changes)
         setting = setting.model_copy(update={"learning_rate": factor * setting.learning_rate})
         model = model or classifier(kind, weights)
@@ -78,73 +80,24 @@ def same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> None:
     torch.testing.assert_close(one, other, rtol=0, atol=0)
 
 
-Hook = Callable[[Callable[[int], None]], None]
-
-
-@pytest.fixture
-def before_updates() -> Iterator[Hook]:
-    """Has something called before each update of any optimiser, with the number of updates made."""
-    handles = []
-
-    def register(call: Callable[[int], None]) -> None:
-        made = iter(range(10**6))
-        handles.append(register_optimizer_step_pre_hook(lambda *_: call(next(made))))
-
-    yield register
-    for handle in handles:
-        handle.remove()
-
-
-def killed_at(*updates: int, begun: list[int]) -> Callable[[int], None]:
-    """Dies at these updates; keeps all that were begun."""
-
-    def kill(number: int) -> None:
-        begun.append(number)
-        if number in updates:
-            raise KeyboardInterrupt
-
-    return kill
-
-
 # Lacking classes
 
 HARD = dict.fromkeys(("baseball", "controller_base", "potato", "ice_block"), Part.TRAIN)
 """All of the highest hardness; none of the highest bumpiness."""
 
 
-@pytest.mark.parametrize("kind", [*GRADIENTS, "probe"])
+@pytest.mark.parametrize("kind", GRADIENTS)
 def test_a_class_that_training_lacks_does_not_stop_it(
     kind: str, weights: Path, catalogue: Catalogue, tmp_path: Path
 ) -> None:
     assert {catalogue.labels(o)[0] for o in HARD} == {2}
     data = encoder_data(tmp_path, catalogue, {**HARD, "pillow": Part.VALIDATION, "rug": Part.TEST})
-    if kind == "probe":
-        model: PropertyClassifier = JointFrameClassifier(SceneEncoder(), CLASSES)
-        history = fitted(model, data)
-        assert [m.name for m in history] == ["inner_combined"] * len(STRENGTHS)
-    else:
-        model = classifier(kind, weights)
-        history, _ = training(kind, weights, data, epochs=2)(model=model)
+    model = classifier(kind, weights)
+    history, _ = training(kind, weights, data, epochs=2)(model=model)
     assert all(np.isfinite(m.value) for m in history)
     judged = classify(model, data, [Part.TEST], 4, DEVICE)
     assert [r.expected for r in judged] == list(catalogue.labels("rug"))
     assert all(np.isfinite(r.probabilities).all() and min(r.probabilities) > 0 for r in judged)
-    if kind == "probe":
-        assert judged[0].predicted == 2
-        assert judged[0].probabilities[:2] == pytest.approx((0, 0), abs=1e-3)
-
-
-def fitted(model: PropertyClassifier, data: EncoderData) -> list[Measurement]:
-    """The curve of heads fitted to what the model's encoder says."""
-    assert isinstance(model, JointFrameClassifier)
-    videos = data.videos(Part.TRAIN)
-    return fit_heads(model, describe_clips(model.encoder, data, videos, 4, DEVICE), videos, data, 0)
-
-
-def test_a_single_video_fits() -> None:
-    clips = np.random.default_rng(0).normal(size=(1, 3, 4)).astype(np.float32)
-    heads = fit_frame_heads(clips, np.array([[2, 0]]), ["a"], [3, 2], STRENGTHS[0])
-    assert heads.predict(clips).tolist() == heads.predict(-1e6 * clips).tolist() == [[2, 0]]
 
 
 # NaN
@@ -175,7 +128,7 @@ def with_a_bright_video(folder: Path, catalogue: Catalogue, parts: dict[str, Par
 def test_what_is_not_finite_is_named_by_its_video(
     value: float, weights: Path, catalogue: Catalogue, tmp_path: Path
 ) -> None:
-    """Embeddings, logits in batches of any size, and features that heads are fitted to."""
+    """Embeddings, logits in batches of any size, and the features that heads are fitted to."""
     data = with_a_bright_video(tmp_path, catalogue, PARTS, "pillow_0")
     with pytest.raises(UserError, match=r"^pillow_0: .*not finite"):
         embed_videos(Loaded(Sick(value), data.store, DEVICE, 3), data.assignments)
@@ -191,21 +144,18 @@ def test_what_is_not_finite_is_named_by_its_video(
         with pytest.raises(UserError, match=r"^pillow_0: .*not finite"):
             classify(JointFrameClassifier(Sick(value), CLASSES), data, list(Part), batch, DEVICE)
     with pytest.raises(UserError, match="pillow_0"):
-        fitted(JointFrameClassifier(Sick(value), CLASSES), data)
+        describe_clips(Sick(value), data, data.videos(Part.TRAIN), 4, DEVICE)
 
 
 # Rates that are too high
 
 
 @pytest.mark.parametrize("kind", GRADIENTS)
-def test_a_rate_too_high_ends_finite_or_in_one_line(
-    kind: str, weights: Path, catalogue: Catalogue, tmp_path: Path
-) -> None:
+def test_a_rate_too_high_ends_finite_or_in_one_line(kind: str, weights: Path, data: EncoderData) -> None:
     """Params allow no rate from 10 on; a model may be as badly scaled all the same.
 
     A batch of eight makes the first update the last: what diverges in it is told too.
     """
-    data = encoder_data(tmp_path, catalogue, PARTS)
     run = training(kind, weights, data, epochs=1, batch_size=1)
     for factor in (100, 1e6):
         history, state = run(factor)
@@ -218,13 +168,13 @@ def test_a_rate_too_high_ends_finite_or_in_one_line(
 
 
 def test_a_loss_that_is_no_number_stops_the_training_and_leaves_the_last_checkpoint(
-    weights: Path, catalogue: Catalogue, tmp_path: Path, before_updates: Hook
+    weights: Path, data: EncoderData, tmp_path: Path, before_updates: Hook
 ) -> None:
-    run = training("paper", weights, encoder_data(tmp_path, catalogue, PARTS), epochs=4, batch_size=2)
+    run = training("paper", weights, data, epochs=4, batch_size=2)
     _, smooth = run()
     model = classifier("paper", weights)
 
-    def poison(update: int) -> None:
+    def poison(update: int, _: torch.optim.Optimizer) -> None:
         if update == 7:  # The second of the third epoch's three.
             torch.nn.init.constant_(next(iter(model.heads.parameters())), float("inf"))
 
@@ -242,17 +192,22 @@ def in_order(history: list[Measurement]) -> list[tuple[int, str, float]]:
     return sorted((m.step, m.name, m.value) for m in history)
 
 
-@pytest.mark.parametrize(("kind", "validated"), [("paper", True), ("release", True), ("scratch", False)])
+@pytest.mark.parametrize(
+    ("kind", "validated"), [("paper", True), ("release", True), ("scratch", False), ("tuned", True)]
+)
 def test_a_killed_training_ends_as_if_it_had_not_been(
     kind: str, validated: bool, weights: Path, catalogue: Catalogue, tmp_path: Path, before_updates: Hook
 ) -> None:
-    """Killed in the second epoch, and again in the third; release drops units at random."""
+    """Killed in the second epoch, and again in the third.
+
+    `release` drops units at random, `tuned` trains above what its trunk makes of mirrored frames.
+    """
     parts = PARTS if validated else dict.fromkeys(PARTS, Part.TRAIN)
     run = training(kind, weights, encoder_data(tmp_path, catalogue, parts), epochs=3, batch_size=2)
     epoch = 3 if validated else 4
     history, state = run()
     begun: list[int] = []
-    before_updates(killed_at(epoch + 1, 2 * epoch + 2, begun=begun))
+    before_updates(killed_at([epoch + 1, 2 * epoch + 2], begun))
     for number in (1, 2):
         with pytest.raises(KeyboardInterrupt):
             run()
@@ -285,12 +240,12 @@ def flip(file: Path) -> None:
 
 
 def test_a_damaged_checkpoint_is_passed_over(
-    weights: Path, catalogue: Catalogue, tmp_path: Path, before_updates: Hook, caplog: pytest.LogCaptureFixture
+    weights: Path, data: EncoderData, tmp_path: Path, before_updates: Hook, caplog: pytest.LogCaptureFixture
 ) -> None:
     """One that was being written, however far it had come; or cut short, or with a byte changed: a checksum tells."""
-    run = training("release", weights, encoder_data(tmp_path, catalogue, PARTS), epochs=3, batch_size=2)
+    run = training("release", weights, data, epochs=3, batch_size=2)
     history, whole = run()
-    before_updates(killed_at(7, begun=[]))
+    before_updates(killed_at([7], []))
     with pytest.raises(KeyboardInterrupt):
         run()
     shutil.copytree(tmp_path / "checkpoints", tmp_path / "kept")
@@ -309,11 +264,10 @@ def test_a_damaged_checkpoint_is_passed_over(
 
 
 def test_a_corrected_label_begins_anew(
-    weights: Path, catalogue: Catalogue, tmp_path: Path, before_updates: Hook
+    weights: Path, data: EncoderData, catalogue: Catalogue, before_updates: Hook
 ) -> None:
-    data = encoder_data(tmp_path, catalogue, PARTS)
     begun: list[int] = []
-    before_updates(killed_at(4, begun=begun))
+    before_updates(killed_at([4], begun))
     with pytest.raises(KeyboardInterrupt):
         training("paper", weights, data, epochs=2, batch_size=2)()
     rated = data.assignments[0].object_id
@@ -352,7 +306,7 @@ def test_a_killed_pretraining_ends_as_if_it_had_not_been(killed: int, tmp_path: 
     encoder, history = pretrained(8, 2)
     shutil.rmtree("checkpoints")
     begun: list[int] = []
-    before_updates(killed_at(killed, begun=begun))
+    before_updates(killed_at([killed], begun))
     with pytest.raises(KeyboardInterrupt):
         pretrained(8, 2)
     assert [f.name for f in tmp_path.glob("checkpoints/pretrain/*/*")] == [f"checkpoint-{killed - 1}"]
@@ -370,7 +324,7 @@ def test_what_diverges_between_two_reports_replaces_no_good_checkpoint(
     original: Callable[[SceneEncoder, SyntheticPictures], PretrainingModel] = pretraining.pretraining_model
     monkeypatch.setattr(pretraining, "pretraining_model", lambda *given: made.append(original(*given)) or made[-1])
 
-    def poison(update: int) -> None:
+    def poison(update: int, _: torch.optim.Optimizer) -> None:
         if update == 41:
             torch.nn.init.constant_(made[-1].head[1].weight, float("inf"))
 
@@ -392,24 +346,3 @@ def test_a_tiny_pretraining_draws_trains_and_tells_what_it_left_aside(tmp_path: 
     assert all(v.isfinite().all() for v in trainable_state(encoder).values())
     counts = [int(b) for n, b in encoder.named_buffers() if n.endswith("num_batches_tracked")]
     assert counts == [4] * len(CHANNELS), "the object left aside has touched no statistics"
-
-
-# Too few objects
-
-
-def test_two_objects_are_too_few_for_five_folds_and_enough_for_two(
-    weights: Path, catalogue: Catalogue, tmp_path: Path
-) -> None:
-    """With one object to train on none is left to validate by."""
-    videos = fake_videos(OBJECTS[1:3], 2)
-    frames = write_frames(tmp_path / "frames", {v.video_id: 1 for v in videos})
-    data = CrossValidationData(
-        videos=videos,
-        catalogue=catalogue,
-        frames=frames,
-        recordings=frames,
-        per_video=1,
-        encoder=EncoderConfig(weights=str(weights), epochs=1),
-        runtime=CPU,
-    )
-    assert len(cross_validate_candidate(CANDIDATES["paper"], data, CrossValidationConfig(folds=2, repeats=1))) == 4

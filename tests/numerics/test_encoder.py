@@ -208,13 +208,7 @@ def test_the_network_is_seven_convolutions_of_what_differs_from_128(check: Check
     def found(f: Format) -> torch.Tensor:
         return cast(torch.Tensor, encoder("tuned", f)(shown, TIMES))
 
-    check(
-        "scenes: against folded convolutions",
-        FLOAT32,
-        found,
-        2 * network("tuned", "noise", FLOAT32),
-        exact.numpy(),
-    )
+    check("scenes: against folded convolutions", FLOAT32, found, 2 * network("tuned", "noise", FLOAT32), exact.numpy())
 
 
 @pytest.mark.parametrize("kind", CLASSIFIERS)
@@ -239,7 +233,7 @@ def test_classifications_do_not_depend_on_the_batch(
 
 
 @pytest.mark.parametrize("kind", CLASSIFIERS)
-def test_a_video_of_one_frame_is_that_frame_repeated(check: Check, kind: str, tmp_path: Path) -> None:
+def test_a_video_of_one_frame_is_that_frame_repeated(kind: str, tmp_path: Path) -> None:
     """The mean of equal features is off by what a sum of five rounds."""
     store = FrameStore(write_frames(tmp_path, {"long_0": 4, "short_0": 1}))
     video, model = LabelledVideo("short_0", (0, 1, 2)), classifier(kind).eval()
