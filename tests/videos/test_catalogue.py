@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
 from collections import Counter
 from collections.abc import Callable, Sequence
+from decimal import ROUND_HALF_UP, Decimal
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +49,12 @@ def test_release_split_differs_as_published(catalogue: Catalogue) -> None:
 
 
 def test_a_label_is_the_rounded_mean_of_the_ratings(catalogue: Catalogue) -> None:
-    assert (catalogue.objects["gauze_pad"].ratings[0], catalogue.labels("gauze_pad")[0]) == ((1, 2, 2), 2)
+    gauze = catalogue.objects["gauze_pad"]
+    assert (gauze.ratings[0], catalogue.labels("gauze_pad")[0]) == ((1, 2, 2), 2)
+    for ratings in (r for raters in range(1, 5) for r in itertools.product(range(4), repeat=raters)):
+        mean = Decimal(sum(ratings)) / len(ratings)
+        expected = int(mean.quantize(Decimal(1), ROUND_HALF_UP))
+        assert gauze.model_copy(update={"ratings": (ratings,)}).labels == (expected,)
 
 
 def test_descriptions_name_every_class_and_no_other(catalogue: Catalogue) -> None:
