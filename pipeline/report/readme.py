@@ -230,7 +230,7 @@ def _touch(effects: pd.DataFrame, solved: Collection[str]) -> list[str]:
         return [f"Answers use touch in {', '.join(dict.fromkeys(sure['task']))}: {fact}.{none if rest else ''}"]
     if len(likely):
         some = f"{len(likely)} of {len(rows)} intervals lie above 0, none is significant after Holm's adjustment"
-        return [f"Answers seem to use touch: {fact}; {some}{_impossible(effects)}."]
+        return [f"Answers may use touch: {fact}; {some}{_impossible(effects)}."]
     none = "none significant after Holm's adjustment where real touch brings more than chance"
     return [f"That answers use touch is not shown: {fact}, {none}{_impossible(effects)}."]
 

@@ -81,7 +81,7 @@ TOUCH = {"part": "touch", "change": "real - swapped"}
             [effect(**TOUCH, p_holm=0.01, low=0.02)],
             "Answers use touch in PC: with real touch, against touch that was swapped, accuracy differs by +10.0 to",
         ),
-        ([effect(**TOUCH, low=0.02)], "Answers seem to use touch: with real touch, against touch that was swapped"),
+        ([effect(**TOUCH, low=0.02)], "Answers may use touch: with real touch, against touch that was swapped"),
         ([effect(**TOUCH)], "That answers use touch is not shown: with real touch, against touch that was swapped"),
         ([effect(**TOUCH, p_holm=0.01, difference=-0.1, low=-0.2)], "That answers use touch is not shown"),
         (
