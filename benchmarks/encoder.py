@@ -100,7 +100,7 @@ def measure(root: Path, size: Size | None = None) -> list[Row]:
         )
     with one_thread(), TemporaryDirectory() as made:
         frames = Path(made) / "frames"
-        config = FramesConfig(selection="salient", size=SIDE)
+        config = FramesConfig(selection="salient", pixels=SIDE)
         videos = extract_frames(folder, catalogue, config, frames, Path(made) / "partial").videos
         bed = Bed(
             videos=videos,

@@ -93,7 +93,7 @@ def _classifier(candidate: Candidate, bed: Bed) -> PropertyClassifier:
 
 
 def _scan(file: VideoFile) -> Scan:
-    found = scan(file, FramesConfig(selection="salient", size=SIDE))
+    found = scan(file, FramesConfig(selection="salient", pixels=SIDE))
     assert isinstance(found, Scan), "all videos were extracted before"
     return found
 

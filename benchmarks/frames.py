@@ -71,7 +71,7 @@ def extraction(folder: Path, catalogue: Catalogue, repeats: int) -> list[Row]:
     def extract(rule: Selection, size: int) -> Callable[[object], None]:
         def run(_: object) -> None:
             with TemporaryDirectory() as out:
-                config = FramesConfig(selection=rule, size=size, fraction=FRACTION)
+                config = FramesConfig(selection=rule, pixels=size, fraction=FRACTION)
                 extract_frames(folder, catalogue, config, Path(out) / "frames", Path(out) / "partial")
 
         return run
@@ -182,7 +182,7 @@ def _sample(file: VideoFile) -> Sample | None:
     for setting in SETTINGS:
         key = setting.rule, setting.tolerance
         if key not in passes:
-            config = FramesConfig(selection=setting.rule, fraction=FRACTION, tolerance=setting.tolerance, size=SMALL)
+            config = FramesConfig(selection=setting.rule, fraction=FRACTION, tolerance=setting.tolerance, pixels=SMALL)
             found: list[object] = []
             spent = milliseconds(lambda config=config, found=found: found.append(scan(file, config)))  # type: ignore[misc]
             if not isinstance(found[0], Scan) or not found[0].kept:

@@ -102,10 +102,11 @@ class FramesConfig(Section):
     """Frames drawn of those that are kept (paper: 5)."""
     tolerance: Annotated[float, Field(ge=0, le=10)] = 0.8
     """`adaptive`: what a further frame must add to be kept, as a share of the strongest contact."""
-    size: Annotated[int, Field(ge=16, le=1024)] = 224
-    """Side of the square that frames are stored at; a CLIP's own or more, as larger frames are averaged."""
+    pixels: Annotated[int, Field(ge=16, le=1024)] = 224
+    """Side of the square that frames are stored at; a CLIP's own or more, as larger frames are averaged. No key may be
+    called `size` or `nfiles`: DVC's run cache leaves those out, and would bring back frames of another size."""
     fit: Literal["crop", "squash"] = "crop"
-    """`crop`: the centre, then to `size`. `squash`: the whole frame, aspect lost."""
+    """`crop`: the centre, then to `pixels`. `squash`: the whole frame, aspect lost."""
 
 
 class SplitConfig(Section):

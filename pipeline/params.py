@@ -13,6 +13,8 @@ from pipeline.config import Params
 from pipeline.errors import UserError, did_you_mean
 
 PARAMS_FILE = Path("params.yaml")
+RENAMED = {"frames.size": "frames.pixels"}
+"""What a parameter was called before, and what it is called now."""
 
 
 def load_params(path: Path = PARAMS_FILE) -> Params:
@@ -51,6 +53,8 @@ def explain(error: ValidationError) -> str:
     detail = error.errors(include_url=False)[0]
     key = ".".join(str(part) for part in detail["loc"])
     if detail["type"] == "extra_forbidden":
+        if key in RENAMED:
+            return f"{key} is called {RENAMED[key]} now; write that name"
         known = _known_keys(detail["loc"])
         hint = did_you_mean(str(detail["loc"][-1]), known)
         return f"{key} is not a parameter; {hint}allowed here: {', '.join(known)}"

@@ -98,7 +98,7 @@ def check_inputs(params: Params) -> None:
     catalogue = load_catalogue(Path(params.data.catalogue))
     check_recipe(params.encoder.recipe)
     check_backbones(params.encoder.backbone)
-    check_candidates(params.cross_validation.models, params.encoder, params.frames.size)
+    check_candidates(params.cross_validation.models, params.encoder, params.frames.pixels)
     counts_by_task(params.questions, "train")
     counts_by_task(params.questions, "evaluation")
     launcher = shlex.split(params.runtime.launcher)
@@ -119,7 +119,7 @@ def check_inputs(params: Params) -> None:
         raise UserError(f"scenes.objects: {unknown[0]} is not in {params.data.catalogue}/objects.csv")
     check_objects(params, catalogue)
     backbone = params.encoder.backbone
-    weights.check_encoder(Path(params.encoder.weights), params.frames.size, backbone)
+    weights.check_encoder(Path(params.encoder.weights), params.frames.pixels, backbone)
     check_encoder_files(Path(params.encoder.weights), backbone)
     if params.language.weights == TAUGHT and not params.teach.base:
         raise UserError(f"language.weights: {TAUGHT} is what teaching makes; name the model to teach in teach.base")

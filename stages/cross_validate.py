@@ -15,7 +15,7 @@ def main() -> None:
     (name,) = matrix_key(model=CANDIDATES)
     with stage("cross_validate", name) as run:
         params = run.params
-        check_encoder(Path(params.encoder.weights), params.frames.size, params.encoder.backbone)
+        check_encoder(Path(params.encoder.weights), params.frames.pixels, params.encoder.backbone)
         catalogue = load_catalogue(Path(params.data.catalogue))
         data = CrossValidationData(
             videos=read_table(DATA / "videos.parquet", Video),

@@ -41,7 +41,7 @@ def write(run: Stage, key: str, split: Sequence[Assignment], raw: torch.Tensor, 
 def main() -> None:
     with stage("embed") as run:
         params = run.params
-        check_encoder(Path(params.encoder.weights), params.frames.size, params.encoder.backbone)
+        check_encoder(Path(params.encoder.weights), params.frames.pixels, params.encoder.backbone)
         splits = {seed: read_table(DATA / "splits" / f"{seed}.parquet", Assignment) for seed in params.ablation.seeds}
         for which in params.ablation.encoders:
             if which is Encoder.BASE:

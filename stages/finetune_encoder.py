@@ -20,7 +20,7 @@ def main() -> None:
     (seed,) = matrix_key(seed=None)
     with stage("finetune_encoder", str(seed)) as run:
         params = run.params
-        check_encoder(Path(params.encoder.weights), params.frames.size, params.encoder.backbone)
+        check_encoder(Path(params.encoder.weights), params.frames.pixels, params.encoder.backbone)
         split = DATA / "splits" / f"{seed}.parquet"
         data = EncoderData(
             store=FrameStore(DATA / "frames", params.encoder.reference),

@@ -105,6 +105,6 @@ def recorded(object_id: str, seed: int, sensor: int = 0) -> list[np.ndarray]:
 
 
 def look_at(path: Path, video_id: str) -> Probe:
-    found = scan(VideoFile(path, path.name, video_id.rpartition("_")[0], video_id), FramesConfig(size=16))
+    found = scan(VideoFile(path, path.name, video_id.rpartition("_")[0], video_id), FramesConfig(pixels=16))
     assert isinstance(found, Scan)
     return found.probe

@@ -108,7 +108,7 @@ def spoilt(write: Callable[[Path], Path], file: str, change: Callable[[bytes], b
 
 
 NOT_THERE = "(no such file|does not exist).*dvc repro"
-CLIP, LLAMA = "scale smoke encoder.weights=weights frames.size=32", "scale smoke language.weights=weights"
+CLIP, LLAMA = "scale smoke encoder.weights=weights frames.pixels=32", "scale smoke language.weights=weights"
 
 
 def bad_inputs() -> Iterator[BadInput]:

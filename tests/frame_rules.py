@@ -17,7 +17,7 @@ from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.decoding import Decoder, planes
 from pipeline.videos.frames.extract import Extraction, extract_frames
 
-CONFIG = FramesConfig(size=16)
+CONFIG = FramesConfig(pixels=16)
 FILES = ("frames.npy", "references.npy", "frames.parquet", "probes.parquet")
 
 

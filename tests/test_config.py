@@ -44,6 +44,7 @@ def test_committed_params_are_the_default_scale() -> None:
     [
         (["frames.per_vido=1"], ["frames.per_vido", "did you mean per_video"]),
         (["nothing=1"], ["nothing", "allowed here"]),
+        (["frames.size=64"], ["frames.size is called frames.pixels now"]),
         (["frames.per_video=0"], ["frames.per_video", "greater than or equal to 1"]),
         (["frames.fraction=1.5"], ["frames.fraction", "less than or equal to 1"]),
         (["split.name='Side ways'"], ["split.name", "Side ways", "pattern"]),
@@ -80,6 +81,7 @@ def test_wrong_override_is_one_line_with_key_and_mend(overrides: list[str], word
         (b"", "octopi scale smoke"),
         (b"scale: [", "not YAML"),
         (b"scale: smoke\n", "missing"),
+        ((ROOT / "params.yaml").read_bytes().replace(b"  pixels:", b"  size:"), "frames.size is called frames.pixels"),
         (b"seed: 1\nseed: 2\n", "seed stands twice"),
         (b"align: {epochs: 1, epochs: 2}\n", "epochs stands twice"),
         ("scale: smoke\n".encode("utf-16"), "not UTF-8"),
@@ -121,7 +123,7 @@ def test_any_folder_may_hold_the_videos(name: str, tmp_path: Path) -> None:
         ("smoke language.weights=nowhere", "hf download lmsys"),
         ("small teach.base=", "language.weights: data/taught is what teaching makes.*teach.base"),
         ("smoke scenes.objects=[unicorn]", "scenes.objects: unicorn"),
-        ("smoke frames.size=48", "frames.size"),
+        ("smoke frames.pixels=48", "frames.pixels"),
         ("smoke cross_validation.models=[papers]", "papers is no model; did you mean paper"),
         (
             "smoke encoder.recipe=release cross_validation.models=[trees,paper]",

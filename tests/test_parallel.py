@@ -50,7 +50,7 @@ def main():
         import ray
         ray.init(num_cpus=2, log_to_driver=False)
     use_backend(backend)
-    extract_frames(Path(videos), load_catalogue(Path(catalogue)), FramesConfig(size=16), Path("out"), Path("partial"))
+    extract_frames(Path(videos), load_catalogue(Path(catalogue)), FramesConfig(pixels=16), Path("out"), Path("partial"))
     jobs = list(range(70))
     results = list(run_parallel(fails, jobs, "numbers", "number"))
     assert [job for job, _ in results] == jobs

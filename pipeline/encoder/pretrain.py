@@ -122,17 +122,17 @@ def pretrain(
 ) -> tuple[SceneEncoder, list[Measurement]]:
     """Draw the pictures and train the encoder on them; a killed run goes on where it was.
 
-    The pictures are as large as the encoder will see frames: `frames.size`, or its own side where that is larger.
+    The pictures are as large as the encoder will see frames: `frames.pixels`, or its own side where that is larger.
 
     Returns:
         The encoder, and the curve of its loss; `held_out_*` at the last step are over objects that it never saw.
     """
     seed_everything(config.seed)
-    frames = frames.model_copy(update={"size": min(frames.size, SIDE)})
+    frames = frames.model_copy(update={"pixels": min(frames.pixels, SIDE)})
     # What decides how pictures look, so that half of them are never drawn by one version and half by another.
     code = [*sorted(Path(invent.__file__).parent.rglob("*.py")), Path(synthetic.__file__), Path(subtraction.__file__)]
     shown = repr((config.objects, config.presses, config.seed))
-    work = CHECKPOINTS / "pretrain" / f"pictures-{fingerprint(shown, frames.fit, frames.size, *code)}"
+    work = CHECKPOINTS / "pretrain" / f"pictures-{fingerprint(shown, frames.fit, frames.pixels, *code)}"
     drawn = draw_pictures(config, frames, work)
     border = len(drawn.pictures) - max(1, round(HELD_OUT * len(drawn.pictures)))
     training, held = (
@@ -141,7 +141,7 @@ def pretrain(
     )
     model = pretraining_model(SceneEncoder(), training)
     arguments = training_arguments(
-        checkpoint_dir("pretrain", fingerprint(config, frames.fit, frames.size, *code)),
+        checkpoint_dir("pretrain", fingerprint(config, frames.fit, frames.pixels, *code)),
         runtime,
         config.seed,
         max_steps=config.steps,

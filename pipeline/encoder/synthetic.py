@@ -178,6 +178,6 @@ def _fit(picture: Image, frames: FramesConfig) -> Image:
     if frames.fit == "crop":
         left = (WIDTH - HEIGHT) // 2
         picture = picture[:, left : left + HEIGHT]
-    way = cv2.INTER_AREA if frames.size < HEIGHT else cv2.INTER_LINEAR
-    fitted: Image = cv2.resize(picture, (frames.size, frames.size), interpolation=way)
+    way = cv2.INTER_AREA if frames.pixels < HEIGHT else cv2.INTER_LINEAR
+    fitted: Image = cv2.resize(picture, (frames.pixels, frames.pixels), interpolation=way)
     return fitted

@@ -31,7 +31,7 @@ from pipeline.videos.catalogue import Catalogue
 if TYPE_CHECKING:
     from transformers import PreTrainedTokenizerBase
 
-FORMAT = 1
+FORMAT = 2
 CONFIG, CATALOGUE = "config.json", "catalogue.json"
 ENCODER_DIR, LANGUAGE_DIR, BASE_DIR, BACKBONE_DIR = "encoder", "language", "base", "backbone"
 TRAINED, SCENES = "encoder.safetensors", "scenes.safetensors"

@@ -168,7 +168,7 @@ def _to_be_made(folder: Path, kind: str, key: str) -> bool:
 def _check_size(folder: Path, size: int, wanted: int) -> None:
     if size < wanted:
         raise UserError(
-            f"frames.size is {size} but the encoder in {folder} takes {wanted} or more; set frames.size={wanted}"
+            f"frames.pixels is {size} but the encoder in {folder} takes {wanted} or more; set frames.pixels={wanted}"
         )
 
 

@@ -46,7 +46,7 @@ from pipeline.videos.frames.subtraction import subtract
 from tests.frame_rules import pillow
 
 CONFIG = PretrainConfig(objects=9, presses=2, seed=5)
-FRAMES = FramesConfig(size=32)
+FRAMES = FramesConfig(pixels=32)
 ARRAYS = ("pictures", "quantities", "kinds")
 
 
@@ -235,7 +235,7 @@ def test_frames_are_fitted_as_those_of_videos(fit: str, size: int, monkeypatch: 
 
     monkeypatch.setattr(module, "shade", light)
     monkeypatch.setattr(module, "subtract", note)
-    found = draw_object(2, CONFIG, FramesConfig(size=size, fit=fit))
+    found = draw_object(2, CONFIG, FramesConfig(pixels=size, fit=fit))
     assert found.pictures.shape == (1, 2, size, size, 3)
     for sensor, (frame, reference), shown in zip(seen, taken, found.pictures[0], strict=True):
         for found, whole in ((frame, waves), (reference, cv2.convertScaleAbs(sensor.background))):

@@ -315,7 +315,7 @@ def edit_clip(folder: Path, part: str, **changes: object) -> None:
 
 
 def test_small_frames_and_a_language_model_of_pickles_are_one_line(tmp_path: Path) -> None:
-    with refused(r"frames\.size is 24 .* frames\.size=32$"):
+    with refused(r"frames\.pixels is 24 .* frames\.pixels=32$"):
         check_encoder(write_clip(tmp_path / "clip"), 24, ("clip",))
     folder = write_llama(tmp_path / "llama")
     (folder / "model.safetensors").rename(folder / "pytorch_model.bin")

@@ -296,7 +296,7 @@ def noise(monkeypatch: pytest.MonkeyPatch) -> SyntheticPictures:
 
 def pretrained(steps: int, saved: int, objects: int = 16, side: int = 16) -> tuple[SceneEncoder, list[Measurement]]:
     setting = PretrainConfig(objects=objects, presses=2, steps=steps, batch_size=4)
-    return pretrain(setting, FramesConfig(size=side), RuntimeConfig(device="cpu", save_steps=saved))
+    return pretrain(setting, FramesConfig(pixels=side), RuntimeConfig(device="cpu", save_steps=saved))
 
 
 @pytest.mark.usefixtures("noise")

@@ -100,6 +100,6 @@ def test_kept_frames_are_those_with_the_largest_differences(check: Check, tmp_pa
     """30 % of them, of equal ones the earlier; index and score of each."""
     path = tmp_path / "video.mp4"
     write_film(path, VIDEOS[name], 25.0)
-    kept = run_pass(path, FramesConfig(size=16, fraction=0.3)).kept
+    kept = run_pass(path, FramesConfig(pixels=16, fraction=0.3)).kept
     found = [(k.index, k.score) for k in kept]
     check(f"salient frames of a video: {name}", UINT8, lambda _: found, 0, salience(luma(path), "0.3"))

@@ -90,7 +90,7 @@ def test_files_are_equal_for_equal_seeds(recipes: dict[str, Recipe], catalogue: 
     assert [(folders[0] / n).read_bytes() for n in names] == [(folders[1] / n).read_bytes() for n in names]
     assert (folders[0] / names[0]).read_bytes() != (folders[0] / names[1]).read_bytes()
     for file in list_videos(folders[0], catalogue).files:
-        found = scan(file, FramesConfig(size=16))
+        found = scan(file, FramesConfig(pixels=16))
         assert isinstance(found, Scan)
         video = found.probe
         assert (video.frames, video.width, video.height, video.fps) == (8, 64, 48, 25.0)

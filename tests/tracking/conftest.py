@@ -103,7 +103,7 @@ class FakeChain:
             write_json(Path("runs") / f"{title}.json", {**times, **cost, "metrics": {"loss": 1.0, "answers": 5}})
             lock["stages"][title] = {
                 "cmd": f"python {title}",
-                "params": {"params.yaml": {"seed": 0, "frames": {"size": 64}}},
+                "params": {"params.yaml": {"seed": 0, "frames": {"pixels": 64}}},
                 "outs": [{"path": out(title), "md5": mark * 32}],
             }
         path.write_text(yaml.safe_dump(lock))

@@ -179,7 +179,7 @@ def test_a_clone_that_only_pulled_has_hashes_and_no_stage_runs(chain: FakeChain)
 
 def test_entries_of_other_parameters_are_no_part(chain: FakeChain) -> None:
     lock = yaml.safe_load(Path("dvc.lock").read_text())
-    lock["stages"]["lora@base-all-0"]["params"]["params.yaml"]["frames"]["size"] = 224
+    lock["stages"]["lora@base-all-0"]["params"]["params.yaml"]["frames"]["pixels"] = 224
     lock["stages"]["align@base-needed-7"] = lock["stages"]["split"]
     Path("dvc.lock").write_text(yaml.safe_dump(lock))
     publish(chain.params)

@@ -71,7 +71,7 @@ class Made(NamedTuple):
 def make(where: Path, variant: Variant, *overrides: str) -> Made:
     """Run what the stages run, in `where` as the working directory, down to `package`."""
     params = fake_params(
-        *("frames.size=32", "frames.per_video=3", "language.max_new_tokens=12", "language.generation_batch_size=8"),
+        *("frames.pixels=32", "frames.per_video=3", "language.max_new_tokens=12", "language.generation_batch_size=8"),
         *("encoder.weights=clip", "language.weights=llama", "encoder.prompts=3", *overrides),
     )
     catalogue = load_catalogue(Path(params.data.catalogue))

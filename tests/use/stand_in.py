@@ -35,7 +35,9 @@ class FakeOctopi:
         self.threads.add(threading.get_ident())
         assert isinstance(video, str | os.PathLike)
         path = Path(video)
-        found = scan(VideoFile(path, str(path), "x", "x_0"), FramesConfig(size=96, fraction=0.15, selection="contact"))
+        found = scan(
+            VideoFile(path, str(path), "x", "x_0"), FramesConfig(pixels=96, fraction=0.15, selection="contact")
+        )
         if not isinstance(found, Scan):
             raise UserError(f"{path}: {found.measured}")
         frames = np.stack([kept.image for kept in found.kept])

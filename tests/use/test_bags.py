@@ -121,7 +121,7 @@ def test_each_press_becomes_a_video_that_the_chain_takes(
         assert [r.frame for r in rows] == list(range(end - begin))
         inside = [r.contact for r in rows if begin + r.frame in touched]
         assert min(inside) > 3 * max(r.contact for r in rows if begin + r.frame not in touched)
-        seen = scan(file, FramesConfig(size=32, per_video=3, selection="contact"))
+        seen = scan(file, FramesConfig(pixels=32, per_video=3, selection="contact"))
         assert isinstance(seen, Scan)
         assert (seen.probe.frames, seen.probe.fps, seen.probe.starts_touching) == (len(rows), 25.0, False)
         assert all(begin + kept.index in touched for kept in seen.kept), "what is kept shows contact"

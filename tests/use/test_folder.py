@@ -111,7 +111,12 @@ def test_a_changed_or_missing_file_is_named(name: str, copy: Path) -> None:
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [(None, "holds no config.json"), ("{", "not JSON"), ("[]", "of format None"), ('{"format": 1}', "Field required")],
+    [
+        (None, "holds no config.json"),
+        ("{", "not JSON"),
+        ("[]", "of format None"),
+        (f'{{"format": {FORMAT}}}', "Field required"),
+    ],
 )
 def test_what_is_no_model_is_refused(text: str | None, message: str, tmp_path: Path) -> None:
     if text is not None:

@@ -107,14 +107,14 @@ def test_pictures_and_fitted_frames_follow_range_and_format(
     (frame,) = frames_of(encode(tmp_path / f"w.{suffix}", [gradient(48, 64)], codec, pixels))
     for size in (16, 96):
         expected = cv2.resize(picture(frame)[:, 8:56, ::-1], (size, size), interpolation=cv2.INTER_AREA).astype(int)
-        found = fit(frame, FramesConfig(size=size)).astype(int)
+        found = fit(frame, FramesConfig(pixels=size)).astype(int)
         # Twice the size and bent edges: a picture enlarged in blocks is off by a step or two of the gradient.
         assert np.abs(found - expected).mean() < 2
         assert np.abs(found - expected).max() <= 8
     # Full range or not: 0 is black, 255 is white; the encoder's own rounding takes up to 5 steps.
     for value in (0, 16, 77, 128, 235, 255):
         (frame,) = frames_of(encode(tmp_path / f"g.{suffix}", [np.full((32, 32, 3), value, np.uint8)], codec, pixels))
-        shown, fitted = picture(frame)[0, 0, ::-1].astype(int), fit(frame, FramesConfig(size=16)).astype(int)
+        shown, fitted = picture(frame)[0, 0, ::-1].astype(int), fit(frame, FramesConfig(pixels=16)).astype(int)
         assert np.abs(shown - value).max() <= 5
         assert np.abs(fitted - shown).max() <= 2
 
@@ -134,23 +134,23 @@ def test_a_stream_that_names_bt709_is_taken_at_its_word() -> None:
     frame, other = (av.VideoFrame.from_ndarray(np.full((48, 32), 110, np.uint8), format="yuv420p") for _ in range(2))
     other.colorspace = 1
     for each in (frame, other):
-        found = fit(each, FramesConfig(size=16))
+        found = fit(each, FramesConfig(pixels=16))
         assert np.abs(found.astype(int) - picture(each)[:16, :16, ::-1]).max() <= 2
-    assert (fit(frame, FramesConfig(size=16)) != fit(other, FramesConfig(size=16))).any()
+    assert (fit(frame, FramesConfig(pixels=16)) != fit(other, FramesConfig(pixels=16))).any()
 
 
 @pytest.mark.parametrize("degrees", TURNED)
 @pytest.mark.parametrize(("codec", "pixels", "mode"), [("mpeg4", "yuv420p", "crop"), ("png", "rgb24", "squash")])
 def test_turned_videos_are_upright(tmp_path: Path, degrees: int, codec: str, pixels: str, mode: str) -> None:
     path = encode(tmp_path / "v.mov", [gradient(36, 48)] * 2, codec, pixels)
-    upright = fit(frames_of(path)[0], FramesConfig(size=32, fit=mode))
+    upright = fit(frames_of(path)[0], FramesConfig(pixels=32, fit=mode))
     turn(path, degrees)
     frame = frames_of(path)[0]
     assert 90 * turns(frame) == degrees
     expected = opencv(path)[0].astype(int)
     assert picture(frame).shape == expected.shape == ((48, 36, 3) if degrees % 180 else (36, 48, 3))
     assert np.abs(picture(frame).astype(int) - expected).max() <= 2, "OpenCV turns pictures by itself"
-    turned = fit(frame, FramesConfig(size=32, fit=mode))
+    turned = fit(frame, FramesConfig(pixels=32, fit=mode))
     np.testing.assert_array_equal(turned, np.rot90(upright, degrees // 90))
     assert turned.flags.c_contiguous
 
@@ -232,7 +232,7 @@ def test_fitted_frames_are_near_a_bicubic_resize(tmp_path: Path, height: int, wi
         (frame,) = frames_of(encode(tmp_path / "v.mkv", [waves(height, width)], "ffv1", pixels))
         shown = picture(frame)[..., ::-1]
         for mode in ("crop", "squash"):
-            error = np.abs(fit(frame, FramesConfig(size=size, fit=mode)) - pillow(shown, size, mode).astype(int))
+            error = np.abs(fit(frame, FramesConfig(pixels=size, fit=mode)) - pillow(shown, size, mode).astype(int))
             assert error.mean() <= (4 if height == 97 else 2), (pixels, mode)
             assert np.quantile(error, 0.99) <= 16, (pixels, mode)
 
@@ -246,7 +246,7 @@ def test_one_colour_fills_every_square(pixels: str, mode: str) -> None:
         for plane, value in zip(frame.planes, (100, 90, 200), strict=True):
             plane.update(bytes([value]) * plane.buffer_size)
         for size in (16, 64):
-            image = fit(frame, FramesConfig(size=size, fit=mode))
+            image = fit(frame, FramesConfig(pixels=size, fit=mode))
             assert (image.shape, image.dtype) == ((size, size, 3), np.uint8)
             assert np.abs(image - np.array(expected)).max() <= 1
 

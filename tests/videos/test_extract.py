@@ -171,11 +171,11 @@ def test_what_videos_csv_says_after_a_kill_counts(place: Place) -> None:
 
 
 def test_other_parameters_start_anew(place: Place) -> None:
-    place.extract(FramesConfig(size=32))
+    place.extract(FramesConfig(pixels=32))
     expected = place.bytes()
     kill_after(4, place)
     place.decoded()
-    place.extract(FramesConfig(size=32))
+    place.extract(FramesConfig(pixels=32))
     assert place.decoded() == NAMES
     assert place.bytes() == expected
     place.extract()
@@ -249,7 +249,7 @@ def test_a_full_disk_leaves_no_half_of_a_file(place: Place, monkeypatch: pytest.
 
 def test_short_videos_are_left_out_by_the_published_rule(place: Place, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
-        found = place.extract(FramesConfig(size=16, selection="release"))
+        found = place.extract(FramesConfig(pixels=16, selection="release"))
     assert [v.video_id for v in found.videos] == ["potato_0", "rug_0"]
     assert [p.video_id for p in found.probes] == NAMES
     assert [p.kept for p in found.probes] == [0, 0, 0, 6, 0, 9, 0]
@@ -264,7 +264,7 @@ def test_nothing_to_keep_is_an_error(tmp_path: Path, catalogue: Catalogue) -> No
     place = Place(tmp_path / "v", tmp_path, catalogue)
     write_video(place.folder / "rug_0.avi", moving_square(3))
     with pytest.raises(UserError, match=r"no video has a frame to keep; choose another frames\.selection"):
-        place.extract(FramesConfig(size=16, selection="release"))
+        place.extract(FramesConfig(pixels=16, selection="release"))
     assert not place.out.exists()
 
 

@@ -47,7 +47,7 @@ def chosen(found: VideoPass) -> list[tuple[int, float]]:
 def test_salience_equals_the_reference(tmp_path: Path, frames: list[np.ndarray]) -> None:
     path = write_video(tmp_path / "v.avi", frames)
     for fraction in ("0.01", "0.07", "0.3", "1.0"):
-        found = run_pass(path, FramesConfig(size=16, fraction=float(fraction)))
+        found = run_pass(path, FramesConfig(pixels=16, fraction=float(fraction)))
         assert found.frames == len(frames)
         assert chosen(found) == salience(luma(path), fraction)
         assert_fitted(path, found)
@@ -75,7 +75,7 @@ def test_ties_go_to_the_earlier_frame(case: tuple[list[int], int]) -> None:
 @pytest.mark.parametrize("name", ["salient", "release", "contact", "adaptive", "uniform"])
 def test_what_is_held_in_memory_changes_nothing(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_video(tmp_path / "v.avi", pressing(40))
-    config = FramesConfig(size=16, selection=name)
+    config = FramesConfig(pixels=16, selection=name)
     held = run_pass(path, config)
     monkeypatch.setattr(selection, "HELD_BYTES", 0)
     at_once = run_pass(path, config)
@@ -111,7 +111,7 @@ def test_the_published_rule(tmp_path: Path, count: int) -> None:
     for make in (moving_square, pressing, constant):
         path = write_video(tmp_path / "v.avi", make(count))
         for promised in (max(1, count - 14), count, count + 7):
-            found = run_pass(path, FramesConfig(size=16, selection="release"), promised)
+            found = run_pass(path, FramesConfig(pixels=16, selection="release"), promised)
             assert chosen(found) == published(path, promised)
             assert_fitted(path, found)
 
@@ -134,7 +134,7 @@ def test_uniform_places(frames: int, count: int) -> None:
 @pytest.mark.parametrize(("count", "fraction"), [(1, 0.3), (2, 0.3), (7, 0.3), (30, 0.1), (30, 1.0)])
 def test_uniform_frames(tmp_path: Path, count: int, fraction: float) -> None:
     path = write_video(tmp_path / "v.avi", moving_square(count))
-    config = FramesConfig(size=16, selection="uniform", fraction=fraction)
+    config = FramesConfig(pixels=16, selection="uniform", fraction=fraction)
     found = run_pass(path, config)
     assert [k.index for k in found.kept] == uniform_indices(count, kept_count(count, config))
     assert_fitted(path, found)
@@ -154,7 +154,7 @@ def strengths(path: Path) -> list[float]:
 @pytest.mark.parametrize(("seed", "fraction"), [(0, 0.05), (1, 0.3)])
 def test_contact_frames_are_those_most_unlike_the_reference(tmp_path: Path, seed: int, fraction: float) -> None:
     path = write_video(tmp_path / "v.avi", pressing(50, seed))
-    found = run_pass(path, FramesConfig(size=16, selection="contact", fraction=fraction))
+    found = run_pass(path, FramesConfig(pixels=16, selection="contact", fraction=fraction))
     expected = strengths(path)
     best = sorted(sorted(range(50), key=lambda i: -expected[i])[: math.ceil(fraction * 50)])
     assert [k.index for k in found.kept] == best
@@ -174,8 +174,8 @@ def test_adaptive_frames_cover_the_contact_and_differ_from_each_other(
 ) -> None:
     path = write_video(tmp_path / "v.avi", pressing(60, seed))
     # At no tolerance at all, nothing that is in contact is thinned out but what noise could have made.
-    pool = run_pass(path, FramesConfig(size=16, selection="adaptive", tolerance=0.0)).kept
-    found = run_pass(path, FramesConfig(size=16, selection="adaptive", tolerance=tolerance))
+    pool = run_pass(path, FramesConfig(pixels=16, selection="adaptive", tolerance=0.0)).kept
+    found = run_pass(path, FramesConfig(pixels=16, selection="adaptive", tolerance=tolerance))
     noise = min(found.strengths)
     reach = max(k.score for k in pool) - noise
     near = tolerance * reach + math.sqrt(2) * noise
@@ -226,9 +226,9 @@ def test_less_tolerance_keeps_more(count: int, seed: int, one: float, other: flo
 @pytest.mark.parametrize("name", ["hairbrush_bristles_side_4", "tv_remote_back_3", "rice_spatula_base_1"])
 def test_real_frames(real_data: Path, name: str) -> None:
     path = real_data / f"{name}.mov"
-    assert chosen(run_pass(path, FramesConfig(size=64))) == salience(luma(path), "0.3")
+    assert chosen(run_pass(path, FramesConfig(pixels=64))) == salience(luma(path), "0.3")
     promised = Decoder(path).header.frames
-    assert chosen(run_pass(path, FramesConfig(size=64, selection="release"))) == published(path, promised)
+    assert chosen(run_pass(path, FramesConfig(pixels=64, selection="release"))) == published(path, promised)
     for frame in frames_of(path)[::40]:
         expected = pillow(picture(frame)[..., ::-1], 64, "crop").astype(int)
-        assert np.abs(fit(frame, FramesConfig(size=64)).astype(int) - expected).mean() < 1.5
+        assert np.abs(fit(frame, FramesConfig(pixels=64)).astype(int) - expected).mean() < 1.5

@@ -25,7 +25,7 @@ from tests.frame_rules import Place, constant, luma, pressing, salience
 
 def one(folder: Path, catalogue: Catalogue, selection: str = "salient") -> tuple[Extraction, Probe]:
     place = Place(folder, folder.parent, catalogue)
-    found = place.extract(FramesConfig(size=16, selection=selection))
+    found = place.extract(FramesConfig(pixels=16, selection=selection))
     (probe,) = found.probes
     numbers = [v for v in probe.model_dump().values() if isinstance(v, float)]
     assert all(map(math.isfinite, [*numbers, *probe.thumbnail, *probe.signature]))
@@ -89,7 +89,7 @@ def test_a_cut_off_video_keeps_what_decodes_and_warns(
 @pytest.mark.parametrize("selection", ["salient", "uniform", "contact", "adaptive"])
 def test_a_header_that_lies_changes_nothing(tmp_path: Path, selection: str, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_video(tmp_path / "rug_0.avi", pressing(40))
-    file, config = VideoFile(path, path.name, "rug", "rug_0"), FramesConfig(size=16, selection=selection)
+    file, config = VideoFile(path, path.name, "rug", "rug_0"), FramesConfig(pixels=16, selection=selection)
     honest = scan(file, config)
     assert isinstance(honest, Scan)
     init, promised = Decoder.__init__, 0

@@ -46,7 +46,7 @@ def film(depths: list[float], seed: int = 0, light: list[float] | None = None) -
 
 def scanned(path: Path, frames: list[np.ndarray], name: str = "contact") -> Scan:
     write_video(path, frames)
-    found = scan(VideoFile(path, path.name, "rug", "rug_0"), FramesConfig(size=32, selection=name))
+    found = scan(VideoFile(path, path.name, "rug", "rug_0"), FramesConfig(pixels=32, selection=name))
     assert isinstance(found, Scan)
     return found
 
@@ -71,7 +71,7 @@ def test_the_reference_of_usual_lengths(tmp_path: Path, count: int, expected: tu
     assert reference_indices(count) == expected
     path = tmp_path / "v.avi"
     found = scanned(path, film(rise(count)))
-    fitted = [fit(frame, FramesConfig(size=32)).astype(np.float64) for frame in frames_of(path)]
+    fitted = [fit(frame, FramesConfig(pixels=32)).astype(np.float64) for frame in frames_of(path)]
     np.testing.assert_array_equal(found.reference, np.rint(np.mean([fitted[i] for i in expected], axis=0)))
     assert not found.probe.starts_touching
     if count > 3:

@@ -43,7 +43,7 @@ def test_what_cannot_be_made_is_refused() -> None:
         check_encoder(MADE_DIR / "tiny-clip", 64, ("timm",))
     with refused("teach.base: data/weights/gpt is none .* smollm2, tiny-llama"):
         check_language(MADE_DIR / "gpt", "teach.base")
-    with refused("set frames.size=64"):
+    with refused("set frames.pixels=64"):
         check_encoder(MADE_DIR / "tiny-clip", 63, ("clip",))
 
 

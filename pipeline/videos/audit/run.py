@@ -106,4 +106,4 @@ def _scan_all(files: Sequence[VideoFile]) -> tuple[list[Scan], list[Finding]]:
 
 def _scan_small(file: VideoFile) -> Scan | Finding:
     # The pictures are not wanted here: the smallest size, and hardly any of them.
-    return scan(file, FramesConfig(size=16, fraction=0.01))
+    return scan(file, FramesConfig(pixels=16, fraction=0.01))

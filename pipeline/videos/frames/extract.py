@@ -119,7 +119,7 @@ def extract_frames(folder: Path, catalogue: Catalogue, config: FramesConfig, out
             frames.append(Frame(video_id=each.probe.video_id, frame_index=index, score=score, row=len(frames)))
     for file, name, count in ((FRAMES_FILE, "frames", len(frames)), (REFERENCES_FILE, "reference", len(used))):
         with atomic(out / file) as temporary, temporary.open("wb") as stream:
-            shape = (count, config.size, config.size, 3)
+            shape = (count, config.pixels, config.pixels, 3)
             np.lib.format.write_array_header_1_0(stream, {"descr": "|u1", "fortran_order": False, "shape": shape})
             for job, _ in used:
                 with safe_open(job.pixels, "np") as stored:

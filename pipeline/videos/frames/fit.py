@@ -20,7 +20,7 @@ def fit(frame: av.VideoFrame, config: FramesConfig) -> Image:
     shown = planes(frame)
     if config.fit == "crop":
         shown = tuple(_square(plane, *shown[0].shape) for plane in shown)
-    shown = tuple(_resize(plane, config.size) for plane in shown)
+    shown = tuple(_resize(plane, config.pixels) for plane in shown)
     return np.ascontiguousarray(np.rot90(to_rgb(cv2.merge(shown), frame), turns(frame)))
 
 
