@@ -35,7 +35,7 @@ test: install
 	python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 stability: install
-	python -m pytest tests/numerics --stability-csv reports/stability.csv
+	python -m pytest tests/numerics --stability-csv reports/stability.csv; status=$$?; octopi page && exit $$status
 
 drill: install
 	python -m tests.drill --kills $(KILLS) --minutes $(MINUTES) --seed $(SEED)
@@ -54,6 +54,7 @@ dashboard: install
 bench: install
 	@test -n "$(SECTION)" || { echo "make bench: name a section, as in make bench SECTION=frames"; exit 1; }
 	python -m benchmarks $(SECTION)
+	octopi page
 
 clean:
 	rm -rf data runs checkpoints mlruns .pytest_cache .mypy_cache .ruff_cache .hypothesis

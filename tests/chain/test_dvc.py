@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import shutil
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
+from types import FunctionType
 from typing import Any, get_args, get_origin
 
 import pytest
@@ -16,6 +19,7 @@ from dvc.stage.serialize import to_single_stage_lockfile
 from dvc_data.hashfile.meta import Meta
 from pydantic import BaseModel
 
+from pipeline import config
 from pipeline.config import Params
 from pipeline.scales import compose, shipped_scales
 from pipeline.tasks import TASKS
@@ -23,10 +27,13 @@ from tests.closure import ROOT, closure
 
 TOLD = {
     *("pipeline/__init__.py", "pipeline/errors.py", "pipeline/config.py", "pipeline/params.py", "pipeline/stage.py"),
-    *("pipeline/parallel.py", "pipeline/io.py", "pipeline/records.py", "pipeline/tracking", "pipeline/card.py"),
+    *("pipeline/parallel.py", "pipeline/tracking"),
 }
-"""How a stage is told what to do, says what it did and hands on what it made. They change no result: parameters are
-dependencies by value, and a file that does not fit today's records is refused when it is read."""
+"""How a stage is told what to do and says what it did. They change no result. Of `config.py`, which every stage reads,
+that holds for all but what it computes: a parameter is a dependency by its value, and params.yaml has them all."""
+
+COMPUTED = {"fold_of", "replicate_of", "variants"}
+"""What `config.py` computes of parameters, so that it is a dependency of a stage which calls it."""
 
 
 def stages() -> dict[str, dict[str, Any]]:
@@ -38,19 +45,57 @@ def code(name: str) -> list[str]:
     return [d for d in stages()[name]["deps"] if d.startswith(("pipeline/", "stages/"))]
 
 
-@pytest.mark.parametrize("name", sorted(stages().keys() - {"publish"}))
+def data_of(module: str) -> Iterator[str]:
+    """What is no code in a module's folder, and Jinja's templates there: the module may read it."""
+    folder = (ROOT / module).parent
+    for file in (*folder.glob("*"), *folder.glob("templates/*")) if folder != ROOT / "pipeline" else ():
+        if file.is_file() and file.suffix not in (".py", ".md"):
+            yield file.relative_to(ROOT).as_posix()
+
+
+@pytest.mark.parametrize("name", sorted(stages()))
 def test_dependencies_cover_what_a_stage_can_import(name: str) -> None:
     reached = closure(ROOT / "stages" / f"{name}.py", unfollowed=["pipeline/tracking/live.py"])
-    covered = (*TOLD, *code(name))
-    missing = [m for m in reached if not any(m == d or m.startswith(f"{d}/") for d in covered)]
+    others = set(reached) - {"pipeline/config.py"}
+    called = {word for file in others for word in re.findall(r"\.(\w+)\b", (ROOT / file).read_text())}
+    told = TOLD - ({"pipeline/config.py"} if called & COMPUTED else set())
+    told -= {"pipeline/tracking"} if name == "publish" else set()
+    read = [file for module in reached for file in data_of(module)]
+    covered = (*told, *code(name))
+    missing = {m for m in (*reached, *read) if not any(m == d or m.startswith(f"{d}/") for d in covered)}
     assert not missing, f"add to the dependencies of {name} in dvc.yaml"
-    idle = [d for d in code(name) if not any(m == d or m.startswith(f"{d}/") for m in reached)]
-    assert not idle, f"{name} imports nothing of these dependencies"
+    idle = [d for d in code(name) if d in told or not any(m == d or m.startswith(f"{d}/") for m in reached)]
+    assert not idle, f"{name} has no use for these dependencies"
+
+
+def test_config_computes_nothing_else() -> None:
+    """`report_name` is where dvc.yaml looks for the report, and what begins with _ checks a value."""
+    sections = [kind for kind in vars(config).values() if isinstance(kind, type) and issubclass(kind, config.Section)]
+    own = {n for s in sections for n, value in vars(s).items() if isinstance(value, FunctionType | property)}
+    assert {name for name in own if not name.startswith("_")} == {*COMPUTED, "report_name"}
 
 
 def test_dvc_yaml_is_read_on_a_few_screens() -> None:
     assert len((ROOT / "dvc.yaml").read_text().splitlines()) <= 300
     assert len((ROOT / "params.yaml").read_text().splitlines()) <= 150
+
+
+@pytest.mark.parametrize(("target", "status"), [("bench", 0), ("stability", 0), ("stability", 1)])
+def test_what_measures_draws_the_page_anew(target: str, status: int, tmp_path: Path) -> None:
+    """The page shows its table; a hard case that fails stands on it too, and still fails the command."""
+    shutil.copy(ROOT / "Makefile", tmp_path)
+    for name in ("requirements.lock", "requirements-weights.lock", "pyproject.toml", ".venv/.installed"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    for name, ends in (("python", status), ("octopi", 0)):
+        program = tmp_path / ".venv" / "bin" / name
+        program.parent.mkdir(exist_ok=True)
+        program.write_text(f'#!/bin/sh\necho "{name} $*" >> ran\nexit {ends}\n')
+        program.chmod(0o755)
+    done = subprocess.run(["make", "-C", str(tmp_path), target, "SECTION=frames"], check=False, capture_output=True)
+    measured, *after = (tmp_path / "ran").read_text().splitlines()
+    assert measured.startswith("python -m")
+    assert (after, bool(done.returncode)) == (["octopi page"], bool(status))
 
 
 def test_every_script_is_a_stage() -> None:
