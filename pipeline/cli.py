@@ -40,7 +40,8 @@ def scale(
     # First, since what a scale takes is asked before its weights are fetched.
     counted = ["Memory in GiB on each device, counted from shapes:", table(uses)] if uses else []
     typer.echo("\n".join([*counted, *notes]))
-    check_inputs(params)
+    if lacking := check_inputs(params):
+        typer.echo(lacking)
     changed = write_params(params)
     prune(params, Path("data"))
     typer.echo(

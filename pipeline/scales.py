@@ -26,7 +26,7 @@ from pipeline.records import Part, Touch
 from pipeline.tasks.questions import counts_by_task
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.files import list_videos, raise_errors
-from pipeline.videos.split import FEWEST_TRAINING_OBJECTS, assign_objects
+from pipeline.videos.split import FEWEST_TRAINING_OBJECTS, assign_objects, without_videos
 from pipeline.weights.check import check_encoder_files, check_language_files
 
 CONF = Path("conf")
@@ -93,8 +93,12 @@ def _literal(override: str) -> str:
     return f"{key}='{escaped}'"
 
 
-def check_inputs(params: Params) -> None:
-    """Raise UserError where something that the scale needs is not there: videos, catalogue, objects, tasks, weights."""
+def check_inputs(params: Params) -> str:
+    """Raise UserError where something that the scale needs is not there: videos, catalogue, objects, tasks, weights.
+
+    Returns:
+        As `check_objects`.
+    """
     catalogue = load_catalogue(Path(params.data.catalogue))
     check_recipe(params.encoder.recipe)
     check_backbones(params.encoder.backbone)
@@ -117,7 +121,7 @@ def check_inputs(params: Params) -> None:
     unknown = [o for o in params.scenes.objects if o not in catalogue.objects]
     if unknown:
         raise UserError(f"scenes.objects: {unknown[0]} is not in {params.data.catalogue}/objects.csv")
-    check_objects(params, catalogue)
+    lacking = check_objects(params, catalogue)
     backbone = params.encoder.backbone
     weights.check_encoder(Path(params.encoder.weights), params.frames.pixels, backbone)
     check_encoder_files(Path(params.encoder.weights), backbone)
@@ -132,21 +136,29 @@ def check_inputs(params: Params) -> None:
         if base not in ("", TAUGHT):
             weights.check_language(Path(base), key)
             check_language_files(Path(base), key)
+    return lacking
 
 
-def check_objects(params: Params, catalogue: Catalogue) -> None:
-    """Raise UserError where the objects that have videos are too few for what was chosen, before hours of training."""
+def check_objects(params: Params, catalogue: Catalogue) -> str:
+    """Raise UserError where the objects that have videos are too few for what was chosen, before hours of training.
+
+    Returns:
+        A line on test and validation objects without videos; empty where all have some.
+    """
     if params.data.source == "scenes":
         present = set(params.scenes.objects or catalogue.objects)
     else:
         present = {file.object_id for file in list_videos(Path(params.data.dir), catalogue).files}
         if not present:
             raise_errors(Path(params.data.dir), list_videos(Path(params.data.dir), catalogue).findings)
+    lacking = ""
     for seed in params.ablation.seeds:
         parts = assign_objects(catalogue, present, params.split, seed)
         training, tested = (sorted(o for o in present if parts.get(o) == part) for part in (Part.TRAIN, Part.TEST))
         fold = params.split.fold_of(seed)
         where = f"split.name={params.split.name}" + (f", fold {fold}" if fold is not None else "")
+        if absent := without_videos(parts, present):
+            lacking = f"{where}: {absent}"
         if len(training) < FEWEST_TRAINING_OBJECTS:
             raise UserError(
                 f"{where}: {len(training)} training objects have videos, but questions about three objects need three; "
@@ -162,6 +174,7 @@ def check_objects(params: Params, catalogue: Catalogue) -> None:
             f"cross_validation.folds is {params.cross_validation.folds}, but only {len(present)} objects have videos; "
             "lower it"
         )
+    return lacking
 
 
 def write_params(params: Params, path: Path = PARAMS_FILE) -> bool:

@@ -1,24 +1,29 @@
 """Assign each object, and with it its videos, to training, validation or test; with kfold anew for each seed."""
 
+import logging
 from pathlib import Path
 
 from pipeline.io import read_table, write_table
 from pipeline.records import Assignment, Part, Video
 from pipeline.stage import DATA, stage
 from pipeline.videos.catalogue import load_catalogue
-from pipeline.videos.split import assign
+from pipeline.videos.split import assign, assign_objects, without_videos
 
 
 def main() -> None:
     with stage("split") as run:
-        catalogue = load_catalogue(Path(run.params.data.catalogue))
+        catalogue, config = load_catalogue(Path(run.params.data.catalogue)), run.params.split
         videos = read_table(DATA / "videos.parquet", Video)
         for seed in run.params.ablation.seeds:
-            split = assign(catalogue, videos, run.params.split, seed)
+            split = assign(catalogue, videos, config, seed)
             write_table(DATA / "splits" / f"{seed}.parquet", Assignment, split)
             for part in Part:
                 run.metrics[f"{seed}.{part}_videos"] = sum(a.part == part for a in split)
                 run.metrics[f"{seed}.{part}_objects"] = len({a.object_id for a in split if a.part == part})
+        if not any(run.metrics[f"{seed}.{Part.TEST}_objects"] for seed in run.params.ablation.seeds):
+            present = {video.object_id for video in videos}
+            lacking = without_videos(assign_objects(catalogue, present, config), present)
+            logging.getLogger(__name__).warning("nothing can be asked, as %s", lacking)
 
 
 if __name__ == "__main__":

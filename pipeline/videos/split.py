@@ -61,15 +61,26 @@ def assign_objects(
         parts = _develop(catalogue, present, config)
     else:
         parts = {o.object_id: o.splits[config.name] for o in catalogue.objects.values()}
-    absent = [o for o, part in sorted(parts.items()) if part in (Part.VALIDATION, Part.TEST) and o not in present]
-    if absent and config.missing == "error":
+    if config.missing == "error" and (lacking := without_videos(parts, present)):
         raise UserError(
-            f"split {config.name}: no video of {', '.join(absent)}; add videos to data.dir, or set "
-            "split.missing=report to go on without them"
+            f"split.name={config.name}: {lacking}; add videos to data.dir, or set split.missing=report to go on "
+            "without them"
         )
     if not any(parts.get(object_id) == Part.TRAIN for object_id in present):
         raise UserError(f"split {config.name}: no video of a training object; add videos, or choose another split.name")
     return parts
+
+
+def without_videos(parts: Mapping[str, Part], present: Collection[str]) -> str:
+    """In words, how many test and validation objects have no videos, and which; empty where all have some."""
+    said = []
+    for part in (Part.TEST, Part.VALIDATION):
+        known = sorted(o for o, own in parts.items() if own == part)
+        if lacking := [o for o in known if o not in present]:
+            said.append(f"{len(lacking)} of {len(known)} {part} objects have no videos ({', '.join(lacking)})")
+        elif not known and part is Part.TEST:
+            said.append("no object is for test")
+    return "; ".join(said)
 
 
 def check_split(catalogue: Catalogue, name: str) -> None:

@@ -24,6 +24,7 @@ from pipeline.config import Params
 from pipeline.scales import compose, shipped_scales
 from pipeline.tasks import TASKS
 from tests.closure import ROOT, closure
+from tests.project import OBJECTS, REDUCED, copy_project
 
 TOLD = {
     *("pipeline/__init__.py", "pipeline/errors.py", "pipeline/config.py", "pipeline/params.py", "pipeline/stage.py"),
@@ -164,6 +165,22 @@ def test_every_listed_parameter_changes_the_stage_s_key_in_the_run_cache(tmp_pat
             section[last] = old
     assert checked == {(name, key) for name, keys in every.items() for key in keys}
     assert not silent, "the run cache would bring back the results of another value"
+
+
+def test_a_split_without_a_test_object_is_one_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """DVC warns of every empty file at every stage that depends on it, and there are eight that answer."""
+    project = copy_project(tmp_path / "untested")
+    learnt = ",".join(o for o in OBJECTS if o not in ("bath_towel", "ice_block", "toilet_brush_bristles"))
+    project.run("octopi", "scale", *REDUCED, f"scenes.objects=[{learnt}]", "cross_validation.folds=2")
+    said = [line for line in project.run("dvc", "repro", "questions").splitlines() if "WARNING" in line]
+    with Repo(str(project.folder)) as repo:
+        for stage in repo.index.stages:
+            for dependency in stage.deps if stage.name.startswith("answer@") else ():
+                if dependency.exists:
+                    dependency.save()
+    assert [line for line in caplog.messages if "is empty" in line] == []
+    assert len(said) == 1
+    assert "7 of 7 test objects have no videos (bath_towel, " in said[0]
 
 
 def test_language_training_does_not_depend_on_the_encoders_code() -> None:

@@ -14,7 +14,7 @@ from pipeline.config import SplitConfig
 from pipeline.errors import UserError
 from pipeline.records import Assignment, Part
 from pipeline.videos.catalogue import Catalogue, load_catalogue
-from pipeline.videos.split import VALIDATION, assign, check_split
+from pipeline.videos.split import VALIDATION, assign, check_split, without_videos
 from tests.conftest import ROOT, fake_videos, refused
 
 CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")
@@ -118,8 +118,12 @@ def test_missing_objects_are_reported_or_refused() -> None:
     present = [o for o in OBJECTS if CATALOGUE.objects[o].splits["paper"] != Part.TEST and o != "denim"]
     split = assign(CATALOGUE, fake_videos(present), SplitConfig(name="paper"))
     assert not objects_of(split, Part.TEST)
-    with refused(r"denim.*ice_block.*split\.missing"):
+    with refused(r"ice_block.*denim.*split\.missing"):
         assign(CATALOGUE, fake_videos(present), SplitConfig(name="paper", missing="error"))
+
+
+def test_a_split_that_tests_nothing_says_so() -> None:
+    assert without_videos({"rug": Part.TRAIN, "denim": Part.VALIDATION}, {"rug", "denim"}) == "no object is for test"
 
 
 def renamed(**columns: str) -> Catalogue:
