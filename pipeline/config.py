@@ -463,6 +463,8 @@ class Params(Section):
     align: AlignConfig
     lora: LoraTrainConfig
     ablation: AblationConfig
+    packaged: Literal["full", "all"] = "full"
+    """Which variants get a folder in models/: the full system of each seed, or all. Each holds the whole encoder."""
     tracking: TrackingConfig
     runtime: RuntimeConfig
 

@@ -1,4 +1,4 @@
-"""Put each variant that answers into one folder that it can be used from."""
+"""Put each full system, or with `packaged=all` each variant, into one folder that it can be used from."""
 
 from pathlib import Path
 
@@ -12,9 +12,10 @@ def main() -> None:
     with stage("package") as run:
         params = run.params
         base = describe_base(Path(params.language.weights))
-        for variant in params.ablation.variants():
+        wanted = [v for v in params.ablation.variants() if v.full or params.packaged == "all"]
+        for variant in wanted:
             package(DATA, params, variant, base, MODELS / variant.key)
-        run.metrics["models"] = len(params.ablation.variants())
+        run.metrics["models"] = len(wanted)
 
 
 if __name__ == "__main__":

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -13,7 +15,9 @@ from pipeline.use.folder import FORMAT, read_folder
 from pipeline.use.model import Octopi
 from pipeline.use.package import describe_base, export, package
 from tests.checkpoints import write_llama
+from tests.closure import ROOT
 from tests.conftest import refused
+from tests.fake_run import fake_params
 from tests.report.shared import files_of
 from tests.use.shared import Made
 
@@ -49,6 +53,23 @@ def test_equal_inputs_give_equal_bytes(made: Made, tmp_path: Path, monkeypatch: 
     monkeypatch.chdir(made.folder.parents[1])
     package(Path("data"), made.params, made.variant, describe_base(Path("llama")), tmp_path / "again")
     assert files_of(tmp_path / "again") == files_of(made.folder)
+
+
+@pytest.mark.parametrize(("overrides", "made_too"), [([], []), (["packaged=all"], ["finetuned-with-none-0"])])
+def test_the_stage_packages_the_full_system_and_the_others_on_demand(
+    overrides: list[str], made_too: list[str], made: Made, tmp_path: Path
+) -> None:
+    """Each folder holds the whole encoder, and the chain trains eight variants."""
+    shutil.copytree(made.folder.parents[1], tmp_path, dirs_exist_ok=True, ignore=shutil.ignore_patterns("models"))
+    trained = made.folder.parents[1] / "data" / "models" / "with"
+    shutil.copytree(trained, tmp_path / "data" / "models" / "with")
+    shutil.copytree(trained / "finetuned-all-0", tmp_path / "data" / "models" / "with" / "finetuned-none-0")
+    lists = ["ablation.encoders=[finetuned]", "ablation.lora=[with]", "ablation.opd=[none,all]"]
+    values = fake_params(*lists, *overrides).model_dump(mode="json")
+    values |= {name: made.params.model_dump(mode="json")[name] for name in ("frames", "encoder", "language")}
+    (tmp_path / "params.yaml").write_text(yaml.safe_dump(values))
+    subprocess.run([sys.executable, ROOT / "stages" / "package.py"], cwd=tmp_path, check=True, timeout=300)
+    assert sorted(f.name for f in (tmp_path / "models").iterdir()) == sorted([made.variant.key, *made_too])
 
 
 def test_export_with_its_base_needs_nothing_else(made: Made, copy: Path, files: list[Path], tmp_path: Path) -> None:
