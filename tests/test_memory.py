@@ -266,6 +266,9 @@ def test_the_papers_scales_fit_the_cards_they_name() -> None:
         assert max(use.total for use in uses) < card - GIB
         assert "published" in " ".join(notes)
         assert table(uses).count("\n") == len(uses)
+    two, usual = (count(compose("paper-7b", [f"encoder.micro_batch_size={n}"]))[0][0].total / GIB for n in (2, 8))
+    assert two < 5 < usual, "the paper's encoder took less than 5 GB"
+    assert f"eight {usual:.1f} GiB in all, and two at a time {two:.1f} GiB" in Path("conf/paper-7b.yaml").read_text()
 
 
 def test_settings_move_what_they_should() -> None:

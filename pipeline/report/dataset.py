@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean, median
@@ -29,7 +30,8 @@ HEADINGS = {"row": "", "with_videos": "With videos"}
 def dataset_frame(
     catalogue: Catalogue, videos: Sequence[Video], splits: Sequence[Sequence[Assignment]]
 ) -> pd.DataFrame:
-    """The content of dataset.csv, with `COLUMNS`: a row a class, a combination of classes, and a figure of lengths.
+    """The content of dataset.csv, with `COLUMNS`: a row a class, a combination of classes that an object has or
+    the paper counts, and a figure of lengths.
 
     Of several splits, an object counts in each part that any of them puts it in.
     Published figures stand beside where the catalogue is the paper's, joined by (table, row).
@@ -42,9 +44,11 @@ def dataset_frame(
         for index, p in enumerate(catalogue.properties)
         for number, level in enumerate(p.levels)
     ]
-    for labels in sorted({*classes.values()}):
+    for labels in itertools.product(*(range(len(p.levels)) for p in catalogue.properties)):
         words = ", ".join(p.levels[level] for p, level in zip(catalogue.properties, labels, strict=True))
-        groups.append(("property_combinations", words, words, {o for o, own in classes.items() if own == labels}))
+        members = {o for o, own in classes.items() if own == labels}
+        if members or ("property_combinations", words) in values:
+            groups.append(("property_combinations", words, words, members))
     filmed = {v.object_id for v in videos}
     parts = {(a.object_id, a.part) for assignments in splits for a in assignments}
     rows: list[dict[str, Any]] = [

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.report import load
+from pipeline.report.dataset import dataset_frame
 from pipeline.report.load import KEYS, Report, load_report, published, read_frame
 from pipeline.report.tables import TABLES, Table, headline, side_by_side, task_title
 from pipeline.tasks import TASKS
@@ -38,6 +39,17 @@ def test_a_row_is_written_as_by_hand_with_published_figures_in_their_own_columns
         "Published 7b % (n)": "48.10 (158)",
         "Published 13b % (n)": "55.06 (158)",
     }
+
+
+def test_all_of_the_papers_combinations_stand_beside_the_ratings(catalogue: Catalogue) -> None:
+    """Also those that no object has by its ratings: the paper's counts add up to its 74 objects."""
+    rows = dataset_frame(catalogue, [], []).set_index("table").loc["property_combinations"]
+    assert (len(rows), rows["objects"].sum(), rows["published"].sum()) == (27, 74, 74)
+    unseen = rows[rows["objects"] == 0].set_index("row")["published"]
+    assert dict(unseen[unseen > 0]) == {"soft, smooth, big bumps": 1, "soft, rough, big bumps": 3}
+    other = catalogue.model_copy(update={"language": catalogue.language.model_copy(update={"dataset": "another"})})
+    own = dataset_frame(other, [], []).set_index("table").loc["property_combinations"]
+    assert own["objects"].min() > 0, "of four properties of five classes there would be 625"
 
 
 def test_effects_are_written_in_points_and_what_is_unknown_is_empty() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from pipeline.config import Params
 from pipeline.encoder.release import DROPOUT, HIDDEN
 from pipeline.encoder.vpt import PUBLISHED_DEVIATION, VisualPrompts
 from pipeline.language.connector import Connector
+from pipeline.records import Part
 from pipeline.scales import compose
 from pipeline.tasks import TASKS
 from pipeline.videos.catalogue import load_catalogue
@@ -89,8 +91,14 @@ def test_values_that_are_no_settings_are_the_codes() -> None:
     assert "two vectors" in row("Word embeddings")["Here"]
     language = load_catalogue(ROOT / "pipeline" / "physiclear").language
     bumps = language.properties[2]
-    assert f'"{bumps.most}"' in row("Superlative of bumps")["Here"]
+    superlatives = row("Superlative of bumps")
+    assert f'"{bumps.most}"' in superlatives["Published code"]
+    assert superlatives["Here"] == "the same"
     assert bumps.most.replace("biggest", "smallest") == bumps.least
+    catalogue = load_catalogue(ROOT / "pipeline" / "physiclear")
+    tested = [catalogue.labels(o) for o, own in catalogue.objects.items() if own.splits["release"] == Part.TEST]
+    alike = [a == b for pair in combinations(tested, 2) for a, b in zip(*pair, strict=True)]
+    assert f"{sum(alike) / len(alike):.0%}".replace("%", " %") in row("Comparison, answers")["Published code"]
     counts = [str(PAPER.questions.evaluation[task]) for task in ("pc", "pss", "pom")]
     assert ", ".join(counts) in row("Number of test questions")["Here"]
     assert f"and {PAPER.questions.evaluation['psr']}," in row("Number of test questions")["Here"]
