@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +55,7 @@ def explain(error: ValidationError) -> str:
     if detail["type"] == "extra_forbidden":
         if key in RENAMED:
             return f"{key} is called {RENAMED[key]} now; write that name"
-        known = _known_keys(detail["loc"])
+        known = list(getattr(kind_of(detail["loc"][:-1]), "model_fields", ()))
         hint = did_you_mean(str(detail["loc"][-1]), known)
         return f"{key} is not a parameter; {hint}allowed here: {', '.join(known)}"
     message = detail["msg"].removeprefix("Value error, ")
@@ -74,11 +74,10 @@ def validate(values: Mapping[str, Any], origin: str) -> Params:
         raise UserError(f"{origin}: {explain(error)}") from None
 
 
-def _known_keys(location: tuple[int | str, ...]) -> list[str]:
-    model: type[BaseModel] = Params
-    for part in location[:-1]:
-        annotation = model.model_fields[str(part)].annotation
-        if not (isinstance(annotation, type) and issubclass(annotation, BaseModel)):
-            return []
-        model = annotation
-    return list(model.model_fields)
+def kind_of(key: Iterable[int | str]) -> Any:
+    """The type of a section or parameter, by the parts of its name; None where there is none of that name."""
+    kind: Any = Params
+    for part in key:
+        kind = kind.model_fields.get(str(part)) if isinstance(kind, type) and issubclass(kind, BaseModel) else None
+        kind = kind and kind.annotation
+    return kind

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from pydantic import BaseModel
 
 from pipeline import weights
 from pipeline.config import Params
@@ -21,7 +20,7 @@ from pipeline.errors import UserError
 from pipeline.io import write_text
 from pipeline.memory import launched
 from pipeline.parallel import check_backend
-from pipeline.params import PARAMS_FILE, validate
+from pipeline.params import PARAMS_FILE, kind_of, validate
 from pipeline.records import Part, Touch
 from pipeline.tasks.questions import counts_by_task
 from pipeline.videos.catalogue import Catalogue, load_catalogue
@@ -82,11 +81,7 @@ def compose(name: str, overrides: Sequence[str] = (), conf: Path = CONF) -> Para
 def _literal(override: str) -> str:
     """The override with a text as it stands: Hydra's grammar would read brackets, commas or blanks of a path."""
     key, value = override.split("=", 1)
-    field: Any = Params
-    for part in key.split("."):
-        fields = field.model_fields if isinstance(field, type) and issubclass(field, BaseModel) else {}
-        field = fields[part].annotation if part in fields else None
-    if field is not str or (len(value) > 1 and value[0] == value[-1] and value[0] in "'\""):
+    if kind_of(key.split(".")) is not str or (len(value) > 1 and value[0] == value[-1] and value[0] in "'\""):
         return override
     # Hydra halves backslashes only where a quotation mark follows.
     escaped = re.sub(r"(\\*)('|$)", lambda found: found[1] * 2 + ("\\'" if found[2] else ""), value)
@@ -94,11 +89,7 @@ def _literal(override: str) -> str:
 
 
 def check_inputs(params: Params) -> str:
-    """Raise UserError where something that the scale needs is not there: videos, catalogue, objects, tasks, weights.
-
-    Returns:
-        As `check_objects`.
-    """
+    """Raise UserError where videos, catalogue, objects, tasks or weights are not there; return as `check_objects`."""
     catalogue = load_catalogue(Path(params.data.catalogue))
     check_recipe(params.encoder.recipe)
     check_backbones(params.encoder.backbone)
@@ -140,11 +131,7 @@ def check_inputs(params: Params) -> str:
 
 
 def check_objects(params: Params, catalogue: Catalogue) -> str:
-    """Raise UserError where the objects that have videos are too few for what was chosen, before hours of training.
-
-    Returns:
-        A line on test and validation objects without videos; empty where all have some.
-    """
+    """Raise UserError where too few objects have videos for what was chosen; return a line on those that have none."""
     if params.data.source == "scenes":
         present = set(params.scenes.objects or catalogue.objects)
     else:

@@ -63,19 +63,10 @@ def dataset_frame(
         for table, row, printed_as, members in groups
     ]
     if lengths := [v.frames for v in videos]:
-        figures = (("average", fmean), ("median", median), ("minimum", min), ("maximum", max))
-        rows += [
-            {
-                "table": "video_lengths",
-                "row": row,
-                "frames": f(lengths),
-                "published": values.get(("video_lengths", row)),
-            }
-            for row, f in figures
-        ]
-    frame = pd.DataFrame(rows, columns=list(COLUMNS))
-    whole = list(COLUMNS[2:7])
-    return frame.astype(dict.fromkeys(whole, "Int64"))
+        table = "video_lengths"
+        for row, f in (("average", fmean), ("median", median), ("minimum", min), ("maximum", max)):
+            rows.append({"table": table, "row": row, "frames": f(lengths), "published": values.get((table, row))})
+    return pd.DataFrame(rows, columns=list(COLUMNS)).astype(dict.fromkeys(COLUMNS[2:7], "Int64"))
 
 
 def dataset_tables(folder: Path, dataset: str) -> dict[str, pd.DataFrame]:

@@ -17,8 +17,7 @@ import numpy.typing as npt
 Track = npt.NDArray[np.float64]
 
 RECORDED = ((126, 25.0), (50, 10.0))
-"""Frames and frames a second of the public videos: five seconds each. 366 of the 370 of no test object of the paper's
-have exactly these."""
+"""Frames and frames a second of the public videos, five seconds each; 366 of the 370 of no test object have these."""
 SLOW_SHARE = 0.18
 """Share of the videos at 10 frames a second."""
 FORCE_N = (0.5, 4.0)

@@ -10,8 +10,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import yaml
-
+from pipeline.card import front_matter
 from pipeline.config import Params
 from pipeline.io import read_table
 from pipeline.records import Classification, Part, Variant, Video
@@ -56,7 +55,7 @@ def log_model(client: Any, run: str, params: Params, variant: Variant, folder: P
     text = DataType.string
     inputs, outputs = [ColSpec(text, "question"), ColSpec(Array(text), "videos")], [ColSpec(text, "answer")]
     card = json.loads((folder / "config.json").read_text(encoding="utf-8"))
-    about = {"variant": variant.key, "scale": params.report_name, "license": _licence(folder)}
+    about = {"variant": variant.key, "scale": params.report_name, "license": str(front_matter(folder).get("license", ""))}
     experiment = client.get_run(run).info.experiment_id
     made = client.create_logged_model(experiment, NAME, source_run_id=run, tags=about, model_type="pyfunc")
     with TemporaryDirectory() as temporary:
@@ -132,11 +131,3 @@ def _example(params: Params) -> Any:
     file = next((path for v in videos if (path := Path(params.data.dir) / v.path).is_file()), None)
     touch = [base64.b64encode(file.read_bytes()).decode()] if file else []
     return pd.DataFrame({"question": [QUESTION if touch else "What can you feel?"], "videos": [touch]})
-
-
-def _licence(folder: Path) -> str:
-    """What the model card's front matter says."""
-    card = folder / "README.md"
-    parts = card.read_text(encoding="utf-8").split("---\n") if card.is_file() else []
-    front = yaml.safe_load(parts[1]) if len(parts) > 2 else None
-    return str(front.get("license", "")) if isinstance(front, dict) else ""

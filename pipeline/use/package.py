@@ -9,8 +9,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
 
-from pydantic import BaseModel
-
 from pipeline.card import CARD_FILE, write_card
 from pipeline.config import PRETRAINED, Params
 from pipeline.embeddings import STATISTICS_FILE, EmbeddingStore, Statistics
@@ -216,7 +214,10 @@ def _write_card(
             "catalogue": params.data.catalogue,
             "split": f"{params.split.name}; scores are of its test objects, which nothing was trained or chosen on",
         },
-        settings={**_flat("frames", config.frames), **_flat("encoder", config.encoder), **config.versions},
+        settings={
+            **{f"{s}.{name}": v for s in ("frames", "encoder") for name, v in getattr(config, s).model_dump().items()},
+            **config.versions,
+        },
         limits=LIMITS,
         front={"library_name": "octopi-pipeline", "model-index": [{"name": config.variant, "results": results}]},
         tables={
@@ -253,7 +254,3 @@ def _write_card(
             ],
         },
     )
-
-
-def _flat(section: str, settings: BaseModel) -> dict[str, object]:
-    return {f"{section}.{name}": value for name, value in settings.model_dump().items()}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
+from operator import eq
 from pathlib import Path
 
 from pipeline.config import SplitConfig
@@ -128,13 +129,8 @@ def _balanced(labels: Mapping[str, tuple[int, ...]], count: int, seed: int) -> l
     for o in sorted(objects, key=lambda o: labels[o]):
         smallest = min(map(len, groups))
         open_groups = [members for members in groups if len(members) == smallest]
-        min(open_groups, key=lambda members: sum(_alike(labels[o], labels[other]) for other in members)).append(o)
+        min(open_groups, key=lambda members: sum(sum(map(eq, labels[o], labels[m])) for m in members)).append(o)
     return groups
-
-
-def _alike(one: Sequence[int], other: Sequence[int]) -> int:
-    """The properties in which two objects are of one class."""
-    return sum(a == b for a, b in zip(one, other, strict=True))
 
 
 def _develop(catalogue: Catalogue, present: Collection[str], config: SplitConfig) -> dict[str, Part]:
