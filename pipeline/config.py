@@ -327,7 +327,10 @@ class TrainConfig(Section):
     batch_size: Positive = 16
     """Questions an update, over all devices."""
     micro_batch_size: Positive = 16
-    """Questions at a time on one device, of like length; the rest is accumulated, each token weighing the same."""
+    """Questions at a time on one device, of like length; the rest is accumulated."""
+    weighting: Literal["question", "token"] = "question"
+    """What weighs alike in the loss of an update: each `question`, by the mean over its answer's tokens (the published
+    code, whose batches hold one), or each `token`, so that long answers count for more."""
     projection_learning_rate: Rate = 2e-5
     """Of the projection, and of word embeddings as far as they are trained."""
     projection_schedule: Literal["cosine", "constant"] = "cosine"
@@ -369,8 +372,8 @@ class LoraTrainConfig(TrainConfig):
     """Share of the questions answered with descriptions that come with videos of other objects, to have what is
     concluded learnt from the description and not from touch; of these the description is not learnt."""
     conclusion_weight: Annotated[float, Field(gt=0)] = 1.0
-    """How much a token behind a description weighs in the loss. Descriptions are long: what decides an answer is one
-    token among a hundred."""
+    """How much a token behind a description weighs beside one of it. Descriptions are long: what decides an answer is
+    one token among a hundred."""
     replay: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """Share of the stage `teach`'s text among what is trained on, beside the questions, so that a base which was taught
     keeps what it learnt there."""

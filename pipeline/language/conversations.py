@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 
 import torch
+from torch.nn import functional as F
 from torch.nn.utils.rnn import pad_sequence
 from torch.utils.data import Sampler
 from transformers import PreTrainedTokenizerBase
@@ -34,6 +35,7 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
             follows from the description is learnt. Touch tells the classes of training objects too, and is not what
             a conclusion shall be learnt from.
         conclusion_weight: Of each token behind a description, in the loss; all others weigh 1.
+        by_question: Divide the weights of a conversation by their sum, so that all conversations weigh alike.
         replayed: Conversations without touch, all of whose labels weigh as conclusions do; they stand behind the
             questions.
 
@@ -56,6 +58,7 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
         bos: bool = True,
         counterfactual: float = 0.0,
         conclusion_weight: float = 1.0,
+        by_question: bool = True,
         replayed: Sequence[Encoded] = (),
     ) -> None:
         super().__init__()
@@ -64,7 +67,7 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
         self.per_video = per_video
         self.flip_probability = flip_probability
         self.seed = seed
-        self.counterfactual, self.conclusion_weight = counterfactual, conclusion_weight
+        self.counterfactual, self.conclusion_weight, self.by_question = counterfactual, conclusion_weight, by_question
         self.videos = sorted({video for question in self.questions for video in question.videos})
         self.encoded: list[Encoded] = []
         self.concluding: list[Encoded | None] = []
@@ -95,7 +98,7 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
         encoded = self.encoded[index]
         if index >= len(self.questions):
             weights = torch.full((len(encoded.labels),), self.conclusion_weight)
-            return _tensors(encoded, torch.zeros(0, self.store.dim), weights)
+            return self._tensors(encoded, torch.zeros(0, self.store.dim), weights)
         question = self.questions[index]
         rng = random.Random(derive_seed(self.seed, self.epoch, question.question_id))
         parts, videos, concluding = [], question.videos, self.concluding[index]
@@ -108,16 +111,17 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
             positions = sample_training(self.store.count(video_id), self.per_video, rng)
             horizontal, vertical = (rng.random() < self.flip_probability for _ in range(2))
             parts.append(self.store.features(video_id, positions, FLIPS[horizontal + 2 * vertical]))
-        return _tensors(encoded, torch.cat(parts), weights)
+        return self._tensors(encoded, torch.cat(parts), weights)
 
-
-def _tensors(encoded: Encoded, features: torch.Tensor, weights: torch.Tensor) -> dict[str, torch.Tensor]:
-    return {
-        "input_ids": torch.tensor(encoded.input_ids),
-        "labels": torch.tensor(encoded.labels),
-        "features": features,
-        "weights": weights,
-    }
+    def _tensors(self, encoded: Encoded, features: torch.Tensor, weights: torch.Tensor) -> dict[str, torch.Tensor]:
+        labels = torch.tensor(encoded.labels)
+        weights = weights * (labels != IGNORE_INDEX)
+        return {
+            "input_ids": torch.tensor(encoded.input_ids),
+            "labels": labels,
+            "features": features,
+            "weights": F.normalize(weights, p=1.0, dim=0) if self.by_question else weights,
+        }
 
 
 def check_length(question_id: str, tokens: int, positions: int | None) -> None:

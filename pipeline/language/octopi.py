@@ -50,7 +50,7 @@ class OctopiForCausalLM(nn.Module):
     """
 
     _keys_to_ignore_on_save = None  # read by transformers' Trainer when it reloads a checkpoint
-    accepts_loss_kwargs = True  # has Trainer count an update's tokens and give them to `forward`
+    accepts_loss_kwargs = True  # has Trainer add up an update's weights and give their sum to `forward`
 
     def __init__(
         self,
@@ -230,14 +230,14 @@ class OctopiForCausalLM(nn.Module):
             features: batch x frames x tactile_dim, as `embed` wants them.
             attention_mask: batch x length. Rows that are padded on the right need none: no token sees a later one.
             labels: batch x length, each token its own label; `IGNORE_INDEX` is left out.
-            weights: batch x length, how much each labelled token counts in the sum; by default 1.
-            num_items_in_batch: Labelled tokens of the whole update, so that accumulated batches weigh each token
-                alike; by default those of this batch.
+            weights: batch x length, how much each labelled token counts; by default 1.
+            num_items_in_batch: Sum of the weights of the whole update, of which this may be a part; by default that
+                of this batch.
 
         Returns:
-            Without labels `logits`, batch x length x vocabulary. With labels `loss`, the sum over labelled tokens
-            divided by their number; 0 where there is none. Logits are then computed only for columns that some row
-            needs: in long prompts that saves the larger part of them.
+            Without labels `logits`, batch x length x vocabulary. With labels `loss`, the weighted sum over labelled
+            tokens divided by that of the weights; 0 where there is none. Logits are then computed only for columns
+            that some row needs: in long prompts that saves the larger part of them.
         """
         if labels is None:
             embeddings = self.embed(input_ids, features)
@@ -254,13 +254,10 @@ class OctopiForCausalLM(nn.Module):
         output = self.llm(inputs_embeds=embeddings[:, shared:], **call, logits_to_keep=columns)
         logits = output.logits[learned[:, columns]]
         exact = logits.to(torch.promote_types(logits.dtype, torch.float32))
-        if weights is None:
-            loss = F.cross_entropy(exact, targets[learned], reduction="sum")
-        else:
-            each = F.cross_entropy(exact, targets[learned], reduction="none")
-            loss = each @ weights[:, shared + 1 :][learned].to(each.dtype)
-        count = len(logits) if num_items_in_batch is None else num_items_in_batch
-        return CausalLMOutput(loss=loss / torch.as_tensor(count, device=loss.device).clamp(min=1))
+        each = F.cross_entropy(exact, targets[learned], reduction="none")
+        counted = torch.ones_like(each) if weights is None else weights[:, shared + 1 :][learned].to(each.dtype)
+        total = counted.sum() if num_items_in_batch is None else torch.as_tensor(num_items_in_batch, device=each.device)
+        return CausalLMOutput(loss=each @ counted / torch.where(total > 0, total, 1))
 
     def _shared(self, input_ids: torch.Tensor, labels: torch.Tensor) -> int:
         """Columns that all rows begin with alike, before any frame and before what foretells a label.

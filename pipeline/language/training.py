@@ -144,6 +144,7 @@ def assemble(
         seed=material.seed,
         positions=model.positions,
         bos=language.bos,
+        by_question=config.weighting == "question",
         **own,
     )
     return model, data

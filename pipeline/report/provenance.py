@@ -94,8 +94,8 @@ def provenance(
 BEYOND = {
     "questions": ("restate", "two_turns"),
     "language": ("normalize_touch",),
-    "align": ("begin_with_words",),
-    "lora": ("target_modules", "dropout", "counterfactual", "conclusion_weight", "replay"),
+    "align": ("weighting", "begin_with_words"),
+    "lora": ("weighting", "target_modules", "dropout", "counterfactual", "conclusion_weight", "replay"),
 }
 """Settings by which a small model is trained otherwise than the paper's."""
 

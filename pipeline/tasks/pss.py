@@ -44,7 +44,7 @@ def read(answer: str) -> str | None:
 
 
 class PropertySuperlativeSelection(TaskDefinition):
-    """The right video is the only one of its class, so that the answer is never a matter of taste."""
+    """The right video has the extreme class of all objects of the part, and the others do not (the published code)."""
 
     name = "PSS"
     title = "Property Superlative Selection"
@@ -55,16 +55,16 @@ class PropertySuperlativeSelection(TaskDefinition):
         return 3 * 2 * len(catalogue.properties)
 
     def draft(self, pool: Pool, stratum: int, rng: random.Random) -> Draft | None:
-        if len(pool.objects) < 3:
-            return None
         position = stratum % 3
         index, most = divmod(stratum // 3 % (2 * len(pool.catalogue.properties)), 2)
         prop = pool.catalogue.properties[index]
-        objects = rng.sample(pool.objects, 3)
-        levels = [pool.catalogue.labels(o)[index] for o in objects]
-        extreme = max(levels) if most else min(levels)
-        if levels.count(extreme) != 1 or levels[position] != extreme:
+        levels = {o: pool.catalogue.labels(o)[index] for o in pool.objects}
+        extreme = (max if most else min)(levels.values(), default=0)
+        others = [o for o, level in levels.items() if level != extreme]
+        if len(others) < 2:
             return None
+        objects = rng.sample(others, 2)
+        objects.insert(position, rng.choice([o for o, level in levels.items() if level == extreme]))
         superlative = prop.most if most else prop.least
         user = asked(rng.choice(TEMPLATES), superlative, prop.spoken)
         verdict = f"{LETTERS[position]}) is the {superlative}."

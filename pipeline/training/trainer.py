@@ -65,6 +65,15 @@ class TrainableTrainer(Trainer):
     def _get_train_sampler(self, train_dataset: Any = None) -> Sampler[int] | None:
         return self._sampler or cast("Sampler[int] | None", super()._get_train_sampler(train_dataset))
 
+    def _get_num_items_in_batch(
+        self, batch_samples: list[dict[str, torch.Tensor]], device: torch.device
+    ) -> torch.Tensor | int | None:
+        """What an update's loss is divided by: the sum of its weights over all devices; without any, its labels."""
+        if not batch_samples or "weights" not in batch_samples[0]:
+            return cast("torch.Tensor | int | None", super()._get_num_items_in_batch(batch_samples, device))
+        total = torch.stack([batch["weights"].sum() for batch in batch_samples]).sum()
+        return cast(torch.Tensor, self.accelerator.gather(total.to(device))).sum()
+
     def create_optimizer(self, model: torch.nn.Module | None = None) -> torch.optim.Optimizer:
         """AdamW with one group a prefix of `rates`, or the Trainer's own without."""
         if self._rates is None:

@@ -42,7 +42,7 @@ def generation(batch_size: int, tokens: int = 12) -> LanguageConfig:
     return LanguageConfig(weights="", max_new_tokens=tokens, generation_batch_size=batch_size)
 
 
-def taking(samples: int, **own: float) -> LoraTrainConfig:
+def taking(samples: int, **own: float | str) -> LoraTrainConfig:
     """Settings that take so many questions."""
     return LoraTrainConfig(samples=samples, **own)
 

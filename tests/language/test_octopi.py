@@ -30,7 +30,7 @@ from tests.language.shared import DIM, FRAMES, LORA, adapted, assert_comes_back,
 @pytest.mark.parametrize("weight", [1.0, 3.0])
 def test_loss_is_over_answers_only(weight: float, model: OctopiForCausalLM, held: Material) -> None:
     """By hand in float64, over rows of unlike lengths whose answers begin at other columns."""
-    _, data = assemble(held, taking(4, conclusion_weight=weight), "test")
+    _, data = assemble(held, taking(4, conclusion_weight=weight, weighting="token"), "test")
     batch = collate([data[i] for i in range(len(data))])
     labels, weights = batch.pop("labels"), batch["weights"]
     concluding = ["".join(model.tokenizer.decode(i[w > 1])) for i, w in zip(labels, weights, strict=True)]
@@ -43,10 +43,11 @@ def test_loss_is_over_answers_only(weight: float, model: OctopiForCausalLM, held
         -weights[row, column] * logits[row, column - 1].log_softmax(-1)[labels[row, column]]
         for row, column in (labels != IGNORE_INDEX).nonzero().tolist()
     ]
+    total, counted = torch.stack(losses).sum(), weights[labels != IGNORE_INDEX].sum()
     output = model(**batch, labels=labels)
-    torch.testing.assert_close(output.loss.double(), torch.stack(losses).mean(), atol=1e-5, rtol=0)
+    torch.testing.assert_close(output.loss.double(), total / counted, atol=1e-5, rtol=0)
     share = model(**batch, labels=labels, num_items_in_batch=torch.tensor(1000)).loss
-    torch.testing.assert_close(share.double(), torch.stack(losses).sum() / 1000, atol=1e-5, rtol=0)
+    torch.testing.assert_close(share.double(), total / 1000, atol=1e-5, rtol=0)
     frames = batch["input_ids"] == model.frame_id
     assert (labels[frames] == IGNORE_INDEX).all()
 

@@ -1,7 +1,7 @@
 """conf/accelerate/fsdp.yaml on two CPU processes: sharded trainings against those of one process.
 
-One process sees four questions of an update in two halves, two processes see a half each: the same terms of the same
-sums, added in another order. Adam divides each gradient by its own size, so an update differs by its rounding relative
+One process sees the questions of an update one by one, two processes see a half each: the same terms of the same sums,
+added in another order. Adam divides each gradient by its own size, so an update differs by its rounding relative
 to the rate: 1e-7 times the terms that cancel, far below the hundredth of a rate that is allowed here.
 """
 

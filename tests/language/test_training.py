@@ -13,7 +13,6 @@ import pytest
 import torch
 from safetensors.torch import load_file
 from torch.optim.optimizer import register_optimizer_step_pre_hook
-from torch.utils.data import SequentialSampler
 from transformers import TrainerCallback, TrainerState
 
 from pipeline.config import LoraTrainConfig, RuntimeConfig
@@ -23,7 +22,7 @@ from pipeline.language.chat import IGNORE_INDEX
 from pipeline.language.training import Job, Material, add_lora, assemble, fit, write_model_card
 from pipeline.training.trainer import Trained
 from tests.closure import ROOT
-from tests.language.shared import SMALL, assert_comes_back, taking, train
+from tests.language.shared import SMALL, assert_comes_back, embedded, taking, train
 
 CPU = RuntimeConfig(device="cpu")
 RUNTIME = RuntimeConfig(device="cpu", save_steps=2)
@@ -181,26 +180,50 @@ def test_each_part_learns_at_its_own_rate_and_in_float32(dtype: str, held: Mater
     assert all(line in card for line in ("fine-tuned with LoRA", "| rank | 4 |", f"base_model:\n- {language.weights}"))
 
 
-def test_accumulated_batches_weigh_every_token_alike(
-    held: Material, checkpoints: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("weighting", ["question", "token"])
+@pytest.mark.parametrize("micro", [4, 2, 1])
+def test_an_updates_gradient_is_that_of_its_questions_one_at_a_time(
+    micro: int, weighting: str, held: Material, checkpoints: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By the gradient of the first update: rounding aside, four batches of one must give that of one of four."""
-    # Buckets depend on how many questions a batch has.
-    monkeypatch.setattr("pipeline.language.training.LengthBuckets", lambda lengths, *_: SequentialSampler(lengths))
-    gradients: list[torch.Tensor] = []
-    for micro in (4, 2, 1):
-        model, data = assemble(held, taking(4), "test")
-        counts = [sum(label != IGNORE_INDEX for label in e.labels) for e in data.encoded]
-        assert max(counts) > 1.5 * min(counts), "or equal weights would do"
-        config = SMALL.model_copy(update={"micro_batch_size": micro, "epochs": 1, "max_grad_norm": 1e9})
-        kept = register_optimizer_step_pre_hook(
-            lambda optimizer, *_: gradients.append(
-                torch.cat([p.grad.flatten() for group in optimizer.param_groups for p in group["params"]])
-            )
-        )
-        fit(model.double(), data, config, CPU, Job("align", f"x{micro}", 0))
-        kept.remove()
-    assert len(gradients) == 3
-    for other in gradients[1:]:
-        # transformers' normalisation computes in float32 whatever it is given.
-        torch.testing.assert_close(gradients[0], other, atol=1e-6 * float(gradients[0].abs().max()), rtol=0)
+    """Updates of four, four and one, by a plain loop in float64 over tokens, without batches, padding or a cache."""
+    order = [7, 0, 1, 2, 8, 3, 4, 5, 6]  # The last two are text without touch.
+    monkeypatch.setattr("pipeline.language.training.LengthBuckets", lambda *_: order)
+    own = {"weighting": weighting, "counterfactual": 0.4, "conclusion_weight": 3.0, "replay": 0.25}
+    config = LoraTrainConfig(**{**SMALL.model_dump(), "epochs": 1, "samples": 7, "max_grad_norm": 0.0, **own})
+    model, data = assemble(held, config, "test")
+    parameters, gaps, counts = list(model.double().connector.parameters()), [], []
+
+    def loss(update: list[int]) -> torch.Tensor:
+        own, total, whole = dict(model.connector.named_parameters()), torch.zeros(()).double(), 0.0
+        for index in update:
+            ids, labels = data[index]["input_ids"].tolist(), data[index]["labels"].tolist()
+            features, words = data[index]["features"].double(), model.llm.get_input_embeddings().weight
+            said = model.llm(inputs_embeds=embedded(model, ids, features, words, own)[None]).logits[0].log_softmax(-1)
+            late = data.concluding[index].labels if index < 7 and data.concluding[index] else labels  # type: ignore[union-attr]
+            heavy = index >= 7 or data.concluding[index] is not None
+            terms = [
+                (3.0 if heavy and late[place] != IGNORE_INDEX else 1.0, said[place - 1, label])
+                for place, label in enumerate(labels)
+                if label != IGNORE_INDEX
+            ]
+            counts.append(len(terms))
+            share = sum(weight for weight, _ in terms) if weighting == "question" else 1.0
+            total = total - sum(weight * value for weight, value in terms) / share
+            whole += sum(weight for weight, _ in terms) / share
+        return total / whole
+
+    @torch.enable_grad()
+    def compare(*_: object) -> None:
+        update = order[4 * len(gaps) : 4 * len(gaps) + 4]
+        wanted = torch.cat([g.flatten() for g in torch.autograd.grad(loss(update), parameters)])
+        found = torch.cat([p.grad.flatten() for p in parameters])  # type: ignore[union-attr]
+        gaps.append(float((found - wanted).abs().max() / wanted.abs().max()))
+
+    kept = register_optimizer_step_pre_hook(compare)
+    fit(model, data, config.model_copy(update={"micro_batch_size": micro}), CPU, Job("align", "x", 0))
+    kept.remove()
+    assert len(data) == 9
+    assert max(counts) > 3 * min(counts), "or either weighting would do"
+    # transformers' normalisation computes in float32 whatever it is given.
+    assert len(gaps) == 3
+    assert max(gaps) < 2e-6, gaps

@@ -35,14 +35,12 @@ def reference(model: OctopiForCausalLM, folder: Path, batch: dict[str, torch.Ten
     own = {n: p.detach().clone().requires_grad_() for n, p in model.connector.named_parameters()}
     words = plain.model.embed_tokens.weight.detach().clone().requires_grad_()
     total = torch.zeros((), dtype=torch.float64)
-    count = 0
     for ids, labels, features in zip(batch["input_ids"], batch["labels"], batch["features"], strict=True):
         row = embedded(model, ids.tolist(), features.double(), words, own)
         said = plain(inputs_embeds=row[None]).logits[0].log_softmax(-1)
-        for column in (labels != IGNORE_INDEX).nonzero().flatten().tolist():
-            total = total - said[column - 1, labels[column]]
-            count += 1
-    (total / count).backward()
+        columns = (labels != IGNORE_INDEX).nonzero().flatten().tolist()
+        total = total - sum(said[column - 1, labels[column]] for column in columns) / len(columns)
+    (total / len(batch["labels"])).backward()
     return {name: leaf.grad for name, leaf in (*own.items(), ("words", words)) if leaf.grad is not None}
 
 

@@ -15,6 +15,8 @@ from pipeline.language.chat import TACTILE
 from pipeline.records import Opd, Part, Question, Score
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool, conclusion, find_level
+from pipeline.tasks.questions import build_questions
+from pipeline.videos.catalogue import Catalogue
 from tests.tasks.shared import CATALOGUE, grade
 
 POOL = Pool(Part.TRAIN, CATALOGUE, {o: [f"{o}_{i}" for i in range(3)] for o in CATALOGUE.objects})
@@ -88,6 +90,33 @@ def test_comparisons_and_superlatives_are_true_and_the_extreme_is_unique(task: s
             assert levels.count(extreme) == 1
             truth = "abc"[levels.index(extreme)]
         assert question.gold.choice == truth
+
+
+LABELS = st.lists(st.tuples(*(st.integers(0, len(p.levels) - 1) for p in CATALOGUE.properties)), max_size=9)
+
+
+@settings(max_examples=40)
+@given(LABELS, st.integers(0, 3))
+def test_a_superlative_is_the_extreme_of_all_that_the_part_has(labels: list[tuple[int, ...]], seed: int) -> None:
+    """Whatever classes there are; a middle one is asked for where nothing beyond it is there."""
+    objects = {
+        name: CATALOGUE.objects[name].model_copy(update={"ratings": tuple((label,) for label in own)})
+        for name, own in zip(CATALOGUE.objects, labels, strict=False)
+    }
+    pool = Pool(Part.TEST, Catalogue(language=CATALOGUE.language, objects=objects), {o: [f"{o}_0"] for o in objects})
+    questions = build_questions(pool, {"PSS": 18}, seed=seed, distinct=True)
+    asked = set()
+    for question in questions:
+        place = CATALOGUE.property_index(question.gold.properties[0])
+        most = f"the {CATALOGUE.properties[place].most}" in question.dialogues[0].turns[0].user
+        levels = [own[place] for own in question.gold.labels]
+        right = (max if most else min)(own[place] for own in labels)
+        assert [level == right for level in levels] == [letter == question.gold.choice for letter in "abc"]
+        asked.add((place, most))
+    for place in range(len(CATALOGUE.properties)):
+        classes = [own[place] for own in labels]
+        for most, extreme in ((True, max(classes, default=0)), (False, min(classes, default=0))):
+            assert ((place, most) in asked) == (len(classes) - classes.count(extreme) > 1)
 
 
 def test_options_are_alphabetical_and_told_apart() -> None:
