@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 from jinja2 import TemplateError
@@ -21,13 +22,18 @@ if TYPE_CHECKING:
 
 TACTILE = "{tactile}"
 TACT_START, TACT_FRAME, TACT_END = TACTILE_TOKENS = ("<tact_start>", "<tact_frame>", "<tact_end>")
+PROBE = "Octopi"
+"""Said to a chat template to see what it writes around an answer."""
 IGNORE_INDEX = -100
 """Label of a token that the loss leaves out (torch's and transformers' convention)."""
 
 
 @dataclass(frozen=True)
 class Rendered:
-    """A conversation as text, with the character spans that the assistant says, end token included."""
+    """A conversation as text, with the character spans that the assistant says, end token included.
+
+    What a template writes of its own before an answer, as an empty block of thoughts, is asked and not said.
+    """
 
     text: str
     answers: tuple[tuple[int, int], ...]
@@ -70,14 +76,29 @@ def render(
     if tokenizer.chat_template is None:
         return vicuna(shown, system_prompt, str(tokenizer.eos_token), complete)
     messages = [{"role": "system", "content": system_prompt}] if system_prompt else []
-    prompts = []
+    written = []
     for turn in shown:
         messages.append({"role": "user", "content": turn.user})
-        prompts.append(_templated(messages, tokenizer, ask=True))
+        written.append(_templated(messages, tokenizer, ask=True))
         messages.append({"role": "assistant", "content": turn.assistant})
-    text = _templated(messages, tokenizer, ask=False) if complete else prompts.pop() if prompts else ""
-    ends = [str(tokenizer.convert_ids_to_tokens(i)) for i in end_ids(tokenizer)]
-    return Rendered(text, tuple(_answer(text, prompt, ends, tokenizer) for prompt in prompts), templated=True)
+    if complete:
+        written.append(_templated(messages, tokenizer, ask=False))
+    where, (lead, _) = f"language.weights: the chat template in {tokenizer.name_or_path}", _around_answers(tokenizer)
+    text, starts = "", []
+    for before, longer in pairwise(["", *written]):
+        if not longer.startswith(before):
+            raise UserError(f"{where} writes a prompt otherwise once it is answered; take one that only appends")
+        added = longer.removeprefix(before)
+        # Some write it before the last answer alone, but every answer is the last one when it is asked for.
+        text += added if not before or added.startswith(lead) else lead + added
+        starts.append(len(text) + len(lead))
+    ends, answers = [str(tokenizer.convert_ids_to_tokens(i)) for i in end_ids(tokenizer)], []
+    for start in starts[:-1]:
+        stops = [place + len(end) for end in ends if (place := text.find(end, start)) >= 0]
+        if not stops:
+            raise UserError(f"{where} ends an answer with none of {', '.join(ends)}; the model could not learn to stop")
+        answers.append((start, min(stops)))
+    return Rendered(text if complete else text + lead, tuple(answers), templated=True)
 
 
 def end_ids(tokenizer: PreTrainedTokenizerBase) -> tuple[int, ...]:
@@ -88,11 +109,9 @@ def end_ids(tokenizer: PreTrainedTokenizerBase) -> tuple[int, ...]:
     eos = [] if tokenizer.eos_token_id is None else [int(tokenizer.eos_token_id)]
     if tokenizer.chat_template is None:
         return tuple(eos)
-    messages = [{"role": "user", "content": "a"}, {"role": "assistant", "content": "b"}]
-    asked = _templated(messages[:1], tokenizer, ask=True)
-    said = _templated(messages, tokenizer, ask=False)[len(asked) :]
+    _, rest = _around_answers(tokenizer)
     special = {i for i, token in tokenizer.added_tokens_decoder.items() if token.special}
-    behind = [i for i in tokenizer(said, add_special_tokens=False)["input_ids"] if i in special]
+    behind = [i for i in tokenizer(rest, add_special_tokens=False)["input_ids"] if i in special]
     return tuple(dict.fromkeys(eos + behind[:1]))
 
 
@@ -165,12 +184,9 @@ def _templated(messages: Sequence[dict[str, str]], tokenizer: PreTrainedTokenize
         ) from None
 
 
-def _answer(text: str, prompt: str, ends: Sequence[str], tokenizer: PreTrainedTokenizerBase) -> tuple[int, int]:
-    """Where the answer to a prompt stands in the text, its end token included."""
-    where = f"language.weights: the chat template in {tokenizer.name_or_path}"
-    if not text.startswith(prompt):
-        raise UserError(f"{where} writes a prompt otherwise once it is answered; take one that only appends")
-    stops = [place + len(end) for end in ends if (place := text.find(end, len(prompt))) >= 0]
-    if not stops:
-        raise UserError(f"{where} ends an answer with none of {', '.join(ends)}; the model could not learn to stop")
-    return len(prompt), min(stops)
+def _around_answers(tokenizer: PreTrainedTokenizerBase) -> tuple[str, str]:
+    """What the template writes of its own between a prompt and the answer's text, and behind that."""
+    messages = [{"role": "user", "content": "a"}, {"role": "assistant", "content": PROBE}]
+    before, _, behind = _templated(messages, tokenizer, ask=False).rpartition(PROBE)
+    # The space before a word belongs to its token.
+    return before.removeprefix(_templated(messages[:1], tokenizer, ask=True)).rstrip(" "), behind

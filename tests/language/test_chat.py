@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 from contextlib import suppress
+from itertools import pairwise, takewhile
 from pathlib import Path
 
 import pytest
@@ -149,6 +150,76 @@ def test_smollm2_is_asked_in_chatml_with_its_own_system_message_or_ours(smollm2_
     assert own.endswith("Describe both.<|im_end|>\n<|im_start|>assistant\n")
     ours = render(PSR[:1], tokenizer, system_prompt="Feel.", frames=1, complete=False).text
     assert ours.startswith("<|im_start|>system\nFeel.<|im_end|>\n<|im_start|>user\nFeel <tact_start><tact_frame>")
+
+
+IM = "<|im_start|>{role}\n{text}<|im_end|>\n"
+CHATML = (
+    "{% for m in messages %}<|im_start|>{{ m.role }}\n{{ m.content }}<|im_end|>\n{% endfor %}"
+    "{% if add_generation_prompt %}<|im_start|>assistant\n{% endif %}"
+)
+QWEN3 = """{%- set ns = namespace(last=-1) %}
+{%- for m in messages %}{% if m.role == 'user' %}{% set ns.last = loop.index0 %}{% endif %}{% endfor %}
+{%- for m in messages %}
+    {%- set content = m.content.split('</think>')[-1].lstrip('\\n') if m.role == 'assistant' else m.content %}
+    {%- if m.role == 'assistant' and loop.index0 > ns.last %}
+        {{- '<|im_start|>' + m.role + '\\n<think>\\n\\n</think>\\n\\n' + content }}
+    {%- else %}
+        {{- '<|im_start|>' + m.role + '\\n' + content }}
+    {%- endif %}
+    {{- '<|im_end|>\\n' }}
+{%- endfor %}
+{%- if add_generation_prompt %}{{- '<|im_start|>assistant\\n' }}{% endif %}"""
+"""As Qwen3 writes it: the last answer alone has a block of thoughts, which is empty, and a prompt has none."""
+ALWAYS = CHATML.replace("{{ m.content }}", "{% if m.role == 'assistant' %}[FINAL]{% endif %}{{ m.content }}")
+FAMILIES = {
+    "chatml": (CHATML, "", IM),
+    "qwen3": (QWEN3, "<think>\n\n</think>\n\n", IM),
+    "always": (ALWAYS, "[FINAL]", IM),
+    "llama3": (plain(LLAMA3), "", "<|head|>{role}<|/head|>\n\n{text}<|eot|>"),
+}
+"""Templates by family, with what each writes before an answer of its own, and how it writes a message."""
+OWN = ("<|im_start|>", "<|im_end|>", "<|head|>", "<|/head|>", "<|eot|>")
+
+
+@pytest.fixture(scope="module", params=[False, True])
+def knows_all(request: pytest.FixtureRequest) -> PreTrainedTokenizerFast:
+    """A tokenizer of the families' tokens; those around thoughts may be special ones."""
+    tokenizer = sentence_piece()
+    tokenizer.add_special_tokens({"additional_special_tokens": list(OWN)})
+    tokenizer.add_tokens(["<think>", "</think>"], special_tokens=request.param)
+    add_tactile_tokens(tokenizer)
+    return tokenizer
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+@given(talk=st.lists(st.tuples(WORDS, WORDS), min_size=1, max_size=3))
+def test_what_a_template_writes_before_an_answer_is_asked_and_not_learnt(
+    family: str, knows_all: PreTrainedTokenizerFast, talk: list[tuple[str, str]]
+) -> None:
+    """Before each answer alike, in training and in every prompt, against the format written by hand."""
+    template, lead, message = FAMILIES[family]
+    knows_all.chat_template = template
+    turns = tuple(Turn(user=f"Feel {u}.", assistant=f"It is {a}.") for u, a in talk)
+    trained = encode(render(turns, knows_all, system_prompt="", frames=1, complete=True), knows_all)
+    text = "<s>" if family == "llama3" else ""
+    for number, turn in enumerate(turns, 1):
+        opening, _, closing = message.format(role="assistant", text="|text|").partition("|text|")
+        text += message.format(role="user", text=turn.user) + opening + lead
+        prompt = render(turns[:number], knows_all, system_prompt="", frames=1, complete=False)
+        assert prompt.text == text
+        asked = encode(prompt, knows_all)
+        place = len(asked.input_ids)
+        assert trained.input_ids[:place] == asked.input_ids
+        text += turn.assistant + closing
+        learnt = list(takewhile(lambda label: label != IGNORE_INDEX, trained.labels[place:]))
+        assert [trained.labels[place - 1], learnt[-1]] == [
+            IGNORE_INDEX,
+            knows_all.convert_tokens_to_ids(closing.strip()),
+        ]
+        assert str(knows_all.decode(learnt[:-1])).strip() == turn.assistant
+    assert render(turns, knows_all, system_prompt="", frames=1, complete=True).text == text
+    assert sum(label != IGNORE_INDEX and a == IGNORE_INDEX for a, label in pairwise(trained.labels)) == len(turns)
+    assert end_ids(knows_all) == (2, knows_all.convert_tokens_to_ids(closing.strip()))
 
 
 def test_both_end_tokens_end_an_answer() -> None:
