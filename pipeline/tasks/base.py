@@ -10,10 +10,19 @@ from dataclasses import dataclass, replace
 
 from pipeline.records import Dialogue, Gold, Opd, Part, Prediction, Question, Score, Turn
 from pipeline.videos.catalogue import Catalogue, Property
-from pipeline.videos.catalogue.wording import mentioned, plain
+from pipeline.videos.catalogue.wording import mentioned, plain, unmarked
 
 LETTERS = "abc"
 ORDINALS = ("First", "Second")
+MARKER = r"[^\S\n]*(?:[:,]|-\s|is\b|\n|$)"
+LETTER = (
+    r"(?<![\w'])(?:(?:option|object|video) \(?([a-z])\b\)?|"
+    r"\(?([a-z])(?:\)|(?=\s*(?:[.,:;!]|is\b|because\b))|(?<=[b-z])(?=\s*$)))"
+)
+CHOICE = rf"{LETTER}(?:,?\s*(?:or|nor|and|/)\s*{LETTER})?"
+"""How answers name what they choose: "b)", "(b)", "option B", or "b" where nothing follows that "a" could belong to."""
+BEGUN = r"(?:^|[.,;:]\s+|\b(?:so|thus)\s+)"
+"""Where a clause begins that nothing before it can doubt or deny."""
 
 
 @dataclass(frozen=True)
@@ -202,9 +211,13 @@ def lettered(count: int) -> str:
     return ", ".join(f"{LETTERS[i]}) {{tactile}}" for i in range(count))
 
 
-def conclusion(text: str) -> str:
-    """What an answer says after its last "Conclusion:", or all of it where it has none."""
-    return re.split(r"conclusion\s*:", text, flags=re.IGNORECASE)[-1].strip()
+def conclusion(text: str) -> list[str]:
+    """What an answer says after its last "Conclusion:", or all of it where it has none, as a person reads it.
+
+    It is cut where it says "Answer:" once more. Parts that choose otherwise contradict each other.
+    """
+    said = re.split(rf"\bconclusion{MARKER}", unmarked(text), flags=re.IGNORECASE)[-1]
+    return [" ".join(part.split()) for part in re.split(rf"\banswer{MARKER}", said, flags=re.IGNORECASE)]
 
 
 def find_level(text: str, prop: Property) -> int | None:
@@ -213,16 +226,25 @@ def find_level(text: str, prop: Property) -> int | None:
     return list(map(plain, prop.levels)).index(named[0]) if len(named) == 1 else None
 
 
-def chosen_letter(text: str, before: str) -> str | None:
-    """The one letter, a or b, that stands as "x)" behind `before` (a pattern), or None.
+def chosen_letter(answer: str, letters: str, *sayings: str, concluded: bool = False) -> str | None:
+    """The one of `letters` that an answer chooses, or None: two, another one, or "a) or b)" are no choice.
 
-    Two different letters there, another one, or "a) or b)", are no choice.
+    Args:
+        sayings: Patterns in which CHOICE stands for the letter. The first that is found decides. Where none is, a
+            letter that is all of an answer, or that its conclusion begins with, before any reason.
+        concluded: Look for sayings in the conclusion alone.
     """
-    pattern = rf"{before}\s+\(?([a-z])\)(?:,?\s*(?:or|and|/)\s*\(?([a-z])\))?"
-    said = re.findall(pattern, text, flags=re.IGNORECASE)
-    letters = {letter.lower() for pair in said for letter in pair if letter}
-    letter = letters.pop() if len(letters) == 1 else None
-    return letter if letter in ("a", "b") else None
+    whole, parts = " ".join(unmarked(answer).split()), conclusion(answer)
+    found: list[tuple[str, ...]] = []
+    for saying in sayings:
+        found = found or re.findall(saying.replace("CHOICE", CHOICE), " ".join(parts) if concluded else whole, re.I)
+    follows = r"\W*$" if parts == [whole] else r"\W*$|[,.;!]|\s*-"
+    for part in () if found else parts:
+        claim = re.split(r"\b(?:because|since)\b", part, flags=re.I)[0]
+        if begun := re.match(rf"\W*(?:{LETTER}(?={follows})|([a-z])\s*$)", claim, re.I):
+            found += [begun.groups(""), *re.findall(r"\b([a-z])[).]", claim, re.I)]
+    named = {letter.lower() for group in found for letter in group if letter}
+    return named.pop() if len(named) == 1 and named <= {*letters} else None
 
 
 def begins_as_published(question: Question, prediction: Prediction) -> bool:

@@ -92,5 +92,6 @@ def build_examples(assignments: Sequence[Assignment], catalogue: Catalogue, *, s
 def grade_example(question: Question, prediction: Prediction) -> Score:
     """Read from the letter behind the example's `answer`; two different letters there are no choice."""
     before = next(e.answer for e in EXAMPLES if e.name == question.task)
-    (score,) = choice_score(question, prediction, chosen_letter(prediction.outputs[-1], re.escape(before)))
+    letter = chosen_letter(prediction.outputs[-1], LETTERS[:2], rf"{re.escape(before)} CHOICE")
+    (score,) = choice_score(question, prediction, letter)
     return score

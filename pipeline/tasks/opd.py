@@ -10,7 +10,7 @@ from string import Formatter
 from pipeline.records import Opd, Prediction, Question, Score
 from pipeline.tasks.base import Draft, Pool, TaskDefinition, draft_single_turn, find_level, scored
 from pipeline.videos.catalogue import Catalogue
-from pipeline.videos.catalogue.wording import OPENING
+from pipeline.videos.catalogue.wording import OPENING, unmarked
 
 TEMPLATES = ("Describe the physical properties of {tactile}.", "How does this tactile video {tactile} feel?")
 
@@ -45,7 +45,7 @@ class ObjectPropertyDescription(TaskDefinition):
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         """One score a property, read from the closing sentence ("Overall ..."), and `combined` for all at once."""
         # Before that sentence an answer describes freely, in words that may name a class in passing.
-        closing = "".join(re.split(rf"\b{OPENING}\b", prediction.outputs[0], flags=re.IGNORECASE)[1:][-1:])
+        closing = "".join(re.split(rf"\b{OPENING}\b", unmarked(prediction.outputs[0]), flags=re.IGNORECASE)[1:][-1:])
         expected = question.gold.labels[0]
         predicted = [find_level(closing, p) for p in catalogue.properties]
         strict = as_published(prediction.outputs[0], expected, catalogue)

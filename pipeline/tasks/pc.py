@@ -40,9 +40,10 @@ def asked(template: str, comparative: str, spoken: str) -> dict[Opd, str]:
 
 def read(answer: str) -> Reading | None:
     """One of `CHOICES`, from how the conclusion begins: "Yes", "No" or "Both"; "yes and no" is none of them."""
-    match = re.match(r"(yes|no|both)\b(?!\s*(?:and|or|/)\s*(?:yes|no|both)\b)", conclusion(answer), flags=re.IGNORECASE)
+    pattern = r"\W*(yes|no|both)\b(?!\s*(?:and|or|/)\s*(?:yes|no|both)\b|\s+(?:idea|answer|conclusion|clue)\b)"
+    found = {m[1].lower() for part in conclusion(answer) if (m := re.match(pattern, part, flags=re.IGNORECASE))}
     readings: dict[str, Reading] = {"yes": "yes", "no": "no", "both": "same"}
-    return readings[match[1].lower()] if match else None
+    return readings[found.pop()] if len(found) == 1 else None
 
 
 class PropertyComparison(TaskDefinition):

@@ -22,6 +22,7 @@ from pipeline.tasks.base import (
     lettered,
 )
 from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.catalogue.wording import unmarked
 
 OPENINGS = ("Given three tactile videos: {videos}.", "You have tactile videos of one object each: {videos}.")
 REQUEST = "atch each video to one of the following objects in alphabetical order: {options}."
@@ -52,9 +53,11 @@ def asked(opening: str, names: Iterable[str]) -> dict[Opd, str]:
 
 def read(answer: str, names: Sequence[str]) -> dict[str, int] | None:
     """Each letter's place among the names, from "a) is NAME": one name for each, and no name twice; else None."""
-    said = "|".join(re.escape(name) for name in sorted(names, key=len, reverse=True))
-    pairs = re.findall(rf"\b([abc])\) is ({said})(?!['\w])", conclusion(answer), flags=re.IGNORECASE)
-    found = {letter.lower(): [n.lower() for n in names].index(name.lower()) for letter, name in pairs}
+    known = [unmarked(name).lower() for name in names]
+    said = "|".join(re.escape(name) for name in sorted(known, key=len, reverse=True))
+    pattern = rf"\b([abc])(?:\)|(?=\s*[:=-]|\s+is\b))(?:\s*:|\s*=|\s*->?|\s+is)?\s+({said})(?!'?\w|\s+or\b)"
+    pairs = re.findall(pattern, " ".join(conclusion(answer)), flags=re.IGNORECASE)
+    found = {letter.lower(): known.index(name.lower()) for letter, name in pairs}
     whole = len(pairs) == 3 and sorted(found) == list(LETTERS) and sorted(found.values()) == [0, 1, 2]
     return found if whole else None
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 from pipeline.records import Dialogue, Opd, Prediction, Question, Score, Turn
 from pipeline.tasks.base import (
+    BEGUN,
     LETTERS,
     Draft,
     Pool,
@@ -40,7 +41,8 @@ def asked(question: str, aspects: str) -> dict[Opd, tuple[str, ...]]:
 
 def read(answer: str) -> str | None:
     """The letter in "The most suitable object is x)", or "... for this is x)"; "x) or y)", or two letters, are none."""
-    return chosen_letter(answer, r"most suitable object(?: for [^.;]*?)? is")
+    said = r"most suitable object(?: for [^.;]*?)? is:? CHOICE"
+    return chosen_letter(answer, LETTERS[:2], said, rf"{BEGUN}CHOICE is the (?:most suitable|best)\b")
 
 
 class PropertyScenarioReasoning(TaskDefinition):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-import re
 
 from pipeline.records import Opd, Prediction, Question, Score
 from pipeline.tasks.base import (
@@ -13,8 +12,8 @@ from pipeline.tasks.base import (
     TaskDefinition,
     begins_as_published,
     choice_score,
+    chosen_letter,
     concluded,
-    conclusion,
     draft_single_turn,
     lettered,
 )
@@ -39,8 +38,8 @@ def asked(template: tuple[str, str], superlative: str, spoken: str) -> dict[Opd,
 
 def read(answer: str) -> str | None:
     """The one letter that the conclusion calls the superlative."""
-    letters = set(re.findall(r"\b([abc])\) is the\b", conclusion(answer), flags=re.IGNORECASE))
-    return letters.pop().lower() if len(letters) == 1 else None
+    named = (r"CHOICE is (?:\w+ly )?the\b(?! same)", r"(?:\w+est|(?:most|least) \w+)(?: \w+)? is CHOICE")
+    return chosen_letter(answer, LETTERS, *named, concluded=True)
 
 
 class PropertySuperlativeSelection(TaskDefinition):

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 from pipeline.records import Dialogue, Opd, Prediction, Question, Score, Turn
 from pipeline.tasks.base import (
+    BEGUN,
     LETTERS,
     Draft,
     Pool,
@@ -86,7 +87,8 @@ class Ripeness(TaskDefinition):
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         """Read from "The riper FRUIT is x)"; two different letters there are no answer."""
         fruits = "|".join(map(re.escape, _fruits(catalogue)))
-        return choice_score(question, prediction, chosen_letter(prediction.outputs[-1], rf"riper (?:{fruits}|one) is"))
+        said = (rf"riper (?:{fruits}|one) is CHOICE", rf"{BEGUN}CHOICE is (?:the )?riper\b")
+        return choice_score(question, prediction, chosen_letter(prediction.outputs[-1], LETTERS[:2], *said))
 
 
 def _fruits(catalogue: Catalogue) -> list[str]:

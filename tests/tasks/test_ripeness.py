@@ -80,7 +80,7 @@ def test_without_two_ranks_nothing_is_asked(objects: list[str]) -> None:
         ("The riper avocado is a) and b).", None),
         ("The riper avocado is a). No: the riper avocado is b).", None),
         ("The less ripe avocado is a).", None),
-        ("a", None),
+        ("a riper one", None),
     ],
 )
 def test_what_is_read(said: str, letter: str | None) -> None:

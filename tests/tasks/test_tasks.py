@@ -188,19 +188,43 @@ UNREADABLE = {
     "PC": [
         *("", "Maybe.", "Not sure.", "None", "Nobody knows", "The first object is harder.", "Yesterday", "Bothersome"),
         *("Conclusion:", "Conclusion: maybe", "Yes. Conclusion: I cannot say.", "First object: Overall, yes."),
-        *("Yes and no.", "yes or no", "Yes/No", "Conclusion: No / yes", "Both or no"),
+        *("Yes and no.", "yes or no", "Yes/No", "Conclusion: No / yes", "Both or no", "**Yes** / **No**"),
+        *("No idea.", "**No** answer can be given.", "Conclusion: Yes. Answer: No.", "Conclusion: ~~Yes~~"),
+        *("<think>Conclusion: Yes.</think> I cannot tell.", "<think>Conclusion: Yes."),
     ],
     "PSS": [
-        *("", "a", "The hardest.", "a), b) or c)", "d) is the hardest.", "a) is the hardest. b) is the hardest."),
-        "ba) is the",
+        *(
+            "",
+            "a hard one",
+            "The hardest.",
+            "a), b) or c)",
+            "d) is the hardest.",
+            "a) is the hardest. b) is the hardest.",
+        ),
+        *("ba) is the", "a) is the same as b).", "The hardest is **a)** or **b)**.", "Answer: A human cannot tell."),
+        *(f"Conclusion: {x}" for x in ("a), b) or c)", "a) is soft, b) is hard, c) is hard.", "d)", "unclear", "a b)")),
+        *("a) The surface feels hard", "a. The surface feels hard.", "Conclusion: **a)**. Answer: **b)**."),
+        *("Answer: b) Conclusion: I cannot tell.", "Option A or option B", "None of **b)**"),
     ],
-    "RIPE": ["", "a)", "The riper avocado is a) or b).", "The riper avocado is c).", "The riper kiwi is a)."],
+    "RIPE": [
+        "",
+        "a) It is soft",
+        "The riper avocado is a) or b).",
+        "The riper avocado is c).",
+        "The riper kiwi is a).",
+    ],
     "PSR": [
         *(
             f"The most suitable object is {x}"
             for x in ("a) or b).", "a) and b).", "c).", "x), because xxx", "a hammer")
         ),
-        *("The most suitable object is a). The most suitable object is b).", "a)", ""),
+        *("The most suitable object is a). The most suitable object is b).", "a) and b)", "", "The object is a)."),
+        *(
+            "Neither a) nor b) is the most suitable.",
+            "I do not think that b) is the most suitable.",
+            "Answer: c",
+            "The most suitable object is a",
+        ),
         *("The most suitable object for this is a) or b).", "The most suitable object for a pan. What is b)?"),
     ],
 }
@@ -226,11 +250,130 @@ def test_what_is_read_of_a_scenario(output: str, predicted: str) -> None:
     assert choice(QUESTIONS["PSR"][0], "descriptions", output).predicted == predicted
 
 
+MARKS = (
+    "**{}**",
+    "*{}*",
+    "_{}_",
+    "__{}__",
+    "***{}***",
+    "`{}`",
+    "<b>{}</b>",
+    "\\textbf{{{}}}",
+    "“{}”",
+    "'{}'",
+    "${}$",
+    "({})",
+)
+OPENINGS = ("", "### ", "- ", "* ", "> ", "2. ", "**Answer:** ", "<think>\nConclusion: no. a) is the</think>\n\n")
+
+
+@every_task
+@settings(max_examples=40)
+@given(st.data())
+def test_markdown_and_the_like_leave_what_is_read(task: str, data: st.DataObject) -> None:
+    """Marks around any words of a right answer, breaks between its sentences, a heading, thoughts before it."""
+    question = data.draw(st.sampled_from(QUESTIONS[task]))
+    *before, last = data.draw(st.sampled_from([outputs for _, outputs in answers(question)]))
+    words, separator = last.split(" "), data.draw(st.sampled_from([" ", "\N{NO-BREAK SPACE}", "  "]))
+    for mark in data.draw(st.lists(st.sampled_from(MARKS[:-1]), max_size=3)):
+        start = data.draw(st.integers(0, len(words) - 1))
+        stop = data.draw(st.integers(start + 1, min(len(words), start + 4)))
+        words[start:stop] = mark.format(" ".join(words[start:stop])).split(" ")
+    text = separator.join(words)
+    if data.draw(st.booleans()):
+        text = text.replace("Conclusion:", data.draw(st.sampled_from(["\n\n### Conclusion\n", "\n**Conclusion:**"])))
+    text = data.draw(st.sampled_from(OPENINGS)) + text
+    plain, decorated = grade(question, *before, last), grade(question, *before, text)
+    assert [(s.predicted, s.parsed, s.correct) for s in decorated] == [
+        (s.predicted, s.parsed, s.correct) for s in plain
+    ]
+
+
+@pytest.mark.parametrize(
+    ("task", "read", "outputs"),
+    [
+        (
+            "PC",
+            "yes",
+            [
+                *("**Conclusion:** Yes, the first.", "**Conclusion**: yes", "### Conclusion\n\nYes.", "\\boxed{Yes}"),
+                *("Answer: Yes", "The answer is **yes**.", "In conclusion, yes.", "_Yes_ — the first", "“Yes”, it is."),
+                *(
+                    "1. Yes.",
+                    "$\\boxed{\\text{Yes, the first}}$",
+                    "# Answer\nYES",
+                    "It is hard.\n\n**Final Answer:** yes",
+                ),
+            ],
+        ),
+        ("PC", "same", ["Conclusion: **Both** objects are similar.", "Answer: both are."]),
+        (
+            "PSS",
+            "b",
+            [
+                *(
+                    "Conclusion: **b)** is the hardest.",
+                    "**b)** is the hardest. So B) is the hardest.",
+                    "**Conclusion: b)**",
+                ),
+                *(
+                    "Option B is the hardest.",
+                    "Answer: b",
+                    "Answer: Option B.",
+                    "The hardest object is b).",
+                    "(b)",
+                    "B.",
+                ),
+                *(
+                    "\\boxed{b}",
+                    "**Conclusion:** b), because a) is soft",
+                    "b is clearly the hardest",
+                    "Final answer - B",
+                ),
+                *(
+                    "The most bumpy one is **b**.",
+                    "`b)` is the hardest",
+                    "Conclusion: \\(b\\)",
+                    "\N{FULLWIDTH LATIN SMALL LETTER B}) is the hardest",
+                ),
+            ],
+        ),
+        (
+            "PSR",
+            "b",
+            [
+                *(
+                    "Conclusion: **b)**",
+                    "The most suitable object is **b**, because it is soft.",
+                    "b) is the best choice.",
+                ),
+                *(
+                    "The **most suitable object** is *b)*, since a) is hard.",
+                    "Answer: B",
+                    "\\boxed{\\text{b)}}",
+                    "Option B",
+                ),
+                *(
+                    "The most suitable object is: b)",
+                    "So, b) is the most suitable object.",
+                    "the most suitable object is Object b",
+                ),
+            ],
+        ),
+        ("RIPE", "b", ["The riper avocado is **b)**.", "**Answer:** b", "Thus b) is riper.", "\\boxed{B}"]),
+    ],
+)
+def test_what_a_person_reads_is_read(task: str, read: str, outputs: list[str]) -> None:
+    for output in outputs:
+        found = grade(QUESTIONS[task][0], *(["descriptions"] if task in ("PSR", "RIPE") else []), output)
+        assert [s.predicted for s in found] == [read], output
+
+
 def test_the_last_conclusion_counts() -> None:
     question = next(q for q in QUESTIONS["PC"] if q.gold.choice == "yes")
     assert choice(question, "Conclusion: No. Conclusion: Yes, the first object is harder.").correct
     assert not choice(question, "Conclusion: Yes. CONCLUSION : No, the second.").correct
-    assert conclusion("no marker") == "no marker"
+    assert conclusion("no marker") == ["no marker"]
 
 
 def matching(*names: str) -> Question:
@@ -257,6 +400,27 @@ def test_a_matching_must_be_whole() -> None:
         f"a) is {a}, b) is {b} and c) is a spaceship.",
         f"{a}, {b}, {c}",
         f"1) is {a}, 2) is {b} and 3) is {c}.",
+    ):
+        assert not choice(question, output).parsed, output
+
+
+def test_a_matching_is_read_however_it_is_set() -> None:
+    names = a, b, c = ("a lanyard's card holder", "a baseball", "a lemon")
+    question = matching(*names)
+    for output in (
+        f"**Conclusion:** **a)** is **{a}**, **b)** is *{b}* and c) is `{c}`.",
+        f"- a) {a}\n- b) {b}\n- c) {c}",
+        f"A: {a}; B: {b}; C: {c}",
+        f"(a) is “{a}”, (b) is '{b}', (c) is \"{c}\".",
+        f"Option A is {a.replace(chr(39), chr(8217))}, option B is {b} and option C is {c}",
+        f"\\boxed{{a) = {a}, b) = {b}, c) = {c}}}",
+        f"1. a) → {a}\n2. b) → {b}\n3. c) → {c}",
+    ):
+        assert choice(question, output).correct, output
+    for output in (
+        f"a) is not {a}, b) is {b} and c) is {c}.",
+        f"a) {a} or {b}, b) {b}, c) {c}",
+        f"a) is {a}, b) or c) is {c}",
     ):
         assert not choice(question, output).parsed, output
 

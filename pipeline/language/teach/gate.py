@@ -20,7 +20,7 @@ from pipeline.language.teach.items import held_out
 from pipeline.records import Described, Turn
 from pipeline.runtime import derive_seed, track
 from pipeline.videos.catalogue import Catalogue
-from pipeline.videos.catalogue.wording import Scenario
+from pipeline.videos.catalogue.wording import Scenario, unmarked
 
 LETTERS = "abc"
 TOKENS, MATCHING = 16, 40
@@ -42,7 +42,7 @@ class GateQuestion:
 
     def read(self, answer: str) -> str | None:
         """What an answer chooses; None where it names no choice, or several."""
-        text = answer.lower().rpartition("conclusion:")[2]
+        text = unmarked(answer).lower().rpartition("conclusion:")[2]
         if self.task == "POM":
             longest = sorted(self.names, key=len, reverse=True)
             found = list(dict.fromkeys(re.findall("|".join(rf"\b{re.escape(n)}\b" for n in longest), text)))

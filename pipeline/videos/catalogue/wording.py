@@ -4,6 +4,7 @@ which classes a free text names."""
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Iterable
 from string import Formatter
 from typing import Annotated, Self
@@ -19,9 +20,30 @@ PREFIXES = ("label_", "split_", "ripeness_")
 Phrase = Annotated[str, Field(pattern=r"\w")]
 
 
+MARKUP = (
+    ("[\u2018\u2019\u201a\u201b]", "'"),
+    ("[\u2010-\u2015\u2212]", "-"),
+    ("\u2192", "->"),
+    (r"(?s)\A.*</think>|<think>.*|~~.*?~~", " "),  # Thoughts, which are not the answer, and what is struck out.
+    (r"(?i)</?[a-z][^<>]*>", ""),
+    (r"\\[a-zA-Z]+\s*(?=\{)|\\(?=\W)|[{}$*`\"\u201c-\u201f\xab\xbb\u200b-\u200d\ufeff]", ""),
+    (r"(?m)^[\s>#+•-]*(?:\d+[.)]\s)?\s*", ""),  # Headings, lists, quoted lines.
+    (r"(?<!\w)[_']+|[_']+(?!\w)", ""),
+)
+"""Patterns of what sets a text and is not read, and what takes its place."""
+
+
+def unmarked(text: str) -> str:
+    """As a person reads it: without Markdown, LaTeX, HTML, quotes or thoughts, and with keyboard signs."""
+    text = unicodedata.normalize("NFKC", text)
+    for pattern, instead in MARKUP:
+        text = re.sub(pattern, instead, text)
+    return text.strip()
+
+
 def plain(text: str) -> str:
-    """In small letters, with one space wherever spaces, line breaks or hyphens stood."""
-    return " ".join(re.split(r"[\s-]+", text.lower()))
+    """In small letters and unmarked, with one space wherever spaces, line breaks or hyphens stood."""
+    return " ".join(re.split(r"[\s-]+", unmarked(text).lower()))
 
 
 def mentioned(text: str, phrases: Iterable[str]) -> list[str]:
