@@ -23,7 +23,7 @@ QuestionCounts = dict[str, Annotated[int, Field(ge=0)]]
 
 Recipe = Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]*$")]
 """A name in `pipeline.encoder.recipes.RECIPES`; `octopi scale` checks that it is one."""
-Backend = Literal["loky", "ray", "dask"]
+Backend = Literal["processes", "ray"]
 CLIP_RECIPES = ("paper", "release")
 """Recipes that are for `encoder.backbone=[clip]` alone."""
 TrainedEmbeddings = Literal["all", "new"]
@@ -437,9 +437,9 @@ class RuntimeConfig(Section):
     device: DeviceName = "auto"
     launcher: str = "python"
     """What starts a training stage: `python`, or `accelerate launch` with its configuration for several GPUs."""
-    parallel: Backend = "loky"
-    """Where many files are worked on at once: `loky`, processes of this machine; `ray` and `dask`, a cluster of theirs,
-    which `RAY_ADDRESS` or `DASK_SCHEDULER_ADDRESS` names (without it: one of this machine's cores)."""
+    parallel: Backend = "processes"
+    """Where many files are worked on at once: `processes` of this machine, or `ray`, a cluster that `RAY_ADDRESS` names
+    (without it: one of this machine's cores)."""
     threads: Annotated[int, Field(ge=0, le=1024)] = 0
     """CPU threads of torch; 0 leaves it to torch. Sums depend on it in their last bits, so fix it to compare runs."""
     save_steps: Annotated[int, Field(ge=0)] = 0

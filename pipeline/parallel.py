@@ -1,7 +1,7 @@
-"""Work on many files at once: in processes of this machine, or on a cluster of Ray's or Dask's.
+"""Work on many files at once: in processes of this machine, or on a cluster of Ray's.
 
-joblib reaches all three, and loses by each: its own workers outlive a parent that is killed, and cost over a second of
-processor time a call; on Dask it waits for ever for a worker that died; from Ray it gives nothing before all is done.
+joblib reaches both, and loses by each: its own workers outlive a parent that is killed, and cost over a second of
+processor time a call; from Ray it gives nothing before all is done.
 """
 
 from __future__ import annotations
@@ -26,26 +26,21 @@ from pipeline.runtime import DeviceName, cores, progress, track
 J = TypeVar("J")
 M = TypeVar("M")
 R = TypeVar("R")
-Spread = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[Any]]
-"""Applies work to jobs on a cluster and gives results in their order."""
 
-_chosen: Backend = "loky"
-NEEDED: dict[Backend, tuple[str, ...]] = {"loky": (), "ray": ("ray",), "dask": ("dask", "distributed")}
-"""Packages of each backend beside the pipeline's own."""
+_chosen: Backend = "processes"
 
 
 def use_backend(name: Backend) -> None:
-    """Have `run_parallel` work there from now on (`runtime.parallel`); raises UserError where a package is missing."""
+    """Have `run_parallel` work there from now on (`runtime.parallel`); UserError where its package is missing."""
     global _chosen
     check_backend(name)
     _chosen = name
 
 
 def check_backend(name: Backend) -> None:
-    """Raise UserError where a package of the backend is not installed."""
-    for package in NEEDED[name]:
-        if find_spec(package) is None:
-            raise UserError(f"runtime.parallel: {name} takes the package {package}: pip install -e '.[{name}]'")
+    """Raise UserError where the backend's package is not installed."""
+    if name == "ray" and find_spec("ray") is None:
+        raise UserError("runtime.parallel: ray takes the package ray: pip install -e '.[ray]'")
 
 
 def end_with_parent(parent: int) -> None:
@@ -78,7 +73,7 @@ def run_parallel(
     if not jobs:
         return
     with progress(len(jobs), label, unit) as advance:
-        for result in _in_processes(work, jobs, label) if _chosen == "loky" else _on_cluster(work, jobs, label, device):
+        for result in _on_ray(work, jobs, label, device) if _chosen == "ray" else _in_processes(work, jobs, label):
             yield result
             advance()
 
@@ -89,7 +84,7 @@ def run_with(
     """Apply `work` to a model and every job; yield results in the order of the jobs.
 
     Here, one after another, since this machine has one device. On a cluster each worker has a model of its own, loaded
-    once. On Ray it takes a GPU of its own where there are any; a worker of Dask's has those that it was started with.
+    once, and takes a GPU of its own where there are any.
 
     Args:
         model: Used in this process.
@@ -97,7 +92,7 @@ def run_with(
             what lies at the same place later must be another source. Without one all is done here.
         work: A function of a module, for workers to import.
     """
-    if _chosen == "loky" or source is None:
+    if _chosen == "processes" or source is None:
         for job in track(jobs, label, unit):
             yield work(model, job)
     else:
@@ -106,7 +101,7 @@ def run_with(
 
 def device_here(name: DeviceName) -> DeviceName:
     """Where this process computes: on a cluster the workers have the devices, and it keeps off theirs."""
-    return name if _chosen == "loky" else "cpu"
+    return name if _chosen == "processes" else "cpu"
 
 
 def _with_loaded(source: Callable[[], M], work: Callable[[M, J], R], job: J) -> R:
@@ -147,63 +142,33 @@ def _in_processes(work: Callable[[J], R], jobs: Sequence[J], label: str) -> Iter
             raise
 
 
-def _on_cluster(work: Callable[[J], R], jobs: Sequence[J], label: str, device: bool) -> Iterator[R]:
-    """On all workers of the cluster that `RAY_ADDRESS` or `DASK_SCHEDULER_ADDRESS` names, else of one on this machine.
+def _on_ray(work: Callable[[J], R], jobs: Sequence[J], label: str, device: bool) -> Iterator[R]:
+    """On all workers of the cluster that `RAY_ADDRESS` names, else of one on this machine.
 
     Workers see the project under this machine's path.
     """
-    try:
-        spread = _ray(device) if _chosen == "ray" else _dask()
-    except (OSError, ValueError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise UserError(
-            f"runtime.parallel: {_chosen} has no cluster ({reason}); start it, or unset its address"
-        ) from None
-    done = 0
-    try:
-        for result in spread(partial(_there, os.getcwd(), work), jobs):
-            yield result
-            done += 1
-    except Exception as error:
-        # What a cluster says of a lost worker fills a page.
-        if type(error).__module__.split(".")[0] in NEEDED[_chosen]:
-            raise _died(label, jobs[done]) from None
-        raise
-
-
-def _ray(device: bool) -> Spread:
     import ray
 
-    ray.init(ignore_reinit_error=True, log_to_driver=False, logging_level="ERROR")
-
-    gpus = 1 if device and ray.cluster_resources().get("GPU") else 0
-
-    def spread(work: Callable[[Any], Any], jobs: Sequence[Any]) -> Iterator[Any]:
-        # Ray hides GPUs from work that does not ask for them.
-        remote = ray.remote(num_gpus=gpus)(lambda job: work(job))
-        waiting = deque(remote.remote(job) for job in jobs)
-        try:
-            while waiting:
-                yield ray.get(waiting.popleft())
-        except ray.exceptions.RayTaskError as error:
-            raise error.cause from None
-        finally:
-            for each in waiting:
-                ray.cancel(each)
-
-    return spread
-
-
-def _dask() -> Spread:
-    import dask
-    from distributed import Client, default_client
-
     try:
-        client = default_client()
-    except ValueError:
-        local = {"n_workers": cores(), "threads_per_worker": 1, "dashboard_address": None}
-        client = Client() if dask.config.get("scheduler-address", None) else Client(**local)
-    return client.get_executor().map  # type: ignore[no-any-return]
+        ray.init(ignore_reinit_error=True, log_to_driver=False, logging_level="ERROR")
+    except (OSError, ValueError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise UserError(f"runtime.parallel: ray has no cluster ({reason}); start it, or unset its address") from None
+    # Ray hides GPUs from work that does not ask for them.
+    gpus = 1 if device and ray.cluster_resources().get("GPU") else 0
+    there = partial(_there, os.getcwd(), work)
+    remote = ray.remote(num_gpus=gpus)(lambda job: there(job))
+    waiting = deque(remote.remote(job) for job in jobs)
+    try:
+        while waiting:
+            yield ray.get(waiting.popleft())
+    except ray.exceptions.RayTaskError as error:
+        raise error.cause from None
+    except ray.exceptions.RayError:  # What it says of a lost worker fills a page.
+        raise _died(label, jobs[len(jobs) - len(waiting) - 1]) from None
+    finally:
+        for each in waiting:
+            ray.cancel(each)
 
 
 def _there(folder: str, work: Callable[[J], R], job: J) -> R:

@@ -9,7 +9,7 @@ import pytest
 from tests.closure import ROOT, imported
 
 CORE = (
-    *("__init__", "errors", "records", "runtime", "io", "config", "params", "progress", "parallel", "card"),
+    *("__init__", "errors", "records", "runtime", "io", "config", "params", "parallel", "card"),
     *("embeddings", "shapes", "weights", "training", "stage"),
 )
 ROOMS = ("videos", "scenes", "tasks", "encoder", "language", "evaluation", "report", "tracking", "use")
@@ -22,6 +22,10 @@ def room(file: Path) -> str | None:
     """The room of a project file, or None outside pipeline/."""
     parts = file.relative_to(ROOT).with_suffix("").parts
     return parts[1] if parts[0] == "pipeline" else None
+
+
+def test_what_is_listed_is_there_once() -> None:
+    assert sorted(ORDER) == sorted({str(room(file)) for file in MODULES})
 
 
 @pytest.mark.parametrize("file", MODULES, ids=lambda f: str(f.relative_to(ROOT)))

@@ -1,4 +1,4 @@
-"""Work on many files in processes of this machine and on local clusters of Ray and Dask: the same bytes come out.
+"""Work on many files in processes of this machine and on a local cluster of Ray's: the same bytes come out.
 
 That a worker of this machine dies or outlives nothing is tests/videos/test_extract.py's.
 """
@@ -10,6 +10,7 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import psutil
@@ -130,29 +131,28 @@ def work_on(backend: str, folder: Path, videos: Path) -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def here(tiny_videos: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    return work_on("loky", tmp_path_factory.mktemp("work") / "here", tiny_videos)
+    return work_on("processes", tmp_path_factory.mktemp("work") / "here", tiny_videos)
 
 
-@pytest.fixture(scope="module", params=["ray", "dask"])
-def backend(request: pytest.FixtureRequest) -> str:
-    package = {"ray": "ray", "dask": "distributed"}[request.param]
-    pytest.importorskip(package, reason=f"needs {request.param}: pip install -e '.[{request.param}]'")
-    return str(request.param)
+needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="needs ray: pip install -e '.[ray]'")
 
 
-def test_two_workers_of_a_cluster_make_the_same_bytes(
-    backend: str, here: dict[str, str], tiny_videos: Path, tmp_path: Path
-) -> None:
+def test_this_machines_processes_make_four_files(here: dict[str, str]) -> None:
     assert len(here) == 4
-    assert work_on(backend, tmp_path / "there", tiny_videos) == here
 
 
-def test_a_cluster_embeds_and_answers_to_the_same_bytes(backend: str, tmp_path: Path) -> None:
-    run_script(MODELS, tmp_path, backend)
+@needs_ray
+def test_two_workers_of_a_cluster_make_the_same_bytes(here: dict[str, str], tiny_videos: Path, tmp_path: Path) -> None:
+    assert work_on("ray", tmp_path / "there", tiny_videos) == here
+
+
+@needs_ray
+def test_a_cluster_embeds_and_answers_to_the_same_bytes(tmp_path: Path) -> None:
+    run_script(MODELS, tmp_path, "ray")
 
 
 def test_a_worker_that_outlives_a_stage_loads_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As one behind DASK_SCHEDULER_ADDRESS does: what is trained later lies at the same place."""
+    """As one behind RAY_ADDRESS may: what is trained later lies at the same place."""
     monkeypatch.chdir(tmp_path)
     made = make(tmp_path, Variant(Encoder.FINETUNED, Lora.WITH, Opd.ALL, 0))
     state, catalogue = Path("data/encoder/0/encoder.safetensors"), Path(made.params.data.catalogue)
@@ -165,18 +165,24 @@ def test_a_worker_that_outlives_a_stage_loads_anew(tmp_path: Path, monkeypatch: 
 
 
 def test_a_missing_package_is_one_line_before_anything_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    params = compose("smoke", ["runtime.parallel=dask"])
-    monkeypatch.setattr(parallel, "find_spec", lambda name: None if name == "distributed" else True)
-    message = r"\Aruntime\.parallel: dask takes the package distributed: pip install -e '\.\[dask\]'\Z"
+    params = compose("smoke", ["runtime.parallel=ray"])
+    monkeypatch.setattr(parallel, "find_spec", lambda _: None)
+    message = r"\Aruntime\.parallel: ray takes the package ray: pip install -e '\.\[ray\]'\Z"
     with pytest.raises(UserError, match=message):
         check_inputs(params)
     with pytest.raises(UserError, match=message):
-        use_backend("dask")
+        use_backend("ray")
+
+
+@pytest.mark.parametrize("old", ["loky", "dask"])
+def test_a_name_of_before_is_told_the_new_one(old: str) -> None:
+    with pytest.raises(UserError, match=rf"\Ascale smoke: runtime\.parallel is '{old}': .*'processes' or 'ray'\Z"):
+        compose("smoke", [f"runtime.parallel={old}"])
 
 
 def test_a_stage_works_where_its_parameters_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(parallel, "_chosen", "loky")
+    monkeypatch.setattr(parallel, "_chosen", "processes")
     monkeypatch.setattr(parallel, "find_spec", lambda _: True)
     write_params(compose("smoke", ["runtime.parallel=ray"], ROOT / "conf"))
     with stage("x"):

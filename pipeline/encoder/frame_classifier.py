@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch import nn
 
 from pipeline.encoder.baseline.predictor import Labels, decode_jointly, log_dependence
 from pipeline.encoder.baseline.validation import deal
@@ -45,13 +44,16 @@ class JointFrameClassifier(PropertyClassifier):
 
     def __init__(self, encoder: FrameEncoder, classes: Sequence[int]) -> None:
         super().__init__(encoder, Heads(encoder.dim, classes), classes)
-        self.centre = nn.Parameter(torch.zeros(encoder.dim))
-        self.spread = nn.Parameter(torch.ones(encoder.dim))
-        self.dependence = nn.Parameter(torch.zeros(tuple(classes)))
+        self.centre: torch.Tensor
+        self.spread: torch.Tensor
+        self.dependence: torch.Tensor
+        self.register_buffer("centre", torch.zeros(encoder.dim))
+        self.register_buffer("spread", torch.ones(encoder.dim))
+        self.register_buffer("dependence", torch.zeros(tuple(classes)))
 
     def standardise(self, features: torch.Tensor) -> torch.Tensor:
         """Features on the training frames' scale, within `FARTHEST`."""
-        scaled = (features - self.centre.detach()) / self.spread.detach()  # A scale, and not trained.
+        scaled = (features - self.centre) / self.spread
         # What is infinite stays so, and is found: a wild frame is held, a broken one is not.
         return torch.where(scaled.isinf(), scaled, scaled.clamp(-FARTHEST, FARTHEST))
 
@@ -64,7 +66,7 @@ class JointFrameClassifier(PropertyClassifier):
     def decide(self, logits: torch.Tensor) -> torch.Tensor:
         """The most probable combination: int64, batch x properties."""
         evidence = [z.log_softmax(1).numpy() for z in logits.detach().cpu().double().split(self.classes, dim=1)]
-        return torch.from_numpy(decode_jointly(evidence, self.dependence.detach().cpu().double().numpy()))
+        return torch.from_numpy(decode_jointly(evidence, self.dependence.cpu().double().numpy()))
 
 
 @dataclass(frozen=True)
@@ -91,12 +93,12 @@ class FittedHeads:
         return decode_jointly(self.evidence(clips), self.dependence)
 
     def copy_into(self, model: JointFrameClassifier) -> None:
-        """Copy into a model's parameters."""
+        """Copy into a model."""
         own = [model.centre, model.spread, model.dependence, *model.heads.parameters()]
         heads = [array for pair in zip(self.weights, self.biases, strict=True) for array in pair]
         with torch.no_grad():
-            for parameter, value in zip(own, [self.centre, self.spread, self.dependence, *heads], strict=True):
-                parameter.copy_(torch.from_numpy(value))
+            for tensor, value in zip(own, [self.centre, self.spread, self.dependence, *heads], strict=True):
+                tensor.copy_(torch.from_numpy(value))
 
 
 def fit_frame_heads(

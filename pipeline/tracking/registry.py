@@ -20,7 +20,7 @@ MODELS = Path("models")
 NAME, ALIAS = "octopi", "best"
 PACKAGE = Path(__file__).parents[1]
 NEEDED = (
-    *("accelerate", "av", "filelock", "joblib", "mlflow", "numpy", "open_clip_torch", "opencv-contrib-python-headless"),
+    *("accelerate", "av", "filelock", "mlflow", "numpy", "open_clip_torch", "opencv-contrib-python-headless"),
     *("pandas", "peft", "psutil", "pyarrow", "pydantic", "pyyaml", "safetensors", "scipy", "scikit-learn"),
     *("statsmodels", "threadpoolctl", "timm", "tokenizers", "torch", "torchvision", "tqdm", "transformers"),
 )

@@ -13,13 +13,14 @@ from pipeline.io import load_tensors, save_tensors
 
 
 def trainable_state(module: nn.Module) -> dict[str, torch.Tensor]:
-    """What is trained, by name: parameters, and the running statistics of the layers that they are in."""
+    """What is trained, by name: parameters, and buffers of the modules that they are in."""
     state: dict[str, torch.Tensor] = {}
     kept = module.state_dict()
     for prefix, part in module.named_modules():
         own = {n: p for n, p in part.named_parameters(prefix, recurse=False) if p.requires_grad}
-        running = {n: b for n, b in part.named_buffers(prefix, recurse=False) if own and n in kept}
-        state |= {name: value.detach() for name, value in (own | running).items()}
+        within = any(p.requires_grad for p in part.parameters())
+        buffers = {n: b for n, b in part.named_buffers(prefix, recurse=False) if within and n in kept}
+        state |= {name: value.detach() for name, value in (own | buffers).items()}
     return state
 
 

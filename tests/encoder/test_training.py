@@ -275,6 +275,8 @@ def test_each_recipe_saves_what_is_its_own_and_reloads_exactly(
     assert {p for p in OWN[recipe] if any(n.startswith(p) for n in trainable_state(model))} == set(OWN[recipe])
     save_trainable(model, tmp_path / "model.safetensors")
     load_trainable(other, tmp_path / "model.safetensors")
+    other(frames, FRAME_INDICES, labels=torch.tensor([[0, 1]] * len(frames)))["loss"].backward()
+    assert all(p.grad is not None for p in other.parameters() if p.requires_grad), "what is constant is no parameter"
     with torch.no_grad():
         first, second = (m(frames, FRAME_INDICES)["logits"] for m in (model, other))
     assert torch.equal(first, second)

@@ -116,6 +116,9 @@ def test_a_process_without_this_repository_answers(
     there = {name.split(".")[0] for name in found["modules"]} & _imported() & homes.keys()
     assert there > {"torch", "av", "transformers", "pydantic"}
     brought = _brought(NEEDED)
+    asked = {_plain(home) for name in _imported() for home in homes.get(name, ())}
+    # No code imports torchvision, but open_clip's must be of torch's build.
+    assert set(map(_plain, NEEDED)) - asked == {"torchvision"}
     unneeded = {"sentencepiece"}  # transformers imports it where it is installed; answering does without
     assert {name for name in there - unneeded if not {_plain(home) for home in homes[name]} & brought} == set()
 
