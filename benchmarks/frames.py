@@ -38,7 +38,7 @@ from pipeline.videos.frames.selection import changed_pixels
 
 FRACTION, SMALL, LARGE = 0.3, 64, 224
 PUBLISHED = "published way"
-BASELINE = "uniform, 5 frames"
+BASELINE = "salient, 5 frames"
 
 
 def bench_videos(root: Path) -> tuple[Path, Catalogue]:
@@ -122,22 +122,16 @@ def _publish(path: Path, out: Path) -> None:
 
 @dataclass(frozen=True)
 class Setting:
-    """A rule, and how many of the frames that it keeps (all of them for `adaptive`)."""
+    """A rule, and how many of the frames that it keeps."""
 
     rule: Selection
-    count: int | None = None
-    tolerance: float = 0.0
+    count: int
 
     def __str__(self) -> str:
-        if self.count is None:
-            return f"{self.rule}, tolerance {self.tolerance:g}"
         return f"{self.rule}, {self.count} frame{'s' * (self.count > 1)}"
 
 
-SETTINGS = (
-    *(Setting(rule, count) for rule in ("salient", "release", "uniform", "contact") for count in (1, 3, 5, 10)),
-    *(Setting("adaptive", tolerance=tolerance) for tolerance in (0.3, 0.5, 0.8)),
-)
+SETTINGS = tuple(Setting(rule, count) for rule in get_args(Selection) for count in (1, 3, 5, 10))
 
 
 @dataclass(frozen=True)
@@ -178,17 +172,15 @@ def selection(folder: Path, catalogue: Catalogue, folds: int, deals: int) -> lis
 
 def _sample(file: VideoFile) -> Sample | None:
     """None for a video that cannot be read or that the published rule leaves out."""
-    passes: dict[tuple[Selection, float], tuple[Scan, float]] = {}
-    for setting in SETTINGS:
-        key = setting.rule, setting.tolerance
-        if key not in passes:
-            config = FramesConfig(selection=setting.rule, fraction=FRACTION, tolerance=setting.tolerance, pixels=SMALL)
-            found: list[object] = []
-            spent = milliseconds(lambda config=config, found=found: found.append(scan(file, config)))  # type: ignore[misc]
-            if not isinstance(found[0], Scan) or not found[0].kept:
-                return None
-            passes[key] = found[0], spent
-    chosen = [_chosen(passes[s.rule, s.tolerance][0], s.count) for s in SETTINGS]
+    passes: dict[Selection, tuple[Scan, float]] = {}
+    for rule in get_args(Selection):
+        config = FramesConfig(selection=rule, fraction=FRACTION, pixels=SMALL)
+        found: list[object] = []
+        spent = milliseconds(lambda config=config, found=found: found.append(scan(file, config)))  # type: ignore[misc]
+        if not isinstance(found[0], Scan) or not found[0].kept:
+            return None
+        passes[rule] = found[0], spent
+    chosen = [_chosen(passes[s.rule][0], s.count) for s in SETTINGS]
     frames = list(decode(file.path))
     untouched = untouched_frames(len(frames), next(iter(passes.values()))[0].probe.starts_touching)
     reference = mean([frames[i] for i in untouched])
@@ -199,13 +191,10 @@ def _sample(file: VideoFile) -> Sample | None:
         object_id=file.object_id,
         features=tuple(pool_features([rows[i] for i in indices]) for indices in chosen),
         frames=tuple(map(len, chosen)),
-        costs=tuple(
-            passes[s.rule, s.tolerance][1] + each * len(indices) for s, indices in zip(SETTINGS, chosen, strict=True)
-        ),
+        costs=tuple(passes[s.rule][1] + each * len(indices) for s, indices in zip(SETTINGS, chosen, strict=True)),
     )
 
 
-def _chosen(found: Scan, count: int | None) -> list[int]:
+def _chosen(found: Scan, count: int) -> list[int]:
     """The chosen frames' numbers in the video, each once."""
-    positions = range(len(found.kept)) if count is None else sample_evaluation(len(found.kept), count)
-    return sorted({found.kept[p].index for p in positions})
+    return sorted({found.kept[p].index for p in sample_evaluation(len(found.kept), count)})

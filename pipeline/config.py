@@ -27,7 +27,7 @@ Backend = Literal["processes", "ray"]
 CLIP_RECIPES = ("paper", "release")
 """Recipes that are for `encoder.backbone=[clip]` alone."""
 TrainedEmbeddings = Literal["all", "new"]
-Selection = Literal["salient", "release", "uniform", "contact", "adaptive"]
+Selection = Literal["salient", "release", "contact"]
 
 SCENES_DIR = Path("data/scenes/videos")
 """Where the chain puts the videos that it makes itself."""
@@ -93,15 +93,12 @@ class FramesConfig(Section):
     """Which frames of a video are kept for the encoder, and how large."""
 
     selection: Selection = "salient"
-    """`salient`: the largest differences to the frame before (paper). `release`: the published code's rule. `uniform`:
-    equal distances in time. `contact`: the largest differences to the no-contact reference. `adaptive`: of those,
-    only as many as differ from each other."""
+    """`salient`: the largest differences to the frame before (paper). `release`: the published code's rule. `contact`:
+    the largest differences to the no-contact reference."""
     fraction: Fraction = 0.3
-    """Share of a video's frames that is kept (paper: 30 %); `adaptive` keeps at most that."""
+    """Share of a video's frames that is kept (paper: 30 %)."""
     per_video: Annotated[int, Field(ge=1, le=64)] = 5
     """Frames drawn of those that are kept (paper: 5)."""
-    tolerance: Annotated[float, Field(ge=0, le=10)] = 0.8
-    """`adaptive`: what a further frame must add to be kept, as a share of the strongest contact."""
     pixels: Annotated[int, Field(ge=16, le=1024)] = 224
     """Side of the square that frames are stored at; a CLIP's own or more, as larger frames are averaged. No key may be
     called `size` or `nfiles`: DVC's run cache leaves those out, and would bring back frames of another size."""

@@ -172,8 +172,8 @@ class Frame(Record):
     """Position in the video, in decoding order."""
     score: float = Field(ge=0)
     """What the selection went by: `salient` sums absolute differences in brightness to the frame before, over all
-    pixels (8-bit steps); `release` counts changed grey pixels; `contact` and `adaptive` take the contact strength;
-    0 where there was nothing to choose by."""
+    pixels (8-bit steps); `release` counts changed grey pixels; `contact` takes the contact strength; 0 where there
+    was nothing to choose by."""
     row: int = Field(ge=0)
 
 

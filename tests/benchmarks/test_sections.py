@@ -88,7 +88,7 @@ def test_frames(project: Path, tmp_path: Path) -> None:
     rules = found["frames"]
     assert list(rules) == [str(s) for s in frames.SETTINGS]
     # 30 % of the frames are fewer than ten.
-    assert [rules[f"uniform, {n} frame{'s' * (n > 1)}"].frames for n in (1, 3, 5, 10)] == [1, 3, 5, 6]
+    assert [rules[f"salient, {n} frame{'s' * (n > 1)}"].frames for n in (1, 3, 5, 10)] == [1, 3, 5, 6]
     assert all(row.n == 12 and row.low is not None for row in rules.values())
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from fractions import Fraction
 from pathlib import Path
@@ -17,8 +16,8 @@ from pipeline.config import FramesConfig
 from pipeline.videos.decoding import Decoder, picture
 from pipeline.videos.frames import selection
 from pipeline.videos.frames.fit import fit
-from pipeline.videos.frames.reference import contact_strength, reference_indices, thumbnail
-from pipeline.videos.frames.selection import TOUCHING, BestFrames, Kept, difference, kept_count, thin, uniform_indices
+from pipeline.videos.frames.reference import reference_indices, thumbnail
+from pipeline.videos.frames.selection import BestFrames, difference, kept_count
 from pipeline.videos.frames.video_pass import VideoPass, run_pass
 from tests.conftest import moving_square, write_video
 from tests.frame_rules import CONFIG, constant, frames_of, luma, pillow, pressing, published, salience
@@ -72,7 +71,7 @@ def test_ties_go_to_the_earlier_frame(case: tuple[list[int], int]) -> None:
     assert nothing.kept() == []
 
 
-@pytest.mark.parametrize("name", ["salient", "release", "contact", "adaptive", "uniform"])
+@pytest.mark.parametrize("name", ["salient", "release", "contact"])
 def test_what_is_held_in_memory_changes_nothing(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_video(tmp_path / "v.avi", pressing(40))
     config = FramesConfig(pixels=16, selection=name)
@@ -94,11 +93,11 @@ def test_differences_are_exact(height: int, width: int, seed: int) -> None:
 def test_the_fraction_is_taken_as_written() -> None:
     assert math.ceil(0.07 * 100) == 8, "what floating point would say"
     assert kept_count(101, FramesConfig(fraction=0.07)) == 7
-    assert kept_count(100, FramesConfig(fraction=0.07, selection="uniform")) == 7
+    assert kept_count(100, FramesConfig(fraction=0.07, selection="contact")) == 7
     assert int(0.29 * 100) == 28 == kept_count(100, FramesConfig(fraction=0.29, selection="release")), "as published"
 
 
-@given(st.integers(2, 2000), st.floats(0.001, 1), st.sampled_from(["salient", "uniform", "contact", "adaptive"]))
+@given(st.integers(2, 2000), st.floats(0.001, 1), st.sampled_from(["salient", "contact"]))
 def test_as_many_as_the_fraction_rounded_up(frames: int, fraction: float, name: str) -> None:
     count = kept_count(frames, FramesConfig(fraction=fraction, selection=name))
     candidates = frames - (name == "salient")
@@ -114,30 +113,6 @@ def test_the_published_rule(tmp_path: Path, count: int) -> None:
             found = run_pass(path, FramesConfig(pixels=16, selection="release"), promised)
             assert chosen(found) == published(path, promised)
             assert_fitted(path, found)
-
-
-@given(st.integers(1, 500), st.integers(1, 500))
-def test_uniform_places(frames: int, count: int) -> None:
-    count = min(frames, count)
-    places = uniform_indices(frames, count)
-    assert len(set(places)) == count
-    assert places == sorted(places)
-    if count == 1:
-        assert places == [frames // 2]
-    else:
-        exact = np.linspace(0, frames - 1, count)
-        assert (places[0], places[-1]) == (0, frames - 1)
-        assert np.abs(np.array(places) - exact).max() < 1
-        assert np.ptp(np.diff(places)) <= 1
-
-
-@pytest.mark.parametrize(("count", "fraction"), [(1, 0.3), (2, 0.3), (7, 0.3), (30, 0.1), (30, 1.0)])
-def test_uniform_frames(tmp_path: Path, count: int, fraction: float) -> None:
-    path = write_video(tmp_path / "v.avi", moving_square(count))
-    config = FramesConfig(pixels=16, selection="uniform", fraction=fraction)
-    found = run_pass(path, config)
-    assert [k.index for k in found.kept] == uniform_indices(count, kept_count(count, config))
-    assert_fitted(path, found)
 
 
 def strengths(path: Path) -> list[float]:
@@ -160,66 +135,6 @@ def test_contact_frames_are_those_most_unlike_the_reference(tmp_path: Path, seed
     assert [k.index for k in found.kept] == best
     assert [k.score for k in found.kept] == pytest.approx([expected[i] for i in best], abs=1e-9)
     assert found.contact == pytest.approx(max(expected), abs=1e-9)
-
-
-def gap(one: Kept, other: Kept) -> float:
-    assert one.thumb is not None
-    assert other.thumb is not None
-    return contact_strength(one.thumb, other.thumb)
-
-
-@pytest.mark.parametrize(("seed", "tolerance"), [(0, 0.0), (0, 0.3), (1, 0.7), (2, 2.0)])
-def test_adaptive_frames_cover_the_contact_and_differ_from_each_other(
-    tmp_path: Path, seed: int, tolerance: float
-) -> None:
-    path = write_video(tmp_path / "v.avi", pressing(60, seed))
-    # At no tolerance at all, nothing that is in contact is thinned out but what noise could have made.
-    pool = run_pass(path, FramesConfig(pixels=16, selection="adaptive", tolerance=0.0)).kept
-    found = run_pass(path, FramesConfig(pixels=16, selection="adaptive", tolerance=tolerance))
-    noise = min(found.strengths)
-    reach = max(k.score for k in pool) - noise
-    near = tolerance * reach + math.sqrt(2) * noise
-    taken = {k.index: k for k in found.kept}
-    assert list(taken) == sorted(taken)
-    assert set(taken) <= {k.index for k in pool}
-    assert len(taken) <= kept_count(60, FramesConfig())
-    assert all(k.score - noise >= TOUCHING * reach for k in found.kept)
-    assert all(gap(a, b) > near for a, b in itertools.combinations(taken.values(), 2))
-    assert all(min(gap(k, t) for t in taken.values()) <= near for k in pool if k.index not in taken)
-
-
-def made_up(count: int, seed: int) -> list[Kept]:
-    """Frames of noise that are in contact or not."""
-    rng = np.random.default_rng(seed)
-    thumbs = [rng.integers(0, 256, (4, 5, 3), np.uint8) for _ in range(count)]
-    scores = rng.uniform(0, 60, count).tolist()
-    return [Kept(i, s, np.zeros((1, 1, 3), np.uint8), t) for i, (t, s) in enumerate(zip(thumbs, scores, strict=True))]
-
-
-@given(st.integers(1, 12), st.integers(0, 2**32), st.floats(0, 3), st.floats(0, 20))
-def test_what_is_thinned_out_looks_like_what_is_left(count: int, seed: int, tolerance: float, noise: float) -> None:
-    kept = made_up(count, seed)
-    taken = thin(kept, tolerance, noise)
-    reach = max(0.0, max(k.score for k in kept) - noise)
-    near = tolerance * reach + math.sqrt(2) * noise
-    assert [k.index for k in taken] == sorted({k.index for k in taken})
-    assert all(gap(a, b) > near - 1e-9 for a, b in itertools.combinations(taken, 2))
-    for k in kept:
-        if k not in taken and k.score - noise >= TOUCHING * reach:
-            assert min(gap(k, t) for t in taken) <= near + 1e-9
-
-
-@given(st.integers(1, 12), st.integers(0, 2**32), st.floats(0, 3), st.floats(0, 3), st.floats(0, 20))
-def test_less_tolerance_keeps_more(count: int, seed: int, one: float, other: float, noise: float) -> None:
-    """Whatever is taken, a lower tolerance takes it too: it goes on where the higher one stopped."""
-    kept = made_up(count, seed)
-    less, more = sorted((one, other))
-    wide, narrow = ({k.index for k in thin(kept, t, noise)} for t in (less, more))
-    assert narrow <= wide
-    strongest = max(kept, key=lambda k: k.score)
-    assert strongest.index in narrow
-    reach = max(0.0, strongest.score - noise)
-    assert all(kept[i].score - noise >= TOUCHING * reach for i in wide - {strongest.index})
 
 
 @pytest.mark.real

@@ -33,7 +33,7 @@ def one(folder: Path, catalogue: Catalogue, selection: str = "salient") -> tuple
     return found, probe
 
 
-@pytest.mark.parametrize("selection", ["salient", "uniform", "contact", "adaptive"])
+@pytest.mark.parametrize("selection", ["salient", "contact"])
 @pytest.mark.parametrize(
     ("frames", "saturated"),
     [
@@ -58,7 +58,6 @@ def test_hard_videos(
         assert probe.saturated == saturated
         assert (probe.contact, probe.contact_end, probe.starts_touching) == (0, 0, False)
         assert all(frame.score == 0 for frame in found.frames)
-        assert probe.kept == 1 or selection != "adaptive"
 
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 2), (1, 9), (13, 17), (97, 17)])
@@ -86,7 +85,7 @@ def test_a_cut_off_video_keeps_what_decodes_and_warns(
     assert "31 frames in its header" in caplog.text
 
 
-@pytest.mark.parametrize("selection", ["salient", "uniform", "contact", "adaptive"])
+@pytest.mark.parametrize("selection", ["salient", "contact"])
 def test_a_header_that_lies_changes_nothing(tmp_path: Path, selection: str, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_video(tmp_path / "rug_0.avi", pressing(40))
     file, config = VideoFile(path, path.name, "rug", "rug_0"), FramesConfig(pixels=16, selection=selection)

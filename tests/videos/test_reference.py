@@ -80,7 +80,7 @@ def test_the_reference_of_usual_lengths(tmp_path: Path, count: int, expected: tu
         assert found.probe.quiet < 1
 
 
-@pytest.mark.parametrize(("count", "name"), [(12, "contact"), (50, "salient"), (50, "contact"), (126, "adaptive")])
+@pytest.mark.parametrize(("count", "name"), [(12, "contact"), (50, "salient"), (50, "contact"), (126, "contact")])
 def test_a_video_that_starts_in_contact_takes_its_reference_from_the_end(tmp_path: Path, count: int, name: str) -> None:
     backward = rise(count)[::-1]
     found = scanned(tmp_path / "back.avi", film(backward), name)

@@ -5,14 +5,13 @@ is the brightness that the codec keeps.
 `release`: what the published code does (github.com/clear-nus/octopi, utils/process_dataset.py): it counts changed grey
 pixels, takes its number of frames from the header, saves the frame *before* each that it chose, and leaves out videos
 that would keep fewer than five.
-`uniform`, `contact` and `adaptive` are this project's.
+`contact` is this project's.
 """
 
 from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -23,24 +22,19 @@ import numpy as np
 from pipeline.config import FramesConfig
 from pipeline.videos.decoding import Image
 from pipeline.videos.frames.fit import fit
-from pipeline.videos.frames.reference import contact_strength
 
 RELEASE_FEWEST = 5
 HELD_BYTES = 64 * 2**20
-TOUCHING = 0.5
-"""`adaptive`: in contact is a frame with at least this share of the video's strongest contact, both over noise."""
 
 
 @dataclass(frozen=True)
 class Kept:
-    """A frame that was kept: its place in the video, what it was chosen by, and its pictures."""
+    """A frame that was kept: its place in the video, what it was chosen by, and its picture."""
 
     index: int
     score: float
     image: Image
     """size x size x RGB."""
-    thumb: Image | None
-    """Where the selection looked at thumbnails."""
 
 
 def kept_count(frames: int, config: FramesConfig) -> int:
@@ -53,13 +47,6 @@ def kept_count(frames: int, config: FramesConfig) -> int:
         return int(config.fraction * frames)
     candidates = frames - 1 if config.selection == "salient" else frames  # The first frame has no predecessor.
     return max(1, math.ceil(Fraction(str(config.fraction)) * candidates))
-
-
-def uniform_indices(frames: int, count: int) -> list[int]:
-    """`count` places at equal distances over a whole video, the first and last frame among them if count > 1."""
-    if count == 1:
-        return [frames // 2]
-    return [i * (frames - 1) // (count - 1) for i in range(count)]
 
 
 def difference(brightness: Image, before: Image) -> float:
@@ -85,24 +72,21 @@ class BestFrames:
         self.config = config
         self._heap: list[tuple[float, int, int]] = []  # Smallest (score, -index) first: the next to go. Then the slot.
         self._held: list[av.VideoFrame | Image] = []
-        self._thumbs: list[Image | None] = []
 
-    def offer(self, score: float, index: int, frame: av.VideoFrame, thumb: Image | None = None) -> None:
+    def offer(self, score: float, index: int, frame: av.VideoFrame) -> None:
         """Keep a frame if it is among the best."""
         if len(self._heap) < self.capacity:
             heapq.heappush(self._heap, (score, -index, len(self._held)))
             self._held.append(self._hold(frame))
-            self._thumbs.append(thumb)
         elif self._heap and (score, -index) > self._heap[0][:2]:
             slot = self._heap[0][2]
             heapq.heapreplace(self._heap, (score, -index, slot))
             self._held[slot] = self._hold(frame)
-            self._thumbs[slot] = thumb
 
     def kept(self) -> list[Kept]:
         """What was kept, in time order."""
         chosen = sorted((-back, score, slot) for score, back, slot in self._heap)
-        return [Kept(index, score, self._image(self._held[slot]), self._thumbs[slot]) for index, score, slot in chosen]
+        return [Kept(index, score, self._image(self._held[slot])) for index, score, slot in chosen]
 
     def _hold(self, frame: av.VideoFrame) -> av.VideoFrame | Image:
         heavy = self.capacity * frame.width * frame.height * 1.5 > HELD_BYTES
@@ -110,34 +94,3 @@ class BestFrames:
 
     def _image(self, held: av.VideoFrame | Image) -> Image:
         return held if isinstance(held, np.ndarray) else fit(held, self.config)
-
-
-def thin(kept: Sequence[Kept], tolerance: float, noise: float) -> list[Kept]:
-    """Of the frames in contact only those that add something, in time order: `adaptive`.
-
-    Starts from the strongest contact and adds, one at a time, the frame that differs most from all that were taken
-    (farthest point first, Gonzalez 1985), until that difference, less what noise alone makes between two frames, is
-    below `tolerance` times the strongest contact over noise: what is left looks like something that is there already.
-    Where nothing touches, a single frame remains.
-
-    Args:
-        kept: frames with their thumbnails and contact strengths as scores.
-        noise: the strength of a frame that nothing touches. Two such frames differ by sqrt(2) times that.
-    """
-    strongest = max(kept, key=lambda k: (k.score, -k.index))
-    reach = max(0.0, strongest.score - noise)
-    rest = [k for k in kept if k.score - noise >= TOUCHING * reach and k is not strongest]
-    taken = [strongest]
-    gaps = [_gap(k, strongest) for k in rest]
-    while rest and max(gaps) - math.sqrt(2) * noise > tolerance * reach:
-        farthest = gaps.index(max(gaps))
-        taken.append(rest.pop(farthest))
-        gaps.pop(farthest)
-        gaps = [min(gap, _gap(k, taken[-1])) for gap, k in zip(gaps, rest, strict=True)]
-    return sorted(taken, key=lambda k: k.index)
-
-
-def _gap(one: Kept, other: Kept) -> float:
-    assert one.thumb is not None, "adaptive looks at thumbnails"
-    assert other.thumb is not None, "adaptive looks at thumbnails"
-    return contact_strength(one.thumb, other.thumb)

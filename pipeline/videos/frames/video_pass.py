@@ -21,8 +21,6 @@ from pipeline.videos.frames.selection import (
     changed_pixels,
     difference,
     kept_count,
-    thin,
-    uniform_indices,
 )
 
 PROBES = 8
@@ -117,7 +115,7 @@ def run_pass(
         choose = _rule(config, best, count)
         reference_places = reference_indices(count)
         stride, often = max(1, count // PROBES), max(1, count // SIGNATURE_FRAMES)
-        by_contact = config.selection in ("contact", "adaptive")  # at every frame, not only where the audit does
+        by_contact = config.selection == "contact"  # at every frame, not only where the audit does
         untouched = ReferenceMean(config)
         frame = None
         for index, frame in enumerate(decoder.frames()):
@@ -136,7 +134,7 @@ def run_pass(
                 if index % stride == 0:
                     found.probe(index, frame, thumb, strength)
                 if by_contact and found.reference is not None:
-                    best.offer(strength, index, frame, thumb)
+                    best.offer(strength, index, frame)
             if index % often == 0 and found.reference is not None:
                 found.brightness_thumbnails.append(brightness_thumbnail(frame))
             choose(index, frame)
@@ -144,10 +142,12 @@ def run_pass(
             return found
         found.reference = found.reference or untouched.mean()
         found.first, found.last = untouched.mean().thumb, thumbnail(frame)
-        found.kept = _kept(best, config, min(found.strengths, default=0.0))
-        if not found.kept and config.selection != "release":
+        found.kept = best.kept()
+        if config.selection == "release" and len(found.kept) < RELEASE_FEWEST:
+            found.kept = []
+        elif not found.kept:
             # A single frame has no predecessor and shows no contact; it is kept because it is all there is.
-            found.kept = [Kept(0, 0.0, untouched.pictures[0], None)]
+            found.kept = [Kept(0, 0.0, untouched.pictures[0])]
     return found
 
 
@@ -160,13 +160,6 @@ def reference_from_end(path: Path, frames: int, config: FramesConfig) -> Referen
             if index in wanted:
                 untouched.add(frame)
     return untouched.mean()
-
-
-def _kept(best: BestFrames, config: FramesConfig, noise: float) -> list[Kept]:
-    kept = best.kept()
-    if config.selection == "release" and len(kept) < RELEASE_FEWEST:
-        return []
-    return thin(kept, config.tolerance, noise) if config.selection == "adaptive" and kept else kept
 
 
 def _rule(config: FramesConfig, best: BestFrames, count: int) -> Callable[[int, av.VideoFrame], None]:
@@ -192,10 +185,4 @@ def _rule(config: FramesConfig, best: BestFrames, count: int) -> Callable[[int, 
             before.append((frame, grey))
 
         return release
-    places = set(uniform_indices(count, best.capacity)) if config.selection == "uniform" else set()
-
-    def uniform(index: int, frame: av.VideoFrame) -> None:
-        if index in places:
-            best.offer(0.0, index, frame)
-
-    return uniform
+    return lambda index, frame: None
