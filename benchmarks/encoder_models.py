@@ -117,7 +117,7 @@ def _trees(bed: Bed) -> Callable[[VideoFile], object]:
 
     def said(file: VideoFile) -> object:
         probe = _scan(file).probe
-        return predictor.predict(describe(Recording(file.path, probe.frames, probe.starts_touching))[None])
+        return predictor.predict(describe(Recording(file.path, probe.frames, probe.untouched))[None])
 
     return said
 

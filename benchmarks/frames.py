@@ -23,7 +23,7 @@ from benchmarks.table import Row, make_rows
 from benchmarks.timing import interleaved, machine, milliseconds
 from pipeline.config import FramesConfig, Selection
 from pipeline.encoder.baseline.features import frame_features, pool_features
-from pipeline.encoder.baseline.recordings import mean, untouched_frames
+from pipeline.encoder.baseline.recordings import mean
 from pipeline.encoder.baseline.validation import forest
 from pipeline.errors import UserError
 from pipeline.parallel import run_parallel
@@ -182,8 +182,7 @@ def _sample(file: VideoFile) -> Sample | None:
         passes[rule] = found[0], spent
     chosen = [_chosen(passes[s.rule][0], s.count) for s in SETTINGS]
     frames = list(decode(file.path))
-    untouched = untouched_frames(len(frames), next(iter(passes.values()))[0].probe.starts_touching)
-    reference = mean([frames[i] for i in untouched])
+    reference = mean([frames[i] for i in passes["salient"][0].probe.untouched])
     rows: dict[int, np.ndarray] = {}
     wanted = sorted({i for indices in chosen for i in indices})
     each = milliseconds(lambda: rows.update({i: frame_features(frames[i], reference) for i in wanted})) / len(wanted)

@@ -139,6 +139,10 @@ class Probe(Video):
     """Contact strength in the last frame."""
     starts_touching: bool
     """Whether the reference had to be taken from the end."""
+    unsteady: int
+    """First frames that are left out, since the light still changes in them; all of them where it never is steady."""
+    untouched: tuple[int, ...]
+    """Numbers of the frames that the reference is the mean of."""
     thumbnail: tuple[float, ...]
     """The reference, 6 x 8 x (brightness, two colour differences), flattened."""
     signature: tuple[float, ...]

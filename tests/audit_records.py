@@ -56,6 +56,8 @@ def probe(video_id: str = "rug_0", **changes: object) -> Probe:
         "quiet": 0.25,
         "contact_end": 0.3,
         "starts_touching": False,
+        "unsteady": 0,
+        "untouched": (0, 2, 4, 6),
         "thumbnail": tuple(rng.normal(90, 1, 6 * 8 * 3)),
         "signature": tuple(contact / np.linalg.norm(contact)),
     }

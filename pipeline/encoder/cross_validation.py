@@ -148,9 +148,9 @@ def _constant(_: Candidate, data: CrossValidationData) -> Predict:
 def _trees(_: Candidate, data: CrossValidationData) -> Predict:
     from pipeline.encoder.baseline.recordings import Recording, recording_features
 
-    touching = {p.video_id for p in read_table(data.frames / PROBES_FILE, Probe) if p.starts_touching}
+    untouched = {p.video_id: p.untouched for p in read_table(data.frames / PROBES_FILE, Probe)}
     features = recording_features(
-        [Recording(data.recordings / v.path, v.frames, v.video_id in touching) for v in data.videos]
+        [Recording(data.recordings / v.path, v.frames, untouched[v.video_id]) for v in data.videos]
     )
     return forest(features, data.labels, data.objects, data.classes)
 

@@ -32,6 +32,7 @@ from pipeline.videos.frames.reference import (
     reference_indices,
     starts_touching,
     thumbnail,
+    unsteady_frames,
 )
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -212,16 +213,20 @@ def _picture(message: Any, where: str) -> Image:
 
 
 def _measure(source: Iterator[Shot]) -> tuple[list[int], npt.NDArray[np.float64]]:
-    """Times (ns) and contact strengths of all pictures, by the untouched picture at the beginning, else at the end."""
+    """Times (ns) and contact strengths of all pictures, by the untouched picture at the beginning, else at the end.
+
+    First pictures in which the light still changes count as quiet.
+    """
     received, thumbs = list[int](), list[Image]()
     for shot in source:
         received.append(shot.recorded)
         frame = av.VideoFrame.from_ndarray(shot.picture, format="bgr24")
         thumbs.append(thumbnail(frame.reformat(format="yuv444p")))
-    places = reference_indices(len(thumbs))
-    first, last = _mean([thumbs[i] for i in places]), _mean([thumbs[-1 - i] for i in places])
+    places, cold = reference_indices(len(thumbs)), unsteady_frames(thumbs, len(thumbs)) % len(thumbs)
+    first, last = _mean([thumbs[cold + i] for i in places]), _mean([thumbs[-1 - i] for i in places])
     reference = last if starts_touching(first, last) else first
-    return received, np.array([contact_strength(thumb, reference) for thumb in thumbs])
+    strengths = [contact_strength(thumb, reference) for thumb in thumbs[cold:]]
+    return received, np.array([min(strengths)] * cold + strengths)
 
 
 def _mean(thumbs: Sequence[Image]) -> Image:

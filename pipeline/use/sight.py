@@ -17,7 +17,7 @@ from pipeline.errors import UserError
 from pipeline.records import Finding
 from pipeline.training.sampling import sample_evaluation
 from pipeline.use.results import Pictures, Touch, Video
-from pipeline.videos.audit.files import FOUND
+from pipeline.videos.audit.files import FOUND, unsteady
 from pipeline.videos.files import VideoFile
 from pipeline.videos.frames.scan import Scan, scan
 from pipeline.videos.frames.subtraction import GAIN, MIDDLE, subtract
@@ -72,6 +72,8 @@ def _shown(name: str, found: Scan, frames: FramesConfig, subtracts: bool, quiet:
         notes.append(f"nothing touches the sensor: strength {probe.contact:.2f}, where noise alone has {quiet:.2f}")
     elif probe.contact <= FOUND * quiet:
         notes.append(f"little touches the sensor: strength {probe.contact:.2f}, where noise alone has {quiet:.2f}")
+    if probe.unsteady:
+        notes.append(f"the light is {unsteady(probe)}")
     if probe.header_frames > probe.frames:
         notes.append(f"damaged: only {probe.frames} of its {probe.header_frames} frames decode")
     touch = Touch(

@@ -380,11 +380,13 @@ def test_features_of_a_recording_are_those_of_five_frames_at_equal_distances(tmp
         reference = np.mean([frames[i] for i in reference_indices(count)], axis=0, dtype=np.float64)
         inner = [frames[round(k * (count - 1) / 6)] for k in range(1, 6)]
         expected = video_features(inner, reference.astype(np.float32))
-        np.testing.assert_allclose(describe(Recording(path, count, False)), expected, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(
+            describe(Recording(path, count, reference_indices(count))), expected, rtol=1e-4, atol=1e-5
+        )
     back = encode(tmp_path / "back.mkv", moving_square(13, 13)[::-1])
-    turned = describe(Recording(back, 13, True))
-    np.testing.assert_allclose(turned, expected, rtol=1e-4, atol=1e-5, err_msg="one that starts touching, from its end")
-    assert not np.allclose(describe(Recording(back, 13, False)), turned)
+    turned = describe(Recording(back, 13, (12,)))
+    np.testing.assert_allclose(turned, expected, rtol=1e-4, atol=1e-5, err_msg="by what it is told is untouched")
+    assert not np.allclose(describe(Recording(back, 13, (0,))), turned)
 
 
 def test_trees_are_the_baseline_on_whole_recordings(
@@ -394,14 +396,14 @@ def test_trees_are_the_baseline_on_whole_recordings(
     videos = [v.model_copy(update={"path": f"{v.video_id}.mkv", "frames": 6}) for v in data.videos[:8]]
     for seed, video in enumerate(videos):
         encode(tmp_path / video.path, moving_square(6, seed))
-    touching = {videos[1].video_id, videos[4].video_id}
-    probes = [probe(v.video_id, starts_touching=v.video_id in touching) for v in videos]
+    untouched = {v.video_id: (number % 6,) for number, v in enumerate(videos)}
+    probes = [probe(v.video_id, untouched=untouched[v.video_id]) for v in videos]
     write_table(data.frames / "probes.parquet", Probe, probes)
     found = {
         r.video_id: r.predicted
         for r in cross_validate_candidate(CANDIDATES["trees"], replace(data, videos=videos), SMALL)
     }
-    recordings = [Recording(tmp_path / v.path, 6, v.video_id in touching) for v in videos]
+    recordings = [Recording(tmp_path / v.path, 6, untouched[v.video_id]) for v in videos]
     features = np.stack([describe(recording) for recording in recordings])
     np.testing.assert_array_equal(recording_features(recordings), features)
     labels = np.array([data.catalogue.labels(v.object_id) for v in videos])

@@ -148,6 +148,18 @@ def test_a_recording_that_begins_in_contact_is_measured_from_its_end(
     assert rows[0].contact > 3 * rows[-1].contact
 
 
+def test_a_warm_up_is_no_press(tmp_path: Path, pictures: list[np.ndarray]) -> None:
+    gains = [*np.linspace(0.25, 1, 12, endpoint=False), *[1.0] * (LENGTH - 12)]
+    warm = [np.rint(picture * gain).astype(np.uint8) for picture, gain in zip(pictures, gains, strict=True)]
+    videos = import_bag(write_bag(tmp_path, "ros1", warm), TOPIC, tmp_path / "out", "rug")
+    for video, touched in zip(videos, TOUCHED, strict=True):
+        begin = touched.start - LONGEST
+        rows = read_csv(video.with_suffix(".csv"), FrameTime)
+        assert rows[0].recorded_ns == START_NS + begin * STEP_NS
+        inside = [r.contact for r in rows if begin + r.frame in touched]
+        assert min(inside) > 3 * max(r.contact for r in rows if begin + r.frame not in touched)
+
+
 def test_odd_sizes_are_written(tmp_path: Path) -> None:
     bag = write_bag(tmp_path, "ros1", recording(47, 65))
     assert {frame.shape for frame in decode(import_bag(bag, TOPIC, tmp_path / "out", "rug")[0])} == {(47, 65, 3)}

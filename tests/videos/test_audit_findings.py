@@ -46,6 +46,13 @@ def test_flawless_videos_no_videos_and_a_single_one_give_no_warning(catalogue: C
         ({"contact": 0.4}, "contact", "not found: strength 0.40", "over 0.50"),
         ({"contact_end": 1.0}, "contact at the end", "still 1.00 of 1.40", "under 0.70"),
         (
+            {"unsteady": 8},
+            "light at the start",
+            "not steady in the first 8 frames, which are left out",
+            "steady",
+        ),
+        ({"unsteady": 126}, "light at the start", "never steady: contact may be light", "steady"),
+        (
             {"starts_touching": True},
             "contact at the start",
             "touched from the first frame: the reference comes from the end",

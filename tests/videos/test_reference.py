@@ -13,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.config import FramesConfig
-from pipeline.videos.decoding import brightness
+from pipeline.use.sight import see
+from pipeline.videos.decoding import brightness, decode
 from pipeline.videos.files import VideoFile
 from pipeline.videos.frames.fit import fit
 from pipeline.videos.frames.reference import (
@@ -108,6 +109,86 @@ def test_a_step_of_the_light_is_no_contact(tmp_path: Path) -> None:
     assert found.probe.brightness_step == pytest.approx(12, abs=1)
     assert without.probe.brightness_step < 0.5
     assert found.probe.contact < without.probe.contact + 0.5 < touched.probe.contact / 3
+
+
+WARM_UPS = [
+    ("salient", [0.25 + 0.75 * i / 8 for i in range(8)]),
+    ("contact", [0.25 + 0.75 * i / 8 for i in range(8)]),
+    ("contact", [1 - 0.6 * 0.8**i for i in range(18)]),
+    ("salient", [0.0]),
+    ("release", [1.3, 1.3, 1.2, 1.2, 1.1]),
+]
+
+
+def warmed(frames: list[np.ndarray], gains: list[float]) -> list[np.ndarray]:
+    """The same frames under a light that begins with these gains and then stays as it is."""
+    gains = [*gains, *[1.0] * (len(frames) - len(gains))]
+    return [np.clip(np.rint(f * gain), 0, 255).astype(np.uint8) for f, gain in zip(frames, gains, strict=True)]
+
+
+def lossless(path: Path, frames: list[np.ndarray], name: str) -> Scan:
+    encode(path, frames)
+    found = scan(VideoFile(path, path.name, "rug", "rug_0"), FramesConfig(size=32, selection=name))
+    assert isinstance(found, Scan)
+    return found
+
+
+@pytest.mark.parametrize(("name", "gains"), WARM_UPS)
+@pytest.mark.parametrize("shape", ["press", "throughout", "start"])
+def test_a_warm_up_changes_neither_contact_nor_what_is_kept(
+    tmp_path: Path, name: str, gains: list[float], shape: str
+) -> None:
+    """Against the same press without the frames whose light is not yet that of the others."""
+    depths = {"press": rise(100), "throughout": [0.0] * 100, "start": rise(100)[::-1]}[shape]
+    steady = film(depths)
+    found = lossless(tmp_path / "warm.avi", warmed(steady, gains), name)
+    cold = found.probe.unsteady
+    # At the end of a slow rise a change of a step in eight frames is left in.
+    assert max(1, len(gains) - 6) <= cold <= len(gains)
+    expected = lossless(tmp_path / "cut.avi", warmed(steady, gains)[cold:], name)
+    assert found.probe.untouched == tuple(i + cold for i in expected.probe.untouched)
+    np.testing.assert_array_equal(found.reference, expected.reference)
+    for measure in ("contact", "contact_end", "starts_touching", "brightness", "thumbnail"):
+        assert getattr(found.probe, measure) == pytest.approx(getattr(expected.probe, measure), rel=0.2, abs=0.05)
+    assert found.probe.starts_touching == (shape == "start")
+    if name != "release":
+        assert min(k.index for k in found.kept) >= cold + (name == "salient"), "no difference in light is kept"
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("name", ["baseball_0", "potato_1", "rug_2", "masking_tape_0"])
+def test_real_presses_after_a_warm_up(real_data: Path, tmp_path: Path, name: str) -> None:
+    """At 25 and at 10 frames a second, where contact begins before a tenth of the video is steady."""
+    frames = list(decode(real_data / f"{name}.mov"))
+    steady = lossless(tmp_path / "steady.avi", frames, "contact")
+    warm = lossless(tmp_path / "warm.avi", warmed(frames, WARM_UPS[0][1]), "contact")
+    assert (steady.probe.unsteady, warm.probe.unsteady) == (0, 8)
+    assert warm.probe.contact == pytest.approx(steady.probe.contact, rel=0.1)
+    assert np.abs(warm.reference.astype(int) - steady.reference).mean() < 1
+
+
+def test_a_warm_up_is_noted_and_hides_no_lack_of_contact(tmp_path: Path) -> None:
+    frames = warmed(film([0.0] * 60), WARM_UPS[0][1])
+    seen = see(encode(tmp_path / "v.avi", frames), FramesConfig(size=32), subtracts=True, quiet=1.0)
+    assert not seen.felt
+    first, second = seen.touch.notes
+    assert first.startswith("nothing touches the sensor")
+    assert second == "the light is not steady in the first 8 frames, which are left out"
+
+
+def test_a_steady_press_has_the_reference_that_it_had(tmp_path: Path) -> None:
+    """Also where contact begins at once, and under a light that only ever changes later."""
+    late = [0.0] * 30 + [20.0] * 70
+    for number, frames in enumerate((film([4.0 * i for i in range(60)]), film(rise(100)), film(rise(100), light=late))):
+        found = lossless(tmp_path / f"{number}.avi", frames, "salient")
+        assert found.probe.unsteady == 0
+        assert found.probe.untouched == reference_indices(len(frames))
+
+
+def test_a_light_that_never_settles_is_named_and_measured_as_before(tmp_path: Path) -> None:
+    flicker = [15.0 * (i % 2) for i in range(60)]
+    found = lossless(tmp_path / "v.avi", film(rise(60), light=flicker), "salient")
+    assert (found.probe.unsteady, found.probe.untouched) == (60, reference_indices(60))
 
 
 thumbs = st.tuples(st.integers(1, 12), st.integers(1, 12), st.integers(0, 2**32)).map(

@@ -12,7 +12,6 @@ from pipeline.encoder.baseline.features import Plane, video_features
 from pipeline.encoder.baseline.predictor import Features
 from pipeline.parallel import run_parallel
 from pipeline.videos.decoding import Image, decode
-from pipeline.videos.frames.reference import reference_indices
 
 FRAMES = 5
 
@@ -24,8 +23,8 @@ class Recording:
     path: Path
     frames: int
     """That decode (`Video.frames`)."""
-    starts_touching: bool
-    """Whether its no-contact reference has to come from its end (`Probe.starts_touching`)."""
+    untouched: tuple[int, ...]
+    """Numbers of the frames without contact (`Probe.untouched`)."""
 
     def __str__(self) -> str:
         return str(self.path)
@@ -39,15 +38,9 @@ def recording_features(recordings: Sequence[Recording]) -> Features:
 def describe(recording: Recording) -> Features:
     """Features of one recording."""
     inner = np.linspace(0, recording.frames - 1, FRAMES + 2).round().astype(int)[1:-1].tolist()
-    untouched = untouched_frames(recording.frames, recording.starts_touching)
-    wanted = {*inner, *untouched}  # A whole recording may be gigabytes.
+    wanted = {*inner, *recording.untouched}  # A whole recording may be gigabytes.
     kept = {i: frame for i, frame in enumerate(decode(recording.path)) if i in wanted}
-    return video_features([kept[i] for i in inner], mean([kept[i] for i in untouched]))
-
-
-def untouched_frames(frames: int, starts_touching: bool) -> list[int]:
-    """Numbers of the frames without contact, of so many."""
-    return [frames - 1 - i if starts_touching else i for i in reference_indices(frames)]
+    return video_features([kept[i] for i in inner], mean([kept[i] for i in recording.untouched]))
 
 
 def mean(frames: Sequence[Image]) -> Plane:

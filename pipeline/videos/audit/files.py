@@ -49,6 +49,13 @@ def touches(probe: Probe, level: float) -> bool:
     return probe.contact > FOUND * level
 
 
+def unsteady(probe: Probe) -> str:
+    """What is to be said of a video whose light changes in its first frames."""
+    if probe.unsteady == probe.frames:
+        return "never steady: contact may be light"
+    return f"not steady in the first {probe.unsteady} frames, which are left out"
+
+
 def _overview(probes: Sequence[Probe], catalogue: Catalogue) -> Iterator[Finding]:
     videos = Counter(p.object_id for p in probes)
     frames = [p.frames for p in probes]
@@ -127,6 +134,8 @@ def _contact(probes: Sequence[Probe]) -> Iterator[Finding]:
     level = quiet_level(probes)
     yield _finding("contact", "all", f"quiet level {level:.2f}, median contact {median(p.contact for p in probes):.2f}")
     for p in probes:
+        if p.unsteady:
+            yield _finding("light at the start", p.path, unsteady(p), "steady", warn=True)
         if p.starts_touching:
             measured = "touched from the first frame: the reference comes from the end"
             yield _finding("contact at the start", p.path, measured, "untouched", warn=True)

@@ -1,10 +1,13 @@
 """The no-contact reference of a video, and how strongly a frame differs from it.
 
 A GelSight picture without contact is the sensor's own: smooth light, dust, scratches. What is touched is the difference
-to it. The reference is the mean of the video's first frames, or of its last where the video starts in contact.
+to it. The reference is the mean of the video's first frames, or of its last where the video starts in contact. First
+frames in which the light still changes, as a camera's do that has just been started, are left out.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
 
 import av
 import cv2
@@ -21,12 +24,41 @@ THUMB = 80
 TOUCHED = 1.12
 """Detail of the first picture over that of the last, from which the video counts as starting in contact: contact adds
 detail. Untouched real videos lie between .95 and 1.08 (99 % of them)."""
+UNSTEADY = 1.0
+"""The light changes where three quarters of a picture become brighter, or darker, by more than so many 8-bit steps:
+contact makes some parts brighter and others darker. In the first frames of 370 real videos nothing changes by that."""
 
 
 def reference_indices(frames: int) -> tuple[int, ...]:
     """Which of a video's first frames the reference is the mean of, in rising order."""
     span = max(1, min(LONGEST, frames // SHARE))
     return tuple(range(0, span, -(-span // MOST_FRAMES)))
+
+
+def unsteady_frames(thumbs: Iterable[Image], frames: int) -> int:
+    """How many of a video's first frames go by before a reference can be taken; all, where the light is never steady.
+
+    Args:
+        thumbs: the video's thumbnails, in order; no more are drawn than it takes.
+        frames: how many the video has.
+    """
+    places = [*reference_indices(frames), reference_indices(frames)[-1] + 1]
+    seen: list[Image] = []
+    for thumb in thumbs:
+        seen.append(thumb)
+        begin = len(seen) - 1 - places[-1]
+        if begin >= 0 and is_steady([seen[begin + place] for place in places]):
+            return begin
+    return frames
+
+
+def is_steady(thumbs: Sequence[Image]) -> bool:
+    """Whether frames have the light of the last one (`UNSTEADY`), by their thumbnails."""
+    for thumb in thumbs[:-1]:
+        low, high = np.quantile(thumb.astype(np.int16) - thumbs[-1], (0.25, 0.75), axis=(0, 1))
+        if max(low.max(), -high.min()) > UNSTEADY:
+            return False
+    return True
 
 
 def thumbnail(frame: av.VideoFrame) -> Image:

@@ -11,11 +11,18 @@ import numpy as np
 from pipeline.config import FramesConfig
 from pipeline.io import sha256
 from pipeline.records import Finding, Probe, Severity
-from pipeline.videos.decoding import Image
+from pipeline.videos.decoding import Decoder, Image
 from pipeline.videos.files import VideoFile
-from pipeline.videos.frames.reference import contact_strength, starts_touching
+from pipeline.videos.frames.reference import (
+    contact_strength,
+    detail,
+    reference_indices,
+    starts_touching,
+    thumbnail,
+    unsteady_frames,
+)
 from pipeline.videos.frames.selection import Kept
-from pipeline.videos.frames.video_pass import VideoPass, reference_from_end, run_pass
+from pipeline.videos.frames.video_pass import VideoPass, reference_of, run_pass
 
 THUMBNAIL_SIZE = (8, 6)
 SIGNATURE_SIZE = (24, 18)
@@ -34,7 +41,8 @@ class Scan:
 def scan(file: VideoFile, config: FramesConfig) -> Scan | Finding:
     """Look at one video; what is wrong with it comes back as a finding, so that one bad file hides no other.
 
-    One decode, unless the header lies about the number of frames or the video starts in contact.
+    One decode, unless the header lies about the number of frames, the light is not steady at the beginning, or the
+    video starts in contact.
     """
     try:
         size = file.path.stat().st_size
@@ -52,16 +60,28 @@ def scan(file: VideoFile, config: FramesConfig) -> Scan | Finding:
     count = found.header.frames if config.selection == "release" else found.frames
     if count != found.header.frames:
         found = run_pass(file.path, config, count)
+    unsteady, begin = 0, 0
+    if not found.steady:
+        with Decoder(file.path) as decoder:
+            unsteady = unsteady_frames(map(thumbnail, decoder.frames()), found.frames)
+        # Where no frame is as good as another, the first are as good as any.
+        begin = unsteady if unsteady < found.frames else 0
+        found = run_pass(file.path, config, count, unsteady=begin)
     assert found.first is not None, "set where there are frames"
     assert found.last is not None, "set where there are frames"
+    untouched = tuple(begin + i for i in reference_indices(count) if begin + i < found.frames)
     touching = starts_touching(found.first, found.last)
-    if touching:
-        found = run_pass(file.path, config, count, reference_from_end(file.path, found.frames, config))
+    # What comes after unsteady frames need not be untouched any more: then the end is taken unless it has more detail.
+    if touching or (begin and detail(found.first) > detail(found.last)):
+        untouched = tuple(found.frames - 1 - i for i in reference_indices(found.frames))
+        found = run_pass(file.path, config, count, reference_of(file.path, untouched, config), begin)
     assert found.reference is not None, "set where there are frames"
-    return Scan(_probe(file, content, found, touching), tuple(found.kept), found.reference.picture)
+    return Scan(_probe(file, content, found, touching, unsteady, untouched), tuple(found.kept), found.reference.picture)
 
 
-def _probe(file: VideoFile, content: str, found: VideoPass, touching: bool) -> Probe:
+def _probe(
+    file: VideoFile, content: str, found: VideoPass, touching: bool, unsteady: int, places: tuple[int, ...]
+) -> Probe:
     assert found.reference is not None, "set where there are frames"
     assert found.last is not None, "set where there are frames"
     shown = found.last if found.strongest is None else found.strongest
@@ -88,6 +108,8 @@ def _probe(file: VideoFile, content: str, found: VideoPass, touching: bool) -> P
         quiet=min(found.strengths, default=0.0),
         contact_end=contact_strength(found.last, untouched),
         starts_touching=touching,
+        unsteady=unsteady,
+        untouched=places,
         thumbnail=_flat(cv2.resize(untouched, THUMBNAIL_SIZE, interpolation=cv2.INTER_AREA)),
         signature=_signature(found.brightness_thumbnails, untouched),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,7 +13,13 @@ import numpy as np
 from pipeline.config import FramesConfig
 from pipeline.videos.decoding import Decoder, Header, Image, brightness, picture, turns
 from pipeline.videos.frames.fit import fit
-from pipeline.videos.frames.reference import brightness_thumbnail, contact_strength, reference_indices, thumbnail
+from pipeline.videos.frames.reference import (
+    brightness_thumbnail,
+    contact_strength,
+    is_steady,
+    reference_indices,
+    thumbnail,
+)
 from pipeline.videos.frames.selection import (
     RELEASE_FEWEST,
     BestFrames,
@@ -48,6 +54,8 @@ class VideoPass:
     rotation: int = 0
     """Degrees against the clock."""
     reference: Reference | None = None
+    steady: bool = True
+    """Whether the light is in the frames that make a reference."""
     first: Image | None = None
     last: Image | None = None
     """Thumbnails: the mean of the first frames, and the last frame."""
@@ -100,20 +108,25 @@ class ReferenceMean:
 
 
 def run_pass(
-    path: Path, config: FramesConfig, promised: int | None = None, given: Reference | None = None
+    path: Path,
+    config: FramesConfig,
+    promised: int | None = None,
+    given: Reference | None = None,
+    unsteady: int = 0,
 ) -> VideoPass:
     """Decode a video once.
 
     Args:
         promised: how many frames it has, where the header is not to be trusted.
         given: its no-contact reference; None takes it from the first frames.
+        unsteady: first frames that are not looked at; only the published rule, which knows no light, may choose them.
     """
     with Decoder(path) as decoder:
         found = VideoPass(decoder.header, reference=given)
         count = decoder.header.frames if promised is None else promised
         best = BestFrames(kept_count(count, config), config)
         choose = _rule(config, best, count)
-        reference_places = reference_indices(count)
+        reference_places = [unsteady + i for i in reference_indices(count)]
         stride, often = max(1, count // PROBES), max(1, count // SIGNATURE_FRAMES)
         by_contact = config.selection == "contact"  # at every frame, not only where the audit does
         untouched = ReferenceMean(config)
@@ -124,10 +137,15 @@ def run_pass(
             found.sizes.add((frame.height, frame.width) if found.rotation % 180 == 0 else (frame.width, frame.height))
             if len(found.sizes) > 1:
                 return found
+            if index >= unsteady or config.selection == "release":
+                choose(index, frame)
+            if index < unsteady:
+                continue
             if index in reference_places:
                 untouched.add(frame)
-            elif found.reference is None and index > reference_places[-1]:
-                found.reference = untouched.mean()
+            elif index == reference_places[-1] + 1:
+                found.steady = is_steady([*untouched.thumbs, thumbnail(frame)])
+                found.reference = found.reference or untouched.mean()
             if by_contact or index % stride == 0:
                 thumb = thumbnail(frame)
                 strength = found.note(thumb)
@@ -137,7 +155,6 @@ def run_pass(
                     best.offer(strength, index, frame)
             if index % often == 0 and found.reference is not None:
                 found.brightness_thumbnails.append(brightness_thumbnail(frame))
-            choose(index, frame)
         if frame is None:
             return found
         found.reference = found.reference or untouched.mean()
@@ -147,17 +164,16 @@ def run_pass(
             found.kept = []
         elif not found.kept:
             # A single frame has no predecessor and shows no contact; it is kept because it is all there is.
-            found.kept = [Kept(0, 0.0, untouched.pictures[0])]
+            found.kept = [Kept(unsteady, 0.0, untouched.pictures[0])]
     return found
 
 
-def reference_from_end(path: Path, frames: int, config: FramesConfig) -> Reference:
-    """The reference of a video that ends untouched: the mean of its last frames."""
-    wanted = {frames - 1 - i for i in reference_indices(frames)}
+def reference_of(path: Path, places: Sequence[int], config: FramesConfig) -> Reference:
+    """The mean of the frames at these places of a video."""
     untouched = ReferenceMean(config)
     with Decoder(path) as decoder:
         for index, frame in enumerate(decoder.frames()):
-            if index in wanted:
+            if index in places:
                 untouched.add(frame)
     return untouched.mean()
 
