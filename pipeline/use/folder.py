@@ -15,11 +15,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ValidationError
+from pydantic import AfterValidator, BaseModel, ValidationError
 
 from pipeline.config import EncoderConfig, FramesConfig, LanguageConfig
 from pipeline.errors import UserError, first_problem
@@ -39,6 +39,8 @@ IDENTITY = ("*.safetensors", "tokenizer.json")
 """Files by which a base language model is known."""
 
 M = TypeVar("M", bound=BaseModel)
+Rounded = Annotated[float, AfterValidator(lambda value: round(value, 4))]
+"""What was fitted or summed: its last bits depend on the processor, and a folder's bytes must not."""
 
 
 class Base(Record):
@@ -69,11 +71,11 @@ class ModelConfig(Record):
     base: Base
     chat: str
     """A conversation as its chat format writes it; another format would be asked what was never trained."""
-    quiet: float
+    quiet: Rounded
     """Contact strength that noise alone gives in its data."""
-    usual: float
+    usual: Rounded
     """How far its training and validation videos lie from their mean at most, in deviations a dimension."""
-    temperatures: dict[str, float]
+    temperatures: dict[str, Rounded]
     """By property, fitted on validation objects."""
     scores: dict[str, tuple[float, float, float]]
     """By task, on test questions: accuracy, and the ends of its interval."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import platform
 import shutil
 from collections.abc import Mapping, Sequence
@@ -151,7 +152,7 @@ def _scores(file: Path, params: Params, variant: Variant) -> dict[str, Score]:
 
 
 def _usual(embeddings: Path, split: Path, params: Params) -> float:
-    """How far a training or validation video's mean embedding lies from that of all, at most."""
+    """How far a training or validation video's mean embedding lies from that of all, at most; rounded up."""
     store, known = EmbeddingStore(embeddings), Statistics.load(embeddings / STATISTICS_FILE)
     distances = []
     for assignment in read_table(split, Assignment):
@@ -161,7 +162,7 @@ def _usual(embeddings: Path, split: Path, params: Params) -> float:
             distances.append(
                 distance(found.numpy() if params.encoder.standardize else ((found - known.mean) / known.scale).numpy())
             )
-    return max(distances, default=0.0)
+    return math.ceil(1e4 * max(distances, default=0.0)) / 1e4
 
 
 def _copy(source: Path, to: Path) -> None:
