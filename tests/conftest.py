@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+import socket
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,8 +14,9 @@ from typing import TYPE_CHECKING, Any
 import av
 import cv2
 import numpy as np
+import psutil
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 from pipeline.errors import UserError
 from pipeline.records import Video
@@ -25,9 +29,37 @@ ROOT = Path(__file__).parents[1]
 DATA_VARIABLE = "OCTOPI_DATA_DIR"
 NO_DATA = f"needs real videos: set {DATA_VARIABLE} to a folder of the PhysiCLeAR videos"
 
+HUNG = 600.0
+"""Seconds after which a test may take something for hung, however busy the machine is; nothing is measured by them."""
+
 # A loaded machine is no reason to fail, and a test that passes today passes tomorrow.
-settings.register_profile("house", deadline=None, derandomize=True, database=None, max_examples=60)
+settings.register_profile(
+    "house",
+    deadline=None,
+    derandomize=True,
+    database=None,
+    max_examples=60,
+    suppress_health_check=[HealthCheck.too_slow],
+)
 settings.load_profile("house")
+
+
+def wait_until_ended(processes: Iterable[psutil.Process]) -> None:
+    """A zombie has ended, even where nobody fetches it; a process of the same number is another."""
+    end = time.monotonic() + HUNG
+    for process in processes:
+        with suppress(psutil.NoSuchProcess):
+            while process.is_running() and process.status() != psutil.STATUS_ZOMBIE:
+                assert time.monotonic() < end, f"{process} is alive"
+                time.sleep(0.02)
+
+
+@contextmanager
+def deaf_port() -> Iterator[int]:
+    """A port of this machine that refuses connections for as long as it is held: bound, but nobody listens."""
+    with closing(socket.socket()) as held:
+        held.bind(("127.0.0.1", 0))
+        yield held.getsockname()[1]
 
 
 def refused(words: str) -> Any:

@@ -53,7 +53,7 @@ class Project:
     def run(self, *command: str, status: int = 0) -> str:
         """Run a command; return what it printed."""
         done = subprocess.run(
-            command, cwd=self.folder, env=self.environment, text=True, capture_output=True, timeout=540, check=False
+            command, cwd=self.folder, env=self.environment, text=True, capture_output=True, check=False
         )
         output = done.stdout + done.stderr
         assert done.returncode == status, output[-4000:]

@@ -1,19 +1,20 @@
-"""Counted memory against what torch keeps, what the process takes, and published numbers of parameters."""
+"""Counted memory against what torch keeps and holds at once, and published numbers of parameters."""
 
 from __future__ import annotations
 
-import ctypes
-import gc
 import shlex
-import sys
+import weakref
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 import open_clip
 import pytest
 import torch
 from peft import LoraConfig, get_peft_model
 from torch import nn
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 from transformers import DynamicCache, LlamaConfig, LlamaForCausalLM
 
 from pipeline.encoder.vpt import VisualPrompts
@@ -27,8 +28,6 @@ from tests.closure import ROOT
 
 LINEAR = ("q_proj", "k_proj", "v_proj", "o_proj", "gate_proj", "up_proj", "down_proj")
 ROWS, LENGTH, RANK = 2, 60, 8
-M_MMAP_THRESHOLD = -3
-"""glibc's malloc.h."""
 
 
 @pytest.fixture(autouse=True)
@@ -182,33 +181,41 @@ def test_published_models_have_their_published_sizes() -> None:
     }
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the kernel's own mark of the highest memory")
-def test_a_process_takes_what_is_counted() -> None:
-    """Forward and backward through a tower that holds far more than what the process moves beside it."""
+class Held(TorchDispatchMode):
+    """The bytes of all tensors that exist at once, counted as operations make them: no process or heap is measured."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.now = self.most = 0
+        self._known: weakref.WeakSet[torch.UntypedStorage] = weakref.WeakSet()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        made = func(*args, **(kwargs or {}))
+        for tensor in tree_leaves(made):
+            if isinstance(tensor, torch.Tensor) and (storage := tensor.untyped_storage()) not in self._known:
+                self._known.add(storage)
+                self._add(storage.nbytes())
+                weakref.finalize(storage, self._add, -storage.nbytes())
+        return made
+
+    def _add(self, size: int) -> None:
+        self.now += size
+        self.most = max(self.most, self.now)
+
+
+def test_what_passes_is_counted_too() -> None:
+    """Forward and backward through a tower: the largest sum of all tensors that exist at once, its weights aside."""
     shape = Vision(8, 256, patch_size=16, image_size=224, embed_dim=64, head_width=64, quick_gelu=True)
     tower = tower_of(shape)
     VisualPrompts(8, 8, 256, 768).attach(tower)
-
-    def run(frames: int) -> None:
-        tower(torch.zeros(frames, 3, 224, 224)).sum().backward()
-
-    # Each tensor its own mapping, which goes when it is freed: else the heap's holes would be measured too.
-    heap = ctypes.CDLL(None)
-    heap.mallopt(M_MMAP_THRESHOLD, 2**16)
-    run(1)
-    gc.collect()
-    heap.malloc_trim(0)
-    before = resident("VmRSS")
-    Path("/proc/self/clear_refs").write_text("5")
-    run(8)
-    taken = resident("VmHWM") - before
-    heap.mallopt(M_MMAP_THRESHOLD, 2**17)
-    assert taken == pytest.approx(shape.saved(8, 8, 4) + shape.passing(8, 8, 4), rel=0.1)
-
-
-def resident(name: str) -> int:
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return 1024 * int(next(line for line in lines if line.startswith(name)).split()[1])
+    with Held() as held:
+        for parameter in tower.parameters():
+            parameter.view(-1)
+        weights = held.now
+        tower(torch.zeros(8, 3, 224, 224)).sum().backward()
+    expected = shape.saved(8, 8, 4) + shape.passing(8, 8, 4)
+    assert held.most - weights == pytest.approx(expected, rel=0.05)
+    assert shape.saved(8, 8, 4) * 1.05 < held.most - weights, "what is kept alone is less"
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")

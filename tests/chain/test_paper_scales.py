@@ -85,7 +85,7 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
         write_vicuna(folder / "weights" / f"vicuna-{scale[6:]}-v1.5", words, num_hidden_layers=layers)
     (folder / "launched.py").write_text(LAUNCHED)
     shipped = yaml.safe_load((folder / "conf" / "accelerate" / "fsdp.yaml").read_text())
-    (folder / "cpu.yaml").write_text(yaml.safe_dump({**shipped, "use_cpu": True}))
+    (folder / "cpu.yaml").write_text(yaml.safe_dump({**shipped, "use_cpu": True, "main_process_port": 0}))
     return project
 
 

@@ -34,6 +34,7 @@ from pipeline.stage import alone
 from pipeline.tasks.questions import build_questions, pool_of
 from pipeline.videos.catalogue import Catalogue
 from tests.closure import ROOT, closure
+from tests.conftest import HUNG, deaf_port
 from tests.fake_run import fake_params, write_run
 
 KEY = "sk-a-key-that-nobody-may-see"
@@ -293,7 +294,7 @@ def test_a_killed_run_loses_nothing(project: Path, server: Server) -> None:
     options = ["--endpoint", server.url, "--model", "some-maker/sees-1", "--input", "frames"]
     command = [sys.executable, "-c", "from pipeline.cli import main; main()", "answer-with", *options]
     process.append(subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(ROOT)}))
-    assert process[0].wait(120) == -signal.SIGKILL
+    assert process[0].wait(HUNG) == -signal.SIGKILL
     cache = PLACE / "cache.jsonl"
     lines = cache.read_bytes().splitlines(keepends=True)
     assert len(lines) == 5
@@ -359,20 +360,22 @@ def test_a_server_that_is_silent_or_gone(
 
     def step(n: int) -> Response:
         if n >= 2:
-            asleep.wait(30)
+            asleep.wait(HUNG)
         return right(n)
 
     server.step = step
     assert "no answer within 0.3 s" in run(server, "--timeout", "0.3", status=1)
     asleep.set()
-    options = ["--endpoint", "http://127.0.0.1:9/v1", "--model", "m", "--input", "frames"]
-    monkeypatch.setattr(sys, "argv", ["octopi", "answer-with", *options])
-    with pytest.raises(SystemExit) as ended:
-        main()
+    with deaf_port() as port:
+        nobody = f"http://127.0.0.1:{port}/v1"
+        options = ["--endpoint", nobody, "--model", "m", "--input", "frames"]
+        monkeypatch.setattr(sys, "argv", ["octopi", "answer-with", *options])
+        with pytest.raises(SystemExit) as ended:
+            main()
     said = capsys.readouterr().err
     assert ended.value.code == 1
     assert said.count("\n") == 1
-    assert "http://127.0.0.1:9/v1: cannot be reached" in said
+    assert f"{nobody}: cannot be reached" in said
 
 
 SAYS_NOTHING: dict[str, tuple[Response, str]] = {

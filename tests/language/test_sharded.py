@@ -14,7 +14,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -27,6 +27,7 @@ from pipeline.io import write_jsonl
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import Material
 from tests.closure import ROOT
+from tests.conftest import HUNG
 from tests.language.sharded import CONFIG, KINDS, run
 
 CHECKPOINT = {
@@ -40,7 +41,7 @@ def launched(folder: Path, *arguments: str, **settings: object) -> Iterator[subp
     """A launch with the shipped settings, but on CPUs."""
     shipped = yaml.safe_load((ROOT / "conf/accelerate/fsdp.yaml").read_text())
     own = folder / f"cpu-{settings.get('machine_rank', 0)}.yaml"
-    own.write_text(yaml.safe_dump({**shipped, "use_cpu": True, "main_process_port": free_port(), **settings}))
+    own.write_text(yaml.safe_dump({**shipped, "use_cpu": True, "main_process_port": 0, **settings}))
     command = [sys.executable, "-m", "accelerate.commands.launch", "--config_file", str(own)]
     process = subprocess.Popen(
         [*command, "-m", "tests.language.sharded", str(folder), *arguments],
@@ -58,9 +59,12 @@ def launched(folder: Path, *arguments: str, **settings: object) -> Iterator[subp
 
 
 def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    """Below those that systems give away unasked, so that nobody is given it before it is used."""
+    for port in range(20_000 + os.getpid() % 10_000, 32_000):
+        with suppress(OSError), socket.socket() as probe:
+            probe.bind(("127.0.0.1", port))
+            return port
+    raise AssertionError("no port is free")
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +73,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory, held: Material) -> Path:
     folder = tmp_path_factory.mktemp("sharded")
     write_jsonl(folder / "questions.jsonl", held.questions)
     with launched(folder, held.language.weights, str(held.store.folder), "killed") as process:
-        output, _ = process.communicate(timeout=300)
+        output, _ = process.communicate(timeout=HUNG)
     assert "SIGKILL" in output, output[-3000:]
     return folder
 
@@ -122,7 +126,7 @@ def test_two_machines_go_on_where_two_processes_were_killed(trained: Path, held:
         launched(trained, *arguments, **shared, machine_rank=1) as second,
     ):
         for process in (first, second):
-            output, _ = process.communicate(timeout=300)
+            output, _ = process.communicate(timeout=HUNG)
             assert process.returncode == 0, output[-3000:]
     whole, resumed = (load_file(trained / f"lora-{name}-1.safetensors") for name in ("whole", "resumed"))
     assert whole.keys() == resumed.keys()

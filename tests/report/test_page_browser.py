@@ -45,7 +45,7 @@ def browse(folder: Path, page: Path, *options: str) -> subprocess.CompletedProce
     log = ("--enable-logging=stderr", "--virtual-time-budget=3000", f"--user-data-dir={folder / 'profile'}")
     command = [*BROWSER, *log, *options, page.as_uri()]
     environment = {**os.environ, "HOME": str(folder)}
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=True, env=environment)
+    return subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
 
 
 def asked(log: Path) -> list[str]:

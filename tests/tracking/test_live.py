@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import re
 import shutil
 import signal
 import socket
@@ -15,7 +16,6 @@ from contextlib import closing, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
-from urllib.request import urlopen
 
 import mlflow
 import pytest
@@ -34,6 +34,7 @@ from pipeline.tracking.publish import publish
 from pipeline.tracking.store import TrackingError, out_of_reach
 from pipeline.training.trainer import TrainableTrainer, Trained, TrainingMonitor, train, training_arguments
 from tests.closure import ROOT
+from tests.conftest import HUNG, deaf_port
 from tests.tracking.conftest import FIRST, FULL, FakeChain, by_name, client, losses, runs
 
 ALIGN = "align@finetuned-all-0"
@@ -70,7 +71,7 @@ def test_a_training_and_publishing_share_one_run(chain: FakeChain, monkeypatch: 
     with live(stage) as callbacks:
         assert by_name("stage")[ALIGN].info.status == "RUNNING"
         trained = fit(chain.params, callbacks)
-        deadline = time.monotonic() + 30
+        deadline = time.monotonic() + HUNG
         while not any(m.startswith("system/") for m in by_name("stage")[ALIGN].data.metrics):
             assert time.monotonic() < deadline, "no system metrics"
             time.sleep(0.1)
@@ -122,7 +123,7 @@ def test_four_killed_cold_starts_and_the_next_attempt(chain: FakeChain) -> None:
     for process in started:
         process.start()
     for process in started:
-        process.join(240)
+        process.join(HUNG)
     assert [process.exitcode for process in started] == [9] * 4
     killed = by_name("stage")
     assert {name: run.info.status for name, run in killed.items()} == dict.fromkeys(names, "RUNNING")
@@ -176,9 +177,8 @@ def silent_server() -> Iterator[str]:
 
 @contextmanager
 def closed_port() -> Iterator[str]:
-    with silent_server() as uri:
-        pass
-    yield uri
+    with deaf_port() as port:
+        yield f"http://127.0.0.1:{port}"
 
 
 @contextmanager
@@ -224,26 +224,24 @@ def test_out_of_reach_costs_one_warning_and_one_call(
 def test_a_server_that_dies_while_a_training_goes_on(
     chain: FakeChain, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with closed_port() as uri:
-        port = uri.rsplit(":", 1)[1]
     Path("mlruns").rename(tmp_path / "server")
     store = ["--backend-store-uri", f"sqlite:///{tmp_path / 'server' / 'mlflow.db'}"]
-    place = ["--host", "127.0.0.1", "--port", port, "--workers", "1"]
+    place = ["--host", "127.0.0.1", "--port", "0", "--workers", "1"]
     command = [sys.executable, "-m", "mlflow", "server", *place, *store]
     command += ["--artifacts-destination", str(tmp_path / "artifacts")]
     environment = {**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false", "MLFLOW_DISABLE_TELEMETRY": "true"}
     with (tmp_path / "server.log").open("w") as log:
         server = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True, env=environment)
     try:
-        wait_for(f"{uri}/health")
-        params = watched(chain.params, uri=uri, experiment="remote", timeout_seconds=60)
+        uri = address(tmp_path / "server.log")
+        params = watched(chain.params, uri=uri, experiment="remote", timeout_seconds=int(HUNG))
         publish(params)
         assert "nothing new" in publish(params)
         there = client(uri)
         experiment = there.get_experiment_by_name("remote").experiment_id
         (variant,) = there.search_runs([experiment], f"tags.`octopi.variant` = '{FULL}'")
         assert {a.path for a in there.list_artifacts(variant.info.run_id, "encoder")} == {"encoder/encoder.safetensors"}
-        with live(Stage(ALIGN, watched(params, timeout_seconds=3))) as callbacks:
+        with live(Stage(ALIGN, params)) as callbacks:
             assert len(callbacks) == 1
             os.killpg(server.pid, signal.SIGKILL)
             server.wait()
@@ -257,15 +255,13 @@ def test_a_server_that_dies_while_a_training_goes_on(
     assert mlflow.active_run() is None
 
 
-def wait_for(url: str) -> None:
-    deadline = time.monotonic() + 120
-    while True:
-        try:
-            with urlopen(url, timeout=2):
-                return
-        except OSError:
-            assert time.monotonic() < deadline, "the server did not start"
-            time.sleep(0.3)
+def address(log: Path) -> str:
+    """Where a server listens, at a port that it chose itself, as soon as it says so."""
+    deadline = time.monotonic() + HUNG
+    while not (found := re.search(r"running on (http://\S+)", log.read_text())):
+        assert time.monotonic() < deadline, "the server did not start"
+        time.sleep(0.3)
+    return found[1]
 
 
 def test_a_curve_that_broke_off_is_completed(chain: FakeChain, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,6 +16,8 @@ from typing import Any
 
 import pytest
 
+from tests.conftest import HUNG
+
 QUIET = ("--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run")
 BROWSER = next(
     ([found, *QUIET] for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), []
@@ -36,7 +38,7 @@ class Tab:
         number = next(self._ids)
         self._socket.send(json.dumps({"id": number, "method": method, "params": parameters}))
         while True:
-            message = json.loads(self._socket.recv(timeout=60))
+            message = json.loads(self._socket.recv(timeout=HUNG))
             if message.get("id") == number:
                 assert "error" not in message, message
                 return dict(message["result"])
@@ -50,11 +52,11 @@ class Tab:
 
     def until(self, script: str) -> None:
         """Wait until an expression is true."""
-        for _ in range(300):
-            if self.run(f"!!({script})"):
-                return
+        end = time.monotonic() + HUNG
+        while not self.run(f"!!({script})"):
+            said = self.run("document.body.innerText")
+            assert time.monotonic() < end, f"never true: {script}; the page says {said!r}"
             time.sleep(0.1)
-        raise AssertionError(f"never true: {script}; the page says {self.run('document.body.innerText')!r}")
 
     def choose(self, selector: str, *files: Path) -> None:
         """Put files into a file input, as its dialogue does."""
@@ -103,9 +105,7 @@ def tab(folder: Path, width: int = 1280, height: int = 900) -> Iterator[Tab]:
     )
     try:
         noted = profile / "DevToolsActivePort"
-        for _ in range(600):
-            if noted.exists() and noted.read_text().count("\n"):
-                break
+        while not (noted.exists() and noted.read_text().count("\n")):
             assert process.poll() is None, "the browser ended"
             time.sleep(0.1)
         port, path = noted.read_text().split()
@@ -118,4 +118,4 @@ def tab(folder: Path, width: int = 1280, height: int = 900) -> Iterator[Tab]:
             yield Tab(socket)
     finally:
         process.terminate()
-        process.wait(30)
+        process.wait(HUNG)

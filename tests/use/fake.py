@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -12,6 +13,7 @@ from typing import Any
 
 from pipeline.errors import UserError
 from pipeline.use.server import listen, make_server
+from tests.conftest import HUNG
 
 
 def digest(data: bytes) -> str:
@@ -46,9 +48,10 @@ class FakeOctopi:
             raise UserError(f"{videos[0]}: 12 frames show no touch; record it again")
         if question == "break":
             raise RuntimeError("a secret of /home/somebody")
-        for word in self.words(question, [Path(v).read_bytes() for v in videos], history).split(" "):
+        words = self.words(question, [Path(v).read_bytes() for v in videos], history).split(" ")
+        for word in itertools.repeat("on") if question == "endless" else words:
             if self.gate is not None:
-                self.gate.wait(20)
+                self.gate.wait(HUNG)
             time.sleep(self.seconds)
             yield f"{word} "
             if word == "late":
@@ -73,5 +76,5 @@ def running(app: Any) -> Iterator[int]:
             yield listening.getsockname()[1]
         finally:
             there.should_exit = True
-            thread.join(30)
+            thread.join(HUNG)
             assert not thread.is_alive()

@@ -15,6 +15,7 @@ from pipeline.errors import UserError
 from pipeline.use.results import Description, Exchange, Touch, Video
 from pipeline.videos.files import VideoFile
 from pipeline.videos.frames.scan import Scan, scan
+from tests.conftest import HUNG
 
 KEPT = 5
 LEVELS = {"hardness": ("soft", "hard"), "roughness": ("smooth", "slightly rough", "rough")}
@@ -68,6 +69,6 @@ class FakeOctopi:
             self.made += 1
             yield f"{piece} "
             if "wait" in question:
-                self.paused.wait(30)
+                self.paused.wait(HUNG)
         if "break" in question:
             raise ValueError("within")

@@ -29,7 +29,7 @@ from pipeline.use.model import Octopi
 from pipeline.use.results import Exchange
 from pipeline.use.worker import Failed
 from pipeline.videos.catalogue import Catalogue
-from tests.conftest import ROOT, encode
+from tests.conftest import HUNG, ROOT, encode
 from tests.use.browser import tab
 from tests.use.fake import running
 from tests.use.shared import Made
@@ -69,7 +69,7 @@ def call(address: str, method: str, body: bytes | dict[str, Any] | None = None, 
         body, headers = json.dumps(body).encode(), {"Content-Type": "application/json", **headers}
     request = urllib.request.Request(address, body, headers, method=method)
     try:
-        with urllib.request.urlopen(request, timeout=60) as response:
+        with urllib.request.urlopen(request, timeout=HUNG) as response:
             return response.status, response.read()
     except urllib.error.HTTPError as error:
         return error.code, error.read()
@@ -115,7 +115,7 @@ def test_an_answer_streams_with_its_history(site: str, room: Room, tmp_path: Pat
     request = urllib.request.Request(
         f"{site}/api/ask", json.dumps(asked).encode(), {"Content-Type": "application/json"}, method="POST"
     )
-    with urllib.request.urlopen(request, timeout=30) as response:
+    with urllib.request.urlopen(request, timeout=HUNG) as response:
         assert response.read(4) == b"And ", "the first piece comes while the model goes on"
         model.paused.set()
         assert response.read() == b"it wait <b>1</b> "
@@ -246,7 +246,7 @@ def test_the_command_shows_it_until_it_is_interrupted(made: Made) -> None:
         assert "choose another" in taken.stderr
     finally:
         process.send_signal(signal.SIGINT)
-    assert process.wait(60) == 0
+    assert process.wait(HUNG) == 0
 
 
 def test_in_a_browser(site: str, tmp_path: Path) -> None:

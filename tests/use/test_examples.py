@@ -75,7 +75,7 @@ def test_the_notebook_runs(made: Made) -> None:
         for cell in cells:
             cell.source = cell.source.replace(ours, theirs)
     place = {"metadata": {"path": str(made.folder.parents[1])}}
-    done = nbclient.NotebookClient(notebook, timeout=240, resources=place).execute()
+    done = nbclient.NotebookClient(notebook, timeout=None, resources=place).execute()
     shown = []
     for outputs in (cell.outputs for cell in done.cells if cell.cell_type == "code"):
         said = [o for o in outputs if o.get("name") != "stderr"]

@@ -107,7 +107,7 @@ def test_a_process_without_this_repository_answers(
     rows = json.dumps([[QUESTIONS[0], [encoded(files[0])]]])
     env["OCTOPI_BASE"] = logged.base
     command = [sys.executable, "-c", FRESH, logged.address]
-    done = subprocess.run(command, input=rows, env=env, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(command, input=rows, env=env, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout.splitlines()[-1])
     assert found["said"] == [octopi.ask(QUESTIONS[0], files[:1])]

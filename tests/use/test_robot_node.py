@@ -17,6 +17,7 @@ from pipeline.use.serve import make_app
 from pipeline.use.worker import Failed
 from pipeline.videos.decoding import decode
 from tests.closure import ROOT, imported
+from tests.conftest import deaf_port
 from tests.use.fake import FakeOctopi, digest, running
 from tests.use.test_demo import press
 
@@ -177,8 +178,9 @@ def test_what_goes_wrong_is_one_line_of_the_server(node: Any, tmp_path: Path, mo
         assert "Traceback" not in result.error
     monkeypatch.setenv("OCTOPI_TOKEN", "another")
     assert "token" in node.server.execute(Goal("Soft?", notes)).error
-    node.url = "http://127.0.0.1:9"
-    assert "is `octopi serve` running?" in node.server.execute(Goal("Soft?", notes)).error
+    with deaf_port() as port:
+        node.url = f"http://127.0.0.1:{port}"
+        assert "is `octopi serve` running?" in node.server.execute(Goal("Soft?", notes)).error
 
 
 def test_an_answer_that_breaks_off_is_no_answer(node: Any, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from pipeline.config import FramesConfig
 from pipeline.videos.decoding import Decoder, Header, brightness, decode, picture, planes, to_rgb, turns
 from pipeline.videos.frames.fit import fit
-from tests.conftest import encode, moving_square, write_video
+from tests.conftest import HUNG, encode, moving_square, write_video
 from tests.frame_rules import frames_of, pillow
 
 ONE = 1 << 16
@@ -198,7 +198,7 @@ def test_a_fork_decodes_after_its_parent_has(tmp_path: Path) -> None:
     assert len(frames_of(tmp_path / "parent.mkv")) == 2
     child = multiprocessing.get_context("fork").Process(target=frames_of, args=(tmp_path / "child.mkv",))
     child.start()
-    child.join(30)
+    child.join(HUNG)
     child.kill()
     child.join()
     assert child.exitcode == 0

@@ -31,7 +31,7 @@ from pipeline.videos.frames.fit import fit
 from pipeline.videos.frames.reference import reference_indices
 from pipeline.videos.frames.scan import Scan, scan
 from tests.closure import ROOT
-from tests.conftest import moving_square, refused, write_video
+from tests.conftest import moving_square, refused, wait_until_ended, write_video
 from tests.frame_rules import CONFIG, FILES, Place, frames_of, luma, published, salience
 
 NAMES = ["baseball_0", "baseball_1", "baseball_10", "potato_0", "potato_2", "rug_0", "rug_1"]
@@ -212,7 +212,7 @@ def test_no_worker_outlives_its_parent(tmp_path: Path, signal_number: int) -> No
     script = tmp_path / "work.py"
     script.write_text(
         "import os, sys, time\nfrom pathlib import Path\nfrom pipeline.parallel import run_parallel\n"
-        "def work(i):\n    (Path(sys.argv[1]) / f'{os.getpid()}.pid').touch()\n    time.sleep(60)\n"
+        "def work(i):\n    (Path(sys.argv[1]) / f'{os.getpid()}.pid').touch()\n    time.sleep(10**6)\n"
         "if __name__ == '__main__':\n    list(run_parallel(work, range(4), 'x', 'y'))\n"
     )
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
@@ -226,15 +226,11 @@ def test_no_worker_outlives_its_parent(tmp_path: Path, signal_number: int) -> No
     while not (pids := [int(p.stem) for p in tmp_path.glob("*.pid")]):
         assert process.poll() is None
         time.sleep(0.05)
+    workers = [psutil.Process(pid) for pid in pids]
     process.send_signal(signal_number)
-    for _ in range(100):
-        process.poll()
-        if not any(psutil.pid_exists(p) and psutil.Process(p).status() != psutil.STATUS_ZOMBIE for p in pids):
-            break
-        time.sleep(0.05)
-    else:
-        pytest.fail("a worker is alive five seconds after its parent's end")
+    wait_until_ended(workers)
     process.kill()
+    process.wait()
 
 
 def test_a_full_disk_leaves_no_half_of_a_file(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
