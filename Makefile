@@ -13,6 +13,7 @@ PIP := $(if $(UV),uv pip install --quiet --python $(BIN)/python,python -m pip in
 # Stages are started by DVC as plain `python`; this makes it the one in .venv.
 export PATH := $(BIN):$(PATH)
 export PYTHONUNBUFFERED := 1
+export PYTHONUTF8 := 1
 export HF_HUB_OFFLINE := 1
 
 .PHONY: install repro test stability drill lint dashboard bench clean

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import random
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -113,7 +113,7 @@ class Octopi:
         Raises:
             UserError: for a question that does not fit its videos or is too long, or a video that cannot be used.
         """
-        return self._reply([(*history, Exchange(question, _listed(videos), ""))], max_new_tokens)[0]
+        return self._reply([self._prompt((*history, Exchange(question, _listed(videos), "")))], max_new_tokens)[0]
 
     def stream(
         self,
@@ -131,7 +131,8 @@ class Octopi:
         self, asked: Sequence[tuple[str, Video | Sequence[Video]]], *, max_new_tokens: int | None = None
     ) -> list[str]:
         """As `ask`, of many questions in one batch."""
-        return self._reply([(Exchange(question, _listed(videos), ""),) for question, videos in asked], max_new_tokens)
+        prompts = [self._prompt([Exchange(question, _listed(videos), "")]) for question, videos in asked]
+        return self._reply(prompts, max_new_tokens)
 
     def look(self, video: Video) -> Touch:
         """What the model sees of a video.
@@ -154,12 +155,13 @@ class Octopi:
 
     def describe_all(self, videos: Sequence[Video], *, sentence: bool = True) -> list[Description]:
         """As `describe`, of many videos in one batch. A video without contact is described with a note."""
-        if self.config.opd is Opd.NONE or not sentence:
-            sentences = [""] * len(videos)
-        else:
-            question = opd.TEMPLATES[0]
-            sentences = self._reply([(Exchange(question, (v,), ""),) for v in videos], None, untouched=True)
-        return [self._described(video, said) for video, said in zip(videos, sentences, strict=True)]
+        described, asked = [], []
+        for video in videos:  # All of a video at once, as not all may be remembered.
+            described.append(self._described(video))
+            if sentence and self.config.opd is not Opd.NONE:
+                asked.append(self._prompt([Exchange(opd.TEMPLATES[0], (video,), "")], untouched=True))
+        said = self._reply(asked, None) or [""] * len(videos)
+        return [d.model_copy(update={"sentence": s}) for d, s in zip(described, said, strict=True)]
 
     def compare(self, a: Video, b: Video, property: str) -> Comparison:
         """Whether the first video is more of a property than the second, in the wording of training."""
@@ -177,11 +179,14 @@ class Octopi:
         if len(videos) < 2:
             raise UserError(f"{len(videos)} videos: two or more can be ranked")
         known = self._property(property)
-        for video in videos:
-            self._touched(video)
         place = self.properties.index(known.name)
-        judged = [self.sense.judge(video).probabilities[place] for video in videos]
-        expected = [sum(level * p for level, p in enumerate(probabilities)) for probabilities in judged]
+        expected: list[float] = []
+        notes: list[str] = []
+        for video in videos:  # All of a video at once, as not all may be remembered.
+            self._touched(video)
+            probabilities = self.sense.judge(video).probabilities[place]
+            expected.append(sum(level * p for level, p in enumerate(probabilities)))
+            notes += self._notes([video])
         answer, most = "", None
         if len(videos) == 3:
             answer = self.ask(pss.asked(pss.TEMPLATES[0], known.most, known.spoken)[self.config.opd], videos)
@@ -198,7 +203,7 @@ class Octopi:
             expected=tuple(expected),
             answer=answer,
             most=most,
-            notes=self._notes(videos),
+            notes=tuple(notes),
         )
 
     def match(self, videos: Sequence[Video], names: Sequence[str]) -> Matching:
@@ -242,10 +247,7 @@ class Octopi:
         language = self.config.language
         return language.model_copy(update={"max_new_tokens": max_new_tokens or language.max_new_tokens})
 
-    def _reply(
-        self, conversations: Iterable[Sequence[Exchange]], max_new_tokens: int | None, *, untouched: bool = False
-    ) -> list[str]:
-        asked = [self._prompt(conversation, untouched=untouched) for conversation in conversations]
+    def _reply(self, asked: Sequence[tuple[tuple[int, ...], torch.Tensor]], max_new_tokens: int | None) -> list[str]:
         prompts, features = [prompt for prompt, _ in asked], [found for _, found in asked]
         return [said.text for said in reply(self.llm, prompts, features, self._language(max_new_tokens), label="")]
 
@@ -280,14 +282,14 @@ class Octopi:
         found = [self.sense.feel(video) for video in videos]
         return tuple(f"{felt.seen.name}: {note}" for felt in found for note in felt.notes)
 
-    def _described(self, video: Video, sentence: str) -> Description:
+    def _described(self, video: Video) -> Description:
         felt, judged = self.sense.feel(video), self.sense.judge(video)
         each = list(zip(self.catalogue.properties, judged.probabilities, judged.levels, strict=True))
         silent = ("this variant was not trained to describe, so there is no sentence",)
         return Description(
             levels={p.name: p.levels[level] for p, _, level in each},
             probabilities={p.name: dict(zip(p.levels, found, strict=True)) for p, found, _ in each},
-            sentence=sentence,
+            sentence="",
             frames=felt.seen.touch.numbers,
             notes=(*felt.notes, *(silent if self.config.opd is Opd.NONE else ())),
         )

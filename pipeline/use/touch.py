@@ -26,8 +26,8 @@ from pipeline.use.results import Video
 from pipeline.use.sight import Seen, see
 from pipeline.videos.catalogue import Catalogue
 
-REMEMBERED = 32
-"""Videos whose embeddings are kept, so that a conversation about them goes on at once."""
+REMEMBERED = 2**28
+"""Bytes of pictures that are kept, so that a conversation about them goes on at once: some 150 videos at 224 pixels."""
 
 
 class Felt(NamedTuple):
@@ -38,6 +38,12 @@ class Felt(NamedTuple):
     """float32, frames x dim."""
     notes: tuple[str, ...]
     """What should make one doubt an answer."""
+
+    @property
+    def size(self) -> int:
+        """Bytes of its pictures."""
+        touch = self.seen.touch
+        return touch.frames.nbytes + touch.reference.nbytes + touch.difference.nbytes
 
 
 class Judgement(NamedTuple):
@@ -82,7 +88,7 @@ class TactileSense:
             features = standard if config.encoder.standardize else raw
             self._felt[name] = Felt(seen, features, (*seen.touch.notes, *self._unlike(standard)))
         self._felt.move_to_end(name)
-        while len(self._felt) > REMEMBERED:
+        while len(self._felt) > 1 and sum(felt.size for felt in self._felt.values()) > REMEMBERED:
             self._felt.popitem(last=False)
         return self._felt[name]
 

@@ -13,8 +13,10 @@ from pydantic import BaseModel
 
 from pipeline.errors import UserError
 from pipeline.records import Encoder, Lora, Opd, Part, Variant
+from pipeline.use import touch
 from pipeline.use.model import Octopi, check_question
 from pipeline.use.results import Exchange
+from pipeline.use.sight import see
 from pipeline.use.touch import TactileSense
 from pipeline.videos.decoding import decode
 from tests.conftest import moving_square, refused, write_video
@@ -71,6 +73,25 @@ def test_a_batch_answers_as_one_by_one(octopi: Octopi, files: list[Path]) -> Non
     asked += [("Compare {tactile} and {tactile}.", files[:2])]
     assert octopi.ask_all(asked) == [octopi.ask(*a) for a in asked]
     assert octopi.describe_all(files) == [octopi.describe(f) for f in files]
+
+
+def test_each_video_is_decoded_once_a_call(
+    octopi: Octopi, files: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However many there are, and however little of them is remembered; where they are, one call takes all."""
+    seen: list[str] = []
+    monkeypatch.setattr(touch, "see", lambda video, *a, **k: (seen.append(str(video)), see(video, *a, **k))[1])
+    videos = [tmp_path / f"{i}.avi" for i in range(40)]
+    for number, video in enumerate(videos):
+        video.write_bytes(files[number % 3].read_bytes())
+    octopi.ask_all([("Describe {tactile}.", video) for video in (*videos, *videos)], max_new_tokens=1)
+    assert seen == list(map(str, videos))
+    monkeypatch.setattr(touch, "REMEMBERED", 0)
+    octopi.look(files[0])
+    for call in (octopi.describe_all, lambda given: octopi.rank(given, "hardness")):
+        seen.clear()
+        call(videos)
+        assert seen == list(map(str, videos))
 
 
 def test_one_video_needs_no_list(octopi: Octopi, files: list[Path]) -> None:
