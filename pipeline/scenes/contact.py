@@ -24,7 +24,6 @@ import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 from scipy.special import erf
 
-from pipeline.scenes.elastic.arrays import back, on
 from pipeline.scenes.elastic.kernels import Gel, Kernel, half_space_table, layer_table, make_kernel
 from pipeline.scenes.elastic.solver import solve
 from pipeline.scenes.elastic.winkler import Heights, hang_skin, press_springs, series
@@ -102,7 +101,6 @@ def press(
     method: Method | None = None,
     *,
     tolerance: float = 0.25,
-    device: str | None = None,
 ) -> Imprint:
     """Press a body with forces from 0 to `force`.
 
@@ -113,9 +111,8 @@ def press(
         pitch: In mm a pixel.
         method: None takes the cheapest whose estimated error is below the tolerance.
         tolerance: Relative error of the skin's slopes, which are what the light shows.
-        device: Where torch solves; None is NumPy.
     """
-    body = Body(heights, modulus, pitch, device)
+    body = Body(heights, modulus, pitch)
     forces = force * (np.arange(1, LEVELS + 1) / LEVELS) ** 1.5
     error = None
     if method is None:
@@ -181,8 +178,8 @@ class Pressed:
 class Body:
     """An object over the gel, with what its coarser grids share."""
 
-    def __init__(self, heights: Heights, modulus: float, pitch: float, device: str | None = None) -> None:
-        self.heights, self.modulus, self.pitch, self.device = heights, modulus, pitch, device
+    def __init__(self, heights: Heights, modulus: float, pitch: float) -> None:
+        self.heights, self.modulus, self.pitch = heights, modulus, pitch
         self.side = heights.shape[0]
         self.together = series(GEL.modulus, modulus)
 
@@ -201,12 +198,11 @@ class Body:
         cells = min(method.cells or self.side, self.side)
         coarse = cv2.resize(self.heights, (cells, cells), interpolation=cv2.INTER_AREA)
         pitch = self.side * self.pitch / cells
-        gap = on(coarse.max() - coarse, self.device)
-        gel, unit = _bodies(cells, pitch, method.tier, self.device)
+        gel, unit = _bodies(cells, pitch, method.tier)
         # Compliances of gel and object add.
         both = gel.plus(unit, 1 / self.modulus)
-        solution = solve(gap, forces, both, pitch, tolerance=RESIDUAL / cells)
-        sinks, pressures = back(gel.sink(solution.pressure)), back(solution.pressure)
+        solution = solve(coarse.max() - coarse, forces, both, pitch, tolerance=RESIDUAL / cells)
+        sinks, pressures = gel.sink(solution.pressure), solution.pressure
         areas = np.count_nonzero(pressures > 0, axis=(1, 2)) * pitch**2
         if cells == self.side:
             return Pressed(sinks, areas, float(solution.residual.max()))
@@ -222,10 +218,10 @@ class Body:
 
 
 @lru_cache(maxsize=16)
-def _bodies(cells: int, pitch: float, tier: Tier, device: str | None) -> tuple[Kernel, Kernel]:
+def _bodies(cells: int, pitch: float, tier: Tier) -> tuple[Kernel, Kernel]:
     """Of the gel, and of a half-space of modulus 1."""
     shape = (cells, cells)
-    field = on(np.zeros(shape, np.float32), device)
+    field = np.zeros(shape, np.float32)
     own = layer_table(shape, pitch, GEL) if tier == "layer" else half_space_table(shape, pitch, GEL.modulus)
     return make_kernel(own, field), make_kernel(half_space_table(shape, pitch, 1.0), field)
 

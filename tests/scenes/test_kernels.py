@@ -6,12 +6,10 @@ import math
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import dblquad, quad
 
-from pipeline.scenes.elastic.arrays import back
 from pipeline.scenes.elastic.kernels import (
     Gel,
     Kernel,
@@ -154,8 +152,6 @@ def test_convolution_is_the_direct_sum() -> None:
     found = make_kernel(table, single).sink(single)
     assert found.dtype == np.float32
     np.testing.assert_allclose(found, direct, rtol=2e-6)
-    tensor = torch.from_numpy(pressure)
-    np.testing.assert_allclose(back(make_kernel(table, tensor).sink(tensor)), direct, rtol=1e-12)
 
 
 @pytest.mark.parametrize("bad", [{"modulus": 0.0}, {"poisson": 0.6}, {"poisson": -0.1}, {"thickness": -1.0}])

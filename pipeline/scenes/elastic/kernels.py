@@ -8,15 +8,16 @@ Lengths in mm, pressures and moduli in MPa.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.fft import next_fast_len
+import scipy.fft  # NumPy's is several times slower at float32.
 from scipy.interpolate import CubicSpline
 from scipy.special import j0
 
-from pipeline.scenes.elastic.arrays import Array, array_namespace, forward, inverse, like
-
+Array = npt.NDArray[np.floating[Any]]
+"""float32 or float64."""
 Table = npt.NDArray[np.float64]
 DECAY = 22.0
 """Beyond this wave number (times thickness) a layer answers as a half-space does, to 1e-16."""
@@ -122,16 +123,17 @@ class Kernel:
         """How far the surface sinks, in mm, under a pressure in MPa; ... x rows x columns."""
         rows, columns = self.shape
         double = _quick((2 * rows, 2 * columns))
-        return inverse(forward(pressure, double) * self.spectrum, double)[..., :rows, :columns]
+        sunk: Array = scipy.fft.irfft2(scipy.fft.rfft2(pressure, double) * self.spectrum, double)[..., :rows, :columns]
+        return sunk
 
     def press(self, sink: Array) -> Array:
         """About the pressure that makes the surface sink so: exact where both repeat without end."""
         rows, columns = self.shape
         own = _quick(self.shape)
-        xp = array_namespace(self.waves)
         # A layer that keeps its volume does not sink under even pressure at all.
-        waves = xp.clip(self.waves, float(xp.max(self.waves)) * 1e-4, None)
-        return inverse(forward(sink, own) / waves, own)[..., :rows, :columns]
+        waves = np.clip(self.waves, float(self.waves.max()) * 1e-4, None)
+        pressed: Array = scipy.fft.irfft2(scipy.fft.rfft2(sink, own) / waves, own)[..., :rows, :columns]
+        return pressed
 
     def plus(self, other: Kernel, share: float) -> Kernel:
         """With `share` times the other's compliance added."""
@@ -140,10 +142,10 @@ class Kernel:
 
 
 def make_kernel(table: Table, field: Array) -> Kernel:
-    """Prepare a table of offsets for fields of the number format and device of `field`, rows x columns last."""
+    """Prepare a table of offsets for fields of the number format of `field`, rows x columns last."""
     rows, columns = field.shape[-2:]
     spectrum, waves = (_transform(table, _quick(domain)) for domain in ((2 * rows, 2 * columns), (rows, columns)))
-    return Kernel(like(spectrum, field), like(waves, field), float(table[0, 0]), (rows, columns))
+    return Kernel(spectrum.astype(field.dtype), waves.astype(field.dtype), float(table[0, 0]), (rows, columns))
 
 
 def _transform(table: Table, domain: tuple[int, int]) -> Table:
@@ -156,7 +158,7 @@ def _transform(table: Table, domain: tuple[int, int]) -> Table:
 
 def _quick(shape: tuple[int, int]) -> tuple[int, int]:
     """The next size that is quick to transform."""
-    rows, columns = (next_fast_len(n, real=True) for n in shape)
+    rows, columns = (scipy.fft.next_fast_len(n, real=True) for n in shape)
     return rows, columns
 
 

@@ -16,8 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.scenes.elastic.arrays import Array, array_namespace, back, like
-from pipeline.scenes.elastic.kernels import Kernel
+from pipeline.scenes.elastic.kernels import Array, Kernel
 
 Values = npt.NDArray[np.float64]
 ITERATIONS = 500
@@ -63,32 +62,31 @@ def solve(
     Raises:
         ValueError: for a force that is negative or not finite, or a gap that is not finite.
     """
-    xp = array_namespace(gap)
     loads = np.atleast_1d(np.asarray(forces, dtype=np.float64))
     if not (np.isfinite(loads).all() and (loads >= 0).all()):
         raise ValueError(f"forces must be finite and not negative, not {loads}")
-    if not bool(xp.all(xp.isfinite(gap))):
+    if not np.isfinite(gap).all():
         raise ValueError("the gap has values that are not finite")
     shape = (len(loads), *gap.shape[-2:])
     # Lengths and pressures as multiples of the mean pressure, so that float32 holds any force.
     mean = np.where(loads > 0, loads, 1.0) / (pitch * pitch * shape[1] * shape[2])
-    scale = like(mean[:, None, None], gap)
-    pressure = xp.zeros_like(xp.broadcast_to(gap, shape))
+    scale = mean[:, None, None].astype(gap.dtype)
+    pressure = np.zeros_like(np.broadcast_to(gap, shape))
     approach, residual = np.zeros(len(loads)), np.zeros(len(loads))
     steps = np.zeros(len(loads), dtype=np.int64)
 
     active = np.flatnonzero(loads > 0)
-    work = _Contacts(xp.ones_like(pressure[active]), xp.broadcast_to(gap, shape)[active] / scale[active])
+    work = _Contacts(np.ones_like(pressure[active]), np.broadcast_to(gap, shape)[active] / scale[active])
     for step in range(1, iterations + 1):
         if not len(active):
             break
         work.measure(kernel)
-        undone = back(work.residual)[:, 0, 0]
+        undone = work.residual[:, 0, 0]
         done = ~(undone > tolerance) | (step == iterations)
         if done.any():
             out = active[done]
             pressure[out] = work.p[done] * scale[out]
-            approach[out] = back(work.approach)[done, 0, 0] * mean[out]
+            approach[out] = work.approach[done, 0, 0] * mean[out]
             residual[out], steps[out] = undone[done], step
             active = active[~done]
             work.keep(np.flatnonzero(~done))
@@ -110,29 +108,27 @@ class _Contacts:
     """Contacts on their way to equilibrium; letters as in Polonsky & Keer."""
 
     def __init__(self, p: Array, gap: Array) -> None:
-        self.xp = array_namespace(p)
         self.p, self.gap = p, gap
-        self.t = self.xp.zeros_like(p)
+        self.t = np.zeros_like(p)
         """Direction of descent."""
-        self.g_old = self.xp.ones_like(p[:, :1, :1])
+        self.g_old = np.ones_like(p[:, :1, :1])
         """Gap times direction before; infinite after the contact has grown, so that the direction starts afresh."""
 
     def measure(self, kernel: Kernel) -> None:
         """Gaps, approach and residual of the pressures as they are."""
-        xp = self.xp
         u = kernel.sink(self.p)
         pressed = self.p > 0
         g = self.gap + u
         # The approach is the mean over the contact; the residual is measured from the lowest gap, as g >= 0 must hold.
         self.approach = self._mean(g, pressed)
-        worst = xp.min(g, axis=(-2, -1), keepdims=True)
-        undone = xp.sum(self.p * (g - worst), axis=(-2, -1), keepdims=True)
-        total = xp.sum(self.p * u, axis=(-2, -1), keepdims=True)
-        self.residual = undone / xp.where(total > 0, total, xp.ones_like(total))
+        worst = np.min(g, axis=(-2, -1), keepdims=True)
+        undone = np.sum(self.p * (g - worst), axis=(-2, -1), keepdims=True)
+        total = np.sum(self.p * u, axis=(-2, -1), keepdims=True)
+        self.residual = undone / np.where(total > 0, total, 1)
         self.g = g - self.approach
         # Where bodies overlap without pressure, there is contact from now on.
         self.touching = pressed | (self.g < 0)
-        self.grown = xp.any(self.touching & ~pressed, axis=(-2, -1), keepdims=True)
+        self.grown = np.any(self.touching & ~pressed, axis=(-2, -1), keepdims=True)
 
     def keep(self, which: npt.NDArray[np.int64]) -> None:
         """Go on with these only."""
@@ -141,31 +137,26 @@ class _Contacts:
 
     def descend(self, kernel: Kernel) -> None:
         """One step along the conjugate direction, cut off at 0."""
-        xp = self.xp
-        zero = xp.zeros_like(self.p)
-        inside = xp.where(self.touching, self.g, zero)
-        z = xp.where(self.touching, kernel.press(inside), zero)
-        z = xp.where(self.touching, z - self._mean(z, self.touching), zero)
-        squares = xp.sum(inside * z, axis=(-2, -1), keepdims=True)
-        share = xp.where(self.grown, xp.zeros_like(squares), squares / self.g_old)
-        self.t = xp.where(self.touching, z + share * self.t, zero)
+        inside = np.where(self.touching, self.g, 0)
+        z = np.where(self.touching, kernel.press(inside), 0)
+        z = np.where(self.touching, z - self._mean(z, self.touching), 0)
+        squares = np.sum(inside * z, axis=(-2, -1), keepdims=True)
+        share = np.where(self.grown, 0, squares / self.g_old)
+        self.t = np.where(self.touching, z + share * self.t, 0)
         r = kernel.sink(self.t)
-        under = xp.sum(r * self.t, axis=(-2, -1), keepdims=True)
-        length = xp.sum(inside * self.t, axis=(-2, -1), keepdims=True) / xp.where(under > 0, under, xp.ones_like(under))
-        self.p = _to_mean_one(xp.clip(self.p - length * self.t, 0, None))
-        self.g_old = xp.where(squares == 0, xp.full_like(squares, float("inf")), squares)
+        under = np.sum(r * self.t, axis=(-2, -1), keepdims=True)
+        length = np.sum(inside * self.t, axis=(-2, -1), keepdims=True) / np.where(under > 0, under, 1)
+        self.p = _to_mean_one(np.clip(self.p - length * self.t, 0, None))
+        self.g_old = np.where(squares == 0, np.inf, squares)
 
-    def _mean(self, field: Array, where: Array) -> Array:
+    def _mean(self, field: Array, where: npt.NDArray[np.bool_]) -> Array:
         """Over the contact."""
-        xp = self.xp
-        inside = xp.where(where, field, xp.zeros_like(field))
-        count = xp.sum(xp.astype(where, field.dtype), axis=(-2, -1), keepdims=True)
-        return xp.sum(inside, axis=(-2, -1), keepdims=True) / count
+        count = np.sum(where, axis=(-2, -1), keepdims=True, dtype=field.dtype)
+        mean: Array = np.sum(np.where(where, field, 0), axis=(-2, -1), keepdims=True) / count
+        return mean
 
 
 def _to_mean_one(p: Array) -> Array:
     """Scaled to a mean of 1; even where there is none."""
-    xp = array_namespace(p)
-    mean = xp.mean(p, axis=(-2, -1), keepdims=True)
-    some = mean > 0
-    return xp.where(some, p / xp.where(some, mean, xp.ones_like(mean)), xp.ones_like(p))
+    mean = np.mean(p, axis=(-2, -1), keepdims=True)
+    return np.where(mean > 0, p / np.where(mean > 0, mean, 1), 1)
