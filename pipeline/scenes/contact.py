@@ -145,7 +145,7 @@ def choose(body: Body, force: float, tolerance: float) -> tuple[Method, float, P
     # A layer's influence is smooth on cells of half its thickness only.
     ladder = [m for m in LADDER if body.side * body.pitch <= m.cells * GEL.thickness / 2]
     rungs = [m for m in ladder if m.cells < body.side]
-    if len(rungs) < len(ladder):
+    if len(rungs) < max(2, len(ladder)):  # One alone would be held against nothing.
         rungs.append(Method("layer"))
     top = np.array([force])
     springs, coarse = body.press(Method("winkler"), top), body.press(rungs[0], top)

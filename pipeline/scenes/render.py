@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.config import ScenesConfig
 from pipeline.errors import UserError
 from pipeline.runtime import derive_seed
-from pipeline.scenes.contact import GEL, Imprint, Method, press
+from pipeline.scenes.contact import GEL, LADDER, Imprint, Method, press
 from pipeline.scenes.elastic.torsion import slip_turn, twist
 from pipeline.scenes.geometry import IMAGE_MM, Heights, heights
 from pipeline.scenes.light import Image, Sensor, shade
@@ -45,8 +45,12 @@ def make_scene(recipe: Recipe, config: ScenesConfig, frames: int, seed: int) -> 
     side = int(np.hypot(config.width, config.height) + 2 * MARGIN_MM / pitch) | 1
     patch = heights(recipe.body, recipe.relief, side, pitch, rng)
     needed = math.ceil(2 * side * pitch / GEL.thickness)
-    if config.tier == "layer" and config.cells < min(needed, side):
-        raise UserError(f"scenes.cells is {config.cells}, but pictures of this shape need {needed} or more")
+    most = {"layer": config.cells, "auto": LADDER[-1].cells}.get(config.tier, side)
+    if most < min(needed, side):
+        raise UserError(
+            f"scenes.tier={config.tier} has {most} cells, but pictures of {config.width} x {config.height} need "
+            f"{needed} or more; take scenes.tier=layer and scenes.cells={needed}, or a shape nearer to 4:3"
+        )
     method = None if config.tier == "auto" else Method(config.tier, 0 if config.tier == "winkler" else config.cells)
     force = float(motion.force.max())
     imprint = press(patch, force, recipe.modulus, pitch, method, tolerance=config.tolerance)

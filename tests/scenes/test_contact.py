@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.scenes import contact
 from pipeline.scenes.contact import LEVELS, Body, Imprint, Method, choose, press, slope_error
 from pipeline.scenes.elastic.kernels import Gel
 from pipeline.scenes.elastic.solver import NotConverged
@@ -94,6 +95,13 @@ def test_auto_spends_more_on_a_tighter_tolerance_and_less_on_a_plain_body() -> N
     method, error, _ = choose(Body(np.zeros((SIDE, SIDE), np.float32), 0.05, PITCH), 0.5, 0.2)
     assert method == Method("winkler")
     assert error < 0.2
+
+
+def test_where_one_grid_alone_is_fine_enough_it_is_held_against_all_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(contact, "LADDER", (Method("layer", 32),))
+    method, error, _ = choose(Body(bumpy(), 5.0, PITCH), 8.0, 1e-6)
+    assert method == FINEST
+    assert error > 0, "an estimate, and not the nothing that it was held against"
 
 
 @pytest.mark.parametrize("method", [WAYS[0], WAYS[1], WAYS[3]], ids=str)

@@ -9,6 +9,7 @@ import pytest
 
 from pipeline.config import FramesConfig, ScenesConfig
 from pipeline.errors import UserError
+from pipeline.scenes.contact import GEL
 from pipeline.scenes.geometry import IMAGE_MM, Round
 from pipeline.scenes.light import make_sensor
 from pipeline.scenes.recipe import Recipe, load_recipes
@@ -19,7 +20,7 @@ from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.decoding import decode
 from pipeline.videos.files import list_videos
 from pipeline.videos.frames.scan import Scan, scan
-from tests.conftest import ROOT
+from tests.conftest import ROOT, refused
 
 SMALL = ScenesConfig(objects=("rug",), videos_per_object=2, frames=8, width=64, height=48)
 PLAIN = Recipe(modulus=100.0, body=Round(kind="round", radii=(30.0, 30.0)))
@@ -77,8 +78,15 @@ def test_a_scene_is_the_same_at_other_resolutions(recipes: dict[str, Recipe]) ->
 def test_pictures_may_be_upright(tier: str) -> None:
     config = SMALL.model_copy(update={"width": 48, "height": 64, "tier": tier, "cells": 64})
     assert film(PLAIN, config, 1)[1][0].shape == (64, 48, 3)
-    with pytest.raises(UserError, match=r"scenes.cells is 32, but pictures of this shape need \d+ or more"):
-        make_scene(PLAIN, config.model_copy(update={"width": 120, "height": 160, "tier": "layer", "cells": 32}), 8, 1)
+
+
+@pytest.mark.parametrize(("tier", "width", "height"), [("auto", 32, 960), ("layer", 32, 960), ("layer", 120, 160)])
+def test_pictures_that_no_grid_is_fine_enough_for(tier: str, width: int, height: int) -> None:
+    config = SMALL.model_copy(update={"width": width, "height": height, "tier": tier, "cells": 32})
+    with refused(rf"tier={tier} has .* {width} x {height} need \d+ or more; take .*scenes.cells=\d+") as said:
+        make_scene(PLAIN, config, 8, 1)
+    needed = int(str(said.value).partition("scenes.cells=")[2].split(",")[0])
+    assert 2 * np.hypot(width, height) * IMAGE_MM[0] / width / GEL.thickness < needed <= 1024
 
 
 def test_files_are_equal_for_equal_seeds(recipes: dict[str, Recipe], catalogue: Catalogue, tmp_path: Path) -> None:
