@@ -29,7 +29,7 @@ from pipeline.embeddings import FLIPS, INDEX_FILE, TENSOR, TENSOR_FILE, Embeddin
 from pipeline.encoder.model import FrameEncoder, base_encoder
 from pipeline.io import save_tensors, write_table
 from pipeline.language.chat import IGNORE_INDEX
-from pipeline.language.conversations import ConversationDataset, LengthBuckets, collate
+from pipeline.language.conversations import ConversationDataset, UpdateSampler, collate
 from pipeline.language.generate import answer
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.params import load_params
@@ -151,7 +151,6 @@ WAYS = {
     "and not padded": Way(all_logits=True),
     "and logits of answers only": Way(),
     "and 16 at a time, in any order": Way(batch=16),
-    "and of like length": Way(batch=16, buckets=True),
     "4 at a time, of like length": Way(batch=4, buckets=True),
 }
 """From the published way on, one thing more each; the last is beside them."""
@@ -181,7 +180,7 @@ def training(bed: Bed, size: Size) -> list[Row]:
 def train(bed: Bed, way: Way, questions: Sequence[Question], optimiser: torch.optim.Optimizer) -> None:
     """Train on all of the questions once, a step after every `UPDATE`."""
     data = bed.conversations(questions)
-    order = list(LengthBuckets(data.lengths, way.batch, 0, lambda: 0)) if way.buckets else list(range(len(data)))
+    order = list(UpdateSampler(data.lengths, UPDATE, 0, lambda: 0)) if way.buckets else list(range(len(data)))
     for start in range(0, len(data), UPDATE):
         chosen = order[start : start + UPDATE]
         labelled = sum(sum(label != IGNORE_INDEX for label in data.encoded[i].labels) for i in chosen)

@@ -17,6 +17,7 @@ from pipeline.runtime import DeviceName, DtypeName, Quantization
 Fraction = Annotated[float, Field(gt=0, le=1)]
 Positive = Annotated[int, Field(ge=1)]
 Rate = Annotated[float, Field(gt=0, lt=10)]
+GradNorm = Annotated[float, Field(ge=0)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
 QuestionCounts = dict[str, Annotated[int, Field(ge=0)]]
 """Questions of each task; `pipeline.tasks.questions.counts_by_task` knows which tasks there are."""
@@ -182,6 +183,8 @@ class EncoderConfig(Section):
     """Number format that training computes in where torch holds it safe; what is trained stays in float32."""
     learning_rate: Rate = 1e-3
     weight_decay: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    max_grad_norm: GradNorm = 0.0
+    """Gradients longer than this are shortened to it; 0 leaves all as they are (paper, published code)."""
     flip_probability: Annotated[float, Field(ge=0, le=1)] = 0.5
     """Chance of each of the two flips in training."""
     reference: Literal["none", "subtract"] = "none"
@@ -228,6 +231,7 @@ class PretrainConfig(Section):
     """Objects an update."""
     learning_rate: Rate = 2e-3
     weight_decay: Annotated[float, Field(ge=0, lt=1)] = 0.01
+    max_grad_norm: GradNorm = 1.0
     augment: bool = True
     """Vary how strong each picture's light is, and mirror it."""
     seed: Seed = 0
@@ -286,7 +290,24 @@ class MaxUpdates(Section):
     whole: Positive = 20
 
 
-class TeachConfig(Section):
+class Accumulated(Section):
+    """A training whose updates are computed in parts."""
+
+    batch_size: Positive = 16
+    """Items an update, over all devices."""
+    micro_batch_size: Positive = 16
+    """Items at a time on one device; the rest is accumulated. It changes time, memory and, by rounding, last digits."""
+    max_grad_norm: GradNorm = 1.0
+    """Gradients longer than this are shortened to it; 0 leaves all as they are (the published code)."""
+
+    @model_validator(mode="after")
+    def _batches_divide(self) -> Self:
+        if self.batch_size % self.micro_batch_size:
+            raise ValueError(f"micro_batch_size {self.micro_batch_size} does not divide batch_size {self.batch_size}")
+        return self
+
+
+class TeachConfig(Accumulated):
     """Teaching a small language model, in text, to reason about described things (LoRA on all linear layers, AdamW)."""
 
     base: str = ""
@@ -296,10 +317,6 @@ class TeachConfig(Section):
     learning_rate: Rate = 5e-4
     warmup: Annotated[int, Field(ge=0)] = 10
     """Updates until the rate is reached; it stays there."""
-    batch_size: Positive = 16
-    """Items an update."""
-    micro_batch_size: Positive = 16
-    """Items at a time, of like length."""
     max_updates: MaxUpdates = MaxUpdates()
     check_every: Positive = 20
     """Updates between two looks at items that are not trained on."""
@@ -308,23 +325,13 @@ class TeachConfig(Section):
     gate_questions: Annotated[int, Field(ge=0)] = 100
     """Questions of each task that the untaught and the taught model are asked in words."""
 
-    @model_validator(mode="after")
-    def _batches_divide(self) -> Self:
-        if self.batch_size % self.micro_batch_size:
-            raise ValueError(f"micro_batch_size {self.micro_batch_size} does not divide batch_size {self.batch_size}")
-        return self
 
-
-class TrainConfig(Section):
+class TrainConfig(Accumulated):
     """One stage of language training (AdamW)."""
 
     samples: Positive
     """Questions trained on (paper: 8k for alignment, 3k end to end)."""
     epochs: Positive = 1
-    batch_size: Positive = 16
-    """Questions an update, over all devices."""
-    micro_batch_size: Positive = 16
-    """Questions at a time on one device, of like length; the rest is accumulated."""
     weighting: Literal["question", "token"] = "question"
     """What weighs alike in the loss of an update: each `question`, by the mean over its answer's tokens (the published
     code, whose batches hold one), or each `token`, so that long answers count for more."""
@@ -334,14 +341,6 @@ class TrainConfig(Section):
     """Of the projection alone (the published code has none for it); all else that is trained has a cosine."""
     warmup_ratio: Annotated[float, Field(ge=0, lt=1)] = 0.0
     weight_decay: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    max_grad_norm: Annotated[float, Field(ge=0)] = 1.0
-    """Gradients longer than this are shortened to it; 0 leaves all as they are (the published code)."""
-
-    @model_validator(mode="after")
-    def _batches_divide(self) -> Self:
-        if self.batch_size % self.micro_batch_size:
-            raise ValueError(f"micro_batch_size {self.micro_batch_size} does not divide batch_size {self.batch_size}")
-        return self
 
 
 class AlignConfig(TrainConfig):
@@ -433,7 +432,7 @@ class RuntimeConfig(Section):
 
     device: DeviceName = "auto"
     launcher: str = "python"
-    """What starts a training stage: `python`, or `accelerate launch` with its configuration for several GPUs."""
+    """What align and lora start themselves with: `python`, or `accelerate launch` with a file of conf/accelerate."""
     parallel: Backend = "processes"
     """Where many files are worked on at once: `processes` of this machine, or `ray`, a cluster that `RAY_ADDRESS` names
     (without it: one of this machine's cores)."""

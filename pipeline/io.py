@@ -228,6 +228,20 @@ def fingerprint(*parts: BaseModel | str | int | Path) -> str:
     return digest.hexdigest()[:16]
 
 
+def code_of(stage: str) -> list[Path]:
+    """All files of code that dvc.yaml lists for a stage (`@` and what follows, a matrix's key, is left out).
+
+    In the fingerprint of unfinished work they say which version of the project it is of.
+    """
+    import yaml
+
+    root = Path(__file__).parents[1]
+    stages = yaml.safe_load((root / "dvc.yaml").read_text(encoding="utf-8"))["stages"]
+    listed = [root / d for d in stages[stage.partition("@")[0]]["deps"] if d.startswith(("pipeline/", "stages/"))]
+    files = [f for path in listed for f in ([path] if path.is_file() else sorted(path.rglob("*")))]
+    return [file for file in files if file.is_file() and file.suffix != ".pyc"]
+
+
 def _schema(model: type[Record]) -> pa.Schema:
     import pyarrow as pa
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+import shutil
 import socket
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
@@ -105,6 +106,45 @@ def smollm2_folder() -> Path:
 def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Checkpoints go to a folder of the working directory."""
     monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def versions(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """Changes a byte of a file of the code, as unfinished work knows it; the code that runs stays as it is."""
+    copy = tmp_path_factory.mktemp("version")
+    for part in ("pipeline", "stages"):
+        shutil.copytree(ROOT / part, copy / part, ignore=shutil.ignore_patterns("__pycache__", ".*.part"))
+    shutil.copy(ROOT / "dvc.yaml", copy)
+    monkeypatch.setattr("pipeline.io.__file__", str(copy / "pipeline" / "io.py"))
+
+    def change(path: str) -> None:
+        content = (copy / path).read_bytes()
+        (copy / path).write_bytes(content[:-1] + b"#")
+
+    return change
+
+
+Begun = Callable[[Callable[[], object]], str]
+
+
+@pytest.fixture
+def begun_in(monkeypatch: pytest.MonkeyPatch) -> Begun:
+    """Where a training looks for checkpoints when it begins; it goes no further."""
+    from transformers import Trainer
+
+    def begin(run: Callable[[], object]) -> str:
+        asked: list[str] = []
+
+        def stop(trainer: Trainer, **_: object) -> None:
+            asked.append(str(trainer.args.output_dir))
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(Trainer, "train", stop)
+        with pytest.raises(KeyboardInterrupt):
+            run()
+        return asked[0]
+
+    return begin
 
 
 @pytest.fixture

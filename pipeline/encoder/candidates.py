@@ -44,7 +44,7 @@ PRETRAINED = Candidate(
     "pretrained on synthetic pictures, frame classifier, decided jointly", "frame_heads", ("scenes",), reference="own"
 )
 PAPER = Candidate("CLIP with visual prompts, three heads", "gradient", ("clip",))
-RELEASE = {"epochs": 40, "batch_size": 4, "learning_rate": 1e-3, "weight_decay": 0.01}
+RELEASE = {"epochs": 40, "batch_size": 4, "learning_rate": 1e-3, "weight_decay": 0.01, "max_grad_norm": 0.0}
 
 CANDIDATES: dict[str, Candidate] = {
     "constant": Candidate("the training objects' most frequent combination of classes", "constant"),

@@ -19,7 +19,7 @@ from pipeline.encoder.baseline.predictor import Labels
 from pipeline.encoder.baseline.validation import Fold, Predict, cross_validate, deal, forest
 from pipeline.encoder.candidates import Candidate
 from pipeline.errors import UserError
-from pipeline.io import fingerprint, read_json, read_table, write_json
+from pipeline.io import code_of, fingerprint, read_json, read_table, write_json
 from pipeline.records import Assignment, OutOfFold, Part, Probe, Video
 from pipeline.runtime import CHECKPOINTS, derive_seed, limit_threads, progress, resolve_device, seed_everything
 from pipeline.videos.catalogue import Catalogue
@@ -100,10 +100,9 @@ def cross_validate_candidate(
             f"cross_validation.folds is {config.folds} but only {objects} objects have videos; lower it, to 2 at least"
         )
     labelled = repr([(v.video_id, data.catalogue.labels(v.object_id)) for v in data.videos])
-    code = sorted(Path(__file__).parent.rglob("*.py"))  # No table of folds of two versions.
     folds = config.model_copy(update={"models": ()})
-    key = fingerprint(repr(candidate), folds, data.encoder, data.per_video, labelled, *data.files, *code)
-    work = CHECKPOINTS / "cross_validation" / key
+    settings = (repr(candidate), folds, data.encoder, data.per_video, labelled)
+    work = CHECKPOINTS / "cross_validation" / fingerprint(*settings, *data.files, *code_of("cross_validate"))
     predict = KINDS[candidate.kind](candidate, data)
     with progress(config.folds * config.repeats, "cross-validation", "fold") as advance:
 
@@ -200,8 +199,9 @@ def _gradient(candidate: Candidate, data: CrossValidationData) -> Predict:
 
     limit_threads(data.runtime.threads)
     named = {"recipe": "release" if candidate.recipe == "release" else "paper", "backbone": ("clip",)}
-    own = {"micro_batch_size": 0, **candidate.settings} if candidate.settings else {}  # Of its own batch size.
-    config = data.encoder.model_copy(update={**named, **own})
+    # What has a batch size of its own is computed whole, and so is a network that normalises over a batch.
+    whole = {"micro_batch_size": 0} if candidate.settings or candidate.recipe == "scratch" else {}
+    config = data.encoder.model_copy(update={**named, **whole, **candidate.settings})
     store, device = data.store(candidate), resolve_device(data.runtime.device)
 
     def predict(fold: Fold) -> Labels:

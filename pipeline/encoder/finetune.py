@@ -24,7 +24,6 @@ from pipeline.encoder.frame_classifier import Clips, JointFrameClassifier, choos
 from pipeline.encoder.model import PropertyClassifier, SideBySide
 from pipeline.encoder.recipes import property_classifier
 from pipeline.encoder.tuned import FLIPS, AboveTrunks, TrunkDataset, Trunks, run_trunks
-from pipeline.io import fingerprint
 from pipeline.records import Measurement, Part
 from pipeline.runtime import resolve_device, seed_everything
 from pipeline.training.sampling import EpochDataset
@@ -146,10 +145,9 @@ def train_classifier(
     # Imported here, since fitted heads need no Trainer, and importing it takes seconds.
     from pipeline.training.trainer import TrainableTrainer, TrainingMonitor, checkpoint_dir, train, training_arguments
 
-    micro = min(config.micro_batch_size or config.batch_size, config.batch_size)
     # By video: a label that was corrected must not go on with what was learnt from the wrong one.
     labelled = repr([(a.video_id, a.part, data.catalogue.labels(a.object_id)) for a in data.assignments])
-    folder = checkpoint_dir(f"finetune_encoder-{seed}", fingerprint(config, seed, data.per_video, labelled, *inputs))
+    folder = checkpoint_dir("finetune_encoder", config, seed, data.per_video, labelled, *inputs)
     # The published code's cosine is as long as one epoch, so that the rate falls to a hundredth and rises again.
     waves = {
         "lr_scheduler_type": "cosine_with_min_lr",
@@ -159,10 +157,10 @@ def train_classifier(
         folder,
         runtime,
         seed,
+        batch_size=config.batch_size,
+        micro_batch_size=min(config.micro_batch_size or config.batch_size, config.batch_size),
+        max_grad_norm=config.max_grad_norm,
         num_train_epochs=config.epochs,
-        per_device_train_batch_size=micro,
-        per_device_eval_batch_size=micro,
-        gradient_accumulation_steps=config.batch_size // micro,
         bf16=config.autocast == "bfloat16",
         learning_rate=config.learning_rate,
         weight_decay=config.weight_decay,

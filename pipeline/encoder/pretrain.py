@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
 from typing import cast
 
 import numpy as np
@@ -15,16 +14,12 @@ from torch.nn import functional as F
 from transformers import TrainerCallback
 
 from pipeline.config import FramesConfig, PretrainConfig, RuntimeConfig
-from pipeline.encoder import synthetic
 from pipeline.encoder.scene_encoder import SIDE, SceneEncoder
 from pipeline.encoder.synthetic import SyntheticPictures, draw_pictures
-from pipeline.io import fingerprint
 from pipeline.records import Measurement
-from pipeline.runtime import CHECKPOINTS, derive_seed, seed_everything
-from pipeline.scenes import invent
+from pipeline.runtime import derive_seed, seed_everything
 from pipeline.training.sampling import EpochDataset
 from pipeline.training.trainer import TrainableTrainer, TrainingMonitor, checkpoint_dir, train, training_arguments
-from pipeline.videos.frames import subtraction
 from pipeline.videos.frames.subtraction import MIDDLE
 
 HIDDEN = 192
@@ -129,11 +124,8 @@ def pretrain(
     """
     seed_everything(config.seed)
     frames = frames.model_copy(update={"pixels": min(frames.pixels, SIDE)})
-    # What decides how pictures look, so that half of them are never drawn by one version and half by another.
-    code = [*sorted(Path(invent.__file__).parent.rglob("*.py")), Path(synthetic.__file__), Path(subtraction.__file__)]
     shown = repr((config.objects, config.presses, config.seed))
-    work = CHECKPOINTS / "pretrain" / f"pictures-{fingerprint(shown, frames.fit, frames.pixels, *code)}"
-    drawn = draw_pictures(config, frames, work)
+    drawn = draw_pictures(config, frames, checkpoint_dir("pretrain", "pictures", shown, frames.fit, frames.pixels))
     border = len(drawn.pictures) - max(1, round(HELD_OUT * len(drawn.pictures)))
     training, held = (
         SyntheticPictures(**{name: rows[part] for name, rows in vars(drawn).items()})
@@ -141,11 +133,13 @@ def pretrain(
     )
     model = pretraining_model(SceneEncoder(), training)
     arguments = training_arguments(
-        checkpoint_dir("pretrain", fingerprint(config, frames.fit, frames.pixels, *code)),
+        checkpoint_dir("pretrain", config, frames.fit, frames.pixels),
         runtime,
         config.seed,
+        batch_size=config.batch_size,
+        micro_batch_size=config.batch_size,  # Its layers normalise over what is computed at once.
+        max_grad_norm=config.max_grad_norm,
         max_steps=config.steps,
-        per_device_train_batch_size=config.batch_size,
         learning_rate=config.learning_rate,
         weight_decay=config.weight_decay,
         warmup_steps=round(WARMUP * config.steps),

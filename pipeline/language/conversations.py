@@ -19,8 +19,8 @@ from pipeline.records import Opd, Question
 from pipeline.runtime import derive_seed
 from pipeline.training.sampling import EpochDataset, sample_evaluation, sample_training
 
-POOL = 16
-"""Batches that are drawn together and dealt by length: more of them pad less, fewer mix lengths more freely."""
+FILLER = -1
+"""In place of an index: a conversation of one token, of which nothing is learnt."""
 
 
 class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
@@ -95,6 +95,8 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
         return len(self.encoded)
 
     def __getitem__(self, index: int) -> dict[str, torch.Tensor]:
+        if index == FILLER:
+            return self._tensors(Encoded((0,), (IGNORE_INDEX,)), torch.zeros(0, self.store.dim), torch.zeros(1))
         encoded = self.encoded[index]
         if index >= len(self.questions):
             weights = torch.full((len(encoded.labels),), self.conclusion_weight)
@@ -148,39 +150,32 @@ def collate(samples: Sequence[Mapping[str, torch.Tensor]]) -> dict[str, torch.Te
     return {name: pad_sequence([s[name] for s in samples], True, value) for name, value in padding.items()}
 
 
-class LengthBuckets(Sampler[int]):
-    """Every index once: random pools of `POOL` batches, cut by length into batches, which come in random order.
+class UpdateSampler(Sampler[int]):
+    """Every index once, in random order; within an update by length, since what is computed at once is padded.
 
-    transformers' own grouping goes from long to short within each pool, so that updates run through the tasks in the
-    order of their lengths, and draws from the process's random numbers, whose state depends on what came before. Here
-    the order follows from seed and epoch alone, on every device and in a resumed training alike.
+    Which items an update has follows from seed and epoch. It does not depend on how many are computed at once, nor on
+    how many devices share them. A last update that devices cannot share evenly is filled up with `FILLER`, where
+    accelerate would repeat items of the first one.
 
     Args:
         lengths: Tokens of each item.
-        size: Items of a batch.
+        update: Items of an update.
+        shared: Items that all devices together compute at once; 1 fills nothing up.
         epoch: Asked whenever the order is drawn.
     """
 
-    def __init__(self, lengths: Sequence[int], size: int, seed: int, epoch: Callable[[], int]) -> None:
-        self.lengths = lengths
-        self.size = size
-        self.seed = seed
-        self.epoch = epoch
+    def __init__(
+        self, lengths: Sequence[int], update: int, seed: int, epoch: Callable[[], int], shared: int = 1
+    ) -> None:
+        self.lengths, self.update, self.seed, self.epoch = lengths, update, seed, epoch
+        self.fillers = [FILLER] * (-len(lengths) % shared)
 
     def __len__(self) -> int:
-        return len(self.lengths)
+        return len(self.lengths) + len(self.fillers)
 
     def __iter__(self) -> Iterator[int]:
-        rng = random.Random(derive_seed(self.seed, self.epoch(), "order"))
         order = list(range(len(self.lengths)))
-        rng.shuffle(order)
-        whole = len(order) - len(order) % self.size
-        # A batch that is not full ends the epoch, or all behind it would be cut elsewhere.
-        rest = order[whole:]
-        for start in range(0, whole, POOL * self.size):
-            pool = sorted(order[start : min(start + POOL * self.size, whole)], key=self.lengths.__getitem__)
-            batches = [pool[i : i + self.size] for i in range(0, len(pool), self.size)]
-            rng.shuffle(batches)
-            for batch in batches:
-                yield from batch
-        yield from rest
+        random.Random(derive_seed(self.seed, self.epoch(), "order")).shuffle(order)
+        for start in range(0, len(order), self.update):
+            yield from sorted(order[start : start + self.update], key=self.lengths.__getitem__)
+        yield from self.fillers

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import random
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -19,7 +18,7 @@ from pipeline.embeddings import TENSOR_FILE, EmbeddingStore
 from pipeline.errors import UserError
 from pipeline.io import fingerprint, read_jsonl
 from pipeline.language.connector import read_config
-from pipeline.language.conversations import ConversationDataset, LengthBuckets, collate
+from pipeline.language.conversations import ConversationDataset, UpdateSampler, collate
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.teach.training import replay
 from pipeline.records import Encoder, Opd, Question
@@ -175,12 +174,12 @@ def fit(
         checkpoint_dir(job.stage, job.fingerprint),
         runtime,
         job.seed,
+        batch_size=config.batch_size,
+        micro_batch_size=config.micro_batch_size,
+        max_grad_norm=config.max_grad_norm,
         num_train_epochs=config.epochs,
-        per_device_train_batch_size=config.micro_batch_size,
-        gradient_accumulation_steps=_accumulation(config),
         weight_decay=config.weight_decay,
         warmup_steps=round(config.warmup_ratio * steps),
-        max_grad_norm=config.max_grad_norm,
         logging_steps=max(1, steps // 50),
     )
     trainer = TrainableTrainer(
@@ -191,7 +190,13 @@ def fit(
         callbacks=[TrainingMonitor(), *job.callbacks],
         rates={**dict.fromkeys(trained, config.projection_learning_rate), **adapters},
         constant=("connector.projection",) if config.projection_schedule == "constant" else (),
-        sampler=LengthBuckets(data.lengths, config.micro_batch_size, job.seed, lambda: data.epoch),
+        sampler=UpdateSampler(
+            data.lengths,
+            config.batch_size,
+            job.seed,
+            lambda: data.epoch,
+            shared=config.micro_batch_size * arguments.world_size if arguments.world_size > 1 else 1,
+        ),
     )
     return train(trainer)
 
@@ -228,17 +233,6 @@ def write_model_card(folder: Path, material: Material, data: ConversationDataset
             "The language model's own weights are not in this folder and have limits of their own.",
         ),
     )
-
-
-def _accumulation(config: TrainConfig) -> int:
-    """Micro-batches an update on each device, so that an update sees `batch_size` questions over all devices."""
-    devices = int(os.environ.get("WORLD_SIZE", "1"))
-    if config.batch_size % (config.micro_batch_size * devices):
-        raise UserError(
-            f"batch_size {config.batch_size} cannot be shared by {devices} devices at micro_batch_size "
-            f"{config.micro_batch_size}; lower micro_batch_size"
-        )
-    return config.batch_size // (config.micro_batch_size * devices)
 
 
 def _linear(names: Iterable[str]) -> str:

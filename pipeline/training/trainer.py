@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+import os
 import shutil
 import sys
 from collections.abc import Collection, Mapping
@@ -16,6 +17,7 @@ from zipfile import BadZipFile, ZipFile
 import torch
 from accelerate.utils import save_fsdp_optimizer
 from accelerate.utils.constants import OPTIMIZER_NAME
+from pydantic import BaseModel
 from safetensors import SafetensorError, safe_open
 from torch.utils.data import Sampler
 from transformers import PrinterCallback, Trainer, TrainerCallback, TrainerControl, TrainerState, TrainingArguments
@@ -25,8 +27,9 @@ from transformers.utils import SAFE_WEIGHTS_NAME
 
 from pipeline.config import RuntimeConfig
 from pipeline.errors import UserError
+from pipeline.io import code_of, fingerprint
 from pipeline.records import Measurement
-from pipeline.runtime import CHECKPOINTS, LogLines, resolve_device
+from pipeline.runtime import CHECKPOINTS, LogLines, limit_threads, resolve_device
 from pipeline.training.sampling import EpochDataset
 from pipeline.training.trainable import load_trainable, whole_state
 
@@ -177,9 +180,14 @@ class TrainingMonitor(TrainerCallback):
             self._lines.reached(state.global_step, f"loss {values['loss']:.3f}")
 
 
-def checkpoint_dir(stage: str, fingerprint: str) -> Path:
-    """Where a training keeps its checkpoints, outside DVC's reach (DVC deletes a killed stage's outputs)."""
-    return CHECKPOINTS / stage / fingerprint
+def checkpoint_dir(stage: str, *parts: BaseModel | str | int | Path) -> Path:
+    """Where a training keeps its checkpoints, outside DVC's reach (DVC deletes a killed stage's outputs).
+
+    Args:
+        stage: As in dvc.yaml, whose code is part of the key: one version never goes on with another's training.
+        parts: Settings and input files that the training depends on.
+    """
+    return CHECKPOINTS / stage / fingerprint(*parts, *code_of(stage))
 
 
 @dataclass(frozen=True)
@@ -190,11 +198,66 @@ class Trained:
     state: dict[str, torch.Tensor]
 
 
-def training_arguments(folder: Path, runtime: RuntimeConfig, seed: int, **own: Any) -> TrainingArguments:
-    """What all trainings share: AdamW, a cosine, checkpoints every `runtime.save_steps`; `own` adds and overrides."""
+MEANT = {
+    "ACCELERATE_MIXED_PRECISION": "no",
+    "ACCELERATE_DYNAMO_BACKEND": "no",
+    "ACCELERATE_USE_DEEPSPEED": "false",
+    "ACCELERATE_USE_MEGATRON_LM": "false",
+    "ACCELERATE_USE_PARALLELISM_CONFIG": "false",
+}
+"""How accelerate is told, by its launcher or a shell, to compute in another way than the parameters say: what each
+variable must be where it is set."""
+
+
+def check_accelerate() -> None:
+    """Raise UserError where accelerate was told to compute otherwise than the parameters say.
+
+    Sharding changes no result by version 2. Version 1 renames what is trained, so that it would get no learning rate.
+    """
+    sharded = os.environ.get("ACCELERATE_USE_FSDP", "").lower() == "true"
+    meant = MEANT | ({"FSDP_VERSION": "2"} if sharded else {})
+    for name, value in meant.items():
+        found = os.environ.get(name, "1" if name == "FSDP_VERSION" else value)
+        if found.lower() != value:
+            raise UserError(
+                f"runtime.launcher: {name} is {found}, which would change what is trained; launch with a file of "
+                "conf/accelerate, and unset the variable in your shell"
+            )
+
+
+def training_arguments(
+    folder: Path,
+    runtime: RuntimeConfig,
+    seed: int,
+    *,
+    batch_size: int,
+    micro_batch_size: int,
+    max_grad_norm: float,
+    **own: Any,
+) -> TrainingArguments:
+    """What all trainings share: AdamW, a cosine, checkpoints every `runtime.save_steps`.
+
+    Args:
+        batch_size: Items of an update, over all devices.
+        micro_batch_size: Items at a time on one device; the rest is accumulated.
+        max_grad_norm: Longer gradients are shortened to it; 0 leaves all as they are.
+        own: Adds to what is shared, and overrides it.
+    """
+    limit_threads(runtime.threads)
+    check_accelerate()
+    devices = int(os.environ.get("WORLD_SIZE", "1"))
+    if batch_size % (micro_batch_size * devices):
+        raise UserError(
+            f"batch_size {batch_size} cannot be shared by {devices} devices at micro_batch_size {micro_batch_size}; "
+            "lower micro_batch_size"
+        )
     shared: dict[str, Any] = {
         "output_dir": str(folder),
         "seed": seed,
+        "per_device_train_batch_size": micro_batch_size,
+        "per_device_eval_batch_size": micro_batch_size,
+        "gradient_accumulation_steps": batch_size // (micro_batch_size * devices),
+        "max_grad_norm": max_grad_norm,
         "optim": "adamw_torch",
         "lr_scheduler_type": "cosine",
         "save_strategy": "steps" if runtime.save_steps else "no",

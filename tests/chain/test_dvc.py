@@ -183,6 +183,50 @@ def test_a_split_without_a_test_object_is_one_warning(tmp_path: Path, caplog: py
     assert "7 of 7 test objects have no videos (bath_towel, " in said[0]
 
 
+NONE = {
+    **dict.fromkeys(("data.dir", "data.catalogue"), "stands in the paths of dependencies"),
+    **dict.fromkeys(("tracking.uri", "tracking.experiment", "tracking.live", "tracking.timeout_seconds"), "only shows"),
+    "runtime.parallel": "every backend gives the same bytes",
+    "runtime.save_steps": "a resumed training ends as one that was not",
+    # Sums are added in another order, as on another processor; dvc.lock is to hold on the next machine.
+    **dict.fromkeys(("runtime.device", "runtime.threads"), "the machine's"),
+    **dict.fromkeys(("runtime.launcher", "runtime.gradient_checkpointing"), "the machine's"),
+}
+"""Parameters of no stage that computes, and why."""
+
+
+def leaves(model: type[BaseModel], before: str = "") -> Iterator[str]:
+    """Keys of params.yaml that have no keys below them."""
+    for name, field in model.model_fields.items():
+        kind = field.annotation
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            yield from leaves(kind, f"{before}{name}.")
+        elif not field.exclude:
+            yield before + name
+
+
+def test_every_parameter_is_a_stages_or_is_known_to_change_nothing() -> None:
+    """Stages that only show or copy what others made list whole sections, and do not count."""
+    listed = [k for name, s in stages().items() if name not in ("report", "package") for k in s.get("params", [])]
+    covered = {leaf for leaf in leaves(Params) for key in listed if f"{leaf}.".startswith(f"{key}.")}
+    assert set(leaves(Params)) - covered == NONE.keys()
+
+
+@pytest.mark.parametrize("name", sorted(stages()))
+def test_a_command_is_the_same_whatever_the_parameters(name: str) -> None:
+    """DVC runs a stage anew where its command is another."""
+    own = stages()[name]
+    filled = set(re.findall(r"\$\{(.*?)\}", own["cmd"]))
+    assert filled == {f"item.{axis}" for axis in own.get("matrix", {})}
+
+
+def test_what_changes_answers_is_a_parameter_of_what_answers() -> None:
+    batches = {"answer": "language.generation_batch_size", "teach": "language.generation_batch_size"}
+    batches |= dict.fromkeys(("embed", "cross_validate"), "encoder.embed_batch_size")
+    batches |= {"finetune_encoder": "encoder.max_grad_norm"}
+    assert {name for name, key in batches.items() if key not in stages()[name]["params"]} == set()
+
+
 def test_language_training_does_not_depend_on_the_encoders_code() -> None:
     assert not [d for name in ("align", "lora", "answer") for d in code(name) if "encoder" in d]
 

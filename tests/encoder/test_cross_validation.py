@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -172,9 +172,12 @@ def test_gradients_learn_from_no_object_that_they_are_tested_on(
         assert (clips.store.references is None) == (name in ("paper", "release"))
         assert isinstance(model.encoder, SceneEncoder) == (name == "scratch")
         assert CANDIDATES[name].settings.items() <= config.model_dump().items()
+        # What normalises over a batch, or has a batch size of its own, is not computed in parts.
+        assert config.micro_batch_size == (2 if name.startswith("paper") else 0)
         return []
 
     monkeypatch.setattr(finetune, "train_classifier", spy)
+    data = replace(data, encoder=data.encoder.model_copy(update={"micro_batch_size": 2}))
     found = cross_validate_candidate(CANDIDATES[name], data, CONFIG)
     assert len(chosen) == len(folds) == 6
     assert len(set(chosen)) > 1, "drawn anew in each fold"
@@ -322,9 +325,9 @@ def relabelled(data: CrossValidationData) -> CrossValidationData:
     return replace(data, catalogue=Catalogue(language=data.catalogue.language, objects=objects))
 
 
-@pytest.mark.parametrize("other", ["labels", "pretraining", "frames", "folds"])
-def test_folds_of_other_inputs_or_settings_are_not_taken_for_these(
-    other: str, data: CrossValidationData, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("other", ["labels", "pretraining", "frames", "folds", "code"])
+def test_folds_of_other_inputs_settings_or_code_are_not_taken_for_these(
+    other: str, data: CrossValidationData, versions: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     candidate, config = CANDIDATES["pretrained"], CONFIG
     write_pretrained()
@@ -338,6 +341,8 @@ def test_folds_of_other_inputs_or_settings_are_not_taken_for_these(
             candidate = replace(candidate, frames=3)
         case "folds":
             config = CONFIG.model_copy(update={"seed": 5})
+        case "code":
+            versions("pipeline/training/trainer.py")
     begun = kill_after(99, monkeypatch)
     cross_validate_candidate(candidate, data, config)
     assert len(begun) == 6

@@ -26,10 +26,12 @@ from pipeline.encoder.synthetic import SyntheticPictures
 from pipeline.errors import UserError
 from pipeline.records import Measurement, Part
 from pipeline.runtime import seed_everything
+from pipeline.scales import compose
 from pipeline.training.trainable import trainable_state
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
-from tests.conftest import refused
+from tests.closure import ROOT
+from tests.conftest import Begun, refused
 from tests.encoder.conftest import Hook, killed_at
 from tests.encoders import CPU, PARTS, config, encoder_data, write_timm
 
@@ -278,6 +280,30 @@ def test_a_corrected_label_begins_anew(
     assert len(begun) == 5 + 6
 
 
+def test_gradients_are_shortened_to_what_the_parameters_say(
+    weights: Path, data: EncoderData, before_updates: Hook
+) -> None:
+    norms: list[float] = []
+    before_updates(
+        lambda _, optimizer: norms.append(
+            float(torch.cat([p.grad.flatten() for g in optimizer.param_groups for p in g["params"]]).norm())
+        )
+    )
+    longest = {"paper": 0.0, "release": 0.0, "tuned": 1.0}
+    for recipe, limit in longest.items():
+        assert compose("smoke", [f"encoder.recipe={recipe}"], conf=ROOT / "conf").encoder.max_grad_norm == limit
+    for limit in (longest["paper"], 1e-3):
+        # Logits a thousand times as large have gradients that are longer than any limit.
+        model = classifier("paper", weights)
+        with torch.no_grad():
+            for parameter in model.heads.parameters():
+                parameter.mul_(1e3)
+        setting = settings("paper", weights, epochs=1, batch_size=8, max_grad_norm=limit)
+        train_classifier(model, data, setting, CPU, seed=0, inputs=[])
+    assert norms[0] > 10
+    assert norms[1] == pytest.approx(1e-3, rel=1e-2)
+
+
 # Synthetic pretraining
 
 
@@ -346,3 +372,21 @@ def test_a_tiny_pretraining_draws_trains_and_tells_what_it_left_aside(tmp_path: 
     assert all(v.isfinite().all() for v in trainable_state(encoder).values())
     counts = [int(b) for n, b in encoder.named_buffers() if n.endswith("num_batches_tracked")]
     assert counts == [4] * len(CHANNELS), "the object left aside has touched no statistics"
+
+
+@pytest.mark.usefixtures("noise")
+@pytest.mark.parametrize("kind", ["finetune", "pretrain"])
+def test_a_training_is_not_gone_on_with_by_another_version_of_the_code(
+    kind: str, weights: Path, data: EncoderData, versions: Callable[[str], None], begun_in: Begun
+) -> None:
+    def begin() -> None:
+        if kind == "pretrain":
+            pretrained(4, 2)
+        training("paper", weights, data)()
+
+    places = [begun_in(begin)]
+    for file in ("report/build.py", "training/trainer.py", "encoder/model.py", "encoder/pretrain.py"):
+        versions(f"pipeline/{file}")
+        places.append(begun_in(begin))
+    assert places[0] == places[1], "it does not depend on reports"
+    assert len(set(places)) == 4

@@ -25,14 +25,10 @@ from pipeline.training.trainer import TrainableTrainer, Trained
 from tests.language.shared import SMALL, material, train
 
 CONFIG = LoraTrainConfig(
-    **{**SMALL.model_dump(), "samples": 6, "micro_batch_size": 1, "epochs": 3},
-    rank=4,
-    alpha=8,
-    learning_rate=1e-3,
-    dropout=0.0,
+    **{**SMALL.model_dump(), "samples": 9, "epochs": 2}, rank=4, alpha=8, learning_rate=1e-3, dropout=0.0
 )
-"""Six updates, of four questions and of two by turns; of two processes each sees half of them. No dropout: each process
-draws its own."""
+"""Six updates, of four questions or (the last of each epoch) of one. Each process sees two of the four, or one process
+two after two. No dropout: each process draws its own."""
 KINDS = {"align": "float32", "lora": "bfloat16"}
 """Trainings and the number format of the frozen weights; adapters stand in one group with them."""
 DIES = 5

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from accelerate.data_loader import BatchSamplerShard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.utils.data import BatchSampler
@@ -16,10 +17,11 @@ from transformers import PreTrainedTokenizerBase
 
 from pipeline.language.base import load_tokenizer
 from pipeline.language.chat import IGNORE_INDEX, TACTILE_TOKENS, encode, render
-from pipeline.language.conversations import POOL, LengthBuckets, collate
+from pipeline.language.conversations import FILLER, UpdateSampler, collate
 from pipeline.language.generate import write_prompt
 from pipeline.language.training import Material, assemble
 from pipeline.records import Turn
+from pipeline.runtime import derive_seed
 from tests.checkpoints import write_llama
 from tests.language.shared import DIM, FRAMES, generation, taking
 from tests.models import model_folder
@@ -109,35 +111,39 @@ LENGTHS = st.lists(st.integers(1, 500), max_size=300)
 
 
 @settings(max_examples=30)
-@given(LENGTHS, st.integers(1, 20), st.integers(0, 5), st.integers(0, 3))
-def test_each_epoch_has_every_conversation_once(lengths: list[int], size: int, seed: int, epoch: int) -> None:
-    sampler = LengthBuckets(lengths, size, seed, lambda: epoch)
-    order = list(sampler)
-    assert sorted(order) == list(range(len(lengths)))
-    assert len(sampler) == len(lengths)
-    assert list(sampler) == order, "asked again, as a resumed training does"
-    # Batches of sorted neighbours are disjoint in length, but for ties: no other cut of a pool pads less.
-    batches = [order[i * size : (i + 1) * size] for i in range(len(order) // size)]
-    for start in range(0, len(batches), POOL):
-        ranges = sorted((min(b), max(b)) for b in ([lengths[i] for i in x] for x in batches[start : start + POOL]))
+@given(LENGTHS, st.integers(1, 5), st.integers(1, 3), st.sampled_from([1, 2, 4]), st.integers(0, 3))
+def test_an_update_has_the_same_questions_on_any_number_of_devices(
+    lengths: list[int], micro: int, rounds: int, devices: int, epoch: int
+) -> None:
+    """Those of a random order, as accelerate deals them; in a last update that is too small fillers take part."""
+    update = micro * rounds * devices
+    sampler = UpdateSampler(lengths, update, 5, lambda: epoch, shared=micro * devices if devices > 1 else 1)
+    random_order = list(range(len(lengths)))
+    random.Random(derive_seed(5, epoch, "order")).shuffle(random_order)
+    drawn = BatchSampler(sampler, micro, drop_last=False)
+    assert list(drawn) == list(drawn), "asked again, as a resumed training does"
+    dealt = [list(BatchSamplerShard(drawn, devices, place) if devices > 1 else drawn) for place in range(devices)]
+    assert len({len(batches) for batches in dealt}) == 1, "or one device would wait for ever"
+    assert sum(map(len, dealt)) == len(drawn)
+    for number, start in enumerate(range(0, len(lengths), update)):
+        seen = [b for batches in dealt for b in batches[number * rounds : (number + 1) * rounds]]
+        questions = [i for batch in seen for i in batch if i != FILLER]
+        assert sorted(questions) == sorted(random_order[start : start + update])
+        # No other cut of an update into batches pads less: they are disjoint in length, but for ties.
+        ranges = sorted((min(own), max(own)) for b in seen if (own := [lengths[i] for i in b if i != FILLER]))
         assert all(low[1] <= high[0] for low, high in pairwise(ranges))
 
 
 def test_epochs_and_seeds_differ() -> None:
-    orders = [list(LengthBuckets([5] * 64, 4, s, lambda e=e: e)) for s in (0, 1) for e in (0, 1)]  # type: ignore[misc]
+    orders = [list(UpdateSampler([5] * 64, 16, s, lambda e=e: e)) for s in (0, 1) for e in (0, 1)]  # type: ignore[misc]
     assert len({tuple(order) for order in orders}) == 4
 
 
-def test_padding_falls_and_batches_come_in_no_order_of_length() -> None:
-    rng = random.Random(0)
-    lengths = [rng.choice((50, 115, 158, 210)) + rng.randrange(10) for _ in range(800)]
-
-    def padding(order: list[int]) -> float:
-        batches = list(BatchSampler(order, 4, drop_last=False))
-        return 1 - sum(lengths) / sum(len(b) * max(lengths[i] for i in b) for b in batches)
-
-    order = list(LengthBuckets(lengths, 4, 0, lambda: 0))
-    assert padding(order) < 0.05
-    assert padding(list(range(800))) > 0.25
-    first = [lengths[i] for i in order[: 4 * POOL : 4]]
-    assert first not in (sorted(first), sorted(first, reverse=True))
+def test_nothing_is_learnt_of_what_fills_up_an_update(held: Material) -> None:
+    model, data = assemble(held, taking(3), "test")
+    alone, beside = (collate([data[i] for i in chosen]) for chosen in ((0,), (0, FILLER)))
+    torch.testing.assert_close(model(**beside).loss, model(**alone).loss, rtol=1e-5, atol=0)
+    loss = model(**collate([data[FILLER], data[FILLER]]), num_items_in_batch=9).loss
+    loss.backward()
+    assert float(loss.detach()) == 0
+    assert not any(p.grad is None or p.grad.any() for p in model.connector.parameters()), "there, as devices want it"

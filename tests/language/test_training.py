@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import os
+import random
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,13 +18,17 @@ from safetensors.torch import load_file
 from torch.optim.optimizer import register_optimizer_step_pre_hook
 from transformers import TrainerCallback, TrainerState
 
-from pipeline.config import LoraTrainConfig, RuntimeConfig
+from pipeline.config import LoraTrainConfig, RuntimeConfig, TeachConfig
 from pipeline.errors import UserError
 from pipeline.io import write_jsonl
 from pipeline.language.chat import IGNORE_INDEX
+from pipeline.language.conversations import collate
+from pipeline.language.teach.training import teach
 from pipeline.language.training import Job, Material, add_lora, assemble, fit, write_model_card
+from pipeline.runtime import derive_seed
 from pipeline.training.trainer import Trained
 from tests.closure import ROOT
+from tests.conftest import Begun, refused
 from tests.language.shared import SMALL, assert_comes_back, embedded, taking, train
 
 CPU = RuntimeConfig(device="cpu")
@@ -105,7 +112,7 @@ def test_killed_and_resumed_ends_the_same(kind: str, when: str, left: int, held:
             text=True,
         )
         assert done.returncode == -signal.SIGKILL, done.stderr[-2000:]
-    kept = {int(f.parent.name.split("-")[1]) for f in checkpoints.glob(f"killed/{kind}/x/*/trainer_state.json")}
+    kept = {int(f.parent.name.split("-")[1]) for f in checkpoints.glob(f"killed/{kind}/*/*/trainer_state.json")}
     assert kept == {left}
     whole = run(kind, held, checkpoints / "whole")
     again = run(kind, held, checkpoints / "killed")
@@ -151,7 +158,7 @@ def test_running_away_late_leaves_the_last_good_checkpoint(held: Material, check
 
     with pytest.raises(UserError, match="lower the learning rate"):
         fit(model, data, CONFIG, RUNTIME, Job("align", "x", 0, [AtStep(5, spoil)]))
-    (kept,) = checkpoints.glob("align/x/checkpoint-*")
+    (kept,) = checkpoints.glob("align/*/checkpoint-*")
     assert kept.name == "checkpoint-4"
     assert all(value.isfinite().all() for value in load_file(kept / "model.safetensors").values())
 
@@ -187,7 +194,7 @@ def test_an_updates_gradient_is_that_of_its_questions_one_at_a_time(
 ) -> None:
     """Updates of four, four and one, by a plain loop in float64 over tokens, without batches, padding or a cache."""
     order = [7, 0, 1, 2, 8, 3, 4, 5, 6]  # The last two are text without touch.
-    monkeypatch.setattr("pipeline.language.training.LengthBuckets", lambda *_: order)
+    monkeypatch.setattr("pipeline.language.training.UpdateSampler", lambda *_, **__: order)
     own = {"weighting": weighting, "counterfactual": 0.4, "conclusion_weight": 3.0, "replay": 0.25}
     config = LoraTrainConfig(**{**SMALL.model_dump(), "epochs": 1, "samples": 7, "max_grad_norm": 0.0, **own})
     model, data = assemble(held, config, "test")
@@ -227,3 +234,90 @@ def test_an_updates_gradient_is_that_of_its_questions_one_at_a_time(
     # transformers' normalisation computes in float32 whatever it is given.
     assert len(gaps) == 3
     assert max(gaps) < 2e-6, gaps
+@pytest.mark.parametrize("micro", [1, 2, 4])
+def test_how_many_are_computed_at_once_changes_nothing_but_rounding(
+    micro: int, held: Material, checkpoints: Path
+) -> None:
+    """Against a plain loop over whole updates of questions in random order; the last of an epoch has two."""
+    config = SMALL.model_copy(update={"micro_batch_size": micro})
+    model, data = assemble(held, taking(10), "test")
+    begin = {name: p.detach().double().clone() for name, p in model.connector.named_parameters()}
+    trained = {n: v.clone() for n, v in fit(model.double(), data, config, CPU, Job("align", "x", 0)).state.items()}
+    with torch.no_grad():
+        for name, parameter in model.connector.named_parameters():
+            parameter.copy_(begin[name])
+    parameters = [p for p in model.parameters() if p.requires_grad]
+    optimizer = torch.optim.AdamW(parameters, weight_decay=0.0)
+    counts: list[int] = []
+    for epoch in range(2):
+        data.follow(lambda: epoch)  # noqa: B023 - asked in this round alone
+        order = list(range(10))
+        random.Random(derive_seed(0, epoch, "order")).shuffle(order)
+        for start in range(0, 10, 4):
+            optimizer.param_groups[0]["lr"] = 1e-3 * (1 + math.cos(math.pi * len(counts) / 6)) / 2
+            chosen = [data[i] for i in order[start : start + 4]]
+            counts.append(len({len(item["input_ids"]) for item in chosen}))
+            model(**collate(chosen)).loss.backward()
+            torch.nn.utils.clip_grad_norm_(parameters, config.max_grad_norm)
+            optimizer.step()
+            optimizer.zero_grad()
+    assert max(counts) > 2, "of unlike length, or any order would do"
+    moved = max(float((p.detach() - begin[name]).abs().max()) for name, p in model.connector.named_parameters())
+    assert moved > 2e-3
+    for name, parameter in model.connector.named_parameters():
+        # transformers' normalisation computes in float32 whatever it is given.
+        torch.testing.assert_close(trained[f"connector.{name}"], parameter.detach(), atol=1e-5, rtol=0)
+
+
+def test_gradients_are_shortened_to_what_the_parameters_say(held: Material, checkpoints: Path) -> None:
+    norms: list[float] = []
+    kept = register_optimizer_step_pre_hook(
+        lambda optimizer, *_: norms.append(
+            float(torch.cat([p.grad.flatten() for g in optimizer.param_groups for p in g["params"]]).norm())
+        )
+    )
+    for longest in (0.0, 1e-3):
+        model, data = assemble(held, taking(4), "test")
+        fit(model, data, SMALL.model_copy(update={"epochs": 1, "max_grad_norm": longest}), CPU, Job("align", "x", 0))
+    kept.remove()
+    assert norms[0] > 1e-2
+    assert norms[1] == pytest.approx(1e-3, rel=1e-2)
+
+
+@pytest.mark.parametrize("kind", ["align", "lora", "teach"])
+def test_a_training_is_not_gone_on_with_by_another_version_of_the_code(
+    kind: str, held: Material, checkpoints: Path, versions: Callable[[str], None], begun_in: Begun
+) -> None:
+    def begin() -> None:
+        if kind == "teach":
+            teach(TeachConfig(base=held.language.weights), held.language, CPU, stage="teach", seed=0)
+        run(kind, held, checkpoints)
+
+    places = [begun_in(begin)]
+    for file in ("report/build.py", "training/trainer.py", "language/base.py", "language/teach/words.yaml"):
+        versions(f"pipeline/{file}")
+        places.append(begun_in(begin))
+    assert places[0] == places[1], "it does not depend on reports"
+    assert len(set(places)) == 4
+
+
+@pytest.mark.parametrize(
+    ("variables", "words"),
+    [
+        ({"ACCELERATE_MIXED_PRECISION": "bf16"}, "ACCELERATE_MIXED_PRECISION is bf16"),
+        ({"ACCELERATE_MIXED_PRECISION": "fp8"}, "ACCELERATE_MIXED_PRECISION is fp8"),
+        ({"ACCELERATE_DYNAMO_BACKEND": "INDUCTOR"}, "ACCELERATE_DYNAMO_BACKEND is INDUCTOR"),
+        ({"ACCELERATE_USE_DEEPSPEED": "true"}, "ACCELERATE_USE_DEEPSPEED is true"),
+        ({"ACCELERATE_USE_MEGATRON_LM": "true"}, "ACCELERATE_USE_MEGATRON_LM is true"),
+        ({"ACCELERATE_USE_PARALLELISM_CONFIG": "true"}, "ACCELERATE_USE_PARALLELISM_CONFIG is true"),
+        ({"ACCELERATE_USE_FSDP": "true"}, "FSDP_VERSION is 1"),
+        ({"WORLD_SIZE": "3"}, "batch_size 4 cannot be shared by 3 devices"),
+    ],
+)
+def test_accelerate_may_not_compute_otherwise_than_the_parameters_say(
+    variables: dict[str, str], words: str, held: Material, checkpoints: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    with refused(f"{words}.*"):
+        run("align", held, checkpoints)

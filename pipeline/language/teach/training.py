@@ -22,7 +22,6 @@ from transformers.modeling_outputs import CausalLMOutput
 
 from pipeline.card import write_card
 from pipeline.config import LanguageConfig, RuntimeConfig, TeachConfig
-from pipeline.io import fingerprint
 from pipeline.language.base import load_llm, load_tokenizer
 from pipeline.language.chat import IGNORE_INDEX, Encoded, encode_turns
 from pipeline.language.teach import items
@@ -244,17 +243,15 @@ def teach(
         r=config.rank, lora_alpha=config.alpha, target_modules="all-linear", task_type="CAUSAL_LM", lora_dropout=0.0
     )
     course = Course(config, tokenizer, language.system_prompt, seed)
-    text = Path(items.__file__).parent
-    key = fingerprint(config, language.system_prompt, dtype, seed, folder, text)
     arguments = training_arguments(
-        checkpoint_dir(stage, key),
+        checkpoint_dir(stage, config, language.system_prompt, dtype, seed, folder),
         runtime,
         seed,
+        batch_size=config.batch_size,
+        micro_batch_size=config.micro_batch_size,
+        max_grad_norm=config.max_grad_norm,
         max_steps=longest(config),
         learning_rate=config.learning_rate,
-        per_device_train_batch_size=config.micro_batch_size,
-        per_device_eval_batch_size=config.micro_batch_size,
-        gradient_accumulation_steps=config.batch_size // config.micro_batch_size,
         logging_steps=config.check_every,
         eval_strategy="steps",
         eval_steps=config.check_every,

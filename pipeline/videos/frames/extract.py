@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import shutil
 from dataclasses import dataclass
-from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +14,9 @@ from safetensors.numpy import save_file
 
 from pipeline.config import FramesConfig
 from pipeline.errors import UserError
-from pipeline.io import atomic, write_table
+from pipeline.io import atomic, code_of, fingerprint, write_table
 from pipeline.parallel import run_parallel
 from pipeline.records import Finding, Frame, Probe, Record, Video
-from pipeline.videos import decoding
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import VideoFile, list_videos, raise_errors
 from pipeline.videos.frames.scan import scan
@@ -98,7 +95,7 @@ def extract_frames(folder: Path, catalogue: Catalogue, config: FramesConfig, out
     raise_errors(folder, listing.findings)
     for finding in listing.findings:
         log.warning("%s: %s", finding.item, finding.measured)
-    work = partial / _fingerprint(folder, config)
+    work = partial / fingerprint(config, str(folder.resolve()), *code_of("extract_frames"))
     work.mkdir(parents=True, exist_ok=True)
     jobs = [_Job(file, config, work) for file in listing.files]
     found = [job.finished() for job in jobs]
@@ -160,11 +157,3 @@ def _warn(file: VideoFile, probe: Probe) -> None:
         )
     if probe.kept == 0:
         log.warning("%s: %d frames are too few for frames.selection=release; left out", file.relative, probe.frames)
-
-
-def _fingerprint(folder: Path, config: FramesConfig) -> str:
-    """What a finished video depends on besides its file: the parameters and the code that decodes and measures."""
-    sources = [*sorted(Path(__file__).parent.glob("*.py")), Path(decoding.__file__)]
-    code = b"".join(path.read_bytes() for path in sources)
-    text = json.dumps([str(folder.resolve()), config.model_dump(mode="json")])
-    return sha256(code + text.encode()).hexdigest()[:16]
