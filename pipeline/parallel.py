@@ -43,8 +43,8 @@ def check_backend(name: Backend) -> None:
         raise UserError("runtime.parallel: ray takes the package ray: pip install -e '.[ray]'")
 
 
-def end_with_parent(parent: int) -> None:
-    """End this process within a second of its parent's death.
+def end_with_parent(parent: int, grace: float = 0.0) -> None:
+    """End this process within a second of its parent's death, and `grace` seconds for it to end by itself.
 
     A worker waits for jobs for ever, and a pipe that it inherited stays open: `dvc repro | cat` would never end.
     """
@@ -52,6 +52,7 @@ def end_with_parent(parent: int) -> None:
     def watch() -> None:
         while os.getppid() == parent:
             time.sleep(0.5)
+        time.sleep(grace)
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()

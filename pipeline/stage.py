@@ -6,6 +6,7 @@ import errno
 import logging
 import os
 import re
+import shlex
 import shutil
 import sys
 import time
@@ -21,7 +22,7 @@ from filelock import FileLock, Timeout
 from pipeline.config import Params
 from pipeline.errors import UserError
 from pipeline.io import remove_rests, write_json
-from pipeline.parallel import use_backend
+from pipeline.parallel import end_with_parent, use_backend
 from pipeline.params import PARAMS_FILE, load_params
 from pipeline.records import Measurement
 from pipeline.runtime import CHECKPOINTS, limit_threads, quiet_libraries
@@ -72,9 +73,38 @@ def matrix_key(**axes: Iterable[Any] | None) -> list[Any]:
     return values
 
 
+LAUNCHED = "OCTOPI_LAUNCHED"
+
+
+def launch(launcher: str) -> None:
+    """Go on in processes of `runtime.launcher`, which takes this process's place: its number, status and signals.
+
+    `python`, and a process that a launcher started, go on as they are. The latter ends with its launcher: a killed
+    `accelerate launch` of one process would leave it running.
+    """
+    command = shlex.split(launcher) or ["python"]
+    if LAUNCHED in os.environ or "RANK" in os.environ:
+        if os.environ.get(LAUNCHED) != str(os.getpid()):  # Or the launcher took its place without a child.
+            end_with_parent(os.getppid(), GRACE)
+    elif command != ["python"]:
+        os.environ[LAUNCHED] = str(os.getpid())
+        try:
+            os.execvp(command[0], [*command, *sys.argv])
+        except OSError as error:
+            raise UserError(f"runtime.launcher: {launcher}: {error.strerror}; set it to python") from None
+
+
+GRACE = 5.0
+"""Seconds that a process has to end by itself, as after Ctrl-C, when its launcher is gone."""
+
+
 @contextmanager
-def stage(name: str, key: str | None = None) -> Iterator[Stage]:
+def stage(name: str, key: str | None = None, *, launched: bool = False) -> Iterator[Stage]:
     """Run the body as the DVC stage `name` (with `@key` in a matrix).
+
+    Args:
+        launched: Whether `runtime.launcher` starts it. What takes long to import belongs into the body then, since
+            this process ends there.
 
     A UserError, a disk that cannot be read or written, or want of memory ends it with one line and status 1. So does a
     params.yaml that was changed meanwhile: DVC would record the new values for what the old ones made. Metrics, time,
@@ -85,6 +115,8 @@ def stage(name: str, key: str | None = None) -> Iterator[Stage]:
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     quiet_libraries()
     try:
+        if launched:
+            launch(load_params().runtime.launcher)
         with alone(full):
             running = Stage(full, load_params(), started)
             limit_threads(running.params.runtime.threads)

@@ -3,9 +3,8 @@
 from pathlib import Path
 
 from pipeline.io import write_table
-from pipeline.language.training import Job, Material, assemble, fit, write_model_card
-from pipeline.language.words import begin_with_words
 from pipeline.records import Encoder, Measurement, Opd
+from pipeline.runtime import limit_threads
 from pipeline.stage import DATA, matrix_key, stage
 from pipeline.tracking.live import live
 from pipeline.videos.catalogue import load_catalogue
@@ -14,7 +13,11 @@ from pipeline.videos.catalogue import load_catalogue
 def main() -> None:
     encoder, opd, seed = matrix_key(encoder=Encoder, opd=Opd, seed=None)
     key = f"{encoder}-{opd}-{seed}"
-    with stage("align", key) as run:
+    with stage("align", key, launched=True) as run:
+        from pipeline.language.training import Job, Material, assemble, fit, write_model_card
+        from pipeline.language.words import begin_with_words
+
+        limit_threads(run.params.runtime.threads)
         config = run.params.align
         material = Material.load(DATA, run.params, encoder, opd, seed)
         model, data = assemble(material, config, "align")

@@ -1,8 +1,8 @@
 """Fine-tune the aligned model end to end, the language model through low-rank adapters."""
 
 from pipeline.io import write_table
-from pipeline.language.training import Job, Material, add_lora, assemble, fit, write_model_card
 from pipeline.records import Encoder, Measurement, Opd
+from pipeline.runtime import limit_threads
 from pipeline.stage import DATA, matrix_key, stage
 from pipeline.tracking.live import live
 
@@ -10,7 +10,10 @@ from pipeline.tracking.live import live
 def main() -> None:
     encoder, opd, seed = matrix_key(encoder=Encoder, opd=Opd, seed=None)
     key = f"{encoder}-{opd}-{seed}"
-    with stage("lora", key) as run:
+    with stage("lora", key, launched=True) as run:
+        from pipeline.language.training import Job, Material, add_lora, assemble, fit, write_model_card
+
+        limit_threads(run.params.runtime.threads)
         config = run.params.lora
         material = Material.load(DATA, run.params, encoder, opd, seed)
         aligned = DATA / "models" / "without" / key

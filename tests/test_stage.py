@@ -5,12 +5,16 @@ from __future__ import annotations
 import errno
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
+import psutil
 import pytest
 import torch
+import yaml
 from filelock import FileLock
 from hypothesis import given
 from hypothesis import strategies as st
@@ -105,6 +109,85 @@ def test_no_scale_is_chosen_while_a_stage_runs(here: Path) -> None:
     assert "split is running" in str(result.exception)
     assert (here / "params.yaml").read_bytes() == before
     assert running_stages() == []
+
+
+STARTED = """
+import os, sys, time
+from pathlib import Path
+from pipeline.errors import UserError
+from pipeline.stage import stage
+with stage("align", "x", launched=True) as run:
+    Path("started").write_text(str(os.getpid()))
+    while sys.argv[1] == "waits":
+        time.sleep(0.1)
+    from accelerate import Accelerator
+    from pipeline.training.trainer import check_accelerate
+    print("computes in", Accelerator().mixed_precision)
+    check_accelerate()
+    if sys.argv[1] == "fails":
+        raise UserError("no such thing")
+"""
+SHIPPED = compose("paper-7b", conf=ROOT / "conf").runtime.launcher
+
+
+def started(here: Path, launcher: str, what: str) -> subprocess.Popen[str]:
+    """A stage that is started as DVC starts it, where the user's own configuration of accelerate says bfloat16."""
+    (here / "stage.py").write_text(STARTED)
+    (here / "conf").symlink_to(ROOT / "conf")
+    own = {"compute_environment": "LOCAL_MACHINE", "distributed_type": "NO", "mixed_precision": "bf16"}
+    (here / "home" / "accelerate").mkdir(parents=True)
+    (here / "home" / "accelerate" / "default_config.yaml").write_text(yaml.safe_dump(own | {"num_processes": 1}))
+    (here / "two.yaml").write_text(yaml.safe_dump(own | {"distributed_type": "MULTI_CPU", "num_processes": 2}))
+    write_params(compose("smoke", [f"runtime.launcher={launcher}"], conf=ROOT / "conf"), here / "params.yaml")
+    programs = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    return subprocess.Popen(
+        ["python", "stage.py", what],
+        env={**os.environ, "PATH": programs, "PYTHONPATH": str(ROOT), "HF_HOME": str(here / "home")},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+@pytest.mark.parametrize(
+    ("launcher", "line"),
+    [
+        (SHIPPED, "no such thing\n"),
+        ("accelerate launch -q --num_processes 1", "runtime.launcher: ACCELERATE_MIXED_PRECISION is bf16, which"),
+        ("nowhere", "runtime.launcher: nowhere: No such file or directory; set it to python\n"),
+    ],
+)
+def test_a_stage_starts_itself_by_the_launcher(here: Path, launcher: str, line: str) -> None:
+    """With its status and one line. The configuration that comes along keeps the user's own out."""
+    process = started(here, launcher, "fails")
+    output, errors = process.communicate(timeout=300)
+    assert process.returncode == 1
+    assert errors.startswith(f"align@x: {line}")
+    assert errors.count("\n") == 1
+    if launcher == SHIPPED:
+        assert "computes in no\n" in output
+        assert int((here / "started").read_text()) != process.pid
+
+
+@pytest.mark.parametrize(
+    ("launcher", "number"),
+    [
+        (SHIPPED, signal.SIGINT),
+        ("accelerate launch --cpu --config_file two.yaml", signal.SIGKILL),
+    ],
+)
+def test_a_stage_that_is_ended_leaves_no_process(here: Path, launcher: str, number: signal.Signals) -> None:
+    process = started(here, launcher, "waits")
+    file = here / "started"
+    while process.poll() is None and not (file.exists() and file.read_text()):
+        time.sleep(0.1)
+    children = psutil.Process(process.pid).children(recursive=True)
+    assert int(file.read_text()) in {child.pid for child in children}
+    process.send_signal(number)
+    process.communicate(timeout=300)
+    assert process.returncode != 0
+    assert psutil.wait_procs(children, timeout=300)[1] == []
 
 
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
