@@ -55,7 +55,8 @@ def log_model(client: Any, run: str, params: Params, variant: Variant, folder: P
     text = DataType.string
     inputs, outputs = [ColSpec(text, "question"), ColSpec(Array(text), "videos")], [ColSpec(text, "answer")]
     card = json.loads((folder / "config.json").read_text(encoding="utf-8"))
-    about = {"variant": variant.key, "scale": params.report_name, "license": str(front_matter(folder).get("license", ""))}
+    licence = str(front_matter(folder).get("license", ""))
+    about = {"variant": variant.key, "scale": params.report_name, "license": licence}
     experiment = client.get_run(run).info.experiment_id
     made = client.create_logged_model(experiment, NAME, source_run_id=run, tags=about, model_type="pyfunc")
     with TemporaryDirectory() as temporary:

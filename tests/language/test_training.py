@@ -234,6 +234,8 @@ def test_an_updates_gradient_is_that_of_its_questions_one_at_a_time(
     # transformers' normalisation computes in float32 whatever it is given.
     assert len(gaps) == 3
     assert max(gaps) < 2e-6, gaps
+
+
 @pytest.mark.parametrize("micro", [1, 2, 4])
 def test_how_many_are_computed_at_once_changes_nothing_but_rounding(
     micro: int, held: Material, checkpoints: Path
