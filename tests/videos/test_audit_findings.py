@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import re
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.records import Finding, Part
-from pipeline.videos.audit.files import FOUND, check_files
+from pipeline.records import Finding, Part, Probe
+from pipeline.videos.audit.files import FOUND, by_rate, check_files
 from pipeline.videos.audit.labels import check_labels, similar_names
-from pipeline.videos.audit.leakage import check_leakage, evidence
+from pipeline.videos.audit.leakage import check_leakage, evidence, sessions
 from pipeline.videos.catalogue import Catalogue
 from tests.audit_records import ERROR, INFO, OBJECTS, OTHER, PHYSICLEAR, WARNING, leaks, odd, of, probe, probes
 from tests.audit_records import relabelled as relabel
@@ -92,6 +93,30 @@ def test_mixed_frame_rates_and_sizes_name_the_rarer() -> None:
         ("resolution", "640x480", "1 videos", "320x240"),
     ], "fifty frames at ten a second are not short: lengths are compared at one rate"
     assert ("frame rate", "25 frames/s", "21 videos") in [(f.check, f.item, f.measured) for f in findings]
+
+
+def jittered(seed: int) -> list[Probe]:
+    """Twelve videos of a camera at 30 frames a second whose time stamps jitter; one is dark and one is cut short."""
+    rates = 30 * (1 + np.random.default_rng(seed).uniform(-0.012, 0.012, 12))
+    found = [probe(f"{OBJECTS[i % 8]}_{i}", fps=rate, thumbnail=(90.0,) * 144) for i, rate in enumerate(rates)]
+    found[3] = probe("potato_3", fps=rates[3], thumbnail=(90.0,) * 144, brightness=40.0)
+    found[7] = probe("orange_7", fps=rates[7], thumbnail=(90.0,) * 144, frames=20, header_frames=20)
+    return found
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_time_stamps_that_jitter_are_one_rate_and_hide_nothing(seed: int) -> None:
+    findings = odd(check_files(jittered(seed), OTHER))
+    assert [(f.check, f.item) for f in findings] == [("length", "orange_7.mov"), ("brightness", "potato_3.mov")]
+    assert len(set(sessions(jittered(seed)))) == 1
+
+
+def test_rates_that_cameras_have_stay_apart() -> None:
+    """None is taken for its neighbour, among them what a container without a rate is given."""
+    cameras = [0.0, 5.0, 10.0, 12.5, 15.0, 20.0, 24.0, 25.0, 29.97, 48.0, 50.0, 60.0, 90.0, 120.0]
+    groups = by_rate([probe(f"rug_{i}", fps=rate) for i, rate in enumerate(cameras * 2)])
+    assert list(groups) == cameras
+    assert [len(group) for group in groups.values()] == [2] * len(cameras)
 
 
 def test_brightness_is_judged_by_the_spread_at_the_same_rate() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from statistics import fmean, median
 
@@ -23,6 +23,9 @@ STEP = 4.0
 SATURATED = 0.05
 IRREGULAR = 1.5
 """Longest over shortest distance between frames, from which a frame rate counts as variable."""
+SAME_RATE = 1.04
+"""Frame rates are one where neighbours differ by this factor at most, as time stamps jitter. 24 and 25, the nearest that
+cameras have, differ by 1.042."""
 DEVIATION = 1.4826
 """Median absolute deviation to standard deviation, for a normal distribution."""
 
@@ -32,9 +35,9 @@ def check_files(probes: Sequence[Probe], catalogue: Catalogue) -> Iterator[Findi
     if not probes:
         return
     yield from _overview(probes, catalogue)
-    for group in _by_rate(probes).values():
-        yield from _lengths(group)
-        yield from _brightness(group)
+    for rate, group in by_rate(probes).items():
+        yield from _lengths(rate, group)
+        yield from _brightness(rate, group)
     yield from _headers(probes)
     yield from _contact(probes)
 
@@ -70,7 +73,7 @@ def _overview(probes: Sequence[Probe], catalogue: Catalogue) -> Iterator[Finding
     mean = fmean(frames)
     yield _finding("length", "all", f"{min(frames)} to {max(frames)} frames, mean {mean:.1f}")
     for check, groups in (
-        ("frame rate", Counter(f"{p.fps:g} frames/s" for p in probes)),
+        ("frame rate", {f"{rate:.4g} frames/s": len(group) for rate, group in by_rate(probes).items()}),
         ("resolution", Counter(f"{p.width}x{p.height}" for p in probes)),
     ):
         usual = max(groups.items(), key=lambda item: (item[1], item[0]))[0]
@@ -78,28 +81,32 @@ def _overview(probes: Sequence[Probe], catalogue: Catalogue) -> Iterator[Finding
             yield _finding(check, name, f"{count} videos", "" if name == usual else usual, warn=name != usual)
 
 
-def _by_rate(probes: Sequence[Probe]) -> dict[float, list[Probe]]:
-    groups: dict[float, list[Probe]] = defaultdict(list)
-    for probe in probes:
-        groups[probe.fps].append(probe)
-    return groups
+def by_rate(probes: Sequence[Probe]) -> dict[float, list[Probe]]:
+    """The videos of each frame rate (`SAME_RATE`), by the median of what their headers say, the lowest first."""
+    groups: list[list[Probe]] = []
+    for probe in sorted(probes, key=lambda p: p.fps):
+        if groups and probe.fps <= SAME_RATE * groups[-1][-1].fps:
+            groups[-1].append(probe)
+        else:
+            groups.append([probe])
+    return {median(p.fps for p in group): group for group in groups}
 
 
-def _lengths(group: Sequence[Probe]) -> Iterator[Finding]:
+def _lengths(rate: float, group: Sequence[Probe]) -> Iterator[Finding]:
     usual = median(p.frames for p in group)
     for p in group:
         if p.frames < SHORT * usual:
-            expected = f"about {usual:g}, as others at {p.fps:g} frames/s"
+            expected = f"about {usual:g}, as others at {rate:.4g} frames/s"
             yield _finding("length", p.path, f"{p.frames} frames", expected, warn=True)
 
 
-def _brightness(group: Sequence[Probe]) -> Iterator[Finding]:
+def _brightness(rate: float, group: Sequence[Probe]) -> Iterator[Finding]:
     middle = median(p.brightness for p in group)
     # At least one step: where all videos are equally bright, rounding is no outlier.
     spread = max(1.0, DEVIATION * median(abs(p.brightness - middle) for p in group))
     for p in group:
         if abs(p.brightness - middle) > DARK_OR_BRIGHT * spread:
-            expected = f"{middle:.1f} +- {spread:.1f}, as others at {p.fps:g} frames/s"
+            expected = f"{middle:.1f} +- {spread:.1f}, as others at {rate:.4g} frames/s"
             yield _finding("brightness", p.path, f"{p.brightness:.1f} of 255", expected, warn=True)
 
 

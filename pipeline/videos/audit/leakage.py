@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.records import Assignment, Finding, Part, Probe, Severity
 from pipeline.runtime import derive_seed
-from pipeline.videos.audit.files import quiet_level, touches
+from pipeline.videos.audit.files import by_rate, quiet_level, touches
 from pipeline.videos.catalogue import Catalogue
 
 DUPLICATE = 0.965
@@ -72,12 +72,13 @@ def sessions(probes: Sequence[Probe]) -> list[str]:
     The untouched picture carries the sensor's gel, dust and light. Its brightness is taken off, since that drifts.
     """
     names = [p.session for p in probes]
+    rates = {p.video_id: rate for rate, group in by_rate([p for p in probes if not p.session]).items() for p in group}
     groups: dict[tuple[float, int, int], list[int]] = defaultdict(list)
     for place, p in enumerate(probes):
         if not p.session:
-            groups[p.fps, p.width, p.height].append(place)
-    for (fps, width, height), places in sorted(groups.items()):
-        label = f"{fps:g} frames/s, {width}x{height}"
+            groups[rates[p.video_id], p.width, p.height].append(place)
+    for (rate, width, height), places in sorted(groups.items()):
+        label = f"{rate:.4g} frames/s, {width}x{height}"
         pictures = np.array([probes[i].thumbnail for i in places]).reshape(len(places), -1, 3)
         pictures = (pictures - pictures.mean(1, keepdims=True)).reshape(len(places), -1)
         clusters = _clusters(pictures)
