@@ -44,6 +44,8 @@ QUIET = 0.1
 """Quantile of the strengths that is taken for the recording's quiet level."""
 ROUNDING = 0.1
 """Least quiet level, in 8-bit steps: under it a difference is rounding."""
+RATES = (1.0, 240.0)
+"""Frames a second of a video, at least and at most."""
 SHORTEST = 3
 """Frames of a press; what is shorter is a flicker."""
 
@@ -85,14 +87,14 @@ def import_bag(bag: Path, topic: str, out: Path, object_id: str, times: float = 
     """
     if re.fullmatch(r"[\w-]+", object_id) is None:
         raise UserError(f"--object {object_id!r}: take letters, digits, _ and -, as in objects.csv")
-    received, strengths = _measure(shots(bag, topic))
+    stamped, received, strengths = _measure(shots(bag, topic))
     ranges = presses(strengths, times)
     if not ranges:
         raise UserError(
             f"{bag}: nothing touches the sensor in {len(strengths)} pictures of {topic} (strongest difference "
             f"{strengths.max():.2f}, a press begins at {_threshold(strengths, times):.2f}); lower --times"
         )
-    fps = _rate(bag, received)
+    fps = _rate(bag, stamped, received)
     out.mkdir(parents=True, exist_ok=True)
     first, source, position, written = _next_number(out, object_id), shots(bag, topic), 0, []
     for number, (begin, end) in enumerate(ranges, first):
@@ -212,13 +214,16 @@ def _picture(message: Any, where: str) -> Image:
     return np.ascontiguousarray(np.broadcast_to(picture, (height, width, 3)))
 
 
-def _measure(source: Iterator[Shot]) -> tuple[list[int], npt.NDArray[np.float64]]:
-    """Times (ns) and contact strengths of all pictures, by the untouched picture at the beginning, else at the end.
+def _measure(source: Iterator[Shot]) -> tuple[list[int], list[int], npt.NDArray[np.float64]]:
+    """Stamps, times of arrival (ns) and contact strengths of all pictures.
+
+    Contact is measured by the untouched picture at the beginning, else at the end.
 
     First pictures in which the light still changes count as quiet.
     """
-    received, thumbs = list[int](), list[Image]()
+    stamped, received, thumbs = list[int](), list[int](), list[Image]()
     for shot in source:
+        stamped.append(shot.stamped)
         received.append(shot.recorded)
         frame = av.VideoFrame.from_ndarray(shot.picture, format="bgr24")
         thumbs.append(thumbnail(frame.reformat(format="yuv444p")))
@@ -226,7 +231,7 @@ def _measure(source: Iterator[Shot]) -> tuple[list[int], npt.NDArray[np.float64]
     first, last = _mean([thumbs[cold + i] for i in places]), _mean([thumbs[-1 - i] for i in places])
     reference = last if starts_touching(first, last) else first
     strengths = [contact_strength(thumb, reference) for thumb in thumbs[cold:]]
-    return received, np.array([min(strengths)] * cold + strengths)
+    return stamped, received, np.array([min(strengths)] * cold + strengths)
 
 
 def _mean(thumbs: Sequence[Image]) -> Image:
@@ -239,12 +244,19 @@ def _threshold(strengths: npt.NDArray[np.float64], times: float) -> float:
     return times * max(ROUNDING, float(np.quantile(strengths, QUIET)))
 
 
-def _rate(bag: Path, received: Sequence[int]) -> float:
-    """Frames a second, by the median distance of the times (ns)."""
-    gap = float(np.median(np.diff(received)))
-    if gap <= 0:
+def _rate(bag: Path, stamped: Sequence[int], received: Sequence[int]) -> float:
+    """Frames a second, by the stamps where they give a rate that a camera can have (`RATES`), else by arrival.
+
+    It is the median over all runs of `LONGEST` frames: messages arrive in bursts, recordings pause, clocks are set.
+    """
+    run = min(LONGEST, len(received) - 1)
+    by_stamp, by_arrival = (float(np.median(np.subtract(t[run:], t[:-run]))) / run for t in (stamped, received))
+    slowest, fastest = RATES
+    if by_stamp > 0 and slowest <= 1e9 / by_stamp <= fastest:
+        return round(1e9 / by_stamp, 3)
+    if by_arrival <= 0:
         raise UserError(f"{bag}: its pictures bear no rising times; record it again")
-    return min(240.0, max(1.0, round(1e9 / gap, 3)))
+    return min(fastest, max(slowest, round(1e9 / by_arrival, 3)))
 
 
 def _next_number(folder: Path, object_id: str) -> int:

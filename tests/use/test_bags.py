@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from pipeline.io import read_csv
 from pipeline.use.bags import QUIET, RELEASED, ROUNDING, SHORTEST, FrameTime, import_bag, presses, shots
 from pipeline.videos.audit.files import FOUND
 from pipeline.videos.catalogue import Catalogue
-from pipeline.videos.decoding import decode
+from pipeline.videos.decoding import Decoder, decode
 from pipeline.videos.files import list_videos
 from pipeline.videos.frames.reference import LONGEST
 from pipeline.videos.frames.scan import Scan, scan
@@ -49,10 +49,9 @@ def recording(height: int = 48, width: int = 64) -> list[np.ndarray]:
     return pictures
 
 
-def message(store: Any, picture: np.ndarray, encoding: str, index: int) -> tuple[Any, str]:
-    """A ROS message of a picture (BGR) and its type; rows are padded by five bytes."""
+def message(store: Any, picture: np.ndarray, encoding: str, index: int, at: int) -> tuple[Any, str]:
+    """A ROS message of a picture (BGR) with this stamp (ns) and its type; rows are padded by five bytes."""
     types = store.types
-    at = START_NS + index * STEP_NS - 3_000_000
     stamp = types["builtin_interfaces/msg/Time"](sec=at // 10**9, nanosec=at % 10**9)
     extra = {"seq": index} if "seq" in types["std_msgs/msg/Header"].__dataclass_fields__ else {}
     header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="gel", **extra)
@@ -67,8 +66,15 @@ def message(store: Any, picture: np.ndarray, encoding: str, index: int) -> tuple
     return types[kind](header=header, encoding=encoding, is_bigendian=0, data=padded.ravel(), **shape), kind
 
 
-def write_bag(folder: Path, kind: str, pictures: Sequence[np.ndarray], encoding: str = "bgr8") -> Path:
-    """A bag with a topic of images and one of text."""
+def write_bag(
+    folder: Path,
+    kind: str,
+    pictures: Sequence[np.ndarray],
+    encoding: str = "bgr8",
+    received: Callable[[int], int] = lambda index: START_NS + index * STEP_NS,
+    stamped: Callable[[int], int] = lambda index: START_NS + index * STEP_NS - 3_000_000,
+) -> Path:
+    """A bag with a topic of images and one of text; when (ns) each picture was received, and what its stamp says."""
     store = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
     bag = folder / ("touch.bag" if kind == "ros1" else f"touch_{kind}")
     plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
@@ -80,9 +86,9 @@ def write_bag(folder: Path, kind: str, pictures: Sequence[np.ndarray], encoding:
         writer.write(text, START_NS, serialize(said, "std_msgs/msg/String"))
         images = None
         for index, picture in enumerate(pictures):
-            sent, of = message(store, picture, encoding, index)
+            sent, of = message(store, picture, encoding, index, stamped(index))
             images = images or writer.add_connection(TOPIC, of, typestore=store)
-            writer.write(images, START_NS + index * STEP_NS, serialize(sent, of))
+            writer.write(images, received(index), serialize(sent, of))
     return bag
 
 
@@ -158,6 +164,35 @@ def test_a_warm_up_is_no_press(tmp_path: Path, pictures: list[np.ndarray]) -> No
         assert rows[0].recorded_ns == START_NS + begin * STEP_NS
         inside = [r.contact for r in rows if begin + r.frame in touched]
         assert min(inside) > 3 * max(r.contact for r in rows if begin + r.frame not in touched)
+
+
+EVEN, PAIRS = ((lambda step: lambda i: START_NS + i // step * step * STEP_NS + i % step * 1000)(n) for n in (1, 2))
+
+
+@pytest.mark.parametrize(
+    ("received", "stamped"),
+    [
+        (PAIRS, EVEN),
+        (lambda i: START_NS + 3 * i * STEP_NS, lambda i: i * STEP_NS),
+        (PAIRS, lambda i: 0),
+        (PAIRS, lambda i: START_NS),
+        (PAIRS, lambda i: START_NS + i),
+        (EVEN, lambda i: START_NS - i * STEP_NS),
+        (EVEN, lambda i: i * 10**12),
+        (EVEN, lambda i: EVEN(i) - (i > 50) * 10**10),
+    ],
+    ids=[
+        *("in pairs", "played slowly, by a simulation's clock", "no stamps", "one stamp", "numbers for stamps"),
+        *("stamps that fall", "stamps of another unit", "a clock that was set"),
+    ],
+)
+def test_the_rate_is_that_of_the_camera(
+    tmp_path: Path, pictures: list[np.ndarray], received: Callable[[int], int], stamped: Callable[[int], int]
+) -> None:
+    bag = write_bag(tmp_path, "mcap", pictures, received=received, stamped=stamped)
+    for video in import_bag(bag, TOPIC, tmp_path / "out", "rug"):
+        with Decoder(video) as decoder:
+            assert decoder.header.fps == 25
 
 
 def test_odd_sizes_are_written(tmp_path: Path) -> None:

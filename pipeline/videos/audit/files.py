@@ -24,8 +24,8 @@ SATURATED = 0.05
 IRREGULAR = 1.5
 """Longest over shortest distance between frames, from which a frame rate counts as variable."""
 SAME_RATE = 1.04
-"""Frame rates are one where neighbours differ by this factor at most, as time stamps jitter. 24 and 25, the nearest that
-cameras have, differ by 1.042."""
+"""Frame rates are one where neighbours differ by this factor at most, as time stamps jitter. 24 and 25, the nearest
+that cameras have, differ by 1.042."""
 DEVIATION = 1.4826
 """Median absolute deviation to standard deviation, for a normal distribution."""
 
