@@ -15,8 +15,6 @@ from dataclasses import dataclass, field
 from pipeline.errors import UserError
 
 logger = logging.getLogger(__name__)
-BUCKETS = (0.1, 0.3, 1, 3, 10, 30, 100)
-"""Upper ends in seconds of the histogram of answers."""
 
 
 class Failed(Exception):
@@ -32,26 +30,23 @@ class Metrics:
 
     requests: Counter[int] = field(default_factory=Counter)
     """By status."""
-    answers: list[float] = field(default_factory=lambda: [0.0] * (len(BUCKETS) + 1))
-    """How many took as long as each bucket and not less; the last has no end."""
+    answers: int = 0
     seconds: float = 0.0
+    """That the model took for them all."""
     videos: int = 0
 
     def answered(self, seconds: float) -> None:
         """Count an answer that took the model so long."""
-        self.answers[sum(seconds > end for end in BUCKETS)] += 1
+        self.answers += 1
         self.seconds += seconds
 
     @property
     def mean(self) -> float:
         """Seconds an answer; 1 before the first."""
-        return self.seconds / sum(self.answers) if any(self.answers) else 1.0
+        return self.seconds / self.answers if self.answers else 1.0
 
     def text(self, taken: int, places: int) -> str:
         """All of it; `taken` of `places` are in use."""
-        name = "octopi_answer_seconds"
-        ends = [*map(str, BUCKETS), "+Inf"]
-        counts = [sum(self.answers[: i + 1]) for i in range(len(ends))]
         lines = [
             "# TYPE octopi_requests_total counter",
             *(f'octopi_requests_total{{status="{s}"}} {n}' for s, n in sorted(self.requests.items())),
@@ -61,10 +56,9 @@ class Metrics:
             f"octopi_requests_waiting {taken}",
             "# TYPE octopi_requests_places gauge",
             f"octopi_requests_places {places}",
-            f"# TYPE {name} histogram",
-            *(f'{name}_bucket{{le="{end}"}} {count:.0f}' for end, count in zip(ends, counts, strict=True)),
-            f"{name}_sum {self.seconds:.6f}",
-            f"{name}_count {counts[-1]:.0f}",
+            "# TYPE octopi_answer_seconds summary",
+            f"octopi_answer_seconds_sum {self.seconds:.6f}",
+            f"octopi_answer_seconds_count {self.answers}",
         ]
         return "\n".join(lines) + "\n"
 
