@@ -31,8 +31,9 @@ def scale(
     """Choose what `dvc repro` runs: write params.yaml from conf/NAME.yaml and the overrides."""
     from pipeline.memory import count, table
     from pipeline.scales import check_inputs, compose, prune, write_params
-    from pipeline.stage import running_stages
+    from pipeline.stage import in_project, running_stages
 
+    in_project()
     if running := running_stages():
         raise UserError(f"{running[0]} is running, and would be recorded with other parameters; wait for it or stop it")
     params = compose(name, overrides or ())
@@ -90,7 +91,9 @@ def weights(
 def page() -> None:
     """Write reports/index.html, one page over all reports that opens from disk."""
     from pipeline.report.page import write_page
+    from pipeline.stage import in_project
 
+    in_project()
     file = write_page(Path())
     typer.echo(f"{file}: {file.stat().st_size / 1000:.0f} kB")
 
@@ -99,8 +102,10 @@ def page() -> None:
 def publish() -> None:
     """Show what lies in data/ and reports/ in MLflow, as `dvc repro` does at its end; a second call adds nothing."""
     from pipeline.params import load_params
+    from pipeline.stage import in_project
     from pipeline.tracking.publish import publish as to_mlflow
 
+    in_project()
     typer.echo(to_mlflow(load_params()))
 
 
@@ -184,7 +189,9 @@ def answer_with(
     from pipeline.evaluation.answer_with import Endpoint, ask_all
     from pipeline.params import load_params
     from pipeline.records import Shown
+    from pipeline.stage import in_project
 
+    in_project()
     if folder is None and shown == "photos":
         raise UserError("DIR: name the folder with photos, as in `--input photos DIR`")
     asked = Endpoint(endpoint.rstrip("/"), model, temperature, max_tokens, timeout)
@@ -195,7 +202,9 @@ def answer_with(
 def repro(context: typer.Context) -> None:
     """Run `dvc repro`: say how many stages will run, and write the page of all reports behind it."""
     from pipeline.reproduce import reproduce
+    from pipeline.stage import in_project
 
+    in_project()
     raise typer.Exit(reproduce(Path(), context.args))
 
 
@@ -209,7 +218,9 @@ def compare(
     from pipeline.compare import compare as compare_states
     from pipeline.compare import describe
     from pipeline.io import write_json
+    from pipeline.stage import in_project
 
+    in_project()
     found = compare_states(Path(), old, new)
     if json is not None:
         write_json(json, found)

@@ -17,10 +17,12 @@ from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import lru_cache, partial
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any, TypeVar
 
 from pipeline.config import Backend
 from pipeline.errors import UserError
+from pipeline.params import check_code
 from pipeline.runtime import DeviceName, cores, progress, track
 
 J = TypeVar("J")
@@ -175,6 +177,7 @@ def _on_ray(work: Callable[[J], R], jobs: Sequence[J], label: str, device: bool)
 def _there(folder: str, work: Callable[[J], R], job: J) -> R:
     """In a worker: jobs name files from the project's folder on."""
     os.chdir(folder)
+    check_code(Path())
     return work(job)
 
 

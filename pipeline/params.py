@@ -12,9 +12,26 @@ from pydantic import BaseModel, ValidationError
 from pipeline.config import Params
 from pipeline.errors import UserError, did_you_mean
 
-PARAMS_FILE = Path("params.yaml")
+PARAMS_FILE, CHAIN = Path("params.yaml"), Path("dvc.yaml")
+PACKAGE = Path(__file__).parent
 RENAMED = {"frames.size": "frames.pixels"}
 """What a parameter was called before, and what it is called now."""
+
+
+def project_above() -> str:
+    """The project's folder, where this is one within; empty where it is in none, or is it."""
+    above = (folder for folder in Path.cwd().parents if (folder / CHAIN).is_file())
+    return "" if CHAIN.is_file() else str(next(above, ""))
+
+
+def check_code(folder: Path) -> None:
+    """Raise UserError where a folder has a `pipeline` of its own, which dvc.lock records, and another one runs."""
+    own = folder / PACKAGE.name
+    if (own / "stage.py").is_file() and not own.samefile(PACKAGE):
+        raise UserError(
+            f"{PACKAGE} would run, but dvc.lock records {own.resolve()}; activate the environment of that folder "
+            "(`make install` there makes it)"
+        )
 
 
 def load_params(path: Path = PARAMS_FILE) -> Params:

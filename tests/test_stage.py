@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -23,6 +24,7 @@ from typer.testing import CliRunner
 from pipeline.cli import app
 from pipeline.errors import UserError
 from pipeline.io import atomic, load_tensors, read_json, read_jsonl, read_table, write_json, write_jsonl, write_table
+from pipeline.parallel import _there
 from pipeline.records import Assignment, Measurement, Part, Score, Video
 from pipeline.scales import compose, write_params
 from pipeline.stage import running_stages, stage
@@ -98,6 +100,80 @@ def test_parameters_that_change_while_a_stage_runs_are_no_silent_matter(here: Pa
     assert not (here / "runs/split.json").exists()
     with stage("split"):
         os.utime(here / "params.yaml")  # Written anew with the same values.
+
+
+@pytest.fixture
+def clone(tmp_path: Path) -> Path:
+    """Another clone of the project, in a path with a space, as far as a stage's start needs it."""
+    folder = tmp_path / "another clone"
+    for part in ("pipeline", "stages", "conf"):
+        shutil.copytree(ROOT / part, folder / part, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "dvc.yaml", folder)
+    write_params(compose("smoke", conf=ROOT / "conf"), folder / "params.yaml")
+    return folder
+
+
+def test_a_stage_runs_the_code_beside_it_or_refuses(clone: Path) -> None:
+    """Whichever environment is active, since dvc.lock records what lies in the project's folder."""
+    (linked := clone.with_name("linked clone")).symlink_to(clone)
+
+    def split(folder: Path, code: Path) -> tuple[str, str]:
+        command = [sys.executable, "stages/split.py"]
+        environment = {**os.environ, "PYTHONPATH": str(code)}
+        done = subprocess.run(command, cwd=folder, env=environment, text=True, capture_output=True, check=False)
+        assert done.returncode == 1
+        return done.stdout, done.stderr
+
+    for folder in (clone, linked):
+        started, stopped = split(folder, ROOT)
+        assert started == ""
+        assert stopped.count("\n") == 1
+        assert f"split: {ROOT / 'pipeline'} would run, but dvc.lock records {clone / 'pipeline'}" in stopped
+        for code in (clone, linked):
+            started, stopped = split(folder, code)
+            assert started == "split: starts (smoke-scenes)\n"
+            assert "data/videos.parquet: no such file" in stopped
+
+
+RECORDING = ["scale smoke", "repro", "publish", "page", "compare HEAD"]
+RECORDING += ["answer-with --endpoint http://a/v1 --model b --input frames"]
+
+
+@pytest.mark.parametrize("command", RECORDING)
+def test_commands_that_write_records_refuse_likewise(
+    clone: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    monkeypatch.chdir(clone)
+    before = sorted(clone.rglob("*"))
+    error = CliRunner().invoke(app, command.split()).exception
+    assert isinstance(error, UserError)
+    assert f"dvc.lock records {clone / 'pipeline'}" in str(error)
+    assert sorted(clone.rglob("*")) == before
+    with pytest.raises(UserError, match="dvc.lock records"):
+        _there(str(clone), len, "")  # In a worker of a cluster.
+    # A trained model may be asked wherever the package is installed.
+    assert "holds no trained model" in str(CliRunner().invoke(app, ["ask", "x"]).exception)
+
+
+@pytest.mark.parametrize("command", [*RECORDING, "ask x", "describe . --csv a.csv", "serve", "demo"])
+def test_a_command_in_a_wrong_folder_says_which_it_wants(
+    clone: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    uses_model = command.split()[0] in ("ask", "describe", "serve", "demo")
+    for folder, words in (
+        (clone / "pipeline/encoder", f"go to {clone}, the project's folder"),
+        (clone.parent, "holds no trained model" if uses_model else f"{clone.parent} has no dvc.yaml; go to"),
+    ):
+        monkeypatch.chdir(folder)
+        error = CliRunner().invoke(app, command.split()).exception
+        assert isinstance(error, UserError)
+        assert words in str(error)
+
+
+def test_a_stage_in_a_wrong_folder_says_which_it_wants(clone: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(clone / "stages")
+    with pytest.raises(SystemExit, match=f"go to {clone}, the project's folder"), stage("split"):
+        pass
 
 
 def test_no_scale_is_chosen_while_a_stage_runs(here: Path) -> None:

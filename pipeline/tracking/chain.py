@@ -21,12 +21,12 @@ import yaml
 from pipeline.config import Params
 from pipeline.errors import UserError
 from pipeline.io import read_json, read_table
-from pipeline.params import PARAMS_FILE
+from pipeline.params import CHAIN, PARAMS_FILE
 from pipeline.records import Encoder, Graded, Lora, Part, Touch, Variant, Video
 from pipeline.stage import DATA, RUNS
 from pipeline.tasks import TASKS
 
-REPORTS, CHAIN, CHAIN_LOCK = Path("reports"), Path("dvc.yaml"), Path("dvc.lock")
+REPORTS, CHAIN_LOCK = Path("reports"), Path("dvc.lock")
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import UserError
 from pipeline.io import write_text
+from pipeline.params import project_above
 from pipeline.runtime import progress
 from pipeline.use.results import Exchange, Video
 from pipeline.videos.files import SUFFIXES
@@ -35,7 +36,8 @@ def default_model(models: Path = MODELS) -> Path:
     """The full system's folder, or the first that there is; UserError where there is none."""
     found = sorted(models.glob(f"{PREFERRED}/config.json")) or sorted(models.glob("*/config.json"))
     if not found:
-        raise UserError(f"{models}: holds no trained model; `dvc repro` makes some, or name a folder with --model")
+        place = f"go to {above}, the project's folder" if (above := project_above()) else "`dvc repro` makes some"
+        raise UserError(f"{models}: holds no trained model; {place}, or name a folder with --model")
     return found[0].parent
 
 
