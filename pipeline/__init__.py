@@ -3,6 +3,7 @@
 import gc
 import importlib
 import os
+import sys
 from typing import Any
 
 # Read by OpenMP when torch loads. Its default lets waiting threads spin: on a busy machine, answering 57 questions on
@@ -12,6 +13,19 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 # A start imports a million objects that all stay. Looking for garbage among them every 700 took a fifth of the start of
 # a training stage (8.7 s against 7.1 s, median of four in turn).
 gc.set_threshold(100_000, 50, 1000)
+
+
+def _in_a_line(kind: Any, error: Any, trace: Any) -> None:
+    """Ctrl-C in a stage, which imports for seconds before it begins, is a line; all else is shown as ever."""
+    if not issubclass(kind, KeyboardInterrupt):
+        sys.__excepthook__(kind, error, trace)
+    elif os.environ.get("RANK", "0") == "0":
+        name = "@".join(filter(None, (os.path.basename(sys.argv[0])[:-3], "-".join(sys.argv[1:]))))
+        print(f"{name}: stopped; finished stages stay, and `octopi repro` goes on from there", file=sys.stderr)
+
+
+if os.path.basename(os.path.dirname(os.path.abspath(sys.argv[0]))) == "stages":
+    sys.excepthook = _in_a_line
 
 
 def __getattr__(name: str) -> Any:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
+from typer.core import TyperGroup
 
 from pipeline.errors import UserError
 
@@ -14,8 +15,24 @@ if TYPE_CHECKING:
     from pipeline.records import Finding
     from pipeline.use.model import Octopi
 
+
+class Commands(TyperGroup):
+    """Ends a command that Ctrl-C stops with one line."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """As typer's, which says nothing."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            typer.echo("octopi: stopped; what is finished stays, call it again to go on", err=True)
+            raise typer.Exit(130) from None
+
+
 app = typer.Typer(
-    help="Teach a language model the sense of touch.", no_args_is_help=True, pretty_exceptions_enable=False
+    cls=Commands,
+    help="Teach a language model the sense of touch.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
 )
 data_app = typer.Typer(help="Look at a folder of tactile videos.", no_args_is_help=True)
 app.add_typer(data_app, name="data")

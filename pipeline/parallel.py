@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import sys
 import threading
 import time
@@ -123,26 +124,32 @@ def _in_processes(work: Callable[[J], R], jobs: Sequence[J], label: str) -> Iter
     the caller's script needs a main guard.
     """
     context = multiprocessing.get_context("fork" if sys.platform == "linux" else None)
-    with ProcessPoolExecutor(
+    pool = ProcessPoolExecutor(
         min(cores(), len(jobs)), mp_context=context, initializer=end_with_parent, initargs=(os.getpid(),)
-    ) as pool:
-        # A few jobs at a time: handing over each alone costs as much as a tenth of decoding it.
-        results: Any = pool.map(work, jobs, chunksize=max(1, min(4, len(jobs) // (8 * cores()))))
-        done = 0
+    )
+    mask: Any = getattr(signal, "pthread_sigmask", lambda *_: ())  # Windows has none.
+    done = 0
+    try:
+        # Workers are born deaf to Ctrl-C: it is for this process, which ends them.
+        before = mask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
-            for result in results:
-                yield result
-                done += 1
-        except BrokenProcessPool:
-            raise _died(label, jobs[done]) from None
-        except KeyboardInterrupt:
-            # The others wait for what is being worked on; a person who presses Ctrl-C does not.
-            for worker in multiprocessing.active_children():
-                worker.terminate()
-            raise
-        except BaseException:
-            pool.shutdown(wait=True, cancel_futures=True)
-            raise
+            # A few jobs at a time: handing over each alone costs as much as a tenth of decoding it.
+            results: Any = pool.map(work, jobs, chunksize=max(1, min(4, len(jobs) // (8 * cores()))))
+        finally:
+            mask(signal.SIG_SETMASK, before)
+        for result in results:
+            yield result
+            done += 1
+    except BrokenProcessPool:
+        raise _died(label, jobs[done]) from None
+    except KeyboardInterrupt:
+        # The others wait for what is being worked on; a person who presses Ctrl-C does not.
+        pool.shutdown(wait=False, cancel_futures=True)
+        for worker in multiprocessing.active_children():
+            worker.terminate()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def _on_ray(work: Callable[[J], R], jobs: Sequence[J], label: str, device: bool) -> Iterator[R]:

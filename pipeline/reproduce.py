@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 from pipeline.errors import UserError
 from pipeline.params import load_params
 
 CHAIN, LOCK = "dvc.yaml", "dvc.lock"
+INTERRUPTED = ("exited with 130", "exited with -2")
+"""How DVC's error ends for a command that Ctrl-C ended, with and without a shell between."""
 
 
 def outdated(root: Path) -> tuple[int, int]:
@@ -42,14 +45,27 @@ def reproduce(root: Path, arguments: list[str]) -> int:
     """Run `dvc repro` with these arguments where anything changed; return its exit status."""
     from dvc.cli import main as dvc
 
+    stopped: list[BaseException] = []
+
+    def heard(record: logging.LogRecord) -> bool:
+        """Whether DVC's words are shown: a stage that Ctrl-C ended has said so itself."""
+        error = record.exc_info[1] if record.exc_info else None
+        if error and (isinstance(error, KeyboardInterrupt) or str(error.__cause__).endswith(INTERRUPTED)):
+            stopped.append(error)
+        return not stopped
+
     name = load_params(root / "params.yaml").report_name
     waiting, total = outdated(root)
     if waiting:
         print(f"{name}: up to {waiting} of {total} stages will run", flush=True)
     if waiting or arguments:
+        for handler in logging.getLogger("dvc").handlers:
+            handler.addFilter(heard)
         status = int(dvc(["repro", *arguments]))
+        if stopped and isinstance(stopped[0], KeyboardInterrupt):
+            raise KeyboardInterrupt
         if status:
-            return status
+            return 130 if stopped else status
     else:
         print(f"{name}: all {total} stages are up to date")
     print(f"Report: reports/{name}/README.md; all reports on one page: reports/index.html")

@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 from pipeline.cli import app
 from pipeline.params import load_params
+from pipeline.scales import compose, write_params
 from tests.closure import ROOT
 from tests.conftest import moving_square, write_video
 
@@ -59,6 +60,29 @@ def test_scale_names_the_objects_that_nothing_can_be_asked_about(project: Path) 
         assert result.exit_code == 0, result.output
         said = [line for line in result.output.splitlines() if "have no videos" in line]
         assert said == ([f"split.name=paper: {words}"] if words else [])
+
+
+@pytest.mark.parametrize(
+    ("command", "inner"),
+    [
+        ("scale smoke", "pipeline.scales.compose"),
+        ("repro", "pipeline.reproduce.outdated"),
+        ("data audit .", "pipeline.videos.audit.run.audit_folder"),
+        ("answer-with --endpoint http://a/v1 --model b --input frames", "pipeline.evaluation.answer_with.ask_all"),
+        *((f"{use} --model .", "pipeline.use.model.Octopi.from_pretrained") for use in ("ask a", "describe . --csv a")),
+        *((f"{show} .", "pipeline.use.model.Octopi.from_pretrained") for show in ("serve", "demo")),
+    ],
+)
+def test_ctrl_c_is_one_line(project: Path, monkeypatch: pytest.MonkeyPatch, command: str, inner: str) -> None:
+    write_params(compose("smoke"))
+
+    def stopped(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(inner, stopped)
+    result = RUNNER.invoke(app, command.split())
+    assert (result.exit_code, result.stdout) == (130, "")
+    assert result.stderr == "octopi: stopped; what is finished stays, call it again to go on\n"
 
 
 def lines(output: str, severity: str) -> list[str]:

@@ -94,6 +94,49 @@ def test_stage_runs_once_at_a_time(here: Path) -> None:
         pass
 
 
+CHAIN = """\
+stages:
+  first: {cmd: touch first.txt, outs: [first.txt]}
+  slow: {cmd: python stages/slow.py, deps: [first.txt]}
+"""
+RUNNING = "from pipeline.stage import stage\nwith stage('slow'):\n    time.sleep(600)"
+IMPORTING = "import pipeline\nprint('slow: starts', flush=True)\ntime.sleep(600)"
+IN_WORKERS = """from pipeline.parallel import run_parallel
+from pipeline.stage import stage
+with stage('slow'):
+    list(run_parallel(time.sleep, [600] * 64, '', ''))"""
+
+
+@pytest.mark.parametrize("body", [RUNNING, IMPORTING, IN_WORKERS])
+def test_ctrl_c_in_a_chain_is_one_line_and_what_is_finished_stays(here: Path, body: str) -> None:
+    (here / "dvc.yaml").write_text(CHAIN)
+    (here / "stages").mkdir()
+    (here / "stages/slow.py").write_text(f"import time\n{body}\n")
+    programs, place = Path(sys.executable).parent, {"GIT_CONFIG_GLOBAL": os.devnull, "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, **place, "PATH": f"{programs}{os.pathsep}{os.environ['PATH']}", "SHELL": "/bin/sh"}
+    subprocess.run("git init -q && dvc init -q", shell=True, check=True, env=environment)
+    # As a terminal does it, to every process at once; `dvc` adds an ERROR of its own.
+    for command, more, status in ((["octopi", "repro"], [], 130), (["dvc", "repro"], ["ERROR"], 255)):
+        process = subprocess.Popen(
+            command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+            env=environment,
+        )
+        assert process.stdout
+        while "slow: starts" not in (line := process.stdout.readline()):
+            assert line, "it ended"
+        os.killpg(process.pid, signal.SIGINT)
+        rest = process.communicate(timeout=120)[0].splitlines()
+        assert rest[0] == "slow: stopped; finished stages stay, and `octopi repro` goes on from there"
+        assert [line.split(":")[0] for line in rest[1:]] == more
+        assert process.returncode == status
+        assert (here / "first.txt").exists()
+        assert list(yaml.safe_load((here / "dvc.lock").read_text())["stages"]) == ["first"]
+
+
 def test_parameters_that_change_while_a_stage_runs_are_no_silent_matter(here: Path) -> None:
     with pytest.raises(SystemExit, match=r"params.yaml was changed while it ran"), stage("split"):
         write_params(compose("smoke", ["seed=1"], conf=ROOT / "conf"), here / "params.yaml")
