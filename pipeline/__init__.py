@@ -19,9 +19,11 @@ def _in_a_line(kind: Any, error: Any, trace: Any) -> None:
     """Ctrl-C in a stage, which imports for seconds before it begins, is a line; all else is shown as ever."""
     if not issubclass(kind, KeyboardInterrupt):
         sys.__excepthook__(kind, error, trace)
-    elif os.environ.get("RANK", "0") == "0":
+        return
+    if os.environ.get("RANK", "0") == "0":
         name = "@".join(filter(None, (os.path.basename(sys.argv[0])[:-3], "-".join(sys.argv[1:]))))
         print(f"{name}: stopped; finished stages stay, and `octopi repro` goes on from there", file=sys.stderr)
+    raise SystemExit(130)
 
 
 if os.path.basename(os.path.dirname(os.path.abspath(sys.argv[0]))) == "stages":

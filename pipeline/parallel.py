@@ -31,6 +31,8 @@ M = TypeVar("M")
 R = TypeVar("R")
 
 _chosen: Backend = "processes"
+MOST_SECONDS = 5.0
+"""That a worker may take to hand over a result before it is ended."""
 
 
 def use_backend(name: Backend) -> None:
@@ -144,7 +146,12 @@ def _in_processes(work: Callable[[J], R], jobs: Sequence[J], label: str) -> Iter
         raise _died(label, jobs[done]) from None
     except KeyboardInterrupt:
         # The others wait for what is being worked on; a person who presses Ctrl-C does not.
-        pool.shutdown(wait=False, cancel_futures=True)
+        # Not while one hands over a result, of which the pool would wait for the other half.
+        handing: Any = pool._result_queue._wlock  # type: ignore[attr-defined]
+        if handing is not None:
+            handing.acquire(timeout=MOST_SECONDS)
+        # The pool's own thread then trips over jobs that are both cancelled and lost.
+        threading.excepthook = lambda _: None
         for worker in multiprocessing.active_children():
             worker.terminate()
         raise

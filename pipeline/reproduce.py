@@ -10,7 +10,7 @@ from pipeline.params import load_params
 
 CHAIN, LOCK = "dvc.yaml", "dvc.lock"
 INTERRUPTED = ("exited with 130", "exited with -2")
-"""How DVC's error ends for a command that Ctrl-C ended, with and without a shell between."""
+"""How DVC's error ends for a stage that Ctrl-C ended, the second where it had hardly begun or was at its end."""
 
 
 def outdated(root: Path) -> tuple[int, int]:

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import psutil
@@ -99,42 +100,57 @@ stages:
   first: {cmd: touch first.txt, outs: [first.txt]}
   slow: {cmd: python stages/slow.py, deps: [first.txt]}
 """
-RUNNING = "from pipeline.stage import stage\nwith stage('slow'):\n    time.sleep(600)"
-IMPORTING = "import pipeline\nprint('slow: starts', flush=True)\ntime.sleep(600)"
-IN_WORKERS = """from pipeline.parallel import run_parallel
-from pipeline.stage import stage
-with stage('slow'):
-    list(run_parallel(time.sleep, [600] * 64, '', ''))"""
+IMPORTING = "import pipeline\nprint('now', flush=True)\ntime.sleep(600)"
+RUNNING = "from pipeline.stage import stage\nwith stage('slow'):\n    print('now', flush=True)\n    time.sleep(600)"
+WORKERS = "from pipeline.parallel import run_parallel\n"
+SLEEPING = f"{WORKERS}print('now', flush=True)\nlist(run_parallel(time.sleep, [600] * 64, '', ''))"
+# So much to hand over that a worker is always in the middle of it.
+TELLING = (
+    f"{WORKERS}for i, _ in enumerate(run_parallel(bytes, [1 << 22] * 9000, '', '')):\n    i or print('now', flush=True)"
+)
+STOPPED = "slow: stopped; finished stages stay, and `octopi repro` goes on from there"
 
 
-@pytest.mark.parametrize("body", [RUNNING, IMPORTING, IN_WORKERS])
+def interrupted(folder: Path, *command: str) -> tuple[int, list[str]]:
+    """Run a command, press Ctrl-C when `now` is printed, and give its status and the lines from there on."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "SHELL": "/bin/sh"}
+    environment["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    process = subprocess.Popen(
+        command, cwd=folder, env=environment, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
+    )  # fmt: skip
+    try:
+        assert process.stdout
+        while (line := process.stdout.readline()) != "now\n":
+            assert line, "it ended"
+        # As a terminal does it: to every process at once.
+        os.killpg(process.pid, signal.SIGINT)
+        lines = process.communicate(timeout=300)[0].splitlines()
+        return process.returncode, lines
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+
+
+@pytest.mark.parametrize("body", [IMPORTING, RUNNING])
 def test_ctrl_c_in_a_chain_is_one_line_and_what_is_finished_stays(here: Path, body: str) -> None:
     (here / "dvc.yaml").write_text(CHAIN)
     (here / "stages").mkdir()
     (here / "stages/slow.py").write_text(f"import time\n{body}\n")
-    programs, place = Path(sys.executable).parent, {"GIT_CONFIG_GLOBAL": os.devnull, "PYTHONPATH": str(ROOT)}
-    environment = {**os.environ, **place, "PATH": f"{programs}{os.pathsep}{os.environ['PATH']}", "SHELL": "/bin/sh"}
-    subprocess.run("git init -q && dvc init -q", shell=True, check=True, env=environment)
-    # As a terminal does it, to every process at once; `dvc` adds an ERROR of its own.
-    for command, more, status in ((["octopi", "repro"], [], 130), (["dvc", "repro"], ["ERROR"], 255)):
-        process = subprocess.Popen(
-            command,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            start_new_session=True,
-            env=environment,
-        )
-        assert process.stdout
-        while "slow: starts" not in (line := process.stdout.readline()):
-            assert line, "it ended"
-        os.killpg(process.pid, signal.SIGINT)
-        rest = process.communicate(timeout=120)[0].splitlines()
-        assert rest[0] == "slow: stopped; finished stages stay, and `octopi repro` goes on from there"
-        assert [line.split(":")[0] for line in rest[1:]] == more
-        assert process.returncode == status
-        assert (here / "first.txt").exists()
-        assert list(yaml.safe_load((here / "dvc.lock").read_text())["stages"]) == ["first"]
+    subprocess.run("git init -q && python -m dvc init -q", shell=True, check=True)
+    assert interrupted(here, "octopi", "repro") == (130, [STOPPED])
+    assert (here / "first.txt").exists()
+    assert list(yaml.safe_load((here / "dvc.lock").read_text())["stages"]) == ["first"]
+    _, lines = interrupted(here, "dvc", "repro")
+    assert lines[0] == STOPPED
+    assert [line.split(":")[0] for line in lines[1:]] == ["ERROR"], "DVC's own"
+
+
+@pytest.mark.parametrize("body", [SLEEPING, *[TELLING] * 3])
+def test_ctrl_c_ends_the_processes_of_a_stage(tmp_path: Path, body: str) -> None:
+    (tmp_path / "stages").mkdir()
+    (tmp_path / "stages/slow.py").write_text(f"import time\n{body}\n")
+    assert interrupted(tmp_path, sys.executable, "stages/slow.py") == (130, [STOPPED])
 
 
 def test_parameters_that_change_while_a_stage_runs_are_no_silent_matter(here: Path) -> None:
