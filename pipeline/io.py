@@ -7,9 +7,11 @@ Tables are Parquet with one column a field, dialogues are JSON lines, weights ar
 from __future__ import annotations
 
 import csv
+import glob
 import hashlib
 import json
 import os
+import re
 import shutil
 import types
 import typing
@@ -29,6 +31,8 @@ if TYPE_CHECKING:
     import torch
 
 R = TypeVar("R", bound=Record)
+REST = re.compile(r"\..+\.(\d{1,9})\.part(\.\w+)?")
+"""What a process, by its number, is writing: the name that it will have, between dots."""
 
 
 @contextmanager
@@ -44,19 +48,30 @@ def atomic(path: Path) -> Iterator[Path]:
 
 
 def remove_rests(folder: Path) -> None:
-    """Remove the temporary files in a folder whose process was killed; nothing else would ever do it."""
+    """Remove what killed processes were writing anywhere below a folder; nothing else would ever do it."""
+    for place, folders, files in os.walk(folder):  # It passes over what vanishes meanwhile.
+        for name in (*folders, *files):
+            _remove_rest(Path(place, name))
+
+
+def _remove_rest(path: Path) -> None:
     import psutil
 
-    for rest in folder.glob(".*.part"):
-        process = rest.stem.rpartition(".")[2]
-        if process.isdecimal() and not psutil.pid_exists(int(process)):
-            rest.unlink(missing_ok=True)
+    process = REST.fullmatch(path.name)
+    if process is None or psutil.pid_exists(int(process[1])):
+        return
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
 
 
 @contextmanager
 def atomic_folder(folder: Path) -> Iterator[Path]:
     """Give an empty folder beside `folder` that takes its place if the block succeeds; a killed one's rest goes."""
-    temporary = folder.with_name(f".{folder.name}.part")
+    for rest in folder.parent.glob(f".{glob.escape(folder.name)}.*.part"):
+        _remove_rest(rest)
+    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.part")
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(parents=True)
     try:

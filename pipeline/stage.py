@@ -150,7 +150,8 @@ def stage(name: str, key: str | None = None, *, launched: bool = False) -> Itera
             limit_threads(running.params.runtime.threads)
             use_backend(running.params.runtime.parallel)
             if _main_process():
-                remove_rests(DATA)
+                for folder in (DATA, RUNS, Path("reports"), Path("models")):
+                    remove_rests(folder)
                 print(f"{full}: starts ({running.params.report_name})", flush=True)
             yield running
             if load_params() != running.params:

@@ -24,7 +24,17 @@ from typer.testing import CliRunner
 
 from pipeline.cli import app
 from pipeline.errors import UserError
-from pipeline.io import atomic, load_tensors, read_json, read_jsonl, read_table, write_json, write_jsonl, write_table
+from pipeline.io import (
+    atomic,
+    atomic_folder,
+    load_tensors,
+    read_json,
+    read_jsonl,
+    read_table,
+    write_json,
+    write_jsonl,
+    write_table,
+)
 from pipeline.parallel import _there
 from pipeline.records import Assignment, Measurement, Part, Score, Video
 from pipeline.scales import compose, write_params
@@ -349,12 +359,37 @@ def test_a_stage_removes_what_killed_ones_were_writing(here: Path) -> None:
     kill += "; t = atomic(Path('data/graded.parquet')).__enter__(); t.write_text('half'); os.kill(os.getpid(), 9)"
     assert subprocess.run([sys.executable, "-c", kill], cwd=here, check=False).returncode == -9
     (rest,) = (here / "data").iterdir()
-    others = [here / "data" / f".x.{os.getpid()}.part", here / "data" / ".frames.part", here / "data" / "x.1.csv"]
-    for other in others:
-        other.touch()
+    dead = rest.name.split(".")[-2]
+    rests = [rest]
+    for folder in ("data", "data/encoder/0", "reports/smoke-scenes/figures", "models", "runs"):
+        (here / folder).mkdir(parents=True, exist_ok=True)
+        others = [here / folder / name for name in (f".x.{os.getpid()}.part", ".frames.part", f"x.{dead}.csv")]
+        for other in others:
+            other.touch()
+        rests += [here / folder / name for name in (f".b.npy.{dead}.part", f".c.{dead}.part.mp4")]
+        for made in rests[-2:]:
+            made.touch()
+        rests.append(here / folder / f".d.{dead}.part")
+        (rests[-1] / "within").mkdir(parents=True)
+    kept = {f for f in here.rglob("*") if f.is_file()} - set(rests)
     with stage("grade"):
-        assert not rest.exists()
-    assert sorted((here / "data").iterdir()) == sorted(others)
+        assert not [rest for rest in rests if rest.exists()]
+    assert not kept - set(here.rglob("*")), "a living process's, and what is none"
+
+
+def test_a_folder_that_was_killed_is_made_anew_and_one_in_the_making_left_alone(tmp_path: Path) -> None:
+    kill = "import os; from pathlib import Path; from pipeline.io import atomic_folder"
+    kill += "; making = atomic_folder(Path('[a]')); (making.__enter__() / 'half').touch(); os.kill(os.getpid(), 9)"
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    assert subprocess.run([sys.executable, "-c", kill], cwd=tmp_path, env=env, check=False).returncode == -9
+    (rest,) = tmp_path.iterdir()
+    living, other = tmp_path / f".[a].{os.getppid()}.part", rest.with_name(rest.name.replace("[a]", "a"))
+    living.mkdir()
+    other.mkdir()
+    with atomic_folder(tmp_path / "[a]") as made:
+        (made / "whole").touch()
+    assert set(tmp_path.iterdir()) == {tmp_path / "[a]", living, other}
+    assert os.listdir(tmp_path / "[a]") == ["whole"]
 
 
 def test_tables_come_back_as_they_went(tmp_path: Path) -> None:

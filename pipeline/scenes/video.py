@@ -70,7 +70,7 @@ def synthesize(recipes: Mapping[str, Recipe], config: ScenesConfig, folder: Path
     folder.mkdir(parents=True, exist_ok=True)
     rows = []
     # A video waits in a hidden folder until it is whole.
-    with tempfile.TemporaryDirectory(prefix=".", dir=folder) as staging:
+    with tempfile.TemporaryDirectory(f".{os.getpid()}.part", ".", folder) as staging:
         jobs = [
             _Job(recipes[o], config, derive_seed(config.seed, o, n), o, f"{o}_{n}.mp4", Path(staging))
             for o in sorted(set(config.objects) or recipes)

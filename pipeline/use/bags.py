@@ -20,7 +20,7 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from pipeline.errors import UserError
-from pipeline.io import atomic, write_csv
+from pipeline.io import atomic, remove_rests, write_csv
 from pipeline.records import Record
 from pipeline.scenes.film import write_film
 from pipeline.videos.audit.files import FOUND
@@ -96,6 +96,7 @@ def import_bag(bag: Path, topic: str, out: Path, object_id: str, times: float = 
         )
     fps = _rate(bag, stamped, received)
     out.mkdir(parents=True, exist_ok=True)
+    remove_rests(out)
     first, source, position, written = _next_number(out, object_id), shots(bag, topic), 0, []
     for number, (begin, end) in enumerate(ranges, first):
         for _ in range(begin - position):

@@ -232,8 +232,9 @@ def test_a_failure_in_the_middle_leaves_what_was_there(
 
 
 def test_what_a_killed_process_left_is_cleared(tmp_path: Path) -> None:
-    (tmp_path / ".tiny-clip.part").mkdir()
-    (tmp_path / ".tiny-clip.part" / "half").write_text("half")
+    rest = tmp_path / f".tiny-clip.{999_999_999}.part"  # No process has that number.
+    rest.mkdir()
+    (rest / "half").write_text("half")
     make("tiny-clip", tmp_path / "tiny-clip")
     assert [f.name for f in tmp_path.iterdir()] == ["tiny-clip"]
     assert not (tmp_path / "tiny-clip" / "half").exists()
