@@ -159,7 +159,7 @@ class EncoderConfig(Section):
     """`paper`: CLIP with visual prompts, three heads. `release`: the same as the published code has it. `tuned`: a
     frame classifier on the features of any backbones, then their last stage, or prompts, with it."""
     backbone: tuple[str, ...] = Field(default=("clip",), min_length=1)
-    """Names in `pipeline.encoder.backbones.BACKBONES`; of several, features stand side by side. `clip`: a ViT of
+    """Names in `pipeline.weights.BACKBONES`; of several, features stand side by side. `clip`: a ViT of
     open_clip's. `timm`: a network of timm's. `scenes`: the one that the chain pretrains (section `pretrain`)."""
     weights: str
     """Folder of `clip` in open_clip's format (open_clip_config.json and open_clip_model.safetensors), or of `timm` in

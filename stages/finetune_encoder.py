@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-from pipeline.config import PRETRAINED
 from pipeline.encoder.clips import EncoderData, classify
 from pipeline.encoder.finetune import finetune, write_encoder_card
 from pipeline.io import read_table, write_table
@@ -13,7 +12,7 @@ from pipeline.tracking.live import live
 from pipeline.training.trainable import save_trainable
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.frames.store import REFERENCES_FILE, TABLE_FILE, FrameStore
-from pipeline.weights import check_encoder, clip_file
+from pipeline.weights import backbone_files, check_encoder
 
 
 def main() -> None:
@@ -29,9 +28,7 @@ def main() -> None:
             per_video=params.frames.per_video,
         )
         inputs = [DATA / "frames" / name for name in (TABLE_FILE, REFERENCES_FILE)] + [split]
-        inputs.append(clip_file(Path(params.encoder.weights)))
-        if "scenes" in params.encoder.backbone:
-            inputs.append(PRETRAINED)
+        inputs += backbone_files(params.encoder)
         with live(run) as callbacks:
             model, history = finetune(
                 data,

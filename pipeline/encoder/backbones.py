@@ -1,4 +1,4 @@
-"""The registry of backbones. A new one is a module with `load_backbone(config, *, tuned)` and a line in `BACKBONES`."""
+"""Loading of backbones. A new one is a module with `load_backbone(config, *, tuned)` and an entry in `BACKBONES`."""
 
 from __future__ import annotations
 
@@ -8,16 +8,10 @@ from typing import TYPE_CHECKING
 
 from pipeline.config import EncoderConfig
 from pipeline.errors import UserError, did_you_mean
+from pipeline.weights import BACKBONES
 
 if TYPE_CHECKING:
     from pipeline.encoder.model import FrameEncoder
-
-BACKBONES = {
-    "clip": "pipeline.encoder.model",
-    "timm": "pipeline.encoder.timm_backbone",
-    "scenes": "pipeline.encoder.scene_encoder",
-}
-"""Values in `encoder.backbone` and their modules: named, not imported, as `octopi scale` checks them without torch."""
 
 
 def check_backbones(names: Sequence[str]) -> None:
@@ -40,4 +34,4 @@ def load_backbones(config: EncoderConfig, *, tuned: bool = False) -> list[FrameE
         UserError: for an unknown name, or weights that are missing or do not fit.
     """
     check_backbones(config.backbone)
-    return [import_module(BACKBONES[name]).load_backbone(config, tuned=tuned) for name in config.backbone]
+    return [import_module(BACKBONES[name].module).load_backbone(config, tuned=tuned) for name in config.backbone]

@@ -74,11 +74,11 @@ def check_candidates(names: Sequence[str], config: EncoderConfig, size: int) -> 
             hint = did_you_mean(name, CANDIDATES)
             raise UserError(f"cross_validation.models: {name} is no model; {hint}known: {', '.join(CANDIDATES)}")
         candidate = CANDIDATES[name]
-        if "clip" in candidate.backbone:
-            try:
-                check_encoder(Path(config.weights), size, ("clip",))
-            except UserError as error:
-                raise UserError(f"cross_validation.models: {name} needs a CLIP; leave it out, or: {error}") from None
+        try:
+            check_encoder(Path(config.weights), size, candidate.backbone)
+        except UserError as error:
+            needed = " and ".join(candidate.backbone)
+            raise UserError(f"cross_validation.models: {name} needs {needed}; leave it out, or: {error}") from None
         if candidate.settings_of not in ("", config.recipe):
             raise UserError(
                 f"cross_validation.models: {name} would be trained with the settings of "

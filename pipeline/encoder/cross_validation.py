@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.config import PRETRAINED, CrossValidationConfig, EncoderConfig, RuntimeConfig
+from pipeline.config import CrossValidationConfig, EncoderConfig, RuntimeConfig
 from pipeline.encoder.baseline.predictor import Labels
 from pipeline.encoder.baseline.validation import Fold, Predict, cross_validate, deal, forest
 from pipeline.encoder.candidates import Candidate
@@ -24,7 +24,7 @@ from pipeline.records import Assignment, OutOfFold, Part, Probe, Video
 from pipeline.runtime import CHECKPOINTS, derive_seed, limit_threads, progress, resolve_device, seed_everything
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import PROBES_FILE, REFERENCES_FILE, TABLE_FILE, FrameStore
-from pipeline.weights import clip_file
+from pipeline.weights import BACKBONES
 
 if TYPE_CHECKING:
     from pipeline.encoder.clips import EncoderData
@@ -68,8 +68,9 @@ class CrossValidationData:
     @property
     def files(self) -> list[Path]:
         """What results depend on besides the catalogue and the parameters."""
-        files = [self.frames / TABLE_FILE, self.frames / REFERENCES_FILE, clip_file(Path(self.encoder.weights))]
-        return [*files, *([PRETRAINED] if PRETRAINED.is_file() else [])]
+        files = [self.frames / TABLE_FILE, self.frames / REFERENCES_FILE]
+        weights = (file for known in BACKBONES.values() for file in known.files(known.place(self.encoder)))
+        return files + [file for file in weights if file.is_file()]
 
     def store(self, candidate: Candidate) -> FrameStore:
         """The frames as the candidate sees them."""

@@ -18,7 +18,7 @@ import torch
 from torch.utils.data import default_collate
 
 from pipeline.card import write_card
-from pipeline.config import PRETRAINED, EncoderConfig, RuntimeConfig
+from pipeline.config import EncoderConfig, RuntimeConfig
 from pipeline.encoder.clips import ClipDataset, EncoderData, LabelledVideo
 from pipeline.encoder.frame_classifier import Clips, JointFrameClassifier, choose_strength, fit_frame_heads
 from pipeline.encoder.model import PropertyClassifier, SideBySide
@@ -29,6 +29,7 @@ from pipeline.runtime import resolve_device, seed_everything
 from pipeline.training.sampling import EpochDataset
 from pipeline.training.trainable import trainable_state
 from pipeline.videos.catalogue import Catalogue
+from pipeline.weights import BACKBONES
 
 if TYPE_CHECKING:
     from transformers import EvalPrediction, TrainerCallback
@@ -193,18 +194,14 @@ def train_classifier(
 
 def write_encoder_card(folder: Path, data: EncoderData, config: EncoderConfig, seed: int, source: str) -> None:
     """Write the card of a fine-tuned encoder beside it."""
-    bases = {name: Path(config.weights) for name in config.backbone if name != "scenes"}
-    if "scenes" in config.backbone:
-        bases["scenes"] = PRETRAINED
     names = [p.name for p in data.catalogue.properties]
     training = [a for a in data.assignments if a.part == Part.TRAIN]
-    unused = {"weights", "standardize", "embed_batch_size"}
-    unused |= set() if "clip" in config.backbone else {"prompts", "prompt_layers"}
-    unused |= set() if "timm" in config.backbone else {"feature_stage"}
+    own = {key for name in config.backbone for key in BACKBONES[name].settings}
+    unused = {"weights", "standardize", "embed_batch_size"} | {k for b in BACKBONES.values() for k in b.settings} - own
     write_card(
         folder,
         f"Tactile encoder with property heads, recipe {config.recipe}",
-        bases=bases,
+        bases={name: BACKBONES[name].place(config) for name in config.backbone},
         data={
             f"training videos ({source})": len(training),
             "training objects": len({a.object_id for a in training}),

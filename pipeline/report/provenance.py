@@ -21,6 +21,7 @@ from pipeline.io import sha256, tensor_shapes
 from pipeline.params import PARAMS_FILE
 from pipeline.records import Assignment, Part, Video
 from pipeline.videos.catalogue import Catalogue
+from pipeline.weights import BACKBONES
 
 CODE = ("pipeline", "stages", "conf", "dvc.yaml")
 """What a result can depend on. A commit of a report alone does not change its revision."""
@@ -111,19 +112,12 @@ def beyond_paper(params: Params) -> dict[str, Any]:
     }
 
 
-BACKBONE_WORDS = {
-    "clip": "the base CLIP with visual prompts",
-    "timm": "the network of encoder.weights",
-    "scenes": "a convolutional network with synthetic pretraining",
-}
-
-
 def encoder_words(config: EncoderConfig) -> str:
     """What the fine-tuned tactile encoder is, in words."""
     words = {
         "paper": "the base CLIP with visual prompt tuning",
         "release": "the base CLIP with visual prompt tuning as the published code has it",
-        "tuned": " beside ".join(BACKBONE_WORDS.get(n, n) for n in config.backbone) + ", tuned on the properties",
+        "tuned": " beside ".join(BACKBONES[name].words for name in config.backbone) + ", tuned on the properties",
     }.get(config.recipe, f"an encoder of the recipe `{config.recipe}`")
     return words + (" on pictures of the difference to the untouched gel" if config.reference == "subtract" else "")
 

@@ -43,7 +43,7 @@ from pipeline.use.folder import (
 from pipeline.videos.audit.files import quiet_level
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.frames.store import PROBES_FILE
-from pipeline.weights import CLIP_CONFIG, TIMM_CONFIG, TIMM_WEIGHTS, clip_file
+from pipeline.weights import backbone_files
 
 LIBRARIES = ("octopi-pipeline", "torch", "transformers", "peft", "open_clip_torch", "timm", "av")
 LIMITS = (
@@ -172,16 +172,11 @@ def _copy(source: Path, to: Path) -> None:
 
 def _copy_encoder(folder: Path, params: Params, trained: Path) -> None:
     _copy(trained / TRAINED, folder / TRAINED)
-    weights = Path(params.encoder.weights)
-    files: list[Path] = []
-    if "clip" in params.encoder.backbone:
-        files += [weights / CLIP_CONFIG, clip_file(weights)]
-    if "timm" in params.encoder.backbone:
-        files += [weights / TIMM_CONFIG, weights / TIMM_WEIGHTS]
-    for file in {*files, *(f for f in (weights / CARD_FILE,) if files and f.is_file())}:
-        _copy(file, folder / BACKBONE_DIR / file.name)
-    if "scenes" in params.encoder.backbone:
-        _copy(PRETRAINED, folder / SCENES)
+    files, card = backbone_files(params.encoder), Path(params.encoder.weights) / CARD_FILE
+    if card.is_file() and any(file.parent == card.parent for file in files):
+        files.append(card)
+    for file in files:
+        _copy(file, folder / SCENES if file == PRETRAINED else folder / BACKBONE_DIR / file.name)
 
 
 def _write_card(

@@ -6,11 +6,12 @@ Folders below data/weights/ are made by the stage `weights` (pipeline.weights.ma
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
+from pipeline.config import EncoderConfig
 from pipeline.errors import UserError
 from pipeline.io import tensor_shapes
 
@@ -93,14 +94,14 @@ def check_encoder(folder: Path, size: int, backbone: Collection[str]) -> None:
     Args:
         folder: `encoder.weights`; one below data/weights/ may still have to be made.
         size: Side of the frames. Larger ones than CLIP's own will do: the encoder averages over areas.
-        backbone: `encoder.backbone`. `clip` reads an open_clip model, `timm` a timm model; others read no folder.
+        backbone: Names in `BACKBONES`, of which not all read the folder.
 
     Raises:
         UserError: for a missing file, a pickle, a broken configuration, frames too small for a CLIP, or a model to be
             made that is unknown, of another kind or of a package that is not installed.
     """
-    for kind, check in (("clip", _check_clip), ("timm", _check_timm)):
-        if kind not in backbone:
+    for kind in backbone:
+        if (check := BACKBONES[kind].check) is None:
             continue
         if _to_be_made(folder, kind, "encoder.weights"):
             _check_size(folder, size, MADE[folder.name].size)
@@ -213,3 +214,55 @@ def _check_timm(folder: Path, size: int) -> None:
         json.loads((folder / TIMM_CONFIG).read_text(encoding="utf-8"))["architecture"]
     except (ValueError, KeyError, TypeError):
         raise UserError(f"encoder.weights: {folder / TIMM_CONFIG} names no timm architecture; {mend}") from None
+
+
+class Backbone(NamedTuple):
+    """All that is known of a backbone before it is loaded: this needs no torch."""
+
+    module: str
+    """With `load_backbone(config, *, tuned)`."""
+    words: str
+    """What it is, as a report says it."""
+    files: Callable[[Path], list[Path]]
+    """What its frozen weights are read from, in the folder (or the file itself) that `key` names."""
+    key: Literal["weights", "pretrained"] = "weights"
+    """Of the section `encoder`."""
+    check: Callable[[Path, int], None] | None = None
+    """Raises UserError where the folder lacks one of the files, or frames of a side are too small."""
+    settings: tuple[str, ...] = ()
+    """Keys of the section `encoder` that it has a use for and not every backbone has."""
+
+    def place(self, config: EncoderConfig) -> Path:
+        """The folder or file of its weights."""
+        return Path(getattr(config, self.key))
+
+
+BACKBONES = {
+    "clip": Backbone(
+        "pipeline.encoder.model",
+        "the base CLIP with visual prompts",
+        lambda folder: [folder / CLIP_CONFIG, clip_file(folder)],
+        check=_check_clip,
+        settings=("prompts", "prompt_layers"),
+    ),
+    "timm": Backbone(
+        "pipeline.encoder.timm_backbone",
+        "the network of encoder.weights",
+        lambda folder: [folder / TIMM_CONFIG, folder / TIMM_WEIGHTS],
+        check=_check_timm,
+        settings=("feature_stage",),
+    ),
+    "scenes": Backbone(
+        "pipeline.encoder.scene_encoder",
+        "a convolutional network with synthetic pretraining",
+        lambda file: [file],
+        key="pretrained",
+    ),
+}
+"""Values in `encoder.backbone`."""
+
+
+def backbone_files(config: EncoderConfig) -> list[Path]:
+    """What the frozen weights of the backbones are read from; a file that several read comes once."""
+    used = [BACKBONES[name] for name in config.backbone]
+    return list(dict.fromkeys(file for backbone in used for file in backbone.files(backbone.place(config))))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.errors import UserError
 from pipeline.io import tensor_shapes
 from pipeline.shapes import LIKE_LLAMA, LLM_CONFIG, Llama, Vision, read_form
-from pipeline.weights import CLIP_CONFIG, TIMM_WEIGHTS, again, clip_file
+from pipeline.weights import BACKBONES, CLIP_CONFIG, again
 
 if TYPE_CHECKING:
     from tokenizers import Tokenizer
@@ -64,10 +64,10 @@ def check_encoder_files(folder: Path, backbone: Collection[str], key: str = "enc
     """
     if not folder.is_dir():
         return
-    if "timm" in backbone:
-        stored([folder / TIMM_WEIGHTS], key, again(folder))
+    read = [BACKBONES[name] for name in backbone if BACKBONES[name].key == "weights"]
+    files = {file for each in read for file in each.files(folder) if file.suffix == ".safetensors"}
+    found = stored(files, key, again(folder))
     if "clip" in backbone:
-        found = stored([clip_file(folder)], key, again(folder))
         tower = Vision.read(folder)
         if tower is None:
             raise UserError(f"{key}: {folder} is no vision transformer; visual prompts need one such as ViT-L/14")

@@ -18,10 +18,10 @@ from torch.nn import functional as F
 from pipeline.config import EncoderConfig
 from pipeline.encoder import finetune as training
 from pipeline.encoder import tuned
-from pipeline.encoder.backbones import BACKBONES, check_backbones, load_backbones
+from pipeline.encoder.backbones import check_backbones, load_backbones
 from pipeline.encoder.clips import EncoderData, classify
 from pipeline.encoder.embed import EncoderSource, Loaded, embed_videos
-from pipeline.encoder.finetune import finetune, tune
+from pipeline.encoder.finetune import finetune, tune, write_encoder_card
 from pipeline.encoder.frame_classifier import JointFrameClassifier
 from pipeline.encoder.model import FrameEncoder, SideBySide, mean_and_deviation
 from pipeline.encoder.recipes import base_encoder, property_classifier
@@ -30,8 +30,11 @@ from pipeline.encoder.timm_backbone import TimmBackbone
 from pipeline.encoder.tuned import FLIPS, AboveTrunks, TrunkDataset, run_trunks
 from pipeline.errors import UserError
 from pipeline.records import Part
+from pipeline.report.provenance import encoder_words
 from pipeline.runtime import seed_everything
 from pipeline.training.trainable import load_trainable, save_trainable, trainable_state
+from pipeline.weights import BACKBONES, Backbone, backbone_files, check_encoder
+from pipeline.weights.check import check_encoder_files
 from tests.checkpoints import edit
 from tests.closure import ROOT
 from tests.conftest import refused
@@ -309,7 +312,7 @@ def test_what_is_tuned_is_saved_loaded_and_embeds_alike(timm_folder: Path, data:
 # The registry
 
 
-def test_a_new_backbone_is_a_module_and_a_line(
+def test_a_new_backbone_is_a_module_and_an_entry(
     data: EncoderData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Without a trunk of its own it trains, is saved and loaded, and embeds, beside another."""
@@ -326,9 +329,21 @@ def test_a_new_backbone_is_a_module_and_a_line(
 
     module = SimpleNamespace(load_backbone=lambda _, *, tuned: Toy().requires_grad_(tuned))
     monkeypatch.setitem(sys.modules, "toy_backbone", module)  # type: ignore[misc]
-    monkeypatch.setitem(BACKBONES, "toy", "toy_backbone")
-    setting = config(Path("none"), "tuned", backbone=("toy", "scenes"), epochs=1)
+    (weights := tmp_path / "weights").mkdir()
+    (weights / "toy.safetensors").write_bytes(b"toy")
+    toy = Backbone("toy_backbone", "a toy", lambda folder: [folder / "toy.safetensors"], settings=("prompts",))
+    monkeypatch.setitem(BACKBONES, "toy", toy)
+    setting = config(weights, "tuned", backbone=("toy", "scenes"), epochs=1)
+    check_encoder(weights, 32, setting.backbone)
+    with refused("^encoder.weights: .*toy.safetensors"):
+        check_encoder_files(weights, setting.backbone)
+    assert backbone_files(setting) == [weights / "toy.safetensors", Path("data/pretrained/encoder.safetensors")]
+    assert "a toy beside a convolutional network" in encoder_words(setting)
     model, history = finetune(data, setting, CPU, seed=0, inputs=[])
+    write_encoder_card(tmp_path / "card", data, setting, 0, "scenes")
+    card = (tmp_path / "card" / "README.md").read_text()
+    assert all(line in card for line in (f"- toy: `{weights}`", "`toy.safetensors`, sha256", "| prompts |"))
+    assert "feature_stage" not in card
     assert "validation_combined" in {m.name for m in history}
     save_trainable(model, tmp_path / "toy.safetensors")
     again = property_classifier(setting, data.classes)

@@ -438,10 +438,10 @@ def test_a_candidate_that_cannot_be_trained_is_one_clear_line(weights: Path, tmp
     check_candidates(("trees", "backbone", "backbone-tuned"), config(folder, "tuned"), 32)
     for name in ("probe", "release"):
         with pytest.raises(
-            UserError, match=rf"{name} needs a CLIP; leave it out, or: .*timm.open_clip_config.json does not exist"
+            UserError, match=rf"{name} needs clip; leave it out, or: .*timm.open_clip_config.json does not exist"
         ):
             check_candidates((name,), config(folder, "tuned"), 32)
-    with pytest.raises(UserError, match=r"probe needs a CLIP; leave it out, or: .*frames\.pixels is 24"):
+    with pytest.raises(UserError, match=r"probe needs clip; leave it out, or: .*frames\.pixels is 24"):
         check_candidates(("probe",), other, 24)
 
 
