@@ -13,7 +13,6 @@ import yaml
 
 from pipeline import weights
 from pipeline.config import Params
-from pipeline.encoder.backbones import check_backbones
 from pipeline.encoder.candidates import check_candidates
 from pipeline.encoder.recipes import check_recipe
 from pipeline.errors import UserError
@@ -92,7 +91,6 @@ def check_inputs(params: Params) -> str:
     """Raise UserError where videos, catalogue, objects, tasks or weights are not there; return as `check_objects`."""
     catalogue = load_catalogue(Path(params.data.catalogue))
     check_recipe(params.encoder.recipe)
-    check_backbones(params.encoder.backbone)
     check_candidates(params.cross_validation.models, params.encoder, params.frames.pixels)
     counts_by_task(params.questions, "train")
     counts_by_task(params.questions, "evaluation")

@@ -24,7 +24,7 @@ class Candidate:
     tree ensembles. `frame_heads`: a per-frame classifier on frozen features. `gradient`: trained by the Trainer.
     `tuned`: that recipe."""
     backbone: tuple[str, ...] = ()
-    """Whose features: names in `pipeline.encoder.backbones`; none stands for the chain's own `encoder.backbone`."""
+    """Whose features: names in `pipeline.weights.BACKBONES`; none stands for the chain's own `encoder.backbone`."""
     recipe: Literal["paper", "release", "scratch"] = "paper"
     """`gradient`: which. `scratch` trains the network of the backbone `scenes` end to end from random weights."""
     reference: Literal["chain", "none", "own"] = "none"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 from pipeline.errors import UserError
 from pipeline.io import read_json
-from pipeline.weights import CLIP_CONFIG, GET_CLIP, check_finite, clip_file
+from pipeline.weights import CLIP_CONFIG, GET_CLIP, check_finite, frame_side
 
 if TYPE_CHECKING:
     from open_clip.transformer import VisionTransformer
@@ -27,8 +27,7 @@ def load_visual_tower(folder: Path, embedding: Literal["projected", "class_token
     import open_clip
     from safetensors import SafetensorError
 
-    if not clip_file(folder).is_file():  # Of another's folder open_clip would read a pickle, too.
-        raise UserError(f"encoder.weights: {clip_file(folder)} does not exist; {GET_CLIP.format(folder=folder)}")
+    frame_side(folder, "clip")  # Of another's folder open_clip would read a pickle, too.
     try:
         text = read_json(folder / CLIP_CONFIG)["model_cfg"]["text_cfg"]
         if "hf_model_name" in text:

@@ -176,8 +176,7 @@ def _frame_heads(candidate: Candidate, data: CrossValidationData) -> Predict:
 
 def frozen_encoder(candidate: Candidate, data: CrossValidationData) -> FrameEncoder:
     """The encoder that gives a `frame_heads` candidate its features."""
-    from pipeline.encoder.backbones import load_backbones
-    from pipeline.encoder.model import SideBySide
+    from pipeline.encoder.model import SideBySide, load_backbones
 
     backbone = candidate.backbone or data.encoder.backbone
     return SideBySide(load_backbones(data.encoder.model_copy(update={"backbone": backbone})))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib import import_module
 from math import prod
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -14,6 +15,7 @@ from torch.nn import functional as F
 from pipeline.config import EncoderConfig
 from pipeline.encoder.clip import load_visual_tower
 from pipeline.encoder.vpt import VisualPrompts
+from pipeline.weights import BACKBONES
 
 if TYPE_CHECKING:
     from open_clip.transformer import VisionTransformer
@@ -212,6 +214,19 @@ def mean_and_deviation(maps: torch.Tensor) -> torch.Tensor:
     # The root's slope at 0 is infinite, and 0 times that no number.
     deviation = torch.where(varies, variance, 1.0).sqrt() * varies
     return torch.cat([mean, deviation], dim=1).to(maps.dtype)
+
+
+def load_backbones(config: EncoderConfig, *, tuned: bool = False) -> list[FrameEncoder]:
+    """The backbones of `encoder.backbone` with their pretrained weights.
+
+    Args:
+        config: The section `encoder`.
+        tuned: Whether what fine-tuning changes is to be unfrozen: the last stage, or prompts. All else is frozen.
+
+    Raises:
+        UserError: for weights that are missing or do not fit.
+    """
+    return [import_module(BACKBONES[name].module).load_backbone(config, tuned=tuned) for name in config.backbone]
 
 
 def load_backbone(config: EncoderConfig, *, tuned: bool) -> TactileEncoder:

@@ -18,9 +18,7 @@ from torch.nn import functional as F
 from pipeline.config import EncoderConfig
 from pipeline.encoder.model import FrameEncoder, mean_and_deviation
 from pipeline.errors import UserError
-from pipeline.weights import check_finite
-
-WEIGHTS = "model.safetensors"
+from pipeline.weights import check_finite, frame_side
 
 
 class TimmBackbone(FrameEncoder):
@@ -91,12 +89,7 @@ def load_backbone(config: EncoderConfig, *, tuned: bool) -> TimmBackbone:
     from safetensors import SafetensorError
 
     folder = Path(config.weights)
-    for name in ("config.json", WEIGHTS):
-        if not (folder / name).is_file():
-            raise UserError(
-                f"encoder.weights: {folder / name} does not exist; encoder.backbone=timm needs a folder as timm's hub "
-                "has it, with safetensors (pickles are refused because they can run code)"
-            )
+    frame_side(folder, "timm")
     logging.getLogger("timm").setLevel(logging.WARNING)
     try:
         model = timm.create_model(f"local-dir:{folder}", pretrained=True)

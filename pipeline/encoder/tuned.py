@@ -20,10 +20,9 @@ import torch
 from torch import nn
 
 from pipeline.config import EncoderConfig
-from pipeline.encoder.backbones import load_backbones
 from pipeline.encoder.clips import ClipDataset, EncoderData, LabelledVideo, check_finite
 from pipeline.encoder.frame_classifier import Clips, JointFrameClassifier
-from pipeline.encoder.model import SideBySide
+from pipeline.encoder.model import SideBySide, load_backbones
 from pipeline.runtime import derive_seed, track
 from pipeline.training.sampling import EpochDataset
 

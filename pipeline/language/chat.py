@@ -1,8 +1,7 @@
 """The one renderer of a conversation: training and evaluation speak through it.
 
-The chat format is the tokenizer's own template where it has one, else Vicuna v1.5's:
-`SYSTEM USER: question ASSISTANT: answer</s>USER: ...`. A video in a question becomes `<tact_start>`, one `<tact_frame>`
-a frame and `<tact_end>`; the model puts tactile embeddings in the frames' places.
+The chat format is the tokenizer's own template where it has one, else Vicuna v1.5's. A video in a question becomes
+`<tact_start>`, one `<tact_frame>` a frame and `<tact_end>`; the model puts tactile embeddings in the frames' places.
 """
 
 from __future__ import annotations
@@ -22,6 +21,11 @@ if TYPE_CHECKING:
 
 TACTILE = "{tactile}"
 TACT_START, TACT_FRAME, TACT_END = TACTILE_TOKENS = ("<tact_start>", "<tact_frame>", "<tact_end>")
+VICUNA = (
+    "{% for m in messages %}{% if m.role == 'system' %}{{ m.content }} {% elif m.role == 'user' %}"
+    "USER: {{ m.content }} ASSISTANT:{% else %} {{ m.content }}{{ eos_token }}{% endif %}{% endfor %}"
+)
+"""Vicuna v1.5's format (FastChat's `vicuna_v1.1`): `SYSTEM USER: question ASSISTANT: answer</s>USER: ...`."""
 PROBE = "Octopi"
 """Said to a chat template to see what it writes around an answer."""
 IGNORE_INDEX = -100
@@ -62,7 +66,7 @@ def render(
 
     Args:
         turns: Exchanges in order.
-        tokenizer: Whose template writes it; without one, Vicuna's format with its end token.
+        tokenizer: Whose template writes it; without one, Vicuna's with its end token.
         system_prompt: Put before the first turn. Where it is empty nothing is, or what the template puts there itself.
         frames: Tactile embeddings a video.
         complete: With the last answer (training), or up to where it is to be generated.
@@ -73,8 +77,6 @@ def render(
     """
     video = TACT_START + TACT_FRAME * frames + TACT_END
     shown = [Turn(user=turn.user.replace(TACTILE, video), assistant=turn.assistant) for turn in turns]
-    if tokenizer.chat_template is None:
-        return vicuna(shown, system_prompt, str(tokenizer.eos_token), complete)
     messages = [{"role": "system", "content": system_prompt}] if system_prompt else []
     written = []
     for turn in shown:
@@ -89,7 +91,7 @@ def render(
         if not longer.startswith(before):
             raise UserError(f"{where} writes a prompt otherwise once it is answered; take one that only appends")
         added = longer.removeprefix(before)
-        # Some write it before the last answer alone, but every answer is the last one when it is asked for.
+        # Some write the lead before the last answer alone, but every answer is the last one when it is asked for.
         text += added if not before or added.startswith(lead) else lead + added
         starts.append(len(text) + len(lead))
     ends, answers = [str(tokenizer.convert_ids_to_tokens(i)) for i in end_ids(tokenizer)], []
@@ -98,7 +100,7 @@ def render(
         if not stops:
             raise UserError(f"{where} ends an answer with none of {', '.join(ends)}; the model could not learn to stop")
         answers.append((start, min(stops)))
-    return Rendered(text if complete else text + lead, tuple(answers), templated=True)
+    return Rendered(text if complete else text + lead, tuple(answers), templated=bool(tokenizer.chat_template))
 
 
 def end_ids(tokenizer: PreTrainedTokenizerBase) -> tuple[int, ...]:
@@ -107,8 +109,6 @@ def end_ids(tokenizer: PreTrainedTokenizerBase) -> tuple[int, ...]:
     They differ for some: Llama-3's instruct models end a turn with `<|eot_id|>`, a text with `<|end_of_text|>`.
     """
     eos = [] if tokenizer.eos_token_id is None else [int(tokenizer.eos_token_id)]
-    if tokenizer.chat_template is None:
-        return tuple(eos)
     _, rest = _around_answers(tokenizer)
     special = {i for i, token in tokenizer.added_tokens_decoder.items() if token.special}
     behind = [i for i in tokenizer(rest, add_special_tokens=False)["input_ids"] if i in special]
@@ -159,24 +159,11 @@ def encode_turns(
     return encode(rendered, tokenizer, bos=bos)
 
 
-def vicuna(turns: Sequence[Turn], system_prompt: str, eos: str, complete: bool) -> Rendered:
-    """Vicuna v1.5's format (FastChat's `vicuna_v1.1`), each answer followed by the end token `eos`."""
-    text = f"{system_prompt} " if system_prompt else ""
-    answers = []
-    for number, turn in enumerate(turns, 1):
-        text += f"USER: {turn.user} ASSISTANT:"
-        if number == len(turns) and not complete:
-            break
-        start = len(text)
-        text += f" {turn.assistant}{eos}"
-        answers.append((start, len(text)))
-    return Rendered(text, tuple(answers))
-
-
 def _templated(messages: Sequence[dict[str, str]], tokenizer: PreTrainedTokenizerBase, *, ask: bool) -> str:
-    """By the tokenizer's template; `ask`: with what it writes before an answer."""
+    """By the tokenizer's template, or Vicuna's; `ask`: with what it writes before an answer."""
+    asked = {"chat_template": None if tokenizer.chat_template else VICUNA, "add_generation_prompt": ask}
     try:
-        return str(tokenizer.apply_chat_template(list(messages), tokenize=False, add_generation_prompt=ask))
+        return str(tokenizer.apply_chat_template(list(messages), tokenize=False, **asked))
     except (TemplateError, ValueError) as error:
         raise UserError(
             f"language.weights: the chat template in {tokenizer.name_or_path} fails ({' '.join(str(error).split())}); "

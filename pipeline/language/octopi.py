@@ -239,13 +239,11 @@ class OctopiForCausalLM(nn.Module):
             tokens divided by that of the weights; 0 where there is none. Logits are then computed only for columns
             that some row needs: in long prompts that saves the larger part of them.
         """
-        if labels is None:
-            embeddings = self.embed(input_ids, features)
-            call = {"inputs_embeds": embeddings, "attention_mask": attention_mask, "use_cache": False}
-            return CausalLMOutput(logits=self.llm(**call).logits)
-        shared = self._shared(input_ids, labels) if attention_mask is None else 0
         embeddings = self.embed(input_ids, features)
         call = {"attention_mask": attention_mask, "use_cache": False}
+        if labels is None:
+            return CausalLMOutput(logits=self.llm(inputs_embeds=embeddings, **call).logits)
+        shared = self._shared(input_ids, labels) if attention_mask is None else 0
         if shared:
             call = {"past_key_values": self._begin(embeddings[:, :shared]), "use_cache": True}
         targets = labels[:, shared + 1 :]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import random
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -43,7 +43,8 @@ def add_lora(model: OctopiForCausalLM, config: LoraTrainConfig) -> None:
     modules = config.target_modules if isinstance(config.target_modules, str) else list(config.target_modules)
     unknown = [] if isinstance(modules, str) else [module for module in modules if module not in names]
     if unknown:
-        raise UserError(f"lora.target_modules: the language model has no layer {unknown[0]}; it has {_linear(names)}")
+        linear = ", ".join(sorted(n for n in names if n.endswith(("_proj", "lm_head"))))
+        raise UserError(f"lora.target_modules: the language model has no layer {unknown[0]}; it has {linear}")
     lora = LoraConfig(
         r=config.rank,
         lora_alpha=config.alpha,
@@ -233,7 +234,3 @@ def write_model_card(folder: Path, material: Material, data: ConversationDataset
             "The language model's own weights are not in this folder and have limits of their own.",
         ),
     )
-
-
-def _linear(names: Iterable[str]) -> str:
-    return ", ".join(sorted(n for n in names if n.endswith(("_proj", "lm_head"))))

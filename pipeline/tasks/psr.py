@@ -20,7 +20,7 @@ from pipeline.tasks.base import (
     gold,
     lettered,
 )
-from pipeline.videos.catalogue import Catalogue, Scenario
+from pipeline.videos.catalogue import Catalogue
 
 BASED = " based on physical property descriptions of the two objects"
 REQUEST = (
@@ -59,7 +59,9 @@ class PropertyScenarioReasoning(TaskDefinition):
         catalogue = pool.catalogue
         position, number = stratum % 2, stratum // 2 % len(catalogue.language.scenarios)
         scenario = catalogue.language.scenarios[number]
-        targets, others = _candidates(pool, scenario)
+        named = scenario.object
+        targets = [named] if named is not None and named in pool.videos else _matching(pool, scenario.target)
+        others = [o for o in _matching(pool, scenario.other) if o not in targets]
         if not targets or not others:
             return None
         objects = [rng.choice(targets), rng.choice(others)]
@@ -91,13 +93,6 @@ class PropertyScenarioReasoning(TaskDefinition):
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         return choice_score(question, prediction, read(prediction.outputs[-1]))
-
-
-def _candidates(pool: Pool, scenario: Scenario) -> tuple[list[str], list[str]]:
-    """Objects that suit the scenario, and objects that do not."""
-    named = scenario.object
-    suited = [named] if named is not None and named in pool.videos else _matching(pool, scenario.target)
-    return suited, [o for o in _matching(pool, scenario.other) if o not in suited]
 
 
 def _matching(pool: Pool, classes: Mapping[str, tuple[int, ...]]) -> list[str]:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import random
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import islice
 from typing import Literal
 
 from pipeline.config import QuestionsConfig
@@ -12,7 +13,7 @@ from pipeline.errors import UserError, did_you_mean
 from pipeline.records import Assignment, Part, Question
 from pipeline.runtime import derive_seed
 from pipeline.tasks import TASKS
-from pipeline.tasks.base import Pool, in_two_turns
+from pipeline.tasks.base import Draft, Pool, TaskDefinition, in_two_turns
 from pipeline.videos.catalogue import Catalogue
 
 ATTEMPTS = 60
@@ -66,39 +67,42 @@ def build_questions(
     """
     place = str(pool.part) if fold is None else f"{pool.part}-fold{fold}"
     questions: list[Question] = []
-    for task, count in counts.items():
-        questions += (
-            _build_task(pool, task, count, seed, distinct, facts, restate, two_turns, place) if pool.objects else []
+    for task, count in counts.items() if pool.objects else ():
+        definition = TASKS[task]
+        # Streams of their own: however they are worded, the same questions are drawn.
+        rng, order, turns = (
+            random.Random(derive_seed(seed, pool.part, task, *purpose)) for purpose in ((), ("facts",), ("turns",))
         )
+        for number, draft in enumerate(islice(_drafts(definition, pool, rng, distinct), count)):
+            if restate:
+                draft = definition.restated(draft, pool.catalogue)
+            if turns.random() < two_turns:
+                draft = in_two_turns(draft)
+            if facts:
+                draft = definition.with_facts(draft, pool.catalogue, order)
+            questions.append(
+                Question(
+                    question_id=f"{task}-{place}-{number:05d}",
+                    task=task,
+                    part=pool.part,
+                    videos=draft.videos,
+                    objects=draft.objects,
+                    dialogues=draft.dialogues,
+                    gold=draft.gold,
+                )
+            )
     random.Random(derive_seed(seed, pool.part, "order")).shuffle(questions)
     return questions
 
 
-def _build_task(
-    pool: Pool,
-    task: str,
-    count: int,
-    seed: int,
-    distinct: bool,
-    facts: bool,
-    restate: bool,
-    two_turns: float,
-    place: str,
-) -> list[Question]:
-    definition = TASKS[task]
-    rng = random.Random(derive_seed(seed, pool.part, task))
-    # Streams of their own: however they are worded, the same questions are drawn.
-    order, turns = (random.Random(derive_seed(seed, pool.part, task, purpose)) for purpose in ("facts", "turns"))
+def _drafts(definition: TaskDefinition, pool: Pool, rng: random.Random, distinct: bool) -> Iterator[Draft]:
+    """Questions of all strata by turns, until no stratum yields one that is new."""
     live = list(range(definition.strata(pool.catalogue)))
     rng.shuffle(live)
     seen: set[tuple[object, ...]] = set()
-    questions: list[Question] = []
-    while live and len(questions) < count:
+    while live:
         for stratum in list(live):
-            if len(questions) == count:
-                break
-            for _ in range(ATTEMPTS):
-                draft = definition.draft(pool, stratum, rng)
+            for draft in (definition.draft(pool, stratum, rng) for _ in range(ATTEMPTS)):
                 if draft is None:
                     continue
                 # A template or a video more does not make a new question about the same videos and property.
@@ -108,24 +112,7 @@ def _build_task(
                 if distinct and key in seen:
                     continue
                 seen.add(key)
-                if restate:
-                    draft = definition.restated(draft, pool.catalogue)
-                if turns.random() < two_turns:
-                    draft = in_two_turns(draft)
-                if facts:
-                    draft = definition.with_facts(draft, pool.catalogue, order)
-                questions.append(
-                    Question(
-                        question_id=f"{task}-{place}-{len(questions):05d}",
-                        task=task,
-                        part=pool.part,
-                        videos=draft.videos,
-                        objects=draft.objects,
-                        dialogues=draft.dialogues,
-                        gold=draft.gold,
-                    )
-                )
+                yield draft
                 break
             else:
                 live.remove(stratum)
-    return questions

@@ -9,10 +9,10 @@ import json
 from collections.abc import Callable, Collection, Iterable
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from pipeline.config import EncoderConfig
-from pipeline.errors import UserError
+from pipeline.errors import UserError, did_you_mean
 from pipeline.io import tensor_shapes
 
 if TYPE_CHECKING:
@@ -94,19 +94,41 @@ def check_encoder(folder: Path, size: int, backbone: Collection[str]) -> None:
     Args:
         folder: `encoder.weights`; one below data/weights/ may still have to be made.
         size: Side of the frames. Larger ones than CLIP's own will do: the encoder averages over areas.
-        backbone: Names in `BACKBONES`, of which not all read the folder.
+        backbone: `encoder.backbone`.
 
     Raises:
-        UserError: for a missing file, a pickle, a broken configuration, frames too small for a CLIP, or a model to be
-            made that is unknown, of another kind or of a package that is not installed.
+        UserError: for a name that is not in `BACKBONES`, a missing file, a broken configuration, frames too small for a
+            CLIP, or a model to be made that is unknown, of another kind or of a package that is not installed.
     """
-    for kind in backbone:
-        if (check := BACKBONES[kind].check) is None:
+    for name in backbone:
+        if name not in BACKBONES:
+            hint = did_you_mean(name, BACKBONES)
+            raise UserError(f"encoder.backbone: {name} is no backbone; {hint}known: {', '.join(BACKBONES)}")
+        if BACKBONES[name].key != "weights":
             continue
-        if _to_be_made(folder, kind, "encoder.weights"):
-            _check_size(folder, size, MADE[folder.name].size)
-        else:
-            check(folder, size)
+        made_anew = _to_be_made(folder, name, "encoder.weights")
+        wanted = MADE[folder.name].size if made_anew else frame_side(folder, name)
+        if size < wanted:
+            raise UserError(
+                f"frames.size is {size} but the encoder in {folder} takes {wanted} or more; set frames.size={wanted}"
+            )
+
+
+def frame_side(folder: Path, backbone: str) -> int:
+    """Pixels that a backbone wants frames to have at least, by the configuration in `encoder.weights`.
+
+    Raises:
+        UserError: where that is missing or no such one, or the weights are.
+    """
+    known = BACKBONES[backbone]
+    files, mend = known.files(folder), _mend(folder, known.get)
+    for file in files:
+        if not file.is_file():
+            raise UserError(f"encoder.weights: {file} does not exist; {mend} (pickles are refused: they can run code)")
+    try:
+        return 0 if known.side is None else known.side(json.loads(files[0].read_text(encoding="utf-8")))
+    except (ValueError, KeyError, TypeError):
+        raise UserError(f"encoder.weights: {files[0]} is no configuration of a {backbone} backbone; {mend}") from None
 
 
 def check_language(folder: Path, key: str = "language.weights", *, exists: bool = False) -> None:
@@ -166,13 +188,6 @@ def _to_be_made(folder: Path, kind: str, key: str) -> bool:
     return not folder.exists()
 
 
-def _check_size(folder: Path, size: int, wanted: int) -> None:
-    if size < wanted:
-        raise UserError(
-            f"frames.pixels is {size} but the encoder in {folder} takes {wanted} or more; set frames.pixels={wanted}"
-        )
-
-
 def installed(package: str) -> metadata.Distribution:
     """An installed package; raises UserError where it is not."""
     try:
@@ -183,37 +198,6 @@ def installed(package: str) -> metadata.Distribution:
 
 def _mend(folder: Path, text: str) -> str:
     return again(folder) if made(folder) else text.format(folder=folder)
-
-
-def _check_clip(folder: Path, size: int) -> None:
-    mend = _mend(folder, GET_CLIP)
-    if not (folder / CLIP_CONFIG).is_file():
-        raise UserError(f"encoder.weights: {folder / CLIP_CONFIG} does not exist; {mend}")
-    if not clip_file(folder).is_file():
-        raise UserError(
-            f"encoder.weights: {folder} has no {CLIP_WEIGHTS[0]} (pickles are refused because they can run code); "
-            f"{mend}"
-        )
-    try:
-        config = json.loads((folder / CLIP_CONFIG).read_text(encoding="utf-8"))
-        wanted = int(config["model_cfg"]["vision_cfg"]["image_size"])
-    except (json.JSONDecodeError, KeyError, TypeError, ValueError):
-        raise UserError(f"encoder.weights: {folder / CLIP_CONFIG} is no open_clip configuration; {mend}") from None
-    _check_size(folder, size, wanted)
-
-
-def _check_timm(folder: Path, size: int) -> None:
-    mend = _mend(folder, GET_TIMM)
-    if not (folder / TIMM_CONFIG).is_file():
-        raise UserError(f"encoder.weights: {folder / TIMM_CONFIG} does not exist; {mend}")
-    if not (folder / TIMM_WEIGHTS).is_file():
-        raise UserError(
-            f"encoder.weights: {folder} has no {TIMM_WEIGHTS} (pickles are refused because they can run code); {mend}"
-        )
-    try:
-        json.loads((folder / TIMM_CONFIG).read_text(encoding="utf-8"))["architecture"]
-    except (ValueError, KeyError, TypeError):
-        raise UserError(f"encoder.weights: {folder / TIMM_CONFIG} names no timm architecture; {mend}") from None
 
 
 class Backbone(NamedTuple):
@@ -227,8 +211,10 @@ class Backbone(NamedTuple):
     """What its frozen weights are read from, in the folder (or the file itself) that `key` names."""
     key: Literal["weights", "pretrained"] = "weights"
     """Of the section `encoder`."""
-    check: Callable[[Path, int], None] | None = None
-    """Raises UserError where the folder lacks one of the files, or frames of a side are too small."""
+    side: Callable[[Any], int] | None = None
+    """Pixels that frames must have at least, where the first of these files, a JSON, says so."""
+    get: str = ""
+    """How the files are got."""
     settings: tuple[str, ...] = ()
     """Keys of the section `encoder` that it has a use for and not every backbone has."""
 
@@ -242,14 +228,16 @@ BACKBONES = {
         "pipeline.encoder.model",
         "the base CLIP with visual prompts",
         lambda folder: [folder / CLIP_CONFIG, clip_file(folder)],
-        check=_check_clip,
+        side=lambda told: int(told["model_cfg"]["vision_cfg"]["image_size"]),
+        get=GET_CLIP,
         settings=("prompts", "prompt_layers"),
     ),
     "timm": Backbone(
         "pipeline.encoder.timm_backbone",
         "the network of encoder.weights",
         lambda folder: [folder / TIMM_CONFIG, folder / TIMM_WEIGHTS],
-        check=_check_timm,
+        side=lambda told: len(told["architecture"]) and 0,  # Any will do, of a network that has a name.
+        get=GET_TIMM,
         settings=("feature_stage",),
     ),
     "scenes": Backbone(

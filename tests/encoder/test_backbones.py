@@ -18,12 +18,11 @@ from torch.nn import functional as F
 from pipeline.config import EncoderConfig
 from pipeline.encoder import finetune as training
 from pipeline.encoder import tuned
-from pipeline.encoder.backbones import check_backbones, load_backbones
 from pipeline.encoder.clips import EncoderData, classify
 from pipeline.encoder.embed import EncoderSource, Loaded, embed_videos
 from pipeline.encoder.finetune import finetune, tune, write_encoder_card
 from pipeline.encoder.frame_classifier import JointFrameClassifier
-from pipeline.encoder.model import FrameEncoder, SideBySide, mean_and_deviation
+from pipeline.encoder.model import FrameEncoder, SideBySide, load_backbones, mean_and_deviation
 from pipeline.encoder.recipes import base_encoder, property_classifier
 from pipeline.encoder.scene_encoder import SIDE, SceneEncoder
 from pipeline.encoder.timm_backbone import TimmBackbone
@@ -369,7 +368,7 @@ def test_what_does_not_go_together_is_refused(changes: dict[str, object], messag
 
 def test_an_unknown_backbone_is_one_line() -> None:
     with pytest.raises(UserError, match=r"^encoder.backbone: tim is no backbone; did you mean timm\? known: clip, "):
-        check_backbones(("scenes", "tim"))
+        check_encoder(Path("none"), 32, ("scenes", "tim"))
 
 
 WEIGHTS, FORM = "model.safetensors", "config.json"

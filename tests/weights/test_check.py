@@ -74,7 +74,7 @@ def test_a_timm_folder_is_a_configuration_and_safetensors(tmp_path: Path) -> Non
     with refused(r"config.json does not exist; set encoder.weights=data/weights/efficientnet-lite0"):
         check_encoder(tmp_path / "nowhere", 8, ("timm",))
     for number, broken in enumerate(("{}", "no JSON", "[]")):
-        with refused("names no timm architecture"):
+        with refused("is no configuration of a timm backbone"):
             check_encoder(timm_folder(tmp_path / str(number), broken), 8, ("timm",))
     (tmp_path / "good" / "model.safetensors").rename(tmp_path / "good" / "pytorch_model.bin")
     with refused("pickles are refused"):

@@ -132,13 +132,9 @@ class Course(Dataset[Encoded]):
 
 def collate(batch: Sequence[Encoded]) -> dict[str, torch.Tensor]:
     """Input ids and labels (batch x length), padded on the right with a token that no other one sees."""
+    padding = {"input_ids": 0, "labels": IGNORE_INDEX}
     pad = torch.nn.utils.rnn.pad_sequence
-    ids = [torch.tensor(e.input_ids) for e in batch]
-    labels = [torch.tensor(e.labels) for e in batch]
-    return {
-        "input_ids": pad(ids, batch_first=True, padding_value=0),
-        "labels": pad(labels, batch_first=True, padding_value=IGNORE_INDEX),
-    }
+    return {name: pad([torch.tensor(getattr(e, name)) for e in batch], True, value) for name, value in padding.items()}
 
 
 class Pupil(nn.Module):
