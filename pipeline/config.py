@@ -219,7 +219,7 @@ class EncoderConfig(Section):
 
 
 class PretrainConfig(Section):
-    """Pretraining of the backbone `scenes` on pictures of invented objects."""
+    """Pretraining of the backbone `scenes` on pictures of invented objects; its layers normalise over whole updates."""
 
     objects: Annotated[int, Field(ge=8, le=1_000_000)] = 4000
     """Objects that are invented; each is drawn once."""

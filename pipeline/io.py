@@ -244,10 +244,7 @@ def fingerprint(*parts: BaseModel | str | int | Path) -> str:
 
 
 def code_of(stage: str) -> list[Path]:
-    """All files of code that dvc.yaml lists for a stage (`@` and what follows, a matrix's key, is left out).
-
-    In the fingerprint of unfinished work they say which version of the project it is of.
-    """
+    """All files of code that dvc.yaml lists for a stage, or `stage@key`: which version unfinished work is of."""
     import yaml
 
     root = Path(__file__).parents[1]

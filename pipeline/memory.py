@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 
@@ -164,7 +164,10 @@ def language_uses(params: Params, llama: Llama, embedding: int, lengths: Lengths
         whole, layer = frozen + FULL * trained, llama.layer_linear * held
         shards = devices if sharded else 1
         gathered = GATHERED * layer + llama.words * size + FULL * (connector + words) if shards > 1 else 0.0
-        saved, passing = (f(params, llama, config, lengths) for f in (language_saved, language_passing))
+        rows = config.micro_batch_size
+        # What comes and goes at the widest place: the logits and their gradient, or three of a layer's middle.
+        middle = 3 * rows * lengths.training * llama.intermediate_size * size
+        passing = max(2 * llama.saved_loss(rows * lengths.answer), middle)
         yield Use(
             stage,
             devices,
@@ -172,7 +175,7 @@ def language_uses(params: Params, llama: Llama, embedding: int, lengths: Lengths
             # Gradients are shared among devices at the end of an update; until then each adds up its own.
             optimizer=FULL * trained + (ADAM - FULL) * trained / shards,
             # The newest gradient of all words, when what the layers kept is gone.
-            activations=max(saved + passing, FULL * words),
+            activations=max(language_saved(params, llama, config, lengths) + passing, FULL * words),
         )
     rows = language.generation_batch_size
     read = rows * lengths.prompt
@@ -202,13 +205,6 @@ def language_saved(params: Params, llama: Llama, config: TrainConfig, lengths: L
     return kept + tokens * (llama.hidden_size + 1) * FULL + loss
 
 
-def language_passing(params: Params, llama: Llama, config: TrainConfig, lengths: Lengths) -> int:
-    """Bytes that come and go at the widest place: the logits and their gradient, or three of a layer's middle."""
-    rows, size = config.micro_batch_size, BYTES[params.language.dtype]
-    middle = 3 * rows * lengths.training * llama.intermediate_size * size
-    return max(2 * llama.saved_loss(rows * lengths.answer), middle)
-
-
 def launched(launcher: str) -> tuple[int, bool]:
     """Devices that a launcher starts a training on, and whether they share the layers among them."""
     parser = argparse.ArgumentParser(exit_on_error=False, add_help=False, allow_abbrev=False)
@@ -235,7 +231,10 @@ def longest(params: Params, catalogue: Catalogue, language: Path) -> Lengths:
     Args:
         language: Folder of the language model whose tokens are counted.
     """
-    tokens = _tokenizer(language)
+    known = read_tokenizer(language) if (language / TOKENIZER).is_file() else None
+
+    def tokens(text: str) -> int:
+        return len(known.encode(text).ids) if known else -(-len(text) // LETTERS)
 
     def length(question: Question, turns: Sequence[Turn]) -> int:
         text = " ".join([params.language.system_prompt, *(f"USER: {t.user} ASSISTANT: {t.assistant}" for t in turns)])
@@ -274,14 +273,6 @@ def _questions(params: Params, catalogue: Catalogue, part: Part) -> list[Questio
         restate=config.restate,
         two_turns=config.two_turns if part == Part.TRAIN else 0.0,
     )
-
-
-def _tokenizer(folder: Path) -> Callable[[str], int]:
-    """What counts a text's tokens."""
-    if not (folder / TOKENIZER).is_file():
-        return lambda text: -(-len(text) // LETTERS)
-    tokenizer = read_tokenizer(folder)
-    return lambda text: len(tokenizer.encode(text).ids)
 
 
 def table(uses: Sequence[Use]) -> str:

@@ -49,7 +49,7 @@ def check_backend(name: Backend) -> None:
 
 
 def end_with_parent(parent: int, grace: float = 0.0) -> None:
-    """End this process within a second of its parent's death, and `grace` seconds for it to end by itself.
+    """End this process within a second of its parent's death, after `grace` seconds in which it may end by itself.
 
     A worker waits for jobs for ever, and a pipe that it inherited stays open: `dvc repro | cat` would never end.
     """

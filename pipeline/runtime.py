@@ -82,12 +82,8 @@ def resolve_dtype(name: DtypeName) -> torch.dtype:
     """The torch dtype of that name; `auto` for the device that `auto` is."""
     import torch
 
-    dtypes: dict[str, torch.dtype] = {
-        "float32": torch.float32,
-        "bfloat16": torch.bfloat16,
-        "float16": torch.float16,
-    }
-    return dtypes[name_dtype(name)]
+    dtype: torch.dtype = getattr(torch, name_dtype(name))
+    return dtype
 
 
 def limit_threads(count: int) -> None:

@@ -73,29 +73,22 @@ def matrix_key(**axes: Iterable[Any] | None) -> list[Any]:
     return values
 
 
-LAUNCHED = "OCTOPI_LAUNCHED"
-
-
 def launch(launcher: str) -> None:
     """Go on in processes of `runtime.launcher`, which takes this process's place: its number, status and signals.
 
     `python`, and a process that a launcher started, go on as they are. The latter ends with its launcher: a killed
     `accelerate launch` of one process would leave it running.
     """
-    command = shlex.split(launcher) or ["python"]
-    if LAUNCHED in os.environ or "RANK" in os.environ:
-        if os.environ.get(LAUNCHED) != str(os.getpid()):  # Or the launcher took its place without a child.
-            end_with_parent(os.getppid(), GRACE)
+    command, marked = shlex.split(launcher) or ["python"], os.environ.get("OCTOPI_LAUNCHED")
+    if marked or "RANK" in os.environ:
+        if marked != str(os.getpid()):  # Or the launcher has become this process.
+            end_with_parent(os.getppid(), grace=5)
     elif command != ["python"]:
-        os.environ[LAUNCHED] = str(os.getpid())
+        os.environ["OCTOPI_LAUNCHED"] = str(os.getpid())
         try:
             os.execvp(command[0], [*command, *sys.argv])
         except OSError as error:
             raise UserError(f"runtime.launcher: {launcher}: {error.strerror}; set it to python") from None
-
-
-GRACE = 5.0
-"""Seconds that a process has to end by itself, as after Ctrl-C, when its launcher is gone."""
 
 
 def in_project() -> None:

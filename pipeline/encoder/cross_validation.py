@@ -197,7 +197,6 @@ def _gradient(candidate: Candidate, data: CrossValidationData) -> Predict:
     from pipeline.encoder.recipes import property_classifier
     from pipeline.encoder.scene_encoder import SceneEncoder
 
-    limit_threads(data.runtime.threads)
     named = {"recipe": "release" if candidate.recipe == "release" else "paper", "backbone": ("clip",)}
     # What has a batch size of its own is computed whole, and so is a network that normalises over a batch.
     whole = {"micro_batch_size": 0} if candidate.settings or candidate.recipe == "scratch" else {}

@@ -19,8 +19,8 @@ from torch.utils.data import default_collate
 
 from pipeline.card import write_card
 from pipeline.config import EncoderConfig, RuntimeConfig
-from pipeline.encoder.clips import ClipDataset, EncoderData, LabelledVideo
-from pipeline.encoder.frame_classifier import Clips, JointFrameClassifier, choose_strength, fit_frame_heads
+from pipeline.encoder.clips import ClipDataset, EncoderData
+from pipeline.encoder.frame_classifier import JointFrameClassifier, choose_strength, fit_frame_heads
 from pipeline.encoder.model import PropertyClassifier, SideBySide
 from pipeline.encoder.recipes import property_classifier
 from pipeline.encoder.tuned import FLIPS, AboveTrunks, TrunkDataset, Trunks, run_trunks
@@ -87,7 +87,11 @@ def tune(
     """
     device, above = resolve_device(runtime.device), AboveTrunks(model)
     training, validation = data.videos(Part.TRAIN), data.videos(Part.VALIDATION)
-    curve = fit_heads(model, above.describe(trunks, training, device), training, data, seed)
+    owners = {a.video_id: a.object_id for a in data.assignments}
+    features, labels = above.describe(trunks, training, device), np.array([v.labels for v in training])
+    fitted = (features, labels, [owners[v.video_id] for v in training], data.classes)
+    strength, curve = choose_strength(*fitted, seed)
+    fit_frame_heads(*fitted, strength).copy_into(model)
     if not validation:
         return curve
     probe = {name: value.clone() for name, value in trainable_state(model).items()}
@@ -102,18 +106,6 @@ def tune(
             for name, value in trainable_state(model).items():
                 value.copy_(probe[name])
     return [*curve, *history]
-
-
-def fit_heads(
-    model: JointFrameClassifier, clips: Clips, videos: Sequence[LabelledVideo], data: EncoderData, seed: int
-) -> list[Measurement]:
-    """Fit a per-frame classifier's heads to what its encoder says of these videos."""
-    labels = np.array([video.labels for video in videos])
-    owners = {a.video_id: a.object_id for a in data.assignments}
-    objects = [owners[video.video_id] for video in videos]
-    strength, curve = choose_strength(clips, labels, objects, data.classes, seed)
-    fit_frame_heads(clips, labels, objects, data.classes, strength).copy_into(model)
-    return curve
 
 
 def train_classifier(
@@ -158,9 +150,7 @@ def train_classifier(
         folder,
         runtime,
         seed,
-        batch_size=config.batch_size,
-        micro_batch_size=min(config.micro_batch_size or config.batch_size, config.batch_size),
-        max_grad_norm=config.max_grad_norm,
+        config,
         num_train_epochs=config.epochs,
         bf16=config.autocast == "bfloat16",
         learning_rate=config.learning_rate,

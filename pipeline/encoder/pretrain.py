@@ -136,9 +136,7 @@ def pretrain(
         checkpoint_dir("pretrain", config, frames.fit, frames.pixels),
         runtime,
         config.seed,
-        batch_size=config.batch_size,
-        micro_batch_size=config.batch_size,  # Its layers normalise over what is computed at once.
-        max_grad_norm=config.max_grad_norm,
+        config,
         max_steps=config.steps,
         learning_rate=config.learning_rate,
         weight_decay=config.weight_decay,

@@ -175,14 +175,13 @@ def fit(
         checkpoint_dir(job.stage, job.fingerprint),
         runtime,
         job.seed,
-        batch_size=config.batch_size,
-        micro_batch_size=config.micro_batch_size,
-        max_grad_norm=config.max_grad_norm,
+        config,
         num_train_epochs=config.epochs,
         weight_decay=config.weight_decay,
         warmup_steps=round(config.warmup_ratio * steps),
         logging_steps=max(1, steps // 50),
     )
+    shared = config.micro_batch_size * arguments.world_size if arguments.world_size > 1 else 1
     trainer = TrainableTrainer(
         model=model,
         args=arguments,
@@ -191,13 +190,7 @@ def fit(
         callbacks=[TrainingMonitor(), *job.callbacks],
         rates={**dict.fromkeys(trained, config.projection_learning_rate), **adapters},
         constant=("connector.projection",) if config.projection_schedule == "constant" else (),
-        sampler=UpdateSampler(
-            data.lengths,
-            config.batch_size,
-            job.seed,
-            lambda: data.epoch,
-            shared=config.micro_batch_size * arguments.world_size if arguments.world_size > 1 else 1,
-        ),
+        sampler=UpdateSampler(data.lengths, config.batch_size, job.seed, lambda: data.epoch, shared),
     )
     return train(trainer)
 

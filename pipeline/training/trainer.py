@@ -25,7 +25,7 @@ from transformers.trainer import SCHEDULER_NAME, TRAINER_STATE_NAME, TRAINING_AR
 from transformers.trainer_utils import get_last_checkpoint
 from transformers.utils import SAFE_WEIGHTS_NAME
 
-from pipeline.config import RuntimeConfig
+from pipeline.config import Accumulated, EncoderConfig, PretrainConfig, RuntimeConfig
 from pipeline.errors import UserError
 from pipeline.io import code_of, fingerprint
 from pipeline.records import Measurement
@@ -204,21 +204,18 @@ MEANT = {
     "ACCELERATE_USE_DEEPSPEED": "false",
     "ACCELERATE_USE_MEGATRON_LM": "false",
     "ACCELERATE_USE_PARALLELISM_CONFIG": "false",
+    "FSDP_VERSION": "2",
 }
-"""How accelerate is told, by its launcher or a shell, to compute in another way than the parameters say: what each
-variable must be where it is set."""
+"""What its launcher, or a shell, may tell accelerate: with anything else another model would be trained."""
 
 
 def check_accelerate() -> None:
-    """Raise UserError where accelerate was told to compute otherwise than the parameters say.
-
-    Sharding changes no result by version 2. Version 1 renames what is trained, so that it would get no learning rate.
-    """
-    sharded = os.environ.get("ACCELERATE_USE_FSDP", "").lower() == "true"
-    meant = MEANT | ({"FSDP_VERSION": "2"} if sharded else {})
-    for name, value in meant.items():
-        found = os.environ.get(name, "1" if name == "FSDP_VERSION" else value)
-        if found.lower() != value:
+    """Raise UserError where accelerate was told to compute otherwise than the parameters say."""
+    # Of FSDP it takes version 1 where none is named, which renames what is trained: that would have no learning rate.
+    unnamed = {"FSDP_VERSION": "1"} if "ACCELERATE_USE_FSDP" in os.environ else {}
+    for name, meant in MEANT.items():
+        found = os.environ.get(name, unnamed.get(name, meant))
+        if found.lower() != meant:
             raise UserError(
                 f"runtime.launcher: {name} is {found}, which would change what is trained; launch with a file of "
                 "conf/accelerate, and unset the variable in your shell"
@@ -226,38 +223,25 @@ def check_accelerate() -> None:
 
 
 def training_arguments(
-    folder: Path,
-    runtime: RuntimeConfig,
-    seed: int,
-    *,
-    batch_size: int,
-    micro_batch_size: int,
-    max_grad_norm: float,
-    **own: Any,
+    folder: Path, runtime: RuntimeConfig, seed: int, config: Accumulated | EncoderConfig | PretrainConfig, **own: Any
 ) -> TrainingArguments:
-    """What all trainings share: AdamW, a cosine, checkpoints every `runtime.save_steps`.
+    """What all trainings share: AdamW, a cosine, checkpoints every `runtime.save_steps`; `own` adds and overrides.
 
-    Args:
-        batch_size: Items of an update, over all devices.
-        micro_batch_size: Items at a time on one device; the rest is accumulated.
-        max_grad_norm: Longer gradients are shortened to it; 0 leaves all as they are.
-        own: Adds to what is shared, and overrides it.
+    An update has `batch_size` items of `config` over all devices, in parts where it has a `micro_batch_size`.
     """
     limit_threads(runtime.threads)
     check_accelerate()
-    devices = int(os.environ.get("WORLD_SIZE", "1"))
-    if batch_size % (micro_batch_size * devices):
-        raise UserError(
-            f"batch_size {batch_size} cannot be shared by {devices} devices at micro_batch_size {micro_batch_size}; "
-            "lower micro_batch_size"
-        )
+    batch, devices = config.batch_size, int(os.environ.get("WORLD_SIZE", "1"))
+    micro = min(getattr(config, "micro_batch_size", 0) or batch, batch)
+    if batch % (micro * devices):
+        raise UserError(f"micro_batch_size {micro} on {devices} devices does not divide batch_size {batch}; lower it")
     shared: dict[str, Any] = {
         "output_dir": str(folder),
         "seed": seed,
-        "per_device_train_batch_size": micro_batch_size,
-        "per_device_eval_batch_size": micro_batch_size,
-        "gradient_accumulation_steps": batch_size // (micro_batch_size * devices),
-        "max_grad_norm": max_grad_norm,
+        "per_device_train_batch_size": micro,
+        "per_device_eval_batch_size": micro,
+        "gradient_accumulation_steps": batch // (micro * devices),
+        "max_grad_norm": config.max_grad_norm,
         "optim": "adamw_torch",
         "lr_scheduler_type": "cosine",
         "save_strategy": "steps" if runtime.save_steps else "no",

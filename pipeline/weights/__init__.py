@@ -110,7 +110,8 @@ def check_encoder(folder: Path, size: int, backbone: Collection[str]) -> None:
         wanted = MADE[folder.name].size if made_anew else frame_side(folder, name)
         if size < wanted:
             raise UserError(
-                f"frames.pixels is {size} but the encoder in {folder} takes {wanted} or more; set frames.pixels={wanted}"
+                f"frames.pixels is {size} but the encoder in {folder} takes {wanted} or more; set "
+                f"frames.pixels={wanted}"
             )
 
 

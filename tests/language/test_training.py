@@ -26,7 +26,7 @@ from pipeline.language.conversations import collate
 from pipeline.language.teach.training import teach
 from pipeline.language.training import Job, Material, add_lora, assemble, fit, write_model_card
 from pipeline.runtime import derive_seed
-from pipeline.training.trainer import Trained
+from pipeline.training.trainer import Trained, training_arguments
 from tests.closure import ROOT
 from tests.conftest import Begun, refused
 from tests.language.shared import SMALL, assert_comes_back, embedded, taking, train
@@ -313,7 +313,7 @@ def test_a_training_is_not_gone_on_with_by_another_version_of_the_code(
         ({"ACCELERATE_USE_MEGATRON_LM": "true"}, "ACCELERATE_USE_MEGATRON_LM is true"),
         ({"ACCELERATE_USE_PARALLELISM_CONFIG": "true"}, "ACCELERATE_USE_PARALLELISM_CONFIG is true"),
         ({"ACCELERATE_USE_FSDP": "true"}, "FSDP_VERSION is 1"),
-        ({"WORLD_SIZE": "3"}, "batch_size 4 cannot be shared by 3 devices"),
+        ({"WORLD_SIZE": "3"}, "micro_batch_size 2 on 3 devices does not divide batch_size 4"),
     ],
 )
 def test_accelerate_may_not_compute_otherwise_than_the_parameters_say(
@@ -323,3 +323,14 @@ def test_accelerate_may_not_compute_otherwise_than_the_parameters_say(
         monkeypatch.setenv(name, value)
     with refused(f"{words}.*"):
         run("align", held, checkpoints)
+
+
+def test_threads_are_the_parameters_where_torch_was_imported_late(tmp_path: Path) -> None:
+    """A stage limits them when it begins, and imports torch after that."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        training_arguments(tmp_path, RuntimeConfig(device="cpu", threads=2), 0, SMALL)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)

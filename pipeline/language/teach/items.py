@@ -176,7 +176,9 @@ def draw(rng: random.Random, form: Form, *, held: bool = False, further: bool = 
             questions, answers = (_numbered(texts) for texts in (more.keys(), more.values()))
             more = {questions: answers}
         first, *later = more.items()
-        turns = _place(*first, _describe_all(things, form, rng), place, things.words, rng)
+        chosen, style = _wordings(things, rng), rng.choice(STYLES.get(form, ("list",)))
+        described = " ".join(_describe(label, things, i, chosen, style, rng) for i, label in enumerate(things.labels))
+        turns = _place(*first, described, place, things.words, rng)
         turns += [Turn(user=question, assistant=answer) for question, answer in later]
         return Item(kind, tuple(turns))
 
@@ -277,11 +279,6 @@ def _sort(things: Things, order: Sequence[int], rng: random.Random) -> tuple[str
 def _wordings(things: Things, rng: random.Random) -> dict[str, list[str]]:
     """One wording of each level of each topic: what is alike is called alike."""
     return {topic: [rng.choice(level) for level in things.words.properties[topic].levels] for topic in things.topics}
-
-
-def _describe_all(things: Things, form: Form, rng: random.Random) -> str:
-    chosen, style = _wordings(things, rng), rng.choice(STYLES.get(form, ("list",)))
-    return " ".join(_describe(label, things, i, chosen, style, rng) for i, label in enumerate(things.labels))
 
 
 def _describe(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import random
 import shutil
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -50,11 +50,6 @@ KEPT = ("config.json", "README.md")
 """Files of the base that the taught model writes anew, beside the weights."""
 
 
-def longest(config: TeachConfig) -> int:
-    """Updates of a teaching that passes no exam."""
-    return sum(getattr(config.max_updates, phase) for phase in PHASES)
-
-
 def encode_item(item: Item, tokenizer: PreTrainedTokenizerBase, system_prompt: str) -> Encoded:
     """Token ids of an item, with labels on what its answers conclude, end tokens included."""
     return encode_turns(item.turns, tokenizer, system_prompt=system_prompt, frames=0, descriptions=False)
@@ -86,7 +81,8 @@ class Course(Dataset[Encoded]):
         self._update = lru_cache(maxsize=2)(self._draw_update)
 
     def __len__(self) -> int:
-        return longest(self.config) * self.config.batch_size
+        updates: int = sum(getattr(self.config.max_updates, phase) for phase in PHASES)
+        return updates * self.config.batch_size
 
     def __getitem__(self, index: int) -> Encoded:
         update, place = divmod(index, self.config.batch_size)
@@ -117,17 +113,12 @@ class Course(Dataset[Encoded]):
     def exam(self, phase: Form) -> list[Encoded]:
         """Items that are never trained on, of one question; combinations of our properties are held out."""
         rngs = (random.Random(derive_seed(self.seed, "exam", phase, i)) for i in range(self.config.check_items))
-        return self._encoded(draw(rng, phase, held=True) for rng in rngs)
+        return [encode_item(draw(rng, phase, held=True), self.tokenizer, self.system_prompt) for rng in rngs]
 
     def _draw_update(self, update: int, phase: Form) -> list[Encoded]:
-        drawn = []
-        for place in range(self.config.batch_size):
-            rng = random.Random(derive_seed(self.seed, "teach", update, place))
-            drawn.append(draw_of(phase, rng))
-        return sorted(self._encoded(drawn), key=lambda e: len(e.input_ids))
-
-    def _encoded(self, drawn: Iterable[Item]) -> list[Encoded]:
-        return [encode_item(item, self.tokenizer, self.system_prompt) for item in drawn]
+        rngs = (random.Random(derive_seed(self.seed, "teach", update, i)) for i in range(self.config.batch_size))
+        drawn = [encode_item(draw_of(phase, rng), self.tokenizer, self.system_prompt) for rng in rngs]
+        return sorted(drawn, key=lambda e: len(e.input_ids))
 
 
 def collate(batch: Sequence[Encoded]) -> dict[str, torch.Tensor]:
@@ -243,10 +234,8 @@ def teach(
         checkpoint_dir(stage, config, language.system_prompt, dtype, seed, folder),
         runtime,
         seed,
-        batch_size=config.batch_size,
-        micro_batch_size=config.micro_batch_size,
-        max_grad_norm=config.max_grad_norm,
-        max_steps=longest(config),
+        config,
+        max_steps=len(course) // config.batch_size,
         learning_rate=config.learning_rate,
         logging_steps=config.check_every,
         eval_strategy="steps",
