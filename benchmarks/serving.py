@@ -23,7 +23,7 @@ from benchmarks.timing import machine, milliseconds
 from pipeline.errors import UserError
 from pipeline.params import load_params
 from pipeline.use.ask import default_model
-from pipeline.videos.files import SUFFIXES
+from pipeline.videos.files import video_files
 
 QUESTION = "Describe the touch. {tactile}"
 CLIENTS, EACH = 20, 10
@@ -39,7 +39,7 @@ def measure(root: Path, clients: int = CLIENTS, each: int = EACH) -> list[Row]:
     """
     folder = default_model(root / "models")
     place = root / load_params(root / "params.yaml").data.dir
-    videos = sorted(f for f in place.rglob("*") if f.suffix.lower() in SUFFIXES)[:clients]
+    videos = video_files(place)[0][:clients]
     if not videos:
         raise UserError(f"{place}: holds no video to ask about; `dvc repro` makes or finds some")
     ask = [*COMMAND, "ask", QUESTION, str(videos[0]), "--model", str(folder)]

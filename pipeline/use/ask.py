@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -14,10 +15,13 @@ from pipeline.io import write_text
 from pipeline.params import project_above
 from pipeline.runtime import progress
 from pipeline.use.results import Exchange, Video
-from pipeline.videos.files import SUFFIXES
+from pipeline.videos.decoding import SUFFIXES
+from pipeline.videos.files import video_files
 
 if TYPE_CHECKING:
     from pipeline.use.model import Octopi
+
+log = logging.getLogger(__name__)
 
 MODELS = Path("models")
 PREFERRED = "finetuned-with-all-*"
@@ -149,7 +153,9 @@ def describe_folder(model: Octopi, folder: Path, out: Path) -> tuple[int, int]:
     if folder.is_file():
         files, folder = [folder], folder.parent
     else:
-        files = sorted(f for f in folder.rglob("*") if f.suffix.lower() in SUFFIXES and f.is_file())
+        files, findings = video_files(folder)
+        for finding in findings:
+            log.warning("%s: %s", finding.item, finding.measured)
     if not files:
         raise UserError(f"{folder}: holds no video ({', '.join(SUFFIXES)}); name another folder")
     columns = _columns(model)

@@ -25,7 +25,7 @@ from pipeline.records import Record
 from pipeline.scenes.film import write_film
 from pipeline.videos.audit.files import FOUND
 from pipeline.videos.decoding import Image
-from pipeline.videos.files import SUFFIXES
+from pipeline.videos.files import is_video
 from pipeline.videos.frames.reference import (
     LONGEST,
     contact_strength,
@@ -262,5 +262,5 @@ def _rate(bag: Path, stamped: Sequence[int], received: Sequence[int]) -> float:
 
 def _next_number(folder: Path, object_id: str) -> int:
     """One more than the largest number that the object's videos in the folder have."""
-    names = [re.fullmatch(rf"{re.escape(object_id)}_(\d+)", p.stem) for p in folder.iterdir() if p.suffix in SUFFIXES]
+    names = [re.fullmatch(rf"{re.escape(object_id)}_(\d+)", p.stem) for p in folder.iterdir() if is_video(p)]
     return max((int(m[1]) + 1 for m in names if m), default=0)

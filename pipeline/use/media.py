@@ -24,11 +24,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Self
 
+import av
+
 from pipeline.errors import UserError
+from pipeline.videos.decoding import CONTAINERS, SUFFIXES
 
 DATA_URI = re.compile(r"data:[\w.+/-]*(?:;[\w.+/=-]+)*;base64,", re.ASCII)
-FORMATS = "mov,mp4,m4a,3gp,3g2,mj2,avi,matroska,webm"
-"""Containers that hold their own pictures; a playlist would make FFmpeg read other files."""
 SUFFIX = {b"RIFF": ".avi", b"\x1aE\xdf\xa3": ".mkv"}
 PREFIX = "octopi-"
 PLACE = re.compile(rf"\S*{PREFIX}\w+/video(\d+)\.\w+")
@@ -173,12 +174,9 @@ def check(path: Path, limits: Limits) -> None:
     Raises:
         Refused: where it is too much, or no video.
     """
-    import av
-
-    av.logging.set_level(av.logging.PANIC)
     try:
         # FFmpeg decodes the first frames to know their form; it may not take memory for more than these pixels.
-        with av.open(str(path), options={"format_whitelist": FORMATS, "max_pixels": str(limits.pixels)}) as container:
+        with av.open(str(path), options={**CONTAINERS, "max_pixels": str(limits.pixels)}) as container:
             if len(container.streams.video) != 1:
                 raise Refused(f"holds {len(container.streams.video)} video streams; send one")
             stream = container.streams.video[0]
@@ -190,7 +188,7 @@ def check(path: Path, limits: Limits) -> None:
                 message = f"frames are damaged or have more than {limits.pixels} pixels; make them smaller"
                 raise Refused(message, 413)
         # Now as the library opens it, so that what passes here does no harm there.
-        with av.open(str(path)) as container:
+        with av.open(str(path), options=CONTAINERS) as container:
             stream = container.streams.video[0]
             stream.thread_type, stream.codec_context.thread_count = "NONE", 1
             decoded = 0
@@ -214,7 +212,7 @@ def check(path: Path, limits: Limits) -> None:
     except MemoryError:
         raise Refused("takes too much memory to decode; send a shorter or smaller one", 413) from None
     except (av.FFmpegError, ValueError, IndexError):
-        raise Refused("no video that can be read; send an MP4, MOV, AVI or MKV file") from None
+        raise Refused(f"no video that can be read; send one of {', '.join(SUFFIXES)}") from None
 
 
 def _too_long(limits: Limits) -> str:
@@ -223,8 +221,6 @@ def _too_long(limits: Limits) -> str:
 
 def main() -> None:
     """Check the files that standard input names, one a line; answer each with a line of JSON. End with the parent."""
-    import av  # noqa: F401  # Its libraries count as there already.
-
     limits = Limits(**json.loads(sys.argv[1]))
     with suppress(OSError, ValueError):
         pages = int(Path("/proc/self/statm").read_text().split()[0])

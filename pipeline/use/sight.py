@@ -18,7 +18,8 @@ from pipeline.records import Finding
 from pipeline.training.sampling import sample_evaluation
 from pipeline.use.results import Pictures, Touch, Video
 from pipeline.videos.audit.files import FOUND, unsteady
-from pipeline.videos.files import VideoFile
+from pipeline.videos.decoding import SUFFIXES
+from pipeline.videos.files import VideoFile, is_video
 from pipeline.videos.frames.scan import Scan, scan
 from pipeline.videos.frames.subtraction import GAIN, MIDDLE, subtract
 
@@ -98,6 +99,8 @@ def _as_file(video: Video) -> Iterator[Path]:
         # A pipe or a device is not opened: reading it may never end.
         if not os.path.isfile(path):  # pathlib's raises where a name is too long.
             raise UserError(f"{path}: no such file; name a video")
+        if not is_video(path):
+            raise UserError(f"{path}: no video by its name ({', '.join(SUFFIXES)}); rename or convert it")
         yield path
         return
     if video.dtype != np.uint8 or video.ndim != 4 or video.shape[3] != 3 or not all(video.shape):

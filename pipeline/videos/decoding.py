@@ -23,6 +23,10 @@ cv2.setNumThreads(1)  # The files are what runs in parallel.
 av.logging.set_level(av.logging.PANIC)  # Broken files are reported in a line of our own.
 
 Image = npt.NDArray[np.uint8]
+SUFFIXES = (".avi", ".m4v", ".mjpg", ".mkv", ".mov", ".mp4", ".webm")
+"""What is a video by its name, wherever it comes from."""
+CONTAINERS = {"format_whitelist": "avi,matroska,mjpeg,mov"}
+"""And by what it holds, in FFmpeg's words. All hold their own pictures; a playlist would make it read other files."""
 PLANAR = frozenset(f"yuv{j}{kind}p" for j in ("", "j") for kind in ("420", "422", "444", "440", "411", "410"))
 """Formats whose first plane is brightness and whose second and third are colour, 8 bits each."""
 FULL_RANGE, BT709 = 2, 1
@@ -46,7 +50,7 @@ class Decoder:
         self._container: av.container.InputContainer | None = None
         self.header = Header()
         try:
-            self._container = av.open(str(path))
+            self._container = av.open(str(path), options=CONTAINERS)
             stream = self._container.streams.video[0]
         except (av.FFmpegError, IndexError, ValueError):
             return

@@ -14,10 +14,14 @@ from pipeline.errors import UserError
 from pipeline.records import Finding, Severity
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.catalogue.csv_reader import read_rows
+from pipeline.videos.decoding import SUFFIXES
 
-SUFFIXES = (".avi", ".mjpg", ".mkv", ".mov", ".mp4")
 LIST_FILE = "videos.csv"
 """Optional, in the videos' folder: columns `file`, `object_id` and, where known, `session`."""
+
+
+PASSED = "passed over"
+"""The check of what is no video."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,7 @@ def list_videos(folder: Path, catalogue: Catalogue) -> Listing:
     if not folder.is_dir():
         what = "a file and no folder" if folder.exists() else "no such folder"
         return Listing((), (_error(str(folder), f"{what}; set data.dir to the folder of the videos"),))
-    paths, findings = _video_files(folder)
+    paths, findings = video_files(folder)
     if not paths:
         kinds = ", ".join(SUFFIXES)
         empty = _error(str(folder), f"holds no video ({kinds}); set data.dir to the folder of the videos")
@@ -89,27 +93,44 @@ def _error(item: str, message: str) -> Finding:
     return Finding(check="name", item=item, measured=message, severity=Severity.ERROR)
 
 
-def _video_files(folder: Path) -> tuple[list[Path], list[Finding]]:
-    """Files that look like videos, sorted, and what cannot be looked into; nothing hidden.
+def is_video(path: Path) -> bool:
+    """Whether a file is taken for a video: by its name alone. What it holds is found when it is decoded."""
+    return path.suffix.lower() in SUFFIXES
 
-    A dead link counts, so that reading it says so. A pipe or a device does not: reading it may never end.
+
+def video_files(folder: Path) -> tuple[list[Path], list[Finding]]:
+    """The videos of a folder and its subfolders, sorted, and what is passed over or cannot be looked into.
+
+    A dead link counts, so that reading it says so. A pipe or a device does not: reading it may never end. A linked
+    folder is not entered: DVC does not look behind such a link either, so a change there would rerun nothing.
     """
-    paths, findings = [], []
+    paths, findings, others = [], [], Counter[str]()
 
     def unreadable(error: OSError) -> None:
         where = Path(error.filename).relative_to(folder).as_posix()
         findings.append(_error(where, f"cannot be read ({error.strerror}); make it readable, or move it"))
 
     for place, folders, names in os.walk(folder, onerror=unreadable, followlinks=False):
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        for path in (Path(place, name) for name in names if not name.startswith(".")):
-            if path.suffix.lower() not in SUFFIXES:
-                continue
-            if path.exists() and not path.is_file():
-                where = path.relative_to(folder).as_posix()
+        hidden = [name for name in (*folders, *names) if name.startswith(".")]
+        others["hidden"] += len(hidden)
+        for path in (Path(place, name) for name in sorted({*folders, *names} - {*hidden})):
+            where = path.relative_to(folder).as_posix()
+            if path.name in folders:
+                if path.is_symlink():
+                    message = "a linked folder is not looked into, nor by DVC; link the files, or name it as the folder"
+                    findings.append(Finding(check=PASSED, item=where, measured=message, severity=Severity.WARNING))
+            elif not is_video(path):
+                others[path.suffix.lower() or "without a suffix"] += where != LIST_FILE
+            elif path.exists() and not path.is_file():
                 findings.append(_error(where, "is no file but a pipe, socket or device; move it"))
             else:
                 paths.append(path)
+        folders[:] = sorted({*folders} - {*hidden})
+    if others.total():
+        kinds = sorted((-count, kind) for kind, count in others.items() if count)
+        counted = ", ".join(f"{-count} {kind}" for count, kind in kinds)
+        message = f"{others.total()} are no videos by their names: {counted}"
+        findings.append(Finding(check=PASSED, item=str(folder), measured=message, severity=Severity.INFO))
     return sorted(paths), findings
 
 

@@ -103,14 +103,21 @@ def folder(files: list[Path], tmp_path: Path) -> Path:
         shutil.copy(file, place)
     (place / "broken.avi").write_text("no video")
     (place / "notes.txt").touch()
+    (place / "gone.mov").symlink_to(place / "nowhere.mov")
+    (place.parent / "linked").symlink_to(place)
     return place.parent
 
 
-def test_a_folder_is_described(octopi: Octopi, folder: Path, files: list[Path], tmp_path: Path) -> None:
-    assert describe_folder(octopi, folder, tmp_path / "out.csv") == (4, 1)
+def test_a_folder_is_described(
+    octopi: Octopi, folder: Path, files: list[Path], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert describe_folder(octopi, folder, tmp_path / "out.csv") == (5, 2)
     found = {row["file"]: row for row in rows_of(tmp_path / "out.csv")}
-    assert set(found) == {f"a,  b/{name}" for name in ("broken.avi", *(f.name for f in files))}
+    assert set(found) == {f"a,  b/{name}" for name in ("broken.avi", "gone.mov", *(f.name for f in files))}
     assert "no frame decodes" in found["a,  b/broken.avi"]["error"]
+    assert "no such file" in found["a,  b/gone.mov"]["error"]
+    assert [record.getMessage().split(":")[0] for record in caplog.records] == ["linked", str(folder)]
+    assert "1 .txt" in caplog.text
     for file in files:
         row, expected = found[f"a,  b/{file.name}"], octopi.describe(file)
         assert {name: row[name] for name in octopi.properties} == expected.levels
@@ -125,7 +132,7 @@ def test_a_folder_is_described_and_a_model_copied_by_command(
     out, model = tmp_path / "out.csv", ["--model", str(made.folder), "--device", "cpu"]
     said = CliRunner().invoke(app, ["describe", str(folder), "--csv", str(out), *model])
     assert said.exit_code == 0, said.output
-    assert f"{out}: 4 videos, 1 of them not described" in said.stdout
+    assert f"{out}: 5 videos, 2 of them not described" in said.stdout
     alone = tmp_path / "alone.csv"
     assert CliRunner().invoke(app, ["describe", str(files[0]), "--csv", str(alone), *model]).exit_code == 0
     assert [row["file"] for row in rows_of(alone)] == [files[0].name]
@@ -145,7 +152,7 @@ def test_a_killed_description_goes_on(
         looked: list[object] = []
         real = octopi.describe_all
         monkeypatch.setattr(octopi, "describe_all", lambda videos: looked.extend(videos) or real(videos))  # noqa: B023
-        assert describe_folder(octopi, folder, out) == (4, 1)
+        assert describe_folder(octopi, folder, out) == (5, 2)
         monkeypatch.undo()
         monkeypatch.setattr(asking, "BATCH", 1)
         assert out.read_text() == text

@@ -9,14 +9,22 @@ import subprocess
 import sys
 from pathlib import Path
 
+import av
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.config import FramesConfig
+from pipeline.errors import UserError
 from pipeline.use.media import Gate, Limits, Refused, from_base64
+from pipeline.use.sight import see
+from pipeline.videos.decoding import SUFFIXES, Decoder
+from pipeline.videos.files import video_files
 from tests.closure import ROOT
 from tests.conftest import HUNG
 from tests.use.videos import avi_of_giant_jpegs, blank, claims_frames, claims_pixels, video
+
+FRAMES = FramesConfig(size=32)
 
 
 @pytest.fixture(scope="module")
@@ -47,13 +55,24 @@ def test_paths_addresses_and_broken_base64_are_refused(text: str) -> None:
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize(("suffix", "codec"), [(".mp4", "mpeg4"), (".avi", "mjpeg"), (".mkv", "ffv1")])
-def test_good_videos_come_as_files_that_go(gate: Gate, suffix: str, codec: str) -> None:
-    videos = [video(1, suffix=suffix, codec=codec), video(2, suffix=suffix, codec=codec)]
+CODECS = {".avi": "mjpeg", ".mjpg": "mjpeg", ".mkv": "ffv1", ".webm": "libvpx"}
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_video_is_one_for_the_server_for_ask_and_in_a_folder(gate: Gate, suffix: str, tmp_path: Path) -> None:
+    videos = [video(seed, suffix=suffix, codec=CODECS.get(suffix, "mpeg4")) for seed in (1, 2)]
+    named, other = tmp_path / f"rug_0{suffix.upper()}", tmp_path / "rug_0.gif"
+    for path in (named, other):
+        path.write_bytes(videos[0])
+    assert video_files(tmp_path)[0] == [named]
+    with pytest.raises(UserError, match="no video by its name"):
+        see(other, FRAMES, subtracts=False, quiet=0)
+    asked = see(named, FRAMES, subtracts=False, quiet=0)
     with gate.files(videos) as paths:
         assert [p.read_bytes() for p in paths] == videos
-        assert {p.suffix for p in paths} == {suffix if suffix != ".mp4" else ".mov"}
+        served = see(paths[0], FRAMES, subtracts=False, quiet=0)
     assert not any(p.parent.exists() for p in paths)
+    assert (served.pictures == asked.pictures).all()
 
 
 @pytest.mark.parametrize(
@@ -77,6 +96,17 @@ def test_bombs_and_what_is_no_video(gate: Gate, data: object, status: int, words
     assert refused.value.status == status
     assert str(refused.value).startswith("video 1: ")
     assert "/tmp" not in str(refused.value)
+
+
+def test_what_makes_ffmpeg_read_other_files_is_no_video_anywhere(gate: Gate, tmp_path: Path) -> None:
+    (tmp_path / "secret.mp4").write_bytes(video())
+    (playlist := tmp_path / "list.mov").write_text("ffconcat version 1.0\nfile secret.mp4\n")
+    with av.open(str(playlist)) as container:
+        assert next(container.decode(video=0)), "FFmpeg alone reads it"
+    with Decoder(playlist) as decoder:
+        assert list(decoder.frames()) == []
+    with pytest.raises(Refused, match="no video"), gate.files([playlist.read_bytes()]):
+        pass
 
 
 def test_the_last_allowed_frame_and_one_more() -> None:

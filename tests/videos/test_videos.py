@@ -53,12 +53,31 @@ def test_a_good_folder(tiny_videos: Path, catalogue: Catalogue) -> None:
 
 
 def test_hidden_and_other_files_do_not_count(tmp_path: Path, catalogue: Catalogue) -> None:
-    touch(tmp_path, "rug_0.MKV", "rug_1.Mp4", "readme.txt", "._rug_0.mov", ".cache/rug_0.mov", "rug_2.mp3")
+    touch(tmp_path, "rug_0.MKV", "rug_1.Mp4", "readme.txt", "._rug_0.mov", ".cache/rug_0.mov", "rug_2.mp3", "a/b.TXT")
+    touch(tmp_path, "Makefile")
     (tmp_path / "rug_7.mov").mkdir()
     (tmp_path / "rug_8.mov").symlink_to(tmp_path / "gone.mov")
     listing = list_videos(tmp_path, catalogue)
     assert [f.relative for f in listing.files] == ["rug_0.MKV", "rug_1.Mp4", "rug_8.mov"], "reading tells of dead links"
-    assert listing.findings == ()
+    (said,) = listing.findings
+    assert (said.check, said.item, said.severity) == ("passed over", str(tmp_path), Severity.INFO)
+    assert said.measured == "6 are no videos by their names: 2 .txt, 2 hidden, 1 .mp3, 1 without a suffix"
+
+
+def test_linked_folders_are_named_and_linked_files_are_videos(tmp_path: Path, catalogue: Catalogue) -> None:
+    """DVC does not look behind a link to a folder, so a change there would rerun nothing. Loops end nothing either."""
+    folder, elsewhere = touch(tmp_path / "videos", "rug_0.mov"), touch(tmp_path / "monday", "rug_1.mov", "rug_2.mov")
+    (folder / "tuesday").symlink_to(elsewhere)
+    (folder / "loop").symlink_to(folder)
+    (folder / "rug_3.mov").symlink_to(elsewhere / "rug_2.mov")
+    listing = list_videos(folder, catalogue)
+    assert ids(listing) == ["rug_0", "rug_3"]
+    assert [(f.check, f.item, f.severity) for f in listing.findings] == [
+        ("passed over", name, Severity.WARNING) for name in ("loop", "tuesday")
+    ]
+    assert all("link the files" in f.measured for f in listing.findings)
+    (linked := tmp_path / "linked").symlink_to(folder)
+    assert ids(list_videos(linked, catalogue)) == ids(listing), "the folder itself may be a link"
 
 
 def test_accents_are_one_however_they_are_written(tmp_path: Path, catalogue: Catalogue) -> None:

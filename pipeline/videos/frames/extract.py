@@ -16,7 +16,7 @@ from pipeline.config import FramesConfig
 from pipeline.errors import UserError
 from pipeline.io import atomic, code_of, fingerprint, write_table
 from pipeline.parallel import run_parallel
-from pipeline.records import Finding, Frame, Probe, Record, Video
+from pipeline.records import Finding, Frame, Probe, Record, Severity, Video
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import VideoFile, list_videos, raise_errors
 from pipeline.videos.frames.scan import scan
@@ -93,7 +93,7 @@ def extract_frames(folder: Path, catalogue: Catalogue, config: FramesConfig, out
     """
     listing = list_videos(folder, catalogue)
     raise_errors(folder, listing.findings)
-    for finding in listing.findings:
+    for finding in (f for f in listing.findings if f.severity is Severity.WARNING):
         log.warning("%s: %s", finding.item, finding.measured)
     work = partial / fingerprint(config, str(folder.resolve()), *code_of("extract_frames"))
     work.mkdir(parents=True, exist_ok=True)
