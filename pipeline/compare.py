@@ -13,7 +13,7 @@ from typing import Any
 import pandas as pd
 import pyarrow.parquet as pq
 
-from pipeline.errors import UserError
+from pipeline.errors import UserError, without_secrets
 from pipeline.evaluation.scores import difference, grouped, with_holm
 from pipeline.records import EffectRow, Graded
 from pipeline.revisions import State, find_state
@@ -146,4 +146,6 @@ def _changes(old: dict[str, Any], new: dict[str, Any]) -> Rows:
 
 def _flat(nested: dict[str, Any]) -> dict[str, str]:
     """Dotted key to value, as text."""
-    return {str(k): str(v) for row in pd.json_normalize(nested).to_dict("records") for k, v in row.items()}
+    return {
+        str(k): without_secrets(str(v)) for row in pd.json_normalize(nested).to_dict("records") for k, v in row.items()
+    }

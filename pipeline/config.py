@@ -9,8 +9,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from pipeline.errors import without_secrets
 from pipeline.records import Encoder, Lora, Opd, Touch, Variant
 from pipeline.runtime import DeviceName, DtypeName, Quantization
 
@@ -419,12 +420,23 @@ class TrackingConfig(Section):
     """MLflow."""
 
     uri: str = ""
-    """Tracking server; empty stands for the local database mlruns/mlflow.db."""
+    """Tracking server; empty stands for the local database mlruns/mlflow.db. No password: MLflow reads those of a
+    server from MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD."""
     experiment: str = "octopi"
     live: bool = True
     """Log trainings while they run (importing MLflow costs each of them seconds), or only when all is done."""
     timeout_seconds: Annotated[int, Field(ge=1, le=600)] = 10
     """After how long an unanswered call counts as a dead server."""
+
+    @field_validator("uri")
+    @classmethod
+    def _holds_no_secret(cls, uri: str) -> str:
+        if without_secrets(uri) != uri:
+            raise ValueError(
+                "holds a password or token, which Git would keep; leave it out and set MLFLOW_TRACKING_USERNAME and "
+                "MLFLOW_TRACKING_PASSWORD, or MLFLOW_TRACKING_TOKEN (for a database what its driver reads: PGPASSWORD)"
+            )
+        return uri
 
 
 class RuntimeConfig(Section):

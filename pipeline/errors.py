@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable
 
 from pydantic import ValidationError
@@ -11,8 +12,25 @@ from pydantic import ValidationError
 class UserError(Exception):
     """Bad input: one line that names the file or key and how to mend it.
 
-    Stages and the command line print it without a traceback and exit with status 1.
+    Stages and the command line print it without a traceback and exit with status 1. No address in it has a password.
     """
+
+    def __init__(self, line: object = "") -> None:
+        super().__init__(without_secrets(str(line)))
+
+
+SECRET = re.compile(
+    # Before an @: in a web address all of it, as tokens stand alone there; elsewhere what has a colon of no port.
+    r"(?P<web>https?:/{1,2})[^\s/?#]*@"
+    r"|(?P<other>\b[a-z][\w+.-]*:/{1,2})[^\s/:@]*:(?!\d*(?:[/?#\s]|$))\S*@"
+    r"|(?P<key>[?&;](?:pass(?:word|wd)?|pwd|token|secret|api_?key)=)[^\s&;#'\"]+",
+    re.IGNORECASE,
+)
+
+
+def without_secrets(text: str) -> str:
+    """A text in which no address has a password, a token or what may be one."""
+    return SECRET.sub(lambda found: f"{next(filter(None, found.groups()))}***{'' if found['key'] else '@'}", text)
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

@@ -9,10 +9,11 @@ import pytest
 
 from pipeline.encoder.candidates import RELEASE, needs_pretraining
 from pipeline.encoder.recipes import RECIPES
-from pipeline.errors import UserError
+from pipeline.errors import UserError, without_secrets
 from pipeline.params import load_params
 from pipeline.scales import check_inputs, compose, prune, shipped_scales, write_params
 from tests.closure import ROOT
+from tests.conftest import refused
 
 CONF = ROOT / "conf"
 
@@ -97,6 +98,40 @@ def test_broken_params_file(text: bytes | None, word: str, tmp_path: Path) -> No
     # Whatever stands there, the command that the line names writes it anew.
     assert write_params(compose("smoke", conf=CONF), path)
     assert load_params(path) == compose("smoke", conf=CONF)
+
+
+@pytest.mark.parametrize(
+    ("address", "shown"),
+    [
+        ("http://ada:S3cret@host:5000/x", "http://***@host:5000/x"),
+        ("https://S3cret@host", "https://***@host"),
+        ("https://ada:S3cret/c@host/x", "https://***@host/x"),
+        ("postgresql+psycopg2://ada:S3cret/S3cret@host/db", "postgresql+psycopg2://***@host/db"),
+        ("postgresql:///db?user=ada&password=S3cret", "postgresql:///db?user=ada&password=***"),
+        *((a, a) for a in ("http://host:5000/a@b", "postgresql://ada@host/db", "sqlite:////a:b@c/d.db", "sqlite:///x")),
+    ],
+)
+def test_no_password_of_an_address_is_a_parameter_or_printed(address: str, shown: str, tmp_path: Path) -> None:
+    assert without_secrets(f"at '{address}', {address}") == f"at '{shown}', {shown}"
+    assert str(UserError(f"{address} is away")) == f"{shown} is away"
+    plain = compose("smoke", conf=CONF)
+    params = plain.model_copy(update={"tracking": plain.tracking.model_copy(update={"uri": address})})
+    write_params(params, tmp_path / "params.yaml")
+    if address == shown:
+        assert load_params(tmp_path / "params.yaml").tracking.uri == address
+        return
+    for read in (
+        lambda: load_params(tmp_path / "params.yaml"),
+        lambda: compose("smoke", [f"tracking.uri={address}"], conf=CONF),
+        # As YAML and Hydra cannot read it, and say what they could not.
+        lambda: compose("smoke", [f"tracking.uri='{address}"], conf=CONF),
+        lambda: compose("smoke", [f"tracking.uri=[{address}]"], conf=CONF),
+    ):
+        with pytest.raises(UserError) as caught:
+            read()
+        assert "S3cret" not in str(caught.value)
+    with refused("tracking.uri: .*MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD"):
+        load_params(tmp_path / "params.yaml")
 
 
 @pytest.mark.parametrize(

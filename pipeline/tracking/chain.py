@@ -189,11 +189,6 @@ def milliseconds(seconds: float) -> int:
     return int(seconds * 1000)
 
 
-def in_words(error: Exception) -> str:
-    """An error as one short line."""
-    return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-
-
 def git(*arguments: str) -> str:
     """What Git prints; "unknown" where it fails."""
     with suppress(OSError, subprocess.SubprocessError):

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
+from pipeline.config import TrackingConfig
 from pipeline.stage import Stage
 from pipeline.tracking.chain import milliseconds, read_stages, settings
 from pipeline.tracking.store import PARENT, STAGE, Store, attempt
@@ -29,14 +30,14 @@ def live(run: Stage) -> Iterator[list[Any]]:
         return
     status = "FAILED"
     try:
-        yield attempt(_begin, run) or []
+        yield attempt(run.params.tracking, _begin, run) or []
         status = "FINISHED"
     except KeyboardInterrupt:
         status = "KILLED"
         raise
     finally:
         if mlflow := sys.modules.get("mlflow"):
-            attempt(mlflow.end_run, status)
+            attempt(run.params.tracking, mlflow.end_run, status)
             with suppress(Exception):
                 # Forgets a run that could not be ended, or MLflow would try again when the process ends.
                 mlflow.end_run(status)
@@ -60,10 +61,10 @@ def _begin(run: Stage) -> list[Any]:
     mlflow.set_tracking_uri(store.uri)
     # The callback logs to the active run.
     mlflow.start_run(run_id=child, log_system_metrics=True)
-    return [_callback()]
+    return [_callback(run.params.tracking)]
 
 
-def _callback() -> Any:
+def _callback(tracking: TrackingConfig) -> Any:
     from transformers.integrations import MLflowCallback
 
     from pipeline.training.trainer import measured
@@ -72,11 +73,11 @@ def _callback() -> Any:
         """Logs the names of history.parquet; at once and not behind a queue, so that a failure shows."""
 
         def setup(self, args: Any, state: Any, model: Any) -> None:
-            attempt(super().setup, args, state, model)
+            attempt(tracking, super().setup, args, state, model)
             self._async_log, self._initialized = False, True
 
         def on_log(self, args: Any, state: Any, control: Any, logs: Any, model: Any = None, **more: Any) -> None:
             if values := measured(logs):
-                attempt(super().on_log, args, state, control, values, model, **more)
+                attempt(tracking, super().on_log, args, state, control, values, model, **more)
 
     return Callback()

@@ -27,13 +27,12 @@ from pipeline.tracking.chain import (
     digest,
     flatten,
     git,
-    in_words,
     milliseconds,
     read_stages,
     settings,
 )
 from pipeline.tracking.registry import log_model, packaged, register
-from pipeline.tracking.store import KIND, PARENT, STAGE, Store, TrackingError, out_of_reach
+from pipeline.tracking.store import KIND, PARENT, STAGE, Store, TrackingError, cause, out_of_reach
 
 VARIANT, LOCK, CONTENT, STATE = "octopi.variant", "octopi.lock", "octopi.content", "octopi.state"
 """Tags with what a finished stage, variant and reproduction were made from; written last."""
@@ -47,7 +46,7 @@ def publish(params: Params) -> str:
         A line that says what was added.
 
     Raises:
-        TrackingError: where the server or database is out of reach.
+        TrackingError: where the server, the database or a file refuses; it says what and why.
         UserError: where a file of the reproduction is missing or broken.
     """
     stages = [stage for stage in read_stages(params) if stage.lock]
@@ -59,7 +58,7 @@ def publish(params: Params) -> str:
         raise
     except Exception as error:
         out_of_reach.set()
-        raise TrackingError(f"tracking is out of reach, `octopi publish` tries again: {in_words(error)}") from error
+        raise TrackingError(f"{cause(error, params.tracking)}; `octopi publish` tries again") from error
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import shutil
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -61,11 +62,13 @@ def log_model(client: Any, run: str, params: Params, variant: Variant, folder: P
     made = client.create_logged_model(experiment, NAME, source_run_id=run, tags=about, model_type="pyfunc")
     with TemporaryDirectory() as temporary:
         saved = Path(temporary, "model")
+        # Where DVC's cache hands out links, MLflow refuses them: they lead out of the folder.
+        real = shutil.copytree(folder, Path(temporary, folder.name))
         mlflow.pyfunc.save_model(
             saved,
             mlflow_model=Model(made.artifact_location, run_id=run, model_uuid=made.model_id, model_id=made.model_id),
             python_model=str(PACKAGE / "use" / "mlflow_model.py"),
-            artifacts={"folder": str(folder)},
+            artifacts={"folder": str(real)},
             model_config={"base": "", "device": "auto", "dtype": "auto"},
             code_paths=[str(PACKAGE)],
             pip_requirements=requirements(),

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import socket
 import sqlite3
 from collections.abc import Callable, Mapping, Sequence
@@ -16,8 +17,9 @@ from threading import Event
 from typing import Any, ParamSpec, TypeVar
 
 from pipeline.config import Params, TrackingConfig
-from pipeline.errors import UserError
-from pipeline.tracking.chain import ChainStage, git, in_words
+from pipeline.errors import UserError, without_secrets
+from pipeline.stage import main_folder
+from pipeline.tracking.chain import ChainStage, git
 
 logger = logging.getLogger(__name__)
 P = ParamSpec("P")
@@ -34,18 +36,41 @@ out_of_reach = Event()
 """Set by the first call that fails: this process makes no other, so that a dead server costs its time once."""
 
 
+MEANT = re.compile(
+    "MLFLOW_(TRACKING|S3|BOTO|GCS|KERBEROS|MYSQL|SQLALCHEMYSTORE|HTTP|WORKSPACE$|ARTIFACT|MULTIPART|"
+    "ENABLE_(PROXY_)?MULTIPART|SYSTEM_METRICS_SAMPL)"
+)
+"""MLflow's variables that say how a server is reached, who asks and how often: a person's to set. Others would have a
+curve logged to another run or experiment, or add to what is recorded."""
+
+
 class TrackingError(UserError):
-    """The tracking server or database is out of reach."""
+    """The tracking server, the database or a file refuses."""
 
 
-def attempt(call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T | None:
+def cause(error: Exception, tracking: TrackingConfig) -> str:
+    """What could not be tracked and why, in one line without passwords: the first reason of the network or the disk, as
+    MLflow's own words are about its calls."""
+    chain: list[BaseException] = [error]
+    while below := chain[-1].__cause__ or (None if chain[-1].__suppress_context__ else chain[-1].__context__):
+        chain.append(below)
+    first = chain[-1] if any(isinstance(each, OSError) for each in chain) else error
+    words = " ".join(str(first).split())
+    mend = ""
+    if re.search(r"\b40[13]\b|PERMISSION_DENIED|UNAUTHENTICATED", words):
+        mend = "; set MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD to those of the server"
+    place = tracking.uri or MLRUNS / "mlflow.db"
+    return without_secrets(f"tracking at {place}: {type(first).__name__}: {words[:300]}{mend}")
+
+
+def attempt(tracking: TrackingConfig, call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T | None:
     """Call, unless tracking is out of reach already. A failure is one warning: the training is worth more."""
     if not out_of_reach.is_set():
         try:
             return call(*args, **kwargs)
         except Exception as error:
             out_of_reach.set()
-            logger.warning("tracking is off, `octopi publish` completes the run: %s", in_words(error))
+            logger.warning("tracking is off, `octopi publish` completes the run: %s", cause(error, tracking))
     return None
 
 
@@ -54,6 +79,8 @@ class Store:
 
     def __init__(self, tracking: TrackingConfig) -> None:
         """Connect, and make the experiment where it is new."""
+        for name in [name for name in os.environ if "MLFLOW_" in name and not MEANT.match(name)]:
+            del os.environ[name]
         # When a server dies, one call of a training, one of the system monitor and one that ends the run may wait.
         seconds = str(max(1, tracking.timeout_seconds // 3))
         os.environ.update(
@@ -77,15 +104,19 @@ class Store:
         mlflow.store.db.utils.MAX_RETRY_COUNT = 1
         if not event.contains(Engine, "connect", _do_not_wait_for_the_disk):
             event.listen(Engine, "connect", _do_not_wait_for_the_disk)
+        here, home = Path.cwd(), main_folder()
+        (home / MLRUNS).mkdir(exist_ok=True)
+        if home != here and not MLRUNS.is_symlink():
+            MLRUNS.symlink_to(home / MLRUNS)
         database = MLRUNS.resolve() / "mlflow.db"
         self.uri = tracking.uri or f"sqlite:///{database}"
-        # Several folders may share a server; the local database moves with its folder.
-        self.mine = {FOLDER: f"{socket.gethostname()}:{Path.cwd()}".replace("'", "_")} if tracking.uri else {}
-        MLRUNS.mkdir(exist_ok=True)
+        # Several folders may share a server. The local database, which moves with its folder, has experiments' copies.
+        folder = f"{socket.gethostname()}:{here}" if tracking.uri else here.relative_to(home).as_posix()
+        self.mine = {FOLDER: folder.replace("'", "_")}
         self.lock = FileLock(MLRUNS / ".lock", timeout=LOCK_SECONDS)
         # Several first starts at once on a new database break it.
         with self.lock:
-            self.client = mlflow.MlflowClient(self.uri)
+            self.client = mlflow.MlflowClient(self.uri, self.uri)
             found = self.client.get_experiment_by_name(tracking.experiment)
             if found:
                 self.experiment = str(found.experiment_id)

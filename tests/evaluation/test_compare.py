@@ -198,6 +198,12 @@ def test_a_broken_file_is_named(copy: History, file: str, text: str, words: str)
         compare(copy.folder, "HEAD")
 
 
+def test_an_address_is_shown_without_its_password(copy: History) -> None:
+    copy.write("params.yaml", "epochs: 4\ntracking: {uri: 'http://ada:S3cret@host'}\n")
+    assert "tracking.uri" in (found := json.dumps(compare(copy.folder, "HEAD")))
+    assert "S3cret" not in found
+
+
 @pytest.mark.parametrize("revision", ["nowhere", "--all", "HEAD:params.yaml", "first..again", ""])
 def test_an_unknown_revision_is_refused(history: History, revision: str) -> None:
     with pytest.raises(UserError, match="no commit of a Git repository"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import multiprocessing
 import os
 import re
@@ -10,18 +11,23 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, nullcontext
 from functools import partial
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
 import mlflow
 import pytest
 import torch
+from mlflow.environment_variables import _EnvironmentVariable
+from mlflow.tracking import fluent
 from torch import nn
 from torch.nn import functional as F
+from transformers.integrations import MLflowCallback
 
 from pipeline.config import Params
 from pipeline.io import read_table, write_table
@@ -99,6 +105,37 @@ def test_a_training_and_publishing_share_one_run(chain: FakeChain, monkeypatch: 
 def minutes_of(stage: Stage) -> float:
     """When the stage began, a second early: its run is the one that began within."""
     return (stage.started - 1 - FIRST.timestamp()) / 60
+
+
+STRAY = {"MLFLOW_RUN_ID": "0" * 32, "MLFLOW_TAGS": '{"stray": "1"}'}
+READ = set(re.findall(r'os\.getenv\("(\w+)"', inspect.getsource(MLflowCallback)))
+READ |= {found.name for found in vars(fluent).values() if isinstance(found, _EnvironmentVariable)}
+"""Every variable that the callback and MLflow's fluent calls read, by their source."""
+READ |= {"DISABLE_MLFLOW_INTEGRATION", "MLFLOW_SYSTEM_METRICS_NODE_ID", "MLFLOW_REGISTRY_URI"}
+
+
+@pytest.mark.parametrize("name", sorted(READ))
+def test_a_curve_stands_in_its_run_whatever_the_shell_says(
+    chain: FakeChain, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.setenv(name, STRAY.get(name, "1" if "URI" not in name else "sqlite:///stray.db"))
+    kept = {f"MLFLOW_TRACKING_{end}": end for end in ("USERNAME", "PASSWORD", "TOKEN", "SERVER_CERT_PATH")}
+    kept |= {"MLFLOW_S3_ENDPOINT_URL": "http://store", "AWS_ACCESS_KEY_ID": "key"}
+    for variable, value in kept.items():
+        monkeypatch.setenv(variable, value)
+    saving = chain.params.model_copy(update={"runtime": chain.params.runtime.model_copy(update={"save_steps": 2})})
+    with live(Stage(ALIGN, watched(saving))) as callbacks:
+        fit(saving, callbacks)
+        assert not [m for m in by_name("stage")[ALIGN].data.metrics if m.startswith("system/1/")]
+    assert sorted(run.info.run_name for run in runs()) == sorted([ALIGN, saving.report_name])
+    run = by_name("stage")[ALIGN]
+    assert len(losses(run)) == STEPS
+    assert run.data.params.keys() == {*settings(chain.params), "encoder", "opd", "seed"}
+    assert "stray" not in run.data.tags
+    assert client().list_artifacts(run.info.run_id) == []
+    assert {e.name for e in client().search_experiments()} == {"Default", "octopi"}
+    assert not Path("stray.db").exists()
+    assert kept.items() <= os.environ.items()
 
 
 @pytest.mark.parametrize(("error", "status"), [(RuntimeError, "FAILED"), (KeyboardInterrupt, "KILLED")])
@@ -187,18 +224,37 @@ def broken_file(uri: str, file: str, content: bytes) -> Iterator[str]:
     yield uri
 
 
+@contextmanager
+def refusing_server(status: int) -> Iterator[str]:
+    """Answers each request with a status that is no success."""
+
+    class Refusal(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_error(status)
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Refusal) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://ada:S3cret@127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
 @pytest.mark.parametrize(
-    "dead",
+    ("dead", "cause"),
     [
-        silent_server,
-        closed_port,
-        partial(broken_file, "", "mlruns/mlflow.db", b"garbage " * 1000),
-        partial(broken_file, "sqlite:///file/mlflow.db", "file", b""),
-        partial(nullcontext, "htp:/nowhere"),
+        (silent_server, r"http://127\.0\.0\.1:\d+: TimeoutError: timed out"),
+        (closed_port, r"http://127\.0\.0\.1:\d+: ConnectionRefusedError: .*refused"),
+        (
+            partial(refusing_server, 401),
+            r"http://\*\*\*@127.*401.*MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD",
+        ),
+        (partial(refusing_server, 503), r"http://\*\*\*@127.*503"),
+        (partial(broken_file, "", "mlruns/mlflow.db", b"garbage " * 1000), r"mlflow\.db: .*file is not a database"),
+        (partial(broken_file, "sqlite:///file/mlflow.db", "file", b""), "sqlite:///file/mlflow.db: .*File exists"),
+        (partial(nullcontext, "htp://ada:S3cret@nowhere"), r"htp://\*\*\*@nowhere: .*unsupported URI"),
     ],
 )
 def test_out_of_reach_costs_one_warning_and_one_call(
-    chain: FakeChain, dead: Any, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    chain: FakeChain, dead: Any, cause: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     untracked = fit(chain.params, [])
     monkeypatch.setattr("mlflow.store.db.utils.time.sleep", lambda _: pytest.fail("opens the database again"))
@@ -211,14 +267,17 @@ def test_out_of_reach_costs_one_warning_and_one_call(
             assert callbacks == []
         monkeypatch.undo()
         monkeypatch.chdir(chain.folder)
-        with pytest.raises(TrackingError, match="octopi publish` tries again"):
+        with pytest.raises(TrackingError, match="octopi publish` tries again") as refused:
             publish(params)
     assert (os.environ["MLFLOW_HTTP_REQUEST_MAX_RETRIES"], os.environ["MLFLOW_HTTP_REQUEST_TIMEOUT"]) == ("0", "1")
     assert trained.history == untracked.history
     assert all(torch.equal(trained.state[name], value) for name, value in untracked.state.items())
     (warning,) = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
     assert warning.startswith("tracking is off")
-    assert len(warning.splitlines()) == 1
+    for line in (warning, str(refused.value)):
+        assert re.search(cause, line)
+        assert len(line.splitlines()) == 1
+        assert "S3cret" not in line
 
 
 def test_a_server_that_dies_while_a_training_goes_on(

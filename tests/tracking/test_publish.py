@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -24,6 +25,7 @@ from tests.closure import ROOT
 from tests.fake_run import fake_params
 from tests.tracking.conftest import (
     BASE,
+    CHAIN,
     FIRST,
     FULL,
     SCORES,
@@ -221,6 +223,45 @@ def test_the_command_says_in_one_line_why_it_could_not(chain: FakeChain, monkeyp
     assert ended.value.code == 1
 
 
+PUBLISH = """\
+from pipeline.stage import stage
+from pipeline.tracking.publish import publish
+with stage("publish") as run:
+    print(publish(run.params))
+"""
+
+
+def test_an_experiment_publishes_into_the_project_and_by_its_own_code(chain: FakeChain) -> None:
+    """DVC runs it in a copy of what Git has, at once or from its queue, and deletes the copy."""
+    shutil.copytree(ROOT / "pipeline", "pipeline", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / ".gitignore", ".")
+    Path("stages").mkdir()
+    Path("stages/publish.py").write_text(PUBLISH)
+    Path("dvc.yaml").write_text(CHAIN.replace("publish: {cmd: x}", "publish: {cmd: python stages/publish.py}"))
+    code = Path("pipeline/tracking/__init__.py")
+    code.write_text("print('of the project')")
+    environment = {**os.environ, "GIT_CONFIG_GLOBAL": os.devnull, "PYTHONPATH": str(ROOT)}
+    environment["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+
+    def run(command: str) -> str:
+        done = subprocess.run(command, shell=True, env=environment, text=True, capture_output=True, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout + done.stderr
+
+    run("git init -q && git config user.name a && git config user.email a@b && dvc init -q")
+    run("git add . && git commit -qm a")
+    assert "of the project\n" in run("dvc exp run --temp --single-item publish")
+    (parent,) = runs("reproduction")
+    assert {a.path for a in client().list_artifacts(parent.info.run_id)} == {"report"}
+    written = set(Path("mlruns/artifacts").rglob("*"))
+    assert chain.folder / "mlruns" in {p.parents[-len(chain.folder.parts) - 1] for p in map(Path.resolve, written)}
+    run("dvc exp run --queue --single-item publish -S seed=1")
+    code.write_text("raise SystemExit('changed after it was queued')")
+    run("dvc queue start && until dvc queue status | grep -E 'Success|Failed'; do sleep 1; done")
+    assert len(runs("reproduction")) == 2
+    assert run("git status --porcelain -- mlruns") == ""
+
+
 def test_stages_are_those_that_dvc_lists(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for part in ("pipeline", "stages", "conf", "reports"):
         (tmp_path / part).symlink_to(ROOT / part)
@@ -235,12 +276,21 @@ def test_stages_are_those_that_dvc_lists(tmp_path: Path, monkeypatch: pytest.Mon
     assert [s.title for s in read_stages(params)] == [line for line in listed.stdout.split() if line != "publish"]
 
 
-def test_packaged_variants_are_models_and_the_validated_full_system_is_best(chain: FakeChain) -> None:
+def test_packaged_variants_are_models_and_the_validated_full_system_is_best(
+    chain: FakeChain, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    card = {"config.json": json.dumps({"base": {"folder": "x"}}), "README.md": "---\nlicense: mit\n---\n# Card\n"}
     for key in (FULL, BASE):
         folder = Path("models") / key
         folder.mkdir(parents=True)
-        (folder / "config.json").write_text(json.dumps({"base": {"folder": "x"}}))
-        (folder / "README.md").write_text("---\nlicense: mit\n---\n# Card\n")
+        for file, text in card.items():
+            (folder / file).write_text(text)
+    for place in (Path("models") / FULL).iterdir():
+        # As DVC's `cache.type symlink` leaves it: the name in models/, the file in the cache, read-only.
+        cached = place.rename(Path(place.stem).absolute())
+        cached.chmod(0o444)
+        place.symlink_to(cached)
+    monkeypatch.setenv("MLFLOW_REGISTRY_URI", "sqlite:///stray.db")
     publish(chain.params)
     there, variants = client(), by_name("variant")
     experiment = there.get_experiment_by_name("octopi").experiment_id
@@ -254,10 +304,15 @@ def test_packaged_variants_are_models_and_the_validated_full_system_is_best(chai
     # Relative, so that the folder may be moved.
     assert not Path(best.source).is_absolute()
     assert yaml.safe_load((Path(best.source) / "MLmodel").read_text())["metadata"]["license"] == "mit"
+    for file, text in card.items():
+        (logged,) = (Path(best.source) / "artifacts").rglob(file)
+        assert not logged.is_symlink()
+        assert logged.read_text() == text
     publish(chain.params)
     assert len(there.search_logged_models([experiment])) == 2
     assert len(there.search_model_versions(f"name = '{name}'")) == 1
     # A model that was packaged anew is a new one.
+    (Path("models") / FULL / "config.json").unlink()
     (Path("models") / FULL / "config.json").write_text(json.dumps({"base": {"folder": "y"}}))
     chain.ran(["grade"], 60)
     publish(chain.params)
