@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -363,6 +365,9 @@ def _load(folder: Path | None, base: Path | None, device: str) -> Octopi:
 
 def main() -> None:
     """Run the command; bad input ends it with one line and status 1."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # A path may hold bytes that are no UTF-8.
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         app()
     except UserError as error:

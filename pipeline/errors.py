@@ -33,6 +33,11 @@ def without_secrets(text: str) -> str:
     return SECRET.sub(lambda found: f"{next(filter(None, found.groups()))}***{'' if found['key'] else '@'}", text)
 
 
+def readable(text: str) -> str:
+    """A text that every file and terminal takes: bytes of a file's name that are no UTF-8 stand in it as escapes."""
+    return text.encode("utf-8", "backslashreplace").decode()
+
+
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """A question about the closest known name, with a blank behind it; empty where none is close."""
     close = difflib.get_close_matches(name, list(known), n=1)

@@ -11,6 +11,8 @@ from typing import Annotated, Literal, NamedTuple
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
+from pipeline.errors import readable
+
 Share = Annotated[float, AfterValidator(lambda value: round(value, 6))]
 """A figure of a report."""
 Optional = Annotated[Share | None, BeforeValidator(lambda value: None if value == "" else value)]
@@ -161,9 +163,9 @@ class Finding(Record):
     """One result of the audit: a row of audit.csv."""
 
     check: str
-    item: str
+    item: Annotated[str, AfterValidator(readable)]
     """What it is about: a file (relative to the data folder), an object, a class, or the whole folder."""
-    measured: str
+    measured: Annotated[str, AfterValidator(readable)]
     expected: str = ""
     severity: Severity
 

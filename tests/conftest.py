@@ -63,6 +63,17 @@ def deaf_port() -> Iterator[int]:
         yield held.getsockname()[1]
 
 
+def not_utf8(folder: Path, name: str) -> Path:
+    """A place with a byte that begins no character; skips where the file system takes none."""
+    path = folder / name.replace("?", "\udcff")
+    try:
+        path.touch()
+    except OSError:
+        pytest.skip("needs a file system that takes any bytes for a name")
+    path.unlink()
+    return path
+
+
 def refused(words: str) -> Any:
     """A context in which bad input is refused: by one line, in which these words (a regular expression) are found."""
     return pytest.raises(UserError, match=words, check=lambda error: "\n" not in str(error))

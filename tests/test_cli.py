@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import csv
+import os
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -12,7 +16,7 @@ from pipeline.cli import app
 from pipeline.params import load_params
 from pipeline.scales import compose, write_params
 from tests.closure import ROOT
-from tests.conftest import moving_square, write_video
+from tests.conftest import moving_square, not_utf8, write_video
 
 RUNNER = CliRunner()
 
@@ -141,6 +145,31 @@ def test_data_audit_writes_all_it_shows(folder: Path) -> None:
     for row, line in zip(rows, output.splitlines()[1:], strict=True):
         assert line.startswith(f"{row['severity']:8} {row['check']}: {row['item']}: {row['measured']}")
         assert line.endswith(f"(expected: {row['expected']})" if row["expected"] else row["measured"])
+
+
+def test_data_audit_names_what_is_no_text(folder: Path) -> None:
+    (odd := not_utf8(folder, "sub?")).mkdir()
+    shutil.copy(folder / "potato_0.avi", odd / "rug_0.avi")
+    (folder / "potato_0.avi").rename(not_utf8(folder, "rug?_0.avi"))
+    status, output, rows = audited()
+    assert status == 1
+    told = {row["item"]: row["measured"] for row in rows if row["severity"] == "error"}
+    rename = "its name is no text in UTF-8; rename it"
+    assert told == {r"rug\udcff_0.avi": rename, r"sub\udcff/rug_0.avi": rename}
+    assert [line for item in told for line in lines(output, "error") if item in line] == lines(output, "error")
+
+
+def test_any_path_is_printed(folder: Path) -> None:
+    """On a terminal whose locale takes no bytes but UTF-8."""
+    out = not_utf8(folder, "found?.csv")
+    command = [sys.executable, "-c", "from pipeline.cli import main; main()", "data", "audit"]
+    env = {**os.environ, "PYTHONIOENCODING": "utf-8:strict", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([*command, not_utf8(folder, "none?"), "--out", out], env=env, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (1, "")
+    first, second = done.stdout.splitlines()[:2]
+    assert first.endswith(rf" findings in {folder}/found\udcff.csv")
+    assert rf"{folder}/none\udcff: no such folder" in second
+    assert rf"{folder}/none\udcff,no such folder" in out.read_text(encoding="utf-8")
 
 
 def test_data_audit_ends_with_status_1_where_parts_share_a_video(folder: Path) -> None:

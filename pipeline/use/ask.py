@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.errors import UserError
+from pipeline.errors import UserError, readable
 from pipeline.io import write_text
 from pipeline.params import project_above
 from pipeline.runtime import progress
@@ -160,7 +160,7 @@ def describe_folder(model: Octopi, folder: Path, out: Path) -> tuple[int, int]:
         raise UserError(f"{folder}: holds no video ({', '.join(SUFFIXES)}); name another folder")
     columns = _columns(model)
     done = _done(out, columns, model.config.name)
-    rest = [f for f in files if f.relative_to(folder).as_posix() not in done]
+    rest = [f for f in files if _named(f, folder) not in done]
     failed = sum(bool(error) for error in done.values())
     if not out.is_file() or not done:
         write_text(out, _row(columns))
@@ -200,7 +200,7 @@ def _describe(model: Octopi, folder: Path, files: Sequence[Path]) -> list[dict[s
     rows: list[dict[str, object]] = []
     good = []
     for file in files:
-        row: dict[str, object] = {"file": file.relative_to(folder).as_posix(), "model": model.config.name}
+        row: dict[str, object] = {"file": _named(file, folder), "model": model.config.name}
         rows.append(row)
         try:
             model.look(file)
@@ -216,7 +216,11 @@ def _describe(model: Octopi, folder: Path, files: Sequence[Path]) -> list[dict[s
     return rows
 
 
+def _named(file: Path, folder: Path) -> str:
+    return readable(file.relative_to(folder).as_posix())
+
+
 def _row(cells: Iterable[object]) -> str:
     stream = io.StringIO()
     csv.writer(stream, lineterminator="\n").writerow(cells)
-    return stream.getvalue()
+    return readable(stream.getvalue())

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from pipeline.config import LanguageConfig
-from pipeline.errors import UserError, did_you_mean
+from pipeline.errors import UserError, did_you_mean, readable
 from pipeline.language.chat import TACTILE, TACTILE_TOKENS
 from pipeline.language.generate import reply, stream, write_prompt
 from pipeline.language.octopi import OctopiForCausalLM
@@ -313,6 +313,8 @@ def check_question(question: str, videos: int) -> None:
     marks = question.count(TACTILE)
     if not question.strip():
         raise UserError("the question is empty; write one")
+    if readable(question) != question:
+        raise UserError("the question is no text in UTF-8; write it anew")
     if marks != videos:
         raise UserError(
             f"the question has {marks} {TACTILE} for {videos} videos; write {TACTILE} once for each, in their order"

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.errors import UserError
+from pipeline.errors import UserError, readable
 from pipeline.records import Finding, Severity
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.catalogue.csv_reader import read_rows
@@ -85,8 +85,8 @@ def raise_errors(folder: Path, findings: Sequence[Finding]) -> None:
     """Raise the first error as a UserError that names the file."""
     for finding in findings:
         if finding.severity is Severity.ERROR:
-            where = folder if finding.item == str(folder) else folder / finding.item
-            raise UserError(f"{where}: {finding.measured}")
+            where = folder if finding.item == readable(str(folder)) else folder / finding.item
+            raise UserError(readable(f"{where}: {finding.measured}"))
 
 
 def _error(item: str, message: str) -> Finding:
@@ -118,9 +118,11 @@ def video_files(folder: Path) -> tuple[list[Path], list[Finding]]:
             if path.name in folders:
                 if path.is_symlink():
                     message = "a linked folder is not looked into, nor by DVC; link the files, or name it as the folder"
-                    findings.append(Finding(check=PASSED, item=where, measured=message, severity=Severity.WARNING))
+                    findings.append(Finding(check=PASSED, item=readable(where), measured=message, severity=Severity.WARNING))
             elif not is_video(path):
-                others[path.suffix.lower() or "without a suffix"] += where != LIST_FILE
+                others[readable(path.suffix.lower()) or "without a suffix"] += where != LIST_FILE
+            elif readable(where) != where:
+                findings.append(_error(where, "its name is no text in UTF-8; rename it"))
             elif path.exists() and not path.is_file():
                 findings.append(_error(where, "is no file but a pipe, socket or device; move it"))
             else:

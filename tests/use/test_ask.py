@@ -15,7 +15,7 @@ from pipeline.cli import app, main
 from pipeline.use import ask as asking
 from pipeline.use.ask import Chat, default_model, describe_folder
 from pipeline.use.model import Octopi
-from tests.conftest import refused
+from tests.conftest import not_utf8, refused
 from tests.report.shared import rows_of
 from tests.use.shared import Made
 
@@ -124,6 +124,19 @@ def test_a_folder_is_described(
         for name, known in expected.probabilities.items():
             assert {level: float(row[f"{name}: {level}"]) for level in known} == pytest.approx(known, abs=1e-4)
         assert row["error"] == ""
+
+
+def test_names_that_are_no_text_are_described_once(
+    octopi: Octopi, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (folder / "a,  b").rename(not_utf8(folder, "a?b"))
+    broken = next(folder.rglob("broken.avi"))
+    broken.rename(not_utf8(broken.parent, "?.avi"))
+    out = tmp_path / "out.csv"
+    assert describe_folder(octopi, folder, out) == (4, 1)
+    assert r"a\udcffb/\udcff.avi" in {row["file"] for row in rows_of(out)}
+    monkeypatch.setattr(octopi, "describe_all", lambda _: pytest.fail("described again"))
+    assert describe_folder(octopi, folder, out) == (4, 1)
 
 
 def test_a_folder_is_described_and_a_model_copied_by_command(

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import BaseModel
 
-from pipeline.errors import UserError
+from pipeline.errors import UserError, readable
 from pipeline.records import Encoder, Lora, Opd, Part, Variant
 from pipeline.use import touch
 from pipeline.use.model import Octopi, check_question
@@ -190,6 +190,7 @@ def test_tasks_ask_in_the_wording_of_training(made: Made, octopi: Octopi, files:
         ("{tactile} {tactile}", 1, r"2 \{tactile\} for 1 videos"),
         ("{tactile}?", 0, r"1 \{tactile\} for 0 videos"),
         ("  ", 0, "question is empty"),
+        ("Is it \udcff?", 0, "is no text in UTF-8"),
         ("Is <tact_frame> soft?", 0, "<tact_frame>, which stands for a touch"),
         ("long " * 1000, 0, "begin a new conversation"),
     ],
@@ -206,7 +207,7 @@ def test_questions_that_do_not_fit_are_refused(
 @given(st.text(max_size=40), st.integers(0, 3))
 def test_a_question_is_taken_only_with_as_many_videos_as_it_names(text: str, videos: int) -> None:
     marked = text + "{tactile}" * videos
-    if text.strip() and "{tactile}" not in text and "<tact" not in text:
+    if text.strip() and "{tactile}" not in text and "<tact" not in text and readable(text) == text:
         check_question(marked, videos)
     with pytest.raises(UserError):
         check_question(marked + "{tactile}", videos)

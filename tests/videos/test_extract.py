@@ -31,7 +31,7 @@ from pipeline.videos.frames.fit import fit
 from pipeline.videos.frames.reference import reference_indices
 from pipeline.videos.frames.scan import Scan, scan
 from tests.closure import ROOT
-from tests.conftest import moving_square, refused, wait_until_ended, write_video
+from tests.conftest import moving_square, not_utf8, refused, wait_until_ended, write_video
 from tests.frame_rules import CONFIG, FILES, Place, frames_of, luma, published, salience
 
 NAMES = ["baseball_0", "baseball_1", "baseball_10", "potato_0", "potato_2", "rug_0", "rug_1"]
@@ -231,6 +231,13 @@ def test_no_worker_outlives_its_parent(tmp_path: Path, signal_number: int) -> No
     wait_until_ended(workers)
     process.kill()
     process.wait()
+
+
+def test_names_that_are_no_text_are_named(place: Place) -> None:
+    odd = place.folder / "rug_0.avi"
+    odd.rename(not_utf8(place.folder, "rug_?_0.avi"))
+    with refused(r"rug_\\udcff_0\.avi: its name is no text in UTF-8; rename it"):
+        place.extract()
 
 
 def test_a_full_disk_leaves_no_half_of_a_file(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
