@@ -29,7 +29,7 @@ def write_film(path: Path, frames: Iterable[Image], fps: float) -> None:
     """
     rate = Fraction(fps).limit_denominator(1000)
     try:
-        with av.open(str(path), "w", options={"fflags": "+bitexact"}) as container:
+        with av.open(f"file:{path}", "w", options={"fflags": "+bitexact"}) as container:
             stream = container.add_stream("mpeg4", rate=rate)
             stream.pix_fmt, stream.bit_rate = "yuv420p", BITS_A_SECOND
             stream.codec_context.gop_size = KEY_EVERY

@@ -50,7 +50,8 @@ class Decoder:
         self._container: av.container.InputContainer | None = None
         self.header = Header()
         try:
-            self._container = av.open(str(path), options=CONTAINERS)
+            # Without "file:" a name with a colon would be an address.
+            self._container = av.open(f"file:{path}", options=CONTAINERS)
             stream = self._container.streams.video[0]
         except (av.FFmpegError, IndexError, ValueError):
             return
@@ -59,7 +60,11 @@ class Decoder:
         fps = float(stream.average_rate or 0)
         seconds = float(stream.duration * stream.time_base) if stream.duration and stream.time_base else 0.0
         valid = math.isfinite(fps) and fps > 0
-        self.header = Header(stream.frames or (round(seconds * fps) if valid else 0), fps if valid else 0.0)
+        promised = stream.frames
+        if promised and "mov" in self._container.format.name:
+            # An edit list may show fewer frames than are stored.
+            promised = sum(not entry.is_discard for entry in stream.index_entries)
+        self.header = Header(promised or (round(seconds * fps) if valid else 0), fps if valid else 0.0)
 
     def __enter__(self) -> Self:
         return self

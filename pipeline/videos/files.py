@@ -118,7 +118,9 @@ def video_files(folder: Path) -> tuple[list[Path], list[Finding]]:
             if path.name in folders:
                 if path.is_symlink():
                     message = "a linked folder is not looked into, nor by DVC; link the files, or name it as the folder"
-                    findings.append(Finding(check=PASSED, item=readable(where), measured=message, severity=Severity.WARNING))
+                    findings.append(
+                        Finding(check=PASSED, item=readable(where), measured=message, severity=Severity.WARNING)
+                    )
             elif not is_video(path):
                 others[readable(path.suffix.lower()) or "without a suffix"] += where != LIST_FILE
             elif readable(where) != where:

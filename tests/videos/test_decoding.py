@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import shutil
 import struct
 from pathlib import Path
 
@@ -14,6 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.config import FramesConfig
+from pipeline.scenes.film import write_film
+from pipeline.videos.audit.run import check_folder
+from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.decoding import Decoder, Header, brightness, decode, picture, planes, to_rgb, turns
 from pipeline.videos.frames.fit import fit
 from tests.conftest import HUNG, encode, moving_square, write_video
@@ -189,6 +193,43 @@ def test_sound_alone_is_no_video(tmp_path: Path) -> None:
         frame.rate = 8000
         container.mux(stream.encode(frame))
     assert list(decode(tmp_path / "v.mkv")) == []
+
+
+@pytest.mark.parametrize("codec", ["mpeg4", "libx264", "mjpeg"])
+@pytest.mark.parametrize("suffix", ["mp4", "mov"])
+@pytest.mark.parametrize(("first", "shown"), [(10, 40), (0, 60), (20, 40), (0, 1)])
+def test_a_trimmed_file_promises_what_it_shows(
+    tmp_path: Path, catalogue: Catalogue, codec: str, suffix: str, first: int, shown: int
+) -> None:
+    """A lossless trim leaves all frames in the file, with an edit list (ISO 14496-12, 8.6.6) of those shown."""
+    path = tmp_path / f"rug_0.{suffix}"
+    whole = list(decode(encode(path, moving_square(60), codec, "yuvj420p" if codec == "mjpeg" else "yuv420p")))
+    data = bytearray(path.read_bytes())
+    movie, media, edits = (data.index(name) for name in (b"mvhd", b"mdhd", b"elst"))
+    ticks, fine = (struct.unpack_from(">I", data, at + 16)[0] for at in (movie, media))
+    count, _, start = struct.unpack_from(">IIi", data, edits + 8)
+    assert (len(whole), count) == (60, 1)
+    struct.pack_into(">Ii", data, edits + 12, shown * ticks // 25, start + first * fine // 25)
+    path.write_bytes(data)
+    with Decoder(path) as decoder:
+        assert decoder.header.frames == shown
+        found = [picture(frame) for frame in decoder.frames()]
+    np.testing.assert_array_equal(found, whole[first : first + shown])
+    assert not [f for f in check_folder(tmp_path, catalogue) if f.check == "frames that decode" and f.item != "all"]
+
+
+@pytest.mark.parametrize(
+    "name", ["2024-05-01T12:30:05_0.mp4", "concat:a|b.mp4", "http:a.mp4", "file:a.mp4", "pipe:0.mp4", "a:b/%d [1]?.mp4"]
+)
+def test_a_name_is_no_address(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    encode(tmp_path / "plain.mp4", moving_square(5), "mpeg4", "yuv420p")
+    Path(name).parent.mkdir(exist_ok=True)
+    shutil.copy("plain.mp4", name)
+    assert [frame.tolist() for frame in decode(Path(name))] == [frame.tolist() for frame in decode(Path("plain.mp4"))]
+    written = Path(name).with_stem("written:again")
+    write_film(written, moving_square(5), 25.0)
+    assert len(list(decode(written))) == 5
 
 
 def test_a_fork_decodes_after_its_parent_has(tmp_path: Path) -> None:
