@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -83,18 +84,18 @@ def write_pretrained(seed: int = 0) -> SceneEncoder:
     return made.eval()
 
 
-def write_timm(folder: Path, name: str = "test_efficientnet", seed: int = 0) -> Path:
+def write_timm(folder: Path, name: str = "test_efficientnet", seed: int = 0, **arguments: Any) -> Path:
     """A tiny network of timm's in its hub's layout; no normalisation is the identity, which would hide a wrong one."""
     import timm
     from timm.models import save_for_hf
 
     torch.manual_seed(seed)
-    model = timm.create_model(name, pretrained=False)
+    model = timm.create_model(name, pretrained=False, **arguments)
     with torch.no_grad():
         for key, value in model.state_dict().items():
             if value.is_floating_point():
                 value.add_(0.1 * torch.rand_like(value) if "running" in key else 0.1 * torch.randn_like(value))
-    save_for_hf(model, folder, safe_serialization=True)
+    save_for_hf(model, folder, safe_serialization=True, model_args=arguments or None)
     return folder
 
 

@@ -36,7 +36,11 @@ class TimmBackbone(FrameEncoder):
         cast(Any, model).prune_intermediate_layers([stage], prune_norm=True, prune_head=True)
         form: dict[str, Any] = cast(Any, model).pretrained_cfg
         # Position embeddings are as long as they were in pretraining; convolutions take any side.
-        self.side = int(form["input_size"][-1]) if form.get("fixed_input_size") else None
+        cut: Any = getattr(model, "patch_embed", None)
+        plain = hasattr(cut, "strict_img_size")
+        self.own: tuple[int, int] = tuple(cut.img_size if plain else form["input_size"][-2:])
+        self.fixed = form.get("fixed_input_size") or (plain and cut.strict_img_size)
+        self.patch: tuple[int, int] = cut.patch_size if plain else (1, 1)
         self.mean: torch.Tensor
         self.std: torch.Tensor
         self.register_buffer("mean", torch.tensor(form["mean"]).view(1, 3, 1, 1), persistent=False)
@@ -70,8 +74,10 @@ class TimmBackbone(FrameEncoder):
 
     def _map(self, frames: torch.Tensor) -> torch.Tensor:
         pixels = frames.permute(0, 3, 1, 2).to(next(self.model.parameters()).dtype) / 255
-        if self.side is not None and pixels.shape[-1] != self.side:
-            pixels = F.interpolate(pixels, self.side, mode="area")
+        whole = tuple(max(p, n // p * p) for n, p in zip(pixels.shape[2:], self.patch, strict=True))
+        size = self.own if self.fixed else whole
+        if pixels.shape[2:] != size:
+            pixels = F.interpolate(pixels, size, mode="area")
         pixels = ((pixels - self.mean) / self.std).contiguous(memory_format=torch.channels_last)
         found = cast(Any, self.model).forward_intermediates(
             pixels, indices=[self.index], stop_early=True, intermediates_only=True
@@ -104,10 +110,9 @@ def load_backbone(config: EncoderConfig, *, tuned: bool) -> TimmBackbone:
         raise UserError(
             f"encoder.feature_stage is {config.feature_stage}, but the network in {folder} has stages 0 to {stages - 1}"
         )
-    side = int(model.pretrained_cfg["input_size"][-1])
-    tried = torch.randint(256, (1, side, side, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     try:
         backbone = TimmBackbone(model.requires_grad_(False).eval(), config.feature_stage)
+        tried = torch.randint(256, (1, *backbone.own, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
         with torch.inference_mode():
             whole, apart = backbone(tried, torch.zeros(1)), backbone.stage(backbone.trunk(tried))
         same = whole.shape == apart.shape == (1, backbone.dim) and torch.allclose(whole, apart, 1e-3, 1e-3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -103,13 +104,34 @@ def test_timm_features_are_mean_and_deviation_of_its_own_map(network: tuple[str,
     torch.testing.assert_close(apart, found, rtol=1e-5, atol=1e-5)
 
 
-def test_a_transformer_of_one_side_is_shown_means_over_areas(tmp_path: Path) -> None:
-    backbone = loaded(write_timm(tmp_path, "vit_tiny_patch16_224"), 2)
-    assert backbone.side is not None
-    frames = noise(backbone.side)
-    larger = frames.repeat_interleave(2, 1).repeat_interleave(2, 2)
+@pytest.mark.parametrize(
+    ("own", "told"),
+    [((224, 224), True), ((224, 224), False), ((96, 96), True), ((96, 96), False), ((64, 96), False)],
+    ids=str,
+)
+def test_a_transformer_of_one_side_is_shown_means_over_areas(own: tuple[int, int], told: bool, tmp_path: Path) -> None:
+    """Whether or not its configuration says that it takes no other side, and whatever side it was made for."""
+    folder = write_timm(tmp_path, "vit_tiny_patch16_224", **({} if own == (224, 224) else {"img_size": own}))
+    form = json.loads((folder / "config.json").read_text())
+    assert form["pretrained_cfg"].pop("fixed_input_size")
+    if not told:
+        (folder / "config.json").write_text(json.dumps(form))
+    backbone = loaded(folder, 2)
+    frames = noise(2, 3).repeat_interleave(own[0] // 2, 1).repeat_interleave(own[1] // 2, 2)
     with torch.no_grad():
-        torch.testing.assert_close(backbone(larger, torch.zeros(3)), backbone(frames, torch.zeros(3)))
+        expected = backbone(frames, torch.zeros(3))
+        assert expected.shape == (3, 2 * 192)
+        for side in (2 * np.lcm(*own), 32, 100):
+            shown = noise(2, 3).repeat_interleave(side // 2, 1).repeat_interleave(side // 2, 2)
+            torch.testing.assert_close(backbone(shown, torch.zeros(3)), expected, rtol=1e-4, atol=1e-4)
+
+
+def test_a_transformer_of_any_side_is_shown_whole_patches(tmp_path: Path) -> None:
+    backbone = loaded(write_timm(tmp_path, "vit_tiny_patch16_224", dynamic_img_size=True), 2)
+    frames = noise(2, 3).repeat_interleave(24, 1).repeat_interleave(24, 2)
+    ragged = noise(2, 3).repeat_interleave(28, 1).repeat_interleave(28, 2)
+    with torch.no_grad():
+        torch.testing.assert_close(backbone(ragged, torch.zeros(3)), backbone(frames, torch.zeros(3)))
 
 
 def test_scenes_sees_large_frames_as_it_was_pretrained() -> None:
