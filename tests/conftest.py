@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import random
 import shutil
 import socket
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
@@ -80,6 +82,11 @@ def refused(words: str) -> Any:
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
+    # What a test draws without a seed of its own must not hang on the tests before it in this process.
+    random.seed(0)
+    np.random.seed(0)
+    if "torch" in sys.modules:
+        sys.modules["torch"].manual_seed(67_280_421_310_721)  # As where it is imported later.
     if item.get_closest_marker("real") and not os.environ.get(DATA_VARIABLE):
         pytest.skip(NO_DATA)
 

@@ -48,7 +48,7 @@ def broken(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "rug_01.avi").write_bytes((folder / "rug_1.avi").read_bytes())
     (folder / "nameless.avi").write_bytes(good)
     (folder / "cotton_bal_0.avi").write_bytes(good)
-    (folder / "pillow_0.mp4").write_bytes(os.urandom(500))
+    (folder / "pillow_0.mp4").write_bytes(np.random.default_rng(0).bytes(500))
     write_video(folder / "sub" / "millet_0.avi", moving_square(1, 9))
     (folder / "sub" / "orange_0.avi").write_bytes(good)
     (folder / "notes.txt").write_text("no video")
