@@ -148,7 +148,7 @@ class Probe(Video):
     thumbnail: tuple[float, ...]
     """The reference, 6 x 8 x (brightness, two colour differences), flattened."""
     signature: tuple[float, ...]
-    """Mean difference in brightness to the reference where contact is strongest, 18 x 24, flattened; mean 0, norm 1."""
+    """Brightness in the third of the video with most contact less the rest's, 18 x 24, flattened; mean 0, norm 1."""
 
 
 class Severity(StrEnum):

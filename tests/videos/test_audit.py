@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import random
 import re
 import runpy
 import subprocess
@@ -21,11 +22,15 @@ from pipeline.io import read_csv, write_table
 from pipeline.records import Assignment, Finding, Part, Probe, Video
 from pipeline.scales import compose, write_params
 from pipeline.videos.audit import leakage
+from pipeline.videos.audit.files import quiet_level, touches
+from pipeline.videos.audit.leakage import evidence
 from pipeline.videos.audit.run import audit_chain, audit_folder, by_severity, check_folder, stop_on_errors, summary
 from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.decoding import decode
+from pipeline.videos.files import list_videos
 from tests.audit_records import ERROR, GOOD_SPLIT, INFO, WARNING, assigned, look_at, odd, of, probe, probes
 from tests.closure import ROOT
-from tests.conftest import moving_square, refused, write_video
+from tests.conftest import encode, moving_square, refused, write_video
 
 pytestmark = pytest.mark.usefixtures("few_permutations")
 PAPER = SplitConfig(name="paper")
@@ -248,6 +253,26 @@ def test_the_public_videos_decode_and_none_is_a_copy(public: list[Finding]) -> N
     near = [f for f in of(public, "near-duplicate") if f.item != "all"]
     assert odd(near) == []
     assert all("the same object" in f.measured for f in near)
+
+
+@pytest.mark.real
+def test_copies_of_public_videos_are_found(real_data: Path, tmp_path: Path, catalogue: Catalogue) -> None:
+    """Of 24, encoded anew at a low rate, half of them brightened and shortened as well; no other pair is named."""
+    files = list_videos(real_data, catalogue).files
+    probes = [look_at(f.path, f.video_id) for f in files]
+    level = quiet_level(probes)
+    touched = [f for f, p in zip(files, probes, strict=True) if touches(p, level) and p.frames >= 50]
+    copied = random.Random(0).sample(touched, 24)
+    for number, file in enumerate(copied):
+        frames = list(decode(file.path))
+        if number % 2:
+            frames = [cv2.add(frame, np.full_like(frame, 12)) for frame in frames[len(frames) // 12 :]]
+        path = encode(tmp_path / f"copy{number}_0.mp4", frames, "mpeg4", "yuv420p", bits=400_000)
+        probes.append(look_at(path, f"copy{number}_0"))
+    named = [f.item for f in leakage._near_copies(evidence(probes, [])) if f.item != "all"]
+    assert len(named) >= 12
+    assert set(named) <= {f"copy{number}_0.mp4" for number in range(24)}
+    assert len(named) == len(set(named))
 
 
 @pytest.mark.real

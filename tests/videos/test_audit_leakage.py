@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 import re
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from pipeline.records import Part, Probe, Severity
 from pipeline.videos.audit import leakage
@@ -100,6 +102,74 @@ def test_a_changed_copy_is_found(tmp_path: Path, presses: list[Probe], start: in
         near = [f for f in leakage._near_copies(found) if f.item not in known]
         assert [(f.item, f.severity) for f in near] == [(others.path, severity)]
         assert "baseball_0.avi" in near[0].measured
+
+
+def drawn_contacts(videos: int, seed: int) -> list[Probe]:
+    """Contacts of videos of as many objects: blobs somewhere, smooth or with texture, as `synthesize` makes them."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:18, :24]
+    found = []
+    for number in range(videos):
+        middle, radius = rng.normal((9, 12), (1.2, 1.6)), np.exp(rng.normal(np.log(5), 0.35))
+        blob = np.exp(-((y - middle[0]) ** 2 + (x - middle[1]) ** 2) / (2 * radius**2))
+        texture = gaussian_filter(rng.normal(size=(18, 24)), np.exp(rng.uniform(-0.5, 1.5)))
+        texture *= np.exp(rng.normal(-1.5, 1)) / texture.std()
+        # Lit from one side: brighter here, darker there.
+        press = np.gradient(blob * (1 + texture))[1] + rng.normal(0, 0.004, (18, 24))
+        press -= press.mean()
+        found.append(probe(f"thing{number}_0", signature=tuple((press / np.linalg.norm(press)).ravel())))
+    return found
+
+
+def named(found: list[Probe]) -> tuple[list[str], float]:
+    """The videos that are called near-duplicates, and the bound."""
+    *near, summary = leakage._near_copies(evidence(found, []))
+    return [f.item for f in near], float(summary.expected.split()[-1])
+
+
+def test_smooth_blobs_are_no_copies_however_many_there_are() -> None:
+    """Of 40 sets without copies hardly one may have any by chance, though their plain correlations reach .99."""
+    sets = [drawn_contacts(250, seed) for seed in range(40)]
+    assert max(float(np.triu(s @ s.T, 1).max()) for s in (np.array([p.signature for p in f]) for f in sets)) > 0.99
+    assert sum(bool(named(found)[0]) for found in sets) <= 2
+    many = [p for found in sets[:6] for p in found]
+    many = [p.model_copy(update={"video_id": f"t{i}_0", "object_id": f"t{i}"}) for i, p in enumerate(many)]
+    assert named(many)[0] == []
+    assert named(many[:12]) == ([], leakage.DUPLICATE)
+
+
+@pytest.mark.parametrize("pairs", [30, 10_000, 200_000, 10_000_000])
+def test_the_bound_is_that_of_an_exponential_tail(pairs: int) -> None:
+    """Against its quantiles: P(z > t) = exp(-(t - 0.2) / rate), of which one in so many pairs is `CHANCE` likely."""
+    rate, m = 0.1, math.isqrt(pairs)
+    largest = np.tanh(0.2 + rate * np.log(pairs / np.arange(1, m + 2)))
+    expected = np.tanh(0.2 + rate * np.log(pairs / leakage.CHANCE)) if m >= leakage.FEWEST else 0.0
+    found = leakage.likeness_bound(largest, pairs)
+    assert found == pytest.approx(max(leakage.DUPLICATE, expected), rel=0.02)
+    copies = np.concatenate([np.full(m // 20, 0.9999), largest])[: m + 1]
+    assert leakage.likeness_bound(copies, pairs) - found < 0.03, "copies among them hardly move it"
+
+
+def test_likeness_divides_out_what_is_shared() -> None:
+    """Against the definition, by inverting the covariance. Equal ones are wholly alike; nothing is like nothing."""
+    signatures = np.random.default_rng(0).normal(size=(30, 12)) + 3 * np.linspace(-1, 1, 12)
+    signatures = np.vstack([signatures, signatures[:1], np.zeros(12)])
+    inverse = np.linalg.inv(signatures.T @ signatures + np.eye(12))
+    product = signatures @ inverse @ signatures.T
+    length = np.sqrt(np.diag(product))
+    length[-1] = 1
+    own = leakage.likeness_vectors(signatures)
+    np.testing.assert_allclose(own @ own.T, product / length / length[:, None], atol=1e-12)
+    assert own[0] @ own[30] == pytest.approx(1)
+
+
+def test_a_changed_copy_is_found_among_a_thousand(tmp_path: Path, presses: list[Probe]) -> None:
+    frames = made.recorded("baseball", 5)
+    original = look_at(write_video(tmp_path / "baseball_0.avi", frames), "baseball_0")
+    changed = [cv2.add(frame, np.full_like(frame, 12)) for frame in frames[2:]]
+    copy = look_at(encode(tmp_path / "potato_0.mp4", changed, "mpeg4", "yuv420p", bits=400_000), "potato_0")
+    thousand = [p.model_copy(update={"contact": copy.contact, "quiet": copy.quiet}) for p in drawn_contacts(1000, 7)]
+    assert named([*thousand, *presses, original, copy])[0] == [copy.path]
 
 
 def three_sensors(videos: int = 12) -> tuple[list[Probe], list[int]]:

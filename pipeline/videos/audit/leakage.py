@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,16 +15,19 @@ from pipeline.runtime import derive_seed
 from pipeline.videos.audit.files import by_rate, quiet_level, touches
 from pipeline.videos.catalogue import Catalogue
 
-DUPLICATE = 0.965
-"""Correlation of two videos' strongest contacts, from which they count as near-duplicates. Measured on 354 real videos:
-those of different objects reach .963 at most; of 24 copies encoded anew at a low rate, half of them brightened and
-shortened as well, four in five are found."""
+DUPLICATE = 0.91
+"""Likeness of two videos' contacts up to which they are no near-duplicates, however few videos there are. Of 354 real
+ones, those of different objects reach .905, whichever others they are compared among."""
+CHANCE = 0.01
+"""How likely one or more pairs of different objects may be called near-duplicates by chance, in a whole data set."""
 SPREAD = 2.0
 """Sessions are told apart where references lie farther from each other than this many times the usual distance between
 nearest neighbours (average linkage)."""
 PERMUTATIONS = 2000
 FOLDS = 5
 RIDGE = 1.0
+FEWEST = 16
+"""Likenesses that a tail is told from; `DUPLICATE` alone counts below 256 pairs of videos."""
 BLOCK = 512
 """Videos that are compared at a time with all others: a table of all pairs of 100,000 would take 80 GB."""
 SAMPLE = 5000
@@ -191,24 +195,67 @@ def _near_copies(found: Evidence) -> Iterator[Finding]:
     shown = [p for p in found.probes if touches(p, level)]
     if len(shown) < 2:
         nothing = f"{len(shown)} videos in contact: nothing to compare"
-        yield _finding("near-duplicate", "all", nothing, f"at most {DUPLICATE}", Severity.INFO)
+        yield _finding("near-duplicate", "all", nothing, "", Severity.INFO)
         return
-    signatures = np.array([p.signature for p in shown])
+    own = likeness_vectors(np.array([p.signature for p in shown]))
+    objects = np.unique([p.object_id for p in shown], return_inverse=True)[1]
+    pairs = (len(objects) ** 2 - int((np.bincount(objects) ** 2).sum())) // 2
+    largest = np.empty(0)
+    close: list[tuple[int, int, float]] = []
     closest = 0.0
     for start in range(0, len(shown), BLOCK):
-        alike = np.triu(signatures[start : start + BLOCK] @ signatures[start:].T, 1)
+        alike = np.triu(own[start : start + BLOCK] @ own[start:].T, 1)
         closest = max(closest, float(alike.max()))
-        for i, j in np.argwhere(alike > DUPLICATE).tolist():
-            yield from _near_copy(found, shown[start + i], shown[start + j], alike[i, j])
-    measured = f"closest pair of {len(shown)} videos in contact correlates at {closest:.3f}"
-    yield _finding("near-duplicate", "all", measured, f"at most {DUPLICATE}", Severity.INFO)
+        close += [(start + i, start + j, alike[i, j]) for i, j in np.argwhere(alike > DUPLICATE).tolist()]
+        # Below the diagonal stand zeros: never among the largest.
+        chance = alike[objects[start : start + BLOCK, None] != objects[start:]]
+        largest = np.sort(np.concatenate([largest, chance]))[-math.isqrt(pairs) - 1 :]
+    bound = likeness_bound(largest[::-1], pairs)
+    for i, j, likeness in close:
+        if likeness > bound:
+            yield from _near_copy(found, shown[i], shown[j], likeness)
+    measured = f"closest pair of {len(shown)} videos in contact is alike by {closest:.3f}"
+    yield _finding("near-duplicate", "all", measured, f"at most {bound:.3f}", Severity.INFO)
+
+
+def likeness_vectors(signatures: np.ndarray) -> np.ndarray:
+    """Vectors whose products are the likenesses of contacts: correlations after what many videos share is divided out.
+
+    A smooth blob looks like many others and says little; what only two videos have says that one is the other's copy.
+    This is whitening by the videos' own covariance. One is added to each direction, so that what two copies have in
+    common is not itself taken for something that many share.
+
+    Args:
+        signatures: videos x values, each of mean 0 and norm 1.
+    """
+    shared = np.linalg.cholesky(signatures.T @ signatures + np.eye(signatures.shape[1]))
+    own = np.linalg.solve(shared, signatures.T).T
+    unit: np.ndarray = own / np.maximum(np.linalg.norm(own, axis=1, keepdims=True), 1e-12)
+    return unit
+
+
+def likeness_bound(largest: np.ndarray, pairs: int) -> float:
+    """The likeness that, by chance, one of so many pairs of different objects exceeds with probability `CHANCE`.
+
+    Their own largest likenesses tell: under Fisher's transformation these fall off exponentially, at a rate that the
+    m-th and the m/4-th of them give, m = sqrt(pairs); the largest of all may be copies. The bound is where that tail
+    expects `CHANCE` pairs, so it grows with the logarithm of their number.
+
+    Args:
+        largest: m + 1 of them, the largest first.
+    """
+    m = math.isqrt(pairs)
+    if m < FEWEST:
+        return DUPLICATE
+    upper, lower = np.arctanh(np.minimum(largest[[m // 4, m]], 1 - 1e-9))
+    return max(DUPLICATE, math.tanh(lower + (upper - lower) / math.log(4) * math.log(m / CHANCE)))
 
 
 def _near_copy(found: Evidence, one: Probe, other: Probe, alike: float) -> Iterator[Finding]:
     if one.sha256 == other.sha256:
         return  # `_copies` names them.
     crosses = _crosses(found, one.video_id, other.video_id)
-    measured = f"contact correlates at {alike:.3f}"
+    measured = f"contact is alike by {alike:.3f}"
     if one.object_id == other.object_id and not crosses:
         # One object pressed twice in the same way looks alike, and leaks nothing.
         twice = f"{measured} with {one.path}, the same object"

@@ -122,14 +122,15 @@ def _irregular(times: list[tuple[int, float]]) -> float:
 
 
 def _signature(pictures: list[Image], reference: Image) -> tuple[float, ...]:
-    """What the contact looks like, for finding copies: the mean of the quarter of the pictures that show most of it.
+    """What the contact looks like, for finding copies: the third of the pictures that show most of it less the others.
 
-    A mean of several survives a copy that is shortened or encoded anew, which moves the one strongest picture.
+    Means of many survive a copy that is shortened or encoded anew, which changes each picture and the reference.
     """
     untouched = np.ascontiguousarray(reference[:, :, 0])
-    ranked = sorted(pictures, key=lambda p: contact_strength(p, untouched), reverse=True)
-    strongest = ranked[: max(1, len(ranked) // 4)] or [untouched]
-    change = np.mean(strongest, axis=0, dtype=np.float32) - untouched.astype(np.float32)
+    ranked = [*sorted(pictures, key=lambda p: contact_strength(p, untouched), reverse=True), untouched]
+    third = -(-len(ranked) // 3)
+    most, rest = (np.mean(part or [untouched], axis=0, dtype=np.float32) for part in (ranked[:third], ranked[third:]))
+    change = most - rest
     small = cv2.resize(change, SIGNATURE_SIZE, interpolation=cv2.INTER_AREA)
     small -= small.mean()
     norm = float(np.linalg.norm(small))

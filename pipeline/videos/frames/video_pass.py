@@ -31,7 +31,7 @@ from pipeline.videos.frames.selection import (
 
 PROBES = 8
 """Frames of a video that are measured for the audit, besides the reference's and the last."""
-SIGNATURE_FRAMES = 32
+SIGNATURE_FRAMES = 64
 """Frames of a video that the signature is made from, which tells copies."""
 
 
