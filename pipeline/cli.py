@@ -49,8 +49,9 @@ def scale(
 ) -> None:
     """Choose what `dvc repro` runs: write params.yaml from conf/NAME.yaml and the overrides."""
     from pipeline.memory import count, table
+    from pipeline.params import in_project
     from pipeline.scales import check_inputs, compose, prune, write_params
-    from pipeline.stage import in_project, running_stages
+    from pipeline.stage import running_stages
 
     in_project()
     if running := running_stages():
@@ -109,8 +110,8 @@ def weights(
 @app.command()
 def page() -> None:
     """Write reports/index.html, one page over all reports that opens from disk."""
+    from pipeline.params import in_project
     from pipeline.report.page import write_page
-    from pipeline.stage import in_project
 
     in_project()
     file = write_page(Path())
@@ -121,10 +122,8 @@ def page() -> None:
 def publish() -> None:
     """Show what lies in data/ and reports/ in MLflow, as `dvc repro` does at its end; a second call adds nothing."""
     from pipeline.params import load_params
-    from pipeline.stage import in_project
     from pipeline.tracking.publish import publish as to_mlflow
 
-    in_project()
     typer.echo(to_mlflow(load_params()))
 
 
@@ -208,9 +207,7 @@ def answer_with(
     from pipeline.evaluation.answer_with import Endpoint, ask_all
     from pipeline.params import load_params
     from pipeline.records import Shown
-    from pipeline.stage import in_project
 
-    in_project()
     if folder is None and shown == "photos":
         raise UserError("DIR: name the folder with photos, as in `--input photos DIR`")
     asked = Endpoint(endpoint.rstrip("/"), model, temperature, max_tokens, timeout)
@@ -221,9 +218,7 @@ def answer_with(
 def repro(context: typer.Context) -> None:
     """Run `dvc repro`: say how many stages will run, and write the page of all reports behind it."""
     from pipeline.reproduce import reproduce
-    from pipeline.stage import in_project
 
-    in_project()
     raise typer.Exit(reproduce(Path(), context.args))
 
 
@@ -237,7 +232,7 @@ def compare(
     from pipeline.compare import compare as compare_states
     from pipeline.compare import describe
     from pipeline.io import write_json
-    from pipeline.stage import in_project
+    from pipeline.params import in_project
 
     in_project()
     found = compare_states(Path(), old, new)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -34,8 +36,37 @@ def check_code(folder: Path) -> None:
         )
 
 
+def in_project() -> None:
+    """Raise UserError where this is not the project's folder, or the code that runs is not the project's own.
+
+    dvc.lock records the code in the folder, whichever environment is active. In the copy that DVC makes for an
+    experiment the process starts again, with the copy's code: what is recorded is then what runs.
+    """
+    here, script = Path.cwd(), Path(sys.argv[0]).absolute()
+    if not any(path.exists() for path in (CHAIN, PARAMS_FILE, Path("conf"))):
+        above = project_above()
+        raise UserError(f"{here} has no {CHAIN}; go to {f'{above}, ' if above else ''}the project's folder")
+    try:
+        check_code(here)
+        check_code(script.parents[1] if script.parent.name == "stages" else here)
+    except UserError:
+        first, rest = str(here), os.environ.get("PYTHONPATH", "")
+        if main_folder() == here or rest.startswith(first):
+            raise
+        path = os.pathsep.join(filter(None, (first, rest)))
+        os.execve(sys.executable, sys.orig_argv, {**os.environ, "PYTHONPATH": path})
+
+
+def main_folder() -> Path:
+    """The project's folder; for the copy of it that DVC runs an experiment in, and then deletes, what was copied."""
+    here, root = Path.cwd(), Path(os.environ.get("DVC_ROOT", "")).resolve()
+    return root if here.is_relative_to(root / ".dvc" / "tmp" / "exps") else here
+
+
 def load_params(path: Path = PARAMS_FILE) -> Params:
-    """Read and check params.yaml."""
+    """Read and check params.yaml; that of this folder only where it is the project's, with its own code."""
+    if path == PARAMS_FILE:
+        in_project()
     try:
         values = yaml.load(path.read_text(encoding="utf-8"), Loader=OneKeyLoader)
     except UnicodeDecodeError:

@@ -23,12 +23,15 @@ from pipeline.config import Params
 from pipeline.errors import UserError
 from pipeline.io import remove_rests, write_json
 from pipeline.parallel import end_with_parent, use_backend
-from pipeline.params import CHAIN, PARAMS_FILE, check_code, load_params, project_above
+from pipeline.params import PARAMS_FILE, load_params
 from pipeline.records import Measurement
 from pipeline.runtime import CHECKPOINTS, limit_threads, quiet_libraries
 
 DATA = Path("data")
 RUNS = Path("runs")
+NUMBERS = ("NVIDIA_TF32_OVERRIDE", "TORCH_ALLOW_TF32_CUBLAS_OVERRIDE")
+"""Variables by which a GPU multiplies float32 with the digits of float16, or does not where it would; some containers
+set them."""
 
 
 @dataclass
@@ -91,33 +94,6 @@ def launch(launcher: str) -> None:
             raise UserError(f"runtime.launcher: {launcher}: {error.strerror}; set it to python") from None
 
 
-def in_project() -> None:
-    """Raise UserError where this is not the project's folder, or the code that runs is not the project's own.
-
-    dvc.lock records the code in the folder, whichever environment is active. In the copy that DVC makes for an
-    experiment the process starts again, with the copy's code: what is recorded is then what runs.
-    """
-    here, script = Path.cwd(), Path(sys.argv[0]).absolute()
-    if not any(path.exists() for path in (CHAIN, PARAMS_FILE, Path("conf"))):
-        above = project_above()
-        raise UserError(f"{here} has no {CHAIN}; go to {f'{above}, ' if above else ''}the project's folder")
-    try:
-        check_code(here)
-        check_code(script.parents[1] if script.parent.name == "stages" else here)
-    except UserError:
-        first, rest = str(here), os.environ.get("PYTHONPATH", "")
-        if main_folder() == here or rest.startswith(first):
-            raise
-        path = os.pathsep.join(filter(None, (first, rest)))
-        os.execve(sys.executable, sys.orig_argv, {**os.environ, "PYTHONPATH": path})
-
-
-def main_folder() -> Path:
-    """The project's folder; for the copy of it that DVC runs an experiment in, and then deletes, what was copied."""
-    here, root = Path.cwd(), Path(os.environ.get("DVC_ROOT", "")).resolve()
-    return root if here.is_relative_to(root / ".dvc" / "tmp" / "exps") else here
-
-
 @contextmanager
 def stage(name: str, key: str | None = None, *, launched: bool = False) -> Iterator[Stage]:
     """Run the body as the DVC stage `name` (with `@key` in a matrix).
@@ -135,11 +111,13 @@ def stage(name: str, key: str | None = None, *, launched: bool = False) -> Itera
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     quiet_libraries()
     try:
-        in_project()
+        if number := next((name for name in NUMBERS if name in os.environ), None):
+            raise UserError(f"{number} is set, which changes the format that numbers are computed in; unset it")
+        params = load_params()
         if launched:
-            launch(load_params().runtime.launcher)
+            launch(params.runtime.launcher)
         with alone(full):
-            running = Stage(full, load_params(), started)
+            running = Stage(full, params, started)
             limit_threads(running.params.runtime.threads)
             use_backend(running.params.runtime.parallel)
             if _main_process():

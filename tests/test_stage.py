@@ -171,6 +171,13 @@ def test_parameters_that_change_while_a_stage_runs_are_no_silent_matter(here: Pa
         os.utime(here / "params.yaml")  # Written anew with the same values.
 
 
+@pytest.mark.parametrize("name", ["TORCH_ALLOW_TF32_CUBLAS_OVERRIDE", "NVIDIA_TF32_OVERRIDE"])
+def test_no_variable_changes_the_format_of_numbers(here: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.setenv(name, "1")
+    with pytest.raises(SystemExit, match=f"^split: {name} is set.*unset it$"), stage("split"):
+        pass
+
+
 @pytest.fixture
 def clone(tmp_path: Path) -> Path:
     """Another clone of the project, in a path with a space, as far as a stage's start needs it."""

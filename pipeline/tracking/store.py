@@ -18,7 +18,7 @@ from typing import Any, ParamSpec, TypeVar
 
 from pipeline.config import Params, TrackingConfig
 from pipeline.errors import UserError, without_secrets
-from pipeline.stage import main_folder
+from pipeline.params import main_folder
 from pipeline.tracking.chain import ChainStage, git
 
 logger = logging.getLogger(__name__)
