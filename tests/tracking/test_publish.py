@@ -258,6 +258,8 @@ def test_an_experiment_publishes_into_the_project_and_by_its_own_code(chain: Fak
     run("dvc exp run --queue --single-item publish -S seed=1")
     code.write_text("raise SystemExit('changed after it was queued')")
     run("dvc queue start && until dvc queue status | grep -E 'Success|Failed'; do sleep 1; done")
+    # What runs in one folder is not taken for what was killed in another.
+    assert all(run.data.tags["octopi.folder"].startswith(".dvc/tmp/exps/") for run in runs("reproduction"))
     assert len(runs("reproduction")) == 2
     assert run("git status --porcelain -- mlruns") == ""
 
