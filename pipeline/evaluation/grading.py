@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 from pydantic import ValidationError
 
 from pipeline.errors import UserError
 from pipeline.io import fingerprint, read_json, read_jsonl
-from pipeline.records import GradedVision, Prediction, Question, Score, VisionModel
+from pipeline.records import Classification, GradedVision, Prediction, Question, Score, VisionModel
 from pipeline.tasks import TASKS
 from pipeline.videos.catalogue import Catalogue
 
@@ -29,6 +30,36 @@ def grade(questions: Sequence[Question], predictions: Sequence[Prediction], cata
             raise UserError(f"{prediction.question_id}: answered but not asked; run `dvc repro` to answer anew")
         scores += TASKS[question.task].grade(question, prediction, catalogue)
     return scores
+
+
+def conclude(questions: Sequence[Question], classified: Iterable[Classification], catalogue: Catalogue) -> list[Score]:
+    """Grade what follows from the heads' classes by each task's rule, without a language model.
+
+    Questions about a video that the heads said nothing of, and tasks without a rule, have no score.
+
+    Args:
+        classified: Of the videos that the questions are about.
+        catalogue: As `TaskDefinition.conclude` takes it.
+    """
+    said: dict[str, dict[str, tuple[int, float]]] = defaultdict(dict)
+    for c in classified:
+        said[c.video_id][c.property] = (c.predicted, sum(i * p for i, p in enumerate(c.probabilities)))
+    predictions = []
+    for question in questions:
+        if all(video in said for video in question.videos):
+            classes = [[said[video][name] for name in catalogue.property_names] for video in question.videos]
+            answer = TASKS[question.task].conclude(question, classes, catalogue)
+            if answer is not None:
+                predictions.append(
+                    Prediction(
+                        question_id=question.question_id,
+                        task=question.task,
+                        outputs=(answer,),
+                        truncated=False,
+                        tokens=0,
+                    )
+                )
+    return grade(questions, predictions, catalogue)
 
 
 def vision_models(folder: Path) -> dict[Path, VisionModel]:

@@ -31,6 +31,7 @@ from pipeline.records import (
     Opd,
     OutOfFold,
     Part,
+    Score,
     ScoreRow,
     Touch,
 )
@@ -42,13 +43,17 @@ class Setting(NamedTuple):
     """What was asked, apart from the seed."""
 
     encoder: Encoder
-    lora: Lora
-    opd: Opd
+    lora: Lora | None
+    """None where no language model answered."""
+    opd: Opd | None
     touch: Touch
 
 
 FULL = Setting(Encoder.FINETUNED, Lora.WITH, Opd.ALL, Touch.REAL)
+RULES = Setting(Encoder.FINETUNED, None, None, Touch.REAL)
+"""The property heads' classes, and what follows from them by rule."""
 CHANGES: tuple[tuple[str, Setting, Setting], ...] = (
+    ("language", FULL, RULES),
     ("encoder", FULL, FULL._replace(encoder=Encoder.BASE)),
     ("lora", FULL, FULL._replace(lora=Lora.WITHOUT)),
     ("opd", FULL, FULL._replace(opd=Opd.NONE)),
@@ -79,6 +84,7 @@ def score_rows(
     classifications: Mapping[int, Sequence[Classification]] | None = None,
     out_of_fold: Mapping[str, Sequence[OutOfFold]] | None = None,
     seen: Iterable[GradedVision] = (),
+    concluded: Mapping[int, Sequence[Score]] | None = None,
 ) -> list[ScoreRow]:
     """The rows of scores.csv: one a seed and one over all of them, for each measure and setting that has answers.
 
@@ -88,12 +94,14 @@ def score_rows(
         classifications: Of the property heads, by seed, those of its folds together; only test and validation count.
         out_of_fold: By candidate.
         seen: Graded answers of vision-only models.
+        concluded: By seed, what `pipeline.evaluation.grading.conclude` graded.
     """
     rows: list[ScoreRow] = []
-    for (task, measure), settings in _table(graded, catalogue).items():
+    for (task, measure), settings in _table(graded, catalogue, concluded or {}).items():
         chance = TASKS[task].chance(catalogue)[measure]
         for setting, runs in settings.items():
-            rows += _rows(runs, task=task, measure=measure, chance=chance, **setting._asdict())
+            named = {axis: value for axis, value in setting._asdict().items() if value is not None}
+            rows += _rows(runs, task=task, measure=measure, chance=chance, **named)
     by_model: dict[tuple[str, ...], dict[int, dict[str, Answer]]] = defaultdict(lambda: defaultdict(dict))
     for g in seen:
         answer = Answer(g.correct, g.objects, g.parsed, g.strict)
@@ -117,18 +125,27 @@ def score_rows(
     return rows
 
 
-def effect_rows(graded: Iterable[Graded], catalogue: Catalogue) -> list[EffectRow]:
+def effect_rows(
+    graded: Iterable[Graded], catalogue: Catalogue, concluded: Mapping[int, Sequence[Score]] | None = None
+) -> list[EffectRow]:
     """The rows of effects.csv: what each part of the full system brings, task by task, pooled over seeds.
 
     Only each task's measure of a whole answer, on questions and seeds that both settings have. Holm's family is all
     rows.
+
+    Args:
+        graded: As `score_rows` takes it.
+        catalogue: Likewise.
+        concluded: Likewise.
     """
     rows = []
-    table = _table(graded, catalogue)
+    table = _table(graded, catalogue, concluded or {})
     for part, full, less in CHANGES:
         for (task, measure), settings in table.items():
             if measure == TASKS[task].measure and (gap := difference(settings.get(full, {}), settings.get(less, {}))):
-                change = f"{getattr(full, part)} - {getattr(less, part)}"
+                change = "full system - heads and rules"
+                if less is not RULES:
+                    change = f"{getattr(full, part)} - {getattr(less, part)}"
                 rows.append(EffectRow(part=part, change=change, task=task, measure=measure, **vars(gap)))
     return with_holm(rows)
 
@@ -206,7 +223,7 @@ def _row(questions: Sequence[Sequence[Answer]], **named: object) -> ScoreRow:
     )
 
 
-def grouped(graded: Iterable[Graded]) -> Table:
+def grouped(graded: Iterable[Graded]) -> dict[tuple[str, str], dict[Setting, dict[int, dict[str, Answer]]]]:
     """Answers by task and measure, then by setting."""
     found: dict[tuple[str, str], dict[Setting, dict[int, dict[str, Answer]]]] = defaultdict(
         lambda: defaultdict(lambda: defaultdict(dict))
@@ -217,9 +234,12 @@ def grouped(graded: Iterable[Graded]) -> Table:
     return found
 
 
-def _table(graded: Iterable[Graded], catalogue: Catalogue) -> Table:
+def _table(graded: Iterable[Graded], catalogue: Catalogue, concluded: Mapping[int, Sequence[Score]]) -> Table:
     """In the order of the registered tasks and of what each calls its measures."""
     found = grouped(graded)
+    for seed, scores in concluded.items():
+        for s in scores:
+            found[s.task, s.measure][RULES][seed][s.question_id] = Answer(s.correct, s.objects, s.parsed, s.strict)
     keys = [(task, measure) for task, definition in TASKS.items() for measure in definition.chance(catalogue)]
     return {key: found[key] for key in keys if key in found}
 

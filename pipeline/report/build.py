@@ -11,7 +11,7 @@ import pandas as pd
 from pipeline.config import AblationConfig, Params
 from pipeline.evaluation.calibration import CalibrationRow, calibrated, calibration_rows
 from pipeline.evaluation.described import described_rows
-from pipeline.evaluation.grading import EXTERNAL, vision_models
+from pipeline.evaluation.grading import EXTERNAL, conclude, vision_models
 from pipeline.evaluation.ordinal import ErrorRow, error_rows
 from pipeline.evaluation.scores import candidate_rows, effect_rows, score_rows
 from pipeline.io import read_csv, read_jsonl, read_table, write_csv, write_json, write_text
@@ -30,6 +30,7 @@ from pipeline.records import (
     Part,
     Prediction,
     Question,
+    Score,
     ScoreRow,
     Touch,
     Variant,
@@ -90,14 +91,19 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     described = described_rows([row for g in gates if g.is_file() for row in read_csv(g, Described)], catalogue)
     vision = data / "graded_vision.parquet"
     seen = read_table(vision, GradedVision) if vision.is_file() else []
-    scores = score_rows(graded, catalogue, said, out_of_fold, seen) + described
+    concluded: dict[int, list[Score]] = {}
+    for seed, classified in by_encoder.items():
+        asked = read_jsonl(data / "questions" / str(seed) / "evaluation.jsonl", Question)
+        scored = conclude(asked, classified, catalogue.asking(params.questions.scenarios))
+        concluded.setdefault(params.split.replicate_of(seed), []).extend(scored)
+    scores = score_rows(graded, catalogue, said, out_of_fold, seen, concluded) + described
     origin = provenance(params, catalogue, videos, splits, [g.objects for g in graded], root)
     # Not those whose answers are to other questions, which were not graded.
     rated = {(g.model, g.shown) for g in seen}
     sources = vision_models(root / EXTERNAL / params.report_name).values()
     origin["vision"] = [s.model_dump(mode="json") for s in sources if (s.model, s.shown) in rated]
     write_csv(folder / "scores.csv", ScoreRow, scores)
-    write_csv(folder / "effects.csv", EffectRow, effect_rows(graded, catalogue))
+    write_csv(folder / "effects.csv", EffectRow, effect_rows(graded, catalogue, concluded))
     write_csv(folder / "encoder_effects.csv", EffectRow, candidate_rows(out_of_fold, BASELINE))
     write_csv(folder / "encoder_errors.csv", ErrorRow, error_rows(out_of_fold, catalogue))
     write_csv(folder / "calibration.csv", CalibrationRow, calibration_rows(list(by_encoder.values())))

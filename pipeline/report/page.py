@@ -43,7 +43,7 @@ EXPECTED = {
     "confusion.csv": OLDER,
 }
 """Files of a report, and why it may lack one."""
-PARTS = {"encoder": "Encoder", "lora": "LoRA", "opd": "OPD", "touch": "Touch"}
+PARTS = {"language": "Language model", "encoder": "Encoder", "lora": "LoRA", "opd": "OPD", "touch": "Touch"}
 RANK = {"error": 0, "warning": 1, "info": 2}
 BESIDE = (
     (

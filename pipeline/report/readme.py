@@ -26,6 +26,7 @@ OTHER_MODELS = (
     "Published figures are the paper's, of Octopi with Vicuna 7b and 13b (and of CLIP ViT-L/14 where no language model "
     "answers): other models on other questions about other objects. They are no target that was met or missed."
 )
+WORDS = {"lora": "LoRA", "opd": "OPD"}
 TAUGHT = (
     "before it met touch, `{}` learnt from text alone to reason about described objects that were made up, never in "
     "the tasks' own wording. What LoRA and OPD bring comes on top of that; the table *Reasoning about described "
@@ -75,7 +76,7 @@ def finding(report: Report) -> list[str]:
     """
     rows = headline(report.scores)
     solved = set(rows.loc[rows["low"] > rows["chance"], "task"])
-    rest = [*_touch(report.effects, solved), *_parts(report.effects, solved)]
+    rest = [*_touch(report.effects, solved), *_rules(report.effects), *_parts(report.effects, solved)]
     return [" ".join(sentences) for sentences in (_who(report), _against_chance(rows), rest)]
 
 
@@ -241,18 +242,38 @@ def _impossible(effects: pd.DataFrame) -> str:
     return f" ({objects} objects are too few for that)" if effects["p"].count() * 2.0 ** (1 - objects) >= ALPHA else ""
 
 
+def _rules(effects: pd.DataFrame) -> list[str]:
+    """How the full system stands to what its encoder's heads and plain rules answer without a language model."""
+    rows = effects[effects["part"] == "language"]
+    if not len(rows):
+        return []
+    sure = rows[rows["p_holm"] < ALPHA]
+    ahead, behind = (", ".join(sure.loc[kind, "task"]) for kind in (sure["difference"] > 0, sure["difference"] < 0))
+    said = [f"ahead in {ahead}"] if ahead else []
+    said += [f"behind in {behind}"] if behind else []
+    span = f"{100 * rows['difference'].min():+.1f} to {100 * rows['difference'].max():+.1f} points"
+    return [
+        "The encoder's property heads and plain rules answer the same questions without a language model; the full "
+        f"system differs from them by {span}, task by task, and is {' and '.join(said) or 'in no task ahead or behind'} "
+        "(Holm)."
+    ]
+
+
 def _parts(effects: pd.DataFrame, solved: Collection[str]) -> list[str]:
     """What encoder, LoRA and OPD bring; a gain that ends no better than chance is one of form, not of right answers."""
-    rows = effects[effects["part"] != "touch"]
+    rows = effects[~effects["part"].isin(("touch", "language"))]
     if not len(rows):
         return []
     form = rows["difference"].gt(0) & ~rows["task"].isin(solved)
     sure, formal = (rows[rows["p_holm"].lt(ALPHA) & kind] for kind in (~form, form))
     words, only = (
-        ", ".join(f"{r['part']} in {r['task']} {100 * r['difference']:+.1f}" for r in part.to_dict("records"))
+        ", ".join(
+            f"{WORDS.get(r['part'], r['part'])} in {r['task']} {100 * r['difference']:+.1f}"
+            for r in part.to_dict("records")
+        )
         for part in (sure, formal)
     )
-    *others, last = [{"lora": "LoRA", "opd": "OPD"}.get(part, part) for part in dict.fromkeys(rows["part"])]
+    *others, last = [WORDS.get(part, part) for part in dict.fromkeys(rows["part"])]
     all_of_them = f"{len(rows)} effects of {', '.join(others)}{' and ' if others else ''}{last}"
     also = f" Significant too, but answers are no better than chance even so: {only} points." if only else ""
     if words:

@@ -30,6 +30,7 @@ NOT_ANSWERED = (HEADS, VALIDATION_HEADS, CROSS_VALIDATION, DESCRIBED)
 """Tasks of scores.csv that no language model with touch answered."""
 PUBLISHED_MODELS = ("7b", "13b", "CLIP", "PG-InstructBLIP")
 SYSTEM_WORDS = {"base": "base encoder", "without": "without LoRA", "none": "without OPD", "needed": "OPD as needed"}
+RULES_WORDS = "heads and rules, no language model"
 SHOWN_WORDS = {"frames": "frames of the videos", "photos": "photos of the objects"}
 """What vision-only models were shown, in the place where others have their touch."""
 ENCODERS = {"finetuned": "fine-tuned", "base": "base"}
@@ -77,8 +78,8 @@ class Table:
 
 
 def headline(scores: pd.DataFrame) -> pd.DataFrame:
-    """The rows of scores.csv that `FIVE_TASKS` shows."""
-    return FIVE_TASKS.select(scores, scores)
+    """The full system's rows of scores.csv, a row a task that was asked."""
+    return ordered(scores[answers(scores) & whole(scores) & _differs(scores)])
 
 
 def side_by_side(reports: Mapping[str, Report], *, every: bool) -> pd.DataFrame:
@@ -150,6 +151,8 @@ def system(row: dict[str, Any]) -> str:
         return str(row["encoder"])
     if row["touch"] in SHOWN_WORDS:
         return f"{row['encoder']}, {SHOWN_WORDS[row['touch']]}"
+    if not row["lora"]:
+        return ", ".join(filter(None, (RULES_WORDS, TASKS[row["task"]].told if row["task"] in TASKS else "")))
     words = [SYSTEM_WORDS[row[axis]] for axis in FULL if row[axis] in SYSTEM_WORDS]
     return ", ".join(words) or "Octopi (full system)"
 
@@ -211,7 +214,13 @@ def vision(frame: pd.DataFrame) -> pd.Series[bool]:
 def answers(frame: pd.DataFrame) -> pd.Series[bool]:
     """Answers of the language model to real touch, over all seeds."""
     over = ~frame["task"].isin(NOT_ANSWERED) & (frame["seed"] == ALL_SEEDS)
-    return over & (frame["touch"] == "real")
+    return over & (frame["touch"] == "real") & (frame["lora"] != "")
+
+
+def rules(frame: pd.DataFrame) -> pd.Series[bool]:
+    """What follows by rule from the property heads' classes, over all seeds."""
+    over = ~frame["task"].isin(NOT_ANSWERED) & (frame["seed"] == ALL_SEEDS)
+    return over & (frame["touch"] == "real") & (frame["lora"] == "")
 
 
 def whole(frame: pd.DataFrame) -> pd.Series[bool]:
@@ -230,11 +239,13 @@ def _differs(frame: pd.DataFrame, *axes: str) -> pd.Series[bool]:
 def _variants(*axes: str, described: bool | None = None, trained: bool | None = None, seen: bool = False) -> Select:
     """Answers of variants that differ in these axes; only descriptions, or only tasks that were trained, or not.
 
-    With `seen` those of vision-only models, too.
+    Beside whole answers stands what follows by rule from the heads; with `seen` those of vision-only models, too.
     """
 
     def select(frame: pd.DataFrame) -> pd.Series[bool]:
         rows = answers(frame) & _differs(frame, *axes)
+        if not described:
+            rows |= rules(frame)
         if seen:
             rows |= vision(frame)
         if described is not None:
@@ -252,7 +263,7 @@ def _ablated(axis: str, *, described: bool) -> Select:
 
     def select(frame: pd.DataFrame) -> pd.Series[bool]:
         rows = _variants(axis, described=described)(frame)
-        return rows & (frame.loc[rows, axis].nunique() > 1)
+        return rows & (frame.loc[rows & answers(frame), axis].nunique() > 1)
 
     return select
 
@@ -267,11 +278,11 @@ PAPER, PROPERTIES = ("task", *SHOWN, "published"), ("measure", *SHOWN, "publishe
 FIVE_TASKS = Table(
     "five_tasks",
     "The full system",
-    "Whole answers to real touch, over all seeds.",
-    lambda f: answers(f) & whole(f) & _differs(f),
-    ("task", "measured", "n", "unread", "chance", "published"),
+    "Whole answers to real touch, over all seeds; below each, what follows by rule from the property heads.",
+    lambda f: (answers(f) & _differs(f) | rules(f)) & whole(f),
+    ("task", "system", "measured", "n", "unread", "chance", "published"),
 )
-"""A report's first table, one row a task that was asked."""
+"""A report's first table, two rows a task that was asked."""
 TABLES: tuple[Table, ...] = (
     Table(
         "understanding",

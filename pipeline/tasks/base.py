@@ -13,6 +13,11 @@ from pipeline.videos.catalogue import Catalogue, Property
 from pipeline.videos.catalogue.wording import mentioned, plain, unmarked
 
 LETTERS = "abc"
+Classes = Sequence[Sequence[tuple[int, float]]]
+"""What an encoder takes each video for, property by property: its class, and the mean class by its probabilities.
+
+The pairs sort: of two videos of one class, the one with the higher mean comes later.
+"""
 ORDINALS = ("First", "Second")
 MARKER = r"[^\S\n]*(?:[:,]|-\s|is\b|\n|$)"
 LETTER = (
@@ -67,6 +72,8 @@ class TaskDefinition(ABC):
     """How many answers there are to choose from."""
     measure = "choice"
     """The measure that says that a whole answer is right; `chance` lists all measures."""
+    told = ""
+    """What `conclude` knows beside the classes of the videos, as tables say it."""
 
     @abstractmethod
     def strata(self, catalogue: Catalogue) -> int:
@@ -79,6 +86,18 @@ class TaskDefinition(ABC):
     @abstractmethod
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         """One score for each measure; an answer that cannot be read is wrong and not `parsed`."""
+
+    def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str | None:
+        """The answer that follows from the classes of the videos by rule, without a language model.
+
+        It is worded as a right answer is, so that `grade` reads it. None where no rule leads to an answer.
+
+        Args:
+            question: It is read for what is asked; its right answer is not looked at.
+            classes: One entry a video of the question.
+            catalogue: With the scenarios that were asked, and no others (`Catalogue.asking`).
+        """
+        return None
 
     def chance(self, catalogue: Catalogue) -> dict[str, float]:
         """Accuracy of a uniform guess, 0 to 1, by measure."""

@@ -8,7 +8,7 @@ import re
 from string import Formatter
 
 from pipeline.records import Opd, Prediction, Question, Score
-from pipeline.tasks.base import Draft, Pool, TaskDefinition, draft_single_turn, find_level, scored
+from pipeline.tasks.base import Classes, Draft, Pool, TaskDefinition, draft_single_turn, find_level, scored
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.catalogue.wording import OPENING, unmarked
 
@@ -65,6 +65,9 @@ class ObjectPropertyDescription(TaskDefinition):
             )
         )
         return scores
+
+    def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str:
+        return catalogue.structured(tuple(level for level, _ in classes[0]))
 
     def chance(self, catalogue: Catalogue) -> dict[str, float]:
         single = {p.name: 1 / len(p.levels) for p in catalogue.properties}

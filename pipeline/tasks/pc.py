@@ -9,6 +9,7 @@ from typing import Literal
 from pipeline.records import Opd, Prediction, Question, Score
 from pipeline.tasks.base import (
     ORDINALS,
+    Classes,
     Draft,
     Pool,
     TaskDefinition,
@@ -18,14 +19,15 @@ from pipeline.tasks.base import (
     conclusion,
     draft_single_turn,
 )
-from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.catalogue import Catalogue, Property
+from pipeline.videos.catalogue.wording import mentioned, plain
 
 TEMPLATES = (
     "Is the object in the tactile video {tactile} COMPARATIVE than the one in {tactile}?",
     "Is the object in {tactile} COMPARATIVE than the object in {tactile}?",
 )
-CHOICES = ("yes", "no", "same")
 Reading = Literal["yes", "no", "same"]
+CHOICES: tuple[Reading, ...] = ("yes", "no", "same")
 
 
 def asked(template: str, comparative: str, spoken: str) -> dict[Opd, str]:
@@ -36,6 +38,20 @@ def asked(template: str, comparative: str, spoken: str) -> dict[Opd, str]:
         Opd.NEEDED: f"{ask} Describe the {spoken} of both objects before answering.",
         Opd.ALL: f"{ask} Describe both objects before answering.",
     }
+
+
+def compare(first: int, second: int, rising: bool) -> Reading:
+    """Whether the first class is beyond the second in the direction that is asked for."""
+    return "same" if first == second else "yes" if (first > second) == rising else "no"
+
+
+def verdict(choice: Reading, comparative: str, prop: Property) -> str:
+    """The conclusion in words."""
+    return {
+        "yes": f"Yes, the first object is {comparative}.",
+        "no": f"No, the second object is {comparative}.",
+        "same": f"Both objects are similar in {prop.spoken}.",
+    }[choice]
 
 
 def read(answer: str) -> Reading | None:
@@ -65,18 +81,12 @@ class PropertyComparison(TaskDefinition):
         prop = pool.catalogue.properties[index]
         objects = rng.sample(pool.objects, 2)
         first, second = (pool.catalogue.labels(o)[index] for o in objects)
-        actual = "same" if first == second else "yes" if (first > second) == bool(rising) else "no"
-        if actual != choice:
+        if compare(first, second, bool(rising)) != choice:
             return None
         comparative = prop.more if rising else prop.less
         user = asked(rng.choice(TEMPLATES), comparative, prop.spoken)
-        verdict = {
-            "yes": f"Yes, the first object is {comparative}.",
-            "no": f"No, the second object is {comparative}.",
-            "same": f"Both objects are similar in {prop.spoken}.",
-        }[choice]
         prefixes = [f"{o} object:" for o in ORDINALS]
-        answer = concluded(pool.catalogue, objects, prefixes, verdict, [prop.name])
+        answer = concluded(pool.catalogue, objects, prefixes, verdict(choice, comparative, prop), [prop.name])
         found = {"yes": self.listed[0], "no": self.listed[1], "same": "neither"}[choice]
         return draft_single_turn(
             pool,
@@ -88,6 +98,13 @@ class PropertyComparison(TaskDefinition):
             properties=[prop.name],
             finding=f"{comparative.capitalize()}: {found}.",
         )
+
+    def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str:
+        place = catalogue.property_index(question.gold.properties[0])
+        prop = catalogue.properties[place]
+        rising = mentioned(question.dialogues[0].turns[-1].user, (prop.more, prop.less)) == [plain(prop.more)]
+        (first, _), (second, _) = (video[place] for video in classes)
+        return verdict(compare(first, second, rising), prop.more if rising else prop.less, prop)
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         predicted = read(prediction.outputs[0])

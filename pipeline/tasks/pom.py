@@ -11,6 +11,7 @@ from dataclasses import replace
 from pipeline.records import Dialogue, Opd, Prediction, Question, Score
 from pipeline.tasks.base import (
     LETTERS,
+    Classes,
     Draft,
     Pool,
     TaskDefinition,
@@ -62,12 +63,19 @@ def read(answer: str, names: Sequence[str]) -> dict[str, int] | None:
     return found if whole else None
 
 
+def verdict(catalogue: Catalogue, objects: Sequence[str]) -> str:
+    """The conclusion in words, for three object ids in the order of their videos."""
+    names = [f"{letter}) is {catalogue.objects[o].name}" for letter, o in zip(LETTERS, objects, strict=True)]
+    return f"{names[0]}, {names[1]} and {names[2]}."
+
+
 class PropertyObjectMatching(TaskDefinition):
     """The three objects differ in at least one property each, or touch could not tell them apart."""
 
     name = "POM"
     title = "Property-object Matching"
     choices = 6
+    told = "told the classes of the named objects"
 
     def strata(self, catalogue: Catalogue) -> int:
         return len(ORDERS)
@@ -83,9 +91,7 @@ class PropertyObjectMatching(TaskDefinition):
         order = ORDERS[stratum % len(ORDERS)]
         objects = [options[int(number) - 1] for number in order]
         user = asked(rng.choice(OPENINGS), [catalogue.objects[o].name for o in options])
-        names = [f"{letter}) is {catalogue.objects[o].name}" for letter, o in zip(LETTERS, objects, strict=True)]
-        verdict = f"{names[0]}, {names[1]} and {names[2]}."
-        answer = concluded(catalogue, objects, [f"{x})" for x in LETTERS], verdict)
+        answer = concluded(catalogue, objects, [f"{x})" for x in LETTERS], verdict(catalogue, objects))
         return draft_single_turn(
             pool, objects, rng, user=user, answer=answer, choice=order, properties=catalogue.property_names
         )
@@ -100,6 +106,21 @@ class PropertyObjectMatching(TaskDefinition):
             return dialogue.model_copy(update={"turns": (first, *rest)})
 
         return replace(draft, dialogues=tuple(map(begin, draft.dialogues)))
+
+    def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str:
+        """The matching whose classes are off by the fewest steps; of those, the one whose mean classes are nearest."""
+
+        def distance(objects: Sequence[str]) -> tuple[float, float]:
+            pairs = [
+                (said, label)
+                for video, o in zip(classes, objects, strict=True)
+                for said, label in zip(video, catalogue.labels(o), strict=True)
+            ]
+            return sum(abs(level - label) for (level, _), label in pairs), sum(
+                abs(mean - label) for (_, mean), label in pairs
+            )
+
+        return verdict(catalogue, min(itertools.permutations(sorted(question.objects)), key=distance))
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         """Read from "a) is NAME": each letter must name exactly one option, and no option twice."""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from pipeline.records import Dialogue, Opd, Prediction, Question, Score, Turn
 from pipeline.tasks.base import (
     BEGUN,
     LETTERS,
+    Classes,
     Draft,
     Pool,
     TaskDefinition,
@@ -51,6 +52,7 @@ class PropertyScenarioReasoning(TaskDefinition):
     name = "PSR"
     title = "Property Scenario Reasoning"
     trained = False
+    told = "told the classes that suit the scenario"
 
     def strata(self, catalogue: Catalogue) -> int:
         return 2 * len(catalogue.language.scenarios)
@@ -90,6 +92,21 @@ class PropertyScenarioReasoning(TaskDefinition):
             ),
             gold=gold(pool, objects, LETTERS[position], names),
         )
+
+    def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str | None:
+        """The video whose classes are the fewest steps from what suits; of those, whose mean classes are nearest."""
+        asked = question.dialogues[0].turns[-1].user
+        scenario = next((s for s in catalogue.language.scenarios if s.question in asked), None)
+        if scenario is None:
+            return None
+
+        def distance(video: Sequence[tuple[int, float]]) -> tuple[float, float]:
+            wanted = [(video[catalogue.property_index(name)], levels) for name, levels in scenario.target.items()]
+            return sum(min(abs(level - x) for x in levels) for (level, _), levels in wanted), sum(
+                min(abs(mean - x) for x in levels) for (_, mean), levels in wanted
+            )
+
+        return f"The most suitable object is {LETTERS[min((0, 1), key=lambda i: distance(classes[i]))]})."
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         return choice_score(question, prediction, read(prediction.outputs[-1]))

@@ -7,6 +7,7 @@ import random
 from pipeline.records import Opd, Prediction, Question, Score
 from pipeline.tasks.base import (
     LETTERS,
+    Classes,
     Draft,
     Pool,
     TaskDefinition,
@@ -18,6 +19,7 @@ from pipeline.tasks.base import (
     lettered,
 )
 from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.catalogue.wording import mentioned, plain
 
 TEMPLATES = (
     ("Given three tactile videos: {videos}.", "select the {superlative}."),
@@ -79,6 +81,13 @@ class PropertySuperlativeSelection(TaskDefinition):
             properties=[prop.name],
             finding=f"{superlative.capitalize()}: {LETTERS[position]}).",
         )
+
+    def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str:
+        place = catalogue.property_index(question.gold.properties[0])
+        prop = catalogue.properties[place]
+        most = mentioned(question.dialogues[0].turns[-1].user, (prop.most, prop.least)) == [plain(prop.most)]
+        extreme = (max if most else min)(range(len(classes)), key=lambda i: classes[i][place])
+        return f"{LETTERS[extreme]}) is the {prop.most if most else prop.least}."
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         predicted = read(prediction.outputs[0])

@@ -109,19 +109,30 @@ def test_effects_that_hold_are_named_and_those_that_do_not_are_not() -> None:
     assert "None of 2 effects of LoRA and OPD is significant after Holm's adjustment; even before it" in none
     assert "the smallest that this design could have found is 12 points" in none
     some = finding(report([score()], [effect(p_holm=0.001), effect("opd", "all - none")]))[2]
-    assert "Of 2 effects of LoRA and OPD these hold up (Holm): lora in PC +10.0 points." in some
+    assert "Of 2 effects of LoRA and OPD these hold up (Holm): LoRA in PC +10.0 points." in some
     assert "opd in PC" not in some
+
+
+def test_heads_and_rules_are_the_line_that_the_language_model_is_held_to() -> None:
+    against = {"part": "language", "change": "full system - heads and rules"}
+    rows = [effect(**against, difference=-0.17, p_holm=0.01), effect(**against, task="PSS", difference=0.04)]
+    said = finding(report([score()], rows))[2]
+    assert "differs from them by -17.0 to +4.0 points, task by task, and is behind in PC (Holm)." in said
+    assert "effects of" not in said, "it is no part that is left out"
+    even = finding(report([score()], rows[1:]))[2]
+    assert "is in no task ahead or behind (Holm)." in even
+    assert "heads and plain rules" not in finding(report([score()], [effect()]))[2]
 
 
 def test_a_gain_that_ends_at_chance_is_one_of_form() -> None:
     guessed, formed = score("PSS", low=0.2), effect(task="PSS", p_holm=0.001, difference=0.3)
     only = finding(report([guessed], [formed]))[2]
     assert "None of 1 effects of LoRA holds up." in only
-    assert "answers are no better than chance even so: lora in PSS +30.0 points." in only
+    assert "answers are no better than chance even so: LoRA in PSS +30.0 points." in only
     both = finding(report([guessed, score("PC")], [formed, effect(p_holm=0.001)]))[2]
-    assert "these hold up (Holm): lora in PC +10.0 points. Significant too, but" in both
+    assert "these hold up (Holm): LoRA in PC +10.0 points. Significant too, but" in both
     worse = finding(report([guessed], [effect(task="PSS", p_holm=0.001, difference=-0.3)]))[2]
-    assert "these hold up (Holm): lora in PSS -30.0 points." in worse, "a loss is no matter of form"
+    assert "these hold up (Holm): LoRA in PSS -30.0 points." in worse, "a loss is no matter of form"
 
 
 def test_a_readme_stays_short_whatever_is_measured() -> None:

@@ -1,0 +1,145 @@
+"""What follows from classes alone, held against the questions' own right answers and against brute force."""
+
+from __future__ import annotations
+
+import itertools
+import random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.evaluation.grading import conclude
+from pipeline.evaluation.scores import RULES, effect_rows, score_rows
+from pipeline.records import Classification, Part
+from pipeline.tasks import TASKS
+from pipeline.tasks.questions import build_questions
+from pipeline.videos.catalogue import Catalogue
+from tests.tasks.shared import CATALOGUE, POOL
+
+ASKED = {"OPD": 60, "PC": 120, "PSS": 120, "POM": 60, "PSR": 40}
+QUESTIONS = build_questions(POOL, ASKED, seed=0, distinct=False)
+
+
+def heads(
+    levels: dict[str, tuple[int, ...]], means: dict[str, tuple[float, ...]] | None = None
+) -> list[Classification]:
+    """Heads that are sure, or whose probabilities have these means (0 to 2) over the first and the last class."""
+    said = []
+    for object_id, classes in levels.items():
+        for place, prop in enumerate(CATALOGUE.properties):
+            mean = means[object_id][place] if means else classes[place]
+            sure = tuple(float(k == classes[place]) for k in range(3))
+            said.append(
+                Classification(
+                    video_id=f"{object_id}_0",
+                    object_id=object_id,
+                    part=Part.TEST,
+                    property=prop.name,
+                    expected=0,
+                    predicted=classes[place],
+                    probabilities=(1 - mean / 2, 0.0, mean / 2) if means else sure,
+                )
+            )
+    return said
+
+
+TRUE = {o: CATALOGUE.labels(o) for o in CATALOGUE.objects}
+
+
+def shuffled(seed: int) -> dict[str, tuple[int, ...]]:
+    labels = list(TRUE.values())
+    random.Random(seed).shuffle(labels)
+    return dict(zip(TRUE, labels, strict=True))
+
+
+def test_right_classes_lead_to_right_answers_in_the_words_of_right_answers() -> None:
+    scores = conclude(QUESTIONS, heads(TRUE), CATALOGUE)
+    assert {s.task for s in scores} == ASKED.keys()
+    assert len({s.question_id for s in scores}) == len(QUESTIONS)
+    assert [s for s in scores if not s.correct or s.strict is False] == []
+
+
+def test_wrong_classes_lead_to_what_a_plain_reading_of_them_leads_to() -> None:
+    levels = shuffled(1)
+    found = {
+        s.question_id: s for s in conclude(QUESTIONS, heads(levels), CATALOGUE) if s.measure in ("choice", "combined")
+    }
+    names = CATALOGUE.property_names
+    for q in QUESTIONS:
+        said = [levels[o] for o in q.objects]
+        own = [v[names.index(q.gold.properties[0])] for v in said]
+        text = q.dialogues[0].turns[-1].user
+        if q.task == "PC":
+            more = any(word in text for word in ("harder", "rougher", "bigger"))
+            expected = "same" if own[0] == own[1] else "yes" if (own[0] > own[1]) == more else "no"
+        elif q.task == "PSS":
+            most = any(word in text for word in ("hardest", "roughest", "biggest"))
+            extreme = max(own) if most else min(own)
+            if own.count(extreme) > 1:
+                continue
+            expected = "abc"[own.index(extreme)]
+        elif q.task == "POM":
+            options = sorted(q.objects, key=lambda o: CATALOGUE.objects[o].name.lower())
+            costs = {
+                order: sum(
+                    abs(a - b)
+                    for place, n in enumerate(order)
+                    for a, b in zip(said[place], TRUE[options[int(n) - 1]], strict=True)
+                )
+                for order in map("".join, itertools.permutations("123"))
+            }
+            best = [order for order, cost in costs.items() if cost == min(costs.values())]
+            if len(best) > 1:
+                continue
+            expected = best[0]
+        else:
+            continue
+        assert found[q.question_id].predicted == expected, q.question_id
+
+
+@given(seed=st.integers(0, 10_000))
+def test_the_right_answers_are_not_looked_at(seed: int) -> None:
+    """Whatever the objects' labels are said to be, answers to PC and PSS stay as they are."""
+    labels = shuffled(seed)
+    objects = {
+        o: entry.model_copy(update={"ratings": tuple((level,) for level in labels[o])})
+        for o, entry in CATALOGUE.objects.items()
+    }
+    relabelled = Catalogue(language=CATALOGUE.language, objects=objects)
+    asked = [q for q in QUESTIONS if q.task in ("PC", "PSS")]
+    blind = [q.model_copy(update={"gold": q.gold.model_copy(update={"choice": "", "labels": ()})}) for q in asked]
+    answers = [
+        [s.predicted for s in conclude(qs, heads(shuffled(7)), c)]
+        for qs, c in ((asked, CATALOGUE), (blind, relabelled))
+    ]
+    assert answers[0] == answers[1]
+
+
+@pytest.mark.parametrize("task", ["PSS", "POM", "PSR"])
+def test_among_equal_classes_the_mean_class_decides(task: str) -> None:
+    levels, means = dict.fromkeys(TRUE, (1, 1, 1)), {o: tuple(map(float, labels)) for o, labels in TRUE.items()}
+    asked = [q for q in QUESTIONS if q.task == task]
+    scores = conclude(asked, heads(levels, means), CATALOGUE)
+    assert len(scores) == len(asked) > 30
+    assert all(s.correct for s in scores)
+
+
+def test_a_video_that_the_heads_said_nothing_of_and_a_task_without_a_rule_have_no_score() -> None:
+    some = dict(list(TRUE.items())[:40])
+    scored = {s.question_id for s in conclude(QUESTIONS, heads(some), CATALOGUE)}
+    assert scored == {q.question_id for q in QUESTIONS if some.keys() >= {*q.objects}}
+    fruit = QUESTIONS[0].model_copy(update={"task": "RIPE"})
+    assert conclude([fruit], heads(TRUE), CATALOGUE) == []
+
+
+def test_rules_are_a_system_of_their_own_in_scores_and_effects() -> None:
+    concluded = {0: conclude(QUESTIONS, heads(shuffled(1)), CATALOGUE)}
+    rows = score_rows([], CATALOGUE, concluded=concluded)
+    assert {(r.encoder, r.lora, r.opd, r.touch) for r in rows} == {("finetuned", "", "", "real")}
+    for task in ASKED:
+        (row,) = (r for r in rows if (r.task, r.measure, r.seed) == (task, TASKS[task].measure, "all"))
+        own = [s.correct for s in concluded[0] if (s.task, s.measure) == (task, TASKS[task].measure)]
+        assert row.accuracy == pytest.approx(sum(own) / len(own), abs=1e-6)
+    assert RULES.lora is None
+    assert effect_rows([], CATALOGUE, concluded) == []
