@@ -13,29 +13,33 @@ from pipeline.records import Graded, ScoreRow
 
 DESCRIBED = ("PC", "PSS", "POM")
 """Tasks that can be answered without describing, over which errors are averaged."""
+RULES = "heads and rules, no language model (told the classes of POM's objects)"
 
 
 def describing(root: Path) -> list[Row]:
     """Tokens that the full system generates against its errors, means over `DESCRIBED`, under each OPD.
+
+    Beside them stands what follows by rule from the encoder's heads, which generates nothing.
 
     Errors are the report's, tokens those of the answers that it is made of. The interval's ends are means of the tasks'
     ends: as wide as if all tasks erred together.
     """
     graded, report = root / "data" / "graded.parquet", root / "reports" / load_params(root / "params.yaml").report_name
     full = ("finetuned", "with", "real")
+    ways = {opd: (*full, opd) for opd in ("all", "needed", "none")} | {RULES: ("finetuned", "", "real", "")}
     if not (graded.is_file() and (report / "scores.csv").is_file()):
         return []
-    scores = [
-        row
-        for row in read_csv(report / "scores.csv", ScoreRow)
-        if (row.encoder, row.lora, row.touch, row.measure, row.seed) == (*full, "choice", "all")
-    ]
+    scores = [row for row in read_csv(report / "scores.csv", ScoreRow) if (row.measure, row.seed) == ("choice", "all")]
     answers = [a for a in read_table(graded, Graded) if (a.encoder, a.lora, a.touch) == full]
     costs: dict[str, list[float]] = {}
     errors = {}
-    for opd in ("all", "needed", "none"):
-        own = [error_of(row) for row in scores if row.opd == opd and row.task in DESCRIBED]
-        tokens = [a.tokens for a in answers if a.opd == opd and a.task in DESCRIBED]
+    for opd, way in ways.items():
+        own = [
+            error_of(row)
+            for row in scores
+            if (row.encoder, row.lora, row.touch, row.opd) == way and row.task in DESCRIBED
+        ]
+        tokens = [0] if opd == RULES else [a.tokens for a in answers if a.opd == opd and a.task in DESCRIBED]
         if len(own) == len(DESCRIBED) and tokens:
             lows, highs = ([e for e in ends if e is not None] for ends in ([x.low for x in own], [x.high for x in own]))
             whole = len(lows) == len(highs) == len(own)

@@ -83,7 +83,7 @@ def _trade(axes: Axes, rows: Sequence[Row]) -> None:
     axes.margins(0.12)
     axes.grid(alpha=0.3)
     ratios = [row.cost_ratio for row in rows]
-    if max(ratios) > 4 * min(ratios):
+    if max(ratios) > 4 * min(ratios) > 0:  # What costs nothing has no place on a logarithmic axis.
         axes.set_xscale("log", subs=[])
         axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if max(ratios) < 100 * min(ratios) else (1,)))
         axes.xaxis.set_major_formatter(FuncFormatter(lambda ratio, _: f"{ratio:g}"))
