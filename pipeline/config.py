@@ -31,6 +31,8 @@ CLIP_RECIPES = ("paper", "release")
 TrainedEmbeddings = Literal["all", "new"]
 Selection = Literal["salient", "release", "contact"]
 
+INVENTED = Path("data/invented")
+"""Where the chain puts the catalogue of invented objects; `data.catalogue` names it to have them."""
 SCENES_DIR = Path("data/scenes/videos")
 """Where the chain puts the videos that it makes itself."""
 PRETRAINED = Path("data/pretrained/encoder.safetensors")
@@ -66,6 +68,14 @@ class DataConfig(Section):
     """Folder of the videos; for scenes, where the chain puts them."""
     catalogue: str = "pipeline/physiclear"
     """Folder with objects.csv and properties.yaml (and, optionally, descriptions.csv)."""
+
+
+class InventConfig(Section):
+    """A catalogue of invented objects (used where data.catalogue is data/invented)."""
+
+    objects: Annotated[int, Field(ge=27, le=100_000)] = 1500
+    """All 27 combinations of three properties' classes come equally often."""
+    seed: Seed = 0
 
 
 class ScenesConfig(Section):
@@ -462,6 +472,7 @@ class Params(Section):
     """Name of the file in conf/ that this comes from."""
     seed: Seed = 0
     data: DataConfig
+    invent: InventConfig = InventConfig()
     scenes: ScenesConfig
     frames: FramesConfig
     split: SplitConfig

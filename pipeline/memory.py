@@ -18,9 +18,10 @@ import yaml
 from pipeline.config import EncoderConfig, LoraTrainConfig, Params, TrainConfig
 from pipeline.errors import UserError
 from pipeline.records import Assignment, Part, Question, Turn
+from pipeline.scenes.invented import catalogue_of
 from pipeline.shapes import FULL, LLM_CONFIG, Llama, Vision
 from pipeline.tasks.questions import build_questions, counts_by_task, pool_of
-from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.videos.catalogue import Catalogue
 from pipeline.weights.check import TOKENIZER, read_tokenizer
 
 GIB = 2**30
@@ -75,7 +76,7 @@ def count(params: Params) -> tuple[list[Use], list[str]]:
     Returns:
         The stages, and sentences on what was assumed or left out.
     """
-    catalogue = load_catalogue(Path(params.data.catalogue))
+    catalogue = catalogue_of(params)
     uses: list[Use] = []
     notes: list[str] = ["language.dtype is auto: counted as float32."] if params.language.dtype == "auto" else []
     tower, encoder = Vision.read(Path(params.encoder.weights)), Path(params.encoder.weights)

@@ -21,8 +21,9 @@ from pipeline.memory import launched
 from pipeline.parallel import check_backend
 from pipeline.params import PARAMS_FILE, kind_of, validate
 from pipeline.records import Part, Touch
+from pipeline.scenes.invented import catalogue_of
 from pipeline.tasks.questions import counts_by_task
-from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import list_videos, raise_errors
 from pipeline.videos.split import FEWEST_TRAINING_OBJECTS, assign_objects, without_videos
 from pipeline.weights.check import check_encoder_files, check_language_files
@@ -89,7 +90,7 @@ def _literal(override: str) -> str:
 
 def check_inputs(params: Params) -> str:
     """Raise UserError where videos, catalogue, objects, tasks or weights are not there; return as `check_objects`."""
-    catalogue = load_catalogue(Path(params.data.catalogue))
+    catalogue = catalogue_of(params)
     check_recipe(params.encoder.recipe)
     check_candidates(params.cross_validation.models, params.encoder, params.frames.pixels)
     counts_by_task(params.questions, "train")

@@ -249,13 +249,12 @@ def _rules(effects: pd.DataFrame) -> list[str]:
         return []
     sure = rows[rows["p_holm"] < ALPHA]
     ahead, behind = (", ".join(sure.loc[kind, "task"]) for kind in (sure["difference"] > 0, sure["difference"] < 0))
-    said = [f"ahead in {ahead}"] if ahead else []
-    said += [f"behind in {behind}"] if behind else []
+    said = [*([f"ahead in {ahead}"] if ahead else []), *([f"behind in {behind}"] if behind else [])]
+    stands = " and ".join(said) or "in no task ahead or behind"
     span = f"{100 * rows['difference'].min():+.1f} to {100 * rows['difference'].max():+.1f} points"
     return [
         "The encoder's property heads and plain rules answer the same questions without a language model; the full "
-        f"system differs from them by {span}, task by task, and is {' and '.join(said) or 'in no task ahead or behind'} "
-        "(Holm)."
+        f"system differs from them by {span}, task by task, and is {stands} (Holm)."
     ]
 
 

@@ -43,7 +43,9 @@ def stages() -> dict[str, dict[str, Any]]:
 
 
 def code(name: str) -> list[str]:
-    return [d for d in stages()[name]["deps"] if d.startswith(("pipeline/", "stages/"))]
+    """Of its dependencies what is imported; a catalogue is data."""
+    deps: list[str] = stages()[name]["deps"]
+    return [d for d in deps if d.startswith(("pipeline/", "stages/")) and not d.startswith("pipeline/physiclear/")]
 
 
 def data_of(module: str) -> Iterator[str]:

@@ -1,0 +1,160 @@
+"""A catalogue of invented objects, as many as are wanted: all combinations of classes equally often.
+
+Shapes are as wide as `invent` draws them, since an encoder that learnt narrow ones does not carry over to real videos.
+Classes keep a distance from the borders between them, since objects near a border cannot be told apart.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from pipeline.config import INVENTED, InventConfig, Params
+from pipeline.io import atomic_folder, fingerprint, write_text
+from pipeline.parallel import run_parallel
+from pipeline.runtime import CHECKPOINTS, derive_seed
+from pipeline.scenes.contact import Body, Method
+from pipeline.scenes.geometry import IMAGE_MM, heights
+from pipeline.scenes.invent import invent
+from pipeline.scenes.measure import BIG_SHARE, ROUGH_MM, bump_share, texture
+from pipeline.scenes.recipe import MODULUS_MPA, SCENES, Range, Recipe
+from pipeline.scenes.relief import AnyLayer
+from pipeline.videos.catalogue import OBJECTS, PROPERTIES, Catalogue, Object, load_catalogue
+
+WORDS = Path(__file__).parents[1] / "physiclear"
+"""Catalogue whose words for the properties are taken; nothing of its objects is."""
+DATASET = "invented objects"
+LEVELS = 3
+"""Classes of each of the three properties; hardness, roughness and bumpiness are the digits of an object's number."""
+TEXTURE: tuple[Range, ...] = (
+    (0.0, ROUGH_MM[0] / 1.5),
+    (ROUGH_MM[0] * 1.5, ROUGH_MM[1] / 1.5),
+    (ROUGH_MM[1] * 1.5, math.inf),
+)
+"""Root mean square height of the texture by roughness, in mm: half as much again away from each border."""
+BUMPS: tuple[Range, ...] = ((0.0, 0.0), (0.02, BIG_SHARE / 1.25), (BIG_SHARE * 1.25, 1.0))
+"""Width of the bumps by bumpiness, as a share of the image's height: a quarter away from the border."""
+WIDTHS_MM: tuple[Range, ...] = ((0.0, math.inf), (0.7, 4.5), (3.0, math.inf))
+"""Of the widest layer of relief, by bumpiness: outside nothing measures as such, so it need not be pressed."""
+ACROSS = {
+    "domes": "width",
+    "ridges": "width",
+    "plates": "size",
+    "weave": "spacing",
+    "strands": "width",
+    "grains": "width",
+    "creases": "spacing",
+    "digits": "stroke",
+}
+"""By kind of layer, what says how wide it is."""
+FORCES_N = (1.0, 3.0)
+"""A patch is pressed with each; both must show the bumps of the class."""
+WIDTH, HEIGHT = 160, 120
+"""Pixels of the view that is measured."""
+PITCH = IMAGE_MM[0] / WIDTH
+SIDE = int(np.hypot(WIDTH, HEIGHT)) | 1
+METHOD = Method("layer", 64)
+
+
+def classes_of(number: int) -> tuple[int, int, int]:
+    """Hardness, roughness and bumpiness of object `number`: any 27 in a row have all combinations."""
+    return number % LEVELS, number // LEVELS % LEVELS, number // LEVELS**2 % LEVELS
+
+
+def invented_catalogue(config: InventConfig) -> Catalogue:
+    """The objects by number, with their classes and with PhysiCLeAR's words; no recipe is drawn for that."""
+    objects = {
+        f"object_{n:05d}": Object(
+            object_id=f"object_{n:05d}",
+            name=f"object {n:05d}",
+            splits={},
+            stated=(None,) * LEVELS,
+            ratings=tuple((level,) for level in classes_of(n)),
+        )
+        for n in range(config.objects)
+    }
+    language = load_catalogue(WORDS).language.model_copy(update={"dataset": DATASET})
+    return Catalogue(language=language, objects=objects)
+
+
+def catalogue_of(params: Params) -> Catalogue:
+    """The catalogue that `data.catalogue` names, also before the chain has written that of invented objects."""
+    folder = Path(params.data.catalogue)
+    return invented_catalogue(params.invent) if folder == INVENTED else load_catalogue(folder)
+
+
+def write_catalogue(config: InventConfig, folder: Path) -> None:
+    """Draw all objects, in as many processes as there are cores, and write a catalogue's folder with their recipes.
+
+    Object i depends on the seed and i alone. What is finished waits in checkpoints/, where a killed drawing goes on.
+    """
+    code = Path(__file__).parent
+    work = CHECKPOINTS / "invent" / fingerprint(config.seed, code)
+    work.mkdir(parents=True, exist_ok=True)
+    jobs = [_Job(n, config.seed, work / f"{n:05d}.json") for n in range(config.objects)]
+    for _ in run_parallel(_draw, [job for job in jobs if not job.file.is_file()], "invented objects", "object"):
+        pass
+    catalogue = invented_catalogue(config)
+    with atomic_folder(folder) as new:
+        words = (WORDS / PROPERTIES).read_text(encoding="utf-8")
+        write_text(new / PROPERTIES, re.sub(r"(?m)^dataset: .*$", f"dataset: {DATASET}", words))
+        rows = [f"{o.object_id},{o.name},{','.join(map(str, o.labels))}" for o in catalogue.objects.values()]
+        header = ",".join(("object_id", "name", *catalogue.property_names))
+        write_text(new / OBJECTS, "\n".join([header, *rows]) + "\n")
+        # JSON is YAML, and is written and read many times as fast.
+        entries = zip(catalogue.objects, jobs, strict=True)
+        write_text(new / SCENES, "".join(f"{o}: {job.file.read_text()}\n" for o, job in entries))
+
+
+def draw(classes: tuple[int, int, int], rng: np.random.Generator) -> Recipe:
+    """An object that measures as these classes, off their borders, in two patches under different forces."""
+    hardness, roughness, bumpiness = classes
+    while True:
+        recipe = invent(rng)
+        if not _within(max(map(_width, recipe.relief), default=0.0), WIDTHS_MM[bumpiness]):
+            continue
+        modulus = math.exp(rng.uniform(*np.log(MODULUS_MPA[hardness])))
+        recipe = recipe.model_copy(update={"modulus": modulus})
+        if all(_measures(recipe, roughness, bumpiness, force, rng) for force in FORCES_N):
+            return recipe
+
+
+def _measures(recipe: Recipe, roughness: int, bumpiness: int, force: float, rng: np.random.Generator) -> bool:
+    """Whether a fresh patch has the texture and, pressed, shows the bumps of these classes."""
+    surface = heights(recipe.body, recipe.relief, SIDE, PITCH, rng)
+    view = tuple(slice((SIDE - size) // 2, (SIDE - size) // 2 + size) for size in (HEIGHT, WIDTH))
+    if not _within(texture(surface[view], PITCH), TEXTURE[roughness]):
+        return False
+    (skin,) = Body(surface, recipe.modulus, PITCH).press(METHOD, np.array([force])).skins
+    return _within(bump_share(skin[view], PITCH), BUMPS[bumpiness])
+
+
+def _width(layer: AnyLayer) -> float:
+    size = getattr(layer, ACROSS[layer.kind]) if layer.kind in ACROSS else 0.0
+    return float(size[0] if isinstance(size, tuple) else size)
+
+
+def _within(value: float, bounds: Range) -> bool:
+    return bounds[0] <= value <= bounds[1]
+
+
+@dataclass(frozen=True)
+class _Job:
+    number: int
+    seed: int
+    file: Path
+
+    def __str__(self) -> str:
+        return f"object {self.number}"
+
+
+def _draw(job: _Job) -> None:
+    cv2.setNumThreads(1)
+    rng = np.random.default_rng(derive_seed(job.seed, "invented", job.number))
+    write_text(job.file, json.dumps(draw(classes_of(job.number), rng).model_dump(mode="json")))

@@ -1,0 +1,19 @@
+"""Write a catalogue of invented objects, where `data.catalogue` names it; otherwise leave an empty folder."""
+
+from pathlib import Path
+
+from pipeline.config import INVENTED
+from pipeline.scenes.invented import write_catalogue
+from pipeline.stage import stage
+
+
+def main() -> None:
+    with stage("invent") as run:
+        INVENTED.mkdir(parents=True, exist_ok=True)
+        if Path(run.params.data.catalogue) == INVENTED:
+            write_catalogue(run.params.invent, INVENTED)
+            run.metrics["objects"] = run.params.invent.objects
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,104 @@
+"""The catalogue of invented objects: evenly dealt classes, each object its own, and scenes that measure as labelled."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.config import InventConfig, ScenesConfig
+from pipeline.io import fingerprint
+from pipeline.runtime import CHECKPOINTS
+from pipeline.scales import check_inputs, compose
+from pipeline.scenes import invented
+from pipeline.scenes.geometry import Flat
+from pipeline.scenes.invented import classes_of, draw, invented_catalogue, write_catalogue
+from pipeline.scenes.recipe import Recipe, load_recipes
+from pipeline.scenes.render import make_scene, measure_scene
+from pipeline.videos.catalogue import load_catalogue
+from tests.closure import ROOT
+
+
+def test_each_combination_comes_as_often() -> None:
+    catalogue = invented_catalogue(InventConfig(objects=270))
+    assert set(Counter(map(catalogue.labels, catalogue.objects)).values()) == {10}
+    assert len(catalogue.objects) == 270
+    assert [catalogue.labels(o) for o in catalogue.objects] == [classes_of(n) for n in range(270)]
+
+
+def test_an_object_measures_as_its_classes_in_videos_of_it() -> None:
+    """By the scene that a video is made of: a patch, a force and a resolution that the drawing has not seen."""
+    numbers, right = (0, 5, 13, 21, 26), 0
+    config = ScenesConfig(tier="layer", cells=96, width=240, height=180)
+    for number in numbers:
+        recipe = draw(classes_of(number), np.random.default_rng(number))
+        for seed in range(3):
+            measured = measure_scene(make_scene(recipe, config, 2, 100 + seed), recipe, config)
+            right += (measured.hardness, measured.roughness, measured.bumpiness) == classes_of(number)
+    assert right >= 12, "of 15; by chance one in 27"
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder in which objects are drawn one after the other, in this process."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(invented, "run_parallel", lambda work, jobs, *_: map(work, jobs))
+    return tmp_path
+
+
+def drawn(classes: tuple[int, int, int], rng: np.random.Generator) -> Recipe:
+    return Recipe(modulus=1 + classes[0] + rng.random(), body=Flat(kind="flat"))
+
+
+def test_it_is_written_as_a_catalogue_whose_objects_depend_on_seed_and_number(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(invented, "draw", drawn)
+    recipes = {}
+    for name, config in (
+        ("few", InventConfig(objects=27)),
+        ("more", InventConfig(objects=54)),
+        ("other", InventConfig(objects=27, seed=1)),
+    ):
+        write_catalogue(config, here / name)
+        catalogue = load_catalogue(here / name)
+        assert catalogue == invented_catalogue(config), "known before it is written"
+        recipes[name] = load_recipes(here / name, catalogue, seed=0)
+    assert recipes["few"].items() <= recipes["more"].items()
+    assert not recipes["few"].items() & recipes["other"].items()
+    assert catalogue.language.dataset != "PhysiCLeAR", "its published figures are not about these"
+    public = load_catalogue(ROOT / "pipeline" / "physiclear")
+    assert not public.objects.keys() & catalogue.objects.keys()
+
+
+def test_a_killed_drawing_goes_on_from_what_is_finished(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[tuple[int, int, int]] = []
+
+    def dies(classes: tuple[int, int, int], rng: np.random.Generator) -> Recipe:
+        calls.append(classes)
+        if len(calls) == 20:
+            raise KeyboardInterrupt
+        return drawn(classes, rng)
+
+    monkeypatch.setattr(invented, "draw", dies)
+    config = InventConfig(objects=27)
+    with pytest.raises(KeyboardInterrupt):
+        write_catalogue(config, here / "resumed")
+    assert not (here / "resumed").exists()
+    write_catalogue(config, here / "resumed")
+    assert len(calls) == 20 + 8, "19 were finished"
+    (work,) = (CHECKPOINTS / "invent").iterdir()
+    assert work.name == fingerprint(0, Path(invented.__file__).parent)
+    monkeypatch.setattr(invented, "CHECKPOINTS", here / "fresh")
+    monkeypatch.setattr(invented, "draw", drawn)
+    write_catalogue(config, here / "whole")
+    files = [{f.name: f.read_bytes() for f in (here / name).iterdir()} for name in ("resumed", "whole")]
+    assert files[0] == files[1]
+
+
+def test_its_scale_is_checked_before_the_catalogue_is_written(here: Path) -> None:
+    params = compose("invented", ["invent.objects=54"], conf=ROOT / "conf")
+    check_inputs(params)
+    assert not (here / "data").exists()
