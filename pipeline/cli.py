@@ -44,7 +44,9 @@ app.add_typer(import_app, name="import")
 
 @app.command()
 def scale(
-    name: Annotated[str, typer.Argument(help="smoke, small, invented, paper-7b or paper-13b (or a file you added to conf/).")],
+    name: Annotated[
+        str, typer.Argument(help="smoke, small, invented, paper-7b or paper-13b (or a file you added to conf/).")
+    ],
     overrides: Annotated[list[str] | None, typer.Argument(help="key=value, for example split.name=kfold.")] = None,
 ) -> None:
     """Choose what `dvc repro` runs: write params.yaml from conf/NAME.yaml and the overrides."""

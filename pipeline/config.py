@@ -177,10 +177,11 @@ class EncoderConfig(Section):
     timm's (config.json and model.safetensors). The chain makes what is named below data/weights/."""
     feature_stage: Annotated[int, Field(ge=0, le=200)] = 3
     """`timm`: which of the network's stages (a transformer: blocks) is read, from 0 on; what follows is not used."""
-    embedding: Literal["projected", "class_token"] = "projected"
+    embedding: Literal["projected", "class_token", "logits"] = "projected"
     """`paper`: what is read of CLIP, for the heads and the language model (ViT-L/14: 768 or 1024 values). `projected`:
     CLIP's own embedding. `class_token`: the normalised class token before CLIP's projection. `release` reads the
-    class token in any case: normalised for the heads, and before that for the language model."""
+    class token in any case: normalised for the heads, and before that for the language model. `logits`: with any
+    encoder, what property heads say of each frame, of training objects by heads that did not see them."""
     prompts: Annotated[int, Field(ge=1, le=256)] = 8
     """Learnable prompts at each layer."""
     prompt_layers: Annotated[int, Field(ge=0)] = 0
@@ -212,6 +213,12 @@ class EncoderConfig(Section):
         micro = self.micro_batch_size
         if 0 < micro < self.batch_size and self.batch_size % micro:
             raise ValueError(f"encoder.micro_batch_size {micro} does not divide batch_size {self.batch_size}")
+        return self
+
+    @model_validator(mode="after")
+    def _logits_are_standardised(self) -> Self:
+        if self.embedding == "logits" and not self.standardize:
+            raise ValueError("encoder.embedding: logits have any scale; set encoder.standardize=true")
         return self
 
     @model_validator(mode="after")
@@ -280,6 +287,9 @@ class LanguageConfig(Section):
     """Scale each projected tactile embedding to the root mean square of the word embeddings. Without, alignment at a
     high rate makes them a hundred times as long as words, and what attention adds to them, as which video they are of,
     is lost in them."""
+    touch_noise: Annotated[float, Field(ge=0, le=10)] = 0.0
+    """Deviation of the normal noise on the standardised embeddings in training, one draw a video: few objects are apart
+    in many dimensions, and without it a language model learns them by heart."""
     max_new_tokens: Annotated[int, Field(ge=1, le=4096)] = 256
     """Of an answer; fewer where the language model has no more positions. Longer answers are cut and marked."""
     generation_batch_size: Positive = 32
@@ -494,6 +504,12 @@ class Params(Section):
     def _scenes_have_their_place(self) -> Self:
         if self.data.source == "scenes" and Path(self.data.dir) != SCENES_DIR:
             raise ValueError(f"data.dir must be {SCENES_DIR} where data.source is scenes (set data.source=videos?)")
+        return self
+
+    @model_validator(mode="after")
+    def _noise_has_its_scale(self) -> Self:
+        if self.language.touch_noise and not self.encoder.standardize:
+            raise ValueError("language.touch_noise is in deviations of the embeddings; set encoder.standardize=true")
         return self
 
     @model_validator(mode="after")

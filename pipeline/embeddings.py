@@ -29,10 +29,14 @@ class Statistics(NamedTuple):
     """float64, dim each."""
     frames: str = ""
     """Fingerprint of the settings that the frames were chosen by: those of others are standardised by others."""
+    heads: tuple[torch.Tensor, torch.Tensor] | None = None
+    """Where logits stand in place of features (`encoder.embedding=logits`), the heads that give them: weights, classes
+    of all properties x features, and biases; float64. Mean and scale are then of the logits."""
 
     def save(self, file: Path) -> None:
         """Write them as safetensors."""
-        save_tensors(file, {"mean": self.mean, "scale": self.scale}, {"frames": self.frames})
+        heads = dict(zip(("weights", "biases"), self.heads or (), strict=False))
+        save_tensors(file, {"mean": self.mean, "scale": self.scale, **heads}, {"frames": self.frames})
 
     @classmethod
     def load(cls, file: Path) -> Statistics:
@@ -40,8 +44,9 @@ class Statistics(NamedTuple):
         from safetensors import safe_open
 
         tensors = load_tensors(file)
+        heads = (tensors["weights"], tensors["biases"]) if "weights" in tensors else None
         with safe_open(file, framework="pt") as stream:
-            return cls(tensors["mean"], tensors["scale"], stream.metadata()["frames"])
+            return cls(tensors["mean"], tensors["scale"], stream.metadata()["frames"], heads)
 
 
 class EmbeddingStore:

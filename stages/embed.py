@@ -7,11 +7,12 @@ from pathlib import Path
 import torch
 
 from pipeline.embeddings import INDEX_FILE, STATISTICS_FILE, TENSOR, TENSOR_FILE
-from pipeline.encoder.embed import EncoderSource, embed_videos, standardize, statistics, union
+from pipeline.encoder.embed import EncoderSource, embed_videos, logits_of, standardize, statistics, union
 from pipeline.io import fingerprint, read_table, save_tensors, write_table
 from pipeline.parallel import device_here
 from pipeline.records import Assignment, Embedding, Encoder, Part
 from pipeline.stage import DATA, Stage, stage
+from pipeline.videos.catalogue import load_catalogue
 from pipeline.weights import check_encoder
 
 
@@ -29,9 +30,12 @@ def embed(run: Stage, videos: Sequence[Assignment], state: Path | None) -> tuple
 
 
 def write(run: Stage, key: str, split: Sequence[Assignment], raw: torch.Tensor, index: Sequence[Embedding]) -> None:
+    params, heads = run.params, None
+    if params.encoder.embedding == "logits":
+        raw, heads = logits_of(raw, index, split, load_catalogue(Path(params.data.catalogue)), params.seed)
     known = statistics(raw, index, {a.video_id for a in split if a.part == Part.TRAIN})
-    tensor, out = standardize(raw, known) if run.params.encoder.standardize else raw, DATA / "embeddings" / key
-    known._replace(frames=fingerprint(run.params.frames)).save(out / STATISTICS_FILE)
+    tensor, out = standardize(raw, known) if params.encoder.standardize else raw, DATA / "embeddings" / key
+    known._replace(frames=fingerprint(params.frames), heads=heads).save(out / STATISTICS_FILE)
     save_tensors(out / TENSOR_FILE, {TENSOR: tensor})
     write_table(out / INDEX_FILE, Embedding, index)
     run.metrics[f"{key}.rows"] = len(index)

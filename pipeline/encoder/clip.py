@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from pipeline.errors import UserError
 from pipeline.io import read_json
@@ -13,12 +13,12 @@ if TYPE_CHECKING:
     from open_clip.transformer import VisionTransformer
 
 
-def load_visual_tower(folder: Path, embedding: Literal["projected", "class_token"] = "projected") -> VisionTransformer:
+def load_visual_tower(folder: Path, embedding: str = "projected") -> VisionTransformer:
     """Load the visual tower in float32, frozen and in evaluation mode; the text tower is dropped.
 
     Args:
         folder: In open_clip's format.
-        embedding: As `EncoderConfig.embedding`; a class token has the transformer's width.
+        embedding: As `EncoderConfig.embedding`: `class_token` has the transformer's width, all else the projection's.
 
     Raises:
         UserError: where there are no safetensors, for a checkpoint that does not fit its configuration, or a

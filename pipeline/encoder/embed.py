@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import chain
@@ -13,14 +14,16 @@ import torch
 
 from pipeline.config import EncoderConfig
 from pipeline.embeddings import FLIPS, Statistics
+from pipeline.encoder.baseline.validation import deal
+from pipeline.encoder.frame_classifier import FOLDS, FittedHeads, choose_strength, fit_frame_heads
 from pipeline.encoder.model import FrameEncoder
 from pipeline.encoder.recipes import base_encoder, property_classifier
 from pipeline.errors import UserError
 from pipeline.parallel import run_with
 from pipeline.records import Assignment, Embedding, Flip, Part
-from pipeline.runtime import DeviceName, resolve_device
+from pipeline.runtime import DeviceName, derive_seed, resolve_device
 from pipeline.training.trainable import load_trainable
-from pipeline.videos.catalogue import load_catalogue
+from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.frames.store import FrameStore
 
 AXES: dict[Flip, tuple[int, ...]] = {"none": (), "horizontal": (2,), "vertical": (1,), "both": (1, 2)}
@@ -147,5 +150,60 @@ def statistics(embeddings: torch.Tensor, index: Sequence[Embedding], training: C
 
 
 def standardize(embeddings: torch.Tensor, known: Statistics) -> torch.Tensor:
-    """Embeddings, rows x dim, in deviations from the training frames' mean: float32."""
-    return ((embeddings.double() - known.mean) / known.scale).float()
+    """Embeddings, rows x dim, or their logits where the statistics have heads, in deviations from the training frames'
+    mean: float32."""
+    values = embeddings.double()
+    if known.heads is not None:
+        values = values @ known.heads[0].T + known.heads[1]
+    return ((values - known.mean) / known.scale).float()
+
+
+def logits_of(
+    embeddings: torch.Tensor, index: Sequence[Embedding], split: Sequence[Assignment], catalogue: Catalogue, seed: int
+) -> tuple[torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
+    """Logits of property heads in place of each frame's embedding: a passage that a small language model cannot
+    recognise single training objects through.
+
+    Heads know the labels of the objects that they were fitted to. A language model that learnt from such logits would
+    believe them more than it should on new objects. So the training objects are dealt into `FOLDS` parts, and each
+    video's logits are those of heads that did not see its part. All other videos get heads of all training objects.
+
+    Args:
+        embeddings: Rows x features; rows of training videos may be mirrored.
+        index: What each row is.
+        split: The part of each video; the heads are fitted to training videos' unmirrored frames.
+        catalogue: What the labels are from.
+        seed: Of the parts.
+
+    Returns:
+        The logits, rows x classes of all properties, float64, and the heads of all training objects, as `Statistics`
+        has them.
+    """
+    rows: dict[str, list[int]] = defaultdict(list)
+    plain: dict[str, list[int]] = defaultdict(list)
+    for entry in index:
+        rows[entry.video_id].append(entry.row)
+        if entry.flip == "none":
+            plain[entry.video_id].append(entry.row)
+    training = {a.video_id: a.object_id for a in split if a.part == Part.TRAIN and a.video_id in plain}
+    classes = [len(p.levels) for p in catalogue.properties]
+
+    def fit(videos: Sequence[str], strength: float | None = None) -> tuple[FittedHeads, float]:
+        # A frame is a clip of its own, as videos have different numbers of kept frames.
+        chosen = [row for video in videos for row in plain[video]]
+        objects = [training[video] for video in videos for _ in plain[video]]
+        clips = embeddings[chosen].numpy()[:, None]
+        labels = np.array([catalogue.labels(o) for o in objects])
+        if strength is None:
+            strength, _ = choose_strength(clips, labels, objects, classes, seed)
+        return fit_frame_heads(clips, labels, objects, classes, strength), strength
+
+    whole, strength = fit(list(training))
+    weights, biases = (torch.from_numpy(a) for a in whole.linear())
+    found = embeddings.double() @ weights.T + biases
+    for held in deal(list(training.values()), min(FOLDS, len({*training.values()})), derive_seed(seed, "logits")):
+        others = [video for video, o in training.items() if o not in held]
+        w, b = (torch.from_numpy(a) for a in fit(others, strength)[0].linear()) if others else (weights, biases)
+        own = [row for video, o in training.items() if o in held for row in rows[video]]
+        found[own] = embeddings[own].double() @ w.T + b
+    return found, (weights, biases)

@@ -80,6 +80,14 @@ class FittedHeads:
     biases: list[npt.NDArray[np.float64]]
     dependence: npt.NDArray[np.float64]
 
+    def linear(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """Weights, classes of all properties x features, and biases that give a frame's logits from its features.
+
+        Without the bound that wild frames are held within (`FARTHEST`).
+        """
+        weights = np.concatenate(self.weights) / self.spread
+        return weights, np.concatenate(self.biases) - weights @ self.centre
+
     def evidence(self, clips: Clips) -> list[npt.NDArray[np.float64]]:
         """Log of the mean probability over frames, videos x classes of each property."""
         from scipy.special import log_softmax, logsumexp

@@ -38,6 +38,7 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
         by_question: Divide the weights of a conversation by their sum, so that all conversations weigh alike.
         replayed: Conversations without touch, all of whose labels weigh as conclusions do; they stand behind the
             questions.
+        touch_noise: Deviation of the normal noise on embeddings, one draw a video of a question and epoch.
 
     Raises:
         UserError: naming the question that is too long, or has nothing to learn from.
@@ -60,12 +61,14 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
         conclusion_weight: float = 1.0,
         by_question: bool = True,
         replayed: Sequence[Encoded] = (),
+        touch_noise: float = 0.0,
     ) -> None:
         super().__init__()
         self.questions = [q for q in questions if q.dialogue(opd)]
         self.store = store
         self.per_video = per_video
         self.flip_probability = flip_probability
+        self.touch_noise = touch_noise
         self.seed = seed
         self.counterfactual, self.conclusion_weight, self.by_question = counterfactual, conclusion_weight, by_question
         self.videos = sorted({video for question in self.questions for video in question.videos})
@@ -109,10 +112,16 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
             weights[torch.tensor(concluding.labels) != IGNORE_INDEX] = self.conclusion_weight
             if self.counterfactual and rng.random() < self.counterfactual:
                 encoded, videos = concluding, tuple(rng.choice(self.videos) for _ in videos)
-        for video_id in videos:
+        for place, video_id in enumerate(videos):
             positions = sample_training(self.store.count(video_id), self.per_video, rng)
             horizontal, vertical = (rng.random() < self.flip_probability for _ in range(2))
-            parts.append(self.store.features(video_id, positions, FLIPS[horizontal + 2 * vertical]))
+            features = self.store.features(video_id, positions, FLIPS[horizontal + 2 * vertical])
+            if self.touch_noise:
+                # Of a stream of its own, so that the same frames are drawn with noise and without.
+                seed = derive_seed(self.seed, self.epoch, question.question_id, "noise", place)
+                drawn = torch.randn(self.store.dim, generator=torch.Generator().manual_seed(seed))
+                features = features + self.touch_noise * drawn
+            parts.append(features)
         return self._tensors(encoded, torch.cat(parts), weights)
 
     def _tensors(self, encoded: Encoded, features: torch.Tensor, weights: torch.Tensor) -> dict[str, torch.Tensor]:

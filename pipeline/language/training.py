@@ -145,6 +145,7 @@ def assemble(
         positions=model.positions,
         bos=language.bos,
         by_question=config.weighting == "question",
+        touch_noise=language.touch_noise,
         **own,
     )
     return model, data

@@ -91,13 +91,15 @@ def texture(surface: Heights, pitch: float) -> float:
 
     The shorter waves are what a Gaussian filter (ISO 16610-21) leaves; applied twice, nothing remains of curvature. A
     finger meets what stands above its surroundings; valleys between cylinders are out of its reach and do not count.
+    NaN where nothing does, as in a surface with gaps.
     """
     rest = surface - _smooth(surface, TEXTURE_MM, pitch)
     rest = rest - _smooth(rest, TEXTURE_MM, pitch)
     upper = surface >= _smooth(surface, REACH_MM, pitch)
     inner = round(TEXTURE_MM / pitch)  # Nearer to the border the filter lacks neighbours.
     inside = (slice(inner, -inner), slice(inner, -inner))
-    return float(rest[inside][upper[inside]].std())
+    proud = rest[inside][upper[inside]]
+    return float(proud.std()) if proud.size else math.nan
 
 
 def bump_share(skin: Heights, pitch: float) -> float:

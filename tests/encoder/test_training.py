@@ -14,22 +14,25 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from sklearn.linear_model import LogisticRegression
+from sklearn.preprocessing import StandardScaler
 from transformers import TrainerCallback
 
-from pipeline.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
+from pipeline.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore, Statistics
 from pipeline.encoder import finetune as training
+from pipeline.encoder.baseline.validation import deal
 from pipeline.encoder.clip import load_visual_tower
 from pipeline.encoder.clips import ClipDataset, EncoderData, LabelledVideo
-from pipeline.encoder.embed import standardize, statistics, union
+from pipeline.encoder.embed import logits_of, standardize, statistics, union
 from pipeline.encoder.finetune import accuracies, finetune, train_classifier, write_encoder_card
-from pipeline.encoder.frame_classifier import JointFrameClassifier
+from pipeline.encoder.frame_classifier import STRENGTHS, JointFrameClassifier
 from pipeline.encoder.model import Heads, PropertyClassifier
 from pipeline.encoder.recipes import RECIPES, base_encoder, check_recipe, property_classifier
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.errors import UserError
 from pipeline.io import save_tensors, write_table
 from pipeline.records import Assignment, Embedding, Part
-from pipeline.runtime import seed_everything
+from pipeline.runtime import derive_seed, seed_everything
 from pipeline.training.trainable import load_trainable, save_trainable, trainable_state
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
@@ -342,6 +345,50 @@ def test_standardized_by_training_frames_alone() -> None:
     assert done.isfinite().all(), "a constant dimension is only shifted"
     raw[[e.row for e in index if e.video_id == "test_0"]] += 5
     assert torch.equal(standardize(raw, statistics(raw, index, {"train_0", "train_1"}))[rows], done[rows])
+
+
+def test_a_training_object_gets_logits_of_heads_that_did_not_see_it(catalogue: Catalogue, tmp_path: Path) -> None:
+    """Its own label changes nothing of them; a test video's follow from all training objects, as when it is asked."""
+    objects = list(catalogue.objects)[:24]
+    split = [
+        Assignment(video_id=f"{o}_0", object_id=o, part=Part.TEST if i % 4 == 3 else Part.TRAIN)
+        for i, o in enumerate(objects)
+    ]
+    flips = {Part.TRAIN: ("none", "both"), Part.TEST: ("none",)}
+    keys = [(a.video_id, flip, f) for a in split for flip in flips[a.part] for f in range(3)]
+    index = [Embedding(video_id=v, frame_index=f, flip=flip, row=row) for row, (v, flip, f) in enumerate(keys)]
+    raw = torch.randn(len(index), 5, generator=torch.manual_seed(0)) * 3 + 1
+    found, heads = logits_of(raw, index, split, catalogue, 0)
+    assert found.shape == (len(index), 9)
+
+    # By scikit-learn alone, of hardness: all training frames, or those of the other parts.
+    def reference(learnt: list[Embedding], strength: float) -> np.ndarray:
+        frames = raw[[e.row for e in learnt]].numpy()
+        scaler = StandardScaler().fit(frames)
+        labels = [catalogue.labels(e.video_id[:-2])[0] for e in learnt]
+        model = LogisticRegression(C=strength, max_iter=2000).fit(scaler.transform(frames).clip(-5, 5), labels)
+        return model.decision_function(scaler.transform(raw.numpy()))
+
+    learnt = [
+        e for e in index if e.flip == "none" and e.video_id[:-2] in {a.object_id for a in split if a.part == Part.TRAIN}
+    ]
+    tested = [e.row for e in index if next(a for a in split if a.video_id == e.video_id).part is Part.TEST]
+    wholes = [reference(learnt, strength) for strength in STRENGTHS]
+    own = found[tested, :3].numpy()
+    errors = [np.abs(own - whole[tested]).max() for whole in wholes]
+    assert min(errors) < 1e-3, "one of the strengths that are tried"
+    strength = STRENGTHS[int(np.argmin(errors))]
+
+    (first, *_) = deal([a.object_id for a in split if a.part == Part.TRAIN], 5, derive_seed(0, "logits"))
+    held = [e.row for e in index if e.video_id[:-2] in first]
+    others = reference([e for e in learnt if e.video_id[:-2] not in first], strength)
+    np.testing.assert_allclose(found[held, :3].numpy(), others[held], atol=1e-3)
+    assert np.abs(found[held, :3].numpy() - wholes[STRENGTHS.index(strength)][held]).max() > 0.01
+
+    known = statistics(found, index, {a.video_id for a in split if a.part == Part.TRAIN})._replace(heads=heads)
+    known.save(tmp_path / "statistics.safetensors")
+    asked = standardize(raw[tested], Statistics.load(tmp_path / "statistics.safetensors"))
+    torch.testing.assert_close(asked, standardize(found, known._replace(heads=None))[tested], rtol=1e-5, atol=1e-5)
 
 
 def test_a_video_that_any_split_trains_on_is_embedded_for_training() -> None:
