@@ -32,6 +32,8 @@ CONF = Path("conf")
 TAUGHT = "data/taught"
 """What the chain makes of `teach.base`."""
 RECIPE = "encoder.recipe"
+SHORT = 2
+"""Keys of a section that stands in one line of params.yaml."""
 HEADER = "# Written by `octopi scale`; change it with that command, or edit conf/ and run it again.\n"
 
 
@@ -167,9 +169,11 @@ def write_params(params: Params, path: Path = PARAMS_FILE) -> bool:
     """Write params.yaml if that changes it; return whether it did."""
     values = params.model_dump(mode="json")
     lines = {
-        name: {key: _Line(v) if isinstance(v, dict) else v for key, v in section.items()}
-        if isinstance(section, dict)
-        else section
+        name: section
+        if not isinstance(section, dict)
+        else _Line(section)
+        if len(section) <= SHORT
+        else {key: _Line(v) if isinstance(v, dict) else v for key, v in section.items()}
         for name, section in values.items()
     }
     text = HEADER + yaml.dump(lines, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)
@@ -180,7 +184,7 @@ def write_params(params: Params, path: Path = PARAMS_FILE) -> bool:
 
 
 class _Line(dict[str, Any]):
-    """A mapping within a section."""
+    """A short section, or a mapping within one."""
 
 
 class _Dumper(yaml.SafeDumper):

@@ -186,7 +186,7 @@ def test_a_split_without_a_test_object_is_one_warning(tmp_path: Path, caplog: py
 
 
 NONE = {
-    **dict.fromkeys(("data.dir", "data.catalogue"), "stands in the paths of dependencies"),
+    "data.dir": "stands in the paths of dependencies",
     **dict.fromkeys(("tracking.uri", "tracking.experiment", "tracking.live", "tracking.timeout_seconds"), "only shows"),
     "packaged": "which variants are copied",
     "runtime.parallel": "every backend gives the same bytes",

@@ -217,6 +217,7 @@ def test_what_is_missing_is_said_with_the_reason(changed: Path, monkeypatch: pyt
     assert "Scenario" not in words(tasks), "what was not measured has no empty row"
     scores.unlink()
     monkeypatch.chdir(changed)
+    Path("dvc.yaml").touch()  # As in a project.
     assert "make repro" in str(CliRunner().invoke(app, ["page"]).exception)
 
 
@@ -270,6 +271,7 @@ def test_a_task_is_on_the_page_once_its_scores_are_there(changed: Path, monkeypa
     rows = rows_of(scores)
     write_rows(scores, [*rows, *({**row, "task": "TOY"} for row in rows if row["task"] == "PC")])
     monkeypatch.chdir(changed)
+    Path("dvc.yaml").touch()  # As in a project.
     assert CliRunner().invoke(app, ["page"]).output.startswith(f"{PAGE}: ")
     page = Page(changed / PAGE)
     named = [page.named(f"small-videos-{key}") for key in ("understanding", "variants")]
