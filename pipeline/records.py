@@ -170,6 +170,11 @@ class Finding(Record):
     severity: Severity
 
 
+def finding(check: str, item: str, measured: str, expected: str = "", severity: Severity = Severity.INFO) -> Finding:
+    """A finding, by the order of its fields."""
+    return Finding(check=check, item=item, measured=measured, expected=expected, severity=severity)
+
+
 class Frame(Record):
     """One kept frame; row `row` of the frame tensor (uint8, frames x size x size x RGB)."""
 

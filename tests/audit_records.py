@@ -13,7 +13,7 @@ from pipeline.runtime import derive_seed
 from pipeline.scenes.light import make_sensor
 from pipeline.scenes.recipe import recipe_of
 from pipeline.scenes.render import make_scene, render
-from pipeline.videos.audit.leakage import check_leakage, evidence
+from pipeline.videos.audit.leakage import check_leakage
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.files import VideoFile
 from pipeline.videos.frames.scan import Scan, scan
@@ -90,7 +90,7 @@ def of(findings: Sequence[Finding] | Iterator[Finding], check: str) -> list[Find
 
 def leaks(found: Sequence[Probe], parts: dict[str, Part], catalogue: Catalogue, **sha256: str) -> list[Finding]:
     found = [p.model_copy(update={"sha256": sha256.get(p.video_id, p.sha256)}) for p in found]
-    return list(check_leakage(evidence(found, assigned(found, parts)), catalogue))
+    return list(check_leakage(found, assigned(found, parts), catalogue))
 
 
 def relabelled(catalogue: Catalogue, **changes: object) -> Catalogue:

@@ -99,25 +99,13 @@ def import_bag(bag: Path, topic: str, out: Path, object_id: str, times: float = 
     remove_rests(out)
     first, source, position, written = _next_number(out, object_id), shots(bag, topic), 0, []
     for number, (begin, end) in enumerate(ranges, first):
-        for _ in range(begin - position):
-            next(source)
         path, rows = out / f"{object_id}_{number}.mp4", list[FrameTime]()
-
-        def frames(begin: int = begin, end: int = end, rows: list[FrameTime] = rows) -> Iterator[Image]:
-            for index in range(begin, end):
-                shot = next(source)
-                contact = round(float(strengths[index]), 3)
-                row = FrameTime(
-                    frame=index - begin, recorded_ns=shot.recorded, stamped_ns=shot.stamped, contact=contact
-                )
-                rows.append(row)
-                yield shot.picture
-
+        pressed = itertools.islice(source, begin - position, end - position)
         with atomic(path.with_suffix(".csv")) as table:
             # The suffix says the container, so the unfinished file bears it, too.
             part = path.with_name(f".{path.stem}.{os.getpid()}.part.mp4")
             try:
-                write_film(part, frames(), fps)
+                write_film(part, _noting(pressed, strengths[begin:end], rows), fps)
                 write_csv(table, FrameTime, rows)
                 os.replace(part, path)
             finally:
@@ -125,6 +113,13 @@ def import_bag(bag: Path, topic: str, out: Path, object_id: str, times: float = 
         written.append(path)
         position = end
     return written
+
+
+def _noting(pressed: Iterator[Shot], strengths: npt.NDArray[np.float64], rows: list[FrameTime]) -> Iterator[Image]:
+    for frame, (shot, strength) in enumerate(zip(pressed, strengths.tolist(), strict=True)):
+        times = {"recorded_ns": shot.recorded, "stamped_ns": shot.stamped}
+        rows.append(FrameTime(frame=frame, contact=round(strength, 3), **times))
+        yield shot.picture
 
 
 def presses(strengths: npt.NDArray[np.float64], times: float = FOUND) -> list[tuple[int, int]]:

@@ -20,7 +20,7 @@ from pipeline.use.results import Pictures, Touch, Video
 from pipeline.videos.audit.files import FOUND, unsteady
 from pipeline.videos.decoding import SUFFIXES
 from pipeline.videos.files import VideoFile, is_video
-from pipeline.videos.frames.scan import Scan, scan
+from pipeline.videos.frames.scan import scan
 from pipeline.videos.frames.subtraction import GAIN, MIDDLE, subtract
 
 FEWEST = 2
@@ -59,10 +59,6 @@ def see(video: Video, frames: FramesConfig, *, subtracts: bool, quiet: float) ->
         raise UserError(f"{name}: {found.measured}")
     if found.probe.frames < FEWEST or not found.kept:
         raise UserError(f"{name}: {found.probe.frames} frames show no touch; record from before the contact to its end")
-    return _shown(name, found, frames, subtracts, quiet)
-
-
-def _shown(name: str, found: Scan, frames: FramesConfig, subtracts: bool, quiet: float) -> Seen:
     chosen = [found.kept[place] for place in sample_evaluation(len(found.kept), frames.per_video)]
     pictures = np.stack([kept.image for kept in chosen])
     difference = subtract(pictures, found.reference)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import re
 import unicodedata
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 
 from pipeline.errors import UserError, readable
-from pipeline.records import Finding, Severity
+from pipeline.records import Finding, Severity, finding
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.catalogue.csv_reader import read_rows
 from pipeline.videos.decoding import SUFFIXES
@@ -76,21 +77,21 @@ def list_videos(folder: Path, catalogue: Catalogue) -> Listing:
         findings.append(_error(str(folder), message))
     elif unknown_objects:
         message = f"{counted} are left out; list them in objects.csv to use them: {names}"
-        findings.append(Finding(check="name", item=str(folder), measured=message, severity=Severity.WARNING))
+        findings.append(finding("name", str(folder), message, severity=Severity.WARNING))
     files.sort(key=lambda f: (f.object_id, int(f.video_id.rpartition("_")[2]), f.relative))
     return Listing(tuple(files), (*findings, *_same_id(files)), tuple(sorted(unknown_objects)))
 
 
 def raise_errors(folder: Path, findings: Sequence[Finding]) -> None:
     """Raise the first error as a UserError that names the file."""
-    for finding in findings:
-        if finding.severity is Severity.ERROR:
-            where = folder if finding.item == readable(str(folder)) else folder / finding.item
-            raise UserError(readable(f"{where}: {finding.measured}"))
+    for found in findings:
+        if found.severity is Severity.ERROR:
+            where = folder if found.item == readable(str(folder)) else folder / found.item
+            raise UserError(readable(f"{where}: {found.measured}"))
 
 
 def _error(item: str, message: str) -> Finding:
-    return Finding(check="name", item=item, measured=message, severity=Severity.ERROR)
+    return finding("name", item, message, severity=Severity.ERROR)
 
 
 def is_video(path: Path) -> bool:
@@ -118,9 +119,7 @@ def video_files(folder: Path) -> tuple[list[Path], list[Finding]]:
             if path.name in folders:
                 if path.is_symlink():
                     message = "a linked folder is not looked into, nor by DVC; link the files, or name it as the folder"
-                    findings.append(
-                        Finding(check=PASSED, item=readable(where), measured=message, severity=Severity.WARNING)
-                    )
+                    findings.append(finding(PASSED, where, message, severity=Severity.WARNING))
             elif not is_video(path):
                 others[readable(path.suffix.lower()) or "without a suffix"] += where != LIST_FILE
             elif readable(where) != where:
@@ -134,7 +133,7 @@ def video_files(folder: Path) -> tuple[list[Path], list[Finding]]:
         kinds = sorted((-count, kind) for kind, count in others.items() if count)
         counted = ", ".join(f"{-count} {kind}" for count, kind in kinds)
         message = f"{others.total()} are no videos by their names: {counted}"
-        findings.append(Finding(check=PASSED, item=str(folder), measured=message, severity=Severity.INFO))
+        findings.append(finding(PASSED, str(folder), message))
     return sorted(paths), findings
 
 
@@ -182,16 +181,11 @@ def _from_list(listed: Path, folder: Path, paths: Sequence[Path]) -> tuple[list[
     unlisted = len(paths) - len(files)
     if unlisted and not findings:
         message = f"{unlisted} videos of the folder are not listed and are left out"
-        findings.append(Finding(check="name", item=LIST_FILE, measured=message, severity=Severity.WARNING))
+        findings.append(finding("name", LIST_FILE, message, severity=Severity.WARNING))
     return list(files.values()), findings
 
 
 def _same_id(files: Sequence[VideoFile]) -> list[Finding]:
-    same = defaultdict(list)
-    for file in files:
-        same[file.video_id].append(file.relative)
-    return [
-        _error(names[0], f"{video_id} is also {', '.join(names[1:])}; keep one of them")
-        for video_id, names in same.items()
-        if len(names) > 1
-    ]
+    """Of files that are sorted by their ids."""
+    groups = [(video_id, [f.relative for f in group]) for video_id, group in groupby(files, lambda f: f.video_id)]
+    return [_error(n[0], f"{v} is also {', '.join(n[1:])}; keep one of them") for v, n in groups if len(n) > 1]

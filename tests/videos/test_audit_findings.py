@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pipeline.records import Finding, Part, Probe
 from pipeline.videos.audit.files import FOUND, by_rate, check_files
 from pipeline.videos.audit.labels import check_labels, similar_names
-from pipeline.videos.audit.leakage import check_leakage, evidence, sessions
+from pipeline.videos.audit.leakage import check_leakage, sessions
 from pipeline.videos.catalogue import Catalogue
 from tests.audit_records import ERROR, INFO, OBJECTS, OTHER, PHYSICLEAR, WARNING, leaks, odd, of, probe, probes
 from tests.audit_records import relabelled as relabel
@@ -27,7 +27,7 @@ def with_one(**changes: object) -> list[Finding]:
 def test_flawless_videos_no_videos_and_a_single_one_give_no_warning(catalogue: Catalogue) -> None:
     assert odd(check_files(probes(), OTHER)) == []
     assert list(check_files([], OTHER)) == []
-    assert list(check_leakage(evidence([], []), OTHER)) == []
+    assert list(check_leakage([], [], OTHER)) == []
     alone = Catalogue(language=catalogue.language, objects={"rug": catalogue.objects["rug"]})
     assert odd(check_files([probe()], alone)) == odd(leaks([probe()], {}, alone)) == []
 

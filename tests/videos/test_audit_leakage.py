@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter
 
 from pipeline.records import Part, Probe, Severity
 from pipeline.videos.audit import leakage
-from pipeline.videos.audit.leakage import evidence, sessions
+from pipeline.videos.audit.leakage import sessions
 from tests import audit_records as made
 from tests.audit_records import ERROR, GOOD_SPLIT, INFO, OBJECTS, OTHER, WARNING, leaks, look_at, of, probe, probes
 from tests.conftest import encode, write_video
@@ -73,10 +73,11 @@ def presses(tmp_path_factory: pytest.TempPathFactory) -> list[Probe]:
 
 def test_different_presses_have_no_near_duplicates(presses: list[Probe]) -> None:
     assert len(presses) == 16
-    found = evidence(presses, [])
-    touched = [f for f in leakage._near_copies(found) if f.item == "all"]
+    touched = [f for f in leakage._near_copies(presses, {}) if f.item == "all"]
     assert int(re.findall(r"of (\d+) videos", touched[0].measured)[0]) >= 10, "most show contact, so most are compared"
-    assert {f.severity for f in leakage._near_copies(found)} == {INFO}, "an object pressed twice alike is no warning"
+    assert {f.severity for f in leakage._near_copies(presses, {})} == {INFO}, (
+        "an object pressed twice alike is no warning"
+    )
 
 
 @pytest.mark.parametrize("start", [0, 2], ids=["whole", "shortened"])
@@ -97,9 +98,8 @@ def test_a_changed_copy_is_found(tmp_path: Path, presses: list[Probe], start: in
     ):
         pairs = [*presses, original, others]
         parts = {original.video_id: one, others.video_id: two}
-        found = evidence(pairs, made.assigned(pairs, parts))
         known = {p.path for p in presses} | {"all"}
-        near = [f for f in leakage._near_copies(found) if f.item not in known]
+        near = [f for f in leakage._near_copies(pairs, parts) if f.item not in known]
         assert [(f.item, f.severity) for f in near] == [(others.path, severity)]
         assert "baseball_0.avi" in near[0].measured
 
@@ -123,7 +123,7 @@ def drawn_contacts(videos: int, seed: int) -> list[Probe]:
 
 def named(found: list[Probe]) -> tuple[list[str], float]:
     """The videos that are called near-duplicates, and the bound."""
-    *near, summary = leakage._near_copies(evidence(found, []))
+    *near, summary = leakage._near_copies(found, {})
     return [f.item for f in near], float(summary.expected.split()[-1])
 
 
@@ -211,11 +211,11 @@ def test_copies_are_found_whatever_is_compared_at_a_time(
     twin = first.model_copy(
         update={"video_id": "lemon_9", "object_id": "lemon", "path": "lemon_9.avi", "sha256": "its own"}
     )
-    found = evidence([*others, twin, first], [])
-    whole = list(leakage._near_copies(found))
+    found = [*others, twin, first]
+    whole = list(leakage._near_copies(found, {}))
     assert [f.item for f in whole[:-1]] == [first.path]
     monkeypatch.setattr(leakage, "BLOCK", block)
-    assert list(leakage._near_copies(found)) == whole
+    assert list(leakage._near_copies(found, {})) == whole
 
 
 def test_drifting_brightness_is_one_session() -> None:

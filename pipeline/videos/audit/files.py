@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from statistics import fmean, median
 
-from pipeline.records import Finding, Probe, Severity
+from pipeline.records import Finding, Probe, Severity, finding
 from pipeline.videos.catalogue import Catalogue
 
 SHORT = 0.5
@@ -36,10 +36,8 @@ def check_files(probes: Sequence[Probe], catalogue: Catalogue) -> Iterator[Findi
         return
     yield from _overview(probes, catalogue)
     for rate, group in by_rate(probes).items():
-        yield from _lengths(rate, group)
-        yield from _brightness(rate, group)
-    yield from _headers(probes)
-    yield from _contact(probes)
+        yield from _beside_others(rate, group)
+    yield from _each(probes)
 
 
 def quiet_level(probes: Sequence[Probe]) -> float:
@@ -63,22 +61,22 @@ def _overview(probes: Sequence[Probe], catalogue: Catalogue) -> Iterator[Finding
     videos = Counter(p.object_id for p in probes)
     frames = [p.frames for p in probes]
     measured = f"{len(probes)} videos of {len(videos)} objects"
-    yield _finding("videos", "all", measured)
+    yield finding("videos", "all", measured)
     counts = Counter(videos.values())
     spread = ", ".join(f"{n} objects with {count}" for count, n in sorted(counts.items()))
-    yield _finding("videos per object", "all", spread)
+    yield finding("videos per object", "all", spread)
     absent = sorted(catalogue.objects.keys() - videos)
     if absent:
-        yield _finding("videos", ", ".join(absent), "no video", "one or more an object", warn=True)
+        yield finding("videos", ", ".join(absent), "no video", "one or more an object", Severity.WARNING)
     mean = fmean(frames)
-    yield _finding("length", "all", f"{min(frames)} to {max(frames)} frames, mean {mean:.1f}")
+    yield finding("length", "all", f"{min(frames)} to {max(frames)} frames, mean {mean:.1f}")
     for check, groups in (
         ("frame rate", {f"{rate:.4g} frames/s": len(group) for rate, group in by_rate(probes).items()}),
         ("resolution", Counter(f"{p.width}x{p.height}" for p in probes)),
     ):
         usual = max(groups.items(), key=lambda item: (item[1], item[0]))[0]
         for name, count in sorted(groups.items()):
-            yield _finding(check, name, f"{count} videos", "" if name == usual else usual, warn=name != usual)
+            yield finding(check, name, f"{count} videos", *(() if name == usual else (usual, Severity.WARNING)))
 
 
 def by_rate(probes: Sequence[Probe]) -> dict[float, list[Probe]]:
@@ -92,68 +90,50 @@ def by_rate(probes: Sequence[Probe]) -> dict[float, list[Probe]]:
     return {median(p.fps for p in group): group for group in groups}
 
 
-def _lengths(rate: float, group: Sequence[Probe]) -> Iterator[Finding]:
-    usual = median(p.frames for p in group)
-    for p in group:
-        if p.frames < SHORT * usual:
-            expected = f"about {usual:g}, as others at {rate:.4g} frames/s"
-            yield _finding("length", p.path, f"{p.frames} frames", expected, warn=True)
-
-
-def _brightness(rate: float, group: Sequence[Probe]) -> Iterator[Finding]:
-    middle = median(p.brightness for p in group)
+def _beside_others(rate: float, group: Sequence[Probe]) -> Iterator[Finding]:
+    usual, middle = median(p.frames for p in group), median(p.brightness for p in group)
     # At least one step: where all videos are equally bright, rounding is no outlier.
     spread = max(1.0, DEVIATION * median(abs(p.brightness - middle) for p in group))
     for p in group:
+        if p.frames < SHORT * usual:
+            expected = f"about {usual:g}, as others at {rate:.4g} frames/s"
+            yield finding("length", p.path, f"{p.frames} frames", expected, Severity.WARNING)
         if abs(p.brightness - middle) > DARK_OR_BRIGHT * spread:
             expected = f"{middle:.1f} +- {spread:.1f}, as others at {rate:.4g} frames/s"
-            yield _finding("brightness", p.path, f"{p.brightness:.1f} of 255", expected, warn=True)
+            yield finding("brightness", p.path, f"{p.brightness:.1f} of 255", expected, Severity.WARNING)
 
 
-def _headers(probes: Sequence[Probe]) -> Iterator[Finding]:
+def _each(probes: Sequence[Probe]) -> Iterator[Finding]:
+    """What is odd about a video by itself, or by the quiet level of its data set."""
+    level = quiet_level(probes)
     for p in probes:
-        if _header_lies(p):
-            expected = f"{p.header_frames}, by the header"
-            yield _finding("frames that decode", p.path, str(p.frames), expected, warn=True)
-        if p.rotation:
-            yield _finding("rotation", p.path, f"{p.rotation} degrees in the metadata, applied", "0", warn=True)
-        if p.irregular > IRREGULAR:
-            yield _finding("frame rate", p.path, f"varies by a factor of {p.irregular:.1f}", "even", warn=True)
-        if p.brightness_step > STEP:
-            yield _finding(
-                "brightness", p.path, f"a step of {p.brightness_step:.1f} of 255", f"at most {STEP:g}", warn=True
-            )
-        if p.saturated > SATURATED:
-            share = f"{100 * p.saturated:.0f} % of values at 0 or 255"
-            yield _finding("saturation", p.path, share, f"at most {100 * SATURATED:g} %", warn=True)
-        if p.kept == 0:
-            yield _finding("frames kept", p.path, "0", "5 or more, by frames.selection", warn=True)
+        touched, end = touches(p, level), f"still {p.contact_end:.2f} of {p.contact:.2f}"
+        from_end = "touched from the first frame: the reference comes from the end"
+        for check, odd, measured, expected in (
+            ("frames that decode", _header_lies(p), str(p.frames), f"{p.header_frames}, by the header"),
+            ("rotation", p.rotation, f"{p.rotation} degrees in the metadata, applied", "0"),
+            ("frame rate", p.irregular > IRREGULAR, f"varies by a factor of {p.irregular:.1f}", "even"),
+            ("brightness", p.brightness_step > STEP, f"a step of {p.brightness_step:.1f} of 255", f"at most {STEP:g}"),
+            (
+                *("saturation", p.saturated > SATURATED, f"{100 * p.saturated:.0f} % of values at 0 or 255"),
+                f"at most {100 * SATURATED:g} %",
+            ),
+            ("frames kept", p.kept == 0, "0", "5 or more, by frames.selection"),
+            ("light at the start", p.unsteady, unsteady(p), "steady"),
+            ("contact at the start", p.starts_touching, from_end, "untouched"),
+            ("contact", not touched, f"not found: strength {p.contact:.2f}", f"over {FOUND * level:.2f}"),
+            (
+                *("contact at the end", touched and p.contact_end > max(FOUND * level, STILL * p.contact), end),
+                f"under {STILL * p.contact:.2f}",
+            ),
+        ):
+            if odd:
+                yield finding(check, p.path, measured, expected, Severity.WARNING)
     differing = sum(_header_lies(p) for p in probes)
-    yield _finding("frames that decode", "all", f"{differing} of {len(probes)} videos differ from their header", "0")
+    yield finding("frames that decode", "all", f"{differing} of {len(probes)} videos differ from their header", "0")
+    yield finding("contact", "all", f"quiet level {level:.2f}, median contact {median(p.contact for p in probes):.2f}")
 
 
 def _header_lies(probe: Probe) -> bool:
     # Some containers promise no number (0): nothing to hold them to.
     return probe.header_frames not in (0, probe.frames)
-
-
-def _contact(probes: Sequence[Probe]) -> Iterator[Finding]:
-    level = quiet_level(probes)
-    yield _finding("contact", "all", f"quiet level {level:.2f}, median contact {median(p.contact for p in probes):.2f}")
-    for p in probes:
-        if p.unsteady:
-            yield _finding("light at the start", p.path, unsteady(p), "steady", warn=True)
-        if p.starts_touching:
-            measured = "touched from the first frame: the reference comes from the end"
-            yield _finding("contact at the start", p.path, measured, "untouched", warn=True)
-        if not touches(p, level):
-            measured = f"not found: strength {p.contact:.2f}"
-            yield _finding("contact", p.path, measured, f"over {FOUND * level:.2f}", warn=True)
-        elif p.contact_end > max(FOUND * level, STILL * p.contact):
-            measured = f"still {p.contact_end:.2f} of {p.contact:.2f}"
-            yield _finding("contact at the end", p.path, measured, f"under {STILL * p.contact:.2f}", warn=True)
-
-
-def _finding(check: str, item: str, measured: str, expected: str = "", *, warn: bool = False) -> Finding:
-    severity = Severity.WARNING if warn else Severity.INFO
-    return Finding(check=check, item=item, measured=measured, expected=expected, severity=severity)

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from difflib import get_close_matches
 from statistics import fmean
 
-from pipeline.records import Finding, Part, Severity
+from pipeline.records import Finding, Part, Severity, finding
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.catalogue.wording import contradiction
 
@@ -60,32 +60,30 @@ def similar_names(unknown: Sequence[str], catalogue: Catalogue) -> Iterator[Find
     for name in unknown:
         close = get_close_matches(name, catalogue.objects, n=1, cutoff=0.9)
         if close:
-            yield _warning("spelling", name, "not in the catalogue", f"{close[0]}?")
+            yield finding("spelling", name, "not in the catalogue", f"{close[0]}?", Severity.WARNING)
 
 
 def _agreement(catalogue: Catalogue) -> Iterator[Finding]:
     for place, prop in enumerate(catalogue.properties):
         ratings = [o.ratings[place] for o in catalogue.objects.values()]
-        if len({len(r) for r in ratings}) > 1:
-            measured = "undefined: objects have different numbers of ratings"
-            yield _info("agreement, ICC(3,k)", prop.name, measured)
-            continue
-        found = icc3k(ratings)
+        as_many = len({len(r) for r in ratings}) == 1
+        found = icc3k(ratings) if as_many else None
         if found is None:
-            yield _info("agreement, ICC(3,k)", prop.name, "undefined: one rating, or no variance")
+            why = "one rating, or no variance" if as_many else "objects have different numbers of ratings"
+            yield finding("agreement, ICC(3,k)", prop.name, f"undefined: {why}")
             continue
         value, low, high = found
-        yield _info("agreement, ICC(3,k)", prop.name, f"{value:.3f} ({low:.3f} to {high:.3f})")
+        yield finding("agreement, ICC(3,k)", prop.name, f"{value:.3f} ({low:.3f} to {high:.3f})")
         disputed = sum(len(set(r)) > 1 for r in ratings)
-        yield _info("disputed ratings", prop.name, f"{disputed} of {len(ratings)} objects")
+        yield finding("disputed ratings", prop.name, f"{disputed} of {len(ratings)} objects")
 
 
 def _counts(catalogue: Catalogue) -> Iterator[Finding]:
     for place, prop in enumerate(catalogue.properties):
         counts = Counter(o.labels[place] for o in catalogue.objects.values())
         for level, name in enumerate(prop.levels):
-            tell = _info if counts[level] else _warning
-            yield tell("objects of a class", f"{prop.name}: {name}", str(counts[level]))
+            severity = Severity.INFO if counts[level] else Severity.WARNING
+            yield finding("objects of a class", f"{prop.name}: {name}", str(counts[level]), "", severity)
 
 
 def _stated(catalogue: Catalogue) -> Iterator[Finding]:
@@ -94,7 +92,8 @@ def _stated(catalogue: Catalogue) -> Iterator[Finding]:
             if stated is not None and stated != o.labels[place]:
                 prop, ratings = catalogue.properties[place], o.ratings[place]
                 measured = f"{prop.levels[o.labels[place]]} (mean rating {fmean(ratings):.2f})"
-                yield _warning("stated label", f"{o.object_id}: {prop.name}", measured, prop.levels[stated])
+                where = f"{o.object_id}: {prop.name}"
+                yield finding("stated label", where, measured, prop.levels[stated], Severity.WARNING)
 
 
 def _descriptions(catalogue: Catalogue) -> Iterator[Finding]:
@@ -104,7 +103,8 @@ def _descriptions(catalogue: Catalogue) -> Iterator[Finding]:
             if named:
                 words = " or ".join(prop.levels[level] for level in sorted(named))
                 measured = f"rated {prop.levels[label]} ({' '.join(map(str, ratings))})"
-                yield _warning("description", f"{o.object_id}: {prop.name}", measured, f"described as {words}")
+                where = f"{o.object_id}: {prop.name}"
+                yield finding("description", where, measured, f"described as {words}", Severity.WARNING)
 
 
 def _splits(catalogue: Catalogue) -> Iterator[Finding]:
@@ -114,7 +114,7 @@ def _splits(catalogue: Catalogue) -> Iterator[Finding]:
         for o in catalogue.objects.values():
             one, other = o.splits[names[0]], o.splits[name]
             if one != other:
-                yield _info("splits differ", o.object_id, f"{one} in {names[0]}", f"{other} in {name}")
+                yield finding("splits differ", o.object_id, f"{one} in {names[0]}", f"{other} in {name}")
     for name in names:
         for part in (Part.TRAIN, Part.VALIDATION, Part.TEST):
             members = [o for o in catalogue.objects.values() if o.splits[name] == part]
@@ -122,14 +122,7 @@ def _splits(catalogue: Catalogue) -> Iterator[Finding]:
                 there = {o.labels[place] for o in members}
                 lacking = [word for level, word in enumerate(prop.levels) if level not in there]
                 if members and lacking:
-                    yield _warning(
-                        "classes of a part", f"{name}, {part}: {prop.name}", f"no {' or '.join(lacking)}", "all"
+                    measured = f"no {' or '.join(lacking)}"
+                    yield finding(
+                        "classes of a part", f"{name}, {part}: {prop.name}", measured, "all", Severity.WARNING
                     )
-
-
-def _info(check: str, item: str, measured: str, expected: str = "") -> Finding:
-    return Finding(check=check, item=item, measured=measured, expected=expected, severity=Severity.INFO)
-
-
-def _warning(check: str, item: str, measured: str, expected: str = "") -> Finding:
-    return Finding(check=check, item=item, measured=measured, expected=expected, severity=Severity.WARNING)

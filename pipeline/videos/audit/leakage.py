@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from statistics import fmean, pstdev
 
 import numpy as np
 
-from pipeline.records import Assignment, Finding, Part, Probe, Severity
+from pipeline.records import Assignment, Finding, Part, Probe, Severity, finding
 from pipeline.runtime import derive_seed
 from pipeline.videos.audit.files import by_rate, quiet_level, touches
 from pipeline.videos.catalogue import Catalogue
@@ -39,35 +38,26 @@ costs more than one that is looked into, and a few dozen objects give such a tes
 LEARNT_FROM = (Part.TRAIN, Part.VALIDATION)
 
 
-@dataclass(frozen=True)
-class Evidence:
-    """What was measured of the videos; `parts` is empty where no split was asked for."""
-
-    probes: Sequence[Probe]
-    parts: Mapping[str, Part]
-    """By video id."""
+Parts = Mapping[str, Part]
+"""By video id; empty where no split was asked for."""
 
 
-def evidence(probes: Sequence[Probe], assignments: Sequence[Assignment]) -> Evidence:
-    """Put together what the checks need."""
-    return Evidence(probes, {a.video_id: a.part for a in assignments})
-
-
-def check_leakage(found: Evidence, catalogue: Catalogue) -> Iterator[Finding]:
+def check_leakage(probes: Sequence[Probe], split: Sequence[Assignment], catalogue: Catalogue) -> Iterator[Finding]:
     """All checks of this module."""
-    yield from check_split(found, catalogue)
-    if found.probes:
-        yield from _untouched_predictions(found, sessions(found.probes), catalogue)
+    yield from check_split(probes, split, catalogue)
+    if probes:
+        yield from _untouched_predictions(probes, sessions(probes), catalogue)
 
 
-def check_split(found: Evidence, catalogue: Catalogue) -> Iterator[Finding]:
+def check_split(probes: Sequence[Probe], assignments: Sequence[Assignment], catalogue: Catalogue) -> Iterator[Finding]:
     """The checks that depend on the split."""
-    if not found.probes:
+    parts = {a.video_id: a.part for a in assignments}
+    if not probes:
         return
-    yield from _objects(found)
-    yield from _copies(found)
-    yield from _near_copies(found)
-    yield from _sessions(found, sessions(found.probes), catalogue)
+    yield from _objects(probes, parts)
+    yield from _copies(probes, parts)
+    yield from _near_copies(probes, parts)
+    yield from _sessions(probes, parts, sessions(probes), catalogue)
 
 
 def sessions(probes: Sequence[Probe]) -> list[str]:
@@ -163,39 +153,38 @@ def predictability(
     return float(shares[0]), shares[1:].tolist()
 
 
-def _objects(found: Evidence) -> Iterator[Finding]:
-    parts: dict[str, set[Part]] = defaultdict(set)
-    for p in found.probes:
-        if found.parts.get(p.video_id, Part.UNUSED) != Part.UNUSED:
-            parts[p.object_id].add(found.parts[p.video_id])
-    for name, where in sorted(parts.items()):
+def _objects(probes: Sequence[Probe], parts: Parts) -> Iterator[Finding]:
+    stands: dict[str, set[Part]] = defaultdict(set)
+    for p in probes:
+        if parts.get(p.video_id, Part.UNUSED) != Part.UNUSED:
+            stands[p.object_id].add(parts[p.video_id])
+    for name, where in sorted(stands.items()):
         if len(where) > 1:
-            yield _finding("object in two parts", name, ", ".join(sorted(where)), "one part", Severity.ERROR)
-    if found.parts:
-        crossing = sum(len(where) > 1 for where in parts.values())
-        yield _finding("object in two parts", "all", f"{crossing} of {len(parts)} objects", "0", Severity.INFO)
+            yield finding("object in two parts", name, ", ".join(sorted(where)), "one part", Severity.ERROR)
+    if parts:
+        crossing = sum(len(where) > 1 for where in stands.values())
+        yield finding("object in two parts", "all", f"{crossing} of {len(stands)} objects", "0")
 
 
-def _copies(found: Evidence) -> Iterator[Finding]:
+def _copies(probes: Sequence[Probe], parts: Parts) -> Iterator[Finding]:
     earlier: dict[str, list[Probe]] = defaultdict(list)
     copies = 0
-    for video in found.probes:
+    for video in probes:
         twins = earlier[video.sha256]
         if twins:
             copies += 1
-            crossing = [t for t in twins if _crosses(found, video.video_id, t.video_id)]
+            crossing = [t for t in twins if _crosses(parts, video.video_id, t.video_id)]
             twin = (crossing or twins)[0]
             yield _pair("same content", video.path, twin.path, "equal bytes", bool(crossing))
         twins.append(video)
-    yield _finding("same content", "all", f"{copies} of {len(found.probes)} files", "0", Severity.INFO)
+    yield finding("same content", "all", f"{copies} of {len(probes)} files", "0")
 
 
-def _near_copies(found: Evidence) -> Iterator[Finding]:
-    level = quiet_level(found.probes)
-    shown = [p for p in found.probes if touches(p, level)]
+def _near_copies(probes: Sequence[Probe], parts: Parts) -> Iterator[Finding]:
+    level = quiet_level(probes)
+    shown = [p for p in probes if touches(p, level)]
     if len(shown) < 2:
-        nothing = f"{len(shown)} videos in contact: nothing to compare"
-        yield _finding("near-duplicate", "all", nothing, "", Severity.INFO)
+        yield finding("near-duplicate", "all", f"{len(shown)} videos in contact: nothing to compare")
         return
     own = likeness_vectors(np.array([p.signature for p in shown]))
     objects = np.unique([p.object_id for p in shown], return_inverse=True)[1]
@@ -213,9 +202,9 @@ def _near_copies(found: Evidence) -> Iterator[Finding]:
     bound = likeness_bound(largest[::-1], pairs)
     for i, j, likeness in close:
         if likeness > bound:
-            yield from _near_copy(found, shown[i], shown[j], likeness)
+            yield from _near_copy(parts, shown[i], shown[j], likeness)
     measured = f"closest pair of {len(shown)} videos in contact is alike by {closest:.3f}"
-    yield _finding("near-duplicate", "all", measured, f"at most {bound:.3f}", Severity.INFO)
+    yield finding("near-duplicate", "all", measured, f"at most {bound:.3f}")
 
 
 def likeness_vectors(signatures: np.ndarray) -> np.ndarray:
@@ -251,48 +240,48 @@ def likeness_bound(largest: np.ndarray, pairs: int) -> float:
     return max(DUPLICATE, math.tanh(lower + (upper - lower) / math.log(4) * math.log(m / CHANCE)))
 
 
-def _near_copy(found: Evidence, one: Probe, other: Probe, alike: float) -> Iterator[Finding]:
+def _near_copy(parts: Parts, one: Probe, other: Probe, alike: float) -> Iterator[Finding]:
     if one.sha256 == other.sha256:
         return  # `_copies` names them.
-    crosses = _crosses(found, one.video_id, other.video_id)
+    crosses = _crosses(parts, one.video_id, other.video_id)
     measured = f"contact is alike by {alike:.3f}"
     if one.object_id == other.object_id and not crosses:
         # One object pressed twice in the same way looks alike, and leaks nothing.
         twice = f"{measured} with {one.path}, the same object"
-        yield _finding("near-duplicate", other.path, twice, "different videos", Severity.INFO)
+        yield finding("near-duplicate", other.path, twice, "different videos")
     else:
         yield _pair("near-duplicate", other.path, one.path, measured, crosses)
 
 
-def _crosses(found: Evidence, one: str, other: str) -> bool:
+def _crosses(parts: Parts, one: str, other: str) -> bool:
     """Whether two videos stand in different parts of the split that are both used."""
-    parts = {found.parts.get(one, Part.UNUSED), found.parts.get(other, Part.UNUSED)}
-    return len(parts) == 2 and Part.UNUSED not in parts
+    both = {parts.get(one, Part.UNUSED), parts.get(other, Part.UNUSED)}
+    return len(both) == 2 and Part.UNUSED not in both
 
 
 def _pair(check: str, item: str, twin: str, measured: str, crosses: bool) -> Finding:
     severity = Severity.ERROR if crosses else Severity.WARNING
     where = "in another part of the split: remove one of them" if crosses else "remove one of them"
-    return _finding(check, item, f"{measured} with {twin}, {where}", "different videos", severity)
+    return finding(check, item, f"{measured} with {twin}, {where}", "different videos", severity)
 
 
-def _sessions(found: Evidence, names: Sequence[str], catalogue: Catalogue) -> Iterator[Finding]:
+def _sessions(probes: Sequence[Probe], parts: Parts, names: Sequence[str], catalogue: Catalogue) -> Iterator[Finding]:
     """What each session holds beside the whole, and whether training and test share it."""
     members: dict[str, list[Probe]] = defaultdict(list)
-    for name, probe in zip(names, found.probes, strict=True):
+    for name, probe in zip(names, probes, strict=True):
         members[name].append(probe)
-    whole = {p.object_id for p in found.probes}
-    for name, probes in sorted(members.items()):
-        objects = {p.object_id for p in probes}
-        light = fmean(p.brightness for p in probes)
+    whole = {p.object_id for p in probes}
+    for name, own in sorted(members.items()):
+        objects = {p.object_id for p in own}
+        light = fmean(p.brightness for p in own)
         shares = "; ".join(_shares(prop.name, i, objects, catalogue) for i, prop in enumerate(catalogue.properties))
         expected = "; ".join(_shares(prop.name, i, whole, catalogue) for i, prop in enumerate(catalogue.properties))
-        measured = f"{len(probes)} videos of {len(objects)} objects, brightness {light:.1f}; {shares}"
-        yield _finding("session", name, measured, expected, Severity.INFO)
-        parts = Counter(found.parts.get(p.video_id, Part.UNUSED) for p in probes)
-        if parts[Part.TEST] and any(parts[part] for part in LEARNT_FROM):
-            counts = ", ".join(f"{parts[part]} {part}" for part in (*LEARNT_FROM, Part.TEST) if parts[part])
-            yield _finding("session in two parts", name, counts, "one part", Severity.WARNING)
+        measured = f"{len(own)} videos of {len(objects)} objects, brightness {light:.1f}; {shares}"
+        yield finding("session", name, measured, expected)
+        counts = Counter(parts.get(p.video_id, Part.UNUSED) for p in own)
+        if counts[Part.TEST] and any(counts[part] for part in LEARNT_FROM):
+            counted = ", ".join(f"{counts[part]} {part}" for part in (*LEARNT_FROM, Part.TEST) if counts[part])
+            yield finding("session in two parts", name, counted, "one part", Severity.WARNING)
 
 
 def _shares(name: str, place: int, objects: set[str], catalogue: Catalogue) -> str:
@@ -301,13 +290,13 @@ def _shares(name: str, place: int, objects: set[str], catalogue: Catalogue) -> s
     return f"{name} {percent} %"
 
 
-def _untouched_predictions(found: Evidence, names: Sequence[str], catalogue: Catalogue) -> Iterator[Finding]:
+def _untouched_predictions(probes: Sequence[Probe], names: Sequence[str], catalogue: Catalogue) -> Iterator[Finding]:
     """Whether the untouched sensor, or the session alone, tells the property of an object never seen."""
-    chosen = _sampled(len(found.probes)).tolist()
-    objects = [found.probes[i].object_id for i in chosen]
+    chosen = _sampled(len(probes)).tolist()
+    objects = [probes[i].object_id for i in chosen]
     distinct = sorted({names[i] for i in chosen})
     inputs = {
-        "no-contact reference": np.array([found.probes[i].thumbnail for i in chosen]),
+        "no-contact reference": np.array([probes[i].thumbnail for i in chosen]),
         "session": np.eye(len(distinct))[[distinct.index(names[i]) for i in chosen]],
     }
     for place, prop in enumerate(catalogue.properties):
@@ -315,14 +304,10 @@ def _untouched_predictions(found: Evidence, names: Sequence[str], catalogue: Cat
         for what, features in inputs.items():
             check = f"predicted from the {what} alone"
             if len(set(objects)) < FOLDS or len(set(labels)) < 2 or features.shape[1] < 2:
-                yield _finding(check, prop.name, "undefined: too few objects, classes or sessions", "", Severity.INFO)
+                yield finding(check, prop.name, "undefined: too few objects, classes or sessions", "")
                 continue
             share, null = predictability(features, labels, objects, derive_seed(0, what, prop.name))
             p = (1 + sum(n >= share - 1e-12 for n in null)) / (1 + len(null))
             expected = f"{100 * fmean(null):.1f} +- {100 * pstdev(null):.1f} % if it told nothing"
             severity = Severity.WARNING if p < ALPHA else Severity.INFO
-            yield _finding(check, prop.name, f"{100 * share:.1f} %, p = {p:.4f}", expected, severity)
-
-
-def _finding(check: str, item: str, measured: str, expected: str, severity: Severity) -> Finding:
-    return Finding(check=check, item=item, measured=measured, expected=expected, severity=severity)
+            yield finding(check, prop.name, f"{100 * share:.1f} %, p = {p:.4f}", expected, severity)

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from functools import partial
 from pathlib import Path
 
 from pipeline.config import FramesConfig, SplitConfig
 from pipeline.errors import UserError
 from pipeline.parallel import run_parallel
-from pipeline.records import Assignment, Finding, Probe, Severity
+from pipeline.records import Assignment, Finding, Probe, Severity, finding
 from pipeline.videos.audit.files import check_files
 from pipeline.videos.audit.labels import check_labels, similar_names
-from pipeline.videos.audit.leakage import check_leakage, check_split, evidence
+from pipeline.videos.audit.leakage import check_leakage, check_split
 from pipeline.videos.catalogue import Catalogue
-from pipeline.videos.files import VideoFile, list_videos
+from pipeline.videos.files import Listing, VideoFile, list_videos
 from pipeline.videos.frames.scan import Scan, scan
 from pipeline.videos.split import assign
 
@@ -29,45 +30,29 @@ def audit_folder(folder: Path, catalogue: Catalogue, split: SplitConfig | None =
         split: also look for what leaks between its parts, with kfold of every fold.
     """
     listing = list_videos(folder, catalogue)
-    findings: list[Finding] = [*listing.findings, *similar_names(listing.unknown_objects, catalogue)]
-    scans, broken = _scan_all(listing.files)
-    findings += broken
-    probes = [s.probe for s in scans]
-    findings += check_labels(catalogue)
-    if probes:
-        splits: list[Sequence[Assignment]] = []
-        if split is not None:
-            try:
-                folds = range(split.folds if split.fold_of(0) is not None else 1)
-                splits = [assign(catalogue, probes, split, fold) for fold in folds]
-            except UserError as error:
-                message = str(error)
-                findings.append(Finding(check="split", item=split.name, measured=message, severity=Severity.ERROR))
-        findings += _measured(probes, splits, catalogue)
-    return by_severity(findings)
+    probes, wrong = _scan_all(listing.files)
+    splits: list[Sequence[Assignment]] = []
+    if split is not None and probes:
+        try:
+            folds = range(split.folds if split.fold_of(0) is not None else 1)
+            splits = [assign(catalogue, probes, split, fold) for fold in folds]
+        except UserError as error:
+            wrong.append(finding("split", split.name, str(error), severity=Severity.ERROR))
+    return _audit(listing, wrong, probes, splits, catalogue)
 
 
 def check_folder(folder: Path, catalogue: Catalogue) -> list[Finding]:
     """What is wrong or odd about the files of a folder, errors first; labels and leaks are left to the audit."""
     listing = list_videos(folder, catalogue)
-    scans, broken = _scan_all(listing.files)
-    found = [*listing.findings, *broken, *check_files([s.probe for s in scans], catalogue)]
-    return by_severity(found)
+    probes, wrong = _scan_all(listing.files)
+    return by_severity([*listing.findings, *wrong, *check_files(probes, catalogue)])
 
 
 def audit_chain(
     folder: Path, probes: Sequence[Probe], splits: Sequence[Sequence[Assignment]], catalogue: Catalogue
 ) -> list[Finding]:
     """The audit of what the chain has decoded and split, once a fold with kfold, errors first; opens no video."""
-    listing = list_videos(folder, catalogue)
-    return by_severity(
-        [
-            *listing.findings,
-            *similar_names(listing.unknown_objects, catalogue),
-            *check_labels(catalogue),
-            *_measured(probes, splits, catalogue),
-        ]
-    )
+    return _audit(list_videos(folder, catalogue), [], probes, splits, catalogue)
 
 
 def by_severity(findings: Iterable[Finding]) -> list[Finding]:
@@ -90,20 +75,23 @@ def summary(findings: Sequence[Finding]) -> dict[str, float]:
     return {f"{severity}s": counts[severity] for severity in (Severity.ERROR, Severity.WARNING)}
 
 
-def _measured(probes: Sequence[Probe], splits: Sequence[Sequence[Assignment]], catalogue: Catalogue) -> list[Finding]:
-    first, *others = [evidence(probes, assignments) for assignments in splits or [()]]
-    found = [*check_files(probes, catalogue), *check_leakage(first, catalogue)]
-    found += [finding for other in others for finding in check_split(other, catalogue)]
+def _audit(
+    listing: Listing,
+    wrong: Sequence[Finding],
+    probes: Sequence[Probe],
+    splits: Sequence[Sequence[Assignment]],
+    catalogue: Catalogue,
+) -> list[Finding]:
+    first, *others = splits or [()]
+    found = [*listing.findings, *similar_names(listing.unknown_objects, catalogue), *wrong, *check_labels(catalogue)]
+    found += [*check_files(probes, catalogue), *check_leakage(probes, first, catalogue)]
+    found += [each for other in others for each in check_split(probes, other, catalogue)]
     # Most findings are the same under every split.
-    return list(dict.fromkeys(found))
+    return by_severity(dict.fromkeys(found))
 
 
-def _scan_all(files: Sequence[VideoFile]) -> tuple[list[Scan], list[Finding]]:
-    results = list(run_parallel(_scan_small, files, "videos", "video"))
-    scans = [r for r in results if isinstance(r, Scan)]
-    return scans, [r for r in results if isinstance(r, Finding)]
-
-
-def _scan_small(file: VideoFile) -> Scan | Finding:
+def _scan_all(files: Sequence[VideoFile]) -> tuple[list[Probe], list[Finding]]:
     # The pictures are not wanted here: the smallest size, and hardly any of them.
-    return scan(file, FramesConfig(pixels=16, fraction=0.01))
+    look = partial(scan, config=FramesConfig(pixels=16, fraction=0.01))
+    results = list(run_parallel(look, files, "videos", "video"))
+    return [r.probe for r in results if isinstance(r, Scan)], [r for r in results if isinstance(r, Finding)]

@@ -105,7 +105,12 @@ def extract_frames(folder: Path, catalogue: Catalogue, config: FramesConfig, out
             raise_errors(folder, [result])
         else:
             found[place] = result
-            _warn(jobs[place].file, result.probe)
+            name, probe = jobs[place].file.relative, result.probe
+            if probe.header_frames > probe.frames:
+                lost = f"{probe.frames} of the {probe.header_frames} frames in its header decode"
+                log.warning("%s: %s; is it cut off? The %d are used", name, lost, probe.frames)
+            if probe.kept == 0:
+                log.warning("%s: %d frames are too few for frames.selection=release; left out", name, probe.frames)
     done = [each for each in found if each is not None]
     used = [(job, each) for job, each in zip(jobs, done, strict=True) if each.places]
     if not used:
@@ -133,27 +138,10 @@ def _work(job: _Job) -> _Done | Finding:
     result = scan(job.file, job.config)
     if isinstance(result, Finding):
         return result
-    done = _Done(
-        stamp=stamp,
-        probe=result.probe,
-        places=tuple((kept.index, kept.score) for kept in result.kept),
-    )
+    done = _Done(stamp=stamp, probe=result.probe, places=tuple((kept.index, kept.score) for kept in result.kept))
     pixels = {"reference": result.reference}
     if result.kept:
         pixels["frames"] = np.stack([kept.image for kept in result.kept])
     with atomic(job.pixels) as temporary:
         save_file(pixels, temporary, {"done": done.model_dump_json()})
     return done
-
-
-def _warn(file: VideoFile, probe: Probe) -> None:
-    if probe.header_frames > probe.frames:
-        log.warning(
-            "%s: %d of the %d frames in its header decode; is it cut off? The %d are used",
-            file.relative,
-            probe.frames,
-            probe.header_frames,
-            probe.frames,
-        )
-    if probe.kept == 0:
-        log.warning("%s: %d frames are too few for frames.selection=release; left out", file.relative, probe.frames)

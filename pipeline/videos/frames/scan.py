@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.config import FramesConfig
 from pipeline.io import sha256
-from pipeline.records import Finding, Probe, Severity
+from pipeline.records import Finding, Probe, Severity, finding
 from pipeline.videos.decoding import Decoder, Image
 from pipeline.videos.files import VideoFile
 from pipeline.videos.frames.reference import (
@@ -22,7 +22,7 @@ from pipeline.videos.frames.reference import (
     unsteady_frames,
 )
 from pipeline.videos.frames.selection import Kept
-from pipeline.videos.frames.video_pass import VideoPass, reference_of, run_pass
+from pipeline.videos.frames.video_pass import reference_of, run_pass
 
 THUMBNAIL_SIZE = (8, 6)
 SIGNATURE_SIZE = (24, 18)
@@ -67,27 +67,19 @@ def scan(file: VideoFile, config: FramesConfig) -> Scan | Finding:
         # Where no frame is as good as another, the first are as good as any.
         begin = unsteady if unsteady < found.frames else 0
         found = run_pass(file.path, config, count, unsteady=begin)
-    assert found.first is not None, "set where there are frames"
-    assert found.last is not None, "set where there are frames"
     untouched = tuple(begin + i for i in reference_indices(count) if begin + i < found.frames)
     touching = starts_touching(found.first, found.last)
     # What comes after unsteady frames need not be untouched any more: then the end is taken unless it has more detail.
     if touching or (begin and detail(found.first) > detail(found.last)):
         untouched = tuple(found.frames - 1 - i for i in reference_indices(found.frames))
-        found = run_pass(file.path, config, count, reference_of(file.path, untouched, config), begin)
+        with Decoder(file.path) as decoder:
+            ends = [frame for index, frame in enumerate(decoder.frames()) if index in untouched]
+        found = run_pass(file.path, config, count, reference_of(ends, config), begin)
     assert found.reference is not None, "set where there are frames"
-    return Scan(_probe(file, content, found, touching, unsteady, untouched), tuple(found.kept), found.reference.picture)
-
-
-def _probe(
-    file: VideoFile, content: str, found: VideoPass, touching: bool, unsteady: int, places: tuple[int, ...]
-) -> Probe:
-    assert found.reference is not None, "set where there are frames"
-    assert found.last is not None, "set where there are frames"
+    reference = found.reference.thumb
     shown = found.last if found.strongest is None else found.strongest
-    untouched = found.reference.thumb
     ((height, width),) = found.sizes
-    return Probe(
+    probe = Probe(
         video_id=file.video_id,
         object_id=file.object_id,
         path=file.relative,
@@ -101,18 +93,19 @@ def _probe(
         rotation=found.rotation,
         irregular=_irregular(found.times),
         kept=len(found.kept),
-        brightness=float(untouched[:, :, 0].mean()),
+        brightness=float(reference[:, :, 0].mean()),
         brightness_step=max((abs(b - a) for a, b in itertools.pairwise(found.brightness)), default=0.0),
         saturated=float(np.mean((shown[:, :, 0] == 0) | (shown[:, :, 0] == 255))),
         contact=found.contact,
         quiet=min(found.strengths, default=0.0),
-        contact_end=contact_strength(found.last, untouched),
+        contact_end=contact_strength(found.last, reference),
         starts_touching=touching,
         unsteady=unsteady,
-        untouched=places,
-        thumbnail=_flat(cv2.resize(untouched, THUMBNAIL_SIZE, interpolation=cv2.INTER_AREA)),
-        signature=_signature(found.brightness_thumbnails, untouched),
+        untouched=untouched,
+        thumbnail=_flat(cv2.resize(reference, THUMBNAIL_SIZE, interpolation=cv2.INTER_AREA)),
+        signature=_signature(found.brightness_thumbnails, reference),
     )
+    return Scan(probe, tuple(found.kept), found.reference.picture)
 
 
 def _irregular(times: list[tuple[int, float]]) -> float:
@@ -143,4 +136,4 @@ def _flat(array: np.ndarray) -> tuple[float, ...]:
 
 
 def _wrong(file: VideoFile, message: str) -> Finding:
-    return Finding(check="decodes", item=file.relative, measured=message, severity=Severity.ERROR)
+    return finding("decodes", file.relative, message, severity=Severity.ERROR)

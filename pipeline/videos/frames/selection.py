@@ -86,11 +86,9 @@ class BestFrames:
     def kept(self) -> list[Kept]:
         """What was kept, in time order."""
         chosen = sorted((-back, score, slot) for score, back, slot in self._heap)
-        return [Kept(index, score, self._image(self._held[slot])) for index, score, slot in chosen]
+        held = ((index, score, self._held[slot]) for index, score, slot in chosen)
+        return [Kept(i, score, h if isinstance(h, np.ndarray) else fit(h, self.config)) for i, score, h in held]
 
     def _hold(self, frame: av.VideoFrame) -> av.VideoFrame | Image:
         heavy = self.capacity * frame.width * frame.height * 1.5 > HELD_BYTES
         return fit(frame, self.config) if heavy else frame
-
-    def _image(self, held: av.VideoFrame | Image) -> Image:
-        return held if isinstance(held, np.ndarray) else fit(held, self.config)

@@ -35,6 +35,9 @@ SIGNATURE_FRAMES = 64
 """Frames of a video that the signature is made from, which tells copies."""
 
 
+NOTHING: Image = np.zeros((1, 1, 3), np.uint8)
+
+
 @dataclass(frozen=True)
 class Reference:
     """The no-contact picture: size x size x RGB as encoders see it, and the thumbnail that contact is measured on."""
@@ -56,8 +59,8 @@ class VideoPass:
     reference: Reference | None = None
     steady: bool = True
     """Whether the light is in the frames that make a reference."""
-    first: Image | None = None
-    last: Image | None = None
+    first: Image = field(default_factory=lambda: NOTHING)
+    last: Image = field(default_factory=lambda: NOTHING)
     """Thumbnails: the mean of the first frames, and the last frame."""
     contact: float = 0.0
     strongest: Image | None = None
@@ -80,39 +83,15 @@ class VideoPass:
             self.contact, self.strongest = strength, thumb
         return strength
 
-    def probe(self, index: int, frame: av.VideoFrame, thumb: Image, strength: float) -> None:
-        """Note what the audit wants of every few frames."""
-        if self.reference is not None:
-            self.strengths.append(strength)
-        self.brightness.append(cv2.mean(thumb)[0])
-        if frame.time is not None:
-            self.times.append((index, frame.time))
 
-
-class ReferenceMean:
-    """The mean of the frames that make the no-contact reference."""
-
-    def __init__(self, config: FramesConfig) -> None:
-        self.config = config
-        self.pictures: list[Image] = []
-        self.thumbs: list[Image] = []
-
-    def add(self, frame: av.VideoFrame) -> None:
-        """Take a frame in."""
-        self.pictures.append(fit(frame, self.config))
-        self.thumbs.append(thumbnail(frame))
-
-    def mean(self) -> Reference:
-        """The mean so far, of at least one frame."""
-        return Reference(*(np.rint(np.mean(p, axis=0)).astype(np.uint8) for p in (self.pictures, self.thumbs)))
+def reference_of(frames: Sequence[av.VideoFrame], config: FramesConfig) -> Reference:
+    """The mean of frames."""
+    pictures, thumbs = [fit(frame, config) for frame in frames], [thumbnail(frame) for frame in frames]
+    return Reference(*(np.rint(np.mean(p, axis=0)).astype(np.uint8) for p in (pictures, thumbs)))
 
 
 def run_pass(
-    path: Path,
-    config: FramesConfig,
-    promised: int | None = None,
-    given: Reference | None = None,
-    unsteady: int = 0,
+    path: Path, config: FramesConfig, promised: int | None = None, given: Reference | None = None, unsteady: int = 0
 ) -> VideoPass:
     """Decode a video once.
 
@@ -125,80 +104,65 @@ def run_pass(
         found = VideoPass(decoder.header, reference=given)
         count = decoder.header.frames if promised is None else promised
         best = BestFrames(kept_count(count, config), config)
-        choose = _rule(config, best, count)
-        reference_places = [unsteady + i for i in reference_indices(count)]
+        look = _by_change(config, best, count)
+        places = [unsteady + i for i in reference_indices(count)]
         stride, often = max(1, count // PROBES), max(1, count // SIGNATURE_FRAMES)
         by_contact = config.selection == "contact"  # at every frame, not only where the audit does
-        untouched = ReferenceMean(config)
-        frame = None
+        untouched: list[av.VideoFrame] = []
+        own, frame = None, None
         for index, frame in enumerate(decoder.frames()):
             found.frames = index + 1
             found.rotation = 90 * turns(frame)
             found.sizes.add((frame.height, frame.width) if found.rotation % 180 == 0 else (frame.width, frame.height))
             if len(found.sizes) > 1:
                 return found
-            if index >= unsteady or config.selection == "release":
-                choose(index, frame)
+            if config.selection == "release" or (index >= unsteady and not by_contact):
+                look(index, frame)
             if index < unsteady:
                 continue
-            if index in reference_places:
-                untouched.add(frame)
-            elif index == reference_places[-1] + 1:
-                found.steady = is_steady([*untouched.thumbs, thumbnail(frame)])
-                found.reference = found.reference or untouched.mean()
+            if index in places:
+                untouched.append(frame)
+            elif index == places[-1] + 1:
+                found.steady = is_steady([thumbnail(each) for each in (*untouched, frame)])
+                own = reference_of(untouched, config)
+                found.reference = given or own
             if by_contact or index % stride == 0:
                 thumb = thumbnail(frame)
                 strength = found.note(thumb)
                 if index % stride == 0:
-                    found.probe(index, frame, thumb, strength)
-                if by_contact and found.reference is not None:
+                    found.strengths += [strength] if found.reference else []
+                    found.brightness.append(cv2.mean(thumb)[0])
+                    found.times += [] if frame.time is None else [(index, frame.time)]
+                if by_contact and found.reference:
                     best.offer(strength, index, frame)
-            if index % often == 0 and found.reference is not None:
+            if index % often == 0 and found.reference:
                 found.brightness_thumbnails.append(brightness_thumbnail(frame))
         if frame is None:
             return found
-        found.reference = found.reference or untouched.mean()
-        found.first, found.last = untouched.mean().thumb, thumbnail(frame)
+        own = own or reference_of(untouched, config)
+        found.reference, found.first, found.last = given or own, own.thumb, thumbnail(frame)
         found.kept = best.kept()
         if config.selection == "release" and len(found.kept) < RELEASE_FEWEST:
             found.kept = []
         elif not found.kept:
             # A single frame has no predecessor and shows no contact; it is kept because it is all there is.
-            found.kept = [Kept(unsteady, 0.0, untouched.pictures[0])]
+            found.kept = [Kept(unsteady, 0.0, fit(untouched[0], config))]
     return found
 
 
-def reference_of(path: Path, places: Sequence[int], config: FramesConfig) -> Reference:
-    """The mean of the frames at these places of a video."""
-    untouched = ReferenceMean(config)
-    with Decoder(path) as decoder:
-        for index, frame in enumerate(decoder.frames()):
-            if index in places:
-                untouched.add(frame)
-    return untouched.mean()
+def _by_change(config: FramesConfig, best: BestFrames, count: int) -> Callable[[int, av.VideoFrame], None]:
+    """What `salient` and `release` do with each frame that goes by."""
+    before: list[tuple[av.VideoFrame, Image]] = []
 
+    def look(index: int, frame: av.VideoFrame) -> None:
+        salient = config.selection == "salient"
+        now = brightness(frame) if salient else cv2.cvtColor(picture(frame), cv2.COLOR_BGR2GRAY)
+        if before:
+            earlier, shown = before.pop()
+            if salient:
+                best.offer(difference(now, shown), index, frame)
+            elif index < count:
+                best.offer(changed_pixels(now, shown), index - 1, earlier)
+        before.append((frame, now))
 
-def _rule(config: FramesConfig, best: BestFrames, count: int) -> Callable[[int, av.VideoFrame], None]:
-    """What the selection does with each frame that goes by; those that go by contact are served where that is found."""
-    if config.selection == "salient":
-        last: list[Image] = []
-
-        def salient(index: int, frame: av.VideoFrame) -> None:
-            now = brightness(frame)
-            if last:
-                best.offer(difference(now, last.pop()), index, frame)
-            last.append(now)
-
-        return salient
-    if config.selection == "release":
-        before: list[tuple[av.VideoFrame, Image]] = []
-
-        def release(index: int, frame: av.VideoFrame) -> None:
-            grey = cv2.cvtColor(picture(frame), cv2.COLOR_BGR2GRAY)
-            if before and index < count:
-                earlier, earlier_grey = before.pop()
-                best.offer(changed_pixels(grey, earlier_grey), index - 1, earlier)
-            before.append((frame, grey))
-
-        return release
-    return lambda index, frame: None
+    return look
