@@ -87,7 +87,9 @@ def resolve_dtype(name: DtypeName) -> torch.dtype:
 
 
 def limit_threads(count: int) -> None:
-    """Let torch use this many CPU threads, where it is imported by now; 0 leaves it as it is."""
+    """Let torch use this many CPU threads, also where it is imported later; 0 leaves it as it is."""
+    if count:
+        os.environ["OMP_NUM_THREADS"] = str(count)
     if count and "torch" in sys.modules:
         import torch
 

@@ -55,7 +55,7 @@ def cause(error: Exception, tracking: TrackingConfig) -> str:
     while below := chain[-1].__cause__ or (None if chain[-1].__suppress_context__ else chain[-1].__context__):
         chain.append(below)
     first = chain[-1] if any(isinstance(each, OSError) for each in chain) else error
-    words = " ".join(str(first).split())
+    words = without_secrets(" ".join(str(first).split()))
     mend = ""
     if re.search(r"\b40[13]\b|PERMISSION_DENIED|UNAUTHENTICATED", words):
         mend = "; set MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD to those of the server"
