@@ -208,7 +208,8 @@ def _against_chance(rows: pd.DataFrame) -> list[str]:
     tasks = f"{len(above)} of {_count(len(rows), 'task')}{named}"
     text = f"The full system's interval lies above chance in {tasks}"
     text += f" and below it in {', '.join(below['task'])}" if len(below) else ""
-    return [f"{text}. Against chance it is {extremes}." if len(rows) > 1 else f"{text}."]
+    # Nothing is best that is no better than a guess.
+    return [f"{text}. Against chance it is {extremes}." if len(rows) > 1 and over.max() > 0 else f"{text}."]
 
 
 def _touch(effects: pd.DataFrame, solved: Collection[str]) -> list[str]:

@@ -144,6 +144,13 @@ def test_a_readme_stays_short_whatever_is_measured() -> None:
     assert "## Physical understanding" not in text
 
 
+def test_nothing_is_best_that_is_no_better_than_a_guess() -> None:
+    nothing = [score(task, accuracy=0.0, low=0.0, high=0.3) for task in ("PC", "PSS")]
+    assert "best" not in finding(report(nothing))[1]
+    some = [*nothing, score("POM", accuracy=0.9, low=0.8, high=1.0)]
+    assert "Against chance it is best in POM with 90.0 [80.0, 100.0] %" in finding(report(some))[1]
+
+
 @pytest.mark.parametrize("part", ["language", "encoder"])
 def test_random_base_models_are_said_to_be_chance_first(part: str) -> None:
     """By what the models are, whatever the scale is called."""

@@ -24,7 +24,7 @@ from tests.closure import ROOT
 from tests.conftest import HUNG
 from tests.use.videos import avi_of_giant_jpegs, blank, claims_frames, claims_pixels, video
 
-FRAMES = FramesConfig(size=32)
+FRAMES = FramesConfig(pixels=32)
 
 
 @pytest.fixture(scope="module")

@@ -128,7 +128,7 @@ def warmed(frames: list[np.ndarray], gains: list[float]) -> list[np.ndarray]:
 
 def lossless(path: Path, frames: list[np.ndarray], name: str) -> Scan:
     encode(path, frames)
-    found = scan(VideoFile(path, path.name, "rug", "rug_0"), FramesConfig(size=32, selection=name))
+    found = scan(VideoFile(path, path.name, "rug", "rug_0"), FramesConfig(pixels=32, selection=name))
     assert isinstance(found, Scan)
     return found
 
@@ -169,7 +169,7 @@ def test_real_presses_after_a_warm_up(real_data: Path, tmp_path: Path, name: str
 
 def test_a_warm_up_is_noted_and_hides_no_lack_of_contact(tmp_path: Path) -> None:
     frames = warmed(film([0.0] * 60), WARM_UPS[0][1])
-    seen = see(encode(tmp_path / "v.avi", frames), FramesConfig(size=32), subtracts=True, quiet=1.0)
+    seen = see(encode(tmp_path / "v.avi", frames), FramesConfig(pixels=32), subtracts=True, quiet=1.0)
     assert not seen.felt
     first, second = seen.touch.notes
     assert first.startswith("nothing touches the sensor")
