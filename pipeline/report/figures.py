@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 MEASURED, QUIET, LINE = "#0a5fb4", "#555b66", "#c9ced6"
 SERIES = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#000000")
 """Okabe and Ito's colours, safe for the colour-blind."""
-PARTS = {"lora": "LoRA", "opd": "OPD"}
+PARTS = {"language": "language model", "lora": "LoRA", "opd": "OPD"}
 DPI = 150
 
 
