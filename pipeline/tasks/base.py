@@ -13,6 +13,8 @@ from pipeline.videos.catalogue import Catalogue, Property
 from pipeline.videos.catalogue.wording import mentioned, plain, unmarked
 
 LETTERS = "abc"
+LISTED = ("a)", "b)", "c)")
+"""The letters as a list of videos, and what describes them, has them."""
 Classes = Sequence[Sequence[tuple[int, float]]]
 """What an encoder takes each video for, property by property: its class, and the mean class by its probabilities.
 
@@ -137,29 +139,30 @@ def draw_videos(pool: Pool, objects: Sequence[str], rng: random.Random) -> tuple
     return tuple(rng.choice(list(pool.videos[o])) for o in objects)
 
 
-def draft_single_turn(
+def draft_about(
     pool: Pool,
     objects: Sequence[str],
     rng: random.Random,
     *,
-    user: Mapping[Opd, str],
-    answer: Mapping[Opd, str],
+    turns: Mapping[Opd, Sequence[Turn]],
     choice: str,
     properties: Sequence[str],
     finding: str = "",
 ) -> Draft:
-    """A question of one turn about these objects, one dialogue for each OPD mode that `user` names."""
+    """A question about one random video of each of these objects, one dialogue for each OPD mode that has turns."""
     return Draft(
         videos=draw_videos(pool, objects, rng),
         objects=tuple(objects),
-        dialogues=tuple(Dialogue(opd=m, turns=(_turn(user[m], answer[m]),)) for m in Opd if m in user),
+        dialogues=tuple(Dialogue(opd=m, turns=tuple(turns[m])) for m in Opd if m in turns),
         gold=gold(pool, objects, choice, properties),
         finding=finding,
     )
 
 
-def _turn(user: str, answer: str) -> Turn:
-    return Turn(user=user, assistant=answer, described=len(answer.rpartition(" Conclusion: ")[0]))
+def single_turn(user: Mapping[Opd, str], answer: Mapping[Opd, str]) -> dict[Opd, list[Turn]]:
+    """The one turn of each OPD mode; what an answer says before its conclusion describes."""
+    before = {mode: len(text.rpartition(" Conclusion: ")[0]) for mode, text in answer.items()}
+    return {mode: [Turn(user=user[mode], assistant=answer[mode], described=before[mode])] for mode in user}
 
 
 def in_two_turns(draft: Draft) -> Draft:
@@ -202,27 +205,30 @@ def gold(pool: Pool, objects: Sequence[str], choice: str, properties: Sequence[s
 
 
 def descriptions(
-    catalogue: Catalogue, objects: Sequence[str], prefixes: Sequence[str], only: Sequence[str] = ()
+    catalogue: Catalogue, objects: Sequence[str], only: Sequence[str] = (), prefixes: Sequence[str] = LISTED
 ) -> str:
     """The description of each object behind its prefix; only the properties named, or everything."""
     texts = []
-    for prefix, object_id in zip(prefixes, objects, strict=True):
-        text = (
-            " ".join(catalogue.describe_one(object_id, name) for name in only)
-            if only
-            else catalogue.describe(object_id)
-        )
-        texts.append(f"{prefix} {text}")
+    for prefix, object_id in zip(prefixes, objects, strict=False):
+        told = [catalogue.describe_one(object_id, name) for name in only] or [catalogue.describe(object_id)]
+        texts.append(" ".join([prefix, *told]))
     return " ".join(texts)
 
 
 def concluded(
-    catalogue: Catalogue, objects: Sequence[str], prefixes: Sequence[str], verdict: str, only: Sequence[str] = ()
+    catalogue: Catalogue,
+    objects: Sequence[str],
+    verdict: str,
+    only: Sequence[str] = (),
+    prefixes: Sequence[str] = LISTED,
 ) -> dict[Opd, str]:
     """The answer in every OPD mode: descriptions of all objects, then the verdict; `needed` describes `only` these."""
-    described = {Opd.NEEDED: descriptions(catalogue, objects, prefixes, only)}
-    described[Opd.ALL] = descriptions(catalogue, objects, prefixes)
-    return {Opd.NONE: verdict, **{mode: f"{text} Conclusion: {verdict}" for mode, text in described.items()}}
+    needed, whole = (descriptions(catalogue, objects, some, prefixes) for some in (only, ()))
+    return {
+        Opd.NONE: verdict,
+        Opd.NEEDED: f"{needed} Conclusion: {verdict}",
+        Opd.ALL: f"{whole} Conclusion: {verdict}",
+    }
 
 
 def lettered(count: int) -> str:

@@ -67,8 +67,7 @@ def build_examples(assignments: Sequence[Assignment], catalogue: Catalogue, *, s
             if options:
                 opening, described = TEMPLATES[0], catalogue.describe(*objects)
             else:
-                opening = described_first(2)
-                described = descriptions(catalogue, objects, ("a)", "b)"))
+                opening, described = described_first(2), descriptions(catalogue, objects)
             named = " or ".join(f"{x}) {option}" for x, option in zip(LETTERS, options, strict=False))
             request = f"{example.question.format(options=named)} Use the format '{example.answer} x), because xxx'."
             turns = (

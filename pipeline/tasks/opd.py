@@ -8,7 +8,7 @@ import re
 from string import Formatter
 
 from pipeline.records import Opd, Prediction, Question, Score
-from pipeline.tasks.base import Classes, Draft, Pool, TaskDefinition, draft_single_turn, find_level, scored
+from pipeline.tasks.base import Classes, Draft, Pool, TaskDefinition, draft_about, find_level, scored, single_turn
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.catalogue.wording import OPENING, unmarked
 
@@ -32,15 +32,8 @@ class ObjectPropertyDescription(TaskDefinition):
             return None
         user, answer = rng.choice(TEMPLATES), pool.catalogue.describe(object_id)
         modes = (Opd.NEEDED, Opd.ALL)
-        return draft_single_turn(
-            pool,
-            [object_id],
-            rng,
-            user=dict.fromkeys(modes, user),
-            answer=dict.fromkeys(modes, answer),
-            choice="",
-            properties=pool.catalogue.property_names,
-        )
+        turns = single_turn(dict.fromkeys(modes, user), dict.fromkeys(modes, answer))
+        return draft_about(pool, [object_id], rng, turns=turns, choice="", properties=pool.catalogue.property_names)
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         """One score a property, read from the closing sentence ("Overall ..."), and `combined` for all at once."""

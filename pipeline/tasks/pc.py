@@ -17,7 +17,8 @@ from pipeline.tasks.base import (
     choice_score,
     concluded,
     conclusion,
-    draft_single_turn,
+    draft_about,
+    single_turn,
 )
 from pipeline.videos.catalogue import Catalogue, Property
 from pipeline.videos.catalogue.wording import mentioned, plain
@@ -85,15 +86,14 @@ class PropertyComparison(TaskDefinition):
             return None
         comparative = prop.more if rising else prop.less
         user = asked(rng.choice(TEMPLATES), comparative, prop.spoken)
-        prefixes = [f"{o} object:" for o in ORDINALS]
-        answer = concluded(pool.catalogue, objects, prefixes, verdict(choice, comparative, prop), [prop.name])
+        told, prefixes = verdict(choice, comparative, prop), [f"{o} object:" for o in ORDINALS]
+        answer = concluded(pool.catalogue, objects, told, [prop.name], prefixes)
         found = {"yes": self.listed[0], "no": self.listed[1], "same": "neither"}[choice]
-        return draft_single_turn(
+        return draft_about(
             pool,
             objects,
             rng,
-            user=user,
-            answer=answer,
+            turns=single_turn(user, answer),
             choice=choice,
             properties=[prop.name],
             finding=f"{comparative.capitalize()}: {found}.",

@@ -19,8 +19,9 @@ from pipeline.tasks.base import (
     choice_score,
     concluded,
     conclusion,
-    draft_single_turn,
+    draft_about,
     lettered,
+    single_turn,
 )
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.catalogue.wording import unmarked
@@ -91,10 +92,8 @@ class PropertyObjectMatching(TaskDefinition):
         order = ORDERS[stratum % len(ORDERS)]
         objects = [options[int(number) - 1] for number in order]
         user = asked(rng.choice(OPENINGS), [catalogue.objects[o].name for o in options])
-        answer = concluded(catalogue, objects, [f"{x})" for x in LETTERS], verdict(catalogue, objects))
-        return draft_single_turn(
-            pool, objects, rng, user=user, answer=answer, choice=order, properties=catalogue.property_names
-        )
+        turns = single_turn(user, concluded(catalogue, objects, verdict(catalogue, objects)))
+        return draft_about(pool, objects, rng, turns=turns, choice=order, properties=catalogue.property_names)
 
     def with_facts(self, draft: Draft, catalogue: Catalogue, rng: random.Random) -> Draft:
         """The same question after the facts about its objects; touch and reasoning remain to be asked for."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Mapping, Sequence
 
-from pipeline.records import Dialogue, Opd, Prediction, Question, Score, Turn
+from pipeline.records import Opd, Prediction, Question, Score, Turn
 from pipeline.tasks.base import (
     BEGUN,
     LETTERS,
@@ -17,8 +17,7 @@ from pipeline.tasks.base import (
     chosen_letter,
     described_first,
     descriptions,
-    draw_videos,
-    gold,
+    draft_about,
     lettered,
 )
 from pipeline.videos.catalogue import Catalogue
@@ -72,26 +71,17 @@ class PropertyScenarioReasoning(TaskDefinition):
         names = [p for p in catalogue.property_names if p in scenario.target or p in scenario.other]
         spoken = {p.name: p.spoken for p in catalogue.properties}
         reasons, aspects = (" and ".join(spoken[p] for p in chosen) for chosen in (scenario.target, names))
-        prefixes = [f"{letter})" for letter in LETTERS[:2]]
         verdict = f"The most suitable object is {LETTERS[position]}), because of its {reasons}."
-        turns = asked(scenario.question, aspects)
         said = {
             Opd.NONE: (verdict,),
-            Opd.NEEDED: (descriptions(catalogue, objects, prefixes, names), verdict),
-            Opd.ALL: (descriptions(catalogue, objects, prefixes), verdict),
+            Opd.NEEDED: (descriptions(catalogue, objects, names), verdict),
+            Opd.ALL: (descriptions(catalogue, objects), verdict),
         }
-        return Draft(
-            videos=draw_videos(pool, objects, rng),
-            objects=tuple(objects),
-            dialogues=tuple(
-                Dialogue(
-                    opd=mode,
-                    turns=tuple(Turn(user=u, assistant=a) for u, a in zip(turns[mode], said[mode], strict=True)),
-                )
-                for mode in Opd
-            ),
-            gold=gold(pool, objects, LETTERS[position], names),
-        )
+        turns = {
+            mode: [Turn(user=user, assistant=answer) for user, answer in zip(users, said[mode], strict=True)]
+            for mode, users in asked(scenario.question, aspects).items()
+        }
+        return draft_about(pool, objects, rng, turns=turns, choice=LETTERS[position], properties=names)
 
     def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str | None:
         """The video whose classes are the fewest steps from what suits; of those, whose mean classes are nearest."""

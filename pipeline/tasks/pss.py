@@ -7,6 +7,7 @@ import random
 from pipeline.records import Opd, Prediction, Question, Score
 from pipeline.tasks.base import (
     LETTERS,
+    LISTED,
     Classes,
     Draft,
     Pool,
@@ -15,8 +16,9 @@ from pipeline.tasks.base import (
     choice_score,
     chosen_letter,
     concluded,
-    draft_single_turn,
+    draft_about,
     lettered,
+    single_turn,
 )
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.catalogue.wording import mentioned, plain
@@ -49,7 +51,7 @@ class PropertySuperlativeSelection(TaskDefinition):
 
     name = "PSS"
     title = "Property Superlative Selection"
-    listed = ("a)", "b)", "c)")
+    listed = LISTED
     choices = 3
 
     def strata(self, catalogue: Catalogue) -> int:
@@ -69,14 +71,11 @@ class PropertySuperlativeSelection(TaskDefinition):
         superlative = prop.most if most else prop.least
         user = asked(rng.choice(TEMPLATES), superlative, prop.spoken)
         verdict = f"{LETTERS[position]}) is the {superlative}."
-        prefixes = [f"{letter})" for letter in LETTERS]
-        answer = concluded(pool.catalogue, objects, prefixes, verdict, [prop.name])
-        return draft_single_turn(
+        return draft_about(
             pool,
             objects,
             rng,
-            user=user,
-            answer=answer,
+            turns=single_turn(user, concluded(pool.catalogue, objects, verdict, [prop.name])),
             choice=LETTERS[position],
             properties=[prop.name],
             finding=f"{superlative.capitalize()}: {LETTERS[position]}).",

@@ -9,7 +9,7 @@ import random
 import re
 from collections.abc import Sequence
 
-from pipeline.records import Dialogue, Opd, Prediction, Question, Score, Turn
+from pipeline.records import Opd, Prediction, Question, Score, Turn
 from pipeline.tasks.base import (
     BEGUN,
     LETTERS,
@@ -20,8 +20,7 @@ from pipeline.tasks.base import (
     chosen_letter,
     described_first,
     descriptions,
-    draw_videos,
-    gold,
+    draft_about,
     lettered,
 )
 from pipeline.videos.catalogue import Catalogue
@@ -55,34 +54,22 @@ class Ripeness(TaskDefinition):
             return None
         objects.sort(key=ranks.__getitem__, reverse=position == 0)
         names = _telling(catalogue, fruit)
-        prefixes = [f"{letter})" for letter in LETTERS[:2]]
         spoken = _spoken(catalogue, names)
         verdict = f"The riper {fruit} is {LETTERS[position]}), because of its {' and '.join(spoken)}."
         talk = Turn(user=_question(catalogue, fruit), assistant=f"First to last: {', '.join(spoken)}.")
         ask = f"Each shows one {fruit}. Which {fruit} is riper? Use the format 'The riper {fruit} is x), because xxx'."
-        first = {
-            Opd.NEEDED: Turn(
-                user=f"Describe the {' and '.join(spoken)} of these two tactile videos: {lettered(2)}.",
-                assistant=descriptions(catalogue, objects, prefixes, names),
-            ),
-            Opd.ALL: Turn(
-                user=described_first(2),
-                assistant=descriptions(catalogue, objects, prefixes),
-            ),
-        }
-        bare = Turn(user=f"Given two tactile videos: {lettered(2)}. {ask}", assistant=verdict)
-        return Draft(
-            videos=draw_videos(pool, objects, rng),
-            objects=tuple(objects),
-            dialogues=(
-                Dialogue(opd=Opd.NONE, turns=(talk, bare)),
-                *(
-                    Dialogue(opd=mode, turns=(talk, turn, Turn(user=ask, assistant=verdict)))
-                    for mode, turn in first.items()
-                ),
-            ),
-            gold=gold(pool, objects, LETTERS[position], names),
+        needed = Turn(
+            user=f"Describe the {' and '.join(spoken)} of these two tactile videos: {lettered(2)}.",
+            assistant=descriptions(catalogue, objects, names),
         )
+        whole = Turn(user=described_first(2), assistant=descriptions(catalogue, objects))
+        last = Turn(user=ask, assistant=verdict)
+        turns = {
+            Opd.NONE: [talk, Turn(user=f"Given two tactile videos: {lettered(2)}. {ask}", assistant=verdict)],
+            Opd.NEEDED: [talk, needed, last],
+            Opd.ALL: [talk, whole, last],
+        }
+        return draft_about(pool, objects, rng, turns=turns, choice=LETTERS[position], properties=names)
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         """Read from "The riper FRUIT is x)"; two different letters there are no answer."""

@@ -12,7 +12,7 @@ from pipeline.evaluation.grading import grade
 from pipeline.io import read_jsonl, write_jsonl
 from pipeline.records import Opd, Prediction, Question, Score
 from pipeline.tasks import TASKS
-from pipeline.tasks.base import Draft, Pool, TaskDefinition, choice_score, draft_single_turn
+from pipeline.tasks.base import Draft, Pool, TaskDefinition, choice_score, draft_about, single_turn
 from pipeline.tasks.questions import build_questions, counts_by_task
 from pipeline.videos.catalogue import Catalogue
 from tests.conftest import refused
@@ -33,11 +33,8 @@ class Hardest(TaskDefinition):
         choice = "yes" if pool.catalogue.labels(object_id)[0] == 2 else "no"
         if choice != ("no", "yes")[stratum]:
             return None
-        user = {Opd.NONE: "Is {tactile} hard?"}
-        answer = {Opd.NONE: choice}
-        return draft_single_turn(
-            pool, [object_id], rng, user=user, answer=answer, choice=choice, properties=["hardness"]
-        )
+        turns = single_turn({Opd.NONE: "Is {tactile} hard?"}, {Opd.NONE: choice})
+        return draft_about(pool, [object_id], rng, turns=turns, choice=choice, properties=["hardness"])
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         said = prediction.outputs[0]
