@@ -52,7 +52,8 @@ def write_card(
     lines = ["---", yaml.safe_dump(front, sort_keys=False).rstrip(), "---", f"# {title}", "", "## Base models", ""]
     for part, path in bases.items():
         lines.append(f"- {part}: `{path.as_posix()}`, licence: {licences[part] or 'not stated beside the weights'}")
-        lines += [f"  - `{file.name}`, sha256 {sha256(file)}" for file in _weights(path)]
+        files = sorted(path.glob("*.safetensors")) if path.is_dir() else [path]
+        lines += [f"  - `{file.name}`, sha256 {sha256(file)}" for file in files]
     for heading, values in (("Training data", data), ("Hyper-parameters", settings)):
         lines += ["", f"## {heading}", "", "| | |", "|---|---|"]
         lines += [f"| {name} | {_shown(value)} |" for name, value in values.items()]
@@ -66,10 +67,6 @@ def write_card(
 
 def _row(cells: Iterable[object]) -> str:
     return f"| {' | '.join(map(_shown, cells))} |"
-
-
-def _weights(path: Path) -> list[Path]:
-    return sorted(path.glob("*.safetensors")) if path.is_dir() else [path]
 
 
 def front_matter(folder: Path) -> dict[str, Any]:

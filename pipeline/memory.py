@@ -17,10 +17,11 @@ import yaml
 
 from pipeline.config import EncoderConfig, LoraTrainConfig, Params, TrainConfig
 from pipeline.errors import UserError
-from pipeline.records import Assignment, Part, Question, Turn
+from pipeline.records import Dialogue, Part, Question, Turn
 from pipeline.scenes.invented import catalogue_of
 from pipeline.shapes import FULL, LLM_CONFIG, Llama, Vision
-from pipeline.tasks.questions import build_questions, counts_by_task, pool_of
+from pipeline.tasks.base import Pool
+from pipeline.tasks.questions import build_questions, counts_by_task
 from pipeline.videos.catalogue import Catalogue
 from pipeline.weights.check import TOKENIZER, read_tokenizer
 
@@ -242,38 +243,32 @@ def longest(params: Params, catalogue: Catalogue, language: Path) -> Lengths:
         # A video is its frames and two delimiters.
         return tokens(text.replace("{tactile}", "")) + len(question.videos) * (params.frames.per_video + 2)
 
-    modes = params.ablation.opd
     training = [
         (length(q, d.turns), sum(tokens(t.assistant) + 1 for t in d.turns))
-        for q in _questions(params, catalogue, Part.TRAIN)
-        for d in q.dialogues
-        if d.opd in modes
+        for q, d in _dialogues(params, catalogue, Part.TRAIN)
     ]
     prompts = [
         length(q, [*d.turns[:-1], Turn(user=d.turns[-1].user, assistant="")])
-        for q in _questions(params, catalogue, Part.TEST)
-        for d in q.dialogues
-        if d.opd in modes
+        for q, d in _dialogues(params, catalogue, Part.TEST)
     ]
     most, learnt = max(training, default=(0, 0))
     return Lengths(most, learnt, max(prompts, default=0))
 
 
-def _questions(params: Params, catalogue: Catalogue, part: Part) -> list[Question]:
-    videos = [Assignment(video_id=f"{o}_0", object_id=o, part=part) for o in catalogue.objects]
-    wanted = counts_by_task(params.questions, "train" if part == Part.TRAIN else "evaluation")
-    counts = {task: min(number, ASKED) for task, number in wanted.items()}
-    pool = pool_of(part, videos, catalogue)
-    config = params.questions
-    return build_questions(
-        pool,
-        counts,
+def _dialogues(params: Params, catalogue: Catalogue, part: Part) -> Iterator[tuple[Question, Dialogue]]:
+    """Questions to train or evaluate with on all objects, under each OPD mode that is trained."""
+    config, trained = params.questions, part == Part.TRAIN
+    wanted = counts_by_task(config, "train" if trained else "evaluation")
+    questions = build_questions(
+        Pool(part, catalogue, {o: [f"{o}_0"] for o in catalogue.objects}),
+        {task: min(number, ASKED) for task, number in wanted.items()},
         seed=config.seed,
         distinct=False,
         facts=config.facts,
         restate=config.restate,
-        two_turns=config.two_turns if part == Part.TRAIN else 0.0,
+        two_turns=config.two_turns if trained else 0.0,
     )
+    return ((q, d) for q in questions for d in q.dialogues if d.opd in params.ablation.opd)
 
 
 def table(uses: Sequence[Use]) -> str:
@@ -283,10 +278,6 @@ def table(uses: Sequence[Use]) -> str:
     for use in uses:
         stage, devices, *sizes = astuple(use)
         rows.append([stage, str(devices), *(f"{s / GIB:.2f}" for s in (*sizes, use.total))])
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return "\n".join(
-        "  ".join(
-            cell.ljust(w) if i == 0 else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True))
-        )
-        for row in rows
-    )
+    first, *widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ([row[0].ljust(first), *map(str.rjust, row[1:], widths)] for row in rows)
+    return "\n".join("  ".join(cells) for cells in lines)

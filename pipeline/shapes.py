@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -70,15 +71,9 @@ class Vision:
         return (self.image_size // self.patch_size) ** 2 + 1
 
     @property
-    def layer(self) -> int:
-        """Parameters of a layer: two norms, attention, and the two maps behind it that are four times as wide."""
-        return 12 * self.width**2 + 13 * self.width
-
-    @property
     def parameters(self) -> int:
         """Of the whole tower."""
-        patches = 3 * self.patch_size**2 * self.width
-        return patches + self.width * (1 + self.tokens + 4 + self.embed_dim) + self.layers * self.layer
+        return sum(map(prod, self.tensors.values()))
 
     @property
     def tensors(self) -> dict[str, tuple[int, ...]]:
@@ -282,27 +277,20 @@ PUBLISHED_VISION: dict[str, dict[str, Any]] = {
     }
 }
 """From open_clip_config.json of timm/vit_large_patch14_clip_224.openai, by the folder's name."""
-_VICUNA = {
-    "model_type": "llama",
-    "vocab_size": 32000,
-    "max_position_embeddings": 4096,
-    "hidden_act": "silu",
-    "rms_norm_eps": 1e-5,
-}
 PUBLISHED_LANGUAGE: dict[str, dict[str, Any]] = {
-    "vicuna-7b-v1.5": {
-        "hidden_size": 4096,
-        "intermediate_size": 11008,
-        "num_hidden_layers": 32,
-        "num_attention_heads": 32,
-        **_VICUNA,
-    },
-    "vicuna-13b-v1.5": {
-        "hidden_size": 5120,
-        "intermediate_size": 13824,
-        "num_hidden_layers": 40,
-        "num_attention_heads": 40,
-        **_VICUNA,
+    **{
+        f"vicuna-{size}-v1.5": {
+            "hidden_size": hidden,
+            "intermediate_size": middle,
+            "num_hidden_layers": depth,
+            "num_attention_heads": depth,  # Both have as many heads as layers.
+            "model_type": "llama",
+            "vocab_size": 32000,
+            "max_position_embeddings": 4096,
+            "hidden_act": "silu",
+            "rms_norm_eps": 1e-5,
+        }
+        for size, hidden, middle, depth in (("7b", 4096, 11008, 32), ("13b", 5120, 13824, 40))
     },
     "smollm2": {
         "model_type": "llama",

@@ -9,8 +9,8 @@ normalisation.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, cast
+from functools import partial
+from typing import cast
 
 import torch
 from torch import nn
@@ -52,20 +52,16 @@ class VisualPrompts(nn.Module):
         blocks = cast(nn.ModuleList, visual.get_submodule("transformer.resblocks"))
         norm = visual.get_submodule("ln_pre") if self.shared is None else None
         for index, block in enumerate(blocks[: len(self.prompts)]):
-            block.register_forward_pre_hook(self._insert(index, None if index else norm), with_kwargs=False)
-        blocks[-1].register_forward_hook(self._strip)
+            block.register_forward_pre_hook(partial(self._insert, index, None if index else norm))
+        blocks[-1].register_forward_hook(lambda _, __, output: output[:, : -self.count])
 
-    def _insert(self, index: int, norm: nn.Module | None) -> Callable[..., tuple[Any, ...]]:
-        def hook(_: nn.Module, inputs: tuple[torch.Tensor, ...]) -> tuple[torch.Tensor, ...]:
-            tokens, *rest = inputs
-            if index > 0:
-                tokens = tokens[:, : -self.count]
-            prompts = self.prompts[index]
-            for layer in (self.shared, norm):
-                prompts = layer(prompts) if layer is not None else prompts
-            return (torch.cat([tokens, prompts.to(tokens.dtype).expand(len(tokens), -1, -1)], dim=1), *rest)
-
-        return hook
-
-    def _strip(self, _: nn.Module, __: tuple[torch.Tensor, ...], output: torch.Tensor) -> torch.Tensor:
-        return output[:, : -self.count]
+    def _insert(
+        self, index: int, norm: nn.Module | None, _: nn.Module, inputs: tuple[torch.Tensor, ...]
+    ) -> tuple[torch.Tensor, ...]:
+        tokens, *rest = inputs
+        if index > 0:
+            tokens = tokens[:, : -self.count]
+        prompts = self.prompts[index]
+        for layer in (self.shared, norm):
+            prompts = layer(prompts) if layer is not None else prompts
+        return (torch.cat([tokens, prompts.to(tokens.dtype).expand(len(tokens), -1, -1)], dim=1), *rest)
