@@ -72,11 +72,7 @@ class Lengths:
 
 
 def count(params: Params) -> tuple[list[Use], list[str]]:
-    """Count all stages that run a base model.
-
-    Returns:
-        The stages, and sentences on what was assumed or left out.
-    """
+    """Count all stages that run a base model; the sentences say what was assumed or left out."""
     catalogue = catalogue_of(params)
     uses: list[Use] = []
     notes: list[str] = ["language.dtype is auto: counted as float32."] if params.language.dtype == "auto" else []
@@ -116,11 +112,7 @@ def embedding_length(config: EncoderConfig, tower: Vision) -> int:
 
 
 def encoder_uses(params: Params, tower: Vision, classes: int) -> Iterator[Use]:
-    """Fine-tuning by gradients (recipes `paper` and `release`), and embedding.
-
-    Args:
-        classes: Of all properties together.
-    """
+    """Fine-tuning by gradients (recipes `paper` and `release`), and embedding; `classes` counts all properties'."""
     config, frames = params.encoder, params.frames.per_video
     if config.recipe in ("paper", "release"):
         layers = min(tower.layers, config.prompt_layers or tower.layers)
@@ -143,11 +135,7 @@ def encoder_uses(params: Params, tower: Vision, classes: int) -> Iterator[Use]:
 
 
 def language_uses(params: Params, llama: Llama, embedding: int, lengths: Lengths) -> Iterator[Use]:
-    """Alignment, LoRA and answering.
-
-    Args:
-        embedding: Length of a tactile embedding.
-    """
+    """Alignment, LoRA and answering; `embedding` is the length of a tactile one."""
     language, hidden = params.language, llama.hidden_size
     size = BYTES[language.dtype]
     linear = llama.num_hidden_layers * llama.layer_linear
@@ -228,11 +216,7 @@ def launched(launcher: str) -> tuple[int, bool]:
 
 
 def longest(params: Params, catalogue: Catalogue, language: Path) -> Lengths:
-    """Look for the longest conversations among questions on all objects of the catalogue.
-
-    Args:
-        language: Folder of the language model whose tokens are counted.
-    """
+    """Look for the longest conversations among questions on all objects, in tokens of the folder's language model."""
     known = read_tokenizer(language) if (language / TOKENIZER).is_file() else None
 
     def tokens(text: str) -> int:

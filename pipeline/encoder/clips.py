@@ -35,8 +35,6 @@ class ClipDataset(EpochDataset[dict[str, torch.Tensor]]):
     What is drawn depends on seed, epoch and video alone, so a resumed training sees what an uninterrupted one does.
 
     Args:
-        store: The frames.
-        videos: What to draw from.
         per_video: k, frames a clip.
         seed: Of the draws; None gives the evaluation clip (uniform intervals, no flips).
         flip_probability: Chance of a horizontal and, independently, of a vertical flip of the whole clip.

@@ -14,8 +14,9 @@ import torch
 
 from pipeline.config import EncoderConfig
 from pipeline.embeddings import FLIPS, Statistics
+from pipeline.encoder.baseline.predictor import Labels
 from pipeline.encoder.baseline.validation import deal
-from pipeline.encoder.frame_classifier import FOLDS, FittedHeads, choose_strength, fit_frame_heads
+from pipeline.encoder.frame_classifier import FOLDS, Clips, choose_strength, fit_frame_heads
 from pipeline.encoder.model import FrameEncoder
 from pipeline.encoder.recipes import base_encoder, property_classifier
 from pipeline.errors import UserError
@@ -169,11 +170,7 @@ def logits_of(
     video's logits are those of heads that did not see its part. All other videos get heads of all training objects.
 
     Args:
-        embeddings: Rows x features; rows of training videos may be mirrored.
-        index: What each row is.
-        split: The part of each video; the heads are fitted to training videos' unmirrored frames.
-        catalogue: What the labels are from.
-        seed: Of the parts.
+        embeddings: Rows x features; the heads are fitted to training videos' unmirrored ones.
 
     Returns:
         The logits, rows x classes of all properties, float64, and the heads of all training objects, as `Statistics`
@@ -188,22 +185,22 @@ def logits_of(
     training = {a.video_id: a.object_id for a in split if a.part == Part.TRAIN and a.video_id in plain}
     classes = [len(p.levels) for p in catalogue.properties]
 
-    def fit(videos: Sequence[str], strength: float | None = None) -> tuple[FittedHeads, float]:
+    def known(videos: Iterable[str]) -> tuple[Clips, Labels, list[str], list[int]]:
         # A frame is a clip of its own, as videos have different numbers of kept frames.
-        chosen = [row for video in videos for row in plain[video]]
-        objects = [training[video] for video in videos for _ in plain[video]]
-        clips = embeddings[chosen].numpy()[:, None]
-        labels = np.array([catalogue.labels(o) for o in objects])
-        if strength is None:
-            strength, _ = choose_strength(clips, labels, objects, classes, seed)
-        return fit_frame_heads(clips, labels, objects, classes, strength), strength
+        frames = {row: training[video] for video in videos for row in plain[video]}
+        labels = np.array([catalogue.labels(o) for o in frames.values()])
+        return embeddings[list(frames)].numpy()[:, None], labels, list(frames.values()), classes
 
-    whole, strength = fit(list(training))
-    weights, biases = (torch.from_numpy(a) for a in whole.linear())
+    def heads(videos: Iterable[str]) -> tuple[torch.Tensor, torch.Tensor]:
+        weights, biases = fit_frame_heads(*known(videos), strength).linear()
+        return torch.from_numpy(weights), torch.from_numpy(biases)
+
+    strength, _ = choose_strength(*known(training), seed)
+    weights, biases = heads(training)
     found = embeddings.double() @ weights.T + biases
     for held in deal(list(training.values()), min(FOLDS, len({*training.values()})), derive_seed(seed, "logits")):
         others = [video for video, o in training.items() if o not in held]
-        w, b = (torch.from_numpy(a) for a in fit(others, strength)[0].linear()) if others else (weights, biases)
+        w, b = heads(others) if others else (weights, biases)
         own = [row for video, o in training.items() if o in held for row in rows[video]]
         found[own] = embeddings[own].double() @ w.T + b
     return found, (weights, biases)

@@ -115,9 +115,6 @@ def fit_frame_heads(
     """Fit the heads of all properties.
 
     Args:
-        clips: Of the training videos.
-        labels: Videos x properties.
-        objects: Each video's object.
         classes: How many classes each property has; one that training lacks gets a probability near 0.
         strength: One of `STRENGTHS`.
     """

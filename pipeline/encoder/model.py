@@ -22,15 +22,12 @@ if TYPE_CHECKING:
 
 
 class FrameEncoder(nn.Module):
-    """Embeds single frames.
-
-    Args:
-        dim: Length of an embedding.
-    """
+    """Embeds single frames."""
 
     def __init__(self, dim: int) -> None:
         super().__init__()
         self.dim = dim
+        """Length of an embedding."""
 
     def forward(self, frames: torch.Tensor, frame_indices: torch.Tensor) -> torch.Tensor:
         """Embed frames as the language model is given them.
@@ -220,7 +217,6 @@ def load_backbones(config: EncoderConfig, *, tuned: bool = False) -> list[FrameE
     """The backbones of `encoder.backbone` with their pretrained weights.
 
     Args:
-        config: The section `encoder`.
         tuned: Whether what fine-tuning changes is to be unfrozen: the last stage, or prompts. All else is frozen.
 
     Raises:

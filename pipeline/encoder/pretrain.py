@@ -39,7 +39,6 @@ class PretrainingModel(nn.Module):
     """The encoder with a head that predicts, from single pictures, what is known of invented objects.
 
     Args:
-        encoder: To be pretrained.
         quantities: Mean and deviation of each quantity over the pictures, 2 x quantities.
         kinds: How many flags there are.
     """

@@ -42,10 +42,6 @@ def base_encoder(config: EncoderConfig) -> FrameEncoder:
 def property_classifier(config: EncoderConfig, classes: Sequence[int]) -> PropertyClassifier:
     """The classifier to fine-tune, or to load a fine-tuned state into. It is drawn from torch's seed.
 
-    Args:
-        config: The section `encoder`.
-        classes: How many classes each property has.
-
     Raises:
         UserError: for an unknown recipe, or weights that do not fit.
     """

@@ -43,13 +43,7 @@ def error_rows(out_of_fold: Mapping[str, Iterable[OutOfFold]], catalogue: Catalo
 
 
 def quadratic_kappa(expected: Sequence[int], predicted: Sequence[int], classes: int) -> float | None:
-    """1 - (mean squared distance) / (the same if both were paired at random); None where the latter is 0.
-
-    Args:
-        expected: Classes from 0 to `classes` - 1.
-        predicted: As many.
-        classes: How many there are.
-    """
+    """1 - (mean squared distance) / (the same if both were paired at random); None where the latter is 0."""
     if len({*expected, *predicted}) < 2:
         return None
     from sklearn.metrics import cohen_kappa_score

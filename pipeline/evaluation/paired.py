@@ -54,7 +54,6 @@ def paired(values: Values, objects: Sequence[Objects]) -> Difference:
 
     Args:
         values: Differences, seeds x questions.
-        objects: Each question's.
 
     Raises:
         ValueError: without any question.
@@ -159,13 +158,8 @@ def smallest_effect(error: float, freedom: float, power: float = POWER, size: fl
     """The smallest true difference that a two-sided t test finds with the given power, in the unit of `error`.
 
     That is the standard error times the noncentrality at which t exceeds its critical value as often as `power`. The
-    sign flips of few objects need more. For a family of tests give `size` over their number.
-
-    Args:
-        error: Standard error of the difference.
-        freedom: Its degrees of freedom: objects less one, where seeds are not in it.
-        power: How often the difference is to be found.
-        size: How often a difference is found where there is none.
+    sign flips of few objects need more. For a family of tests give `size`, how often a difference is found where there
+    is none, over their number.
     """
     # The square of t is F with one degree of freedom; statsmodels' TTestPower goes astray at fractional freedom.
     critical = stats.f.isf(size, 1, freedom)

@@ -6,7 +6,6 @@ and with it its measures, come from its own module.
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import groupby
@@ -90,7 +89,6 @@ def score_rows(
 
     Args:
         graded: All graded answers of a run; some variants or tasks may be absent.
-        catalogue: What chance follows from.
         classifications: Of the property heads, by seed, those of its folds together; only test and validation count.
         out_of_fold: By candidate.
         seen: Graded answers of vision-only models.
@@ -109,8 +107,7 @@ def score_rows(
     for (task, measure, model, shown), runs in by_model.items():
         chance = TASKS[task].chance(catalogue)[measure]
         rows += _rows(runs, task=task, measure=measure, chance=chance, encoder=model, opd=Opd.ALL, touch=shown)
-    chances = {p.name: 1 / len(p.levels) for p in catalogue.properties}
-    chances["combined"] = math.prod(chances.values())
+    chances = TASKS["OPD"].chance(catalogue)  # What describes a video answers the same as its heads.
     for task_name, part in ((HEADS, Part.TEST), (VALIDATION_HEADS, Part.VALIDATION)):
         found = {seed: _videos(records, part) for seed, records in (classifications or {}).items()}
         for measure, chance in chances.items():
@@ -131,12 +128,7 @@ def effect_rows(
     """The rows of effects.csv: what each part of the full system brings, task by task, pooled over seeds.
 
     Only each task's measure of a whole answer, on questions and seeds that both settings have. Holm's family is all
-    rows.
-
-    Args:
-        graded: As `score_rows` takes it.
-        catalogue: Likewise.
-        concluded: Likewise.
+    rows. Arguments are as `score_rows` takes them.
     """
     rows = []
     table = _table(graded, catalogue, concluded or {})

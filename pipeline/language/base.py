@@ -100,15 +100,11 @@ def load_llm(
 
 
 def _four_bits(dtype: torch.dtype) -> dict[str, Any]:
-    lacking = [
-        name
-        for name, there in (
-            ("bitsandbytes (`pip install bitsandbytes`)", find_spec("bitsandbytes") is not None),
-            ("a CUDA device", torch.cuda.is_available()),
-        )
-        if not there
-    ]
-    if lacking:
+    needed = {
+        "bitsandbytes (`pip install bitsandbytes`)": find_spec("bitsandbytes"),
+        "a CUDA device": torch.cuda.is_available(),
+    }
+    if lacking := [name for name, found in needed.items() if not found]:
         raise UserError(f"language.quantization: nf4 needs {' and '.join(lacking)}; or set language.quantization=none")
     config = BitsAndBytesConfig(
         load_in_4bit=True,

@@ -5,21 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 from torch import nn
 
 from pipeline.config import TrainedEmbeddings
 from pipeline.errors import UserError, first_problem
 from pipeline.io import read_json
 from pipeline.language.chat import TACTILE_TOKENS
+from pipeline.records import Record
 
 CONFIG_FILE = "config.json"
 
 
-class OctopiConfig(BaseModel):
+class OctopiConfig(Record):
     """config.json of a saved model: what it stands on, and its shapes."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     model_type: str = "octopi"
     architectures: tuple[str, ...] = ("OctopiForCausalLM",)

@@ -70,12 +70,7 @@ def dataset_frame(
 
 
 def dataset_tables(folder: Path, dataset: str) -> dict[str, pd.DataFrame]:
-    """The tables of a written report as they are shown, by title: text in every cell.
-
-    Args:
-        folder: of the report, with dataset.csv and audit.csv; what is missing there is no table.
-        dataset: name of the data set.
-    """
+    """The tables of a report's dataset.csv and audit.csv, where there are such, by title: text in every cell."""
     tables = {}
     if (folder / "dataset.csv").is_file():
         frame = pd.read_csv(folder / "dataset.csv", dtype=str).fillna("")

@@ -34,8 +34,6 @@ def draw_figures(
     """Draw what there is figures for and remove figures of an earlier run.
 
     Args:
-        folder: Of the PNG files.
-        effects: effects.csv.
         confusion: property, rated, predicted; one row a video.
         curves: stage, name, step, value.
         properties: the classes of each, in rising order.

@@ -46,14 +46,10 @@ def load_report(folder: Path) -> Report:
     if not (folder / "scores.csv").is_file() or not (folder / "provenance.json").is_file():
         raise UserError(f"{folder}: no report (scores.csv, provenance.json); `dvc repro report` writes one")
     provenance = _json(folder / "provenance.json")
-    scores, effects = (
-        read_frame(folder / name, columns)
-        for name, columns in (("scores.csv", SCORE_COLUMNS), ("effects.csv", EFFECT_COLUMNS))
-    )
     return Report(
         folder=folder,
-        scores=scores,
-        effects=effects,
+        scores=read_frame(folder / "scores.csv", SCORE_COLUMNS),
+        effects=read_frame(folder / "effects.csv", EFFECT_COLUMNS),
         published=published(str(provenance.get("dataset", ""))),
         provenance=provenance,
         samples=_json(folder / "samples.json"),

@@ -140,12 +140,7 @@ def write_page(root: Path) -> Path:
 
 
 def inline(text: str, folder: str = "") -> Markup:
-    """A sentence of a README: its bold words, code and links as HTML, all else as it is.
-
-    Args:
-        text: Markdown.
-        folder: what its links are relative to.
-    """
+    """A sentence of a README: its bold words, code and links, relative to a folder, as HTML; all else as it is."""
     html = re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", str(escape(text)))
     html = re.sub(r"\*(\w[^*]*)\*", r"<em>\1</em>", html)
     html = re.sub(r"`(.+?)`", r"<code>\1</code>", html)

@@ -165,12 +165,7 @@ def taught_words(base: str) -> dict[str, Any]:
 
 
 def settings_note(report: str, split: str) -> str:
-    """What people wrote in notes.yaml about the test objects of a report and split, or else of the split; may be empty.
-
-    Args:
-        report: the folder's name, such as `small-videos`.
-        split: such as `development`.
-    """
+    """What people wrote in notes.yaml about a report's test objects under a split, or else about the split; or nothing."""
     notes: dict[str, str] = yaml.safe_load(NOTES.read_text(encoding="utf-8")) or {}
     return notes.get(f"{report}/{split}", notes.get(split, ""))
 

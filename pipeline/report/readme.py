@@ -35,12 +35,7 @@ TAUGHT = (
 
 
 def render_readme(report: Report, figures: Sequence[str]) -> str:
-    """The text of README.md.
-
-    Args:
-        report: with scores, effects and provenance.
-        figures: names of the files in figures/ that were drawn.
-    """
+    """The text of README.md; `figures` are names of the files in figures/ that were drawn."""
     said = report.provenance
     # Figures that are no evidence are no headline.
     spoilt = [f"## On test objects that were looked at\n\n{said['settings']}\n"] if looked_at(said) else []

@@ -21,13 +21,7 @@ TACTILE = "{tactile}"
 def choose_samples(
     questions: Iterable[Question], predictions: Iterable[Prediction], scores: Iterable[Score]
 ) -> dict[str, Any]:
-    """The content of samples.json: what `RULE` says, in the order of tasks, the right answer first.
-
-    Args:
-        questions: all that were asked.
-        predictions: answers of one variant.
-        scores: theirs; one for each measure.
-    """
+    """The content of samples.json of one variant: what `RULE` says, in the order of tasks, the right answer first."""
     asked = {q.question_id: q for q in questions}
     said = {p.question_id: p for p in predictions}
     graded = sorted(

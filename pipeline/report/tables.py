@@ -60,10 +60,7 @@ class Table:
     def build(self, scores: pd.DataFrame, effects: pd.DataFrame, published: pd.DataFrame) -> pd.DataFrame:
         """The table as it is shown: text in every cell, headings as column names; no row where nothing was measured.
 
-        Args:
-            scores: as `load_report` gives them.
-            effects: likewise.
-            published: likewise; joined by (task, measure, encoder, lora, opd), in columns of their own.
+        Frames are as `load_report` gives them. What is published is joined by `KEYS`, in columns of their own.
         """
         rows = self.select(scores, effects)
         records = rows.to_dict("records")

@@ -292,12 +292,7 @@ def scored(
     predicted: str | None,
     strict: bool | None = None,
 ) -> Score:
-    """The score of one measure.
-
-    Args:
-        predicted: None where nothing could be read.
-        strict: as `Score.strict`.
-    """
+    """The score of one measure; `predicted` is None where nothing could be read."""
     return Score(
         question_id=question.question_id,
         task=question.task,

@@ -75,7 +75,11 @@ def adopt(name: str, source: Path, to: Path | None = None, *, trust_pickle: bool
     if not source.is_dir():
         raise UserError(f"{source} is no folder; `hf download {repository} --local-dir {source}` makes it")
     clip = known in PUBLISHED_VISION
-    if to is None and (_clip_is_ready(source) if clip else _language_is_ready(source)):
+    if clip:
+        ready = (source / CLIP_CONFIG).is_file() and clip_file(source).is_file()
+    else:
+        ready = (source / TOKENIZER).is_file() and _has(source, LLM_WEIGHTS)
+    if to is None and ready:
         check_clip(source, known, name) if clip else check_vicuna(source, known, name)
         write_sums(source)
         return source
@@ -88,12 +92,9 @@ def adopt(name: str, source: Path, to: Path | None = None, *, trust_pickle: bool
 
 def write_sums(folder: Path) -> None:
     """List the SHA-256 of a folder's files in it, as `sha256sum --check` reads it; hidden files are left out."""
-    files = {f.relative_to(folder): f for f in sorted(folder.rglob("*")) if f.is_file()}
-    lines = []
-    for name, file in files.items():
-        if name.as_posix() != SUMS and not any(part.startswith(".") for part in name.parts):
-            lines.append(f"{sha256(file)}  {name.as_posix()}\n")
-    write_text(folder / SUMS, "".join(lines))
+    names = [f.relative_to(folder) for f in sorted(folder.rglob("*")) if f.is_file()]
+    shown = [n for n in names if n.as_posix() != SUMS and not any(part.startswith(".") for part in n.parts)]
+    write_text(folder / SUMS, "".join(f"{sha256(folder / n)}  {n.as_posix()}\n" for n in shown))
 
 
 # ---- language models ----
@@ -301,14 +302,6 @@ def copy_beside(source: Path, target: Path, leave: tuple[str, ...] = ()) -> None
 
 def _has(folder: Path, name: str) -> bool:
     return (folder / name).is_file() or (folder / f"{name}.index.json").is_file()
-
-
-def _language_is_ready(folder: Path) -> bool:
-    return (folder / TOKENIZER).is_file() and _has(folder, LLM_WEIGHTS)
-
-
-def _clip_is_ready(folder: Path) -> bool:
-    return (folder / CLIP_CONFIG).is_file() and clip_file(folder).is_file()
 
 
 def _pickles(folder: Path, names: tuple[str, ...], key: str) -> list[Path]:

@@ -34,9 +34,7 @@ TREES = 200
 class PropertyPredictor:
     """Predicts every property's class from a video's features.
 
-    Args:
-        classes: How many classes each property has.
-        seed: Equal seeds, features and labels give equal predictions, on any number of cores.
+    Equal seeds, features and labels give equal predictions, on any number of cores.
     """
 
     def __init__(self, classes: Sequence[int], *, seed: int = 0) -> None:
@@ -113,9 +111,6 @@ def decode_jointly(evidence: Sequence[Probabilities], dependence: Probabilities)
     Args:
         evidence: Log probabilities, videos x classes for each property.
         dependence: From `log_dependence`.
-
-    Returns:
-        Videos x properties.
     """
     combinations = np.array(list(itertools.product(*map(range, dependence.shape))), dtype=np.int64)
     scores = np.broadcast_to(dependence.ravel(), (len(evidence[0]), dependence.size)).copy()

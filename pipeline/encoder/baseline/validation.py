@@ -34,14 +34,7 @@ Predict = Callable[[Fold], Labels]
 
 
 def forest(features: Features, labels: Labels, objects: Sequence[str], classes: Sequence[int]) -> Predict:
-    """Predict by the baseline predictor, grown anew in each fold.
-
-    Args:
-        features: Videos x features, finite.
-        labels: Videos x properties, equal for all videos of an object.
-        objects: Each video's object.
-        classes: How many classes each property has.
-    """
+    """Predict by the baseline predictor, grown anew in each fold; all videos of an object have the same labels."""
 
     def predict(fold: Fold) -> Labels:
         model = PropertyPredictor(classes, seed=derive_seed(0, "trees", fold.repeat, fold.number))
@@ -56,21 +49,14 @@ def cross_validate(
     objects: Sequence[str],
     classes: Sequence[int],
     *,
-    folds: int = 5,
-    repeats: int = 3,
+    folds: int,
+    repeats: int,
     seed: int = 0,
 ) -> Labels:
     """Predict every video once a repeat, by a model that saw no video of its object.
 
-    Folds depend only on the objects' names and the seed: settings compared with one seed share them.
-
-    Args:
-        predict: Called once a fold.
-        objects: Each video's object; at least as many different ones as folds.
-        classes: How many classes each property has.
-        folds: Groups of objects, each predicted from all others.
-        repeats: How often the folds are dealt anew.
-        seed: Of the folds.
+    Folds depend only on the objects' names and the seed: settings compared with one seed share them. Each repeat deals
+    them anew; there must be as many objects as folds.
 
     Returns:
         Predicted classes, videos x repeats x properties, in the order of `objects`.

@@ -89,18 +89,12 @@ def examine(
     batch_size: int,
     tokens: int = TOKENS,
 ) -> list[Described]:
-    """Ask a loaded language model everything, greedily; one score a task.
-
-    Args:
-        model: What it is called in the table.
-        tokens: Of the longest answer.
-    """
+    """Ask a loaded language model everything, greedily; one score a task. The table calls it `model`."""
     said: dict[GateQuestion, str] = {}
     by_length = sorted(questions, key=lambda q: (q.task == "POM", len(q.text)))
     for start in track(range(0, len(by_length), batch_size), f"gate of the {model} model", "batch"):
         batch = by_length[start : start + batch_size]
-        for question, text in zip(batch, _answers(llm, tokenizer, batch, system_prompt, tokens), strict=True):
-            said[question] = text
+        said |= zip(batch, _answers(llm, tokenizer, batch, system_prompt, tokens), strict=True)
     scores = []
     for task in dict.fromkeys(q.task for q in questions):
         read = [(q.right, q.read(said[q])) for q in questions if q.task == task]

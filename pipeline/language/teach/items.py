@@ -16,9 +16,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict
 
-from pipeline.records import Turn
+from pipeline.records import Record, Turn
 
 OURS = ("hardness", "roughness", "bumpiness")
 """Properties that the catalogue of PhysiCLeAR rates too. Items in one wording are about them, as are half of others."""
@@ -63,13 +62,7 @@ Place = Literal["behind", "ahead", "told", "earlier"]
 the tasks' answers do; in a second turn, when the descriptions are the first turn's answer."""
 
 
-class Strict(BaseModel):
-    """Unknown keys are errors."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class Topic(Strict):
+class Topic(Record):
     """One property and its words."""
 
     levels: tuple[tuple[str, ...], ...]
@@ -81,7 +74,7 @@ class Topic(Strict):
     verb: Literal["is", "has"] = "is"
 
 
-class Words(Strict):
+class Words(Record):
     """Everything in words.yaml."""
 
     properties: dict[str, Topic]
@@ -119,7 +112,7 @@ def held_out(levels: Sequence[int]) -> bool:
     """Whether this combination of classes is never taught: every third one, each class of each property among them.
 
     Args:
-        levels: The class of each property, counted from 0, in the order of the catalogue.
+        levels: The class of each property, in the order of the catalogue.
     """
     return sum((1 + i % 2) * level for i, level in enumerate(levels)) % 3 == 0
 
