@@ -32,11 +32,7 @@ def write_card(
     """Write README.md with the front matter of Hugging Face's model cards.
 
     Args:
-        folder: Of the trained model.
-        title: What it is, in one line.
         bases: Folder or file of the weights of each model that it was made from, by its part.
-        data: What it was trained on.
-        settings: Hyper-parameters by name.
         limits: What it cannot do, a sentence each.
         front: What else the front matter says.
         tables: Further tables by their heading, a mapping a row.

@@ -28,7 +28,6 @@ from pipeline.weights import BACKBONES
 
 if TYPE_CHECKING:
     from pipeline.encoder.clips import EncoderData
-    from pipeline.encoder.frame_classifier import Clips
     from pipeline.encoder.model import FrameEncoder
 
 VALIDATION = 8
@@ -158,11 +157,14 @@ def _trees(_: Candidate, data: CrossValidationData) -> Predict:
 def _frame_heads(candidate: Candidate, data: CrossValidationData) -> Predict:
     """Features come from an encoder that has seen no label, so they are computed once for all folds."""
     from pipeline.encoder import frame_classifier
+    from pipeline.encoder.clips import EncoderData, describe_clips
 
     limit_threads(data.runtime.threads)
     labels, owners = data.labels, np.array(data.objects)
-    encoder = frozen_encoder(candidate, data)
-    clips = _features(encoder, candidate, data, data.store(candidate))
+    frames = candidate.frames or data.per_video
+    shown = EncoderData(data.store(candidate), data.catalogue, data.assignments({}), frames)
+    encoder, device = frozen_encoder(candidate, data), resolve_device(data.runtime.device)
+    clips = describe_clips(encoder, shown, shown.videos(Part.UNUSED), data.encoder.embed_batch_size, device)
 
     def predict(fold: Fold) -> Labels:
         training = (clips[fold.trained], labels[fold.trained], owners[fold.trained].tolist(), data.classes)
@@ -180,14 +182,6 @@ def frozen_encoder(candidate: Candidate, data: CrossValidationData) -> FrameEnco
 
     backbone = candidate.backbone or data.encoder.backbone
     return SideBySide(load_backbones(data.encoder.model_copy(update={"backbone": backbone})))
-
-
-def _features(encoder: FrameEncoder, candidate: Candidate, data: CrossValidationData, store: FrameStore) -> Clips:
-    from pipeline.encoder.clips import EncoderData, describe_clips
-
-    clips = EncoderData(store, data.catalogue, data.assignments({}), candidate.frames or data.per_video)
-    device = resolve_device(data.runtime.device)
-    return describe_clips(encoder, clips, clips.videos(Part.UNUSED), data.encoder.embed_batch_size, device)
 
 
 def _gradient(candidate: Candidate, data: CrossValidationData) -> Predict:

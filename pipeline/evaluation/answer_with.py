@@ -92,15 +92,12 @@ def ask_all(params: Params, endpoint: Endpoint, shown: Shown, folder: Path, limi
     """Ask what is not in the cache yet, and write what is answered by now to `external/<report>/<model>-<shown>/`.
 
     Each reply is in the cache before the next request leaves, so a killed run goes on where it was. The chain must
-    have run up to its questions (and frames, where they are shown).
+    have run up to its questions (and frames, where they are shown). The text says in a line what was done.
 
     Args:
         params: Whose questions, seeds and frames.
         folder: Of the kept frames, or of the photos: for each object `<object>.jpg` or a folder `<object>/`.
         limit: Most requests of this call, not counting what the client sends again; None: no limit.
-
-    Returns:
-        What was done, in a line.
 
     Raises:
         UserError: where an input is missing, or the endpoint fails (what it said before is kept and written).
@@ -370,7 +367,11 @@ def _frames(folder: Path, most: int) -> Show:
 
 def _photos(folder: Path, objects: Sequence[str], most: int) -> Show:
     """Photos of an object, upright and without what a camera notes beside them (such as the place)."""
-    found = {o: _inside(folder, o) for o in objects}
+    found: dict[str, list[Path]] = {}
+    for name in objects:
+        # Those named after it, and those in the folder of its name.
+        files = chain(folder.glob(f"{name}.*"), (folder / name).glob("[!.]*"))
+        found[name] = sorted(f for f in files if f.suffix.lower() in PHOTO_SUFFIXES)
     if missing := [o for o, files in found.items() if not files]:
         name, kinds = missing[0], ", ".join(PHOTO_SUFFIXES)
         others = f" (nor of {len(missing) - 1} others)" if missing[1:] else ""
@@ -382,12 +383,6 @@ def _photos(folder: Path, objects: Sequence[str], most: int) -> Show:
         return [_url(_read_photo(files[i]), "jpg") for i in sorted(set(sample_evaluation(len(files), most)))]
 
     return lambda video_id, object_id: of_object(object_id)
-
-
-def _inside(folder: Path, object_id: str) -> list[Path]:
-    """The files of an object: those named after it, and those in the folder of its name."""
-    files = chain(folder.glob(f"{object_id}.*"), (folder / object_id).glob("[!.]*"))
-    return sorted(f for f in files if f.suffix.lower() in PHOTO_SUFFIXES)
 
 
 def _read_photo(file: Path) -> Picture:

@@ -139,7 +139,6 @@ def accuracy_interval(values: Values, objects: Sequence[Objects]) -> Interval | 
 
     Args:
         values: How right each question was answered, from 0 to 1; with several seeds, the mean over them.
-        objects: Each question's.
 
     Returns:
         None without questions, or where they cannot show that objects differ: fewer than two objects, or each question

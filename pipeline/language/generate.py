@@ -135,7 +135,6 @@ def reply(
     Args:
         prompts: Of `write_prompt`, each shorter than the language model has positions.
         features: Of each prompt's frames in reading order: frames x tactile_dim.
-        label: What progress is called.
         source: Of the model, for the workers of a cluster.
     """
     # Neighbours of like length share a batch, so little is spent on padding.

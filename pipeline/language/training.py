@@ -75,20 +75,18 @@ class Material:
     def load(cls, folder: Path, params: Params, encoder: Encoder, opd: Opd, seed: int) -> Self:
         """Read the questions and one encoder's embeddings from the chain's data folder."""
         dtype = name_dtype(params.language.dtype, params.runtime.device)
-        files = (
-            folder / "questions" / str(seed) / "train.jsonl",
-            folder / "embeddings" / f"{encoder}-{seed}" / TENSOR_FILE,
-        )
+        asked = folder / "questions" / str(seed) / "train.jsonl"
+        embedded = folder / "embeddings" / f"{encoder}-{seed}"
         return cls(
-            questions=read_jsonl(files[0], Question),
-            store=EmbeddingStore(files[1].parent),
+            questions=read_jsonl(asked, Question),
+            store=EmbeddingStore(embedded),
             opd=opd,
             language=params.language.model_copy(update={"dtype": dtype}),
             per_video=params.frames.per_video,
             flip_probability=params.encoder.flip_probability,
             seed=params.seed + seed,
             source=params.data.source,
-            files=files,
+            files=(asked, embedded / TENSOR_FILE),
         )
 
     def fingerprint(self, config: TrainConfig, *inputs: Path) -> str:

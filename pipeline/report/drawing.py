@@ -30,7 +30,6 @@ def draw_table(frame: pd.DataFrame, caption: str, file: str, at_lines: bool = Tr
 
     Args:
         frame: text in every cell; rows of one task, measure or severity are brought together.
-        caption: what the table is called.
         file: the CSV that it comes from.
         at_lines: whether the frame's index is that of the CSV, so that each row can name its line.
     """

@@ -5,7 +5,7 @@ Drawn without pyplot (no global state, no window) and saved without dates, so th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -41,20 +41,20 @@ def draw_figures(
     Returns:
         The names of the files, in reading order.
     """
-    wanted: list[tuple[str, pd.DataFrame, Callable[[], Figure]]] = [
-        ("effects.png", effects, lambda: draw_effects(effects)),
-        ("confusion.png", confusion, lambda: draw_confusion(confusion, properties)),
-        ("curves.png", curves[curves["name"] == "loss"], lambda: draw_curves(curves)),
-    ]
+    drawn: dict[str, Figure] = {}
+    if len(effects):
+        drawn["effects.png"] = draw_effects(effects)
+    if len(confusion):
+        drawn["confusion.png"] = draw_confusion(confusion, properties)
+    if (curves["name"] == "loss").any():
+        drawn["curves.png"] = draw_curves(curves)
     folder.mkdir(parents=True, exist_ok=True)
-    drawn = [name for name, rows, _ in wanted if len(rows)]
     for old in folder.glob("*.png"):
         if old.name not in drawn:
             old.unlink()
-    for name, rows, draw in wanted:
-        if len(rows):
-            save(draw(), folder / name)
-    return drawn
+    for name, figure in drawn.items():
+        save(figure, folder / name)
+    return list(drawn)
 
 
 def draw_effects(effects: pd.DataFrame) -> Figure:

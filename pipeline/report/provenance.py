@@ -165,7 +165,7 @@ def taught_words(base: str) -> dict[str, Any]:
 
 
 def settings_note(report: str, split: str) -> str:
-    """What people wrote in notes.yaml about a report's test objects under a split, or else about the split; or nothing."""
+    """What people wrote in notes.yaml about a report's test objects under a split, or else about the split, if any."""
     notes: dict[str, str] = yaml.safe_load(NOTES.read_text(encoding="utf-8")) or {}
     return notes.get(f"{report}/{split}", notes.get(split, ""))
 

@@ -12,14 +12,7 @@ from typing import Any
 import pandas as pd
 
 from pipeline.records import ALL_SEEDS, CROSS_VALIDATION, DESCRIBED, HEADS, VALIDATION_HEADS
-from pipeline.report.load import (
-    DATASET,
-    KEYS,
-    Report,
-    cells,
-    published,
-    published_datasets,
-)
+from pipeline.report.load import DATASET, KEYS, Report, cells, published, published_datasets
 from pipeline.tasks import TASKS
 
 Select = Callable[[pd.DataFrame], "pd.Series[bool]"]

@@ -109,15 +109,13 @@ class PropertyObjectMatching(TaskDefinition):
     def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str:
         """The matching whose classes are off by the fewest steps; of those, the one whose mean classes are nearest."""
 
-        def distance(objects: Sequence[str]) -> tuple[float, float]:
+        def distance(objects: Sequence[str]) -> tuple[float, ...]:
             pairs = [
                 (said, label)
                 for video, o in zip(classes, objects, strict=True)
                 for said, label in zip(video, catalogue.labels(o), strict=True)
             ]
-            return sum(abs(level - label) for (level, _), label in pairs), sum(
-                abs(mean - label) for (_, mean), label in pairs
-            )
+            return tuple(sum(abs(said[i] - label) for said, label in pairs) for i in (0, 1))
 
         return verdict(catalogue, min(itertools.permutations(sorted(question.objects)), key=distance))
 

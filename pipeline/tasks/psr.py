@@ -90,11 +90,9 @@ class PropertyScenarioReasoning(TaskDefinition):
         if scenario is None:
             return None
 
-        def distance(video: Sequence[tuple[int, float]]) -> tuple[float, float]:
-            wanted = [(video[catalogue.property_index(name)], levels) for name, levels in scenario.target.items()]
-            return sum(min(abs(level - x) for x in levels) for (level, _), levels in wanted), sum(
-                min(abs(mean - x) for x in levels) for (_, mean), levels in wanted
-            )
+        def distance(video: Sequence[tuple[int, float]]) -> tuple[float, ...]:
+            pairs = [(video[catalogue.property_index(name)], levels) for name, levels in scenario.target.items()]
+            return tuple(sum(min(abs(said[i] - x) for x in levels) for said, levels in pairs) for i in (0, 1))
 
         return f"The most suitable object is {LETTERS[min((0, 1), key=lambda i: distance(classes[i]))]})."
 

@@ -60,7 +60,6 @@ def adopt(name: str, source: Path, to: Path | None = None, *, trust_pickle: bool
 
     Args:
         name: In `DOWNLOADED`.
-        source: Where it was downloaded to.
         to: Where it goes; without it, it stays where nothing is to be converted, and else goes to weights/.
         trust_pickle: Whether pickles may be read, for their tensors alone.
 

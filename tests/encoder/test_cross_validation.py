@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from pipeline.config import CrossValidationConfig, EncoderConfig, RuntimeConfig
+from pipeline.encoder import clips as clips_module
 from pipeline.encoder import cross_validation as module
 from pipeline.encoder import finetune, frame_classifier, tuned
 from pipeline.encoder.baseline.features import video_features
@@ -20,7 +21,7 @@ from pipeline.encoder.baseline.predictor import PropertyPredictor
 from pipeline.encoder.baseline.recordings import Recording, describe, recording_features
 from pipeline.encoder.baseline.validation import Fold, Predict, cross_validate, deal
 from pipeline.encoder.candidates import CANDIDATES, Candidate, check_candidates
-from pipeline.encoder.clips import EncoderData
+from pipeline.encoder.clips import EncoderData, LabelledVideo
 from pipeline.encoder.cross_validation import CrossValidationData, cross_validate_candidate, frozen_encoder
 from pipeline.encoder.frame_classifier import Clips, FittedHeads, JointFrameClassifier, fit_frame_heads
 from pipeline.encoder.model import FrameEncoder, PropertyClassifier
@@ -270,11 +271,22 @@ def test_the_pretrained_network_is_loaded(data: CrossValidationData) -> None:
     assert all(torch.equal(v, loaded[n]) for n, v in pretrained.items())
 
 
-def test_as_many_frames_as_the_name_says(data: CrossValidationData) -> None:
-    for name, frames in {"": 2, "-one-frame": 1, "-ten-frames": 10}.items():
-        candidate = CANDIDATES[f"pretrained{name}"]
-        clips = module._features(Telling(), candidate, data, data.store(candidate))
-        assert clips.shape == (15, frames, 3)
+def test_as_many_frames_as_the_name_says(data: CrossValidationData, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "frozen_encoder", Telling)
+    shapes: list[tuple[int, ...]] = []
+    original = clips_module.describe_clips
+
+    def seen(
+        encoder: FrameEncoder, data: EncoderData, videos: Sequence[LabelledVideo], size: int, device: torch.device
+    ) -> Clips:
+        found = original(encoder, data, videos, size, device)
+        shapes.append(found.shape)
+        return found
+
+    monkeypatch.setattr(clips_module, "describe_clips", seen)
+    for name in ("", "-one-frame", "-ten-frames"):
+        module.KINDS["frame_heads"](CANDIDATES[f"pretrained{name}"], data)
+    assert shapes == [(15, frames, 3) for frames in (2, 1, 10)]
 
 
 # Kills

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import random
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -20,7 +20,7 @@ from pipeline.language.teach.items import held_out
 from pipeline.records import Described, Turn
 from pipeline.runtime import derive_seed, track
 from pipeline.videos.catalogue import Catalogue
-from pipeline.videos.catalogue.wording import Scenario, unmarked
+from pipeline.videos.catalogue.wording import unmarked
 
 LETTERS = "abc"
 TOKENS, MATCHING = 16, 40
@@ -176,8 +176,8 @@ def _pss(catalogue: Catalogue, rng: random.Random, number: int) -> GateQuestion 
 
 def _psr(catalogue: Catalogue, rng: random.Random, number: int) -> GateQuestion | None:
     scenario = rng.choice(catalogue.language.scenarios)
-    suited = [o for o in _objects(catalogue) if _fits(o, scenario, catalogue, suits=True)]
-    others = [o for o in _objects(catalogue) if _fits(o, scenario, catalogue, suits=False) and o not in suited]
+    suited = [o for o in _objects(catalogue) if _fits(o, scenario.target, catalogue)]
+    others = [o for o in _objects(catalogue) if _fits(o, scenario.other, catalogue) and o not in suited]
     if not suited or not others:
         return None
     objects = [rng.choice(suited), rng.choice(others)]
@@ -206,6 +206,5 @@ def _lettered(catalogue: Catalogue, objects: Sequence[tuple[int, ...]], rng: ran
     return " ".join(f"{x}) {_described(catalogue, o, rng)}" for x, o in zip(LETTERS, objects, strict=False))
 
 
-def _fits(labels: tuple[int, ...], scenario: Scenario, catalogue: Catalogue, *, suits: bool) -> bool:
-    wanted = scenario.target if suits else scenario.other
+def _fits(labels: tuple[int, ...], wanted: Mapping[str, tuple[int, ...]], catalogue: Catalogue) -> bool:
     return all(labels[catalogue.property_index(name)] in classes for name, classes in wanted.items())
