@@ -22,7 +22,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Self
 
 import av
 
@@ -98,12 +97,6 @@ class Gate:
         self._lock = threading.Lock()
         self._checker: subprocess.Popen[str] | None = None
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     @contextmanager
     def files(self, videos: Sequence[bytes]) -> Iterator[list[Path]]:
         """Checked videos as files, which are gone after the block.
@@ -174,6 +167,7 @@ def check(path: Path, limits: Limits) -> None:
     Raises:
         Refused: where it is too much, or no video.
     """
+    too_long = Refused(f"longer than {limits.frames} frames or {limits.seconds:g} s; cut it to the touch", 413)
     try:
         # FFmpeg decodes the first frames to know their form; it may not take memory for more than these pixels.
         with av.open(str(path), options={**CONTAINERS, "max_pixels": str(limits.pixels)}) as container:
@@ -183,7 +177,7 @@ def check(path: Path, limits: Limits) -> None:
             promised = max(stream.frames, len(stream.index_entries))
             seconds = float(stream.duration * stream.time_base) if stream.duration and stream.time_base else 0.0
             if promised > limits.frames or seconds > limits.seconds:
-                raise Refused(_too_long(limits), 413)
+                raise too_long
             if not 0 < stream.width * stream.height <= limits.pixels:
                 message = f"frames are damaged or have more than {limits.pixels} pixels; make them smaller"
                 raise Refused(message, 413)
@@ -195,14 +189,14 @@ def check(path: Path, limits: Limits) -> None:
             for count, packet in enumerate(container.demux(stream)):
                 # A last packet, which is empty, fetches what the decoder holds back.
                 if max(count, decoded) > limits.frames:
-                    raise Refused(_too_long(limits), 413)
+                    raise too_long
                 try:
                     for frame in packet.decode():
                         decoded += 1
                         if frame.width * frame.height > limits.pixels:
                             raise Refused(f"frames have more than {limits.pixels} pixels; make them smaller", 413)
                         if (frame.time or 0) > limits.seconds:
-                            raise Refused(_too_long(limits), 413)
+                            raise too_long
                 except MemoryError:
                     raise
                 except (av.FFmpegError, ValueError):
@@ -213,10 +207,6 @@ def check(path: Path, limits: Limits) -> None:
         raise Refused("takes too much memory to decode; send a shorter or smaller one", 413) from None
     except (av.FFmpegError, ValueError, IndexError):
         raise Refused(f"no video that can be read; send one of {', '.join(SUFFIXES)}") from None
-
-
-def _too_long(limits: Limits) -> str:
-    return f"longer than {limits.frames} frames or {limits.seconds:g} s; cut it to the touch"
 
 
 def main() -> None:

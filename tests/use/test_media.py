@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import av
@@ -29,7 +30,7 @@ FRAMES = FramesConfig(pixels=32)
 
 @pytest.fixture(scope="module")
 def gate() -> object:
-    with Gate(Limits(frames=200, seconds=5, pixels=500_000, check_seconds=int(HUNG))) as gate:
+    with closing(Gate(Limits(frames=200, seconds=5, pixels=500_000, check_seconds=int(HUNG)))) as gate:
         yield gate
 
 
@@ -110,9 +111,9 @@ def test_what_makes_ffmpeg_read_other_files_is_no_video_anywhere(gate: Gate, tmp
 
 
 def test_the_last_allowed_frame_and_one_more() -> None:
-    with Gate(Limits(frames=12)) as gate, gate.files([blank(12)]):
+    with closing(Gate(Limits(frames=12))) as gate, gate.files([blank(12)]):
         pass
-    with Gate(Limits(frames=11)) as gate, pytest.raises(Refused, match="11 frames"), gate.files([blank(12)]):
+    with closing(Gate(Limits(frames=11))) as gate, pytest.raises(Refused, match="11 frames"), gate.files([blank(12)]):
         pass
 
 
@@ -147,7 +148,7 @@ def test_a_checker_that_dies_is_replaced(gate: Gate) -> None:
 def test_time_is_limited(tmp_path: Path) -> None:
     """A pipe that nobody writes to takes for ever to open, as a decoder may take."""
     os.mkfifo(tmp_path / "endless.mov")
-    with Gate(Limits(check_seconds=1)) as gate:
+    with closing(Gate(Limits(check_seconds=1))) as gate:
         with pytest.raises(Refused, match="too long") as refused:
             gate._check(tmp_path / "endless.mov", "video 1")
         assert refused.value.status == 413
