@@ -42,17 +42,8 @@ BUMPS: tuple[Range, ...] = ((0.0, 0.0), (0.02, BIG_SHARE / 1.25), (BIG_SHARE * 1
 """Width of the bumps by bumpiness, as a share of the image's height: a quarter away from the border."""
 WIDTHS_MM: tuple[Range, ...] = ((0.0, math.inf), (0.7, 4.5), (3.0, math.inf))
 """Of the widest layer of relief, by bumpiness: outside nothing measures as such, so it need not be pressed."""
-ACROSS = {
-    "domes": "width",
-    "ridges": "width",
-    "plates": "size",
-    "weave": "spacing",
-    "strands": "width",
-    "grains": "width",
-    "creases": "spacing",
-    "digits": "stroke",
-}
-"""By kind of layer, what says how wide it is."""
+ACROSS = {"plates": "size", "weave": "spacing", "creases": "spacing", "digits": "stroke"}
+"""By kind of layer, what says how wide it is where that is not called `width`."""
 FORCES_N = (1.0, 3.0)
 """A patch is pressed with each; both must show the bumps of the class."""
 WIDTH, HEIGHT = 160, 120
@@ -136,7 +127,8 @@ def _measures(recipe: Recipe, roughness: int, bumpiness: int, force: float, rng:
 
 
 def _width(layer: AnyLayer) -> float:
-    size = getattr(layer, ACROSS[layer.kind]) if layer.kind in ACROSS else 0.0
+    """Of one of its features, in mm; 0 for roughness, which has none."""
+    size = getattr(layer, ACROSS.get(layer.kind, "width"), 0.0)
     return float(size[0] if isinstance(size, tuple) else size)
 
 

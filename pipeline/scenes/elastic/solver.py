@@ -146,7 +146,10 @@ class _Contacts:
         r = kernel.sink(self.t)
         under = np.sum(r * self.t, axis=(-2, -1), keepdims=True)
         length = np.sum(inside * self.t, axis=(-2, -1), keepdims=True) / np.where(under > 0, under, 1)
-        self.p = _to_mean_one(np.clip(self.p - length * self.t, 0, None))
+        p = np.clip(self.p - length * self.t, 0, None)
+        mean = np.mean(p, axis=(-2, -1), keepdims=True)
+        # Scaled to a mean of 1; even where nothing is left of it.
+        self.p = np.where(mean > 0, p / np.where(mean > 0, mean, 1), 1)
         self.g_old = np.where(squares == 0, np.inf, squares)
 
     def _mean(self, field: Array, where: npt.NDArray[np.bool_]) -> Array:
@@ -154,9 +157,3 @@ class _Contacts:
         count = np.sum(where, axis=(-2, -1), keepdims=True, dtype=field.dtype)
         mean: Array = np.sum(np.where(where, field, 0), axis=(-2, -1), keepdims=True) / count
         return mean
-
-
-def _to_mean_one(p: Array) -> Array:
-    """Scaled to a mean of 1; even where there is none."""
-    mean = np.mean(p, axis=(-2, -1), keepdims=True)
-    return np.where(mean > 0, p / np.where(mean > 0, mean, 1), 1)

@@ -71,15 +71,11 @@ def hang_skin(springs: Springs, modulus: float, pitch: float, gel: Gel) -> Heigh
     held = springs.overlap * np.float32(series(gel.modulus, modulus) / gel.modulus)
     if springs.approach == 0:
         return held
-    skin: Heights = np.maximum(held, np.float32(MEMBRANE_SHARE) * _blur(held, MEMBRANE * gel.thickness / pitch))
-    return skin
-
-
-def _blur(image: Heights, sigma: float) -> Heights:
-    """A wide Gaussian, taken on a coarser grid where it is much wider than a pixel."""
-    step = max(1, int(sigma / 2))
-    height, width = image.shape
-    coarse = cv2.resize(image, (max(1, width // step), max(1, height // step)), interpolation=cv2.INTER_AREA)
+    # The Gaussian is taken on a coarser grid where it is much wider than a pixel.
+    sigma = MEMBRANE * gel.thickness / pitch
+    step, (height, width) = max(1, int(sigma / 2)), held.shape
+    coarse = cv2.resize(held, (max(1, width // step), max(1, height // step)), interpolation=cv2.INTER_AREA)
     blurred = cv2.GaussianBlur(coarse, (0, 0), sigma / step, borderType=cv2.BORDER_REPLICATE)
-    fine: Heights = cv2.resize(blurred, (width, height), interpolation=cv2.INTER_LINEAR)
-    return fine
+    around = cv2.resize(blurred, (width, height), interpolation=cv2.INTER_LINEAR)
+    skin: Heights = np.maximum(held, np.float32(MEMBRANE_SHARE) * around)
+    return skin
