@@ -16,7 +16,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from functools import lru_cache, partial
+from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar
@@ -102,16 +102,12 @@ def run_with(
         for job in track(jobs, label, unit):
             yield work(model, job)
     else:
-        yield from run_parallel(partial(_with_loaded, source, work), jobs, label, unit, device=True)
+        yield from run_parallel(lambda job: work(_loaded(source), job), jobs, label, unit, device=True)
 
 
 def device_here(name: DeviceName) -> DeviceName:
     """Where this process computes: on a cluster the workers have the devices, and it keeps off theirs."""
     return name if _chosen == "processes" else "cpu"
-
-
-def _with_loaded(source: Callable[[], M], work: Callable[[M, J], R], job: J) -> R:
-    return work(_loaded(source), job)
 
 
 @lru_cache(maxsize=1)
@@ -173,8 +169,8 @@ def _on_ray(work: Callable[[J], R], jobs: Sequence[J], label: str, device: bool)
         raise UserError(f"runtime.parallel: ray has no cluster ({reason}); start it, or unset its address") from None
     # Ray hides GPUs from work that does not ask for them.
     gpus = 1 if device and ray.cluster_resources().get("GPU") else 0
-    there = partial(_there, os.getcwd(), work)
-    remote = ray.remote(num_gpus=gpus)(lambda job: there(job))
+    folder = os.getcwd()
+    remote = ray.remote(num_gpus=gpus)(lambda job: _there(folder, work, job))
     waiting = deque(remote.remote(job) for job in jobs)
     try:
         while waiting:
