@@ -13,7 +13,7 @@ language model, which is named by hash.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
@@ -129,18 +129,16 @@ def find_base(folder: Path, base: Base, given: Path | None = None) -> Path:
     Raises:
         UserError: where there is none, or it is another.
     """
-    places = [given] if given else list(_places(folder, Path(base.folder)))
-    there = [place for place in places if any(place.glob("*.safetensors"))]
-    for place in there:
-        if wrong := sorted(set(identify(place).items()) ^ set(base.files.items())):
-            found = UserError(
-                f"{place}: is another language model than {folder} was trained on ({wrong[0][0]} differs); name the "
-                f"folder of {base.folder} with --base"
-            )
-            if place == there[-1]:
-                raise found
-            continue
-        return place
+    named, other = Path(base.folder), None
+    above = (parent / named for parent in folder.resolve().parents)
+    places = [given] if given else [folder / BASE_DIR, named, *above, Path("weights") / named.name]
+    for place in places:
+        if any(place.glob("*.safetensors")):
+            if not (wrong := sorted(set(identify(place).items()) ^ set(base.files.items()))):
+                return place
+            other = f"{place}: is another language model than {folder} was trained on ({wrong[0][0]} differs)"
+    if other:
+        raise UserError(f"{other}; name the folder of {base.folder} with --base")
     looked = ", ".join(map(str, dict.fromkeys(places)))
     raise UserError(
         f"{folder}: its language model {base.folder} is not there (looked in {looked}); name its folder with --base, "
@@ -161,14 +159,6 @@ def distance(standardised: npt.NDArray[np.float64]) -> float:
         standardised: Its frames' embeddings, frames x dim, by the training frames' statistics.
     """
     return float(np.sqrt(np.square(standardised.mean(axis=0)).mean()))
-
-
-def _places(folder: Path, named: Path) -> Iterator[Path]:
-    yield folder / BASE_DIR
-    yield named
-    for above in folder.resolve().parents:
-        yield above / named
-    yield Path("weights") / named.name
 
 
 def _json(file: Path) -> Any:

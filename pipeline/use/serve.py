@@ -268,10 +268,8 @@ def make_app(
         counts[500] += 1  # It answers outside of `_Count`.
         return JSONResponse(error_body(str(Failed()), 500), 500)
 
-    app.add_exception_handler(AnyHTTPException, refuse)
-    app.add_exception_handler(UserError, refuse)
-    app.add_exception_handler(Failed, refuse)
-    app.add_exception_handler(ClientDisconnect, refuse)
+    for kind in (AnyHTTPException, UserError, Failed, ClientDisconnect):
+        app.add_exception_handler(kind, refuse)
     app.add_exception_handler(Exception, fail)
     app.add_middleware(_Count, counts=counts)
     return app
