@@ -158,7 +158,9 @@ def describe_folder(model: Octopi, folder: Path, out: Path) -> tuple[int, int]:
             log.warning("%s: %s", finding.item, finding.measured)
     if not files:
         raise UserError(f"{folder}: holds no video ({', '.join(SUFFIXES)}); name another folder")
-    columns = _columns(model)
+    levels = {p.name: p.levels for p in model.catalogue.properties}
+    probabilities = [f"{name}: {level}" for name, known in levels.items() for level in known]
+    columns = ["file", *levels, *probabilities, "sentence", "frames", "notes", "error", "model"]
     done = _done(out, columns, model.config.name)
     rest = [f for f in files if _named(f, folder) not in done]
     failed = sum(bool(error) for error in done.values())
@@ -173,12 +175,6 @@ def describe_folder(model: Octopi, folder: Path, out: Path) -> tuple[int, int]:
             for _ in rows:
                 advance()
     return len(done) + len(rest), failed
-
-
-def _columns(model: Octopi) -> list[str]:
-    levels = {p.name: p.levels for p in model.catalogue.properties}
-    probabilities = [f"{name}: {level}" for name, known in levels.items() for level in known]
-    return ["file", *levels, *probabilities, "sentence", "frames", "notes", "error", "model"]
 
 
 def _done(out: Path, columns: Sequence[str], name: str) -> dict[str, str]:

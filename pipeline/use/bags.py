@@ -149,11 +149,7 @@ def presses(strengths: npt.NDArray[np.float64], times: float = FOUND) -> list[tu
 
 
 def shots(bag: Path, topic: str) -> Iterator[Shot]:
-    """The pictures of a topic, in the order in which they were received.
-
-    Raises:
-        UserError: if the bag, the topic or a message cannot be read.
-    """
+    """The pictures of a topic, in the order in which they were received; UserError where one cannot be read."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore

@@ -105,11 +105,7 @@ class Room:
         return file
 
     def show(self, name: str, video: Path) -> dict[str, Any]:
-        """Let the model feel a video; everything about it that the page draws.
-
-        Raises:
-            UserError: if it is no video that the model can take.
-        """
+        """Let the model feel a video, which is a UserError where it cannot; everything about it that the page draws."""
         touch, said = self.model.look(video), self.model.describe(video, sentence=False)
         key = uuid4().hex
         self.videos[key] = video

@@ -162,11 +162,7 @@ class Gate:
 
 
 def check(path: Path, limits: Limits) -> None:
-    """Read a video's header, then decode it whole; stop at the first limit.
-
-    Raises:
-        Refused: where it is too much, or no video.
-    """
+    """Read a video's header, then decode it whole; it is Refused at the first limit, or where it is no video."""
     too_long = Refused(f"longer than {limits.frames} frames or {limits.seconds:g} s; cut it to the touch", 413)
     try:
         # FFmpeg decodes the first frames to know their form; it may not take memory for more than these pixels.

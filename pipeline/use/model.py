@@ -135,11 +135,7 @@ class Octopi:
         return self._reply(prompts, max_new_tokens)
 
     def look(self, video: Video) -> Touch:
-        """What the model sees of a video.
-
-        Raises:
-            UserError: for what is no video, or is too short.
-        """
+        """What the model sees of a video; UserError for what is no video, or is too short."""
         felt = self.sense.feel(video)
         return felt.seen.touch.model_copy(update={"notes": felt.notes})
 

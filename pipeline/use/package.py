@@ -73,7 +73,12 @@ def package(data: Path, params: Params, variant: Variant, base: Base, out: Path)
     }
     scores = _scores(Path("reports") / params.report_name / "scores.csv", params, variant)
     with atomic_folder(out) as folder:
-        _copy_encoder(folder / ENCODER_DIR, params, data / "encoder" / str(variant.seed))
+        _copy(data / "encoder" / str(variant.seed) / TRAINED, folder / ENCODER_DIR / TRAINED)
+        files, card = backbone_files(params.encoder), Path(params.encoder.weights) / CARD_FILE
+        if card.is_file() and any(file.parent == card.parent for file in files):
+            files.append(card)
+        for file in files:
+            _copy(file, folder / ENCODER_DIR / (SCENES if file == PRETRAINED else f"{BACKBONE_DIR}/{file.name}"))
         _copy(embeddings / STATISTICS_FILE, folder / ENCODER_DIR / STATISTICS_FILE)
         trained = data / "models" / variant.lora / f"{variant.encoder}-{variant.opd}-{variant.seed}"
         for file in (trained / CONFIG_FILE, *sorted(trained.glob("*.safetensors"))):
@@ -168,15 +173,6 @@ def _usual(embeddings: Path, split: Path, params: Params) -> float:
 def _copy(source: Path, to: Path) -> None:
     to.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(source, to)
-
-
-def _copy_encoder(folder: Path, params: Params, trained: Path) -> None:
-    _copy(trained / TRAINED, folder / TRAINED)
-    files, card = backbone_files(params.encoder), Path(params.encoder.weights) / CARD_FILE
-    if card.is_file() and any(file.parent == card.parent for file in files):
-        files.append(card)
-    for file in files:
-        _copy(file, folder / SCENES if file == PRETRAINED else folder / BACKBONE_DIR / file.name)
 
 
 def _write_card(

@@ -91,11 +91,7 @@ class ChatRequest(BaseModel):
 
 
 def read_request(body: bytes) -> ChatRequest:
-    """Read a body.
-
-    Raises:
-        Refused: where it has not the form; the line names the first place.
-    """
+    """Read a body; where it has not the form, it is Refused with the first place that is wrong."""
     try:
         return ChatRequest.model_validate_json(body)
     except ValidationError as error:

@@ -61,11 +61,7 @@ def make_server(app: FastAPI) -> uvicorn.Server:
 
 
 def listen(host: str, port: int, token: str) -> socket.socket:
-    """A socket for the server.
-
-    Raises:
-        UserError: where others could reach it and there is no token, or where the address cannot be had.
-    """
+    """A socket for the server; UserError where others could reach it without a token, or it cannot have the address."""
     with suppress(ValueError):
         if token or host == "localhost" or ipaddress.ip_address(host).is_loopback:
             token = token or "none needed"

@@ -56,11 +56,7 @@ class Judgement(NamedTuple):
 
 
 class TactileSense:
-    """The tactile encoder and heads of a folder, with what embeddings are standardised by.
-
-    Raises:
-        UserError: where the folder's frame settings are not those of training.
-    """
+    """The tactile encoder and heads of a folder, with what embeddings are standardised by."""
 
     def __init__(self, folder: Path, config: ModelConfig, catalogue: Catalogue, device: torch.device) -> None:
         self.place, self.config, self.catalogue, self.device = folder / ENCODER_DIR, config, catalogue, device
@@ -73,11 +69,7 @@ class TactileSense:
 
     @torch.inference_mode()
     def feel(self, video: Video) -> Felt:
-        """A video's frames and their embeddings.
-
-        Raises:
-            UserError: for what is no video, is damaged as a whole or too short.
-        """
+        """A video's frames and their embeddings; UserError for what is no video, is damaged as a whole or too short."""
         name, config = _name(video), self.config
         if name not in self._felt:
             seen = see(video, config.frames, subtracts=config.encoder.reference == "subtract", quiet=config.quiet)

@@ -35,11 +35,6 @@ class Metrics:
     """That the model took for them all."""
     videos: int = 0
 
-    def answered(self, seconds: float) -> None:
-        """Count an answer that took the model so long."""
-        self.answers += 1
-        self.seconds += seconds
-
     @property
     def mean(self) -> float:
         """Seconds an answer; 1 before the first."""
@@ -114,7 +109,8 @@ class Worker:
                     if job.left.is_set():
                         break
                 else:
-                    self.metrics.answered(time.monotonic() - started)
+                    self.metrics.answers += 1
+                    self.metrics.seconds += time.monotonic() - started
             except UserError as error:
                 end = error
             except Exception:
