@@ -90,16 +90,10 @@ def recipe_of(object_id: str, catalogue: Catalogue, seed: int) -> Recipe:
     across, along = RADII_MM[_body(catalogue.objects[object_id], rng)]
     width = max(rng.uniform(*BUMP_SHARE[levels["bumpiness"]]) * IMAGE_MM[1], 0.01)
     height, spacing = width * rng.uniform(*BUMP_STEEPNESS), width * rng.uniform(1.15, 1.7)
-    bumps: AnyLayer = (
-        Domes(kind="domes", height=height, width=width, spacing=spacing)
-        if rng.random() < 0.5
-        else Ridges(kind="ridges", height=height, width=width, spacing=spacing)
-    )
-    rough = Rough(
-        kind="rough",
-        rms=_log_uniform(rng, ROUGH_RMS_MM[levels["roughness"]]),
-        longest=rng.uniform(*ROUGH_LONGEST_MM),
-    )
+    size = {"height": height, "width": width, "spacing": spacing}
+    bumps: AnyLayer = Domes(kind="domes", **size) if rng.random() < 0.5 else Ridges(kind="ridges", **size)
+    rms = _log_uniform(rng, ROUGH_RMS_MM[levels["roughness"]])
+    rough = Rough(kind="rough", rms=rms, longest=rng.uniform(*ROUGH_LONGEST_MM))
     return Recipe(
         modulus=_log_uniform(rng, MODULUS_MPA[levels["hardness"]]),
         body=Round(kind="round", radii=(_log_uniform(rng, across), _log_uniform(rng, along))),

@@ -20,9 +20,6 @@ from pipeline.scenes.measure import Measured, measure
 from pipeline.scenes.motion import REACH_MM, Motion, make_motion
 from pipeline.scenes.recipe import Recipe
 
-MARGIN_MM = REACH_MM
-"""How far a patch reaches beyond the view at every angle."""
-
 
 @dataclass(frozen=True)
 class Scene:
@@ -41,8 +38,9 @@ def make_scene(recipe: Recipe, config: ScenesConfig, frames: int, seed: int) -> 
     rng = np.random.default_rng(seed)
     pitch = IMAGE_MM[0] / config.width
     motion = make_motion(frames, rng, twist=recipe.twist)
-    # An odd side has a pixel in the middle, which is what turns.
-    side = int(np.hypot(config.width, config.height) + 2 * MARGIN_MM / pitch) | 1
+    # A patch reaches beyond the view at every angle and wherever the hand moves. An odd side has a pixel in the middle,
+    # which is what turns.
+    side = int(np.hypot(config.width, config.height) + 2 * REACH_MM / pitch) | 1
     patch = heights(recipe.body, recipe.relief, side, pitch, rng)
     needed = math.ceil(2 * side * pitch / GEL.thickness)
     most = {"layer": config.cells, "auto": LADDER[-1].cells}.get(config.tier, side)

@@ -89,14 +89,11 @@ MEASURED = ("hardness", "roughness", "bumpiness")
 def share_as_labelled(rows: Sequence[SceneRow], catalogue: Catalogue) -> float:
     """The share of the videos whose scene measures in all classes as the catalogue labels its object."""
 
-    def measured(row: SceneRow) -> tuple[int, ...]:
-        own = catalogue.labels(row.object_id)
-        return tuple(
-            getattr(row, p.name) if p.name in MEASURED else label
-            for p, label in zip(catalogue.properties, own, strict=True)
-        )
+    def fits(row: SceneRow) -> bool:
+        labels = zip(catalogue.property_names, catalogue.labels(row.object_id), strict=True)
+        return all(getattr(row, name) == label for name, label in labels if name in MEASURED)
 
-    return round(fmean(measured(row) == catalogue.labels(row.object_id) for row in rows), 4)
+    return round(fmean(map(fits, rows)), 4)
 
 
 @dataclass(frozen=True)

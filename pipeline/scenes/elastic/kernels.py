@@ -168,9 +168,5 @@ def half_space_table(shape: tuple[int, int], pitch: float, modulus: float) -> Ta
 
 
 def layer_table(shape: tuple[int, int], pitch: float, gel: Gel) -> Table:
-    """The influence table of a bonded layer, rows x columns.
-
-    Raises:
-        ValueError: if the gel is thinner than two pixels.
-    """
+    """The influence table of a bonded layer, rows x columns; ValueError as `layer_correction`."""
     return half_space_table(shape, pitch, gel.modulus) + layer_correction(shape, pitch, gel)
