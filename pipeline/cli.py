@@ -5,8 +5,9 @@ from __future__ import annotations
 import io
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args
 
 import typer
 from typer.core import TyperGroup
@@ -270,9 +271,7 @@ def ask(
         raise UserError("--json takes a question")
     asked = _load(model, base, device)
 
-    def say(text: str) -> None:
-        typer.echo(text, nl=False)
-
+    say = partial(typer.echo, nl=False)
     if not question:
         Chat(asked, say).run(lines_of_terminal())
     elif json:
@@ -346,8 +345,6 @@ def demo(
 
 
 def _load(folder: Path | None, base: Path | None, device: str) -> Octopi:
-    from typing import cast, get_args
-
     from pipeline.runtime import DeviceName, quiet_libraries
     from pipeline.use.ask import default_model
 
@@ -367,13 +364,10 @@ def main() -> None:
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
         app()
-    except UserError as error:
-        typer.echo(f"octopi: {error}", err=True)
-        raise SystemExit(1) from None
     except Exception as error:
         from pipeline.stage import disk_error
 
-        if (refused := disk_error(error)) is None:
+        if (line := str(error) if isinstance(error, UserError) else disk_error(error)) is None:
             raise
-        typer.echo(f"octopi: {refused}", err=True)
+        typer.echo(f"octopi: {line}", err=True)
         raise SystemExit(1) from None

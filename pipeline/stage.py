@@ -190,8 +190,7 @@ def running_stages() -> list[str]:
 def alone(name: str) -> Iterator[None]:
     """One process a stage: a killed `dvc` leaves its stage running, and the next must not write beside it.
 
-    Raises:
-        UserError: where another process is in it; the caller puts the name before it.
+    The UserError where another process is in it lacks the stage's name, which the caller puts before it.
     """
     if not _main_process():
         yield

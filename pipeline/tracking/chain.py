@@ -49,8 +49,7 @@ class ChainStage:
 def read_stages(params: Params) -> list[ChainStage]:
     """The stages of dvc.yaml, in its order and without `publish`, as dvc.lock and runs/ know them.
 
-    Raises:
-        UserError: where one of the two files is missing, or no YAML of DVC's.
+    Either file is a UserError where it is missing, or no YAML of DVC's.
     """
     chain, entries = map(_stages_in, (CHAIN, CHAIN_LOCK))
     chain.pop("publish", None)

@@ -1,7 +1,4 @@
-"""Trainings are logged while they run: curves by transformers' MLflowCallback, and the machine's load.
-
-MLflow is imported inside functions only: that costs seconds.
-"""
+"""Trainings are logged while they run. MLflow is imported inside functions only: that costs seconds."""
 
 from __future__ import annotations
 

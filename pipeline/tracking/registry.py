@@ -14,12 +14,12 @@ from typing import Any
 from pipeline.card import front_matter
 from pipeline.config import Params
 from pipeline.io import read_table
+from pipeline.params import PACKAGE
 from pipeline.records import Classification, Part, Variant, Video
 from pipeline.stage import DATA
 
 MODELS = Path("models")
 NAME, ALIAS = "octopi", "best"
-PACKAGE = Path(__file__).parents[1]
 NEEDED = (
     *("accelerate", "av", "filelock", "mlflow", "numpy", "open_clip_torch", "opencv-contrib-python-headless"),
     *("pandas", "peft", "psutil", "pyarrow", "pydantic", "pyyaml", "safetensors", "scipy", "scikit-learn"),
@@ -33,12 +33,6 @@ def packaged(variant: Variant) -> Path | None:
     """The folder of a variant, or None where none was made."""
     folder = MODELS / variant.key
     return folder if (folder / "config.json").is_file() else None
-
-
-def requirements() -> list[str]:
-    """The distributions that answering needs, at the versions of this environment."""
-    # A build's own mark, as in 2.6.0+cpu, is known to no registry.
-    return [f"{name}=={version(name).partition('+')[0]}" for name in NEEDED]
 
 
 def log_model(client: Any, run: str, params: Params, variant: Variant, folder: Path) -> None:
@@ -71,7 +65,8 @@ def log_model(client: Any, run: str, params: Params, variant: Variant, folder: P
             artifacts={"folder": str(real)},
             model_config={"base": "", "device": "auto", "dtype": "auto"},
             code_paths=[str(PACKAGE)],
-            pip_requirements=requirements(),
+            # A build's own mark, as in 2.6.0+cpu, is known to no registry.
+            pip_requirements=[f"{name}=={version(name).partition('+')[0]}" for name in NEEDED],
             signature=ModelSignature(Schema(inputs), Schema(outputs)),
             input_example=_example(params),
             metadata={**about, "base": card.get("base", {})},
