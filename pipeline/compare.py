@@ -103,7 +103,7 @@ def _tested(one: State, two: State) -> tuple[Rows, list[str]]:
         for setting, runs in settings.items() if task in TASKS and measure == TASKS[task].measure else ():
             earlier = before.get((task, measure), {}).get(setting, {})
             if runs != earlier and (gap := difference(runs, earlier)):
-                part = " ".join(setting)
+                part = " ".join(filter(None, setting))  # Heads and rules have no language model to name.
                 rows.append(EffectRow(part=part, change="new - old", task=task, measure=measure, **vars(gap)))
     other = len(meant[0].keys() | meant[1].keys()) - len(same)
     notes = [f"{len(same)} questions are compared; {other} were asked by one side only, or differ."] if other else []
@@ -127,8 +127,11 @@ def _scores(state: State) -> dict[str, str]:
 
 def _answers(state: State) -> list[Graded] | None:
     content = state.read(GRADED)
-    rows = None if content is None else pq.read_table(io.BytesIO(content)).to_pylist()
-    return None if rows is None else [Graded.model_validate(row) for row in rows]
+    return (
+        None
+        if content is None
+        else [Graded.model_validate(row) for row in pq.read_table(io.BytesIO(content)).to_pylist()]
+    )
 
 
 def _questions(state: State) -> dict[str, object]:
@@ -146,6 +149,5 @@ def _changes(old: dict[str, Any], new: dict[str, Any]) -> Rows:
 
 def _flat(nested: dict[str, Any]) -> dict[str, str]:
     """Dotted key to value, as text."""
-    return {
-        str(k): without_secrets(str(v)) for row in pd.json_normalize(nested).to_dict("records") for k, v in row.items()
-    }
+    rows = pd.json_normalize(nested).to_dict("records")
+    return {str(k): without_secrets(str(v)) for row in rows for k, v in row.items()}

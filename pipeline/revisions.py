@@ -31,11 +31,7 @@ class State:
             return None
 
     def mapping(self, path: str) -> dict[str, Any]:
-        """A file in YAML or JSON; empty where it is absent.
-
-        Raises:
-            UserError: where it is something else.
-        """
+        """A file in YAML or JSON; empty where it is absent, a UserError where it is something else."""
         try:
             found = yaml.load(self.read(path) or b"{}", Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
         except yaml.YAMLError:
