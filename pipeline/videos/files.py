@@ -65,6 +65,11 @@ def list_videos(folder: Path, catalogue: Catalogue) -> Listing:
         kinds = ", ".join(SUFFIXES)
         empty = _error(str(folder), f"holds no video ({kinds}); set data.dir to the folder of the videos")
         return Listing((), (*findings, empty))
+    # A table cannot hold such a name; `octopi describe` writes its escapes.
+    named_so = {path: path.relative_to(folder).as_posix() for path in paths}
+    no_text = {path: name for path, name in named_so.items() if readable(name) != name}
+    findings += [_error(name, "its name is no text in UTF-8; rename it") for name in no_text.values()]
+    paths = [path for path in paths if path not in no_text]
     listed = folder / LIST_FILE
     named, problems = _from_list(listed, folder, paths) if listed.is_file() else _from_names(folder, paths)
     findings += problems
@@ -122,8 +127,6 @@ def video_files(folder: Path) -> tuple[list[Path], list[Finding]]:
                     findings.append(finding(PASSED, where, message, severity=Severity.WARNING))
             elif not is_video(path):
                 others[readable(path.suffix.lower()) or "without a suffix"] += where != LIST_FILE
-            elif readable(where) != where:
-                findings.append(_error(where, "its name is no text in UTF-8; rename it"))
             elif path.exists() and not path.is_file():
                 findings.append(_error(where, "is no file but a pipe, socket or device; move it"))
             else:
