@@ -71,7 +71,7 @@ class Bed:
     asked: Sequence[Question]
 
     def conversations(self, questions: Sequence[Question]) -> ConversationDataset:
-        """As the training stages make them."""
+        """As the training stages make them, each token weighing alike: what all ways compute with least ado."""
         return ConversationDataset(
             questions,
             Opd.ALL,
@@ -82,6 +82,7 @@ class Bed:
             flip_probability=0.5,
             seed=0,
             positions=self.model.positions,
+            by_question=False,
         )
 
     @torch.no_grad()
