@@ -128,6 +128,8 @@ def interrupted(folder: Path, *command: str) -> tuple[int, list[str]]:
     process = subprocess.Popen(
         command, cwd=folder, env=environment, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
+        # What a script starts in the background is born deaf to Ctrl-C, as this process then is.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
     try:
         assert process.stdout
