@@ -56,7 +56,7 @@ def cross_validate(
     """Predict every video once a repeat, by a model that saw no video of its object.
 
     Folds depend only on the objects' names and the seed: settings compared with one seed share them. Each repeat deals
-    them anew; there must be as many objects as folds.
+    them anew; there must be at least as many objects as folds.
 
     Returns:
         Predicted classes, videos x repeats x properties, in the order of `objects`.
