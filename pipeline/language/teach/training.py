@@ -22,7 +22,6 @@ from transformers.modeling_outputs import CausalLMOutput
 
 from pipeline.card import write_card
 from pipeline.config import LanguageConfig, RuntimeConfig, TeachConfig
-from pipeline.language import conversations
 from pipeline.language.base import load_llm, load_tokenizer
 from pipeline.language.chat import IGNORE_INDEX, Encoded, encode_turns
 from pipeline.language.teach import items
@@ -123,8 +122,10 @@ class Course(Dataset[Encoded]):
 
 
 def collate(batch: Sequence[Encoded]) -> dict[str, torch.Tensor]:
-    """Input ids and labels (batch x length)."""
-    return conversations.collate([{name: torch.tensor(ids) for name, ids in vars(e).items()} for e in batch])
+    """Input ids and labels (batch x length), padded on the right with a token that no other one sees."""
+    padding = {"input_ids": 0, "labels": IGNORE_INDEX}
+    pad = torch.nn.utils.rnn.pad_sequence
+    return {name: pad([torch.tensor(getattr(e, name)) for e in batch], True, value) for name, value in padding.items()}
 
 
 class Pupil(nn.Module):
