@@ -94,7 +94,7 @@ def provenance(
 
 BEYOND = {
     "questions": ("restate", "two_turns"),
-    "language": ("normalize_touch",),
+    "language": ("normalize_touch", "touch_noise"),
     "align": ("weighting", "begin_with_words"),
     "lora": ("weighting", "target_modules", "dropout", "counterfactual", "conclusion_weight", "replay"),
 }
@@ -119,7 +119,8 @@ def encoder_words(config: EncoderConfig) -> str:
         "release": "the base CLIP with visual prompt tuning as the published code has it",
         "tuned": " beside ".join(BACKBONES[name].words for name in config.backbone) + ", tuned on the properties",
     }.get(config.recipe, f"an encoder of the recipe `{config.recipe}`")
-    return words + (" on pictures of the difference to the untouched gel" if config.reference == "subtract" else "")
+    words += " on pictures of the difference to the untouched gel" if config.reference == "subtract" else ""
+    return words + (", of which the language model gets heads' logits" if config.embedding == "logits" else "")
 
 
 def base_model(root: Path, folder: str) -> dict[str, Any]:

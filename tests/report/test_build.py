@@ -179,7 +179,9 @@ def test_provenance_counts_and_hashes_the_models(written: Path, tmp_path: Path) 
     ],
 )
 def test_the_encoder_is_called_what_it_is(recipe: str, words: str) -> None:
-    assert "the recipe `mine`" in encoder_words(EncoderConfig.model_construct(recipe="mine", reference="none"))
+    assert "the recipe `mine`" in encoder_words(
+        EncoderConfig.model_construct(recipe="mine", reference="none", embedding="logits")
+    )
     backbone, reference = ("scenes", "subtract") if recipe == "tuned" else ("clip", "none")
     changes = [f"encoder.recipe={recipe}", f"encoder.backbone=[{backbone}]", f"encoder.reference={reference}"]
     assert words in encoder_words(fake_params(*changes).encoder)
