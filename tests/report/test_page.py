@@ -266,7 +266,9 @@ def test_the_papers_examples_are_shown_right_and_wrong(page: Page, changed: Path
 
 
 def test_a_task_is_on_the_page_once_its_scores_are_there(changed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(TASKS, "TOY", SimpleNamespace(title="Telling toys apart", trained=True, measure="choice"))
+    monkeypatch.setitem(
+        TASKS, "TOY", SimpleNamespace(title="Telling toys apart", trained=True, measure="choice", told="")
+    )
     scores = changed / "reports" / "small-videos" / "scores.csv"
     rows = rows_of(scores)
     write_rows(scores, [*rows, *({**row, "task": "TOY"} for row in rows if row["task"] == "PC")])
