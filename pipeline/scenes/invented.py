@@ -1,6 +1,6 @@
 """A catalogue of invented objects, as many as are wanted: all combinations of classes equally often.
 
-Shapes are as wide as `invent` draws them, since an encoder that learnt narrow ones does not carry over to real videos.
+Shapes are as wide as `invent` draws them, so that a class is not one shape, which an encoder would learn in its place.
 Classes keep a distance from the borders between them, since objects near a border cannot be told apart.
 """
 
@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from pipeline.config import INVENTED, InventConfig, Params
-from pipeline.io import atomic_folder, fingerprint, write_text
+from pipeline.io import atomic_folder, code_of, fingerprint, write_text
 from pipeline.parallel import run_parallel
 from pipeline.runtime import CHECKPOINTS, derive_seed
 from pipeline.scenes.contact import Body, Method
@@ -85,8 +85,7 @@ def write_catalogue(config: InventConfig, folder: Path) -> None:
 
     Object i depends on the seed and i alone. What is finished waits in checkpoints/, where a killed drawing goes on.
     """
-    code = Path(__file__).parent
-    work = CHECKPOINTS / "invent" / fingerprint(config.seed, code)
+    work = CHECKPOINTS / "invent" / fingerprint(config.seed, *code_of("invent"))
     work.mkdir(parents=True, exist_ok=True)
     jobs = [_Job(n, config.seed, work / f"{n:05d}.json") for n in range(config.objects)]
     for _ in run_parallel(_draw, [job for job in jobs if not job.file.is_file()], "invented objects", "object"):

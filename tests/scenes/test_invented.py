@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from pipeline.config import InventConfig, ScenesConfig
-from pipeline.io import fingerprint
+from pipeline.io import code_of, fingerprint
 from pipeline.runtime import CHECKPOINTS
 from pipeline.scales import check_inputs, compose
 from pipeline.scenes import invented
+from pipeline.scenes.elastic import solver
 from pipeline.scenes.geometry import Flat
 from pipeline.scenes.invented import classes_of, draw, invented_catalogue, write_catalogue
 from pipeline.scenes.recipe import Recipe, load_recipes
@@ -90,7 +91,8 @@ def test_a_killed_drawing_goes_on_from_what_is_finished(here: Path, monkeypatch:
     write_catalogue(config, here / "resumed")
     assert len(calls) == 20 + 8, "19 were finished"
     (work,) = (CHECKPOINTS / "invent").iterdir()
-    assert work.name == fingerprint(0, Path(invented.__file__).parent)
+    assert work.name == fingerprint(0, *code_of("invent")), "another version of the code draws all anew"
+    assert Path(solver.__file__) in code_of("invent")
     monkeypatch.setattr(invented, "CHECKPOINTS", here / "fresh")
     monkeypatch.setattr(invented, "draw", drawn)
     write_catalogue(config, here / "whole")
