@@ -160,7 +160,9 @@ class QuestionsConfig(Section):
     and compare at once. Reports say so."""
     two_turns: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """Share of the training questions about several videos whose OPD mode `all` takes two turns, as scenarios (PSR) do:
-    describe everything, then answer."""
+    describe everything, then answer every question of the task about these videos."""
+    plainly: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Share of the other training comparisons that are asked as people do: "Which is softer?"."""
 
 
 class EncoderConfig(Section):
@@ -295,22 +297,6 @@ class LanguageConfig(Section):
     generation_batch_size: Positive = 32
 
 
-class PassMarks(Section):
-    """Share of items right at which a phase of teaching ends."""
-
-    plain: Fraction = 0.93
-    several: Fraction = 0.95
-    whole: Fraction = 0.9
-
-
-class MaxUpdates(Section):
-    """The longest that a phase of teaching takes: plain items, several properties, whole descriptions."""
-
-    plain: Positive = 300
-    several: Positive = 260
-    whole: Positive = 20
-
-
 class Accumulated(Section):
     """A training whose updates are computed in parts."""
 
@@ -326,25 +312,6 @@ class Accumulated(Section):
         if self.batch_size % self.micro_batch_size:
             raise ValueError(f"micro_batch_size {self.micro_batch_size} does not divide batch_size {self.batch_size}")
         return self
-
-
-class TeachConfig(Accumulated):
-    """Teaching a small language model, in text, to reason about described things (LoRA on all linear layers, AdamW)."""
-
-    base: str = ""
-    """Folder of the language model that is taught, for language.weights=data/taught; empty: nothing is taught."""
-    rank: Annotated[int, Field(ge=1, le=1024)] = 64
-    alpha: Annotated[float, Field(gt=0)] = 128
-    learning_rate: Rate = 5e-4
-    warmup: Annotated[int, Field(ge=0)] = 10
-    """Updates until the rate is reached; it stays there."""
-    max_updates: MaxUpdates = MaxUpdates()
-    check_every: Positive = 20
-    """Updates between two looks at items that are not trained on."""
-    check_items: Positive = 64
-    pass_marks: PassMarks = PassMarks()
-    gate_questions: Annotated[int, Field(ge=0)] = 100
-    """Questions of each task that the untaught and the taught model are asked in words."""
 
 
 class TrainConfig(Accumulated):
@@ -375,10 +342,27 @@ class AlignConfig(TrainConfig):
     many more questions to read frames of one video apart from those of the next."""
 
 
-class LoraTrainConfig(TrainConfig):
-    """End-to-end fine-tuning with low-rank adapters."""
+class AdapterConfig(TrainConfig):
+    """Training of the low-rank adapters, whose shape `lora` has."""
 
     learning_rate: Rate = 2e-4
+    conclusion_weight: Annotated[float, Field(gt=0)] = 1.0
+    """How much a token behind a description weighs beside one of it. Descriptions are long: what decides an answer is
+    one token among a hundred."""
+
+
+class TeachConfig(AdapterConfig):
+    """Teaching a small language model, in words alone, to conclude from classes: questions about made-up objects."""
+
+    samples: Annotated[int, Field(ge=0)] = 0
+    """Questions trained on; 0: nothing is taught."""
+    gate_questions: Annotated[int, Field(ge=0)] = 100
+    """Questions of each task in words that the taught model is then asked, and the full system."""
+
+
+class LoraTrainConfig(AdapterConfig):
+    """End-to-end fine-tuning with low-rank adapters."""
+
     rank: Annotated[int, Field(ge=1, le=1024)] = 128
     alpha: Annotated[float, Field(gt=0)] = 256.0
     dropout: Annotated[float, Field(ge=0, lt=1)] = 0.05
@@ -388,12 +372,6 @@ class LoraTrainConfig(TrainConfig):
     counterfactual: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """Share of the questions answered with descriptions that come with videos of other objects, to have what is
     concluded learnt from the description and not from touch; of these the description is not learnt."""
-    conclusion_weight: Annotated[float, Field(gt=0)] = 1.0
-    """How much a token behind a description weighs beside one of it. Descriptions are long: what decides an answer is
-    one token among a hundred."""
-    replay: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """Share of the stage `teach`'s text among what is trained on, beside the questions, so that a base which was taught
-    keeps what it learnt there."""
 
 
 class AblationConfig(Section):
@@ -495,6 +473,8 @@ class Params(Section):
     align: AlignConfig
     lora: LoraTrainConfig
     ablation: AblationConfig
+    shipped: Annotated[int, Field(ge=0)] = 0
+    """Questions about this run's videos that the model is asked which is shipped (`pipeline/pretrained`)."""
     packaged: Literal["full", "all"] = "full"
     """Which variants get a folder in models/: the full system of each seed, or all. Each holds the whole encoder."""
     tracking: TrackingConfig

@@ -52,15 +52,21 @@ class Statistics(NamedTuple):
 class EmbeddingStore:
     """Embeddings of every salient frame; training videos also in their three mirrored versions.
 
+    Args:
+        folder: Where `embed` wrote them; without one there are none, as for questions in words.
+
     Raises:
         UserError: naming the video, where an embedding is not finite: it would spoil all that is trained on it.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path | None = None) -> None:
+        self._rows: dict[tuple[str, str], list[int]] = defaultdict(list)
+        self.tensor = torch.zeros(0, 1)
+        """float32, rows x dim."""
+        if folder is None:
+            return
         self.folder = folder
         self.tensor = load_tensors(folder / TENSOR_FILE)[TENSOR]
-        """float32, rows x dim."""
-        self._rows: dict[tuple[str, str], list[int]] = defaultdict(list)
         # A part at a time, as the answers for all values take a quarter of the room of the values.
         finite = [ok for part in self.tensor.split(2**16) for ok in part.isfinite().all(1).tolist()]
         for entry in read_table(folder / INDEX_FILE, Embedding):

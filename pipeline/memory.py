@@ -19,7 +19,7 @@ from pipeline.config import EncoderConfig, LoraTrainConfig, Params, TrainConfig
 from pipeline.errors import UserError
 from pipeline.records import Dialogue, Part, Question, Turn
 from pipeline.scenes.invented import catalogue_of
-from pipeline.shapes import FULL, LLM_CONFIG, Llama, Vision
+from pipeline.shapes import FULL, Llama, Vision
 from pipeline.tasks.base import Pool
 from pipeline.tasks.questions import build_questions, counts_by_task
 from pipeline.videos.catalogue import Catalogue
@@ -84,10 +84,6 @@ def count(params: Params) -> tuple[list[Use], list[str]]:
             notes.append(f"{encoder} is not there: counted with the shapes that are published for {encoder.name}.")
         uses += encoder_uses(params, tower, sum(len(p.levels) for p in catalogue.properties))
     language = Path(params.language.weights)
-    if params.teach.base:
-        notes.append(f"teach is not counted; what it makes of {params.teach.base} has the same shapes.")
-        # Where nothing was taught, the folder holds a table alone.
-        language = language if (language / LLM_CONFIG).is_file() else Path(params.teach.base)
     llama = Llama.read(language)
     if llama is None:
         notes.append(f"{language}: no Llama whose shapes are known; the language model's stages are not counted.")

@@ -29,8 +29,6 @@ from pipeline.videos.split import FEWEST_TRAINING_OBJECTS, assign_objects, witho
 from pipeline.weights.check import check_encoder_files, check_language_files
 
 CONF = Path("conf")
-TAUGHT = "data/taught"
-"""What the chain makes of `teach.base`."""
 RECIPE = "encoder.recipe"
 SHORT = 2
 """Keys of a section that stands in one line of params.yaml."""
@@ -117,17 +115,8 @@ def check_inputs(params: Params) -> str:
     backbone = params.encoder.backbone
     weights.check_encoder(Path(params.encoder.weights), params.frames.pixels, backbone)
     check_encoder_files(Path(params.encoder.weights), backbone)
-    if params.language.weights == TAUGHT and not params.teach.base:
-        raise UserError(f"language.weights: {TAUGHT} is what teaching makes; name the model to teach in teach.base")
-    if params.teach.base and params.language.weights != TAUGHT:
-        raise UserError(
-            f"teach.base: {params.teach.base} would be taught and not used, as language.weights is "
-            f"{params.language.weights}; set teach.base= to nothing, or language.weights={TAUGHT}"
-        )
-    for key, base in (("teach.base", params.teach.base), ("language.weights", params.language.weights)):
-        if base not in ("", TAUGHT):
-            weights.check_language(Path(base), key)
-            check_language_files(Path(base), key)
+    weights.check_language(Path(params.language.weights), "language.weights")
+    check_language_files(Path(params.language.weights), "language.weights")
     return lacking
 
 

@@ -4,14 +4,16 @@ from dataclasses import replace
 from pathlib import Path
 
 from pipeline.embeddings import EmbeddingStore
+from pipeline.evaluation.grading import described
 from pipeline.io import read_jsonl, write_csv, write_jsonl
 from pipeline.language.generate import ModelSource, answer
 from pipeline.language.input_ablation import ablate_input
-from pipeline.language.teach.gate import RESTATING, examine, gate_questions
 from pipeline.parallel import device_here
 from pipeline.records import GATE, Described, Encoder, Lora, Opd, Question, Touch, Variant
 from pipeline.runtime import name_dtype
 from pipeline.stage import DATA, matrix_key, stage
+from pipeline.tasks import TASKS
+from pipeline.tasks.told import in_words
 from pipeline.videos.catalogue import load_catalogue
 
 
@@ -39,20 +41,14 @@ def main() -> None:
                 examples = read_jsonl(asked / "examples.jsonl", Question)
                 shown = answer(model, store, examples, variant.opd, language, per_video, source)
                 write_jsonl(DATA / "answers" / variant.key / "examples.jsonl", shown)
-        if variant.full and params.teach.base:
-            # What its adapter left of the reasoning that the base was taught.
-            if model.words is not None:
-                read = model.llm.get_input_embeddings().weight
-                model.llm.set_input_embeddings(model.words.to(read.dtype))
-            scores = examine(
-                model.llm,
-                model.tokenizer,
-                gate_questions(load_catalogue(Path(params.data.catalogue)), params.teach.gate_questions, params.seed),
-                model=f"with LoRA, seed {variant.seed}",
-                system_prompt=language.system_prompt,
-                batch_size=language.generation_batch_size,
-                tokens=RESTATING,
-            )
+        if variant.full and params.teach.samples:
+            # What it concludes where it need not feel: its own questions, with the true classes in words.
+            catalogue = load_catalogue(Path(params.data.catalogue))
+            several = [q for q in questions if len(q.videos) > 1]
+            asked_of = [[q for q in several if q.task == task][: params.teach.gate_questions] for task in TASKS]
+            told = [in_words(q, q.gold.labels, catalogue) for own in asked_of for q in own]
+            said = answer(model, store, told, variant.opd, language, 0, source)
+            scores = described(f"with LoRA, seed {variant.seed}", told, said, catalogue)
             write_csv(DATA / "answers" / variant.key / GATE, Described, scores)
 
 

@@ -28,6 +28,7 @@ def main() -> None:
                     facts=config.facts,
                     restate=config.restate,
                     two_turns=config.two_turns if part is Part.TRAIN else 0.0,
+                    plainly=config.plainly if part is Part.TRAIN else 0.0,
                     fold=run.params.split.fold_of(seed),
                 )
                 write_jsonl(DATA / "questions" / str(seed) / f"{name}.jsonl", questions)

@@ -11,7 +11,7 @@ def main() -> None:
     with stage("weights") as run:
         params = run.params
         MADE_DIR.mkdir(parents=True, exist_ok=True)
-        folders = {Path(f) for f in (params.encoder.weights, params.language.weights, params.teach.base)}
+        folders = {Path(f) for f in (params.encoder.weights, params.language.weights)}
         names = sorted(name for folder in folders if (name := made(folder)))
         for name in names:
             make(name, MADE_DIR / name, seed=params.seed, catalogue=Path(params.data.catalogue))

@@ -156,7 +156,6 @@ def test_any_folder_may_hold_the_videos(name: str, tmp_path: Path) -> None:
         ("smoke ablation.seeds=[true]", "seeds is .true., but no switch"),
         ("smoke encoder.weights=nowhere", "hf download timm"),
         ("smoke language.weights=nowhere", "hf download lmsys"),
-        ("small teach.base=", "language.weights: data/taught is what teaching makes.*teach.base"),
         ("smoke scenes.objects=[unicorn]", "scenes.objects: unicorn"),
         ("smoke frames.pixels=48", "frames.pixels"),
         ("smoke cross_validation.models=[papers]", "papers is no model; did you mean paper"),

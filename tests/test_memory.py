@@ -305,15 +305,6 @@ def test_settings_move_what_they_should() -> None:
     assert usual["align"].optimizer - projected["align"].optimizer == 12 * 256 * 4096
 
 
-def test_where_nothing_was_taught_the_base_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A chain without teaching leaves its folder with a table alone."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "pipeline").symlink_to(ROOT / "pipeline")
-    (tmp_path / "data" / "taught").mkdir(parents=True)
-    (tmp_path / "data" / "taught" / "gate.csv").touch()
-    assert {"align", "lora", "answer"} <= {use.stage for use in count(compose("small", conf=ROOT / "conf"))[0]}
-
-
 def test_folders_are_read_and_unknown_ones_named(tmp_path: Path) -> None:
     clip = write_clip(tmp_path / "clip")
     uses, notes = count(compose("smoke", [f"encoder.weights={clip}", f"language.weights={tmp_path / 'model'}"]))

@@ -124,7 +124,10 @@ def save_adapter(llm: PreTrainedModel, folder: Path, state: Mapping[str, torch.T
     from peft import PeftModel
 
     if isinstance(llm, PeftModel):
-        llm.save_pretrained(str(folder), state_dict=dict(state))
+        # In the base's own number format, in which it is added; it was trained in float32.
+        dtype = llm.get_input_embeddings().weight.dtype
+        own = {name: value.to(dtype) if "lora_" in name else value for name, value in state.items()}
+        llm.save_pretrained(str(folder), state_dict=own)
         # PEFT writes a set, whose order differs from process to process, and an empty model card.
         values = read_json(folder / ADAPTER_CONFIG)
         write_json(folder / ADAPTER_CONFIG, {**values, "target_modules": sorted(values["target_modules"])})

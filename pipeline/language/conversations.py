@@ -36,8 +36,6 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
             a conclusion shall be learnt from.
         conclusion_weight: Of each token behind a description, in the loss; all others weigh 1.
         by_question: Divide the weights of a conversation by their sum, so that all conversations weigh alike.
-        replayed: Conversations without touch, all of whose labels weigh as conclusions do; they stand behind the
-            questions.
         touch_noise: Deviation of the normal noise on embeddings, one draw a video of a question and epoch.
 
     Raises:
@@ -60,7 +58,6 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
         counterfactual: float = 0.0,
         conclusion_weight: float = 1.0,
         by_question: bool = True,
-        replayed: Sequence[Encoded] = (),
         touch_noise: float = 0.0,
     ) -> None:
         super().__init__()
@@ -87,7 +84,6 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
             self.encoded.append(encoded)
             described = any(turn.described for turn in dialogue.turns)
             self.concluding.append(write(descriptions=False) if described else None)
-        self.encoded += replayed
 
     @property
     def lengths(self) -> list[int]:
@@ -101,12 +97,9 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
         if index == FILLER:
             return self._tensors(Encoded((0,), (IGNORE_INDEX,)), torch.zeros(0, self.store.dim), torch.zeros(1))
         encoded = self.encoded[index]
-        if index >= len(self.questions):
-            weights = torch.full((len(encoded.labels),), self.conclusion_weight)
-            return self._tensors(encoded, torch.zeros(0, self.store.dim), weights)
         question = self.questions[index]
         rng = random.Random(derive_seed(self.seed, self.epoch, question.question_id))
-        parts, videos, concluding = [], question.videos, self.concluding[index]
+        parts, videos, concluding = [torch.zeros(0, self.store.dim)], question.videos, self.concluding[index]
         weights = torch.ones(len(encoded.labels))
         if concluding is not None:
             weights[torch.tensor(concluding.labels) != IGNORE_INDEX] = self.conclusion_weight
@@ -147,7 +140,7 @@ def check_length(question_id: str, tokens: int, positions: int | None) -> None:
 def evaluation_features(question: Question, store: EmbeddingStore, per_video: int) -> torch.Tensor:
     """The embeddings of a question's videos at uniform intervals: (videos x per_video) x dim."""
     parts = [store.features(v, sample_evaluation(store.count(v), per_video)) for v in question.videos]
-    return torch.cat(parts)
+    return torch.cat([torch.zeros(0, store.dim), *parts])
 
 
 def collate(samples: Sequence[Mapping[str, torch.Tensor]]) -> dict[str, torch.Tensor]:

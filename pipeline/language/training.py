@@ -13,14 +13,14 @@ from typing import Self
 from transformers import TrainerCallback
 
 from pipeline.card import write_card
-from pipeline.config import LanguageConfig, LoraTrainConfig, Params, RuntimeConfig, TrainConfig
+from pipeline.config import AdapterConfig, LanguageConfig, LoraTrainConfig, Params, RuntimeConfig, TrainConfig
 from pipeline.embeddings import TENSOR_FILE, EmbeddingStore
 from pipeline.errors import UserError
 from pipeline.io import fingerprint, read_jsonl
+from pipeline.language.base import ADAPTER_WEIGHTS, load_adapter
 from pipeline.language.connector import read_config
 from pipeline.language.conversations import ConversationDataset, UpdateSampler, collate
-from pipeline.language.octopi import OctopiForCausalLM
-from pipeline.language.teach.training import replay
+from pipeline.language.octopi import ADAPTER_DIR, OctopiForCausalLM
 from pipeline.records import Encoder, Opd, Question
 from pipeline.runtime import derive_seed, name_dtype, seed_everything
 from pipeline.training.trainer import (
@@ -36,8 +36,13 @@ logger = logging.getLogger(__name__)
 
 
 def add_lora(model: OctopiForCausalLM, config: LoraTrainConfig) -> None:
-    """Put fresh low-rank adapters (float32) on the language model's linear layers."""
-    from peft import LoraConfig, get_peft_model
+    """Put fresh low-rank adapters (float32) on the language model's linear layers, or train on those that it has."""
+    from peft import LoraConfig, PeftModel, get_peft_model
+
+    if isinstance(model.llm, PeftModel):
+        for name, value in model.llm.named_parameters():
+            value.requires_grad_("lora_" in name)
+        return
 
     names = {name.rsplit(".", 1)[-1] for name, _ in model.llm.named_modules()}
     modules = config.target_modules if isinstance(config.target_modules, str) else list(config.target_modules)
@@ -69,7 +74,9 @@ class Material:
     source: str = "videos"
     """`data.source`: whether the videos are synthetic."""
     files: tuple[Path, ...] = ()
-    """Of the questions and the embeddings."""
+    """Of the questions, the embeddings and what was taught."""
+    taught: Path | None = None
+    """Folder of the adapter that the stage `teach` made, where it made one."""
 
     @classmethod
     def load(cls, folder: Path, params: Params, encoder: Encoder, opd: Opd, seed: int) -> Self:
@@ -77,6 +84,8 @@ class Material:
         dtype = name_dtype(params.language.dtype, params.runtime.device)
         asked = folder / "questions" / str(seed) / "train.jsonl"
         embedded = folder / "embeddings" / f"{encoder}-{seed}"
+        taught = folder / "taught" / ADAPTER_DIR
+        has = taught.is_dir()
         return cls(
             questions=read_jsonl(asked, Question),
             store=EmbeddingStore(embedded),
@@ -86,7 +95,8 @@ class Material:
             flip_probability=params.encoder.flip_probability,
             seed=params.seed + seed,
             source=params.data.source,
-            files=(asked, embedded / TENSOR_FILE),
+            files=(asked, embedded / TENSOR_FILE, *([taught / ADAPTER_WEIGHTS] if has else [])),
+            taught=taught if has else None,
         )
 
     def fingerprint(self, config: TrainConfig, *inputs: Path) -> str:
@@ -104,7 +114,7 @@ def assemble(
     Each OPD mode draws as many, from the questions that have a dialogue in it.
 
     Args:
-        aligned: Folder of a model to go on with; by default a fresh one.
+        aligned: Folder of a model to go on with; by default a fresh one, with the adapter that was taught.
     """
     seed_everything(material.seed)
     language = material.language
@@ -116,6 +126,8 @@ def assemble(
             quantization=language.quantization,
             normalize=language.normalize_touch,
         )
+        if material.taught is not None:
+            model.llm = load_adapter(model.llm, material.taught)
     else:
         model = OctopiForCausalLM.from_pretrained(
             aligned, base=language.weights, dtype=language.dtype, quantization=language.quantization
@@ -126,13 +138,8 @@ def assemble(
         raise UserError(f"no training question has OPD mode {material.opd}; raise questions.train in params.yaml")
     if len(usable) < config.samples:
         logger.warning("%s: only %d training questions for %d samples", purpose, len(usable), config.samples)
-    own = config.model_dump(include={"counterfactual", "conclusion_weight"})  # Only fine-tuning has them.
-    asked = usable[: config.samples]
-    if isinstance(config, LoraTrainConfig) and config.replay:
-        count = round(len(asked) * config.replay / (1 - config.replay))
-        own["replayed"] = replay(count, model.tokenizer, language.system_prompt, material.seed)
     data = ConversationDataset(
-        asked,
+        usable[: config.samples],
         material.opd,
         material.store,
         model.tokenizer,
@@ -144,7 +151,8 @@ def assemble(
         bos=language.bos,
         by_question=config.weighting == "question",
         touch_noise=language.touch_noise,
-        **own,
+        # Only adapters' trainings have them.
+        **config.model_dump(include={"counterfactual", "conclusion_weight"}),
     )
     return model, data
 
@@ -165,7 +173,7 @@ def fit(
     """Train the projection, the two new tokens and the word embeddings, if they are, and adapters at their own rate."""
     # The new tokens' vectors are word embeddings, wherever they are kept.
     trained = ("connector.projection", "connector.delimiters", *(("words",) if model.words is not None else ()))
-    adapters = {"llm": config.learning_rate} if isinstance(config, LoraTrainConfig) else {}
+    adapters = {"llm": config.learning_rate} if isinstance(config, AdapterConfig) else {}
     if runtime.gradient_checkpointing:
         model.llm.gradient_checkpointing_enable(gradient_checkpointing_kwargs={"use_reentrant": False})
     seed_everything(job.seed)
@@ -208,7 +216,6 @@ def write_model_card(folder: Path, material: Material, data: ConversationDataset
             "objects": len({o for q in data.questions for o in q.objects}),
             f"videos ({material.source})": len({v for q in data.questions for v in q.videos}),
             "OPD": material.opd,
-            "replayed conversations in text": len(data) - len(data.questions),
         },
         settings={
             **config.model_dump(),

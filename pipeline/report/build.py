@@ -91,6 +91,8 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     described = described_rows([row for g in gates if g.is_file() for row in read_csv(g, Described)], catalogue)
     vision = data / "graded_vision.parquet"
     seen = read_table(vision, GradedVision) if vision.is_file() else []
+    asked_too = data / "shipped.parquet"
+    seen += read_table(asked_too, GradedVision) if asked_too.is_file() else []
     concluded: dict[int, list[Score]] = {}
     for seed, classified in by_encoder.items():
         asked = read_jsonl(data / "questions" / str(seed) / "evaluation.jsonl", Question)

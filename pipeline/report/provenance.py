@@ -84,19 +84,19 @@ def provenance(
         "encoder": encoder_words(params.encoder),
         "base_models": {
             "encoder": base_model(root, params.encoder.weights),
-            "language": base_model(root, params.language.weights) | taught_words(_shown(params.teach.base)),
+            "language": base_model(root, params.language.weights),
         },
-        "taught_from": _shown(params.teach.base),
+        "taught_questions": params.teach.samples,
         "python": platform.python_version(),
         "packages": {name: _version(name) for name in PACKAGES},
     }
 
 
 BEYOND = {
-    "questions": ("restate", "two_turns"),
+    "questions": ("restate", "two_turns", "plainly"),
     "language": ("normalize_touch", "touch_noise"),
     "align": ("weighting", "begin_with_words"),
-    "lora": ("weighting", "target_modules", "dropout", "counterfactual", "conclusion_weight", "replay"),
+    "lora": ("weighting", "target_modules", "dropout", "counterfactual", "conclusion_weight"),
 }
 """Settings by which a small model is trained otherwise than the paper's."""
 
@@ -157,12 +157,6 @@ def digest(folder: Path) -> str:
     for name in files:
         total.update(f"{name.as_posix()} {sha256(found[name])}\n".encode())
     return total.hexdigest() if files else UNKNOWN
-
-
-def taught_words(base: str) -> dict[str, Any]:
-    """What the chain itself taught the language model, in place of what people noted; empty where `base` is."""
-    words = f"taught here in text alone to reason about described objects (from `{base}`)"
-    return {"taught": words} if base else {}
 
 
 def settings_note(report: str, split: str) -> str:

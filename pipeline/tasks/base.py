@@ -109,6 +109,10 @@ class TaskDefinition(ABC):
         """The question for a language model that knows nothing of the objects: as it is, unless it names objects."""
         return draft
 
+    def plainly(self, draft: Draft, catalogue: Catalogue) -> Draft:
+        """The question as people ask it, where they ask it otherwise."""
+        return draft
+
     def restated(self, draft: Draft, catalogue: Catalogue) -> Draft:
         """The question whose answer, behind descriptions of everything, first names the classes that it is about.
 
@@ -122,16 +126,19 @@ class TaskDefinition(ABC):
         each = (
             f"{name} {prop.levels[labels[place]]}" for name, labels in zip(self.listed, draft.gold.labels, strict=True)
         )
-        told = " ".join(
-            filter(None, (f"{prop.spoken.capitalize()}: {', '.join(each)}.", draft.finding, "Conclusion: "))
-        )
-        dialogues = []
-        for dialogue in draft.dialogues:
-            *before, last = dialogue.turns
-            if dialogue.opd is Opd.ALL:
-                last = last.model_copy(update={"assistant": last.assistant.replace("Conclusion: ", told, 1)})
-            dialogues.append(Dialogue(opd=dialogue.opd, turns=(*before, last)))
-        return replace(draft, dialogues=tuple(dialogues))
+        return before_concluding(draft, f"{prop.spoken.capitalize()}: {', '.join(each)}. {draft.finding}".strip())
+
+
+def before_concluding(draft: Draft, told: str) -> Draft:
+    """The question whose answer in OPD mode `all` says this between its descriptions and its conclusion."""
+    dialogues = []
+    for dialogue in draft.dialogues:
+        *before, last = dialogue.turns
+        if dialogue.opd is Opd.ALL:
+            said = last.assistant.replace("Conclusion: ", f"{told} Conclusion: ", 1)
+            last = last.model_copy(update={"assistant": said})
+        dialogues.append(Dialogue(opd=dialogue.opd, turns=(*before, last)))
+    return replace(draft, dialogues=tuple(dialogues))
 
 
 def draw_videos(pool: Pool, objects: Sequence[str], rng: random.Random) -> tuple[str, ...]:
@@ -165,32 +172,38 @@ def single_turn(user: Mapping[Opd, str], answer: Mapping[Opd, str]) -> dict[Opd,
     return {mode: [Turn(user=user[mode], assistant=answer[mode], described=before[mode])] for mode in user}
 
 
-def in_two_turns(draft: Draft) -> Draft:
+def in_turns(draft: Draft, more: Sequence[Draft] = ()) -> Draft:
     """The question whose answer describes everything in a first turn, and concludes in a second.
 
     A question about one video, without a description or a mode that has none, or of several turns, stays as it is.
+
+    Args:
+        more: Further questions about the same videos, each in a turn of its own: descriptions are long, and so more
+            is concluded from one.
     """
     asked = {d.opd: d.turns for d in draft.dialogues}
     if set(map(len, asked.values())) != {1} or not {Opd.ALL, Opd.NONE} <= asked.keys():
         return draft
-    (whole,), (bare,) = asked[Opd.ALL], asked[Opd.NONE]
+    (whole,), _ = asked[Opd.ALL], asked[Opd.NONE]
     if not whole.described or not 1 < len(draft.videos) <= len(LETTERS):
         return draft
-    question = bare.user
-    for letter in LETTERS[: len(draft.videos)]:
-        question = question.replace(f"{letter}) {{tactile}}", f"{letter})")
-    for letter in LETTERS[: len(draft.videos)]:
-        question = question.replace("{tactile}", f"{letter})", 1)
     first = whole.assistant[: whole.described]
     for ordinal, letter in zip(ORDINALS, LETTERS, strict=False):
         first = first.replace(f"{ordinal} object:", f"{letter})")
-    turns = (
-        Turn(user=described_first(len(draft.videos)), assistant=first, described=len(first)),
-        Turn(user=question, assistant=whole.assistant[whole.described :].strip()),
-    )
+    turns = [Turn(user=described_first(len(draft.videos)), assistant=first, described=len(first))]
+    for one in (draft, *more):
+        (bare,), (told,) = (d.turns for mode in (Opd.NONE, Opd.ALL) for d in one.dialogues if d.opd is mode)
+        question = bare.user
+        for letter in LETTERS[: len(draft.videos)]:
+            question = question.replace(f"{letter}) {{tactile}}", f"{letter})")
+        for letter in LETTERS[: len(draft.videos)]:
+            question = question.replace("{tactile}", f"{letter})", 1)
+        turns.append(Turn(user=question, assistant=told.assistant[told.described :].strip()))
     return replace(
         draft,
-        dialogues=tuple(Dialogue(opd=d.opd, turns=turns if d.opd is Opd.ALL else d.turns) for d in draft.dialogues),
+        dialogues=tuple(
+            Dialogue(opd=d.opd, turns=tuple(turns) if d.opd is Opd.ALL else d.turns) for d in draft.dialogues
+        ),
     )
 
 

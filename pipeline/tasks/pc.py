@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import random
 import re
+from dataclasses import replace
 from typing import Literal
 
-from pipeline.records import Opd, Prediction, Question, Score
+from pipeline.records import Dialogue, Opd, Prediction, Question, Score
 from pipeline.tasks.base import (
     ORDINALS,
     Classes,
@@ -98,6 +99,19 @@ class PropertyComparison(TaskDefinition):
             properties=[prop.name],
             finding=f"{comparative.capitalize()}: {found}.",
         )
+
+    def plainly(self, draft: Draft, catalogue: Catalogue) -> Draft:
+        """ "Which is softer? {tactile} {tactile}", which is answered by the name of one, or by "Both"."""
+        prop = catalogue.properties[catalogue.property_index(draft.gold.properties[0])]
+        comparative = prop.more if draft.finding.startswith(f"{prop.more.capitalize()}:") else prop.less
+        user, dialogues = f"Which is {comparative}? {{tactile}} {{tactile}}", []
+        for dialogue in draft.dialogues:
+            (turn,) = dialogue.turns
+            said = re.sub(r"(?:Yes|No), the (?=first|second)", "The ", turn.assistant)
+            dialogues.append(
+                Dialogue(opd=dialogue.opd, turns=(turn.model_copy(update={"user": user, "assistant": said}),))
+            )
+        return replace(draft, dialogues=tuple(dialogues))
 
     def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str:
         place = catalogue.property_index(question.gold.properties[0])

@@ -15,6 +15,7 @@ from pipeline.tasks.base import (
     Draft,
     Pool,
     TaskDefinition,
+    before_concluding,
     begins_as_published,
     choice_score,
     concluded,
@@ -105,6 +106,11 @@ class PropertyObjectMatching(TaskDefinition):
             return dialogue.model_copy(update={"turns": (first, *rest)})
 
         return replace(draft, dialogues=tuple(map(begin, draft.dialogues)))
+
+    def restated(self, draft: Draft, catalogue: Catalogue) -> Draft:
+        """The question whose answer, behind descriptions of everything, says of each video what a fact would."""
+        told = zip(LETTERS, draft.objects, strict=True)
+        return before_concluding(draft, " ".join(f"{x}) {''.join(fact(catalogue, o))}" for x, o in told))
 
     def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str:
         """The matching whose classes are off by the fewest steps; of those, the one whose mean classes are nearest."""

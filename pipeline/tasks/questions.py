@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import islice
 from typing import Literal
 
@@ -13,7 +14,7 @@ from pipeline.errors import UserError, did_you_mean
 from pipeline.records import Assignment, Part, Question
 from pipeline.runtime import derive_seed
 from pipeline.tasks import TASKS
-from pipeline.tasks.base import Draft, Pool, TaskDefinition, in_two_turns
+from pipeline.tasks.base import Draft, Pool, TaskDefinition, in_turns
 from pipeline.videos.catalogue import Catalogue
 
 ATTEMPTS = 60
@@ -55,15 +56,17 @@ def build_questions(
     facts: bool = False,
     restate: bool = False,
     two_turns: float = 0.0,
+    plainly: float = 0.0,
     fold: int | None = None,
 ) -> list[Question]:
     """Build up to `counts[task]` questions of each task, in random order.
 
     Fewer come back where the pool has no more to ask (too few objects, a class without objects): strata that yield
     nothing after `ATTEMPTS` draws are left out, and with `distinct` no question is asked twice. With `facts` the same
-    questions come as each task's `with_facts` makes them, with `restate` as its `restated` does, and a share of
-    `two_turns` as `in_two_turns` does. The questions of a `fold` carry it in their ids, which are so unique over all
-    folds.
+    questions come as each task's `with_facts` makes them, with `restate` as its `restated` does. A share of `two_turns`
+    is asked as `in_turns` does, with all further questions about the same videos, and of the others a share of
+    `plainly` as the task's method of that name does. The questions of a `fold` carry it in
+    their ids, which are so unique over all folds.
     """
     place = str(pool.part) if fold is None else f"{pool.part}-fold{fold}"
     questions: list[Question] = []
@@ -74,10 +77,14 @@ def build_questions(
             random.Random(derive_seed(seed, pool.part, task, *purpose)) for purpose in ((), ("facts",), ("turns",))
         )
         for number, draft in enumerate(islice(_drafts(definition, pool, rng, distinct), count)):
+            asked_on = turns.random() < two_turns
+            more = further(definition, pool, draft, turns) if asked_on else []
+            if not asked_on and turns.random() < plainly:
+                draft = definition.plainly(draft, pool.catalogue)
             if restate:
-                draft = definition.restated(draft, pool.catalogue)
-            if turns.random() < two_turns:
-                draft = in_two_turns(draft)
+                draft, *more = (definition.restated(d, pool.catalogue) for d in (draft, *more))
+            if asked_on:
+                draft = in_turns(draft, more)
             if facts:
                 draft = definition.with_facts(draft, pool.catalogue, order)
             questions.append(
@@ -93,6 +100,18 @@ def build_questions(
             )
     random.Random(derive_seed(seed, pool.part, "order")).shuffle(questions)
     return questions
+
+
+def further(definition: TaskDefinition, pool: Pool, draft: Draft, rng: random.Random) -> list[Draft]:
+    """Other questions of the task about the videos of a question, in the same order; random order."""
+    few = replace(pool, videos={o: [v] for o, v in zip(draft.objects, draft.videos, strict=True)})
+    found = {}
+    for stratum in range(definition.strata(pool.catalogue)):
+        drawn = (definition.draft(few, stratum, rng) for _ in range(ATTEMPTS // 4))
+        same = next((d for d in drawn if d is not None and d.objects == draft.objects), draft)
+        found[same.finding] = same
+    more = [d for finding, d in found.items() if finding != draft.finding]
+    return rng.sample(more, len(more))
 
 
 def _drafts(definition: TaskDefinition, pool: Pool, rng: random.Random, distinct: bool) -> Iterator[Draft]:

@@ -13,12 +13,14 @@ language model, which is named by hash.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+from platformdirs import user_cache_path
 from pydantic import AfterValidator, BaseModel, ValidationError
 
 from pipeline.config import EncoderConfig, FramesConfig, LanguageConfig
@@ -27,10 +29,15 @@ from pipeline.io import fingerprint, read_json, sha256
 from pipeline.language.chat import render
 from pipeline.records import Encoder, Opd, Record, Turn
 from pipeline.videos.catalogue import Catalogue
+from pipeline.weights.make import PACKAGED, make
 
 if TYPE_CHECKING:
     from transformers import PreTrainedTokenizerBase
 
+logger = logging.getLogger(__name__)
+
+SHIPPED = Path(__file__).parents[1] / "pretrained" / "octopi-small"
+"""The model that is part of the package."""
 FORMAT = 2
 CONFIG, CATALOGUE = "config.json", "catalogue.json"
 ENCODER_DIR, LANGUAGE_DIR, BASE_DIR, BACKBONE_DIR = "encoder", "language", "base", "backbone"
@@ -123,15 +130,19 @@ def read_folder(folder: Path) -> tuple[ModelConfig, Catalogue]:
 def find_base(folder: Path, base: Base, given: Path | None = None) -> Path:
     """The folder of the language model: the one given, or the first of the known places that has it.
 
-    Known places: `base/` in the folder, where it lay in training (from here, and from above the folder), and weights/
-    by its name.
+    Known places: `base/` in the folder, where it lay in training (from here, and from above the folder), weights/ by
+    its name, and the user's cache, where one that an installed package holds is made, once.
 
     Raises:
         UserError: where there is none, or it is another.
     """
     named, other = Path(base.folder), None
     above = (parent / named for parent in folder.resolve().parents)
-    places = [given] if given else [folder / BASE_DIR, named, *above, Path("weights") / named.name]
+    cached = user_cache_path("octopi") / named.name
+    places = [given] if given else [folder / BASE_DIR, named, *above, Path("weights") / named.name, cached]
+    if not given and named.name in PACKAGED and not any(any(p.glob("*.safetensors")) for p in places):
+        logger.warning("%s is made of an installed package in %s, this once", named.name, cached)
+        make(named.name, cached)
     for place in places:
         if any(place.glob("*.safetensors")):
             if not (wrong := sorted(set(identify(place).items()) ^ set(base.files.items()))):

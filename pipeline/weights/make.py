@@ -40,6 +40,8 @@ RECIPES = {
     "tiny-llama": Recipe(tiny.write_llama, tiny.LLAMA_CARD, tiny.ABOUT),
 }
 """By name; `pipeline.weights.MADE` says which kind each is."""
+PACKAGED = {name for name, recipe in RECIPES.items() if recipe.origin}
+"""Those that an installed package holds."""
 
 
 def make(name: str, folder: Path, *, seed: int = 0, catalogue: Path = CATALOGUE) -> None:

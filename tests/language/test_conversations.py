@@ -16,7 +16,7 @@ from torch.utils.data import BatchSampler
 from transformers import PreTrainedTokenizerBase
 
 from pipeline.language.base import load_tokenizer
-from pipeline.language.chat import IGNORE_INDEX, TACTILE_TOKENS, encode, render
+from pipeline.language.chat import IGNORE_INDEX, encode, render
 from pipeline.language.conversations import FILLER, UpdateSampler, collate
 from pipeline.language.generate import write_prompt
 from pipeline.language.training import Material, assemble
@@ -102,30 +102,6 @@ def test_counterfactuals_have_other_videos_and_teach_only_conclusions(held: Mate
             assert said.replace("</s>", "").strip() == turns[-1].assistant[turns[-1].described :].strip()
             assert not torch.equal(usual["features"], drawn["features"])
     assert 0.4 < changed / described < 0.6
-
-
-def test_replayed_text_has_no_touch_and_weighs_as_conclusions_do(held: Material) -> None:
-    own = {"conclusion_weight": 4.0, "weighting": "token"}
-    (_, plain), (_, mixed) = (assemble(held, taking(9, replay=share, **own), "test") for share in (0.0, 0.25))
-    assert (len(plain), len(mixed), len(mixed.lengths)) == (9, 12, 12)
-    assert mixed.questions == plain.questions
-    assert all(torch.equal(plain[i]["weights"], mixed[i]["weights"]) for i in range(9))
-    tokenizer = load_tokenizer(Path(held.language.weights))
-    tactile = set(tokenizer.convert_tokens_to_ids(list(TACTILE_TOKENS)))
-    for sample in (mixed[i] for i in range(9, 12)):
-        assert not tactile & set(sample["input_ids"].tolist())
-        assert sample["features"].shape == (0, DIM)
-        assert set(sample["weights"][sample["labels"] != IGNORE_INDEX].tolist()) == {4.0}
-    assert len({tuple(mixed[i]["input_ids"].tolist()) for i in range(9, 12)}) == 3
-    model, _ = assemble(held, taking(1), "test")
-    alone, beside = collate([mixed[9], mixed[10]]), collate([mixed[0], mixed[9]])
-    model(**alone).loss.backward()
-    gradients = [p.grad for p in model.connector.parameters()]
-    assert all(g is not None and not g.any() for g in gradients), "there, but nothing is learnt of touch"
-    with torch.no_grad():
-        sums = [float(model(**collate([mixed[i]])).loss) * float(mixed[i]["weights"].sum()) for i in (0, 9)]
-        both = float(beside["weights"].sum())
-        assert float(model(**beside).loss) == pytest.approx(sum(sums) / both, rel=1e-5)
 
 
 LENGTHS = st.lists(st.integers(1, 500), max_size=300)

@@ -18,12 +18,11 @@ from safetensors.torch import load_file
 from torch.optim.optimizer import register_optimizer_step_pre_hook
 from transformers import TrainerCallback, TrainerState
 
-from pipeline.config import LoraTrainConfig, RuntimeConfig, TeachConfig
+from pipeline.config import LoraTrainConfig, RuntimeConfig
 from pipeline.errors import UserError
 from pipeline.io import write_jsonl
 from pipeline.language.chat import IGNORE_INDEX
 from pipeline.language.conversations import collate
-from pipeline.language.teach.training import teach
 from pipeline.language.training import Job, Material, add_lora, assemble, fit, write_model_card
 from pipeline.runtime import derive_seed
 from pipeline.training.trainer import Trained, training_arguments
@@ -286,17 +285,15 @@ def test_gradients_are_shortened_to_what_the_parameters_say(held: Material, chec
     assert norms[1] == pytest.approx(1e-3, rel=1e-2)
 
 
-@pytest.mark.parametrize("kind", ["align", "lora", "teach"])
+@pytest.mark.parametrize("kind", ["align", "lora"])
 def test_a_training_is_not_gone_on_with_by_another_version_of_the_code(
     kind: str, held: Material, checkpoints: Path, versions: Callable[[str], None], begun_in: Begun
 ) -> None:
     def begin() -> None:
-        if kind == "teach":
-            teach(TeachConfig(base=held.language.weights), held.language, CPU, stage="teach", seed=0)
         run(kind, held, checkpoints)
 
     places = [begun_in(begin)]
-    for file in ("report/build.py", "training/trainer.py", "language/base.py", "language/teach/words.yaml"):
+    for file in ("report/build.py", "training/trainer.py", "language/base.py", "language/words.py"):
         versions(f"pipeline/{file}")
         places.append(begun_in(begin))
     assert places[0] == places[1], "it does not depend on reports"

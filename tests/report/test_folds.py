@@ -15,7 +15,7 @@ from pipeline.io import read_table
 from pipeline.records import Assignment, Described, Graded, Part
 from pipeline.report.build import write_report
 from pipeline.report.load import load_report
-from pipeline.report.provenance import settings_note, taught_words
+from pipeline.report.provenance import settings_note
 from pipeline.report.readme import render_readme
 from pipeline.tasks import TASKS
 from pipeline.videos.catalogue import load_catalogue
@@ -129,10 +129,7 @@ def test_described_objects_stand_in_a_table_with_wilsons_interval() -> None:
     assert any(line.startswith("| WEIGHT | taught | 100.0 [") for line in table)
 
 
-def test_a_taught_base_is_said_in_every_report() -> None:
-    base = "weights/some-base"
-    assert taught_words("") == {}
-    text = render_readme(report([score()], taught_from=base, language=taught_words(base)), [])
-    assert "**The base was taught:** before it met touch, `weights/some-base` learnt from text alone" in text
-    assert "A 2.2 M-parameter Llama, taught here in text alone to reason about described objects" in text
-    assert "The base was taught" not in render_readme(report([score()]), [])
+def test_teaching_is_said_in_every_report() -> None:
+    text = render_readme(report([score()], taught_questions=3200), [])
+    assert "**The language model was taught:** before it met touch, it answered 3,200 questions in words" in text
+    assert "was taught:" not in render_readme(report([score()], taught_questions=0), [])

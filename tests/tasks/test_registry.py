@@ -10,9 +10,10 @@ import pytest
 from pipeline.config import QuestionsConfig
 from pipeline.evaluation.grading import grade
 from pipeline.io import read_jsonl, write_jsonl
-from pipeline.records import Opd, Prediction, Question, Score
+from pipeline.records import Dialogue, Opd, Prediction, Question, Score
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Draft, Pool, TaskDefinition, choice_score, draft_about, single_turn
+from pipeline.tasks.pom import fact
 from pipeline.tasks.questions import build_questions, counts_by_task
 from pipeline.videos.catalogue import Catalogue
 from tests.conftest import refused
@@ -82,13 +83,17 @@ def test_wrong_counts_are_one_line(train: dict[str, int], message: str) -> None:
     assert counts_by_task(config({"psr": 0}, {"psr": 3}), "train")["PSR"] == 0
 
 
-def test_a_share_of_the_questions_takes_two_turns() -> None:
-    """Those about several videos, where everything is described; what is said stays the same."""
+def test_a_share_of_the_questions_takes_several_turns() -> None:
+    """Those about several videos, where everything is described; what is said stays the same.
+
+    Each further turn is a right question about the same videos, that was not asked before.
+    """
     counts = {"OPD": 4, "PC": 40, "PSS": 40, "POM": 40, "PSR": 6}
     before, after = (build_questions(POOL, counts, seed=0, distinct=False, two_turns=s) for s in (0.0, 0.5))
     changed = [(q, r) for q, r in zip(before, after, strict=True) if q != r]
     assert {q.task for q, _ in changed} == {"PC", "PSS", "POM"}
     assert 40 < len(changed) < 80
+    further = 0
     for question, split in changed:
         assert split.model_copy(update={"dialogues": question.dialogues}) == question
         for opd in (Opd.NONE, Opd.NEEDED):
@@ -96,9 +101,22 @@ def test_a_share_of_the_questions_takes_two_turns() -> None:
         old, new = (q.dialogue(Opd.ALL) for q in (question, split))
         assert old
         assert new
-        (whole,), (first, second) = old.turns, new.turns
+        (whole,), (first, second, *more) = old.turns, new.turns
+        further += len(more)
+        assert len({t.user for t in new.turns}) == len(new.turns)
+        assert question.task != "PC" or len(more) == 5, "three properties in two directions"
+        for turn in more:
+            words = [w for p in CATALOGUE.properties for w in (p.more, p.less, p.most, p.least) if w in turn.user]
+            (prop,) = [p for p in CATALOGUE.properties if max(words, key=len) in (p.more, p.less, p.most, p.least)]
+            gold = question.gold.model_copy(update={"properties": (prop.name,)})
+            about = question.model_copy(update={"gold": gold, "dialogues": (Dialogue(opd=Opd.NONE, turns=(turn,)),)})
+            classes = [[(level, level) for level in labels] for labels in question.gold.labels]
+            assert TASKS[question.task].conclude(about, classes, CATALOGUE) == turn.assistant.removeprefix(
+                "Conclusion: "
+            )
         videos = len(question.videos)
         assert (first.user.count("{tactile}"), second.user.count("{tactile}")) == (videos, 0)
+        assert all(f"{letter})" in t.user for t in more for letter in "abc"[:videos])
         assert all(f"{letter})" in first.user and f"{letter})" in second.user for letter in "abc"[:videos])
         assert first.described == len(first.assistant)
         assert second.described == 0
@@ -106,6 +124,7 @@ def test_a_share_of_the_questions_takes_two_turns() -> None:
         assert f"{first.assistant} {second.assistant}" == said
         psr = next(d for q in before if q.task == "PSR" and (d := q.dialogue(Opd.ALL)))
         assert videos == 3 or first.user == psr.turns[0].user
+    assert further > len(changed)
 
 
 def test_classes_are_restated_before_a_conclusion() -> None:
@@ -113,9 +132,15 @@ def test_classes_are_restated_before_a_conclusion() -> None:
     counts = {"OPD": 4, "PC": 36, "PSS": 36, "POM": 6, "PSR": 6}
     before, after = (build_questions(POOL, counts, seed=0, distinct=False, restate=r) for r in (False, True))
     changed = [(q, r) for q, r in zip(before, after, strict=True) if q != r]
-    assert {q.task for q, _ in changed} == {"PC", "PSS"}
-    assert len(changed) == sum(q.task in ("PC", "PSS") for q in before)
+    assert {q.task for q, _ in changed} == {"PC", "PSS", "POM"}
+    assert len(changed) == sum(q.task in ("PC", "PSS", "POM") for q in before)
     for question, restated in changed:
+        if question.task == "POM":
+            (turn,), (bare,) = (q.dialogue(Opd.ALL).turns for q in (restated, question))  # type: ignore[union-attr]
+            facts = [f"{x}) {''.join(fact(CATALOGUE, o))}" for x, o in zip("abc", question.objects, strict=True)]
+            assert turn.assistant.replace(" ".join((*facts, "")), "", 1) == bare.assistant
+            assert turn.assistant.index(facts[0]) == bare.described + 1
+            continue
         prop = next(p for p in CATALOGUE.properties if p.name == question.gold.properties[0])
         place = CATALOGUE.property_index(prop.name)
         names = ("first object", "second object") if question.task == "PC" else ("a)", "b)", "c)")
@@ -139,3 +164,24 @@ def test_classes_are_restated_before_a_conclusion() -> None:
             assert named == (ends[0] if len(ends) == 1 else "neither")
     right = [predicted(q, d.turns[-1].assistant) for _, q in changed if (d := q.dialogue(Opd.ALL))]
     assert all(score.correct and score.strict for score in grade([q for _, q in changed], right, CATALOGUE))
+
+
+def test_some_comparisons_are_asked_as_people_do() -> None:
+    """In training alone: the answer names what has more of the property, by the labels."""
+    counts = {"OPD": 4, "PC": 90, "PSS": 9, "POM": 6}
+    before, after = (build_questions(POOL, counts, seed=0, distinct=False, plainly=s) for s in (0.0, 0.5))
+    changed = [(q, r) for q, r in zip(before, after, strict=True) if q != r]
+    assert {q.task for q, _ in changed} == {"PC"}
+    assert 30 < len(changed) < 60
+    for question, plain in changed:
+        prop = next(p for p in CATALOGUE.properties if p.name == question.gold.properties[0])
+        first, second = (labels[CATALOGUE.property_index(prop.name)] for labels in question.gold.labels)
+        for old, new in zip(question.dialogues, plain.dialogues, strict=True):
+            (usual,), (turn,) = old.turns, new.turns
+            word = turn.user.removeprefix("Which is ").removesuffix("? {tactile} {tactile}")
+            assert word in (prop.more, prop.less)
+            assert word in usual.user
+            more = "first" if (first > second) == (word == prop.more) else "second"
+            said = f"Both objects are similar in {prop.spoken}." if first == second else f"The {more} object is {word}."
+            assert turn.assistant[turn.described :].removeprefix(" Conclusion: ") == said
+            assert turn.assistant[: turn.described] == usual.assistant[: usual.described]

@@ -27,7 +27,7 @@ def test_what_can_be_made_need_not_be_there() -> None:
     check_encoder(MADE_DIR / "tiny-clip", 64, ("clip",))
     check_encoder(MADE_DIR / "efficientnet-lite0", 32, ("timm", "scenes"))
     check_language(MADE_DIR / "smollm2")
-    check_language(MADE_DIR / "tiny-llama", "teach.base")
+    check_language(MADE_DIR / "tiny-llama", "language.weights")
 
 
 def test_every_kind_that_is_checked_has_a_recipe_of_the_same_package() -> None:
@@ -41,8 +41,8 @@ def test_what_cannot_be_made_is_refused() -> None:
         check_encoder(MADE_DIR / "tiny-llama", 64, ("clip",))
     with refused("allowed below data/weights: efficientnet-lite0"):
         check_encoder(MADE_DIR / "tiny-clip", 64, ("timm",))
-    with refused("teach.base: data/weights/gpt is none .* smollm2, tiny-llama"):
-        check_language(MADE_DIR / "gpt", "teach.base")
+    with refused("language.weights: data/weights/gpt is none .* smollm2, tiny-llama"):
+        check_language(MADE_DIR / "gpt", "language.weights")
     with refused("set frames.pixels=64"):
         check_encoder(MADE_DIR / "tiny-clip", 63, ("clip",))
 
