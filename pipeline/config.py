@@ -369,9 +369,6 @@ class LoraTrainConfig(AdapterConfig):
     target_modules: Literal["all-linear"] | Annotated[tuple[str, ...], Field(min_length=1)] = ("q_proj", "k_proj")
     """Linear layers that get an adapter (the paper does not say; the published code: q_proj and k_proj); `all-linear`:
     all but the one that gives the logits."""
-    counterfactual: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """Share of the questions answered with descriptions that come with videos of other objects, to have what is
-    concluded learnt from the description and not from touch; of these the description is not learnt."""
 
 
 class AblationConfig(Section):

@@ -31,9 +31,6 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
 
     Args:
         positions: Tokens that the language model can read at once; None where that is unknown.
-        counterfactual: Share of the described questions that come with videos of other objects. Of these only what
-            follows from the description is learnt. Touch tells the classes of training objects too, and is not what
-            a conclusion shall be learnt from.
         conclusion_weight: Of each token behind a description, in the loss; all others weigh 1.
         by_question: Divide the weights of a conversation by their sum, so that all conversations weigh alike.
         touch_noise: Deviation of the normal noise on embeddings, one draw a video of a question and epoch.
@@ -55,7 +52,6 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
         seed: int,
         positions: int | None = None,
         bos: bool = True,
-        counterfactual: float = 0.0,
         conclusion_weight: float = 1.0,
         by_question: bool = True,
         touch_noise: float = 0.0,
@@ -67,10 +63,9 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
         self.flip_probability = flip_probability
         self.touch_noise = touch_noise
         self.seed = seed
-        self.counterfactual, self.conclusion_weight, self.by_question = counterfactual, conclusion_weight, by_question
-        self.videos = sorted({video for question in self.questions for video in question.videos})
+        self.by_question = by_question
         self.encoded: list[Encoded] = []
-        self.concluding: list[Encoded | None] = []
+        self.weights: list[torch.Tensor] = []
         for question in self.questions:
             dialogue = question.dialogue(opd)
             assert dialogue is not None
@@ -82,8 +77,11 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
             if all(label == IGNORE_INDEX for label in encoded.labels):
                 raise UserError(f"{question.question_id}: has no answer to learn from; run `dvc repro questions -f`")
             self.encoded.append(encoded)
-            described = any(turn.described for turn in dialogue.turns)
-            self.concluding.append(write(descriptions=False) if described else None)
+            weights = torch.ones(len(encoded.labels))
+            if any(turn.described for turn in dialogue.turns):
+                concluding = torch.tensor(write(descriptions=False).labels)
+                weights[concluding != IGNORE_INDEX] = conclusion_weight
+            self.weights.append(weights)
 
     @property
     def lengths(self) -> list[int]:
@@ -96,16 +94,10 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
     def __getitem__(self, index: int) -> dict[str, torch.Tensor]:
         if index == FILLER:
             return self._tensors(Encoded((0,), (IGNORE_INDEX,)), torch.zeros(0, self.store.dim), torch.zeros(1))
-        encoded = self.encoded[index]
         question = self.questions[index]
         rng = random.Random(derive_seed(self.seed, self.epoch, question.question_id))
-        parts, videos, concluding = [torch.zeros(0, self.store.dim)], question.videos, self.concluding[index]
-        weights = torch.ones(len(encoded.labels))
-        if concluding is not None:
-            weights[torch.tensor(concluding.labels) != IGNORE_INDEX] = self.conclusion_weight
-            if self.counterfactual and rng.random() < self.counterfactual:
-                encoded, videos = concluding, tuple(rng.choice(self.videos) for _ in videos)
-        for place, video_id in enumerate(videos):
+        parts = [torch.zeros(0, self.store.dim)]
+        for place, video_id in enumerate(question.videos):
             positions = sample_training(self.store.count(video_id), self.per_video, rng)
             horizontal, vertical = (rng.random() < self.flip_probability for _ in range(2))
             features = self.store.features(video_id, positions, FLIPS[horizontal + 2 * vertical])
@@ -115,7 +107,7 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
                 drawn = torch.randn(self.store.dim, generator=torch.Generator().manual_seed(seed))
                 features = features + self.touch_noise * drawn
             parts.append(features)
-        return self._tensors(encoded, torch.cat(parts), weights)
+        return self._tensors(self.encoded[index], torch.cat(parts), self.weights[index])
 
     def _tensors(self, encoded: Encoded, features: torch.Tensor, weights: torch.Tensor) -> dict[str, torch.Tensor]:
         labels = torch.tensor(encoded.labels)

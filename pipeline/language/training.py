@@ -151,8 +151,8 @@ def assemble(
         bos=language.bos,
         by_question=config.weighting == "question",
         touch_noise=language.touch_noise,
-        # Only adapters' trainings have them.
-        **config.model_dump(include={"counterfactual", "conclusion_weight"}),
+        # Only adapters' trainings have it.
+        **config.model_dump(include={"conclusion_weight"}),
     )
     return model, data
 

@@ -96,7 +96,7 @@ BEYOND = {
     "questions": ("restate", "two_turns", "plainly"),
     "language": ("normalize_touch", "touch_noise"),
     "align": ("weighting", "begin_with_words"),
-    "lora": ("weighting", "target_modules", "dropout", "counterfactual", "conclusion_weight"),
+    "lora": ("weighting", "target_modules", "dropout", "conclusion_weight"),
 }
 """Settings by which a small model is trained otherwise than the paper's."""
 
