@@ -113,6 +113,10 @@ class TaskDefinition(ABC):
         """The question as people ask it, where they ask it otherwise."""
         return draft
 
+    def as_choice(self, draft: Draft, catalogue: Catalogue) -> Draft | None:
+        """The question as a choice in the form that scenarios ask for, where it leads to one; no scenario is in it."""
+        return None
+
     def restated(self, draft: Draft, catalogue: Catalogue) -> Draft:
         """The question whose answer, behind descriptions of everything, first names the classes that it is about.
 

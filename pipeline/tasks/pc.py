@@ -7,7 +7,8 @@ import re
 from dataclasses import replace
 from typing import Literal
 
-from pipeline.records import Dialogue, Opd, Prediction, Question, Score
+from pipeline.records import Dialogue, Opd, Prediction, Question, Score, Turn
+from pipeline.tasks import psr
 from pipeline.tasks.base import (
     ORDINALS,
     Classes,
@@ -112,6 +113,16 @@ class PropertyComparison(TaskDefinition):
                 Dialogue(opd=dialogue.opd, turns=(turn.model_copy(update={"user": user, "assistant": said}),))
             )
         return replace(draft, dialogues=tuple(dialogues))
+
+    def as_choice(self, draft: Draft, catalogue: Catalogue) -> Draft | None:
+        """ "Which object is softer?", answered as scenarios want it: "The most suitable object is b), ..."."""
+        prop = catalogue.properties[catalogue.property_index(draft.gold.properties[0])]
+        if draft.gold.choice == "same":
+            return None
+        comparative = prop.more if draft.finding.startswith(f"{prop.more.capitalize()}:") else prop.less
+        ask = psr.REQUEST.format(question=f"Which object is {comparative}?", based=psr.BASED)
+        turn = Turn(user=ask, assistant=psr.verdict("ab"[draft.gold.choice == "no"], prop.spoken))
+        return replace(draft, dialogues=tuple(Dialogue(opd=d.opd, turns=(turn,)) for d in draft.dialogues))
 
     def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str:
         place = catalogue.property_index(question.gold.properties[0])

@@ -39,6 +39,11 @@ def asked(question: str, aspects: str) -> dict[Opd, tuple[str, ...]]:
     }
 
 
+def verdict(letter: str, reasons: str) -> str:
+    """The conclusion in words."""
+    return f"The most suitable object is {letter}), because of its {reasons}."
+
+
 def read(answer: str) -> str | None:
     """The letter in "The most suitable object is x)", or "... for this is x)"; "x) or y)", or two letters, are none."""
     said = r"most suitable object(?: for [^.;]*?)? is:? CHOICE"
@@ -71,11 +76,11 @@ class PropertyScenarioReasoning(TaskDefinition):
         names = [p for p in catalogue.property_names if p in scenario.target or p in scenario.other]
         spoken = {p.name: p.spoken for p in catalogue.properties}
         reasons, aspects = (" and ".join(spoken[p] for p in chosen) for chosen in (scenario.target, names))
-        verdict = f"The most suitable object is {LETTERS[position]}), because of its {reasons}."
+        answer = verdict(LETTERS[position], reasons)
         said = {
-            Opd.NONE: (verdict,),
-            Opd.NEEDED: (descriptions(catalogue, objects, names), verdict),
-            Opd.ALL: (descriptions(catalogue, objects), verdict),
+            Opd.NONE: (answer,),
+            Opd.NEEDED: (descriptions(catalogue, objects, names), answer),
+            Opd.ALL: (descriptions(catalogue, objects), answer),
         }
         turns = {
             mode: [Turn(user=user, assistant=answer) for user, answer in zip(users, said[mode], strict=True)]

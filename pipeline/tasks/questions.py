@@ -77,14 +77,15 @@ def build_questions(
             random.Random(derive_seed(seed, pool.part, task, *purpose)) for purpose in ((), ("facts",), ("turns",))
         )
         for number, draft in enumerate(islice(_drafts(definition, pool, rng, distinct), count)):
-            asked_on = turns.random() < two_turns
+            asked_on = turns.random() < two_turns and len(draft.videos) > 1
             more = further(definition, pool, draft, turns) if asked_on else []
             if not asked_on and turns.random() < plainly:
                 draft = definition.plainly(draft, pool.catalogue)
             if restate:
                 draft, *more = (definition.restated(d, pool.catalogue) for d in (draft, *more))
             if asked_on:
-                draft = in_turns(draft, more)
+                choices = (definition.as_choice(d, pool.catalogue) for d in (draft, *more))
+                draft = in_turns(draft, [*more, *islice(filter(None, choices), 1)])
             if facts:
                 draft = definition.with_facts(draft, pool.catalogue, order)
             questions.append(

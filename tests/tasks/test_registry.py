@@ -11,7 +11,7 @@ from pipeline.config import QuestionsConfig
 from pipeline.evaluation.grading import grade
 from pipeline.io import read_jsonl, write_jsonl
 from pipeline.records import Dialogue, Opd, Prediction, Question, Score
-from pipeline.tasks import TASKS
+from pipeline.tasks import TASKS, psr
 from pipeline.tasks.base import Draft, Pool, TaskDefinition, choice_score, draft_about, single_turn
 from pipeline.tasks.pom import fact
 from pipeline.tasks.questions import build_questions, counts_by_task
@@ -104,8 +104,17 @@ def test_a_share_of_the_questions_takes_several_turns() -> None:
         (whole,), (first, second, *more) = old.turns, new.turns
         further += len(more)
         assert len({t.user for t in new.turns}) == len(new.turns)
-        assert question.task != "PC" or len(more) == 5, "three properties in two directions"
-        for turn in more:
+        choices = [t for t in more if t.user.startswith("Which object is ")]
+        assert question.task != "PC" or len(more) == 5 + len(choices), "three properties in two directions"
+        assert len(choices) <= 1
+        for turn in choices:
+            word = turn.user.removeprefix("Which object is ").partition("?")[0]
+            (place,) = [i for i, p in enumerate(CATALOGUE.properties) if word in (p.more, p.less)]
+            first, second = (labels[place] for labels in question.gold.labels)
+            assert first != second
+            letter = "a" if (first > second) == (word == CATALOGUE.properties[place].more) else "b"
+            assert psr.read(turn.assistant) == letter
+        for turn in more[: len(more) - len(choices)]:
             words = [w for p in CATALOGUE.properties for w in (p.more, p.less, p.most, p.least) if w in turn.user]
             (prop,) = [p for p in CATALOGUE.properties if max(words, key=len) in (p.more, p.less, p.most, p.least)]
             gold = question.gold.model_copy(update={"properties": (prop.name,)})
@@ -122,8 +131,8 @@ def test_a_share_of_the_questions_takes_several_turns() -> None:
         assert second.described == 0
         said = whole.assistant.replace("First object:", "a)").replace("Second object:", "b)")
         assert f"{first.assistant} {second.assistant}" == said
-        psr = next(d for q in before if q.task == "PSR" and (d := q.dialogue(Opd.ALL)))
-        assert videos == 3 or first.user == psr.turns[0].user
+        scenario = next(d for q in before if q.task == "PSR" and (d := q.dialogue(Opd.ALL)))
+        assert videos == 3 or first.user == scenario.turns[0].user
     assert further > len(changed)
 
 
