@@ -110,9 +110,9 @@ def test_a_share_of_the_questions_takes_several_turns() -> None:
         for turn in choices:
             word = turn.user.removeprefix("Which object is ").partition("?")[0]
             (place,) = [i for i, p in enumerate(CATALOGUE.properties) if word in (p.more, p.less)]
-            first, second = (labels[place] for labels in question.gold.labels)
-            assert first != second
-            letter = "a" if (first > second) == (word == CATALOGUE.properties[place].more) else "b"
+            one, other = (labels[place] for labels in question.gold.labels)
+            assert one != other
+            letter = "a" if (one > other) == (word == CATALOGUE.properties[place].more) else "b"
             assert psr.read(turn.assistant) == letter
         for turn in more[: len(more) - len(choices)]:
             words = [w for p in CATALOGUE.properties for w in (p.more, p.less, p.most, p.least) if w in turn.user]
