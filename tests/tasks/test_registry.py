@@ -125,7 +125,7 @@ def test_a_share_of_the_questions_takes_several_turns() -> None:
             )
         videos = len(question.videos)
         assert (first.user.count("{tactile}"), second.user.count("{tactile}")) == (videos, 0)
-        assert all(f"{letter})" in t.user for t in more for letter in "abc"[:videos])
+        assert all(f"{letter})" in t.user for t in more if t not in choices for letter in "abc"[:videos])
         assert all(f"{letter})" in first.user and f"{letter})" in second.user for letter in "abc"[:videos])
         assert first.described == len(first.assistant)
         assert second.described == 0
