@@ -35,6 +35,8 @@ INVENTED = Path("data/invented")
 """Where the chain puts the catalogue of invented objects; `data.catalogue` names it to have them."""
 SCENES_DIR = Path("data/scenes/videos")
 """Where the chain puts the videos that it makes itself."""
+LANGUAGE_DIR = "language"
+"""Of a trained model's folder, where connector and adapter lie."""
 PRETRAINED = Path("data/pretrained/encoder.safetensors")
 """Where the chain puts the network that it pretrains on synthetic pictures, the backbone `scenes`."""
 
@@ -275,6 +277,9 @@ class LanguageConfig(Section):
     weights: str
     """Folder in transformers' format with a Llama-like model (safetensors) and a fast tokenizer. The chain makes what
     is named below data/weights/."""
+    start: str = ""
+    """Folder of a trained model (models/..., pipeline/pretrained/octopi-small) whose connector and adapter to train on;
+    empty: fresh ones. `encoder.embedding` and the language model must be as its are."""
     dtype: DtypeName = "float32"
     """Number format of the frozen weights; whatever is trained stays in float32. `auto`: bfloat16 where the device
     computes it in hardware, else float32."""
@@ -342,27 +347,13 @@ class AlignConfig(TrainConfig):
     many more questions to read frames of one video apart from those of the next."""
 
 
-class AdapterConfig(TrainConfig):
-    """Training of the low-rank adapters, whose shape `lora` has."""
+class LoraTrainConfig(TrainConfig):
+    """End-to-end fine-tuning with low-rank adapters."""
 
     learning_rate: Rate = 2e-4
     conclusion_weight: Annotated[float, Field(gt=0)] = 1.0
     """How much a token behind a description weighs beside one of it. Descriptions are long: what decides an answer is
     one token among a hundred."""
-
-
-class TeachConfig(AdapterConfig):
-    """Teaching a small language model, in words alone, to conclude from classes: questions about made-up objects."""
-
-    samples: Annotated[int, Field(ge=0)] = 0
-    """Questions trained on; 0: nothing is taught."""
-    gate_questions: Annotated[int, Field(ge=0)] = 100
-    """Questions of each task in words that the taught model is then asked, and the full system."""
-
-
-class LoraTrainConfig(AdapterConfig):
-    """End-to-end fine-tuning with low-rank adapters."""
-
     rank: Annotated[int, Field(ge=1, le=1024)] = 128
     alpha: Annotated[float, Field(gt=0)] = 256.0
     dropout: Annotated[float, Field(ge=0, lt=1)] = 0.05
@@ -465,7 +456,6 @@ class Params(Section):
     encoder: EncoderConfig
     pretrain: PretrainConfig
     cross_validation: CrossValidationConfig
-    teach: TeachConfig
     language: LanguageConfig
     align: AlignConfig
     lora: LoraTrainConfig

@@ -347,23 +347,6 @@ class OutOfFold(Record):
     predicted: tuple[int, ...]
 
 
-GATE = "gate.csv"
-"""File of `Described` rows, beside the language model that they are about."""
-
-
-class Described(Record):
-    """How a language model reasons about objects that are described in words, by task: a row of a gate.csv."""
-
-    model: str
-    """`taught`, or the variant."""
-    task: str
-    """Name of the task in `pipeline.tasks.TASKS` whose questions were asked in words."""
-    n: int = Field(ge=1)
-    right: int = Field(ge=0)
-    unread: int = Field(ge=0)
-    """Answers that name no choice, or several; they count as wrong."""
-
-
 class Measurement(Record):
     """One logged value of a training: a point of a curve."""
 
@@ -387,7 +370,7 @@ class Embedding(Record):
 
 ALL_SEEDS = "all"
 """In place of a seed: the mean over seeds, or over the repeats of a cross-validation."""
-HEADS, VALIDATION_HEADS, CROSS_VALIDATION, DESCRIBED = "heads", "heads_validation", "cross_validation", "described"
+HEADS, VALIDATION_HEADS, CROSS_VALIDATION = "heads", "heads_validation", "cross_validation"
 """What stands as the task where no language model with touch answered: the fine-tuned encoder's property heads on test
 videos and on validation videos, encoders on objects that they were not trained on, and base models about objects that
 are described to them in words."""

@@ -21,7 +21,7 @@ def main() -> None:
         config = run.params.align
         material = Material.load(DATA, run.params, encoder, opd, seed)
         model, data = assemble(material, config, "align")
-        if config.begin_with_words:
+        if config.begin_with_words and not run.params.language.start:
             begin_with_words(model, data, load_catalogue(Path(run.params.data.catalogue)), material.seed)
         if config.train_embeddings == "all":
             model.train_words()

@@ -1,20 +1,15 @@
 """Let one variant answer the evaluation questions; the full system also under every input ablation."""
 
 from dataclasses import replace
-from pathlib import Path
 
 from pipeline.embeddings import EmbeddingStore
-from pipeline.evaluation.grading import described
-from pipeline.io import read_jsonl, write_csv, write_jsonl
+from pipeline.io import read_jsonl, write_jsonl
 from pipeline.language.generate import ModelSource, answer
 from pipeline.language.input_ablation import ablate_input
 from pipeline.parallel import device_here
-from pipeline.records import GATE, Described, Encoder, Lora, Opd, Question, Touch, Variant
+from pipeline.records import Encoder, Lora, Opd, Question, Touch, Variant
 from pipeline.runtime import name_dtype
 from pipeline.stage import DATA, matrix_key, stage
-from pipeline.tasks import TASKS
-from pipeline.tasks.told import in_words
-from pipeline.videos.catalogue import load_catalogue
 
 
 def main() -> None:
@@ -41,15 +36,6 @@ def main() -> None:
                 examples = read_jsonl(asked / "examples.jsonl", Question)
                 shown = answer(model, store, examples, variant.opd, language, per_video, source)
                 write_jsonl(DATA / "answers" / variant.key / "examples.jsonl", shown)
-        if variant.full and params.teach.samples:
-            # What it concludes where it need not feel: its own questions, with the true classes in words.
-            catalogue = load_catalogue(Path(params.data.catalogue))
-            several = [q for q in questions if len(q.videos) > 1]
-            asked_of = [[q for q in several if q.task == task][: params.teach.gate_questions] for task in TASKS]
-            told = [in_words(q, q.gold.labels, catalogue) for own in asked_of for q in own]
-            said = answer(model, store, told, variant.opd, language, 0, source)
-            scores = described(f"with LoRA, seed {variant.seed}", told, said, catalogue)
-            write_csv(DATA / "answers" / variant.key / GATE, Described, scores)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ from pipeline.io import write_csv, write_jsonl, write_table
 from pipeline.records import (
     Assignment,
     Classification,
-    Described,
     Finding,
     Graded,
     Measurement,
@@ -79,8 +78,6 @@ def write_run(root: Path, params: Params, *, objects: Sequence[str] = (), skill:
         said = [c for a in split for c in _classify(a, catalogue, skill, rng)]
         write_table(data / "encoder" / str(seed) / "classifications.parquet", Classification, said)
         write_table(data / "encoder" / str(seed) / "history.parquet", Measurement, _history("loss", "validation_loss"))
-    gate = [Described(model=m, task="PC", n=50, right=r, unread=50 - r) for m, r in (("untaught", 20), ("taught", 49))]
-    write_csv(data / "taught" / "gate.csv", Described, gate)
     graded = []
     for variant in params.ablation.variants():
         questions, replicate = asked[variant.seed], params.split.replicate_of(variant.seed)

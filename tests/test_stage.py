@@ -175,7 +175,7 @@ def test_parameters_that_change_while_a_stage_runs_are_no_silent_matter(here: Pa
 
 @pytest.mark.parametrize("code", ["import torch; limit_threads(1)", "limit_threads(1); import torch"])
 def test_threads_are_limited_before_and_after_torch_is_imported(code: str) -> None:
-    """`teach` and `pretrain` import it when they need it."""
+    """Some stages import it when they need it."""
     code = f"from pipeline.runtime import limit_threads; {code}; print(torch.get_num_threads())"
     environment = {**os.environ, "OMP_NUM_THREADS": "2", "PYTHONPATH": str(ROOT)}
     assert subprocess.check_output([sys.executable, "-c", code], text=True, env=environment) == "1\n"

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from pipeline.errors import UserError
 from pipeline.io import fingerprint, read_json, read_jsonl
-from pipeline.records import Classification, Described, GradedVision, Prediction, Question, Score, VisionModel
+from pipeline.records import Classification, GradedVision, Prediction, Question, Score, VisionModel
 from pipeline.tasks import TASKS
 from pipeline.videos.catalogue import Catalogue
 
@@ -30,24 +30,6 @@ def grade(questions: Sequence[Question], predictions: Sequence[Prediction], cata
             raise UserError(f"{prediction.question_id}: answered but not asked; run `dvc repro` to answer anew")
         scores += TASKS[question.task].grade(question, prediction, catalogue)
     return scores
-
-
-def described(
-    model: str, questions: Sequence[Question], said: Sequence[Prediction], catalogue: Catalogue
-) -> list[Described]:
-    """What a language model concludes of objects that are told in words, by task.
-
-    Args:
-        model: As the table calls it.
-    """
-    scores = [s for s in grade(questions, said, catalogue) if s.measure == TASKS[s.task].measure]
-    return [
-        Described(
-            model=model, task=task, n=len(own), right=sum(s.correct for s in own), unread=sum(not s.parsed for s in own)
-        )
-        for task in TASKS
-        if (own := [s for s in scores if s.task == task])
-    ]
 
 
 def conclude(questions: Sequence[Question], classified: Iterable[Classification], catalogue: Catalogue) -> list[Score]:

@@ -13,14 +13,13 @@ from typing import Self
 from transformers import TrainerCallback
 
 from pipeline.card import write_card
-from pipeline.config import AdapterConfig, LanguageConfig, LoraTrainConfig, Params, RuntimeConfig, TrainConfig
+from pipeline.config import LANGUAGE_DIR, LanguageConfig, LoraTrainConfig, Params, RuntimeConfig, TrainConfig
 from pipeline.embeddings import TENSOR_FILE, EmbeddingStore
 from pipeline.errors import UserError
 from pipeline.io import fingerprint, read_jsonl
-from pipeline.language.base import ADAPTER_WEIGHTS, load_adapter
-from pipeline.language.connector import read_config
+from pipeline.language.connector import CONFIG_FILE, read_config
 from pipeline.language.conversations import ConversationDataset, UpdateSampler, collate
-from pipeline.language.octopi import ADAPTER_DIR, OctopiForCausalLM
+from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.records import Encoder, Opd, Question
 from pipeline.runtime import derive_seed, name_dtype, seed_everything
 from pipeline.training.trainer import (
@@ -43,7 +42,6 @@ def add_lora(model: OctopiForCausalLM, config: LoraTrainConfig) -> None:
         for name, value in model.llm.named_parameters():
             value.requires_grad_("lora_" in name)
         return
-
     names = {name.rsplit(".", 1)[-1] for name, _ in model.llm.named_modules()}
     modules = config.target_modules if isinstance(config.target_modules, str) else list(config.target_modules)
     unknown = [] if isinstance(modules, str) else [module for module in modules if module not in names]
@@ -74,18 +72,14 @@ class Material:
     source: str = "videos"
     """`data.source`: whether the videos are synthetic."""
     files: tuple[Path, ...] = ()
-    """Of the questions, the embeddings and what was taught."""
-    taught: Path | None = None
-    """Folder of the adapter that the stage `teach` made, where it made one."""
+    """Of the questions, the embeddings and the model that was begun with."""
 
     @classmethod
     def load(cls, folder: Path, params: Params, encoder: Encoder, opd: Opd, seed: int) -> Self:
         """Read the questions and one encoder's embeddings from the chain's data folder."""
-        dtype = name_dtype(params.language.dtype, params.runtime.device)
+        dtype, start = name_dtype(params.language.dtype, params.runtime.device), params.language.start
         asked = folder / "questions" / str(seed) / "train.jsonl"
         embedded = folder / "embeddings" / f"{encoder}-{seed}"
-        taught = folder / "taught" / ADAPTER_DIR
-        has = taught.is_dir()
         return cls(
             questions=read_jsonl(asked, Question),
             store=EmbeddingStore(embedded),
@@ -95,8 +89,7 @@ class Material:
             flip_probability=params.encoder.flip_probability,
             seed=params.seed + seed,
             source=params.data.source,
-            files=(asked, embedded / TENSOR_FILE, *([taught / ADAPTER_WEIGHTS] if has else [])),
-            taught=taught if has else None,
+            files=(asked, embedded / TENSOR_FILE, *([Path(start) / CONFIG_FILE] if start else [])),
         )
 
     def fingerprint(self, config: TrainConfig, *inputs: Path) -> str:
@@ -114,10 +107,21 @@ def assemble(
     Each OPD mode draws as many, from the questions that have a dialogue in it.
 
     Args:
-        aligned: Folder of a model to go on with; by default a fresh one, with the adapter that was taught.
+        aligned: Folder of a model to go on with; by default that of `language.start`, or a fresh one.
+
+    Raises:
+        UserError: where no question has this OPD mode, or `language.start` does not fit.
     """
     seed_everything(material.seed)
     language = material.language
+    if aligned is None and language.start:
+        aligned = Path(language.start) / LANGUAGE_DIR
+        dim, given = read_config(aligned).tactile_dim, material.store.dim
+        if dim != given:
+            raise UserError(
+                f"language.start: {language.start} reads embeddings of {dim}, but the encoder gives {given}; set "
+                "encoder.backbone and encoder.embedding as its config.json has them"
+            )
     if aligned is None:
         model = OctopiForCausalLM.from_base(
             language.weights,
@@ -126,8 +130,6 @@ def assemble(
             quantization=language.quantization,
             normalize=language.normalize_touch,
         )
-        if material.taught is not None:
-            model.llm = load_adapter(model.llm, material.taught)
     else:
         model = OctopiForCausalLM.from_pretrained(
             aligned, base=language.weights, dtype=language.dtype, quantization=language.quantization
@@ -151,7 +153,7 @@ def assemble(
         bos=language.bos,
         by_question=config.weighting == "question",
         touch_noise=language.touch_noise,
-        # Only adapters' trainings have it.
+        # Only fine-tuning has it.
         **config.model_dump(include={"conclusion_weight"}),
     )
     return model, data
@@ -173,7 +175,7 @@ def fit(
     """Train the projection, the two new tokens and the word embeddings, if they are, and adapters at their own rate."""
     # The new tokens' vectors are word embeddings, wherever they are kept.
     trained = ("connector.projection", "connector.delimiters", *(("words",) if model.words is not None else ()))
-    adapters = {"llm": config.learning_rate} if isinstance(config, AdapterConfig) else {}
+    adapters = {"llm": config.learning_rate} if isinstance(config, LoraTrainConfig) else {}
     if runtime.gradient_checkpointing:
         model.llm.gradient_checkpointing_enable(gradient_checkpointing_kwargs={"use_reentrant": False})
     seed_everything(job.seed)

@@ -10,17 +10,14 @@ import pandas as pd
 
 from pipeline.config import AblationConfig, Params
 from pipeline.evaluation.calibration import CalibrationRow, calibrated, calibration_rows
-from pipeline.evaluation.described import described_rows
 from pipeline.evaluation.grading import EXTERNAL, conclude, vision_models
 from pipeline.evaluation.ordinal import ErrorRow, error_rows
 from pipeline.evaluation.scores import candidate_rows, effect_rows, score_rows
 from pipeline.io import read_csv, read_jsonl, read_table, write_csv, write_json, write_text
 from pipeline.params import PARAMS_FILE
 from pipeline.records import (
-    GATE,
     HEADS,
     Classification,
-    Described,
     EffectRow,
     Finding,
     Graded,
@@ -87,8 +84,6 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
         for name in params.cross_validation.models
         if (data / "cross_validation" / name / "out_of_fold.parquet").is_file()
     }
-    gates = [data / "taught" / GATE, *(data / "answers" / v.key / GATE for v in params.ablation.variants())]
-    described = described_rows([row for g in gates if g.is_file() for row in read_csv(g, Described)], catalogue)
     vision = data / "graded_vision.parquet"
     seen = read_table(vision, GradedVision) if vision.is_file() else []
     asked_too = data / "shipped.parquet"
@@ -98,7 +93,7 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
         asked = read_jsonl(data / "questions" / str(seed) / "evaluation.jsonl", Question)
         scored = conclude(asked, classified, catalogue.asking(params.questions.scenarios))
         concluded.setdefault(params.split.replicate_of(seed), []).extend(scored)
-    scores = score_rows(graded, catalogue, said, out_of_fold, seen, concluded) + described
+    scores = score_rows(graded, catalogue, said, out_of_fold, seen, concluded)
     origin = provenance(params, catalogue, videos, splits, [g.objects for g in graded], root)
     # Not those whose answers are to other questions, which were not graded.
     rated = {(g.model, g.shown) for g in seen}

@@ -86,7 +86,6 @@ def provenance(
             "encoder": base_model(root, params.encoder.weights),
             "language": base_model(root, params.language.weights),
         },
-        "taught_questions": params.teach.samples,
         "python": platform.python_version(),
         "packages": {name: _version(name) for name in PACKAGES},
     }

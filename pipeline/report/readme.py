@@ -37,10 +37,6 @@ OTHER_MODELS = (
     "answers): other models on other questions about other objects. They are no target that was met or missed."
 )
 WORDS = {"lora": "LoRA", "opd": "OPD"}
-TAUGHT = (
-    "before it met touch, it answered {:,} questions in words about made-up objects, whose classes were told. All "
-    "variants go on from there, so what LoRA and OPD bring comes on top of that."
-)
 
 
 def render_readme(report: Report, figures: Sequence[str]) -> str:
@@ -124,8 +120,6 @@ def stands_on(said: dict[str, Any]) -> list[str]:
         "**Intervals** are Wilson's with the effective number of questions, since questions share objects. "
         f"{said['intervals']}".rstrip(),
     ]
-    if said.get("taught_questions"):
-        facts.insert(1, f"**The language model was taught:** {TAUGHT.format(said['taught_questions'])}")
     if said["facts_told"]:
         facts.append(
             "**Matching questions** say what the named objects are like: they ask for touch, not for knowledge."

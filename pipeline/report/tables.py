@@ -11,7 +11,7 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.records import ALL_SEEDS, CROSS_VALIDATION, DESCRIBED, HEADS, VALIDATION_HEADS, Shown
+from pipeline.records import ALL_SEEDS, CROSS_VALIDATION, HEADS, VALIDATION_HEADS, Shown
 from pipeline.report.load import DATASET, KEYS, Report, cells, published, published_datasets
 from pipeline.tasks import TASKS
 
@@ -19,7 +19,7 @@ Select = Callable[[pd.DataFrame], "pd.Series[bool]"]
 Cell = Callable[[dict[str, Any]], str]
 FULL = {"encoder": "finetuned", "lora": "with", "opd": "all"}
 CHOICE, COMBINED = "choice", "combined"
-NOT_ANSWERED = (HEADS, VALIDATION_HEADS, CROSS_VALIDATION, DESCRIBED)
+NOT_ANSWERED = (HEADS, VALIDATION_HEADS, CROSS_VALIDATION)
 """Tasks of scores.csv that no language model with touch answered."""
 PUBLISHED_MODELS = ("7b", "13b", "CLIP", "PG-InstructBLIP")
 SYSTEM_WORDS = {"base": "base encoder", "without": "without LoRA", "none": "without OPD", "needed": "OPD as needed"}
@@ -127,7 +127,6 @@ def task_title(task: str) -> str:
         HEADS: "Property heads",
         VALIDATION_HEADS: "Property heads, validation videos",
         CROSS_VALIDATION: "Cross-validation",
-        DESCRIBED: "Described objects",
         **{name: task.title for name, task in TASKS.items()},
     }
     return f"{titles[task]} ({task})" if task in TASKS else titles.get(task, task)
@@ -139,7 +138,7 @@ def system(row: dict[str, Any]) -> str:
         return f"{row['encoder']}, as it is shipped"
     if row["task"] in (HEADS, VALIDATION_HEADS):
         return "property heads, no language model"
-    if row["task"] in (CROSS_VALIDATION, DESCRIBED):
+    if row["task"] == CROSS_VALIDATION:
         return str(row["encoder"])
     if row["touch"] in SHOWN_WORDS:
         return f"{row['encoder']}, {SHOWN_WORDS[row['touch']]}"
@@ -311,15 +310,6 @@ TABLES: tuple[Table, ...] = (
         "Describing one object, as a language model's answer and by the encoder's property heads on the same videos.",
         lambda f: _variants(described=True, seen=True)(f) | _over_seeds(HEADS)(f),
         PROPERTIES,
-        folded=False,
-    ),
-    Table(
-        "described",
-        "Reasoning about described objects",
-        "The language model as it was taught, and the full system: the tasks' questions with classes told in words, "
-        "that are described and not felt; Wilson's intervals over questions.",
-        _over_seeds(DESCRIBED),
-        ("measure", *SHOWN),
         folded=False,
     ),
     *(

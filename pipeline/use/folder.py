@@ -40,7 +40,7 @@ SHIPPED = Path(__file__).parents[1] / "pretrained" / "octopi-small"
 """The model that is part of the package."""
 FORMAT = 2
 CONFIG, CATALOGUE = "config.json", "catalogue.json"
-ENCODER_DIR, LANGUAGE_DIR, BASE_DIR, BACKBONE_DIR = "encoder", "language", "base", "backbone"
+ENCODER_DIR, BASE_DIR, BACKBONE_DIR = "encoder", "base", "backbone"
 TRAINED, SCENES = "encoder.safetensors", "scenes.safetensors"
 IDENTITY = ("*.safetensors", "tokenizer.json")
 """Files by which a base language model is known."""

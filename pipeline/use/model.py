@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 import torch
 
-from pipeline.config import LanguageConfig
+from pipeline.config import LANGUAGE_DIR, LanguageConfig
 from pipeline.errors import UserError, did_you_mean, readable
 from pipeline.language.chat import TACTILE, TACTILE_TOKENS
 from pipeline.language.generate import reply, stream, write_prompt
@@ -29,7 +29,7 @@ from pipeline.runtime import (
 )
 from pipeline.tasks import opd, pc, pom, psr, pss
 from pipeline.tasks.base import LETTERS
-from pipeline.use.folder import LANGUAGE_DIR, SHIPPED, ModelConfig, chat_sample, find_base, read_folder
+from pipeline.use.folder import SHIPPED, ModelConfig, chat_sample, find_base, read_folder
 from pipeline.use.results import Choice, Comparison, Description, Exchange, Matching, Ranking, Touch, Video
 from pipeline.use.touch import Felt, TactileSense
 from pipeline.videos.catalogue import Catalogue, Property

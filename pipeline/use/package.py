@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from pipeline.card import CARD_FILE, write_card
-from pipeline.config import PRETRAINED, Params
+from pipeline.config import LANGUAGE_DIR, PRETRAINED, Params
 from pipeline.embeddings import STATISTICS_FILE, EmbeddingStore, Statistics
 from pipeline.errors import UserError
 from pipeline.evaluation.calibration import calibration_rows, fit_temperature
@@ -29,7 +29,6 @@ from pipeline.use.folder import (
     CONFIG,
     ENCODER_DIR,
     FORMAT,
-    LANGUAGE_DIR,
     SCENES,
     TRAINED,
     Base,

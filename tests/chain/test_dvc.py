@@ -125,7 +125,7 @@ def names(kind: Any, key: str = "") -> Iterator[str]:
 def test_no_parameter_has_a_name_that_dvc_leaves_out() -> None:
     """DVC's run cache does not hash what is called so: other values would bring back the results of earlier ones."""
     found = list(names(Params))
-    assert {"seed", "frames.per_video", "questions.train.opd", "teach.samples"} <= set(found)
+    assert {"seed", "frames.per_video", "questions.train.opd", "lora.rank"} <= set(found)
     assert not [name for name in found if name.rpartition(".")[2] in (Meta.PARAM_SIZE, Meta.PARAM_NFILES)]
 
 
@@ -218,7 +218,7 @@ def test_a_command_is_the_same_whatever_the_parameters(name: str) -> None:
 
 
 def test_what_changes_answers_is_a_parameter_of_what_answers() -> None:
-    batches = {"answer": "language.generation_batch_size", "teach": "language"}
+    batches = {"answer": "language.generation_batch_size"}
     batches |= dict.fromkeys(("embed", "cross_validate"), "encoder.embed_batch_size")
     batches |= {"finetune_encoder": "encoder.max_grad_norm"}
     assert {name for name, key in batches.items() if key not in stages()[name]["params"]} == set()

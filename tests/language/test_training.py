@@ -28,7 +28,7 @@ from pipeline.runtime import derive_seed
 from pipeline.training.trainer import Trained, training_arguments
 from tests.closure import ROOT
 from tests.conftest import Begun, refused
-from tests.language.shared import SMALL, assert_comes_back, embedded, taking, train
+from tests.language.shared import DIM, SMALL, adapted, assert_comes_back, embedded, taking, train, write_store
 
 CPU = RuntimeConfig(device="cpu")
 RUNTIME = RuntimeConfig(device="cpu", save_steps=2)
@@ -179,11 +179,38 @@ def test_each_part_learns_at_its_own_rate_and_in_float32(dtype: str, held: Mater
     assert max(v for n, v in moved.items() if "base_layer" in n or "embed_tokens" in n) == 0
     model.save_pretrained(checkpoints / "saved")
     saved = load_file(checkpoints / "saved" / "adapter" / "adapter_model.safetensors")
-    assert {v.dtype for v in saved.values()} == {torch.float32}
+    # Trained in float32, and written in the base's format.
+    assert {v.dtype for v in saved.values()} == {getattr(torch, dtype)}
+    with torch.no_grad():
+        for name, value in model.named_parameters():
+            value.copy_(value.to(getattr(torch, dtype)) if "lora_" in name else value)
     assert_comes_back(model, checkpoints / "saved", dtype=dtype)
     write_model_card(checkpoints / "saved", held, data, config)
     card = (checkpoints / "saved" / "README.md").read_text()
     assert all(line in card for line in ("fine-tuned with LoRA", "| rank | 4 |", f"base_model:\n- {language.weights}"))
+
+
+def test_training_goes_on_from_a_trained_model(held: Material, checkpoints: Path, tmp_path: Path) -> None:
+    """Its connector and adapter are those that alignment begins with, frozen, and that LoRA trains on."""
+    begun = assemble(held, CONFIG, "test")[0]
+    begun.save_pretrained(tmp_path / "begun" / "language")
+    adapted(begun).save_pretrained(tmp_path / "begun" / "language")
+    went_on = replace(held, language=held.language.model_copy(update={"start": str(tmp_path / "begun")}))
+    model, data = assemble(went_on, CONFIG, "align")
+    before = {name: value.clone() for name, value in model.named_parameters()}
+    for name, value in begun.named_parameters():
+        assert torch.equal(before[name], value), name
+    fit(model, data, SMALL, CPU, Job("align", "x", 0))
+    changed = {name for name, value in model.named_parameters() if not torch.equal(before[name], value)}
+    assert {name.split(".")[0] for name in changed} == {"connector"}
+    add_lora(model, CONFIG)
+    fit(model, data, CONFIG, CPU, Job("lora", "x", 0))
+    after = {name for name, value in model.named_parameters() if not torch.equal(before[name], value)}
+    assert {name for name in before if "lora_" in name} <= after
+    assert not {name for name in after if name.startswith("llm") and "lora_" not in name}
+    other = replace(went_on, store=write_store(tmp_path / "other", [("a_0", 0, "none")], torch.zeros(1, DIM + 1)))
+    with refused(f"begun reads embeddings of {DIM}, but the encoder gives {DIM + 1}; set encoder.backbone"):
+        assemble(other, CONFIG, "align")
 
 
 @pytest.mark.parametrize("weighting", ["question", "token"])

@@ -9,15 +9,13 @@ from statistics import fmean
 import pandas as pd
 import pytest
 
-from pipeline.evaluation.described import described_rows
 from pipeline.evaluation.scores import effect_rows
 from pipeline.io import read_table
-from pipeline.records import Assignment, Described, Graded, Part
+from pipeline.records import Assignment, Graded, Part
 from pipeline.report.build import write_report
 from pipeline.report.load import load_report
 from pipeline.report.provenance import settings_note
 from pipeline.report.readme import render_readme
-from pipeline.tasks import TASKS
 from pipeline.videos.catalogue import load_catalogue
 from tests.closure import ROOT
 from tests.fake_run import fake_params, write_run
@@ -111,25 +109,3 @@ def test_spoilt_test_objects_are_no_headline(name: str) -> None:
     kfold = render_readme(report([score()], split="kfold", settings=fresh), ["curves.png"])
     assert "looked at four times" not in kfold
     assert "| Task" in kfold.split("## What the figures stand on")[0]
-
-
-def test_described_objects_stand_in_a_table_with_wilsons_interval() -> None:
-    """The interval against its closed form (Wilson 1927)."""
-    rows = described_rows([Described(model="untaught", task="PSS", n=50, right=20, unread=5)], CATALOGUE)
-    z, p, n = 1.959964, 0.4, 50
-    middle, half = p + z**2 / (2 * n), z * (p * (1 - p) / n + z**2 / (4 * n**2)) ** 0.5
-    assert rows[0].low == pytest.approx((middle - half) / (1 + z**2 / n), abs=1e-6)
-    assert rows[0].high == pytest.approx((middle + half) / (1 + z**2 / n), abs=1e-6)
-    assert rows[0].chance == pytest.approx(TASKS["PSS"].chance(CATALOGUE)["choice"], abs=1e-6)
-    unknown = described_rows([Described(model="taught", task="WEIGHT", n=2, right=2, unread=0)], CATALOGUE)
-    assert unknown[0].chance is None
-    text = render_readme(report([score(), *(row.model_dump() for row in (*rows, *unknown))]), [])
-    table = text.partition("## Reasoning about described objects")[2].splitlines()
-    assert "| PSS | untaught | 40.0 [27.6, 53.8] | 50 | 33.3 | 10.0 |" in table
-    assert any(line.startswith("| WEIGHT | taught | 100.0 [") for line in table)
-
-
-def test_teaching_is_said_in_every_report() -> None:
-    text = render_readme(report([score()], taught_questions=3200), [])
-    assert "**The language model was taught:** before it met touch, it answered 3,200 questions in words" in text
-    assert "was taught:" not in render_readme(report([score()], taught_questions=0), [])
