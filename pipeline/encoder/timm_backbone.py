@@ -18,7 +18,11 @@ from torch.nn import functional as F
 from pipeline.config import EncoderConfig
 from pipeline.encoder.model import FrameEncoder, mean_and_deviation
 from pipeline.errors import UserError
+from pipeline.io import load_tensors
 from pipeline.weights import check_finite, frame_side
+
+STAGES = "stages.safetensors"
+"""In place of a network's weights those of the stages that are read, as a packaged model has them."""
 
 
 class TimmBackbone(FrameEncoder):
@@ -86,7 +90,7 @@ class TimmBackbone(FrameEncoder):
 
 
 def load_backbone(config: EncoderConfig, *, tuned: bool) -> TimmBackbone:
-    """The network in `encoder.weights`, in timm's own layout; fine-tuning changes the stage that is read.
+    """The network in `encoder.weights`, in timm's own layout, or `STAGES` of it; fine-tuning changes the last one.
 
     Raises:
         UserError: for a folder that is none, weights that do not fit, or a network or stage that cannot be read so.
@@ -95,10 +99,12 @@ def load_backbone(config: EncoderConfig, *, tuned: bool) -> TimmBackbone:
     from safetensors import SafetensorError
 
     folder = Path(config.weights)
-    frame_side(folder, "timm")
+    cut = (folder / STAGES).is_file()
+    if not cut:
+        frame_side(folder, "timm")
     logging.getLogger("timm").setLevel(logging.WARNING)
     try:
-        model = timm.create_model(f"local-dir:{folder}", pretrained=True)
+        model = timm.create_model(f"local-dir:{folder}", pretrained=not cut)
     except (RuntimeError, ValueError, LookupError, TypeError, AttributeError, OSError, SafetensorError) as error:
         reason = " ".join(str(error).split())[:200]
         raise UserError(f"encoder.weights: {folder} does not fit its config.json ({reason})") from None
@@ -112,6 +118,8 @@ def load_backbone(config: EncoderConfig, *, tuned: bool) -> TimmBackbone:
         )
     try:
         backbone = TimmBackbone(model.requires_grad_(False).eval(), config.feature_stage)
+        if cut:
+            backbone.model.load_state_dict(load_tensors(folder / STAGES))
         tried = torch.randint(256, (1, *backbone.own, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
         with torch.inference_mode():
             whole, apart = backbone(tried, torch.zeros(1)), backbone.stage(backbone.trunk(tried))

@@ -15,7 +15,7 @@ from pipeline.config import LANGUAGE_DIR, PRETRAINED, Params
 from pipeline.embeddings import STATISTICS_FILE, EmbeddingStore, Statistics
 from pipeline.errors import UserError
 from pipeline.evaluation.calibration import calibration_rows, fit_temperature
-from pipeline.io import atomic_folder, read_csv, read_table, sha256, write_json
+from pipeline.io import atomic_folder, read_csv, read_table, save_tensors, sha256, write_json
 from pipeline.language.base import load_tokenizer
 from pipeline.language.connector import CONFIG_FILE
 from pipeline.language.octopi import ADAPTER_DIR
@@ -42,7 +42,7 @@ from pipeline.use.folder import (
 from pipeline.videos.audit.files import quiet_level
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.frames.store import PROBES_FILE
-from pipeline.weights import backbone_files
+from pipeline.weights import TIMM_WEIGHTS, backbone_files
 
 LIBRARIES = ("octopi-pipeline", "torch", "transformers", "peft", "open_clip_torch", "timm", "av")
 LIMITS = (
@@ -76,6 +76,13 @@ def package(data: Path, params: Params, variant: Variant, base: Base, out: Path)
         files, card = backbone_files(params.encoder), Path(params.encoder.weights) / CARD_FILE
         if card.is_file() and any(file.parent == card.parent for file in files):
             files.append(card)
+        if "timm" in encoder.backbone:
+            from pipeline.encoder.timm_backbone import STAGES, load_backbone
+
+            files.remove(Path(encoder.weights) / TIMM_WEIGHTS)
+            save_tensors(
+                folder / ENCODER_DIR / BACKBONE_DIR / STAGES, load_backbone(encoder, tuned=False).model.state_dict()
+            )
         for file in files:
             _copy(file, folder / ENCODER_DIR / (SCENES if file == PRETRAINED else f"{BACKBONE_DIR}/{file.name}"))
         _copy(embeddings / STATISTICS_FILE, folder / ENCODER_DIR / STATISTICS_FILE)
