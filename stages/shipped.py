@@ -30,10 +30,12 @@ def main() -> None:
                 videos.setdefault(video.object_id, []).append(video.video_id)
                 felt.append(octopi.sense.feel(Path(params.data.dir) / video.path).features)
                 rows[video.video_id] = range(sum(map(len, felt[:-1])), sum(map(len, felt)))
+            # Half of them describe: those answers are short, and the others follow from what they say.
             asked = {task: count for task, count in counts_by_task(params.questions, "evaluation").items() if count}
+            parts = {task: len(asked) - 1 if task == "OPD" else 1 for task in asked}
             questions = build_questions(
                 Pool(Part.TEST, catalogue, videos),
-                dict.fromkeys(asked, params.shipped // len(asked)),
+                {task: params.shipped * part // sum(parts.values()) for task, part in parts.items()},
                 seed=params.questions.seed,
                 distinct=True,
                 facts=octopi.config.facts,
