@@ -42,13 +42,10 @@ def stages() -> dict[str, dict[str, Any]]:
     return found
 
 
-DATA = ("pipeline/physiclear/", "pipeline/pretrained")
-
-
 def code(name: str) -> list[str]:
-    """Of its dependencies what is imported; a catalogue is data, and so is a model."""
+    """Of its dependencies what is imported; a catalogue is data."""
     deps: list[str] = stages()[name]["deps"]
-    return [d for d in deps if d.startswith(("pipeline/", "stages/")) and not d.startswith(DATA)]
+    return [d for d in deps if d.startswith(("pipeline/", "stages/")) and not d.startswith("pipeline/physiclear/")]
 
 
 def data_of(module: str) -> Iterator[str]:
