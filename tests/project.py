@@ -30,6 +30,7 @@ REDUCED = (
     "encoder.epochs=1",
     "cross_validation.models=[probe]",
     "cross_validation.folds=2",
+    "teach.samples=4",
     "align.samples=16",
     "align.train_embeddings=all",
     "lora.samples=16",

@@ -31,7 +31,7 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
 
     Args:
         positions: Tokens that the language model can read at once; None where that is unknown.
-        conclusion_weight: Of each token behind a description, in the loss; all others weigh 1.
+        description_weight: Of each token of a description, in the loss; all others weigh 1.
         by_question: Divide the weights of a conversation by their sum, so that all conversations weigh alike.
         touch_noise: Deviation of the normal noise on embeddings, one draw a video of a question and epoch.
 
@@ -52,7 +52,7 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
         seed: int,
         positions: int | None = None,
         bos: bool = True,
-        conclusion_weight: float = 1.0,
+        description_weight: float = 1.0,
         by_question: bool = True,
         touch_noise: float = 0.0,
     ) -> None:
@@ -80,7 +80,7 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
             weights = torch.ones(len(encoded.labels))
             if any(turn.described for turn in dialogue.turns):
                 concluding = torch.tensor(write(descriptions=False).labels)
-                weights[concluding != IGNORE_INDEX] = conclusion_weight
+                weights[concluding == IGNORE_INDEX] = description_weight
             self.weights.append(weights)
 
     @property

@@ -4,22 +4,35 @@ from __future__ import annotations
 
 import logging
 import random
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Self
 
+import torch
 from transformers import TrainerCallback
 
 from pipeline.card import write_card
-from pipeline.config import LANGUAGE_DIR, LanguageConfig, LoraTrainConfig, Params, RuntimeConfig, TrainConfig
+from pipeline.config import (
+    LANGUAGE_DIR,
+    AdapterConfig,
+    LanguageConfig,
+    LoraTrainConfig,
+    Params,
+    RuntimeConfig,
+    TeachConfig,
+    TrainConfig,
+)
 from pipeline.embeddings import TENSOR_FILE, EmbeddingStore
 from pipeline.errors import UserError
 from pipeline.io import fingerprint, read_jsonl
+from pipeline.language.base import ADAPTER_WEIGHTS, load_adapter
+from pipeline.language.chat import IGNORE_INDEX, encode_turns
 from pipeline.language.connector import CONFIG_FILE, read_config
 from pipeline.language.conversations import ConversationDataset, UpdateSampler, collate
-from pipeline.language.octopi import OctopiForCausalLM
+from pipeline.language.octopi import ADAPTER_DIR, OctopiForCausalLM
 from pipeline.records import Encoder, Opd, Question
 from pipeline.runtime import derive_seed, name_dtype, seed_everything
 from pipeline.training.trainer import (
@@ -72,7 +85,9 @@ class Material:
     source: str = "videos"
     """`data.source`: whether the videos are synthetic."""
     files: tuple[Path, ...] = ()
-    """Of the questions, the embeddings and the model that was begun with."""
+    """Of the questions, the embeddings, and what was taught or begun with."""
+    taught: Path | None = None
+    """Folder of the adapter that the stage `teach` made, where it made one."""
 
     @classmethod
     def load(cls, folder: Path, params: Params, encoder: Encoder, opd: Opd, seed: int) -> Self:
@@ -80,6 +95,7 @@ class Material:
         dtype, start = name_dtype(params.language.dtype, params.runtime.device), params.language.start
         asked = folder / "questions" / str(seed) / "train.jsonl"
         embedded = folder / "embeddings" / f"{encoder}-{seed}"
+        taught = folder / "taught" / ADAPTER_DIR if params.teach.samples else None
         return cls(
             questions=read_jsonl(asked, Question),
             store=EmbeddingStore(embedded),
@@ -89,7 +105,12 @@ class Material:
             flip_probability=params.encoder.flip_probability,
             seed=params.seed + seed,
             source=params.data.source,
-            files=(asked, embedded / TENSOR_FILE, *([Path(start) / CONFIG_FILE] if start else [])),
+            files=(
+                *(asked, embedded / TENSOR_FILE),
+                *([Path(start) / CONFIG_FILE] if start else []),
+                *([taught / ADAPTER_WEIGHTS] if taught else []),
+            ),
+            taught=taught,
         )
 
     def fingerprint(self, config: TrainConfig, *inputs: Path) -> str:
@@ -107,7 +128,8 @@ def assemble(
     Each OPD mode draws as many, from the questions that have a dialogue in it.
 
     Args:
-        aligned: Folder of a model to go on with; by default that of `language.start`, or a fresh one.
+        aligned: Folder of a model to go on with; by default that of `language.start`, or a fresh one, with what was
+            taught.
 
     Raises:
         UserError: where no question has this OPD mode, or `language.start` does not fit.
@@ -130,6 +152,8 @@ def assemble(
             quantization=language.quantization,
             normalize=language.normalize_touch,
         )
+        if material.taught is not None:
+            model.llm = load_adapter(model.llm, material.taught)
     else:
         model = OctopiForCausalLM.from_pretrained(
             aligned, base=language.weights, dtype=language.dtype, quantization=language.quantization
@@ -153,8 +177,8 @@ def assemble(
         bos=language.bos,
         by_question=config.weighting == "question",
         touch_noise=language.touch_noise,
-        # Only fine-tuning has it.
-        **config.model_dump(include={"conclusion_weight"}),
+        # Of a drill only what is concluded is learnt.
+        description_weight=float(not isinstance(config, TeachConfig)),
     )
     return model, data
 
@@ -175,7 +199,7 @@ def fit(
     """Train the projection, the two new tokens and the word embeddings, if they are, and adapters at their own rate."""
     # The new tokens' vectors are word embeddings, wherever they are kept.
     trained = ("connector.projection", "connector.delimiters", *(("words",) if model.words is not None else ()))
-    adapters = {"llm": config.learning_rate} if isinstance(config, LoraTrainConfig) else {}
+    adapters = {"llm": config.learning_rate} if isinstance(config, AdapterConfig) else {}
     if runtime.gradient_checkpointing:
         model.llm.gradient_checkpointing_enable(gradient_checkpointing_kwargs={"use_reentrant": False})
     seed_everything(job.seed)
@@ -202,6 +226,28 @@ def fit(
         sampler=UpdateSampler(data.lengths, config.batch_size, job.seed, lambda: data.epoch, shared),
     )
     return train(trainer)
+
+
+@torch.inference_mode()
+def examine(model: OctopiForCausalLM, drills: Sequence[Question], language: LanguageConfig) -> dict[str, float]:
+    """Share of a drill's conclusions, by task, that the model would say word by word, each behind right ones."""
+    model.eval()
+    found: dict[str, list[bool]] = defaultdict(list)
+    for question in drills:
+        encoded = encode_turns(
+            question.dialogues[0].turns,
+            model.tokenizer,
+            system_prompt=language.system_prompt,
+            frames=0,
+            bos=language.bos,
+            descriptions=False,
+        )
+        ids = torch.tensor([encoded.input_ids], device=model.connector.delimiters.device)
+        said = model(ids, torch.zeros(1, 0, model.octopi_config.tactile_dim, device=ids.device)).logits[0].argmax(-1)
+        right = [IGNORE_INDEX, *said[:-1].tolist()]
+        spans = groupby(zip(right, encoded.labels, strict=True), lambda pair: pair[1] != IGNORE_INDEX)
+        found[question.task] += [all(a == b for a, b in span) for learnt, span in spans if learnt]
+    return {task: sum(own) / len(own) for task, own in sorted(found.items())}
 
 
 def write_model_card(folder: Path, material: Material, data: ConversationDataset, config: TrainConfig) -> None:

@@ -95,7 +95,8 @@ BEYOND = {
     "questions": ("restate", "two_turns", "plainly"),
     "language": ("normalize_touch", "touch_noise"),
     "align": ("weighting", "begin_with_words"),
-    "lora": ("weighting", "target_modules", "dropout", "conclusion_weight"),
+    "teach": ("samples",),
+    "lora": ("weighting", "target_modules", "dropout"),
 }
 """Settings by which a small model is trained otherwise than the paper's."""
 

@@ -10,6 +10,7 @@ from typing import Literal
 from pipeline.records import Dialogue, Opd, Prediction, Question, Score, Turn
 from pipeline.tasks import psr
 from pipeline.tasks.base import (
+    DRILL,
     ORDINALS,
     Classes,
     Draft,
@@ -18,8 +19,10 @@ from pipeline.tasks.base import (
     begins_as_published,
     choice_score,
     concluded,
+    concluding,
     conclusion,
     draft_about,
+    restated_classes,
     single_turn,
 )
 from pipeline.videos.catalogue import Catalogue, Property
@@ -90,7 +93,6 @@ class PropertyComparison(TaskDefinition):
         user = asked(rng.choice(TEMPLATES), comparative, prop.spoken)
         told, prefixes = verdict(choice, comparative, prop), [f"{o} object:" for o in ORDINALS]
         answer = concluded(pool.catalogue, objects, told, [prop.name], prefixes)
-        found = {"yes": self.listed[0], "no": self.listed[1], "same": "neither"}[choice]
         return draft_about(
             pool,
             objects,
@@ -98,8 +100,23 @@ class PropertyComparison(TaskDefinition):
             turns=single_turn(user, answer),
             choice=choice,
             properties=[prop.name],
-            finding=f"{comparative.capitalize()}: {found}.",
+            finding=self._finding(choice, comparative),
         )
+
+    def _finding(self, choice: Reading, comparative: str) -> str:
+        found = {"yes": self.listed[0], "no": self.listed[1], "same": "neither"}[choice]
+        return f"{comparative.capitalize()}: {found}."
+
+    def drill(self, catalogue: Catalogue, rng: random.Random) -> list[Turn]:
+        turns = []
+        for _ in range(DRILL):
+            prop, rising = rng.choice(catalogue.properties), rng.random() < 0.5
+            first, second = (rng.randrange(len(prop.levels)) for _ in range(2))
+            comparative = prop.more if rising else prop.less
+            told = restated_classes(prop, self.listed, (first, second))
+            finding = self._finding(compare(first, second, rising), comparative)
+            turns.append(concluding(f"Which is {comparative}?", told, finding))
+        return turns
 
     def plainly(self, draft: Draft, catalogue: Catalogue) -> Draft:
         """ "Which is softer? {tactile} {tactile}", which is answered by the name of one, or by "Both"."""

@@ -12,7 +12,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from pipeline.config import LanguageConfig, LoraTrainConfig
+from pipeline.config import AdapterConfig, LanguageConfig, LoraTrainConfig, TeachConfig
 from pipeline.embeddings import EmbeddingStore
 from pipeline.errors import UserError
 from pipeline.language.base import load_llm, load_tokenizer
@@ -27,17 +27,17 @@ from tests.conftest import refused
 from tests.language.shared import DIM, FRAMES, LORA, adapted, assert_comes_back, call, generation, material, taking
 
 
-@pytest.mark.parametrize("weight", [1.0, 3.0])
-def test_loss_is_over_answers_only(weight: float, model: OctopiForCausalLM, held: Material) -> None:
+@pytest.mark.parametrize("config", [LoraTrainConfig, TeachConfig])
+def test_loss_is_over_answers_only(config: type[AdapterConfig], model: OctopiForCausalLM, held: Material) -> None:
     """By hand in float64, over rows of unlike lengths whose answers begin at other columns."""
-    _, data = assemble(held, taking(4, conclusion_weight=weight, weighting="token"), "test")
+    _, data = assemble(held, config(samples=4, weighting="token"), "test")
     batch = collate([data[i] for i in range(len(data))])
     labels, weights = batch.pop("labels"), batch["weights"]
-    concluding = ["".join(model.tokenizer.decode(i[w > 1])) for i, w in zip(labels, weights, strict=True)]
-    assert any(concluding) == (weight > 1)
-    for question, said in zip(data.questions, concluding, strict=True):
+    learnt = ["".join(model.tokenizer.decode(i[w > 0])) for i, w in zip(labels, weights, strict=True)]
+    for question, said in zip(data.questions, learnt, strict=True):
         turn = question.dialogue(Opd.ALL).turns[-1]  # type: ignore[union-attr]
-        assert not said or said.removesuffix("</s>").strip() == turn.assistant[turn.described :].strip()
+        begins = turn.described if config is TeachConfig else 0
+        assert said.removesuffix("</s>").strip() == turn.assistant[begins:].strip()
     logits = model(**batch).logits.double()
     losses = [
         -weights[row, column] * logits[row, column - 1].log_softmax(-1)[labels[row, column]]
