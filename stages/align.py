@@ -1,5 +1,6 @@
 """Align the projection to the language model."""
 
+import shutil
 from pathlib import Path
 
 from pipeline.io import write_table
@@ -14,6 +15,7 @@ def main() -> None:
     encoder, opd, seed = matrix_key(encoder=Encoder, opd=Opd, seed=None)
     key = f"{encoder}-{opd}-{seed}"
     with stage("align", key, launched=True) as run:
+        from pipeline.language.octopi import ADAPTER_DIR
         from pipeline.language.training import Job, Material, assemble, fit, write_model_card
         from pipeline.language.words import begin_with_words
 
@@ -31,6 +33,9 @@ def main() -> None:
         run.finish_training(trained.history)
         out = DATA / "models" / "without" / key
         model.save_pretrained(out, trained.state)
+        if material.adapter:
+            # Alignment leaves it as it is, so that it is not among what was trained.
+            shutil.copytree(material.adapter, out / ADAPTER_DIR, dirs_exist_ok=True)
         write_table(out / "history.parquet", Measurement, trained.history)
         write_model_card(out, material, data, config)
 

@@ -148,14 +148,17 @@ class OctopiForCausalLM(nn.Module):
 
         Args:
             folder: Made where it is not there.
-            state_dict: The parameters by name where the model's own are sharded over processes.
+            state_dict: The parameters by name where the model's own are sharded over processes. An adapter that is not
+                among them is not written.
         """
         folder, state = Path(folder), self.state_dict() if state_dict is None else state_dict
         write_json(folder / CONFIG_FILE, self.octopi_config.model_dump(mode="json"))
         save_tensors(folder / CONNECTOR_FILE, _below("connector", state))
         if self.words is not None:
             save_tensors(folder / WORDS_FILE, _below("words", state))
-        save_adapter(self.llm, folder / ADAPTER_DIR, _below("llm", state))
+        adapter = _below("llm", state)
+        if any("lora_" in name for name in adapter):
+            save_adapter(self.llm, folder / ADAPTER_DIR, adapter)
 
     def train_words(self) -> nn.Embedding:
         """Have all word embeddings trained: a copy in float32, which begins as the language model's own.

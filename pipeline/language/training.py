@@ -86,8 +86,8 @@ class Material:
     """`data.source`: whether the videos are synthetic."""
     files: tuple[Path, ...] = ()
     """Of the questions, the embeddings, and what was taught or begun with."""
-    taught: Path | None = None
-    """Folder of the adapter that the stage `teach` made, where it made one."""
+    adapter: Path | None = None
+    """Folder of the adapter that alignment begins with: the one that was taught, or that of `language.start`."""
 
     @classmethod
     def load(cls, folder: Path, params: Params, encoder: Encoder, opd: Opd, seed: int) -> Self:
@@ -95,7 +95,9 @@ class Material:
         dtype, start = name_dtype(params.language.dtype, params.runtime.device), params.language.start
         asked = folder / "questions" / str(seed) / "train.jsonl"
         embedded = folder / "embeddings" / f"{encoder}-{seed}"
-        taught = folder / "taught" / ADAPTER_DIR if params.teach.samples else None
+        taught = folder / "taught" if params.teach.samples else None
+        begun = Path(start) / LANGUAGE_DIR if start else taught
+        adapter = begun / ADAPTER_DIR if begun and (begun / ADAPTER_DIR).is_dir() else None
         return cls(
             questions=read_jsonl(asked, Question),
             store=EmbeddingStore(embedded),
@@ -108,9 +110,9 @@ class Material:
             files=(
                 *(asked, embedded / TENSOR_FILE),
                 *([Path(start) / CONFIG_FILE] if start else []),
-                *([taught / ADAPTER_WEIGHTS] if taught else []),
+                *([adapter / ADAPTER_WEIGHTS] if adapter else []),
             ),
-            taught=taught,
+            adapter=adapter,
         )
 
     def fingerprint(self, config: TrainConfig, *inputs: Path) -> str:
@@ -152,8 +154,8 @@ def assemble(
             quantization=language.quantization,
             normalize=language.normalize_touch,
         )
-        if material.taught is not None:
-            model.llm = load_adapter(model.llm, material.taught)
+        if material.adapter is not None:
+            model.llm = load_adapter(model.llm, material.adapter)
     else:
         model = OctopiForCausalLM.from_pretrained(
             aligned, base=language.weights, dtype=language.dtype, quantization=language.quantization

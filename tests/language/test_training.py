@@ -249,7 +249,7 @@ def test_what_was_taught_is_examined_by_conclusion(held: Material) -> None:
 def test_alignment_begins_with_what_was_taught_and_leaves_it(held: Material, checkpoints: Path, tmp_path: Path) -> None:
     taught = assemble(held, CONFIG, "test")[0]
     save_adapter(adapted(taught, CONFIG).llm, tmp_path, taught.llm.state_dict())
-    model, data = assemble(replace(held, taught=tmp_path), SMALL, "align")
+    model, data = assemble(replace(held, adapter=tmp_path), SMALL, "align")
     fit(model, data, SMALL, CPU, Job("align", "x", 0))
     own = dict(model.llm.named_parameters())
     assert all(torch.equal(own[name], value) for name, value in taught.llm.named_parameters())
