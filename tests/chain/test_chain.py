@@ -94,8 +94,9 @@ def test_two_processes_train_like_one(project: Project) -> None:
         results.append(load_file(project.folder / "data/models/without/finetuned-all-0/connector.safetensors"))
     project.run("octopi", "scale", *REDUCED)
     assert results[0].keys() == results[1].keys()
+    # Of AdamW's one step of 3e-3. Where a gradient is as small as its epsilon of 1e-8, the step follows rounding.
     for name, value in results[0].items():
-        torch.testing.assert_close(value, results[1][name], atol=1e-6, rtol=1e-5)
+        torch.testing.assert_close(value, results[1][name], atol=1e-5, rtol=1e-5)
 
 
 def test_a_further_fold_trains_none_of_the_others_anew(project: Project) -> None:
