@@ -278,8 +278,8 @@ class LanguageConfig(Section):
     """Folder in transformers' format with a Llama-like model (safetensors) and a fast tokenizer. The chain makes what
     is named below data/weights/."""
     start: str = ""
-    """Folder of a trained model (models/..., pipeline/pretrained/octopi-small) whose connector and adapter to train on;
-    empty: fresh ones. `encoder.embedding` and the language model must be as its are."""
+    """Folder of a trained model, such as models/finetuned-with-all-0, whose connector and adapter to train on; empty:
+    fresh ones. Encoder, language model and adapter must be as its are. DVC knows the folder by its name alone."""
     dtype: DtypeName = "float32"
     """Number format of the frozen weights; whatever is trained stays in float32. `auto`: bfloat16 where the device
     computes it in hardware, else float32."""

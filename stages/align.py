@@ -25,7 +25,7 @@ def main() -> None:
         model, data = assemble(material, config, "align")
         if config.begin_with_words and not run.params.language.start:
             begin_with_words(model, data, load_catalogue(Path(run.params.data.catalogue)), material.seed)
-        if config.train_embeddings == "all":
+        if config.train_embeddings == "all" and model.words is None:
             model.train_words()
         with live(run) as callbacks:
             job = Job(run.name, material.fingerprint(config), material.seed, callbacks)

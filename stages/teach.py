@@ -43,7 +43,8 @@ def main() -> None:
                 trained = fit(model, data, params.teach, params.runtime, Job(run.name, key, material.seed, callbacks))
             run.finish_training(trained.history)
             write_table(OUT / "history.parquet", Measurement, trained.history)
-            save_adapter(model.llm, OUT / ADAPTER_DIR, model.llm.state_dict())
+            state = {name.removeprefix("llm."): value for name, value in trained.state.items()}
+            save_adapter(model.llm, OUT / ADAPTER_DIR, state)
             write_card(
                 OUT,
                 "A language model's adapter, taught to conclude in words",

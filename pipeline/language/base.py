@@ -32,27 +32,28 @@ ADAPTER_CONFIG = "adapter_config.json"
 ADAPTER_WEIGHTS = "adapter_model.safetensors"
 
 
-def load_tokenizer(folder: Path, key: str = "language.weights") -> PreTrainedTokenizerBase:
+def load_tokenizer(folder: Path) -> PreTrainedTokenizerBase:
     """The tokenizer with the tactile tokens added, and with a padding token.
 
     Where there is none, the unknown token pads, or else the end token: what is padding is known by its place, never by
     its id, so that an end token stays one that is learnt and stops an answer.
 
-    Args:
-        key: The parameter that names the folder.
-
     Raises:
         UserError: for a broken file; where there is no end token, which answers are stopped by; and for no chat
             template that `render` can use.
     """
-    check_language(folder, key, exists=True)
+    check_language(folder, exists=True)
     try:
         tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True, use_fast=True, trust_remote_code=False)
     except Exception as error:  # The library for tokenizers raises nothing narrower.
         reason = " ".join(str(error).split())[:200]
-        raise UserError(f"{key}: the tokenizer in {folder} cannot be read ({reason}); {again(folder)}") from None
+        raise UserError(
+            f"language.weights: the tokenizer in {folder} cannot be read ({reason}); {again(folder)}"
+        ) from None
     if tokenizer.eos_token is None:
-        raise UserError(f"{key}: {folder / 'tokenizer_config.json'} names no eos_token; answers end with it, so add it")
+        raise UserError(
+            f"language.weights: {folder / 'tokenizer_config.json'} names no eos_token; answers end with it, so add it"
+        )
     add_tactile_tokens(tokenizer)
     render([Turn(user="a", assistant="b")] * 2, tokenizer, system_prompt="", frames=1, complete=True)
     if tokenizer.pad_token is None:
@@ -60,21 +61,18 @@ def load_tokenizer(folder: Path, key: str = "language.weights") -> PreTrainedTok
     return tokenizer
 
 
-def load_llm(
-    folder: Path, dtype: torch.dtype, quantization: Quantization = "none", key: str = "language.weights"
-) -> PreTrainedModel:
+def load_llm(folder: Path, dtype: torch.dtype, quantization: Quantization = "none") -> PreTrainedModel:
     """The language model, frozen and in evaluation mode.
 
     Args:
         dtype: Of the weights; with `nf4`, of what is computed and of the layers that are left whole.
         quantization: `nf4` holds linear layers in four bits (Dettmers et al. 2023), on the CUDA device.
-        key: The parameter that names the folder.
 
     Raises:
         UserError: for a missing folder or file, a pickle, a checkpoint that does not fit its configuration, or
             four bits where they cannot be had.
     """
-    check_language(folder, key, exists=True)
+    check_language(folder, exists=True)
     own = _four_bits(dtype) if quantization == "nf4" else {}
     try:
         model, info = AutoModelForCausalLM.from_pretrained(
@@ -88,14 +86,16 @@ def load_llm(
         )
     except Exception as error:  # transformers and what it asks for raise nearly any of them.
         reason = " ".join(str(error).split())[:200]
-        raise UserError(f"{key}: {folder} cannot be loaded ({reason}); {GET_LLM.format(folder=folder)}") from None
+        raise UserError(
+            f"language.weights: {folder} cannot be loaded ({reason}); {GET_LLM.format(folder=folder)}"
+        ) from None
     wrong = sorted(map(str, [*info["missing_keys"], *info["mismatched_keys"]]))
     if wrong:
         raise UserError(
-            f"{key}: {folder} does not fit its config.json ({wrong[0]} is missing or of another shape); "
+            f"language.weights: {folder} does not fit its config.json ({wrong[0]} is missing or of another shape); "
             f"{GET_LLM.format(folder=folder)}"
         )
-    check_finite(folder, key, model.named_parameters())
+    check_finite(folder, "language.weights", model.named_parameters())
     return model.requires_grad_(False).eval()
 
 

@@ -48,10 +48,19 @@ logger = logging.getLogger(__name__)
 
 
 def add_lora(model: OctopiForCausalLM, config: LoraTrainConfig) -> None:
-    """Put fresh low-rank adapters (float32) on the language model's linear layers, or train on those that it has."""
+    """Put fresh low-rank adapters (float32) on the language model's linear layers, or train on those that it has.
+
+    Raises:
+        UserError: for layers that it lacks, or an adapter of another shape.
+    """
     from peft import LoraConfig, PeftModel, get_peft_model
 
     if isinstance(model.llm, PeftModel):
+        own = model.llm.peft_config["default"]
+        shape = {"rank": own.r, "alpha": own.lora_alpha, "dropout": own.lora_dropout}
+        for name, has in shape.items():
+            if has != getattr(config, name):
+                raise UserError(f"lora.{name}: the adapter to train on has {has}; set lora.{name}={has}")
         for name, value in model.llm.named_parameters():
             value.requires_grad_("lora_" in name)
         return

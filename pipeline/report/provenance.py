@@ -93,7 +93,7 @@ def provenance(
 
 BEYOND = {
     "questions": ("restate", "two_turns", "plainly"),
-    "language": ("normalize_touch", "touch_noise"),
+    "language": ("start", "normalize_touch", "touch_noise"),
     "align": ("weighting", "begin_with_words"),
     "teach": ("samples",),
     "lora": ("weighting", "target_modules", "dropout"),

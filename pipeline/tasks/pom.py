@@ -55,8 +55,8 @@ def asked(opening: str, names: Iterable[str]) -> dict[Opd, str]:
 
 
 def _word(number: int) -> str:
-    """A word that means nothing, of a number below 10**5."""
-    return "".join(f"{'bdfgjklmprstvz'[n % 14]}{'aeiou'[n % 5]}" for n in (number, number // 14, number // 140))
+    """A word that means nothing, another one for each number below 70**3."""
+    return "".join(f"{'bdfgjklmprstvz'[n % 14]}{'aeiou'[n % 5]}" for n in (number, number // 70, number // 4900))
 
 
 def read(answer: str, names: Sequence[str]) -> dict[str, int] | None:

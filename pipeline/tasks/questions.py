@@ -105,11 +105,10 @@ def build_questions(
 
 def drills(catalogue: Catalogue, count: int, seed: int, part: Part) -> list[Question]:
     """Drills of the tasks by turns (`TaskDefinition.drill`), as questions about no video."""
+    tasks = [name for name, task in TASKS.items() if task.drill(catalogue, random.Random(0))]
     asked = []
     for number in range(count):
-        rng = random.Random(derive_seed(seed, "drill", part, number))
-        turns = {name: turns for name, task in TASKS.items() if (turns := task.drill(catalogue, rng))}
-        task = sorted(turns)[number % len(turns)]
+        task, rng = tasks[number % len(tasks)], random.Random(derive_seed(seed, "drill", part, number))
         asked.append(
             Question(
                 question_id=f"{task}-drill-{number:05d}",
@@ -117,7 +116,7 @@ def drills(catalogue: Catalogue, count: int, seed: int, part: Part) -> list[Ques
                 part=part,
                 videos=(),
                 objects=(),
-                dialogues=(Dialogue(opd=Opd.ALL, turns=tuple(turns[task])),),
+                dialogues=(Dialogue(opd=Opd.ALL, turns=tuple(TASKS[task].drill(catalogue, rng))),),
                 gold=Gold(choice="", labels=(), properties=()),
             )
         )

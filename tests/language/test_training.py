@@ -198,8 +198,7 @@ def test_each_part_learns_at_its_own_rate_and_in_float32(dtype: str, held: Mater
 def test_training_goes_on_from_a_trained_model(held: Material, checkpoints: Path, tmp_path: Path) -> None:
     """Its connector and adapter are those that alignment begins with, frozen, and that LoRA trains on."""
     begun = assemble(held, CONFIG, "test")[0]
-    begun.save_pretrained(tmp_path / "begun" / "language")
-    adapted(begun).save_pretrained(tmp_path / "begun" / "language")
+    adapted(begun, CONFIG).save_pretrained(tmp_path / "begun" / "language")
     went_on = replace(held, language=held.language.model_copy(update={"start": str(tmp_path / "begun")}))
     model, data = assemble(went_on, CONFIG, "align")
     before = {name: value.clone() for name, value in model.named_parameters()}
@@ -208,6 +207,8 @@ def test_training_goes_on_from_a_trained_model(held: Material, checkpoints: Path
     fit(model, data, SMALL, CPU, Job("align", "x", 0))
     changed = {name for name, value in model.named_parameters() if not torch.equal(before[name], value)}
     assert {name.split(".")[0] for name in changed} == {"connector"}
+    with refused("lora.rank: the adapter to train on has 4; set lora.rank=4"):
+        add_lora(model, CONFIG.model_copy(update={"rank": 8}))
     add_lora(model, CONFIG)
     fit(model, data, CONFIG, CPU, Job("lora", "x", 0))
     after = {name for name, value in model.named_parameters() if not torch.equal(before[name], value)}

@@ -52,7 +52,7 @@ def test_matching_looks_up_a_fact() -> None:
     names = set()
     for turns in drawn("POM", 60):
         facts = dict(re.findall(r"(\w[^.]*?) is ((?:a|object) \w+)\.", turns[0].user))
-        assert len(facts) == len(turns) == 3
+        assert len(facts) == len(set(facts.values())) == len(turns) == 3
         for letter, turn in zip("abc", turns, strict=True):
             given, said = turn.assistant[: turn.described], turn.assistant[turn.described :]
             classes = given.removeprefix(f"{letter}) ").removesuffix(" is")

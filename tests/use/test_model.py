@@ -11,7 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import BaseModel
 
+from pipeline.encoder.timm_backbone import STAGES
 from pipeline.errors import UserError, readable
+from pipeline.io import tensor_shapes
 from pipeline.records import Encoder, Lora, Opd, Part, Variant
 from pipeline.use import touch
 from pipeline.use.model import Octopi, check_question
@@ -52,6 +54,11 @@ def test_of_other_recipes_too(
     monkeypatch.chdir(tmp_path)
     made = make(tmp_path, variant, *overrides)
     assert (made.folder / "language" / "words.safetensors").is_file() == ("encoder.recipe=release" in overrides)
+    if "encoder.backbone=[timm,scenes]" in overrides:
+        kept = tensor_shapes(made.folder / "encoder" / "backbone" / STAGES)
+        whole = tensor_shapes(tmp_path / "clip" / "model.safetensors")
+        assert kept.items() < whole.items(), "what follows the stage that is read stays behind"
+        assert not (made.folder / "encoder" / "backbone" / "model.safetensors").exists()
     monkeypatch.chdir("/")
     assert answers_as_stored(made) >= 40
 
