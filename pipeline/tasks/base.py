@@ -111,7 +111,7 @@ class TaskDefinition(ABC):
         """The question for a language model that knows nothing of the objects: as it is, unless it names objects."""
         return draft
 
-    def plainly(self, draft: Draft, catalogue: Catalogue) -> Draft:
+    def plainly(self, draft: Draft, catalogue: Catalogue, rng: random.Random) -> Draft:
         """The question as people ask it, where they ask it otherwise."""
         return draft
 

@@ -118,11 +118,12 @@ class PropertyComparison(TaskDefinition):
             turns.append(concluding(f"Which is {comparative}?", told, finding))
         return turns
 
-    def plainly(self, draft: Draft, catalogue: Catalogue) -> Draft:
-        """ "Which is softer? {tactile} {tactile}", which is answered by the name of one, or by "Both"."""
+    def plainly(self, draft: Draft, catalogue: Catalogue, rng: random.Random) -> Draft:
+        """ "Which is softer?" with the videos in front or behind, which is answered by the name of one, or by "Both"."""
         prop = catalogue.properties[catalogue.property_index(draft.gold.properties[0])]
         comparative = prop.more if draft.finding.startswith(f"{prop.more.capitalize()}:") else prop.less
-        user, dialogues = f"Which is {comparative}? {{tactile}} {{tactile}}", []
+        places = ("{{tactile}} {{tactile}} Which is {}?", "Which is {}? {{tactile}} {{tactile}}")
+        user, dialogues = rng.choice(places).format(comparative), []
         for dialogue in draft.dialogues:
             (turn,) = dialogue.turns
             said = re.sub(r"(?:Yes|No), the (?=first|second)", "The ", turn.assistant)

@@ -80,7 +80,7 @@ def build_questions(
             asked_on = turns.random() < two_turns and len(draft.videos) > 1
             more = further(definition, pool, draft, turns) if asked_on else []
             if not asked_on and turns.random() < plainly:
-                draft = definition.plainly(draft, pool.catalogue)
+                draft = definition.plainly(draft, pool.catalogue, turns)
             if restate:
                 draft, *more = (definition.restated(d, pool.catalogue) for d in (draft, *more))
             if asked_on:

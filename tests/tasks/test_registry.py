@@ -182,15 +182,20 @@ def test_some_comparisons_are_asked_as_people_do() -> None:
     changed = [(q, r) for q, r in zip(before, after, strict=True) if q != r]
     assert {q.task for q, _ in changed} == {"PC"}
     assert 30 < len(changed) < 60
+    in_front: set[bool] = set()
     for question, plain in changed:
         prop = next(p for p in CATALOGUE.properties if p.name == question.gold.properties[0])
         first, second = (labels[CATALOGUE.property_index(prop.name)] for labels in question.gold.labels)
         for old, new in zip(question.dialogues, plain.dialogues, strict=True):
             (usual,), (turn,) = old.turns, new.turns
-            word = turn.user.removeprefix("Which is ").removesuffix("? {tactile} {tactile}")
+            asked = turn.user.removeprefix("{tactile} {tactile} ").removesuffix(" {tactile} {tactile}")
+            assert turn.user.count("{tactile}") == 2
+            in_front.add(turn.user.startswith("{"))
+            word = asked.removeprefix("Which is ").removesuffix("?")
             assert word in (prop.more, prop.less)
             assert word in usual.user
             more = "first" if (first > second) == (word == prop.more) else "second"
             said = f"Both objects are similar in {prop.spoken}." if first == second else f"The {more} object is {word}."
             assert turn.assistant[turn.described :].removeprefix(" Conclusion: ") == said
             assert turn.assistant[: turn.described] == usual.assistant[: usual.described]
+    assert in_front == {True, False}
