@@ -119,7 +119,7 @@ class PropertyComparison(TaskDefinition):
         return turns
 
     def plainly(self, draft: Draft, catalogue: Catalogue, rng: random.Random) -> Draft:
-        """ "Which is softer?" with the videos in front or behind, which is answered by the name of one, or by "Both"."""
+        """ "Which is softer?", videos in front or behind, which is answered by the name of one, or by "Both"."""
         prop = catalogue.properties[catalogue.property_index(draft.gold.properties[0])]
         comparative = prop.more if draft.finding.startswith(f"{prop.more.capitalize()}:") else prop.less
         places = ("{{tactile}} {{tactile}} Which is {}?", "Which is {}? {{tactile}} {{tactile}}")
