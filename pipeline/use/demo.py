@@ -122,7 +122,7 @@ class Room:
             "touched": [uri(picture) for picture in where(touch)],
             "reference": uri(touch.reference),
             "contact": touch.contact,
-            "notes": list(dict.fromkeys([*touch.notes, *said.notes])),
+            "notes": list(dict.fromkeys([*said.notes, *touch.notes])),
             "levels": said.levels,
             "probabilities": said.probabilities,
         }

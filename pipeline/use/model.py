@@ -32,6 +32,9 @@ from pipeline.use.folder import ModelConfig, chat_sample, find_base, read_folder
 from pipeline.use.results import Choice, Comparison, Description, Exchange, Matching, Ranking, Touch, Video
 from pipeline.use.touch import Felt, TactileSense
 from pipeline.videos.catalogue import Catalogue, Property
+from pipeline.weights import is_tiny
+
+RANDOM = "its base models are tiny and random, made to test the chain: no answer of it means anything"
 
 
 class Octopi:
@@ -43,6 +46,7 @@ class Octopi:
         card: What the folder's config.json says.
         properties: The catalogue's properties.
         names: The names of the catalogue's objects.
+        doubts: What should make one doubt every answer; empty for a model that was trained from real weights.
     """
 
     def __init__(
@@ -54,6 +58,13 @@ class Octopi:
         self.properties: tuple[str, ...] = catalogue.property_names
         self.names: tuple[str, ...] = tuple(o.name for o in catalogue.objects.values())
         self.sense = TactileSense(folder, config, catalogue, device)
+        bases = (config.base.folder, config.encoder.weights)
+        self.doubts: tuple[str, ...] = (RANDOM,) if any(map(is_tiny, bases)) else ()
+
+    def __repr__(self) -> str:
+        scores = ", ".join(f"{task} {100 * accuracy:.0f} %" for task, (accuracy, *_) in self.config.scores.items())
+        base, source = self.config.base.folder, self.config.trained_on
+        return f"Octopi({self.config.variant}, base {base}, trained on {source}; {scores or 'no scores'})"
 
     @classmethod
     def from_pretrained(
@@ -105,7 +116,7 @@ class Octopi:
         """Answer a question.
 
         Args:
-            question: With "{tactile}" once for each video, in their order.
+            question: With "{tactile}" once for each video, in their order; without any, the videos stand in front.
             videos: Files, or arrays of uint8, frames x height x width x RGB; one, or several in a list.
             history: Earlier exchanges of the conversation.
             max_new_tokens: Of the answer; by default those of the evaluation.
@@ -139,6 +150,11 @@ class Octopi:
         felt = self.sense.feel(video)
         return felt.seen.touch.model_copy(update={"notes": felt.notes})
 
+    def notes(self, videos: Video | Sequence[Video] = ()) -> tuple[str, ...]:
+        """What should make one doubt an answer: of the model itself, then of each video, behind its name."""
+        found = [self.sense.feel(video) for video in _listed(videos)]
+        return (*self.doubts, *(f"{felt.seen.name}: {note}" for felt in found for note in felt.notes))
+
     # ---- the tasks ----
 
     def describe(self, video: Video, *, sentence: bool = True) -> Description:
@@ -164,7 +180,7 @@ class Octopi:
         known = self._property(property)
         question = pc.asked(pc.TEMPLATES[0], known.more, known.spoken)[self.config.opd]
         answer = self.ask(question, [a, b])
-        return Comparison(question=question, answer=answer, choice=pc.read(answer), notes=self._notes([a, b]))
+        return Comparison(question=question, answer=answer, choice=pc.read(answer), notes=self.notes([a, b]))
 
     def rank(self, videos: Sequence[Video], property: str) -> Ranking:
         """Videos by a property, least first: by the heads, and the model's own answer for two or three.
@@ -182,7 +198,7 @@ class Octopi:
             self._touched(video)
             probabilities = self.sense.judge(video).probabilities[place]
             expected.append(sum(level * p for level, p in enumerate(probabilities)))
-            notes += self._notes([video])
+            notes += self.notes(video)[len(self.doubts) :]
         answer, most = "", None
         if len(videos) == 3:
             answer = self.ask(pss.asked(pss.TEMPLATES[0], known.most, known.spoken)[self.config.opd], videos)
@@ -199,30 +215,37 @@ class Octopi:
             expected=tuple(expected),
             answer=answer,
             most=most,
-            notes=tuple(notes),
+            notes=(*self.doubts, *notes),
         )
 
     def match(self, videos: Sequence[Video], names: Sequence[str]) -> Matching:
-        """Which of three videos is of which of three objects of the catalogue."""
-        if len(videos) != 3 or len(names) != 3:
-            raise UserError(f"{len(videos)} videos and {len(names)} names: three of each can be matched")
-        if len({name.lower() for name in names}) < 3:
-            raise UserError(f"{', '.join(names)}: a name is given twice; name three objects")
-        ids = {o.name.lower(): i for i, o in self.catalogue.objects.items()}
-        for name in names:
-            if name.lower() not in ids:
-                hint = did_you_mean(name.lower(), ids)
-                raise UserError(f"{name}: the catalogue has no such object; {hint}its objects.csv lists all")
-        listed = sorted(names, key=str.lower)
-        question = pom.asked(pom.OPENINGS[0], listed)[self.config.opd]
+        """Which of two or three videos is of which of as many objects of the catalogue, by their names or ids.
+
+        It was trained to match three; for two a note says so.
+        """
+        if len(videos) != len(names) or len(videos) not in (2, 3):
+            raise UserError(f"{len(videos)} videos and {len(names)} names: two or three of each can be matched")
+        found = [self._object(name) for name in names]
+        if len(set(found)) < len(found):
+            raise UserError(f"{', '.join(names)}: a name is given twice; name {len(names)} objects")
+        known = {
+            i: self.catalogue.objects[i].name
+            for i in sorted(found, key=lambda i: self.catalogue.objects[i].name.lower())
+        }
+        listed = list(known.values())
+        question = pom.asked(pom.OPENINGS[len(listed) == 2], listed)[self.config.opd]
         if self.config.facts:
-            rng = random.Random(derive_seed("facts", *listed))
-            told = pom.facts(self.catalogue, [ids[name.lower()] for name in names], rng)
+            told = pom.facts(self.catalogue, known, random.Random(derive_seed("facts", *listed)))
             question = f"{told} {question}"
         answer = self.ask(question, videos)
-        found = pom.read(answer, listed)
-        given = None if found is None else tuple(listed[found[letter]] for letter in LETTERS)
-        return Matching(question=question, answer=answer, names=given, notes=self._notes(videos))
+        read = pom.read(answer, listed)
+        untrained = () if len(listed) == 3 else ("it was trained to match three videos, not two",)
+        return Matching(
+            question=question,
+            answer=answer,
+            names=None if read is None else tuple(listed[read[letter]] for letter in LETTERS[: len(listed)]),
+            notes=(*untrained, *self.notes(videos)),
+        )
 
     def scenario(self, question: str, videos: Sequence[Video]) -> Choice:
         """Which of two videos suits a situation better, described first where the variant describes."""
@@ -235,7 +258,7 @@ class Octopi:
             history.append(Exchange(turn, shown, self.ask(turn, shown, history=history)))
         letter = psr.read(history[-1].answer)
         place = None if letter is None else LETTERS.index(letter)
-        return Choice(question=question, answer=history[-1].answer, choice=place, notes=self._notes(videos))
+        return Choice(question=question, answer=history[-1].answer, choice=place, notes=self.notes(videos))
 
     # ---- within ----
 
@@ -251,9 +274,7 @@ class Octopi:
         self, conversation: Sequence[Exchange], *, untouched: bool = False
     ) -> tuple[tuple[int, ...], torch.Tensor]:
         """Token ids of a conversation whose last answer is to be said, and its frames' embeddings."""
-        for exchange in conversation:
-            check_question(exchange.question, len(exchange.videos))
-        turns = [Turn(user=exchange.question, assistant=exchange.answer) for exchange in conversation]
+        turns = [Turn(user=with_marks(e.question, len(e.videos)), assistant=e.answer) for e in conversation]
         prompt = write_prompt(turns, self.llm.tokenizer, self.config.language, self.config.frames.per_video)
         positions = self.llm.positions
         if positions is not None and len(prompt) >= positions:
@@ -273,11 +294,6 @@ class Octopi:
             raise UserError(f"{felt.seen.name}: {felt.notes[0]}; record the sensor being pressed")
         return felt
 
-    def _notes(self, videos: Sequence[Video]) -> tuple[str, ...]:
-        """What is to be doubted of each video, behind its name."""
-        found = [self.sense.feel(video) for video in videos]
-        return tuple(f"{felt.seen.name}: {note}" for felt in found for note in felt.notes)
-
     def _described(self, video: Video) -> Description:
         felt, judged = self.sense.feel(video), self.sense.judge(video)
         each = list(zip(self.catalogue.properties, judged.probabilities, judged.levels, strict=True))
@@ -287,8 +303,18 @@ class Octopi:
             probabilities={p.name: dict(zip(p.levels, found, strict=True)) for p, found, _ in each},
             sentence="",
             frames=felt.seen.touch.numbers,
-            notes=(*felt.notes, *(silent if self.config.opd is Opd.NONE else ())),
+            notes=(*self.doubts, *felt.notes, *(silent if self.config.opd is Opd.NONE else ())),
         )
+
+    def _object(self, name: str) -> str:
+        """The id of an object that is named by its name or its id."""
+        if name in self.catalogue.objects:
+            return name
+        ids = {o.name.lower(): i for i, o in self.catalogue.objects.items()}
+        if name.lower() not in ids:
+            hint = did_you_mean(name.lower(), [*ids, *self.catalogue.objects])
+            raise UserError(f"{name}: the catalogue has no such object; {hint}its objects.csv lists all")
+        return ids[name.lower()]
 
     def _property(self, name: str) -> Property:
         for known in self.catalogue.properties:
@@ -304,19 +330,26 @@ def _listed(videos: Video | Sequence[Video]) -> tuple[Video, ...]:
     return (videos,) if alone else tuple(videos)  # type: ignore[arg-type, return-value]
 
 
-def check_question(question: str, videos: int) -> None:
-    """Raise UserError where a question does not name its videos, or writes the tokens that stand for them."""
-    marks = question.count(TACTILE)
+def with_marks(question: str, videos: int) -> str:
+    """The question with "{tactile}" once for each video; where it has none at all, they stand in front, in order.
+
+    Raises:
+        UserError: where it is empty, marks more or fewer, or writes the tokens that stand for them.
+    """
     if not question.strip():
         raise UserError("the question is empty; write one")
+    if TACTILE not in question:
+        question = " ".join([*[TACTILE] * videos, question])
+    marks = question.count(TACTILE)
     if readable(question) != question:
         raise UserError("the question is no text in UTF-8; write it anew")
     if marks != videos:
         raise UserError(
-            f"the question has {marks} {TACTILE} for {videos} videos; write {TACTILE} once for each, in their order"
+            f"the question has {marks} {TACTILE} for {videos} videos; write one for each, in their order, or none"
         )
     for token in TACTILE_TOKENS:
         if token in question:
             raise UserError(
                 f"the question has {token}, which stands for a touch itself; write {TACTILE} and give a video"
             )
+    return question

@@ -103,7 +103,9 @@ def read_request(body: bytes) -> ChatRequest:
 def read_conversation(messages: Sequence[Message], most: int) -> list[Said]:
     """Turn messages into exchanges; the last is the question, whose answer is "".
 
-    A video stands where its part stands, or, where the texts of a message say `{tactile}`, at those marks in order.
+    A video stands where its part stands between two texts. Where a text of the message says `{tactile}`, videos stand
+    at those marks in order, and where there is one text without a mark, in front of it.
+
     System messages are left out: the model was trained under its own and knows no other.
 
     Args:
@@ -127,7 +129,8 @@ def read_conversation(messages: Sequence[Message], most: int) -> list[Said]:
 
 
 def _read(message: Message, place: str) -> tuple[str, tuple[bytes, ...]]:
-    marked = any(isinstance(p, TextPart) and MARK in p.text for p in message.content)
+    texts = [part.text for part in message.content if isinstance(part, TextPart)]
+    placed = len(texts) == 1 or any(MARK in text for text in texts)
     text, videos = "", []
     for i, part in enumerate(message.content):
         if isinstance(part, TextPart):
@@ -135,7 +138,7 @@ def _read(message: Message, place: str) -> tuple[str, tuple[bytes, ...]]:
         else:
             url = part.video_url if isinstance(part, VideoPart) else part.image_url
             videos.append(from_base64(url.url, f"{place}.content.{i}"))
-            piece = "" if marked else MARK
+            piece = "" if placed else MARK
         apart = text and piece and not text[-1].isspace() and not piece[0].isspace()
         text += f" {piece}" if apart else piece
     return text, tuple(videos)
@@ -147,22 +150,25 @@ def _read(message: Message, place: str) -> tuple[str, tuple[bytes, ...]]:
 class Reply:
     """The answer to one request, in OpenAI's form; token counts are left out, since the model hands out text.
 
-    `finish_reason` is `stop` also where an answer was cut at its longest, which the text does not tell.
+    `finish_reason` is `stop` also where an answer was cut at its longest, which the text does not tell. `notes`, which
+    OpenAI's has not, is what should make one doubt the answer: of a stream its last chunk has it.
     """
 
-    def __init__(self, model: str) -> None:
+    def __init__(self, model: str, notes: Sequence[str] = ()) -> None:
+        self.notes = notes
         self.head: Json = {"id": f"chatcmpl-{uuid.uuid4().hex}", "created": int(time.time()), "model": model}
 
     def whole(self, text: str) -> Json:
         """A `chat.completion`."""
         message = {"role": "assistant", "content": text, "refusal": None}
         choice = {"index": 0, "message": message, "logprobs": None, "finish_reason": "stop"}
-        return {**self.head, "object": "chat.completion", "choices": [choice]}
+        return {**self.head, "object": "chat.completion", "choices": [choice], "notes": [*self.notes]}
 
     def chunk(self, delta: Mapping[str, str], finish: str | None = None) -> Json:
         """A `chat.completion.chunk`."""
         choice = {"index": 0, "delta": dict(delta), "logprobs": None, "finish_reason": finish}
-        return {**self.head, "object": "chat.completion.chunk", "choices": [choice]}
+        notes = {"notes": [*self.notes]} if finish else {}
+        return {**self.head, "object": "chat.completion.chunk", "choices": [choice], **notes}
 
 
 def model_entry(name: str, created: int) -> Json:

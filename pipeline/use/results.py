@@ -87,7 +87,7 @@ class Ranking(Record):
 
 
 class Matching(Record):
-    """Which of three videos is of which of three objects."""
+    """Which of two or three videos is of which of as many objects."""
 
     question: str
     answer: str

@@ -14,7 +14,6 @@ import time
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack, asynccontextmanager, suppress
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from fastapi import FastAPI, Request
@@ -77,13 +76,13 @@ class Service:
         with ExitStack() as stack:
             stack.callback(self._free.release)
             body = await _read(request, self.limits.body_bytes)
-            wanted, asked, files = await asyncio.to_thread(self._prepare, body, stack)
+            wanted, asked, files, notes = await asyncio.to_thread(self._prepare, body, stack)
             del body
             # From here on the worker gives the place back, when it needs the files no more.
             job = Job(asked, stack.pop_all().close)
             self.worker.add(job)
         self.metrics.videos += files
-        reply = Reply(self.name)
+        reply = Reply(self.name, notes)
         pieces = job.pieces()
         try:
             if wanted.stream:
@@ -94,7 +93,8 @@ class Service:
             job.left.set()
             raise
 
-    def _prepare(self, body: bytes, stack: ExitStack) -> tuple[Any, Callable[[], Iterator[str]], int]:
+    def _prepare(self, body: bytes, stack: ExitStack) -> tuple[Any, Callable[[], Iterator[str]], int, list[str]]:
+        """The request, how to answer it, its number of videos, and a list that takes the notes when it is answered."""
         wanted = read_request(body)
         if wanted.model != self.name:
             raise HTTPException(404, f"model {wanted.model[:80]!r} is not served here; ask for {self.name!r}")
@@ -104,8 +104,14 @@ class Service:
         *history, last = [Exchange(q, tuple(next(files) for _ in videos), a) for q, videos, a in said]
         most = wanted.max_completion_tokens or wanted.max_tokens
         most = min(most, self.most_tokens) if most else None
-        ask = partial(self.model.stream, last.question, last.videos, history=history, max_new_tokens=most)
-        return wanted, ask, len(every)
+        notes: list[str] = []
+
+        def ask() -> Iterator[str]:
+            pieces = self.model.stream(last.question, last.videos, history=history, max_new_tokens=most)
+            notes.extend(PLACE.sub(r"video \1", note) for note in self.model.notes(last.videos))
+            return pieces
+
+        return wanted, ask, len(every), notes
 
 
 async def _read(request: Request, most: int) -> bytes:

@@ -12,6 +12,7 @@ import numpy as np
 
 from pipeline.config import FramesConfig
 from pipeline.errors import UserError
+from pipeline.use.model import with_marks
 from pipeline.use.results import Description, Exchange, Touch, Video
 from pipeline.videos.files import VideoFile
 from pipeline.videos.frames.scan import Scan, scan
@@ -58,12 +59,14 @@ class FakeOctopi:
         levels = {p: names[0] for p, names in LEVELS.items()}
         return Description(levels=levels, probabilities=share, sentence="It is soft.", frames=(1, 2), notes=())
 
+    def notes(self, videos: Sequence[Video]) -> tuple[str, ...]:
+        return tuple(f"{video}: little touches the sensor" for video in videos)
+
     def stream(
         self, question: str, videos: Sequence[Video] = (), *, history: Sequence[Exchange] = (), **_: Any
     ) -> Iterator[str]:
         self.threads.add(threading.get_ident())
-        if question.count("{tactile}") != len(videos):
-            raise UserError(f"the question has {question.count('{tactile}')} {{tactile}} for {len(videos)} videos")
+        question = with_marks(question, len(videos))
         self.heard.append((question, [Path(str(v)).name for v in videos], list(history)))
         for piece in (*question.replace("{tactile}", "it").split(), f"<b>{len(history)}</b>"):
             self.made += 1

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from pipeline import runtime
 from pipeline.cli import app, main
 from pipeline.use import ask as asking
+from pipeline.use import model as model_code
 from pipeline.use.ask import Chat, default_model, describe_folder
 from pipeline.use.model import Octopi
 from tests.conftest import not_utf8, refused
@@ -151,6 +152,33 @@ def test_a_folder_is_described_and_a_model_copied_by_command(
     assert [row["file"] for row in rows_of(alone)] == [files[0].name]
     assert CliRunner().invoke(app, ["export", str(made.folder), str(tmp_path / "copy"), "--with-base"]).exit_code == 0
     assert Octopi.from_pretrained(tmp_path / "copy", device="cpu").ask("Why?") == octopi.ask("Why?")
+
+
+def test_videos_described_compared_ranked_and_matched_by_command(
+    made: Made, octopi: Octopi, files: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each as the call of the same name, and what makes one doubt it on stderr, once."""
+    monkeypatch.setattr(model_code, "is_tiny", lambda _: True)
+
+    def said(*words: str) -> str:
+        found = CliRunner().invoke(app, [*words, "--model", str(made.folder), "--device", "cpu"])
+        assert found.exit_code == 0, found.output
+        assert found.stderr.count("tiny and random") == 1
+        return found.stdout
+
+    one, two, three = map(str, files)
+    table = said("describe", one)
+    level, *_ = (known := octopi.describe(one)).levels.values()
+    for word in (files[0].name, *known.levels, level, f"({max(known.probabilities['hardness'].values()):.0%})"):
+        assert word in table
+    assert said("compare", one, two, "hardness") == octopi.compare(one, two, "hardness").answer + "\n"
+    ranked = octopi.rank([three, one, two], "roughness")
+    *lines, answer = said("rank", "roughness", three, one, two).rstrip("\n").split("\n")
+    assert [line.split("  ")[1] for line in lines] == [[three, one, two][i] for i in ranked.order]
+    assert answer == ranked.answer
+    names = "rug, a fuzzy rug" if "rug" not in octopi.catalogue.objects else "rug, millet"
+    ids = [name.strip() for name in names.split(",")]
+    assert said("match", one, two, "--names", names).startswith(octopi.match([one, two], ids).answer)
 
 
 def test_a_killed_description_goes_on(

@@ -16,7 +16,7 @@ from pipeline.errors import UserError, readable
 from pipeline.io import tensor_shapes
 from pipeline.records import Encoder, Lora, Opd, Part, Variant
 from pipeline.use import touch
-from pipeline.use.model import Octopi, check_question
+from pipeline.use.model import Octopi, with_marks
 from pipeline.use.results import Exchange
 from pipeline.use.sight import see
 from pipeline.use.touch import TactileSense
@@ -176,6 +176,11 @@ def test_typed_tasks(octopi: Octopi, files: list[Path], monkeypatch: pytest.Monk
     matched = octopi.match(files, names)
     assert matched.names == (names[0], names[2], names[1])
     assert all(name in matched.question for name in names)
+    said["match"] = f"Conclusion: a) is {names[0]} and b) is {names[2]}."
+    for named in ([names[0], names[2]], ["rug", "millet"], ["rug", names[2].upper()]):
+        two = octopi.match(files[:2], named)
+        assert (two.names, two.question.count("{tactile}")) == ((names[0], names[2]), 2)
+        assert "it was trained to match three videos, not two" in two.notes
     chosen = octopi.scenario("I must sleep.", files[:2])
     assert chosen.choice == 1
     assert [q.count("{tactile}") for q in asked[-2:]] == [2, 0], "described first"
@@ -193,7 +198,7 @@ def test_tasks_ask_in_the_wording_of_training(made: Made, octopi: Octopi, files:
 @pytest.mark.parametrize(
     ("question", "count", "words"),
     [
-        ("Which is softer?", 1, r"0 \{tactile\} for 1 videos"),
+        ("{tactile} is it softer?", 2, r"1 \{tactile\} for 2 videos"),
         ("{tactile} {tactile}", 1, r"2 \{tactile\} for 1 videos"),
         ("{tactile}?", 0, r"1 \{tactile\} for 0 videos"),
         ("  ", 0, "question is empty"),
@@ -215,9 +220,10 @@ def test_questions_that_do_not_fit_are_refused(
 def test_a_question_is_taken_only_with_as_many_videos_as_it_names(text: str, videos: int) -> None:
     marked = text + "{tactile}" * videos
     if text.strip() and "{tactile}" not in text and "<tact" not in text and readable(text) == text:
-        check_question(marked, videos)
+        assert with_marks(marked, videos) == marked
+        assert with_marks(text, videos) == " ".join(["{tactile}"] * videos + [text])
     with pytest.raises(UserError):
-        check_question(marked + "{tactile}", videos)
+        with_marks(marked + "{tactile}", videos)
 
 
 def test_videos_that_cannot_be_used_are_refused(octopi: Octopi, tmp_path: Path, files: list[Path]) -> None:
@@ -264,10 +270,10 @@ def test_unknown_words_are_refused(octopi: Octopi, files: list[Path]) -> None:
         octopi.compare(files[0], files[1], "hardnes")
     with refused("the catalogue has no such object"):
         octopi.match(files, ["rug", "millet", "a unicorn"])
-    with refused("three of each"):
-        octopi.match(files[:2], ["rug", "millet"])
+    with refused("two or three of each"):
+        octopi.match(files[:2], ["rug", "millet", "candle"])
     with refused("a name is given twice"):
-        octopi.match(files, ["a rug", "A rug", "millet"])
+        octopi.match(files, ["rug", octopi.catalogue.objects["rug"].name, "millet"])
     with refused("1 videos: two or more can be ranked"):
         octopi.rank(files[:1], "hardness")
     with refused("chooses between two"):
@@ -295,6 +301,16 @@ def test_a_little_touch_and_a_damaged_video_are_noted(
     compared = octopi.compare(files[0], cut, "hardness")
     assert [n.partition(": ")[0] for n in compared.notes] == [str(cut)]
     assert "damaged" in compared.notes[0]
+
+
+def test_a_model_on_random_weights_says_so(octopi: Octopi, made: Made, files: list[Path]) -> None:
+    assert octopi.notes(files[:2]) == octopi.doubts == ()
+    base = octopi.config.base.model_copy(update={"folder": "data/weights/tiny-llama"})
+    config = octopi.config.model_copy(update={"base": base})
+    random = Octopi(made.folder, config, octopi.catalogue, octopi.llm, octopi.sense.device)
+    assert random.notes(files[:1]) == random.describe(files[0]).notes == random.doubts
+    assert "tiny and random" in random.doubts[0]
+    assert repr(random).startswith("Octopi(finetuned-with-all-0, base data/weights/tiny-llama, trained on ")
 
 
 def test_what_is_unlike_training_is_noted(octopi: Octopi, files: list[Path]) -> None:

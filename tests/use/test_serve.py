@@ -84,13 +84,14 @@ def test_an_answer_has_openai_s_fields(client: TestClient) -> None:
     assert response.status_code == 200
     answer = response.json()
     # github.com/openai/openai-openapi, CreateChatCompletionResponse: required are all of these; usage is not.
-    assert set(answer) == {"id", "object", "created", "model", "choices"}
+    assert set(answer) == {"id", "object", "created", "model", "choices", "notes"}
+    assert answer["notes"] == ["video 1: little touches the sensor"]
     assert answer["id"].startswith("chatcmpl-")
     assert (answer["object"], answer["model"]) == ("chat.completion", "octopi")
     assert type(answer["created"]) is int
     assert abs(answer["created"] - began) < HUNG
     (choice,) = answer["choices"]
-    message = {"role": "assistant", "content": f"How soft is it? {{tactile}} | {digest(video(1))} ", "refusal": None}
+    message = {"role": "assistant", "content": f"{{tactile}} How soft is it? | {digest(video(1))} ", "refusal": None}
     assert choice == {"index": 0, "message": message, "logprobs": None, "finish_reason": "stop"}
 
 
@@ -99,6 +100,7 @@ def test_a_stream_has_openai_s_chunks(client: TestClient) -> None:
     assert response.headers["content-type"].startswith("text/event-stream")
     *chunks, done = events(response.text)
     assert done == "[DONE]"
+    assert chunks[-1].pop("notes") == []
     for chunk in chunks:
         assert set(chunk) == {"id", "object", "created", "model", "choices"}
         assert chunk["object"] == "chat.completion.chunk"
@@ -143,7 +145,7 @@ def test_the_real_model_answers_as_the_library_does(octopi: Octopi, files: list[
 @pytest.mark.parametrize(
     ("content", "question"),
     [
-        ((text("Which is softer?"), part(video(1)), part(video(2))), "Which is softer? {tactile} {tactile}"),
+        ((text("Which is softer?"), part(video(1)), part(video(2))), "{tactile} {tactile} Which is softer?"),
         ((part(video(1)), part(video(2)), text("Which is softer?")), "{tactile} {tactile} Which is softer?"),
         ((text("a) {tactile} b) {tactile}?"), part(video(1)), part(video(2))), "a) {tactile} b) {tactile}?"),
         ((text("a)\n"), part(video(1)), text("\nb)\n"), part(video(2))), "a)\n{tactile}\nb)\n{tactile}"),
@@ -169,7 +171,7 @@ def test_a_conversation_and_what_is_let_through(client: TestClient, fake: FakeOc
     ]
     more = {"temperature": 0.2, "top_p": 1, "seed": 4, "user": "r2", "n": 1, "tools": [], "stop": None, "x": {"y": 1}}
     response = client.post(CHAT, json=body(*messages, max_tokens=7, **more))
-    said = f"Second {{tactile}} | First {{tactile}}>Soft.:{digest(video(1))} | {digest(video(2))} "
+    said = f"{{tactile}} Second | First>Soft.:{digest(video(1))} | {digest(video(2))} "
     assert response.json()["choices"][0]["message"]["content"] == said
     assert fake.tokens[-1] == 7
     client.post(CHAT, json=body(user("a"), max_completion_tokens=5000))
@@ -271,7 +273,7 @@ def test_a_thousand_bad_requests_and_a_good_one(client: TestClient) -> None:
         error(send(client, BAD[i % len(BAD)][0]), 422)
     assert client.get("/health").json()["waiting"] == 0
     answer = client.post(CHAT, json=body(user(text("good"), part(video(3))))).json()
-    assert answer["choices"][0]["message"]["content"] == f"good {{tactile}} | {digest(video(3))} "
+    assert answer["choices"][0]["message"]["content"] == f"{{tactile}} good | {digest(video(3))} "
 
 
 def test_other_refusals(client: TestClient) -> None:

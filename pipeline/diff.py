@@ -1,4 +1,4 @@
-"""What differs between two commits, or a commit and what lies on disk: `octopi compare`.
+"""What differs between two commits, or a commit and what lies on disk: `octopi diff`.
 
 DVC reads both states: Git's files and, by the hashes in dvc.lock, what its cache holds. Nothing is checked out or run.
 """

@@ -1,4 +1,4 @@
-"""`octopi compare` in a small Git and DVC repository: what it names, what it leaves out, and its paired test."""
+"""`octopi diff` in a small Git and DVC repository: what it names, what it leaves out, and its paired test."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from dvc.repo import Repo
 from typer.testing import CliRunner
 
 from pipeline.cli import app
-from pipeline.compare import compare
+from pipeline.diff import compare
 from pipeline.errors import UserError
 from pipeline.evaluation.scores import score_rows
 from pipeline.io import write_csv, write_table
@@ -218,10 +218,10 @@ def test_outside_of_git_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def test_what_a_person_sees(history: History, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(history.folder)
-    same = CliRunner().invoke(app, ["compare", "first", "again"])
+    same = CliRunner().invoke(app, ["diff", "first", "again"])
     assert (same.exit_code, same.output.strip()) == (0, "Nothing differs")
     file = tmp_path / "out" / "compared.json"
-    other = CliRunner().invoke(app, ["compare", "again", "longer", "--json", str(file)])
+    other = CliRunner().invoke(app, ["diff", "again", "longer", "--json", str(file)])
     assert other.exit_code == 0, other.output
     for words in (r"epochs +4 +5", r"smoke-scenes\.OPD +0\.25 +0\.75", r"finetuned with all real +new - old +OPD"):
         assert re.search(words, other.output), words

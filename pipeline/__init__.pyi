@@ -1,0 +1,1 @@
+from pipeline.use.model import Octopi as Octopi
