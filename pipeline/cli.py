@@ -185,10 +185,27 @@ def bag(
     times: Annotated[float, typer.Option(help="A press begins at this many times the quiet level.")] = 2.0,
 ) -> None:
     """Cut a robot's recording into presses: videos for the chain and `octopi ask`, each with its times in a CSV."""
-    from pipeline.use.bags import import_bag
+    from pipeline.use.bags import shots
+    from pipeline.use.presses import cut
 
-    written = import_bag(file, topic, out, object_id or file.stem, times)
+    written = cut(lambda: shots(file, topic), f"{file}, {topic}", out, object_id or file.stem, times)
     typer.echo(f"{len(written)} presses in {out}: {', '.join(path.name for path in written)}")
+
+
+@import_app.command()
+def video(
+    file: Annotated[Path, typer.Argument(help="A video with several presses, or a folder of PNG or JPEG pictures.")],
+    out: Annotated[Path, typer.Option(help="Folder of the videos.")],
+    object_id: Annotated[str, typer.Option("--object", help="What is touched; the file's name by default.")] = "",
+    times: Annotated[float, typer.Option(help="A press begins at this many times the quiet level.")] = 2.0,
+    fps: Annotated[float, typer.Option(min=0, help="Pictures a second, where the file does not say.")] = 0.0,
+    whole: Annotated[bool, typer.Option("--whole", help="Write one video of all of it.")] = False,
+) -> None:
+    """Cut a long recording into presses: videos for the chain and `octopi ask`, each with its times in a CSV."""
+    from pipeline.use.presses import cut, film
+
+    written = cut(lambda: film(file, fps), str(file), out, object_id or file.stem, times, whole=whole)
+    typer.echo(f"{len(written)} videos in {out}: {', '.join(path.name for path in written)}")
 
 
 def _show(findings: Sequence[Finding]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import posixpath
 import re
 import unicodedata
 from collections import Counter
@@ -166,6 +167,8 @@ def _from_list(listed: Path, folder: Path, paths: Sequence[Path]) -> tuple[list[
     for place, row in rows:
         line = place.removeprefix(str(listed)).lstrip(", ")
         name, object_id = (unicodedata.normalize("NFC", row[column]) for column in ("file", "object_id"))
+        # As people and spreadsheets of Windows write it.
+        name = name if name in {"", *there} else posixpath.normpath(name.replace("\\", "/"))
         if name not in there:
             findings.append(
                 _error(LIST_FILE, f"{line}: no video {name!r} in the folder; correct the line or remove it")

@@ -18,7 +18,9 @@ from pipeline.config import FramesConfig
 from pipeline.errors import UserError
 from pipeline.io import read_csv
 from pipeline.records import Severity
-from pipeline.use.bags import QUIET, RELEASED, ROUNDING, SHORTEST, FrameTime, import_bag, presses, shots
+from pipeline.scenes.film import write_film
+from pipeline.use.bags import shots
+from pipeline.use.presses import QUIET, RELEASED, ROUNDING, SHORTEST, FrameTime, cut, presses
 from pipeline.videos.audit.files import FOUND
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.decoding import Decoder, decode
@@ -50,6 +52,10 @@ def recording(height: int = 48, width: int = 64) -> list[np.ndarray]:
     return pictures
 
 
+def import_bag(bag: Path, topic: str, out: Path, object_id: str) -> list[Path]:
+    return cut(lambda: shots(bag, topic), str(bag), out, object_id)
+
+
 def message(store: Any, picture: np.ndarray, encoding: str, index: int, at: int) -> tuple[Any, str]:
     """A ROS message of a picture (BGR) with this stamp (ns) and its type; rows are padded by five bytes."""
     types = store.types
@@ -61,7 +67,15 @@ def message(store: Any, picture: np.ndarray, encoding: str, index: int, at: int)
         kind = "sensor_msgs/msg/CompressedImage"
         return types[kind](header=header, format="bgr8; png compressed bgr8", data=data), kind
     height, width = picture.shape[:2]
-    pixels = {"rgb8": picture[:, :, ::-1], "mono8": picture[:, :, :1]}.get(encoding, picture).reshape(height, -1)
+    clear = np.full((height, width, 1), 7, np.uint8)
+    sent = {
+        "rgb8": picture[:, :, ::-1],
+        "mono8": picture[:, :, :1],
+        "8UC1": picture[:, :, :1],
+        "bgra8": np.dstack([picture, clear]),
+        "rgba8": np.dstack([picture[:, :, ::-1], clear]),
+    }
+    pixels = sent.get(encoding, picture).reshape(height, -1)
     padded = np.pad(pixels, ((0, 0), (0, 5)), constant_values=255)
     kind, shape = "sensor_msgs/msg/Image", {"height": height, "width": width, "step": padded.shape[1]}
     return types[kind](header=header, encoding=encoding, is_bigendian=0, data=padded.ravel(), **shape), kind
@@ -99,14 +113,16 @@ def pictures() -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("kind", ["ros1", "sqlite3", "mcap"])
-@pytest.mark.parametrize("encoding", ["bgr8", "8UC3", "rgb8", "mono8", "png"])
+@pytest.mark.parametrize("encoding", ["bgr8", "8UC3", "rgb8", "bgra8", "rgba8", "mono8", "8UC1", "png"])
 def test_pictures_come_back_as_they_were_sent(
     tmp_path: Path, pictures: list[np.ndarray], kind: str, encoding: str
 ) -> None:
     bag = write_bag(tmp_path, kind, pictures[18:22], encoding)
     found = list(shots(bag, TOPIC))
     for index, (shot, sent) in enumerate(zip(found, pictures[18:22], strict=True)):
-        np.testing.assert_array_equal(shot.picture, sent[:, :, :1].repeat(3, 2) if encoding == "mono8" else sent)
+        np.testing.assert_array_equal(
+            shot.picture, sent[:, :, :1].repeat(3, 2) if "1" in encoding or encoding == "mono8" else sent
+        )
         assert shot.recorded == START_NS + index * STEP_NS
         assert shot.stamped == shot.recorded - 3_000_000
 
@@ -260,7 +276,7 @@ def test_what_is_no_recording_of_touch_is_refused_in_one_line(tmp_path: Path, pi
         [
             (quiet, "bgr8", "nothing touches the sensor in 78 pictures"),
             (pictures[:1], "bgr8", "nothing touches the sensor in 1 pictures"),
-            (pictures[:2], "16UC1", "has encoding '16UC1'; send one of bgr8, 8UC3, rgb8, mono8"),
+            (pictures[:2], "16UC1", "has encoding '16UC1'; send one of bgr8, 8UC3, rgb8, mono8, 8UC1"),
             (pictures[:2], "broken", "is no picture that OpenCV reads"),
             ([pictures[0], pictures[1][:-2]], "bgr8", "change their size"),
         ]
@@ -274,6 +290,50 @@ def test_what_is_no_recording_of_touch_is_refused_in_one_line(tmp_path: Path, pi
     assert "not a whole recording" in refused(tmp_path / "empty", out)
     bag = write_bag(tmp_path, "ros1", pictures)
     assert "--object" in refused(bag, out, TOPIC, "--object", "../rug")
+
+
+@pytest.mark.parametrize("encoding", ["yuv422", "yuv422_yuy2"])
+def test_colours_that_two_pixels_share_are_read(tmp_path: Path, encoding: str) -> None:
+    """By ITU-R BT.601's own formula, brightness from 16 to 235, of pictures whose pairs of pixels have one colour."""
+    y, u, v = (np.random.default_rng(0).integers(60, 180, size) for size in ((8, 12), (8, 6), (8, 6)))
+    parts = (u, y[:, ::2], v, y[:, 1::2]) if encoding == "yuv422" else (y[:, ::2], u, y[:, 1::2], v)
+    packed = np.stack(parts, axis=2).reshape(8, 12, 2).astype(np.uint8)
+    (shot,) = shots(write_bag(tmp_path, "ros1", [packed], encoding), TOPIC)
+    light, blue, red = 1.164 * (y - 16), u.repeat(2, 1) - 128, v.repeat(2, 1) - 128
+    bgr = np.stack([light + 2.018 * blue, light - 0.813 * red - 0.391 * blue, light + 1.596 * red], axis=2)
+    assert np.abs(shot.picture - np.clip(bgr, 0, 255)).max() < 3
+
+
+def test_a_long_video_and_a_folder_of_pictures_are_cut_as_a_bag_is(tmp_path: Path, pictures: list[np.ndarray]) -> None:
+    (folder := tmp_path / "grasp").mkdir()
+    for number, shown in enumerate(pictures):
+        cv2.imwrite(str(folder / f"frame_{number}.png"), shown)  # frame_10 comes after frame_9.
+    write_film(long := tmp_path / "long.mp4", pictures, 25.0)
+    (text := tmp_path / "text.mp4").write_text("no video")
+    command = ["import", "video", "--out", str(out := tmp_path / "videos"), "--object", "rug"]
+    for name, more, end in ((str(folder), ["--fps", "25"], ".png"), (str(long), ["--times", "4"], ".mp4")):
+        said = CliRunner().invoke(app, [*command, name, *more])
+        assert said.exit_code == 0, said.output
+        for number, touched in zip((0, 1) if end == ".png" else (2, 3), TOUCHED, strict=True):
+            rows = read_csv(out / f"rug_{number}.csv", FrameTime)
+            begin = touched.start - LONGEST
+            expected = [(begin + i) * STEP_NS for i in range(len(touched) + 2 * LONGEST)]
+            times = [r.recorded_ns for r in rows]
+            assert times == [r.stamped_ns for r in rows] == expected
+    assert CliRunner().invoke(app, [*command, str(long), "--whole"]).exit_code == 0
+    assert len(list(decode(out / "rug_4.mp4"))) == LENGTH
+    cv2.imwrite(str(folder / "frame_3.png"), pictures[3][:-2])
+    (empty := tmp_path / "empty").mkdir()
+    for name, more, words in (
+        (folder, ["--fps", "25"], "frame_3.png: of another size"),
+        (folder, [], "say --fps"),
+        (empty, ["--fps", "25"], "no picture (.jpeg, .jpg, .png) in it"),
+        (tmp_path / "none.mp4", [], "no such file"),
+        (text, ["--fps", "25"], "no frame decodes"),
+    ):
+        error = CliRunner().invoke(app, [*command, str(name), *more]).exception
+        assert isinstance(error, UserError), name
+        assert words in str(error)
 
 
 def test_the_command_says_what_it_wrote(tmp_path: Path, pictures: list[np.ndarray]) -> None:

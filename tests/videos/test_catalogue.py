@@ -159,6 +159,9 @@ def test_a_spreadsheet_s_csv_is_read(tmp_path: Path) -> None:
     lines = [SHORT.replace(",", " , "), "", BALL.replace(",", ", "), ",,,,"]
     loaded = load_catalogue(write(tmp_path, *lines, described=["object_id,description"], encoding="utf-8-sig"))
     assert loaded.objects["ball"].name == "a ball"
+    as_decimals = BALL.replace("1 1 2", "1.0 1 2.00")
+    assert as_decimals != BALL
+    assert load_catalogue(write(tmp_path, SHORT, as_decimals)).objects == loaded.objects
     write(tmp_path, SHORT, BALL.replace("a ball", "a käse"), encoding="latin-1")
     with pytest.raises(UserError, match=r"objects\.csv.*UTF-8"):
         load_catalogue(tmp_path)

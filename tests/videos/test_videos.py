@@ -204,8 +204,9 @@ def test_what_a_list_lacks_is_left_out_with_one_line(tmp_path: Path, catalogue: 
         'object_id,note,file\nrug,"one, two",a.mov\npotato,,b c.mp4',
         "file,object_id\r\na.mov,rug\r\nb c.mp4,potato\r\n",
         "file,object_id,session\na.mov,rug\nb c.mp4,potato,\n",
+        "file,object_id\n./a.mov,rug\n.\\b c.mp4,potato\n",
     ],
-    ids=["byte order mark", "spaces and empty lines", "other columns", "Windows", "short lines"],
+    ids=["byte order mark", "spaces and empty lines", "other columns", "Windows", "short lines", "as a shell writes"],
 )
 def test_lists_are_read_as_people_write_them(tmp_path: Path, catalogue: Catalogue, text: str) -> None:
     folder = listed(tmp_path, "", "a.mov", "b c.mp4")

@@ -214,9 +214,9 @@ def _read_object(row: Row, language: Language, splits: dict[str, str], where: st
 
 
 def _classes(text: str, most: int) -> tuple[int, ...]:
-    """The numbers of a cell; empty where one is none, or no class."""
+    """The numbers of a cell, 1.0 as 1; empty where one is none, or no class."""
     words = text.split()
-    values = tuple(int(word) for word in words if re.fullmatch(r"[0-9]+", word))
+    values = tuple(int(word.partition(".")[0]) for word in words if re.fullmatch(r"[0-9]+(\.0*)?", word))
     return values if len(values) == len(words) and all(v <= most for v in values) else ()
 
 

@@ -1,0 +1,241 @@
+"""Recordings cut into presses, one video each, as the chain and `octopi ask` take them.
+
+A press is where the picture differs from the untouched one by much more than the recording's quiet frames do.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+
+from pipeline.errors import UserError
+from pipeline.io import atomic, remove_rests, write_csv
+from pipeline.records import Record
+from pipeline.scenes.film import write_film
+from pipeline.videos.audit.files import FOUND
+from pipeline.videos.decoding import Decoder, Image, decode
+from pipeline.videos.files import is_video
+from pipeline.videos.frames.reference import (
+    LONGEST,
+    contact_strength,
+    reference_indices,
+    starts_touching,
+    thumbnail,
+    unsteady_frames,
+)
+
+PICTURES = (".jpeg", ".jpg", ".png")
+RELEASED = 0.75
+"""A press ends under this share of the strength that it begins at, so that noise at the threshold cuts none in two."""
+QUIET = 0.1
+"""Quantile of the strengths that is taken for the recording's quiet level."""
+ROUNDING = 0.1
+"""Least quiet level, in 8-bit steps: under it a difference is rounding."""
+RATES = (1.0, 240.0)
+"""Frames a second of a video, at least and at most."""
+SHORTEST = 3
+"""Frames of a press; what is shorter is a flicker."""
+
+
+class FrameTime(Record):
+    """When a frame of a video was recorded: a row of the CSV beside it."""
+
+    frame: int
+    """Position in the video."""
+    recorded_ns: int
+    """When a bag received the message, in ns since 1970; of a film, from its beginning."""
+    stamped_ns: int
+    """The message's own header stamp, in ns; of a film, as `recorded_ns`."""
+    contact: float
+    """Contact strength in 8-bit steps (`pipeline.videos.frames.reference.contact_strength`)."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One picture of a recording: height x width x BGR, and its times in ns."""
+
+    picture: Image
+    recorded: int
+    stamped: int
+
+
+def cut(
+    read: Callable[[], Iterator[Shot]],
+    name: str,
+    out: Path,
+    object_id: str,
+    times: float = FOUND,
+    *,
+    whole: bool = False,
+) -> list[Path]:
+    """Write every press of a recording as `<object_id>_<n>.mp4` with a CSV of times; numbers go on from those in `out`.
+
+    The recording is read twice, so that no more than one picture is in memory: first to measure contact, then to write.
+
+    Args:
+        read: Begins the recording anew: `film`, or `bags.shots`.
+        name: What an error calls it.
+        times: A press begins at this many times the quiet level.
+        whole: Write all of it as one video, without looking for presses.
+
+    Raises:
+        UserError: if the recording cannot be read, or nothing touches the sensor.
+    """
+    if re.fullmatch(r"[\w-]+", object_id) is None:
+        raise UserError(f"--object {object_id!r}: take letters, digits, _ and -, as in objects.csv")
+    stamped, received, strengths = _measure(read())
+    ranges = [(0, len(strengths))] if whole else presses(strengths, times)
+    if not ranges:
+        raise UserError(
+            f"{name}: nothing touches the sensor in {len(strengths)} pictures (strongest difference "
+            f"{strengths.max():.2f}, a press begins at {_threshold(strengths, times):.2f}); lower --times"
+        )
+    fps = _rate(name, stamped, received)
+    out.mkdir(parents=True, exist_ok=True)
+    remove_rests(out)
+    first, source, position, written = _next_number(out, object_id), read(), 0, []
+    for number, (begin, end) in enumerate(ranges, first):
+        path, rows = out / f"{object_id}_{number}.mp4", list[FrameTime]()
+        pressed = itertools.islice(source, begin - position, end - position)
+        with atomic(path.with_suffix(".csv")) as table:
+            # The suffix says the container, so the unfinished file bears it, too.
+            part = path.with_name(f".{path.stem}.{os.getpid()}.part.mp4")
+            try:
+                write_film(part, _noting(pressed, strengths[begin:end], rows), fps)
+                write_csv(table, FrameTime, rows)
+                os.replace(part, path)
+            finally:
+                part.unlink(missing_ok=True)
+        written.append(path)
+        position = end
+    return written
+
+
+def _noting(pressed: Iterator[Shot], strengths: npt.NDArray[np.float64], rows: list[FrameTime]) -> Iterator[Image]:
+    for frame, (shot, strength) in enumerate(zip(pressed, strengths.tolist(), strict=True)):
+        times = {"recorded_ns": shot.recorded, "stamped_ns": shot.stamped}
+        rows.append(FrameTime(frame=frame, contact=round(strength, 3), **times))
+        yield shot.picture
+
+
+def film(path: Path, fps: float = 0.0) -> Iterator[Shot]:
+    """The pictures of a video, or of a folder of PNG or JPEG files by their names (2 before 10).
+
+    Args:
+        fps: Pictures a second; 0 for the video's own. A folder has none of its own.
+
+    Raises:
+        UserError: where there is no picture, one cannot be read or has another size, or the rate is unknown.
+    """
+    if not path.exists():
+        raise UserError(f"{path}: no such file; name a video or a folder of pictures")
+    rate = fps
+    if path.is_dir():
+        files = [file for file in path.iterdir() if file.suffix.lower() in PICTURES]
+        files.sort(key=lambda file: [int(word) if word.isdecimal() else word for word in re.split(r"(\d+)", file.name)])
+        pictures = ((str(file), cv2.imread(str(file))) for file in files)
+    else:
+        with Decoder(path) as decoder:
+            rate = rate or decoder.header.fps
+        pictures = ((f"{path}, frame {number}", frame) for number, frame in enumerate(decode(path)))
+    if rate <= 0:
+        raise UserError(f"{path}: its frames a second are not known; say --fps")
+    size = None
+    for number, (where, picture) in enumerate(pictures):
+        if picture is None:
+            raise UserError(f"{where}: no picture that OpenCV reads; copy it again, or remove it")
+        size = size or picture.shape
+        if picture.shape != size:
+            raise UserError(f"{where}: of another size than the first picture; record them in one size")
+        at = round(number * 1e9 / rate)
+        yield Shot(np.asarray(picture, dtype=np.uint8), at, at)
+    if size is None:
+        what = f"no picture ({', '.join(PICTURES)}) in it" if path.is_dir() else "no frame decodes"
+        raise UserError(f"{path}: {what}; name a video or a folder of pictures")
+
+
+def presses(strengths: npt.NDArray[np.float64], times: float = FOUND) -> list[tuple[int, int]]:
+    """Where something touches: (first frame, one behind the last), rising, none overlapping.
+
+    Hysteresis: a press reaches `times` the quiet level, and lasts while strengths lie over `RELEASED` of that.
+    Each is widened on both sides by up to `LONGEST` untouched frames, which the chain takes its reference from, but
+    not beyond the middle to its neighbour.
+
+    Args:
+        strengths: contact strength by frame, in 8-bit steps.
+    """
+    threshold = _threshold(strengths, times)
+    labels, _ = ndimage.label(strengths > RELEASED * threshold)
+    found = [
+        (place.start, place.stop)
+        for (place,) in ndimage.find_objects(labels)
+        if place.stop - place.start >= SHORTEST and strengths[place].max() > threshold
+    ]
+    if not found:
+        return []
+    middles = [0, *((a[1] + b[0]) // 2 for a, b in itertools.pairwise(found)), len(strengths)]
+    return [
+        (max(begin - LONGEST, low), min(end + LONGEST, high))
+        for (begin, end), low, high in zip(found, middles[:-1], middles[1:], strict=True)
+    ]
+
+
+def _measure(source: Iterator[Shot]) -> tuple[list[int], list[int], npt.NDArray[np.float64]]:
+    """Stamps, times of arrival (ns) and contact strengths of all pictures.
+
+    Contact is measured by the untouched picture at the beginning, else at the end.
+
+    First pictures in which the light still changes count as quiet.
+    """
+    stamped, received, thumbs = list[int](), list[int](), list[Image]()
+    for shot in source:
+        stamped.append(shot.stamped)
+        received.append(shot.recorded)
+        frame = av.VideoFrame.from_ndarray(shot.picture, format="bgr24")
+        thumbs.append(thumbnail(frame.reformat(format="yuv444p")))
+    places, cold = reference_indices(len(thumbs)), unsteady_frames(thumbs, len(thumbs)) % len(thumbs)
+    first, last = _mean([thumbs[cold + i] for i in places]), _mean([thumbs[-1 - i] for i in places])
+    reference = last if starts_touching(first, last) else first
+    strengths = [contact_strength(thumb, reference) for thumb in thumbs[cold:]]
+    return stamped, received, np.array([min(strengths)] * cold + strengths)
+
+
+def _mean(thumbs: Sequence[Image]) -> Image:
+    mean: Image = np.rint(np.mean(thumbs, axis=0)).astype(np.uint8)
+    return mean
+
+
+def _threshold(strengths: npt.NDArray[np.float64], times: float) -> float:
+    """The strength that a press begins at."""
+    return times * max(ROUNDING, float(np.quantile(strengths, QUIET)))
+
+
+def _rate(name: str, stamped: Sequence[int], received: Sequence[int]) -> float:
+    """Frames a second, by the stamps where they give a rate that a camera can have (`RATES`), else by arrival.
+
+    It is the median over all runs of `LONGEST` frames: messages arrive in bursts, recordings pause, clocks are set.
+    """
+    run = min(LONGEST, len(received) - 1)
+    by_stamp, by_arrival = (float(np.median(np.subtract(t[run:], t[:-run]))) / run for t in (stamped, received))
+    slowest, fastest = RATES
+    if by_stamp > 0 and slowest <= 1e9 / by_stamp <= fastest:
+        return round(1e9 / by_stamp, 3)
+    if by_arrival <= 0:
+        raise UserError(f"{name}: its pictures bear no rising times; record it again")
+    return min(fastest, max(slowest, round(1e9 / by_arrival, 3)))
+
+
+def _next_number(folder: Path, object_id: str) -> int:
+    """One more than the largest number that the object's videos in the folder have."""
+    names = [re.fullmatch(rf"{re.escape(object_id)}_(\d+)", p.stem) for p in folder.iterdir() if is_video(p)]
+    return max((int(m[1]) + 1 for m in names if m), default=0)
