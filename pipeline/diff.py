@@ -30,7 +30,7 @@ def compare(root: Path, old: str, new: str = "") -> dict[str, Any]:
 
     Returns:
         `old` and `new`, the names of both; `differs`; rows of what differs in `parameters`, `stages` (by dvc.lock),
-        `metrics` and `scores`; `tested`, as in effects.csv; `notes`, why something could not be compared.
+        `metrics`, `losses` and `scores`; `tested`, as in effects.csv; `notes`, why something could not be compared.
 
     Raises:
         UserError: for an unknown revision, a folder outside Git and DVC, or a broken file.
@@ -41,6 +41,7 @@ def compare(root: Path, old: str, new: str = "") -> dict[str, Any]:
         "parameters": _changes(_flat(one.mapping("params.yaml")), _flat(two.mapping("params.yaml"))),
         "stages": _stages(_locked(one), _locked(two)),
         "metrics": _changes(_metrics(one), _metrics(two)),
+        "losses": _changes(_losses(one), _losses(two)),
         "scores": _changes(_scores(one), _scores(two)),
         "tested": tested,
     }
@@ -55,7 +56,8 @@ def describe(found: dict[str, Any]) -> str:
             table = pd.DataFrame(rows[:SHOWN]).fillna("").to_string(index=False, max_colwidth=72)
             rest = f"\n... and {len(rows) - SHOWN} more; --json FILE has them all" if len(rows) > SHOWN else ""
             parts.append(f"{title.capitalize()}\n{table}{rest}")
-    return "\n\n".join([*parts, *found["notes"]])
+    same = ["No accuracy changed."] if found["differs"] and not found["scores"] and not found["tested"] else []
+    return "\n\n".join([*parts, *same, *found["notes"]])
 
 
 def _locked(state: State) -> dict[str, Any]:
@@ -114,12 +116,26 @@ def _metrics(state: State) -> dict[str, str]:
     return _flat({Path(folder).name: state.mapping(f"{folder}/metrics.json") for folder in state.folders("reports")})
 
 
+def _losses(state: State) -> dict[str, str]:
+    """By report and training: its last loss."""
+    found = {}
+    for folder in state.folders("reports"):
+        for row in _rows(state, f"{folder}/curves.csv"):
+            if row["name"] == "loss":  # Of each training by rising step.
+                found[f"{Path(folder).name} {row['stage']}"] = row["value"]
+    return found
+
+
+def _rows(state: State, file: str) -> Rows:
+    """Of a CSV file; none where there is no such file."""
+    return pd.read_csv(io.BytesIO(state.read(file) or b"nothing"), dtype=str).fillna("").to_dict("records")
+
+
 def _scores(state: State) -> dict[str, str]:
     """By key: the accuracy and its interval."""
     found = {}
     for folder in state.folders("reports"):
-        table = pd.read_csv(io.BytesIO(state.read(f"{folder}/scores.csv") or b"task"), dtype=str).fillna("")
-        for row in table.to_dict("records"):
+        for row in _rows(state, f"{folder}/scores.csv"):
             name = " ".join([Path(folder).name, *filter(None, map(row.get, KEY))])
             found[name] = f"{row.get('accuracy')} [{row.get('low')}, {row.get('high')}]"
     return found

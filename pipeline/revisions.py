@@ -46,16 +46,21 @@ class State:
 
 
 def find_state(root: Path, revision: str | None) -> State:
-    """The state that a revision (a hash, a tag, a branch, `HEAD~1`) names; the working tree for None.
+    """The state that a revision (a hash, a tag, a branch, `HEAD~1`, a DVC experiment) names; the working tree for None.
 
     Raises:
         UserError: where there is no such commit, or `root` is in no Git repository or no DVC project.
     """
     name = "HEAD" if revision is None else revision
+    # DVC keeps an experiment as refs/exps/<two digits>/<the rest of the commit that it began from>/<its name>.
+    listed = ["git", "for-each-ref", "--format=%(refname)", "refs/exps"]
+    experiments = subprocess.run(listed, cwd=root, capture_output=True, text=True).stdout.split()
+    name = next((ref for ref in experiments if ref.rpartition("/")[2] == name), name)
     git = ["git", "rev-parse", "--verify", "--quiet", "--end-of-options", f"{name}^{{commit}}"]
     commit = subprocess.run(git, cwd=root, capture_output=True, text=True).stdout.split()
     if len(commit) != 1:  # None, or those of a range.
-        raise UserError(f"{name}: no commit of a Git repository in {root.resolve()}; `git log` lists them")
+        there = f"no commit of a Git repository in {root.resolve()}"
+        raise UserError(f"{revision or name}: {there}; `git log` and `dvc exp list` list them")
     try:
         files = DVCFileSystem(repo=Repo(str(root), rev=None if revision is None else commit[0]))
     except DvcException as error:

@@ -16,7 +16,7 @@ from dvc.repo import Repo
 from typer.testing import CliRunner
 
 from pipeline.cli import app
-from pipeline.diff import compare
+from pipeline.diff import compare, describe
 from pipeline.errors import UserError
 from pipeline.evaluation.scores import score_rows
 from pipeline.io import write_csv, write_table
@@ -38,9 +38,9 @@ CHAIN = {
             "outs": ["data/graded.parquet"],
         },
         "report": {
-            "cmd": f"mkdir -p {REPORT} && cp made/metrics.json made/scores.csv {REPORT}/",
-            "deps": ["made/metrics.json", "made/scores.csv", "data/graded.parquet"],
-            "outs": [{f"{REPORT}/{name}": {"cache": False}} for name in ("metrics.json", "scores.csv")],
+            "cmd": f"mkdir -p {REPORT} && cp made/metrics.json made/scores.csv made/curves.csv {REPORT}/",
+            "deps": ["made/metrics.json", "made/scores.csv", "made/curves.csv", "data/graded.parquet"],
+            "outs": [{f"{REPORT}/{name}": {"cache": False}} for name in ("metrics.json", "scores.csv", "curves.csv")],
         },
     }
 }
@@ -73,6 +73,8 @@ class History:
         ]
         self.write("made/evaluation.jsonl", "".join(json.dumps(row) + "\n" for row in rows))
         self.write("made/metrics.json", json.dumps({"OPD": metric}))
+        losses = [f"lora@x,loss,{step},{metric / step}" for step in (1, 2)]
+        self.write("made/curves.csv", "\n".join(["stage,name,step,value", *losses, "lora@x,grad_norm,2,1.0"]) + "\n")
 
     def commit(self, tag: str) -> None:
         with chdir(self.folder), Repo() as repo:
@@ -128,8 +130,8 @@ def test_what_changed_is_named_with_what_it_moved(history: History) -> None:
         {"stage": "grade", "because of": "made/graded.parquet, params", "made": "data/graded.parquet"},
         {
             "stage": "report",
-            "because of": "data/graded.parquet, made/metrics.json, made/scores.csv",
-            "made": f"{REPORT}/metrics.json, {REPORT}/scores.csv",
+            "because of": "data/graded.parquet, made/curves.csv, made/metrics.json, made/scores.csv",
+            "made": f"{REPORT}/curves.csv, {REPORT}/metrics.json, {REPORT}/scores.csv",
         },
     ]
     assert found["metrics"] == [{"name": "smoke-scenes.OPD", "old": "0.25", "new": "0.75"}]
@@ -202,6 +204,7 @@ def test_an_address_is_shown_without_its_password(copy: History) -> None:
     copy.write("params.yaml", "epochs: 4\ntracking: {uri: 'http://ada:S3cret@host'}\n")
     assert "tracking.uri" in (found := json.dumps(compare(copy.folder, "HEAD")))
     assert "S3cret" not in found
+    assert "No accuracy changed." in describe(compare(copy.folder, "HEAD"))
 
 
 @pytest.mark.parametrize("revision", ["nowhere", "--all", "HEAD:params.yaml", "first..again", ""])
@@ -223,8 +226,15 @@ def test_what_a_person_sees(history: History, tmp_path: Path, monkeypatch: pytes
     file = tmp_path / "out" / "compared.json"
     other = CliRunner().invoke(app, ["diff", "again", "longer", "--json", str(file)])
     assert other.exit_code == 0, other.output
-    for words in (r"epochs +4 +5", r"smoke-scenes\.OPD +0\.25 +0\.75", r"finetuned with all real +new - old +OPD"):
+    for words in (
+        r"epochs +4 +5",
+        r"smoke-scenes lora@x +0\.125 +0\.375",
+        r"smoke-scenes\.OPD +0\.25 +0\.75",
+        r"finetuned with all real +new - old +OPD",
+    ):
         assert re.search(words, other.output), words
+    history.git("update-ref", "refs/exps/ab/cdef/odd-name", "longer")
+    assert re.search(r"epochs +4 +5", CliRunner().invoke(app, ["diff", "again", "odd-name"]).output)
     written = json.loads(file.read_text())
     assert written["differs"] is True
     assert written["tested"][0]["task"] == "OPD"
