@@ -128,7 +128,8 @@ def _losses(state: State) -> dict[str, str]:
 
 def _rows(state: State, file: str) -> Rows:
     """Of a CSV file; none where there is no such file."""
-    return pd.read_csv(io.BytesIO(state.read(file) or b"nothing"), dtype=str).fillna("").to_dict("records")
+    rows: Rows = pd.read_csv(io.BytesIO(state.read(file) or b"nothing"), dtype=str).fillna("").to_dict("records")
+    return rows
 
 
 def _scores(state: State) -> dict[str, str]:
