@@ -381,6 +381,24 @@ def match(
 
 
 @app.command()
+def live(
+    camera: Annotated[str, typer.Argument(help="A camera's index (0 is the first) or address, or a video.")],
+    question: Annotated[str, typer.Option("--ask", help="Asked of each press, in place of a description.")] = "",
+    times: Annotated[float, typer.Option(help="A press begins at this many times the quiet level.")] = 2.0,
+    model: Annotated[Path | None, MODEL] = None,
+    base: Annotated[Path | None, BASE] = None,
+    device: Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")] = "auto",
+) -> None:
+    """Watch a camera, and say of each press what is felt when it ends, with the true frame rate; Ctrl-C ends it."""
+    from pipeline.use.live import run
+
+    asked = _load(model, base, device)
+    typer.echo(f"{camera}: leave the sensor untouched for a second, then press it", err=True)
+    if not run(asked, camera, question, typer.echo, times):
+        typer.echo(f"{camera}: no press found; lower --times", err=True)
+
+
+@app.command()
 def export(
     folder: Annotated[Path, typer.Argument(help="Folder of a trained model, such as models/finetuned-with-all-0.")],
     to: Annotated[Path, typer.Argument(help="Folder to make.")],

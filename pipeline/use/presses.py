@@ -204,15 +204,16 @@ def _measure(source: Iterator[Shot]) -> tuple[list[int], list[int], npt.NDArray[
         frame = av.VideoFrame.from_ndarray(shot.picture, format="bgr24")
         thumbs.append(thumbnail(frame.reformat(format="yuv444p")))
     places, cold = reference_indices(len(thumbs)), unsteady_frames(thumbs, len(thumbs)) % len(thumbs)
-    first, last = _mean([thumbs[cold + i] for i in places]), _mean([thumbs[-1 - i] for i in places])
+    first, last = mean([thumbs[cold + i] for i in places]), mean([thumbs[-1 - i] for i in places])
     reference = last if starts_touching(first, last) else first
     strengths = [contact_strength(thumb, reference) for thumb in thumbs[cold:]]
     return stamped, received, np.array([min(strengths)] * cold + strengths)
 
 
-def _mean(thumbs: Sequence[Image]) -> Image:
-    mean: Image = np.rint(np.mean(thumbs, axis=0)).astype(np.uint8)
-    return mean
+def mean(thumbs: Sequence[Image]) -> Image:
+    """The mean picture, rounded."""
+    rounded: Image = np.rint(np.mean(thumbs, axis=0)).astype(np.uint8)
+    return rounded
 
 
 def _threshold(strengths: npt.NDArray[np.float64], times: float) -> float:

@@ -1,0 +1,125 @@
+"""`octopi live`: a running camera is watched, and each press is described, or asked about, when it ends."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import av
+import cv2
+import numpy as np
+
+from pipeline.errors import UserError
+from pipeline.use.presses import RELEASED, ROUNDING, SHORTEST, Shot, film, mean
+from pipeline.videos.audit.files import FOUND
+from pipeline.videos.frames.reference import LONGEST, contact_strength, thumbnail
+
+if TYPE_CHECKING:
+    from pipeline.use.model import Octopi
+
+QUIET = 100
+"""Untouched pictures, the last ones, whose median strength is the quiet level."""
+MOST = 750
+"""Pictures of a press: half a minute at 25 a second. What lasts longer may be a change of the light, so the untouched
+picture is then taken anew."""
+GONE = 100
+"""Reads in a row that bring no picture, `PAUSE` seconds apart, after which a camera is given up."""
+PAUSE = 0.02
+
+
+def watch(camera: str) -> Iterator[Shot]:
+    """The pictures of a file, or of a camera by its index or address, as they come.
+
+    Raises:
+        UserError: for a camera that OpenCV cannot open, or a file that is no video.
+    """
+    if Path(camera).exists() and not camera.isdecimal():
+        yield from film(Path(camera))
+        return
+    capture = cv2.VideoCapture(int(camera) if camera.isdecimal() else camera)
+    if not capture.isOpened():
+        raise UserError(f"{camera}: no camera that opens; name an index (0 is the first), a file or an address")
+    missed = 0
+    try:
+        while missed < GONE:  # One that drops frames goes on with the next.
+            good, picture = capture.read()
+            now = time.monotonic_ns()
+            missed = 0 if good else missed + 1
+            if good:
+                yield Shot(np.asarray(picture, dtype=np.uint8), now, now)
+            else:
+                time.sleep(PAUSE)
+    finally:
+        capture.release()
+    raise UserError(f"{camera}: brings no picture any more; is it connected?")
+
+
+def presses(shots: Iterable[Shot], times: float = FOUND) -> Iterator[list[Shot]]:
+    """Each press as soon as it ends, with up to `LONGEST` untouched pictures in front, which the model compares it to.
+
+    A press begins where the contact strength is `times` the quiet level, and ends under `RELEASED` of that for as many
+    pictures as it needs at least. It is measured against the mean of pictures that are a little older than the last
+    ones: so the untouched picture follows a slow change of light, and the beginning of a press has no part in it.
+    """
+    before = deque[tuple[Shot, np.ndarray]](maxlen=2 * LONGEST)
+    quiet = deque[float](maxlen=QUIET)
+    press: list[Shot] = []
+    touched = behind = 0
+    for shot in shots:
+        thumb = thumbnail(av.VideoFrame.from_ndarray(shot.picture, format="bgr24").reformat(format="yuv444p"))
+        if len(before) < LONGEST:
+            before.append((shot, thumb))
+            continue
+        strength = contact_strength(thumb, mean([old for _, old in list(before)[:LONGEST]]))
+        threshold = times * max(ROUNDING, float(np.median(quiet or [0])))
+        if not press and (strength <= threshold or len(quiet) < LONGEST):
+            before.append((shot, thumb))
+            quiet.append(strength)
+            continue
+        press = [*(press or [old for old, _ in list(before)[-LONGEST:]]), shot]
+        held = strength > RELEASED * threshold
+        touched, behind = touched + held, 0 if held else behind + 1
+        if behind == SHORTEST or len(press) == MOST:
+            if touched >= SHORTEST:
+                yield press
+            if len(press) == MOST:
+                before.clear()
+                quiet.clear()
+            press, touched, behind = [], 0, 0
+    if touched >= SHORTEST:
+        yield press
+
+
+def run(model: Octopi, camera: str, question: str, say: Callable[[str], object], times: float = FOUND) -> int:
+    """Say of each press what is felt, and the true frame rate, until the file ends or Ctrl-C.
+
+    Args:
+        question: Asked of each press; empty for a description.
+        say: Shows a line.
+
+    Returns:
+        How many presses there were.
+    """
+    number = 0
+    for number, press in enumerate(presses(watch(camera), times), 1):
+        video = np.stack([cv2.cvtColor(shot.picture, cv2.COLOR_BGR2RGB) for shot in press])
+        seconds = (press[-1].recorded - press[0].recorded) / 1e9
+        rate = f"{(len(press) - 1) / seconds:.1f} a second" if seconds > 0 else "at once"
+        try:
+            if question:
+                said, notes = model.ask(question, [video]), model.notes([video])
+            else:
+                found = model.describe(video)
+                levels = (
+                    f"{name} {level} ({found.probabilities[name][level]:.0%})" for name, level in found.levels.items()
+                )
+                said, notes = "; ".join([*levels, found.sentence]), found.notes
+        except UserError as error:
+            said, notes = str(error), ()
+        say(f"press {number}, {len(press)} frames, {rate}: {said}")
+        for note in notes:
+            say(f"  note: {note}")
+    return number
