@@ -369,6 +369,10 @@ class LoraTrainConfig(AdapterConfig):
     target_modules: Literal["all-linear"] | Annotated[tuple[str, ...], Field(min_length=1)] = ("q_proj", "k_proj")
     """Linear layers that get an adapter (the paper does not say; the published code: q_proj and k_proj); `all-linear`:
     all but the one that gives the logits."""
+    given: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Share of the questions about several videos whose descriptions are given and not learnt, beside touches of another
+    question: what is concluded then follows from what is said. A small model that is shown touch and description
+    together concludes from neither."""
 
 
 class AblationConfig(Section):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import partial
 
 import torch
@@ -31,7 +31,7 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
 
     Args:
         positions: Tokens that the language model can read at once; None where that is unknown.
-        description_weight: Of each token of a description, in the loss; all others weigh 1.
+        given: Ids of questions whose descriptions are given: nothing of them is learnt.
         by_question: Divide the weights of a conversation by their sum, so that all conversations weigh alike.
         touch_noise: Deviation of the normal noise on embeddings, one draw a video of a question and epoch.
 
@@ -52,7 +52,7 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
         seed: int,
         positions: int | None = None,
         bos: bool = True,
-        description_weight: float = 1.0,
+        given: Collection[str] = (),
         by_question: bool = True,
         touch_noise: float = 0.0,
     ) -> None:
@@ -78,9 +78,8 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
                 raise UserError(f"{question.question_id}: has no answer to learn from; run `dvc repro questions -f`")
             self.encoded.append(encoded)
             weights = torch.ones(len(encoded.labels))
-            if any(turn.described for turn in dialogue.turns):
-                concluding = torch.tensor(write(descriptions=False).labels)
-                weights[concluding == IGNORE_INDEX] = description_weight
+            if question.question_id in given:
+                weights[torch.tensor(write(descriptions=False).labels) == IGNORE_INDEX] = 0
             self.weights.append(weights)
 
     @property

@@ -175,8 +175,13 @@ def assemble(
         raise UserError(f"no training question has OPD mode {material.opd}; raise questions.train in params.yaml")
     if len(usable) < config.samples:
         logger.warning("%s: only %d training questions for %d samples", purpose, len(usable), config.samples)
+    drawn, given = usable[: config.samples], set[str]()
+    if isinstance(config, TeachConfig):
+        given = {q.question_id for q in drawn}
+    elif isinstance(config, LoraTrainConfig) and config.given:
+        drawn, given = with_given(drawn, material.opd, config.given, material.seed)
     data = ConversationDataset(
-        usable[: config.samples],
+        drawn,
         material.opd,
         material.store,
         model.tokenizer,
@@ -188,10 +193,25 @@ def assemble(
         bos=language.bos,
         by_question=config.weighting == "question",
         touch_noise=language.touch_noise,
-        # Of a drill only what is concluded is learnt.
-        description_weight=float(not isinstance(config, TeachConfig)),
+        given=given,
     )
     return model, data
+
+
+def with_given(questions: Sequence[Question], opd: Opd, share: float, seed: int) -> tuple[list[Question], set[str]]:
+    """The questions, of which a share of those that describe several videos have touches of others like them.
+
+    Returns:
+        All questions in their order, and the ids of those whose touches were exchanged.
+    """
+    rng = random.Random(derive_seed(seed, "given"))
+    changed: dict[str, Question] = {}
+    for count in (2, 3):
+        told = [q for q in questions if len(q.videos) == count and (d := q.dialogue(opd)) and d.turns[0].described]
+        chosen = rng.sample(told, round(share * len(told)))
+        for own, other in zip(chosen, chosen[1:] + chosen[:1], strict=True):
+            changed[own.question_id] = own.model_copy(update={"videos": other.videos})
+    return [changed.get(q.question_id, q) for q in questions], set(changed)
 
 
 @dataclass(frozen=True)
