@@ -370,9 +370,9 @@ class LoraTrainConfig(AdapterConfig):
     """Linear layers that get an adapter (the paper does not say; the published code: q_proj and k_proj); `all-linear`:
     all but the one that gives the logits."""
     given: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Share of the questions about several videos whose descriptions are given and not learnt, beside touches of another
-    question: what is concluded then follows from what is said. A small model that is shown touch and description
-    together concludes from neither."""
+    """Share of the questions about several videos whose descriptions are given and not learnt, beside the touches of
+    another question: what is concluded then follows from what is said. A small model to which touch and description say
+    the same concludes from neither."""
 
 
 class AblationConfig(Section):

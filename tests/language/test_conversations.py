@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 import torch
@@ -109,6 +110,35 @@ def test_an_update_has_the_same_questions_on_any_number_of_devices(
 def test_epochs_and_seeds_differ() -> None:
     orders = [list(UpdateSampler([5] * 64, 16, s, lambda e=e: e)) for s in (0, 1) for e in (0, 1)]  # type: ignore[misc]
     assert len({tuple(order) for order in orders}) == 4
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_given_descriptions_are_not_learnt_and_stand_beside_other_touches(share: float, held: Material) -> None:
+    _, usual = assemble(held, taking(1000), "test")
+    _, data = assemble(held, taking(1000, given=share), "test")
+    several, changed = 0, 0
+    for index, (own, question) in enumerate(zip(usual.questions, data.questions, strict=True)):
+        assert question == own.model_copy(update={"videos": question.videos}), "asked and answered as before"
+        learnt = data[index]["weights"] > 0
+        several += len(own.videos) > 1
+        if question.videos == own.videos:
+            assert torch.equal(learnt, usual[index]["weights"] > 0)
+            continue
+        changed += 1
+        assert question.videos in {q.videos for q in usual.questions if len(q.videos) == len(own.videos) > 1}
+        said = data.encoded[index]
+        text = held_text(said.input_ids, learnt, held)
+        dialogue = question.dialogue(held.opd)
+        assert dialogue is not None
+        assert text.split() == " ".join(t.assistant[t.described :] for t in dialogue.turns).split()
+    assert several
+    assert changed == pytest.approx(share * several, abs=1)
+
+
+def held_text(ids: tuple[int, ...], learnt: torch.Tensor, held: Material) -> str:
+    """The words that are learnt, without the tokens that end a turn."""
+    tokenizer = load_tokenizer(Path(held.language.weights))
+    return tokenizer.decode([i for i, one in zip(ids, learnt, strict=True) if one], skip_special_tokens=True)
 
 
 def test_nothing_is_learnt_of_what_fills_up_an_update(held: Material) -> None:
