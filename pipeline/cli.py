@@ -57,21 +57,28 @@ def scale(
         str, typer.Argument(help="smoke, small, invented, paper-7b or paper-13b (or a file you added to conf/).")
     ],
     overrides: Annotated[list[str] | None, typer.Argument(help="key=value, for example split.name=kfold.")] = None,
+    plan: Annotated[bool, typer.Option("--plan", help="Say what it would take, and write nothing.")] = False,
+    card: Annotated[str, typer.Option(help="GPU to count hours for: rtx3090, rtx4090, a6000, a100 or h100.")] = "",
 ) -> None:
     """Choose what `dvc repro` runs: write params.yaml from conf/NAME.yaml and the overrides."""
+    from pipeline.cost import costs
     from pipeline.memory import count, table
     from pipeline.params import in_project
     from pipeline.scales import check_inputs, compose, prune, write_params
     from pipeline.stage import running_stages
 
     in_project()
-    if running := running_stages():
+    if not plan and (running := running_stages()):
         raise UserError(f"{running[0]} is running, and would be recorded with other parameters; wait for it or stop it")
     params = compose(name, overrides or ())
     uses, notes = count(params)
     # First, since what a scale takes is asked before its weights are fetched.
     counted = ["Memory in GiB on each device, counted from shapes:", table(uses)] if uses else []
-    typer.echo("\n".join([*counted, *notes]))
+    typer.echo("\n".join([*counted, *notes, *costs(params, uses, card)]))
+    if plan:
+        variants = len(params.ablation.variants())
+        typer.echo(f"{variants} variants over {len(params.ablation.seeds)} seeds; nothing is written.")
+        return
     if lacking := check_inputs(params):
         typer.echo(lacking)
     changed = write_params(params)

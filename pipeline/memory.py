@@ -61,7 +61,7 @@ class Use:
 
 @dataclass(frozen=True)
 class Lengths:
-    """Tokens of the longest conversations."""
+    """Tokens of the longest conversations, and the mean over all."""
 
     training: int
     """Question and answer, under any OPD mode that is trained."""
@@ -69,6 +69,9 @@ class Lengths:
     """Of `training`, the tokens that are learnt."""
     prompt: int
     """The longest evaluation question, with the answers of earlier turns."""
+    mean_training: float
+    mean_answer: float
+    mean_prompt: float
 
 
 def count(params: Params) -> tuple[list[Use], list[str]]:
@@ -232,7 +235,9 @@ def longest(params: Params, catalogue: Catalogue, language: Path) -> Lengths:
         for q, d in _dialogues(params, catalogue, Part.TEST)
     ]
     most, learnt = max(training, default=(0, 0))
-    return Lengths(most, learnt, max(prompts, default=0))
+    columns = ([t for t, _ in training], [a for _, a in training], prompts)
+    means = (sum(numbers) / max(1, len(numbers)) for numbers in columns)
+    return Lengths(most, learnt, max(prompts, default=0), *means)
 
 
 def _dialogues(params: Params, catalogue: Catalogue, part: Part) -> Iterator[tuple[Question, Dialogue]]:

@@ -13,7 +13,7 @@ CORE = (
     *("embeddings", "shapes", "weights", "training", "stage"),
 )
 ROOMS = ("videos", "scenes", "tasks", "encoder", "language", "evaluation", "report", "tracking", "use")
-TOP = ("memory", "scales", "revisions", "diff", "reproduce", "cli")
+TOP = ("memory", "cost", "scales", "revisions", "diff", "reproduce", "cli")
 ORDER = (*CORE, *ROOMS, *TOP)
 MODULES = sorted((ROOT / "pipeline").rglob("*.py"))
 

@@ -149,10 +149,10 @@ def assemble(
     language = material.language
     if aligned is None and language.start:
         aligned = Path(language.start) / LANGUAGE_DIR
-        dim, given = read_config(aligned).tactile_dim, material.store.dim
-        if dim != given:
+        dim, own = read_config(aligned).tactile_dim, material.store.dim
+        if dim != own:
             raise UserError(
-                f"language.start: {language.start} reads embeddings of {dim}, but the encoder gives {given}; set "
+                f"language.start: {language.start} reads embeddings of {dim}, but the encoder gives {own}; set "
                 "encoder.backbone and encoder.embedding as its config.json has them"
             )
     if aligned is None:

@@ -1,0 +1,197 @@
+"""What a scale takes besides memory: downloads, disk, and hours, counted before anything runs.
+
+Hours follow from floating-point operations (2 a weight and token forward, as many again for the gradient that passes a
+frozen weight; Kaplan et al. 2020, section 2.1) and from a device's rate. Counted are the stages that run a base model.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from pipeline.config import Params
+from pipeline.errors import UserError, did_you_mean
+from pipeline.memory import BYTES, GIB, Lengths, Use, embedding_length, launched, longest
+from pipeline.scenes.invented import catalogue_of
+from pipeline.shapes import FULL, Llama, Vision
+from pipeline.tasks.questions import counts_by_task
+from pipeline.videos.files import list_videos
+from pipeline.weights import DOWNLOADED
+
+GB = 1e9
+
+
+class Card(NamedTuple):
+    """A GPU by its data sheet."""
+
+    flops: float
+    """Dense bfloat16 operations a second, added up in float32."""
+    bandwidth: float
+    """Bytes a second."""
+    gib: float
+
+
+CARDS = {
+    "rtx3090": Card(71e12, 936e9, 24),
+    "rtx4090": Card(165e12, 1008e9, 24),
+    "a6000": Card(155e12, 768e9, 48),
+    "a100": Card(312e12, 2039e9, 80),
+    "h100": Card(989e12, 3350e9, 80),
+}
+"""From NVIDIA's data sheets: RTX 3090 and 4090 (Ada white paper), RTX A6000, A100 80 GB SXM, H100 SXM."""
+REACHED = 0.35
+"""Share of a card's peak that training reaches: an assumption, within the .3 to .5 that reports of model FLOPs
+utilization have (Chowdhery et al. 2022, table 3)."""
+
+
+def costs(params: Params, uses: list[Use], card: str = "") -> list[str]:
+    """Sentences about downloads, disk, hours, and what does not fit the card.
+
+    Args:
+        uses: Memory by stage, from `memory.count`.
+        card: One of `CARDS`; empty for this machine's processor.
+    """
+    known = find_card(card) if card else None
+    catalogue, place = catalogue_of(params), Path(params.data.dir)
+    tower, llama = Vision.read(Path(params.encoder.weights)), Llama.read(Path(params.language.weights))
+    lengths = longest(params, catalogue, Path(params.language.weights)) if llama else None
+    if params.data.source == "scenes":
+        videos = len(params.scenes.objects or catalogue.objects) * params.scenes.videos_per_object
+    else:
+        videos = len(list_videos(place, catalogue).files) if place.is_dir() else 0
+    hidden = llama.hidden_size if llama else 0
+    embedding = embedding_length(params.encoder, tower) if tower else hidden
+    return [
+        *downloads(params),
+        *disk(params, llama, embedding, videos),
+        *describe(work(params, llama, lengths, tower, videos), params, card),
+        *(fits(uses, known.gib) if known else ()),
+    ]
+
+
+class Hours(NamedTuple):
+    """Of a stage over all its variants."""
+
+    stage: str
+    runs: int
+    work: float
+    """Floating-point operations of all runs."""
+    read: float = 0.0
+    """Bytes of weights that all runs read again for each token they say."""
+
+    def on(self, flops: float, bandwidth: float | None) -> float:
+        """Hours at these rates: the longer of computing and reading."""
+        return max(self.work / flops, self.read / bandwidth if bandwidth else 0) / 3600
+
+
+def work(
+    params: Params, llama: Llama | None, lengths: Lengths | None, tower: Vision | None, videos: int
+) -> list[Hours]:
+    """Count the stages' operations; `videos` is how many there are, 0 where that is not known."""
+    found = []
+    encoder, seeds, variants = params.encoder, len(params.ablation.seeds), params.ablation.variants()
+    if tower and videos:
+        picture = 2 * tower.parameters * (tower.tokens + encoder.prompts)
+        shown = videos * params.frames.per_video
+        if encoder.recipe in ("paper", "release"):
+            found.append(Hours("finetune_encoder", seeds, 2 * seeds * encoder.epochs * shown * picture))
+        found.append(Hours("embed", seeds, seeds * len(params.ablation.encoders) * shown * picture))
+    if llama and lengths:
+        forward = 2 * (llama.parameters - llama.words)
+        back = forward * (2 if params.runtime.gradient_checkpointing else 1)
+        aligned = len({(v.encoder, v.opd, v.seed) for v in variants})
+        adapted = sum(v.lora == "with" for v in variants)
+        for stage, runs, config in (("align", aligned, params.align), ("lora", adapted, params.lora)):
+            tokens = runs * config.samples * config.epochs * lengths.mean_training
+            learnt = runs * config.samples * config.epochs * lengths.mean_answer
+            found.append(Hours(stage, runs, tokens * (forward + back) + learnt * 6 * llama.words))
+        asked = len(variants) * sum(counts_by_task(params.questions, "evaluation").values())
+        asked += len(params.ablation.touch) * seeds * sum(counts_by_task(params.questions, "evaluation").values())
+        said = asked * lengths.mean_answer
+        weights = llama.parameters * BYTES[params.language.dtype]
+        batch = params.language.generation_batch_size
+        tokens = asked * lengths.mean_prompt + said
+        found.append(Hours("answer", len(variants), tokens * forward + 2 * said * llama.words, said / batch * weights))
+    return found
+
+
+def describe(hours: list[Hours], params: Params, card: str) -> Iterator[str]:
+    """Lines about time, on the card named, or on this machine's processor, whose rate is measured now."""
+    if not hours:
+        yield "Hours: not counted, as the shapes of the base models are not known."
+        return
+    devices, _ = launched(params.runtime.launcher)
+    if card:
+        known = find_card(card)
+        flops, bandwidth = REACHED * known.flops, known.bandwidth
+        how = f"on {card}, if training reaches {REACHED:.0%} of its {known.flops / 1e12:.0f} TFLOP/s"
+    else:
+        flops, bandwidth = measured_rate(), None
+        how = f"on this processor, at the {flops / 1e9:.0f} GFLOP/s that it reaches now (name a GPU with --card)"
+    each = [(h, h.on(flops * (devices if h.stage in ("align", "lora") else 1), bandwidth)) for h in hours]
+    yield f"Hours, at the least, {how}: " + ", ".join(f"{h.stage} {t:.2g} ({h.runs} runs)" for h, t in each) + "."
+    yield f"Together {sum(t for _, t in each):.2g}; decoding, rendering and the heads' own training are not in it."
+
+
+def measured_rate(side: int = 1024, seconds: float = 0.5) -> float:
+    """Floating-point operations a second of float32 matrix products on this processor, the median of several."""
+    import torch
+
+    a, b = torch.rand(side, side), torch.rand(side, side)
+    times, end = list[float](), time.perf_counter() + seconds
+    while len(times) < 3 or time.perf_counter() < end:
+        begin = time.perf_counter()
+        a @ b
+        times.append(time.perf_counter() - begin)
+    return float(2 * side**3 / sorted(times)[len(times) // 2])
+
+
+def find_card(name: str) -> Card:
+    """A card of `CARDS`; UserError for another."""
+    if name not in CARDS:
+        raise UserError(f"--card {name}: not known; {did_you_mean(name, CARDS)}it is one of {', '.join(CARDS)}")
+    return CARDS[name]
+
+
+def downloads(params: Params) -> Iterator[str]:
+    """What has to be fetched first: weights that are published and not there, with their size by their shapes."""
+    for folder in (Path(params.encoder.weights), Path(params.language.weights)):
+        found = next((d for d in DOWNLOADED.values() if d.folder == folder.name), None)
+        if found and not folder.is_dir():
+            llama = Llama.read(folder)
+            size = f", {llama.parameters * 2 / GB:.0f} GB" if llama else ", 1.7 GB, its text tower included"
+            yield f"Download: {found.repository}{size}, to {folder} (README, section Real weights)."
+    if params.data.source == "videos" and not Path(params.data.dir).is_dir():
+        yield f"Videos: {params.data.dir} is not there; PhysiCLeAR's take 0.04 GB."
+
+
+def disk(params: Params, llama: Llama | None, embedding: int, videos: int) -> Iterator[str]:
+    """What the chain writes of its own: embeddings, trained models, and the checkpoints of the one that trains."""
+    shown = videos * params.frames.per_video * FULL * embedding * (4 if params.encoder.flip_probability else 1)
+    embedded = shown * len(params.ablation.encoders) * len(params.ablation.seeds)
+    parts = [f"embeddings {embedded / GB:.2g}" if videos else "embeddings not known without the videos"]
+    if llama:
+        hidden = llama.hidden_size
+        words = llama.vocab_size * hidden if params.align.train_embeddings == "all" else 0
+        connector = (embedding + 1) * hidden + (hidden + 1) * hidden + words
+        trained = connector + llama.adapters(params.lora.target_modules, params.lora.rank)
+        adapted = sum(v.lora == "with" for v in params.ablation.variants())
+        models = FULL * (trained * adapted + connector * (len(params.ablation.variants()) - adapted))
+        parts += [f"data/models {models / GB:.2g}", f"checkpoints {3 * FULL * trained / GB:.2g} while one trains"]
+    yield f"Disk in GB: {', '.join(parts)}; DVC's cache links to the same files where the disk allows."
+
+
+def fits(uses: list[Use], gib: float) -> Iterator[str]:
+    """Stages that do not fit a card, each with the setting that lowers it."""
+    mends = {
+        "finetune_encoder": "encoder.micro_batch_size=1 encoder.autocast=bfloat16",
+        "embed": "encoder.embed_batch_size=8",
+        "align": "align.micro_batch_size=1 align.train_embeddings=new runtime.gradient_checkpointing=true",
+        "lora": "lora.micro_batch_size=1 align.train_embeddings=new runtime.gradient_checkpointing=true",
+        "answer": "language.generation_batch_size=4",
+    }
+    for use in uses:
+        if use.total / GIB > 0.9 * gib:
+            yield f"{use.stage} nears {gib:g} GiB: set {mends[use.stage]} (docs/scale.md)."
