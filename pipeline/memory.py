@@ -69,9 +69,9 @@ class Lengths:
     """Of `training`, the tokens that are learnt."""
     prompt: int
     """The longest evaluation question, with the answers of earlier turns."""
-    mean_training: float
-    mean_answer: float
-    mean_prompt: float
+    mean_training: float = 0.0
+    mean_answer: float = 0.0
+    mean_prompt: float = 0.0
 
 
 def count(params: Params) -> tuple[list[Use], list[str]]:
