@@ -20,6 +20,7 @@ from markupsafe import Markup, escape
 
 from pipeline.errors import UserError
 from pipeline.io import write_text
+from pipeline.params import PARAMS_FILE, load_params
 from pipeline.report.dataset import dataset_tables
 from pipeline.report.drawing import draw_table, share, span
 from pipeline.report.load import KEYS, Report, cells, load_report, read_frame
@@ -112,7 +113,9 @@ def write_page(root: Path) -> Path:
         UserError: there is no report, or the page would be larger than `LARGEST`.
     """
     folder, gaps = root / PAGE.parent, list[Gap]()
-    chapters = _chapters(folder, gaps)
+    own = root / PARAMS_FILE
+    current = load_params(own).report_name if own.is_file() else ""
+    chapters = _chapters(folder, gaps, current)
     if not chapters:
         raise UserError(f"{folder}: no whole report yet; `make repro` writes one")
     reports = {c["name"] + ("†" if c["looked_at"] else ""): c["report"] for c in chapters}
@@ -147,9 +150,9 @@ def inline(text: str, folder: str = "") -> Markup:
     return Markup(re.sub(r"\[([^]]+)\]\(([\w./-]+)\)", rf'<a href="{escape(folder)}\2">\1</a>', html))
 
 
-def _chapters(folder: Path, gaps: list[Gap]) -> list[dict[str, Any]]:
-    """The reports: real videos, scenes, those on test objects that were looked at, smoke; a broken one is a gap."""
-    found = []
+def _chapters(folder: Path, gaps: list[Gap], current: str) -> list[dict[str, Any]]:
+    """The reports: the current one, real videos, scenes, on objects that were looked at, smoke; broken ones: gaps."""
+    found: list[dict[str, Any]] = []
     for place in sorted({file.parent for name in ("scores.csv", "README.md") for file in folder.glob(f"*/{name}")}):
         try:
             found.append(_chapter(load_report(place), gaps))
@@ -157,9 +160,14 @@ def _chapters(folder: Path, gaps: list[Gap]) -> list[dict[str, Any]]:
             gaps.append((place.name, "the whole report", str(error).replace(f"{folder}/", "")))
         except KeyError as error:
             gaps.append((place.name, "the whole report", f"its provenance.json lacks {error}: {OLDER}"))
-    return sorted(
-        found, key=lambda c: (c["scale"] == "smoke", bool(c["looked_at"]), c["source"] != "videos", c["name"])
-    )
+    for chapter in found:
+        chapter["current"] = chapter["name"] == current
+
+    def order(chapter: dict[str, Any]) -> tuple[bool, bool, bool, bool, str]:
+        smoke, filmed = chapter["scale"] == "smoke", chapter["source"] == "videos"
+        return not chapter["current"], smoke, bool(chapter["looked_at"]), not filmed, str(chapter["name"])
+
+    return sorted(found, key=order)
 
 
 def _chapter(report: Report, gaps: list[Gap]) -> dict[str, Any]:

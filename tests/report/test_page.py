@@ -7,6 +7,7 @@ import hashlib
 import itertools
 import json
 import re
+import shutil
 from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
@@ -115,6 +116,15 @@ def test_published_figures_stand_only_beside_their_data(page: Page, changed: Pat
     other = Page(write_page(changed))
     assert not [cell for cell in other.all(kind="published") if cell.tag == "td"]
     assert all("so none stand here" in words(other.named(name)) for name in ("small-videos", "together"))
+
+
+def test_the_run_of_the_parameters_comes_first(changed: Path) -> None:
+    write_reports(changed, "smoke-scenes")
+    shutil.copy(ROOT / "params.yaml", changed)
+    page = Page(write_page(changed))
+    assert [e.get("id") for e in page.all(kind="chapter")][1:3] == ["smoke-scenes", "small-videos"]
+    marked = [words(e) for e in page.all(kind="kind")]
+    assert ["the run of this folder" in text for text in marked] == [True, False]
 
 
 def test_the_finding_comes_first_and_real_videos_before_smoke(page: Page) -> None:
