@@ -118,10 +118,10 @@ def test_published_figures_stand_only_beside_their_data(page: Page, changed: Pat
     assert all("so none stand here" in words(other.named(name)) for name in ("small-videos", "together"))
 
 
-def test_the_run_of_the_parameters_comes_first(changed: Path) -> None:
-    write_reports(changed, "smoke-scenes")
-    shutil.copy(ROOT / "params.yaml", changed)
-    page = Page(write_page(changed))
+def test_the_run_of_the_parameters_comes_first(tmp_path: Path) -> None:
+    root = write_reports(tmp_path, "smoke-scenes", "small-videos")
+    shutil.copy(ROOT / "params.yaml", root)
+    page = Page(write_page(root))
     assert [e.get("id") for e in page.all(kind="chapter")][1:3] == ["smoke-scenes", "small-videos"]
     marked = [words(e) for e in page.all(kind="kind")]
     assert ["the run of this folder" in text for text in marked] == [True, False]
