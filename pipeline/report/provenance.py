@@ -96,7 +96,7 @@ BEYOND = {
     "language": ("start", "normalize_touch", "touch_noise"),
     "align": ("weighting", "begin_with_words"),
     "teach": ("samples",),
-    "lora": ("weighting", "target_modules", "dropout"),
+    "lora": ("weighting", "target_modules", "dropout", "given"),
 }
 """Settings by which a small model is trained otherwise than the paper's."""
 
