@@ -17,6 +17,8 @@ from pipeline.tasks import TASKS
 from pipeline.tasks.base import Draft, Pool, TaskDefinition, in_turns
 from pipeline.videos.catalogue import Catalogue
 
+CHOICES = 2
+"""Of the questions about the videos of a description, at most, that are asked again in the form of scenarios."""
 ATTEMPTS = 60
 """Draws a question before its stratum is given up for this round (a rare class may need many)."""
 
@@ -85,7 +87,9 @@ def build_questions(
                 draft, *more = (definition.restated(d, pool.catalogue) for d in (draft, *more))
             if asked_on:
                 choices = (definition.as_choice(d, pool.catalogue) for d in (draft, *more))
-                draft = in_turns(draft, [*more, *islice(filter(None, choices), 1)])
+                # A choice may stand anywhere, also first, where a scenario's stands.
+                more += islice(filter(None, choices), CHOICES)
+                draft = in_turns(draft, turns.sample(more, len(more)))
             if facts:
                 draft = definition.with_facts(draft, pool.catalogue, order)
             questions.append(

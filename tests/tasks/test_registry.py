@@ -14,7 +14,7 @@ from pipeline.records import Dialogue, Opd, Prediction, Question, Score
 from pipeline.tasks import TASKS, psr
 from pipeline.tasks.base import Draft, Pool, TaskDefinition, choice_score, draft_about, single_turn
 from pipeline.tasks.pom import fact
-from pipeline.tasks.questions import build_questions, counts_by_task
+from pipeline.tasks.questions import CHOICES, build_questions, counts_by_task
 from pipeline.videos.catalogue import Catalogue
 from tests.conftest import refused
 from tests.tasks.shared import CATALOGUE, POOL, predicted
@@ -93,7 +93,7 @@ def test_a_share_of_the_questions_takes_several_turns() -> None:
     changed = [(q, r) for q, r in zip(before, after, strict=True) if q != r]
     assert {q.task for q, _ in changed} == {"PC", "PSS", "POM"}
     assert 40 < len(changed) < 80
-    further = 0
+    further, placed = 0, set[int]()
     for question, split in changed:
         assert split.model_copy(update={"dialogues": question.dialogues}) == question
         for opd in (Opd.NONE, Opd.NEEDED):
@@ -106,7 +106,8 @@ def test_a_share_of_the_questions_takes_several_turns() -> None:
         assert len({t.user for t in new.turns}) == len(new.turns)
         choices = [t for t in more if t.user.startswith("Which object is ")]
         assert question.task != "PC" or len(more) == 5 + len(choices), "three properties in two directions"
-        assert len(choices) <= 1
+        assert len(choices) <= CHOICES
+        placed |= {more.index(turn) for turn in choices}
         for turn in choices:
             word = turn.user.removeprefix("Which object is ").partition("?")[0]
             (place,) = [i for i, p in enumerate(CATALOGUE.properties) if word in (p.more, p.less)]
@@ -114,7 +115,7 @@ def test_a_share_of_the_questions_takes_several_turns() -> None:
             assert one != other
             letter = "a" if (one > other) == (word == CATALOGUE.properties[place].more) else "b"
             assert psr.read(turn.assistant) == letter
-        for turn in more[: len(more) - len(choices)]:
+        for turn in (t for t in more if t not in choices):
             words = [w for p in CATALOGUE.properties for w in (p.more, p.less, p.most, p.least) if w in turn.user]
             (prop,) = [p for p in CATALOGUE.properties if max(words, key=len) in (p.more, p.less, p.most, p.least)]
             gold = question.gold.model_copy(update={"properties": (prop.name,)})
@@ -134,6 +135,7 @@ def test_a_share_of_the_questions_takes_several_turns() -> None:
         scenario = next(d for q in before if q.task == "PSR" and (d := q.dialogue(Opd.ALL)))
         assert videos == 3 or first.user == scenario.turns[0].user
     assert further > len(changed)
+    assert 0 in placed
 
 
 def test_classes_are_restated_before_a_conclusion() -> None:
