@@ -91,15 +91,15 @@ def settings(params: Params, axes: Mapping[str, str] | None = None) -> dict[str,
 def accuracies(params: Params) -> dict[str, dict[str, float]]:
     """Metrics of each variant by its key, from the report's scores.csv (of folds, from each fold's own answers).
 
-    `accuracy/PC` is the share of right answers (0 to 1), `low/PC` and `high/PC` its interval, `swapped/PC` the share
-    with another object's video; parts of an answer are named like `accuracy/OPD.hardness`.
+    `PC` is the share of right answers (0 to 1), `low/PC` and `high/PC` its interval, `swapped/PC` the share
+    with another object's video; parts of an answer are named like `OPD.hardness`.
     """
     found: dict[str, dict[str, float]] = {}
     for row in _score_rows(params):
         if row["lora"] and row["seed"].isdigit():
             whole = TASKS[row["task"]].measure if row["task"] in TASKS else "choice"
             task = row["task"] if row["measure"] == whole else f"{row['task']}.{row['measure']}"
-            cells = {f"accuracy/{task}": row["accuracy"], f"low/{task}": row["low"], f"high/{task}": row["high"]}
+            cells = {task: row["accuracy"], f"low/{task}": row["low"], f"high/{task}": row["high"]}
             if row["touch"] != Touch.REAL:
                 cells = {f"{row['touch']}/{task}": row["accuracy"]}
             key = "-".join(row[axis] for axis in Variant._fields)

@@ -17,6 +17,7 @@ from pipeline.config import Params
 from pipeline.errors import UserError
 from pipeline.io import read_json, read_table
 from pipeline.records import Measurement, Variant
+from pipeline.tasks import TASKS
 from pipeline.tracking.chain import (
     CHAIN_LOCK,
     REPORTS,
@@ -36,6 +37,10 @@ from pipeline.tracking.store import KIND, PARENT, STAGE, Store, TrackingError, c
 
 VARIANT, LOCK, CONTENT, STATE = "octopi.variant", "octopi.lock", "octopi.content", "octopi.state"
 """Tags with what a finished stage, variant and reproduction were made from; written last."""
+TABLE = "#/experiments/{}/runs?viewStateShareKey=variants"
+"""Where a server has an experiment's table of variants."""
+MOST_COLUMNS = 8
+"""Changed parameters that the table of variants shows."""
 NOTE, VIEW = "mlflow.note.content", "mlflow.sharedViewState.variants"
 
 
@@ -159,9 +164,10 @@ class _Publication:
             new += 1
         if address := register(store.client, self.params, models):
             links["octopi.model"] = address
-        every = {name for metrics in scores.values() for name in metrics}
-        tasks = [name for name in every if name.startswith("accuracy/") and "." not in name]
-        for name, value in _front_page(store.experiment, sorted(tasks)).items():
+        runs = store.find({KIND: "variant"})
+        every = {name for run in runs for name in run.data.metrics}
+        tasks = [*(t for t in TASKS if t in every), *sorted(n for n in every - {*TASKS} if not set("/.") & {*n})]
+        for name, value in _front_page(store.experiment, tasks, _changed(runs)).items():
             store.client.set_experiment_tag(store.experiment, name, value)
         return new
 
@@ -194,18 +200,31 @@ def _cached_tag(stage: ChainStage) -> str:
     return f"cached.{stage.title.replace('@', ':')}"
 
 
-def _front_page(experiment: str, accuracy: Sequence[str]) -> dict[str, str]:
+def _changed(runs: Sequence[Any]) -> list[str]:
+    """The parameters, besides the factors of the ablation, in which runs differ, those of most values first."""
+    values: dict[str, set[str]] = {}
+    for run in runs:
+        for name, value in run.data.params.items():
+            values.setdefault(name, set()).add(value)
+    differ = [name for name, found in values.items() if len(found) > 1 and name not in Variant._fields]
+    return sorted(differ, key=lambda name: (-len(values[name]), name))[:MOST_COLUMNS]
+
+
+def _front_page(experiment: str, accuracy: Sequence[str], changed: Sequence[str]) -> dict[str, str]:
     """The experiment's description, and the table of variants that it leads to, written as MLflow's *Share view* does:
     only so do parameters and metrics become columns without a click each."""
-    columns = [*(f"params.`{axis}`" for axis in Variant._fields), *(f"metrics.`{name}`" for name in accuracy)]
+    accuracies = [f"metrics.`{name}`" for name in accuracy]
+    factors = [f"params.`{axis}`" for axis in (*Variant._fields, *changed)]
+    columns = [*accuracies, *factors]
     name = "attributes.`Run Name`"
     view: dict[str, object] = {
         "columnOrder": [name, *columns],
-        "columnWidths": {name: 240, **dict.fromkeys(columns, 105)},
+        # A laptop's 1,440 pixels show the name, five accuracies, four factors and two or three changes.
+        "columnWidths": {name: 210, **dict.fromkeys(accuracies, 75), **dict.fromkeys(factors, 105)},
         "selectedColumns": columns,
         "searchFilter": f"tags.`{KIND}` = 'variant'",
         # Sorted by time, the table would fold variants below their reproductions.
-        "orderByKey": columns[0],
+        "orderByKey": factors[0],
         "orderByAsc": False,
         "startTime": "ALL",
         "lifecycleFilter": "Active",
@@ -215,5 +234,7 @@ def _front_page(experiment: str, accuracy: Sequence[str]) -> dict[str, str]:
         "runsPinned": [],
         "runsHidden": [],
     }
-    link = f"#/experiments/{experiment}/runs?viewStateShareKey=variants"
-    return {NOTE: f"[All variants with their accuracies]({link}) · docs/dashboard.md", VIEW: json.dumps(view)}
+    return {
+        NOTE: f"[All variants with their accuracies]({TABLE.format(experiment)}) · docs/dashboard.md",
+        VIEW: json.dumps(view),
+    }

@@ -67,10 +67,10 @@ def test_a_variant_has_factors_accuracies_and_what_it_is_made_of(again: FakeChai
     run, base = by_name("variant")[FULL], by_name("variant")[BASE]
     assert list(run.data.params)[:4] == ["encoder", "lora", "opd", "seed"]
     assert run.data.params["lora.rank"] == "8"
-    choice = {"accuracy/PC": 0.5, "low/PC": 0.25, "high/PC": 0.75, "swapped/PC": 0.3333}
-    hardness = {"accuracy/OPD.hardness": 0.5, "low/OPD.hardness": 0.2, "high/OPD.hardness": 0.8}
-    toy = {"accuracy/TOY": 0.75, "low/TOY": 0.5, "high/TOY": 1}
-    assert run.data.metrics == {"accuracy/OPD": 0.125} | choice | hardness | toy
+    choice = {"PC": 0.5, "low/PC": 0.25, "high/PC": 0.75, "swapped/PC": 0.3333}
+    hardness = {"OPD.hardness": 0.5, "low/OPD.hardness": 0.2, "high/OPD.hardness": 0.8}
+    toy = {"TOY": 0.75, "low/TOY": 0.5, "high/TOY": 1}
+    assert run.data.metrics == {"OPD": 0.125} | choice | hardness | toy
     artifacts = {a.path for a in client().list_artifacts(run.info.run_id)}
     assert artifacts == {"predictions", "model", "alignment", "encoder"}
     assert "encoder" not in {a.path for a in client().list_artifacts(base.info.run_id)}
@@ -82,8 +82,12 @@ def test_a_variant_has_factors_accuracies_and_what_it_is_made_of(again: FakeChai
 def test_a_new_task_is_a_column_by_itself(again: FakeChain) -> None:
     experiment = client().get_experiment_by_name("octopi")
     view = json.loads(experiment.tags["mlflow.sharedViewState.variants"])
-    tasks = ["metrics.`accuracy/OPD`", "metrics.`accuracy/PC`", "metrics.`accuracy/TOY`"]
-    assert view["selectedColumns"] == [*(f"params.`{a}`" for a in ("encoder", "lora", "opd", "seed")), *tasks]
+    tasks = ["metrics.`OPD`", "metrics.`PC`", "metrics.`TOY`"]
+    runs = [run.data.params for run in by_name("variant").values()]
+    factors = ("encoder", "lora", "opd", "seed")
+    differ = {name for run in runs for name in run if len({r.get(name) for r in runs}) > 1} - {*factors}
+    assert view["selectedColumns"][:7] == [*tasks, *(f"params.`{a}`" for a in factors)]
+    assert {name[8:-1] for name in view["selectedColumns"][7:]} == differ
     found = client().search_runs([experiment.experiment_id], view["searchFilter"])
     assert {run.info.run_name for run in found} == {FULL, BASE}
     assert "viewStateShareKey=variants" in experiment.tags["mlflow.note.content"]
@@ -100,7 +104,7 @@ def test_a_run_of_a_fold_has_that_folds_accuracies_and_data(chain: FakeChain) ->
         for i in range(4)
     ]
     write_table(Path("data/graded.parquet"), Graded, rows)
-    found = {key: metrics["accuracy/PC"] for key, metrics in accuracies(params).items()}
+    found = {key: metrics["PC"] for key, metrics in accuracies(params).items()}
     assert found == {FULL: 0.25, "finetuned-with-all-1": 0.75}
     shutil.copy("data/splits/0.parquet", "data/splits/1.parquet")
     parts = ("train", "validation", "test")

@@ -1,0 +1,16 @@
+"""The address of the table of all variants, which `make dashboard` says."""
+
+import sys
+
+from pipeline.params import load_params
+from pipeline.tracking.publish import TABLE
+from pipeline.tracking.store import Store
+
+
+def main(port: str) -> None:
+    """Print it."""
+    print(f"http://127.0.0.1:{port}/{TABLE.format(Store(load_params().tracking).experiment)}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
