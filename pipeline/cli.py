@@ -76,8 +76,7 @@ def scale(
     counted = ["Memory in GiB on each device, counted from shapes:", table(uses)] if uses else []
     typer.echo("\n".join([*counted, *notes, *costs(params, uses, card)]))
     if plan:
-        variants = len(params.ablation.variants())
-        typer.echo(f"{variants} variants over {len(params.ablation.seeds)} seeds; nothing is written.")
+        typer.echo(f"{len(params.ablation.variants())} variants; nothing is written.")
         return
     if lacking := check_inputs(params):
         typer.echo(lacking)
@@ -367,7 +366,8 @@ def rank(
     found = _load(model, base, device).rank(videos, property)
     for place in found.order:
         typer.echo(f"{found.expected[place]:.2f}  {videos[place]}")
-    typer.echo(found.answer)
+    if found.answer:
+        typer.echo(found.answer)
     _doubt(found.notes)
 
 

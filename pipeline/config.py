@@ -371,8 +371,7 @@ class LoraTrainConfig(AdapterConfig):
     all but the one that gives the logits."""
     given: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Share of the questions about several videos whose descriptions are given and not learnt, beside the touches of
-    another question: what is concluded then follows from what is said. A small model to which touch and description say
-    the same concludes from neither."""
+    another question: so that it learns to conclude from what it said, and not from touch."""
 
 
 class AblationConfig(Section):

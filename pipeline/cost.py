@@ -1,7 +1,7 @@
 """What a scale takes besides memory: downloads, disk, and hours, counted before anything runs.
 
 Hours follow from floating-point operations (2 a weight and token forward, as many again for the gradient that passes a
-frozen weight; Kaplan et al. 2020, section 2.1) and from a device's rate. Counted are the stages that run a base model.
+frozen weight; Kaplan et al. 2020, section 2.1) and from a device's rate. Stages without such a count are named.
 """
 
 from __future__ import annotations
@@ -63,12 +63,18 @@ def costs(params: Params, uses: list[Use], card: str = "") -> list[str]:
         videos = len(list_videos(place, catalogue).files) if place.is_dir() else 0
     hidden = llama.hidden_size if llama else 0
     embedding = embedding_length(params.encoder, tower) if tower else hidden
+    if params.encoder.embedding == "logits":
+        embedding = sum(len(p.levels) for p in catalogue.properties)
     return [
         *downloads(params),
         *disk(params, llama, embedding, videos),
         *describe(work(params, llama, lengths, tower, videos), params, card),
         *(fits(uses, known.gib) if known else ()),
     ]
+
+
+REST = ("pretrain", "cross_validate", "finetune_encoder", "embed", "teach")
+"""Stages that run a model and may not be counted: for want of shapes, videos, or a formula."""
 
 
 class Hours(NamedTuple):
@@ -97,7 +103,8 @@ def work(
         shown = videos * params.frames.per_video
         if encoder.recipe in ("paper", "release"):
             found.append(Hours("finetune_encoder", seeds, 2 * seeds * encoder.epochs * shown * picture))
-        found.append(Hours("embed", seeds, seeds * len(params.ablation.encoders) * shown * picture))
+        flips = 4 if encoder.flip_probability else 1
+        found.append(Hours("embed", seeds, seeds * len(params.ablation.encoders) * flips * shown * picture))
     if llama and lengths:
         forward = 2 * (llama.parameters - llama.words)
         back = forward * (2 if params.runtime.gradient_checkpointing else 1)
@@ -131,8 +138,9 @@ def describe(hours: list[Hours], params: Params, card: str) -> Iterator[str]:
         flops, bandwidth = measured_rate(), None
         how = f"on this processor, at the {flops / 1e9:.0f} GFLOP/s that it reaches now (name a GPU with --card)"
     each = [(h, h.on(flops * (devices if h.stage in ("align", "lora") else 1), bandwidth)) for h in hours]
-    yield f"Hours, at the least, {how}: " + ", ".join(f"{h.stage} {t:.2g} ({h.runs} runs)" for h, t in each) + "."
-    yield f"Together {sum(t for _, t in each):.2g}; decoding, rendering and the heads' own training are not in it."
+    yield f"Hours {how}: " + ", ".join(f"{h.stage} {t:.2g} ({h.runs} runs)" for h, t in each) + "."
+    rest = [*(s for s in REST if s not in {h.stage for h in hours})]
+    yield f"Together {sum(t for _, t in each):.2g}. Not counted: {', '.join(rest)}, and the work on videos."
 
 
 def measured_rate(side: int = 1024, seconds: float = 0.5) -> float:
@@ -177,8 +185,9 @@ def disk(params: Params, llama: Llama | None, embedding: int, videos: int) -> It
         words = llama.vocab_size * hidden if params.align.train_embeddings == "all" else 0
         connector = (embedding + 1) * hidden + (hidden + 1) * hidden + words
         trained = connector + llama.adapters(params.lora.target_modules, params.lora.rank)
-        adapted = sum(v.lora == "with" for v in params.ablation.variants())
-        models = FULL * (trained * adapted + connector * (len(params.ablation.variants()) - adapted))
+        variants = params.ablation.variants()
+        aligned = len({(v.encoder, v.opd, v.seed) for v in variants})
+        models = FULL * (trained * sum(v.lora == "with" for v in variants) + connector * aligned)
         parts += [f"data/models {models / GB:.2g}", f"checkpoints {3 * FULL * trained / GB:.2g} while one trains"]
     yield f"Disk in GB: {', '.join(parts)}; DVC's cache links to the same files where the disk allows."
 
@@ -194,4 +203,7 @@ def fits(uses: list[Use], gib: float) -> Iterator[str]:
     }
     for use in uses:
         if use.total / GIB > 0.9 * gib:
-            yield f"{use.stage} nears {gib:g} GiB: set {mends[use.stage]} (docs/scale.md)."
+            what = "exceeds" if use.total / GIB > gib else "nears"
+            # Where the weights alone are too many, no smaller batch helps.
+            mend = "language.quantization=nf4" if use.parameters / GIB > 0.8 * gib else mends[use.stage]
+            yield f"{use.stage} {what} {gib:g} GiB: set {mend} (docs/scale.md)."

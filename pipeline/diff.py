@@ -45,6 +45,8 @@ def compare(root: Path, old: str, new: str = "") -> dict[str, Any]:
         "scores": _changes(_scores(one), _scores(two)),
         "tested": tested,
     }
+    same = bool(found["stages"]) and bool(_scores(one)) and not (found["scores"] or notes or tested)
+    notes += ["No accuracy changed."] if same else []
     return {"old": one.name, "new": two.name, "differs": any(found.values()), **found, "notes": notes}
 
 
@@ -56,8 +58,7 @@ def describe(found: dict[str, Any]) -> str:
             table = pd.DataFrame(rows[:SHOWN]).fillna("").to_string(index=False, max_colwidth=72)
             rest = f"\n... and {len(rows) - SHOWN} more; --json FILE has them all" if len(rows) > SHOWN else ""
             parts.append(f"{title.capitalize()}\n{table}{rest}")
-    same = ["No accuracy changed."] if found["differs"] and not found["scores"] and not found["tested"] else []
-    return "\n\n".join([*parts, *same, *found["notes"]])
+    return "\n\n".join([*parts, *found["notes"]])
 
 
 def _locked(state: State) -> dict[str, Any]:

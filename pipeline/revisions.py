@@ -52,12 +52,13 @@ def find_state(root: Path, revision: str | None) -> State:
         UserError: where there is no such commit, or `root` is in no Git repository or no DVC project.
     """
     name = "HEAD" if revision is None else revision
-    # DVC keeps an experiment as refs/exps/<two digits>/<the rest of the commit that it began from>/<its name>.
-    listed = ["git", "for-each-ref", "--format=%(refname)", "refs/exps"]
-    experiments = subprocess.run(listed, cwd=root, capture_output=True, text=True).stdout.split()
-    name = next((ref for ref in experiments if ref.rpartition("/")[2] == name), name)
-    git = ["git", "rev-parse", "--verify", "--quiet", "--end-of-options", f"{name}^{{commit}}"]
-    commit = subprocess.run(git, cwd=root, capture_output=True, text=True).stdout.split()
+    git = ["git", "rev-parse", "--verify", "--quiet", "--end-of-options"]
+    commit = subprocess.run([*git, f"{name}^{{commit}}"], cwd=root, capture_output=True, text=True).stdout.split()
+    if not commit:
+        # DVC keeps an experiment as refs/exps/<two digits>/<the rest of the commit that it began from>/<its name>.
+        listed = ["git", "for-each-ref", "--format=%(refname) %(objectname)", "refs/exps"]
+        lines = subprocess.run(listed, cwd=root, capture_output=True, text=True).stdout.splitlines()
+        commit = [line.split()[1] for line in lines if line.split()[0].rpartition("/")[2] == name]
     if len(commit) != 1:  # None, or those of a range.
         there = f"no commit of a Git repository in {root.resolve()}"
         raise UserError(f"{revision or name}: {there}; `git log` and `dvc exp list` list them")

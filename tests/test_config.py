@@ -40,6 +40,12 @@ def test_committed_params_are_the_default_scale() -> None:
     assert load_params(ROOT / "params.yaml") == compose("smoke", conf=CONF)
 
 
+def test_committed_params_are_written_as_they_are(tmp_path: Path) -> None:
+    """Else `octopi scale smoke` would run stages anew whose sections have gained a key."""
+    write_params(compose("smoke", conf=CONF), tmp_path / "params.yaml")
+    assert (tmp_path / "params.yaml").read_text() == (ROOT / "params.yaml").read_text()
+
+
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [

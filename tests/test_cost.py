@@ -59,6 +59,10 @@ def test_what_is_to_be_fetched_and_what_does_not_fit_is_said() -> None:
     for words in ("lmsys/vicuna-7b-v1.5, 13 GB", "lora nears 24 GiB: set lora.micro_batch_size=1", "(8 runs)"):
         assert words in said
     assert "nears" not in "\n".join(costs(params, uses, "h100"))
+    larger = compose("paper-13b")
+    assert "answer exceeds 24 GiB: set language.quantization=nf4" in "\n".join(
+        costs(larger, count(larger)[0], "rtx4090")
+    )
     with pytest.raises(UserError, match="--card a600: not known; did you mean a6000"):
         costs(params, uses, "a600")
 
@@ -68,4 +72,4 @@ def test_a_plan_needs_nothing_and_writes_nothing(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr("pipeline.scales.check_inputs", lambda *_: 1 / 0)
     said = CliRunner().invoke(app, ["scale", "paper-13b", "--plan", "--card", "a6000"])
     assert said.exit_code == 0, said.output
-    assert "8 variants over 1 seeds; nothing is written." in said.output
+    assert "8 variants; nothing is written." in said.output

@@ -151,7 +151,7 @@ def inline(text: str, folder: str = "") -> Markup:
 
 
 def _chapters(folder: Path, gaps: list[Gap], current: str) -> list[dict[str, Any]]:
-    """The reports: the current one, real videos, scenes, on objects that were looked at, smoke; broken ones: gaps."""
+    """The current report, then real videos, scenes, looked-at test objects, smoke; a broken report is a gap."""
     found: list[dict[str, Any]] = []
     for place in sorted({file.parent for name in ("scores.csv", "README.md") for file in folder.glob(f"*/{name}")}):
         try:

@@ -9,7 +9,8 @@ from pipeline.tracking.store import Store
 
 def main(port: str) -> None:
     """Print it."""
-    print(f"http://127.0.0.1:{port}/{TABLE.format(Store(load_params().tracking).experiment)}")
+    here = load_params().tracking.model_copy(update={"uri": ""})  # `make dashboard` shows the folder's own database.
+    print(f"http://127.0.0.1:{port}/{TABLE.format(Store(here).experiment)}")
 
 
 if __name__ == "__main__":

@@ -91,6 +91,8 @@ class Chat:
 
     def run(self, lines: Iterable[str]) -> None:
         """Answer line by line; what is wrong is said, and the conversation goes on."""
+        for doubt in self.model.doubts:
+            self.say(f"note: {doubt}\n")
         for line in map(str.strip, lines):
             if line == "/quit":
                 return
@@ -180,7 +182,7 @@ def described(model: Octopi, folder: Path) -> tuple[Table, list[str]]:
     """
     files, folder = _files(folder)
     table = Table("video", *model.properties, "in words")
-    notes: list[str] = []
+    notes = [*model.doubts]
     for start in range(0, len(files), BATCH):
         for row in _describe(model, folder, files[start : start + BATCH]):
             found = [(row.get(p), row.get(f"{p}: {row.get(p)}")) for p in model.properties]
@@ -233,7 +235,7 @@ def _describe(model: Octopi, folder: Path, files: Sequence[Path]) -> list[dict[s
         for name, known in found.probabilities.items():
             row |= {f"{name}: {level}": round(p, 4) for level, p in known.items()}
         row |= {"sentence": " ".join(found.sentence.split()), "frames": " ".join(map(str, found.frames))}
-        row["notes"] = "; ".join(found.notes)
+        row["notes"] = "; ".join(note for note in found.notes if note not in model.doubts)
     return rows
 
 

@@ -13,9 +13,10 @@ import cv2
 import numpy as np
 
 from pipeline.errors import UserError
+from pipeline.use.model import with_marks
 from pipeline.use.presses import RELEASED, ROUNDING, SHORTEST, Shot, film, mean
 from pipeline.videos.audit.files import FOUND
-from pipeline.videos.frames.reference import LONGEST, contact_strength, thumbnail
+from pipeline.videos.frames.reference import LONGEST, contact_strength, starts_touching, thumbnail
 
 if TYPE_CHECKING:
     from pipeline.use.model import Octopi
@@ -23,8 +24,7 @@ if TYPE_CHECKING:
 QUIET = 100
 """Untouched pictures, the last ones, whose median strength is the quiet level."""
 MOST = 750
-"""Pictures of a press: half a minute at 25 a second. What lasts longer may be a change of the light, so the untouched
-picture is then taken anew."""
+"""Pictures of a press, at most: half a minute at 25 a second. What lasts longer is taken for a change of the light."""
 GONE = 100
 """Reads in a row that bring no picture, `PAUSE` seconds apart, after which a camera is given up."""
 PAUSE = 0.02
@@ -36,6 +36,8 @@ def watch(camera: str) -> Iterator[Shot]:
     Raises:
         UserError: for a camera that OpenCV cannot open, or a file that is no video.
     """
+    if Path(camera).is_dir():
+        raise UserError(f"{camera}: is a folder; name a camera or a video, or use `octopi import video`")
     if Path(camera).exists() and not camera.isdecimal():
         yield from film(Path(camera))
         return
@@ -62,13 +64,25 @@ def presses(shots: Iterable[Shot], times: float = FOUND) -> Iterator[list[Shot]]
 
     A press begins where the contact strength is `times` the quiet level, and ends under `RELEASED` of that for as many
     pictures as it needs at least. It is measured against the mean of pictures that are a little older than the last
-    ones: so the untouched picture follows a slow change of light, and the beginning of a press has no part in it.
+    ones: so the untouched picture follows a slow change of light, and the beginning of a press has no part in it. It
+    follows a press too that takes seconds to deepen; what is then found is the release, which shows by its detail and
+    is left out.
     """
     before = deque[tuple[Shot, np.ndarray]](maxlen=2 * LONGEST)
     quiet = deque[float](maxlen=QUIET)
     press: list[Shot] = []
     touched = behind = 0
-    for shot in shots:
+    first, recent = np.zeros((1, 1, 3), np.uint8), deque[np.ndarray](maxlen=LONGEST)
+    gone: UserError | None = None
+    source = iter(shots)
+    while True:
+        try:
+            shot = next(source)
+        except StopIteration:
+            break
+        except UserError as error:  # What was pressed until then is no less a press.
+            gone = error
+            break
         thumb = thumbnail(av.VideoFrame.from_ndarray(shot.picture, format="bgr24").reformat(format="yuv444p"))
         if len(before) < LONGEST:
             before.append((shot, thumb))
@@ -79,18 +93,24 @@ def presses(shots: Iterable[Shot], times: float = FOUND) -> Iterator[list[Shot]]
             before.append((shot, thumb))
             quiet.append(strength)
             continue
-        press = [*(press or [old for old, _ in list(before)[-LONGEST:]]), shot]
+        if not press:
+            press, first = [old for old, _ in list(before)[-LONGEST:]], mean([old for _, old in list(before)[:LONGEST]])
+        press.append(shot)
+        recent.append(thumb)
         held = strength > RELEASED * threshold
         touched, behind = touched + held, 0 if held else behind + 1
-        if behind == SHORTEST or len(press) == MOST:
-            if touched >= SHORTEST:
-                yield press
-            if len(press) == MOST:
+        released = touched == LONGEST and starts_touching(first, mean(recent))
+        if behind == SHORTEST or len(press) == MOST or released:
+            if released or len(press) == MOST:
                 before.clear()
                 quiet.clear()
+            elif touched >= SHORTEST:
+                yield press
             press, touched, behind = [], 0, 0
     if touched >= SHORTEST:
         yield press
+    if gone:
+        raise gone
 
 
 def run(model: Octopi, camera: str, question: str, say: Callable[[str], object], times: float = FOUND) -> int:
@@ -103,6 +123,8 @@ def run(model: Octopi, camera: str, question: str, say: Callable[[str], object],
     Returns:
         How many presses there were.
     """
+    if question:
+        with_marks(question, 1)
     number = 0
     for number, press in enumerate(presses(watch(camera), times), 1):
         video = np.stack([cv2.cvtColor(shot.picture, cv2.COLOR_BGR2RGB) for shot in press])

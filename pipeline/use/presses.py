@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -94,6 +94,8 @@ def cut(
     if re.fullmatch(r"[\w-]+", object_id) is None:
         raise UserError(f"--object {object_id!r}: take letters, digits, _ and -, as in objects.csv")
     stamped, received, strengths = _measure(read())
+    if len(received) < SHORTEST:
+        raise UserError(f"{name}: {len(received)} pictures are no press; record from before the contact to its end")
     ranges = [(0, len(strengths))] if whole else presses(strengths, times)
     if not ranges:
         raise UserError(
@@ -149,7 +151,9 @@ def film(path: Path, fps: float = 0.0) -> Iterator[Shot]:
             rate = rate or decoder.header.fps
         pictures = ((f"{path}, frame {number}", frame) for number, frame in enumerate(decode(path)))
     if rate <= 0:
-        raise UserError(f"{path}: its frames a second are not known; say --fps")
+        raise UserError(f"{path}: its frames a second are not known; say --fps, or name a video")
+    if not RATES[0] <= rate <= RATES[1]:  # Nor a number that is none.
+        raise UserError(f"{path}: {rate:g} frames a second; --fps takes {RATES[0]:g} to {RATES[1]:g}")
     size = None
     for number, (where, picture) in enumerate(pictures):
         if picture is None:
@@ -210,9 +214,9 @@ def _measure(source: Iterator[Shot]) -> tuple[list[int], list[int], npt.NDArray[
     return stamped, received, np.array([min(strengths)] * cold + strengths)
 
 
-def mean(thumbs: Sequence[Image]) -> Image:
+def mean(thumbs: Iterable[Image]) -> Image:
     """The mean picture, rounded."""
-    rounded: Image = np.rint(np.mean(thumbs, axis=0)).astype(np.uint8)
+    rounded: Image = np.rint(np.mean(list(thumbs), axis=0)).astype(np.uint8)
     return rounded
 
 

@@ -130,7 +130,7 @@ def read_conversation(messages: Sequence[Message], most: int) -> list[Said]:
 
 def _read(message: Message, place: str) -> tuple[str, tuple[bytes, ...]]:
     texts = [part.text for part in message.content if isinstance(part, TextPart)]
-    placed = len(texts) == 1 or any(MARK in text for text in texts)
+    placed = sum(bool(text.strip()) for text in texts) == 1 or any(MARK in text for text in texts)
     text, videos = "", []
     for i, part in enumerate(message.content):
         if isinstance(part, TextPart):

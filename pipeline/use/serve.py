@@ -108,7 +108,10 @@ class Service:
 
         def ask() -> Iterator[str]:
             pieces = self.model.stream(last.question, last.videos, history=history, max_new_tokens=most)
-            notes.extend(PLACE.sub(r"video \1", note) for note in self.model.notes(last.videos))
+            notes.extend(
+                PLACE.sub(r"video \1", note)
+                for note in self.model.notes([v for e in (*history, last) for v in e.videos])
+            )
             return pieces
 
         return wanted, ask, len(every), notes

@@ -204,7 +204,15 @@ def test_an_address_is_shown_without_its_password(copy: History) -> None:
     copy.write("params.yaml", "epochs: 4\ntracking: {uri: 'http://ada:S3cret@host'}\n")
     assert "tracking.uri" in (found := json.dumps(compare(copy.folder, "HEAD")))
     assert "S3cret" not in found
-    assert "No accuracy changed." in describe(compare(copy.folder, "HEAD"))
+    assert "No accuracy changed." not in describe(compare(copy.folder, "HEAD")), "nothing ran"
+
+
+def test_a_run_that_changed_no_accuracy_says_so(copy: History) -> None:
+    copy.write("made/curves.csv", "stage,name,step,value\nlora@x,loss,1,0.5\n")
+    copy.commit("another-loss")
+    found = compare(copy.folder, "HEAD~1", "HEAD")
+    assert [row["new"] for row in found["losses"]] == ["0.5"]
+    assert describe(found).endswith("No accuracy changed.")
 
 
 @pytest.mark.parametrize("revision", ["nowhere", "--all", "HEAD:params.yaml", "first..again", ""])

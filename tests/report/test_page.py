@@ -124,7 +124,7 @@ def test_the_run_of_the_parameters_comes_first(tmp_path: Path) -> None:
     page = Page(write_page(root))
     assert [e.get("id") for e in page.all(kind="chapter")][1:3] == ["smoke-scenes", "small-videos"]
     marked = [words(e) for e in page.all(kind="kind")]
-    assert ["the run of this folder" in text for text in marked] == [True, False]
+    assert ["that params.yaml names" in text for text in marked] == [True, False]
 
 
 def test_the_finding_comes_first_and_real_videos_before_smoke(page: Page) -> None:

@@ -275,7 +275,7 @@ def test_what_is_no_recording_of_touch_is_refused_in_one_line(tmp_path: Path, pi
     for number, (sent, encoding, told) in enumerate(
         [
             (quiet, "bgr8", "nothing touches the sensor in 78 pictures"),
-            (pictures[:1], "bgr8", "nothing touches the sensor in 1 pictures"),
+            (pictures[:1], "bgr8", "1 pictures are no press"),
             (pictures[:2], "16UC1", "has encoding '16UC1'; send one of bgr8, 8UC3, rgb8, mono8, 8UC1"),
             (pictures[:2], "broken", "is no picture that OpenCV reads"),
             ([pictures[0], pictures[1][:-2]], "bgr8", "change their size"),
@@ -327,6 +327,7 @@ def test_a_long_video_and_a_folder_of_pictures_are_cut_as_a_bag_is(tmp_path: Pat
     for name, more, words in (
         (folder, ["--fps", "25"], "frame_3.png: of another size"),
         (folder, [], "say --fps"),
+        (folder, ["--fps", "0.5"], "--fps takes 1 to 240"),
         (empty, ["--fps", "25"], "no picture (.jpeg, .jpg, .png) in it"),
         (tmp_path / "none.mp4", [], "no such file"),
         (text, ["--fps", "25"], "no frame decodes"),

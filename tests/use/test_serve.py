@@ -96,6 +96,8 @@ def test_an_answer_has_openai_s_fields(client: TestClient) -> None:
 
 
 def test_a_stream_has_openai_s_chunks(client: TestClient) -> None:
+    seen = client.post(CHAT, json=body(user(text("one"), part(video(1))), stream=True))
+    assert events(seen.text)[-2]["notes"] == ["video 1: little touches the sensor"]
     response = client.post(CHAT, json=body(user("one two three"), stream=True))
     assert response.headers["content-type"].startswith("text/event-stream")
     *chunks, done = events(response.text)
