@@ -221,7 +221,7 @@ def test_a_stage_runs_the_code_beside_it_or_refuses(clone: Path) -> None:
             assert "data/videos.parquet: no such file" in stopped
 
 
-RECORDING = ["scale smoke", "repro", "publish", "page", "compare HEAD"]
+RECORDING = ["scale smoke", "repro", "publish", "page", "diff HEAD"]
 RECORDING += ["answer-with --endpoint http://a/v1 --model b --input frames"]
 
 

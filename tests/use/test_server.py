@@ -89,7 +89,7 @@ def test_twenty_clients_ten_requests_none_lost_none_mixed_up() -> None:
     with serving(fake, places=12) as port, ThreadPoolExecutor(20) as pool:
         answers = list(pool.map(client, range(20)))
     for number, found in enumerate(answers):
-        assert found == [f"number {i} {{tactile}} | {digest(data)} " for i, data in jobs[number::20]]
+        assert found == [f"{{tactile}} number {i} | {digest(data)} " for i, data in jobs[number::20]]
     assert fake.asked == 200
     assert len(fake.threads) == 1
 
@@ -209,7 +209,7 @@ def test_stopping_finishes_what_was_asked_and_leaves_no_process() -> None:
         assert [a.result()[0] for a in answers] == [200] * 4
         for i, answer in enumerate(answers[:3]):
             said = answer.result()[1]["choices"][0]["message"]["content"]
-            assert said.split() == [str(i), *"x" * 15, "{tactile}", "|", digest(video(i))]
+            assert said.split() == ["{tactile}", str(i), *"x" * 15, "|", digest(video(i))]
         assert events(answers[3].result()[1])[-1] == "[DONE]"
         process.wait(HUNG)
         assert len(children) == 1
