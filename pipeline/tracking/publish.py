@@ -214,17 +214,18 @@ def _front_page(experiment: str, accuracy: Sequence[str], changed: Sequence[str]
     """The experiment's description, and the table of variants that it leads to, written as MLflow's *Share view* does:
     only so do parameters and metrics become columns without a click each."""
     accuracies = [f"metrics.`{name}`" for name in accuracy]
-    factors = [f"params.`{axis}`" for axis in (*Variant._fields, *changed)]
+    # The factors last: a run's name has them.
+    factors = [f"params.`{axis}`" for axis in (*changed, *Variant._fields)]
     columns = [*accuracies, *factors]
     name = "attributes.`Run Name`"
     view: dict[str, object] = {
         "columnOrder": [name, *columns],
-        # A laptop's 1,440 pixels show the name, five accuracies, four factors and two or three changes.
-        "columnWidths": {name: 210, **dict.fromkeys(accuracies, 75), **dict.fromkeys(factors, 105)},
+        # A laptop's 1,440 pixels show the name, five accuracies and what differs.
+        "columnWidths": {name: 190, **dict.fromkeys(accuracies, 65), **dict.fromkeys(factors, 110)},
         "selectedColumns": columns,
         "searchFilter": f"tags.`{KIND}` = 'variant'",
         # Sorted by time, the table would fold variants below their reproductions.
-        "orderByKey": factors[0],
+        "orderByKey": factors[-len(Variant._fields)],
         "orderByAsc": False,
         "startTime": "ALL",
         "lifecycleFilter": "Active",
