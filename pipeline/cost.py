@@ -42,8 +42,8 @@ CARDS = {
 }
 """From NVIDIA's data sheets: RTX 3090 and 4090 (Ada white paper), RTX A6000, A100 80 GB SXM, H100 SXM."""
 REACHED = 0.35
-"""Share of a card's peak that training reaches: an assumption, within the .3 to .5 that reports of model FLOPs
-utilization have (Chowdhery et al. 2022, table 3)."""
+"""Share of a card's peak that training reaches: an assumption. Large trainings report .21 to .46 (Chowdhery et al.
+2022, table 3); small batches reach less."""
 
 
 def costs(params: Params, uses: list[Use], card: str = "") -> list[str]:
@@ -172,7 +172,7 @@ def downloads(params: Params) -> Iterator[str]:
             size = f", {llama.parameters * 2 / GB:.0f} GB" if llama else ", 1.7 GB, its text tower included"
             yield f"Download: {found.repository}{size}, to {folder} (README, section Real weights)."
     if params.data.source == "videos" and not Path(params.data.dir).is_dir():
-        yield f"Videos: {params.data.dir} is not there; PhysiCLeAR's take 0.04 GB."
+        yield f"Videos: {params.data.dir} is not there (README, section Real videos)."
 
 
 def disk(params: Params, llama: Llama | None, embedding: int, videos: int) -> Iterator[str]:
