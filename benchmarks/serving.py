@@ -22,7 +22,7 @@ from benchmarks.table import Row, make_rows
 from benchmarks.timing import machine, milliseconds
 from pipeline.errors import UserError
 from pipeline.params import load_params
-from pipeline.use.ask import default_model
+from pipeline.use.folder import SHIPPED
 from pipeline.videos.files import video_files
 
 QUESTION = "Describe the touch. {tactile}"
@@ -37,7 +37,7 @@ def measure(root: Path, clients: int = CLIENTS, each: int = EACH) -> list[Row]:
     Raises:
         UserError: where there is no trained model or no video, or an answer under load is not the one given alone.
     """
-    folder = default_model(root / "models")
+    folder = SHIPPED
     place = root / load_params(root / "params.yaml").data.dir
     videos = video_files(place)[0][:clients]
     if not videos:

@@ -1,15 +1,15 @@
-"""Ask a trained model about two touches: `python examples/ask.py [MODEL [VIDEO VIDEO]]`, after `make repro`."""
+"""Ask a trained model about two touches: `python examples/ask.py [VIDEO VIDEO [MODEL]]`; by default the shipped one."""
 
 import sys
 from pathlib import Path
 
 from pipeline import Octopi
 
-scenes = sorted(Path("data/scenes/videos").rglob("*.*"))
-folder = sys.argv[1] if len(sys.argv) > 1 else "models/finetuned-with-all-0"
-if len(sys.argv) == 3:
+if len(sys.argv) == 2:
     sys.exit("name two videos")
-first, second = sys.argv[2:4] if len(sys.argv) > 3 else (scenes[0], scenes[-1])
+here = Path(__file__).parent
+first, second = sys.argv[1:3] if len(sys.argv) > 2 else (here / "soft.mp4", here / "hard.mp4")
+folder = sys.argv[3] if len(sys.argv) > 3 else None
 
 model = Octopi.from_pretrained(folder)
 for piece in model.stream("Is the object in {tactile} softer than the object in {tactile}?", [first, second]):

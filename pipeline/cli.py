@@ -274,7 +274,7 @@ def diff(
     typer.echo(describe(found))
 
 
-MODEL = typer.Option(help="Folder of a trained model; by default the full system in models/.")
+MODEL = typer.Option(help="Folder of a trained model; by default the one that is shipped.")
 BASE = typer.Option(help="Folder of its language model, where it lies in none of the known places.")
 
 
@@ -421,7 +421,7 @@ def export(
 
 @app.command()
 def serve(
-    folder: Annotated[Path | None, typer.Argument(help="A trained model; by default the full system's.")] = None,
+    folder: Annotated[Path | None, typer.Argument(help="A trained model; by default the one that is shipped.")] = None,
     host: Annotated[str, typer.Option(help="Address; another than 127.0.0.1 needs a token.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="0 for any that is free.")] = 8000,
     token_file: Annotated[Path | None, typer.Option(help="File with the token; else OCTOPI_TOKEN is taken.")] = None,
@@ -430,16 +430,15 @@ def serve(
     places: Annotated[int, typer.Option(min=1, help="Requests at once; the next is told to come later.")] = 32,
 ) -> None:
     """Answer questions about touches over HTTP, in the form of OpenAI's chat completions."""
-    from pipeline.use.ask import default_model
+    from pipeline.use.folder import SHIPPED
     from pipeline.use.server import serve
 
-    folder = folder or default_model()
-    serve(lambda: _load(folder, base, device), folder.resolve().name, host, port, token_file, places)
+    serve(lambda: _load(folder, base, device), (folder or SHIPPED).resolve().name, host, port, token_file, places)
 
 
 @app.command()
 def demo(
-    folder: Annotated[Path | None, typer.Argument(help="A trained model; by default the full system's.")] = None,
+    folder: Annotated[Path | None, typer.Argument(help="A trained model; by default the one that is shipped.")] = None,
     base: Annotated[Path | None, BASE] = None,
     device: Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")] = "auto",
     catalogue: Annotated[Path, CATALOGUE] = PHYSICLEAR,
@@ -458,9 +457,7 @@ def _doubt(notes: Sequence[str]) -> None:
 
 def _load(folder: Path | None, base: Path | None, device: str) -> Octopi:
     from pipeline.runtime import DeviceName, quiet_libraries
-    from pipeline.use.ask import default_model
 
-    folder = folder or default_model()
     if device not in get_args(DeviceName):
         raise UserError(f"--device is {device}; allowed: {', '.join(get_args(DeviceName))}")
     quiet_libraries()

@@ -473,6 +473,8 @@ class Params(Section):
     align: AlignConfig
     lora: LoraTrainConfig
     ablation: AblationConfig
+    shipped: Annotated[int, Field(ge=0)] = 0
+    """Questions about this run's videos that the model is asked which is shipped (`pipeline/pretrained`)."""
     packaged: Literal["full", "all"] = "full"
     """Which variants get a folder in models/: the full system of each seed, or all. Each holds the whole encoder."""
     tracking: TrackingConfig

@@ -69,12 +69,14 @@ class Touch(StrEnum):
 
 
 class Shown(StrEnum):
-    """What a model is shown that sees and does not feel."""
+    """What a model is shown that the chain did not train."""
 
     FRAMES = "frames"
     """The salient frames of the question's videos."""
     PHOTOS = "photos"
     """Photos of the question's objects."""
+    TOUCH = "touch"
+    """The videos of the run, that the shipped model feels: it alone is shown this."""
 
 
 class Variant(NamedTuple):
@@ -314,7 +316,7 @@ class VisionModel(Record):
 
 
 class GradedVision(Score):
-    """A score and which vision-only model's it is."""
+    """A score and which model's it is, of those that the chain did not train."""
 
     model: str
     shown: Shown

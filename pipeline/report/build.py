@@ -86,6 +86,8 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     }
     vision = data / "graded_vision.parquet"
     seen = read_table(vision, GradedVision) if vision.is_file() else []
+    asked_too = data / "shipped.parquet"
+    seen += read_table(asked_too, GradedVision) if asked_too.is_file() else []
     concluded: dict[int, list[Score]] = {}
     for seed, classified in by_encoder.items():
         asked = read_jsonl(data / "questions" / str(seed) / "evaluation.jsonl", Question)

@@ -24,8 +24,18 @@ from pipeline.params import PARAMS_FILE, load_params
 from pipeline.report.dataset import dataset_tables
 from pipeline.report.drawing import draw_table, share, span
 from pipeline.report.load import KEYS, Report, cells, load_report, read_frame
-from pipeline.report.readme import OTHER_MODELS, finding, looked_at, origin, stands_on
-from pipeline.report.tables import TABLES, difference, headline, measured, number, side_by_side, task_title, whole
+from pipeline.report.readme import OTHER_MODELS, PLUMBING, finding, looked_at, origin, stands_on
+from pipeline.report.tables import (
+    SHIPPED_TABLE,
+    TABLES,
+    difference,
+    headline,
+    measured,
+    number,
+    side_by_side,
+    task_title,
+    whole,
+)
 from pipeline.tasks import TASKS
 
 PAGE = Path("reports/index.html")
@@ -185,6 +195,8 @@ def _chapter(report: Report, gaps: list[Gap]) -> dict[str, Any]:
         "scale": scale,
         "source": source,
         "finding": finding(report),
+        "shipped": _shipped(report),
+        "plumbing": PLUMBING,
         "looked_at": report.provenance["settings"] if looked_at(report.provenance) else "",
         "tasks": tasks,
         "effects": effects,
@@ -197,6 +209,15 @@ def _chapter(report: Report, gaps: list[Gap]) -> dict[str, Any]:
         "not_asked": _not_asked(report.samples),
         "files": files,
     }
+
+
+def _shipped(report: Report) -> list[Any]:
+    """Heading, caption and table of the shipped model's answers, where it was asked."""
+    shown = SHIPPED_TABLE.build(report.scores, report.effects, report.published)
+    if not len(shown):
+        return []
+    table = draw_table(shown, SHIPPED_TABLE.title, f"{report.name}/scores.csv")
+    return [SHIPPED_TABLE.title, SHIPPED_TABLE.caption, table]
 
 
 def left_to_users(reports: Iterable[Report]) -> list[Gap]:

@@ -13,11 +13,13 @@ import pandas as pd
 from pipeline.report.load import Report
 from pipeline.report.tables import (
     FIVE_TASKS,
+    SHIPPED_TABLE,
     SHOWN_WORDS,
     TABLES,
     headline,
     measured,
     number,
+    ordered,
 )
 from pipeline.weights import is_tiny
 
@@ -26,6 +28,7 @@ CHANCE = (
     "The base models are tiny and random, drawn from a seed and taught nothing: these figures are chance and prove "
     "only that the chain runs."
 )
+PLUMBING = "The chain's own models at this scale are random ones: a test of the plumbing"
 ALPHA = 0.05
 VICUNA = 5e9
 """Parameters below which a language model is no Vicuna 7b."""
@@ -42,10 +45,11 @@ def render_readme(report: Report, figures: Sequence[str]) -> str:
     # Figures that are no evidence are no headline.
     spoilt = [f"## On test objects that were looked at\n\n{said['settings']}\n"] if looked_at(said) else []
     tasks = [five_tasks(report), *([f"{OTHER_MODELS}\n"] if len(report.published) else []), *_pictures(figures)]
+    first = shipped_first(report)
+    own = ["\n\n".join(finding(report)) + "\n", *([] if spoilt else tasks)]
     sections = [
         f"# {report.name}: what was measured\n",
-        "\n\n".join(finding(report)) + "\n",
-        *([] if spoilt else tasks),
+        *([first, f"<details><summary>{PLUMBING}</summary>\n", *own, "</details>\n"] if first else own),
         "## What the figures stand on\n\n" + "".join(f"- {fact}\n" for fact in stands_on(said)),
         "## Where it comes from\n\n" + "".join(f"- {fact}\n" for fact in origin(said)),
         *([*spoilt, *tasks] if spoilt else []),
@@ -64,6 +68,16 @@ def render_readme(report: Report, figures: Sequence[str]) -> str:
     files = (path.name for pattern in ("*.csv", "samples.json") for path in sorted(report.folder.glob(pattern)))
     links = ", ".join(f"[{name}]({name})" for name in files)
     return "\n".join([*sections, f"## More\n\n{more}All figures: {links}."]) + "\n"
+
+
+def shipped_first(report: Report) -> str:
+    """How the shipped model answers about the run's videos, with its table; empty where it was not asked."""
+    rows = ordered(report.scores[SHIPPED_TABLE.rows(report.scores)])
+    if not len(rows):
+        return ""
+    name, table = rows["encoder"].iloc[0], SHIPPED_TABLE.build(report.scores, report.effects, report.published)
+    said = " ".join(_against_chance(rows, f"`{name}`'s"))
+    return f"## {SHIPPED_TABLE.title}\n\n{SHIPPED_TABLE.caption} {said}\n\n{markdown(table)}"
 
 
 def finding(report: Report) -> list[str]:
@@ -188,7 +202,7 @@ def _who(report: Report) -> list[str]:
     return [*chance, f"{maker}.", about, *([said["settings"]] if said["settings"] else [])]
 
 
-def _against_chance(rows: pd.DataFrame) -> list[str]:
+def _against_chance(rows: pd.DataFrame, whose: str = "The full system's") -> list[str]:
     if not len(rows):
         return ["No answer of the full system was graded."]
     over = rows["accuracy"] - rows["chance"]
@@ -201,7 +215,7 @@ def _against_chance(rows: pd.DataFrame) -> list[str]:
         for kind, row in (("best in", best), ("worst in", worst))
     )
     tasks = f"{len(above)} of {_count(len(rows), 'task')}{named}"
-    text = f"The full system's interval lies above chance in {tasks}"
+    text = f"{whose} interval lies above chance in {tasks}"
     text += f" and below it in {', '.join(below['task'])}" if len(below) else ""
     # Nothing is best that is no better than a guess.
     return [f"{text}. Against chance it is {extremes}." if len(rows) > 1 and over.max() > 0 else f"{text}."]

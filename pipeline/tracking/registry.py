@@ -69,13 +69,16 @@ def log_model(client: Any, run: str, params: Params, variant: Variant, folder: P
         saved = Path(temporary, "model")
         # Where DVC's cache hands out links, MLflow refuses them: they lead out of the folder.
         real = shutil.copytree(folder, Path(temporary, folder.name))
+        # The model that is shipped is no code of this one.
+        aside = shutil.ignore_patterns("pretrained", "__pycache__")
+        code = shutil.copytree(PACKAGE, Path(temporary, PACKAGE.name), ignore=aside)
         mlflow.pyfunc.save_model(
             saved,
             mlflow_model=Model(made.artifact_location, run_id=run, model_uuid=made.model_id, model_id=made.model_id),
             python_model=str(PACKAGE / "use" / "mlflow_model.py"),
             artifacts={"folder": str(real)},
             model_config={"base": "", "device": "auto", "dtype": "auto"},
-            code_paths=[str(PACKAGE)],
+            code_paths=[str(code)],
             # A build's own mark, as in 2.6.0+cpu, is known to no registry.
             pip_requirements=[f"{name}=={version(name).partition('+')[0]}" for name in NEEDED],
             signature=ModelSignature(Schema(inputs), Schema(outputs)),

@@ -15,7 +15,6 @@ from rich.table import Table
 
 from pipeline.errors import UserError, readable
 from pipeline.io import write_text
-from pipeline.params import project_above
 from pipeline.runtime import progress
 from pipeline.use.results import Exchange, Video
 from pipeline.videos.decoding import SUFFIXES
@@ -26,9 +25,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-MODELS = Path("models")
-PREFERRED = "finetuned-with-all-*"
-"""The full system: fine-tuned encoder, LoRA, all descriptions."""
 BATCH = 8
 """Videos that are described at once; a killed description loses no more."""
 PROMPT = "> "
@@ -37,15 +33,6 @@ HELP = """\
 /frames    what the model sees of the videos
 /reset     begin a new conversation
 /quit      end"""
-
-
-def default_model(models: Path = MODELS) -> Path:
-    """The full system's folder, or the first that there is; UserError where there is none."""
-    found = sorted(models.glob(f"{PREFERRED}/config.json")) or sorted(models.glob("*/config.json"))
-    if not found:
-        place = f"go to {above}, the project's folder" if (above := project_above()) else "`dvc repro` makes some"
-        raise UserError(f"{models}: holds no trained model; {place}, or name a folder with --model")
-    return found[0].parent
 
 
 def answer_once(model: Octopi, question: str, videos: Sequence[str]) -> dict[str, Any]:

@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+SHIPPED = Path(__file__).parents[1] / "pretrained" / "octopi-small"
+"""The model that is part of the package."""
 FORMAT = 2
 CONFIG, CATALOGUE = "config.json", "catalogue.json"
 ENCODER_DIR, BASE_DIR, BACKBONE_DIR = "encoder", "base", "backbone"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import random
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,13 +29,15 @@ from pipeline.runtime import (
 )
 from pipeline.tasks import opd, pc, pom, psr, pss
 from pipeline.tasks.base import LETTERS
-from pipeline.use.folder import ModelConfig, chat_sample, find_base, read_folder
+from pipeline.use.folder import SHIPPED, ModelConfig, chat_sample, find_base, read_folder
 from pipeline.use.results import Choice, Comparison, Description, Exchange, Matching, Ranking, Touch, Video
 from pipeline.use.touch import Felt, TactileSense
 from pipeline.videos.catalogue import Catalogue, Property
 from pipeline.weights import is_tiny
 
 RANDOM = "its base models are tiny and random, made to test the chain: no answer of it means anything"
+
+logger = logging.getLogger(__name__)
 
 
 class Octopi:
@@ -69,7 +72,7 @@ class Octopi:
     @classmethod
     def from_pretrained(
         cls,
-        folder: Path | str,
+        folder: Path | str | None = None,
         *,
         base: Path | str | None = None,
         device: DeviceName = "auto",
@@ -78,7 +81,7 @@ class Octopi:
         """Load a folder that `dvc repro package` wrote.
 
         Args:
-            folder: `models/<variant>`, or a copy of it.
+            folder: `models/<variant>`, or a copy of it; by default the model that is shipped, and a line says so.
             base: Folder of the language model; by default the first known place that has it.
             device: What to compute on; `auto` takes CUDA, then MPS, then the CPU.
             dtype: Number format of the language model; `auto` is that of the evaluation, where the device computes it.
@@ -87,7 +90,11 @@ class Octopi:
             UserError: naming what is missing, changed, of another version, or another language model.
         """
         quiet_libraries()
-        folder = Path(folder)
+        if folder is None:
+            logger.warning(
+                "no model is named, so %s answers, which is shipped (its README.md has its figures)", SHIPPED
+            )
+        folder = SHIPPED if folder is None else Path(folder)
         config, catalogue = read_folder(folder)
         found = find_base(folder, config.base, None if base is None else Path(base))
         place = resolve_device(device)

@@ -42,10 +42,13 @@ def stages() -> dict[str, dict[str, Any]]:
     return found
 
 
+DATA = ("pipeline/physiclear/", "pipeline/pretrained")
+
+
 def code(name: str) -> list[str]:
-    """Of its dependencies what is imported; a catalogue is data."""
+    """Of its dependencies what is imported; a catalogue is data, and so is a model."""
     deps: list[str] = stages()[name]["deps"]
-    return [d for d in deps if d.startswith(("pipeline/", "stages/")) and not d.startswith("pipeline/physiclear/")]
+    return [d for d in deps if d.startswith(("pipeline/", "stages/")) and not d.startswith(DATA)]
 
 
 def data_of(module: str) -> Iterator[str]:

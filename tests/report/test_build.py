@@ -19,12 +19,13 @@ from safetensors.torch import load_file
 from pipeline.config import EncoderConfig
 from pipeline.errors import UserError
 from pipeline.evaluation.calibration import fit_temperature
-from pipeline.io import read_jsonl, read_table
+from pipeline.io import read_jsonl, read_table, write_table
 from pipeline.params import load_params
-from pipeline.records import Classification, Graded, Part, Prediction, Question
+from pipeline.records import Classification, Graded, GradedVision, Part, Prediction, Question, Shown
 from pipeline.report.build import MOST_METRICS, finish_report, without_places, write_report
 from pipeline.report.dataset import dataset_tables
 from pipeline.report.load import DATASET, load_report
+from pipeline.report.page import write_page
 from pipeline.report.provenance import base_model, digest, encoder_words, parameters
 from pipeline.report.readme import MOST_LINES
 from pipeline.report.samples import choose_samples
@@ -293,3 +294,43 @@ def test_the_committed_report_says_what_made_it() -> None:
     assert "taught here in text alone to reason about described objects" in text
     assert report.provenance["settings"] in text
     assert all(f"| {model} |" in text for model in ("untaught", "taught")), "the untaught base has a row"
+
+
+def test_the_shipped_models_answers_come_first_and_the_plumbing_is_folded(tmp_path: Path) -> None:
+    """In the README and on the page, where it was asked; its figures are no other system's."""
+    params = write_run(tmp_path, fake_params(*ONE))
+    write_report(params, tmp_path)
+    usual = load_report(tmp_path / "reports" / params.report_name)
+    assert "shipped" not in (usual.folder / "README.md").read_text()
+    common = {"measure": "choice", "parsed": True, "truncated": False, "expected": "yes", "predicted": "yes", "seed": 0}
+    rows = [
+        GradedVision(
+            question_id=f"PC-test-{i:05d}",
+            task="PC",
+            correct=i < 30,
+            objects=(f"o{i}", f"p{i}"),
+            model="octopi-small",
+            shown=Shown.TOUCH,
+            **common,
+        )
+        for i in range(40)
+    ]
+    write_table(tmp_path / "data" / "shipped.parquet", GradedVision, rows)
+    write_report(params, tmp_path)
+    report = load_report(tmp_path / "reports" / params.report_name)
+    text = (report.folder / "README.md").read_text()
+    places = [
+        text.index(words)
+        for words in ("The model that is shipped", "<details>", "The full system's interval", "</details>")
+    ]
+    assert places == sorted(places)
+    assert "| Property Comparison (PC) | 75.0 [" in text[: places[1]]
+    assert "`octopi-small`'s interval lies above chance in 1 of 1 task (PC)" in text
+    assert len(report.scores) == len(usual.scores) + 2, "of its seed, and over all"
+    page = write_page(tmp_path).read_text()
+    name = params.report_name
+    order = [page.index(f'id="{name}-{part}"') for part in ("shipped", "tasks", "stands-on")]
+    assert order == sorted(order)
+    assert "75.0 [" in page[order[0] : order[1]]
+    folded = page[order[0] : order[1]]
+    assert folded.count("<details>") - folded.count("</details>") == 1

@@ -14,7 +14,7 @@ from pipeline import runtime
 from pipeline.cli import app, main
 from pipeline.use import ask as asking
 from pipeline.use import model as model_code
-from pipeline.use.ask import Chat, default_model, describe_folder
+from pipeline.use.ask import Chat, describe_folder
 from pipeline.use.model import Octopi
 from tests.conftest import not_utf8, refused
 from tests.report.shared import rows_of
@@ -220,12 +220,3 @@ def test_what_somebody_else_wrote_stays(content: bytes, octopi: Octopi, folder: 
     with refused("is no description by .*name another file with --csv"):
         describe_folder(octopi, folder, out)
     assert out.read_bytes() == content
-
-
-def test_the_full_system_is_asked_by_default(tmp_path: Path) -> None:
-    with refused("holds no trained model"):
-        default_model(tmp_path)
-    for name in ("base-with-all-0", "finetuned-with-all-1", "finetuned-with-all-0"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "config.json").touch()
-    assert default_model(tmp_path).name == "finetuned-with-all-0"

@@ -54,7 +54,7 @@ def test_the_walk_of_a_new_sensor(tmp_path: Path) -> None:
 
 def test_the_script_runs(made: Made, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     files = [str(made.videos / f"{name}_0.avi") for name in ("ice_block", "millet")]
-    monkeypatch.setattr("sys.argv", ["ask.py", str(made.folder), *files])
+    monkeypatch.setattr("sys.argv", ["ask.py", *files, str(made.folder)])
     runpy.run_path(str(EXAMPLES / "ask.py"), run_name="__main__")
     answer, *rest = capsys.readouterr().out.splitlines()
     assert answer
@@ -70,7 +70,11 @@ def test_the_notebook_runs(made: Made) -> None:
     nbformat.validate(notebook)
     cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
     assert not any(cell.outputs for cell in cells), "none is committed"
-    for ours, theirs in (("models/finetuned-with-all-0", str(made.folder)), ("data/scenes/videos", str(made.videos))):
+    for ours, theirs in (
+        ("pipeline/pretrained/octopi-small", str(made.folder)),
+        ("examples", str(made.videos)),
+        ("*.mp4", "*.avi"),
+    ):
         assert sum(ours in cell.source for cell in cells) == 1
         for cell in cells:
             cell.source = cell.source.replace(ours, theirs)

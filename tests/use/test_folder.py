@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
-from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +16,7 @@ import yaml
 from pipeline.embeddings import TENSOR, TENSOR_FILE
 from pipeline.io import load_tensors, read_table, save_tensors, write_table
 from pipeline.records import Classification, Part, Probe
-from pipeline.use import folder
-from pipeline.use.folder import FORMAT, Base, find_base, read_folder
+from pipeline.use.folder import FORMAT, read_folder
 from pipeline.use.model import Octopi
 from pipeline.use.package import describe_base, export, package
 from pipeline.videos.frames.store import PROBES_FILE
@@ -177,32 +175,3 @@ def test_what_is_no_model_is_refused(text: str | None, message: str, tmp_path: P
         (tmp_path / "config.json").write_text(text)
     with refused(message):
         Octopi.from_pretrained(tmp_path)
-
-
-@pytest.fixture
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The user's, and empty."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    return tmp_path / "cache" / "octopi"
-
-
-def test_a_language_model_of_a_package_is_made_once(
-    cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    made: list[Path] = []
-
-    def make(name: str, to: Path) -> None:
-        assert name == "smollm2"
-        made.append(to)
-        to.mkdir(parents=True)
-        (to / "model.safetensors").write_bytes(b"weights")
-
-    monkeypatch.setattr(folder, "make", make)
-    monkeypatch.chdir(tmp_path)
-    lone = tmp_path / "model"
-    lone.mkdir()
-    known = Base(folder="data/weights/smollm2", files={"model.safetensors": sha256(b"weights").hexdigest()})
-    assert find_base(lone, known) == cache / "smollm2"
-    assert "smollm2 is made of an installed package" in caplog.text
-    assert find_base(lone, known) == cache / "smollm2"
-    assert made == [cache / "smollm2"]

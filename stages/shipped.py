@@ -1,0 +1,54 @@
+"""Ask the model that is shipped about this run's videos, all of which are new to it."""
+
+from pathlib import Path
+
+import torch
+
+from pipeline.embeddings import EmbeddingStore
+from pipeline.evaluation.grading import grade
+from pipeline.io import read_table, write_table
+from pipeline.language.generate import answer
+from pipeline.records import GradedVision, Part, Shown, Video
+from pipeline.runtime import track
+from pipeline.stage import DATA, stage
+from pipeline.tasks.base import Pool
+from pipeline.tasks.questions import build_questions, counts_by_task
+from pipeline.use.folder import SHIPPED
+from pipeline.use.model import Octopi
+from pipeline.videos.catalogue import load_catalogue
+
+
+def main() -> None:
+    with stage("shipped") as run:
+        params, graded = run.params, list[GradedVision]()
+        if params.shipped:
+            octopi = Octopi.from_pretrained(SHIPPED, device=params.runtime.device)
+            catalogue = load_catalogue(Path(params.data.catalogue)).asking(params.questions.scenarios)
+            videos: dict[str, list[str]] = {}
+            rows, felt = dict[str, range](), [torch.zeros(0, octopi.llm.octopi_config.tactile_dim)]
+            for video in track(read_table(DATA / "videos.parquet", Video), "touches", "video"):
+                videos.setdefault(video.object_id, []).append(video.video_id)
+                felt.append(octopi.sense.feel(Path(params.data.dir) / video.path).features)
+                rows[video.video_id] = range(sum(map(len, felt[:-1])), sum(map(len, felt)))
+            # Half of them describe: those answers are short, and the others follow from what they say.
+            asked = {task: count for task, count in counts_by_task(params.questions, "evaluation").items() if count}
+            parts = {task: len(asked) - 1 if task == "OPD" else 1 for task in asked}
+            questions = build_questions(
+                Pool(Part.TEST, catalogue, videos),
+                {task: params.shipped * part // sum(parts.values()) for task, part in parts.items()},
+                seed=params.questions.seed,
+                distinct=True,
+                facts=octopi.config.facts,
+            )
+            store, config = EmbeddingStore().with_rows(rows, torch.cat(felt)), octopi.config
+            said = answer(octopi.llm, store, questions, config.opd, config.language, config.frames.per_video)
+            graded = [
+                GradedVision(**score.model_dump(), model=SHIPPED.name, shown=Shown.TOUCH, seed=params.ablation.seeds[0])
+                for score in grade(questions, said, catalogue)
+            ]
+            run.metrics["answers"] = len(said)
+        write_table(DATA / "shipped.parquet", GradedVision, graded)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,102 @@
+"""The model that is shipped: whole, small, found from anywhere, and not random."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from hashlib import sha256
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from pipeline.io import read_json
+from pipeline.language.base import ADAPTER_CONFIG, ADAPTER_WEIGHTS
+from pipeline.use import folder
+from pipeline.use.folder import LANGUAGE_DIR, SHIPPED, Base, find_base, read_folder
+from tests.closure import ROOT
+from tests.models import model_folder
+
+EXAMPLES = ROOT / "examples"
+LARGEST, RANK, VIDEO = 40e6, 32, 200_000
+
+
+def test_it_is_whole_and_small() -> None:
+    """`read_folder` compares every file with its hash."""
+    config, catalogue = read_folder(SHIPPED)
+    files = [f for f in SHIPPED.rglob("*") if f.is_file()]
+    assert {f.relative_to(SHIPPED).as_posix() for f in files} == {*config.files, "config.json", "README.md"}
+    assert sum(f.stat().st_size for f in files) <= LARGEST
+    adapter = SHIPPED / LANGUAGE_DIR / "adapter"
+    assert read_json(adapter / ADAPTER_CONFIG)["r"] <= RANK
+    assert {t.dtype for t in load_file(adapter / ADAPTER_WEIGHTS).values()} == {torch.bfloat16}
+    assert catalogue.property_names == ("hardness", "roughness", "bumpiness")
+    written = "".join(f.read_text(encoding="utf-8") for f in files if f.suffix in (".md", ".json"))
+    assert not re.search(r"[\"'\s(`]/\w+/", written), "no path of a machine"
+
+
+def test_the_card_has_the_licence_the_data_and_every_figure() -> None:
+    config, _ = read_folder(SHIPPED)
+    card = (SHIPPED / "README.md").read_text(encoding="utf-8")
+    assert set(config.scores) == {"OPD", "PC", "PSS", "POM", "PSR"}
+    for accuracy, low, high in config.scores.values():
+        assert f"{100 * accuracy:.1f} [{100 * low:.1f}, {100 * high:.1f}]" in card
+    assert "license:" in card
+    assert "data/invented" in card
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The user's, empty."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache" / "octopi"
+
+
+def test_its_language_model_is_made_once(
+    cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    made: list[Path] = []
+
+    def make(name: str, to: Path) -> None:
+        assert name == "smollm2"
+        made.append(to)
+        to.mkdir(parents=True)
+        (to / "model.safetensors").write_bytes(b"weights")
+
+    monkeypatch.setattr(folder, "make", make)
+    monkeypatch.chdir(tmp_path)
+    lone = tmp_path / "model"
+    lone.mkdir()
+    known = Base(folder="data/weights/smollm2", files={"model.safetensors": sha256(b"weights").hexdigest()})
+    assert find_base(lone, known) == cache / "smollm2"
+    assert "smollm2 is made of an installed package" in caplog.text
+    assert find_base(lone, known) == cache / "smollm2"
+    assert made == [cache / "smollm2"]
+
+
+def test_it_tells_two_touches_apart_from_any_folder(cache: Path, tmp_path: Path) -> None:
+    """As a newcomer types it, both ways round."""
+    cache.mkdir(parents=True)
+    (cache / "smollm2").symlink_to(model_folder("smollm2"))
+    soft, hard = EXAMPLES / "soft.mp4", EXAMPLES / "hard.mp4"
+    assert max(f.stat().st_size for f in EXAMPLES.glob("*.mp4")) <= VIDEO
+
+    def ask(*videos: Path) -> tuple[str, str]:
+        command = [str(Path(sys.executable).with_name("octopi")), "ask", "Which is softer? {tactile} {tactile}"]
+        done = subprocess.run(
+            [*command, *map(str, videos)],
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        return done.stdout, done.stderr
+
+    (one, said), (other, _) = ask(soft, hard), ask(hard, soft)
+    assert "octopi-small answers" in said
+    assert re.search(r"the first object is softer", one, re.IGNORECASE)
+    assert re.search(r"the second object is softer", other, re.IGNORECASE)
