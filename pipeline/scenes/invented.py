@@ -59,16 +59,20 @@ def classes_of(number: int) -> tuple[int, int, int]:
 
 
 def invented_catalogue(config: InventConfig) -> Catalogue:
-    """The objects by number, with their classes and with PhysiCLeAR's words; no recipe is drawn for that."""
+    """The objects by number, with their classes and with PhysiCLeAR's words; no recipe is drawn for that.
+
+    Ids hold the seed, so that objects of two seeds are never taken for the same.
+    """
     objects = {
-        f"object_{n:05d}": Object(
-            object_id=f"object_{n:05d}",
-            name=f"object {n:05d}",
+        object_id: Object(
+            object_id=object_id,
+            name=f"object {n}",
             splits={},
             stated=(None,) * LEVELS,
             ratings=tuple((level,) for level in classes_of(n)),
         )
         for n in range(config.objects)
+        for object_id in (f"object_{100_000 * config.seed + n:05d}",)
     }
     language = load_catalogue(WORDS).language.model_copy(update={"dataset": DATASET})
     return Catalogue(language=language, objects=objects)
