@@ -200,17 +200,25 @@ def bag(
 
 @import_app.command()
 def video(
-    file: Annotated[Path, typer.Argument(help="A video with several presses, or a folder of PNG or JPEG pictures.")],
+    file: Annotated[
+        Path, typer.Argument(help="A video with several presses, a folder of PNG or JPEG pictures, or a table.")
+    ],
     out: Annotated[Path, typer.Option(help="Folder of the videos.")],
     object_id: Annotated[str, typer.Option("--object", help="What is touched; the file's name by default.")] = "",
     times: Annotated[float, typer.Option(help="A press begins at this many times the quiet level.")] = 2.0,
     fps: Annotated[float, typer.Option(min=0, help="Pictures a second, where the file does not say.")] = 0.0,
     whole: Annotated[bool, typer.Option("--whole", help="Write one video of all of it.")] = False,
 ) -> None:
-    """Cut a long recording into presses: videos for the chain and `octopi ask`, each with its times in a CSV."""
-    from pipeline.use.presses import cut, film
+    """Cut a long recording into presses: videos for the chain and `octopi ask`, each with its times in a CSV.
 
-    written = cut(lambda: film(file, fps), str(file), out, object_id or file.stem, times, whole=whole)
+    A table (file, object_id, begin and end in seconds, session) says itself where to cut: one video a line.
+    """
+    from pipeline.use.presses import cut, cut_listed, film
+
+    if file.suffix.lower() == ".csv":
+        written = cut_listed(file, out, fps)
+    else:
+        written = cut(lambda: film(file, fps), str(file), out, object_id or file.stem, times, whole=whole)
     typer.echo(f"{len(written)} videos in {out}: {', '.join(path.name for path in written)}")
 
 

@@ -123,6 +123,8 @@ class Probe(Video):
     """The recording session as videos.csv names it; empty where it does not."""
     header_frames: int
     """Frames that the file's header promises."""
+    hdr: bool
+    """Whether its brightness follows PQ or HLG: such pictures look flat beside others."""
     rotation: int
     """Degrees against the clock by which the metadata turn the picture; done already in what is kept."""
     irregular: float

@@ -46,6 +46,7 @@ def probe(video_id: str = "rug_0", **changes: object) -> Probe:
         "fps": 25.0,
         "width": 320,
         "height": 240,
+        "hdr": False,
         "rotation": 0,
         "irregular": 1.0,
         "kept": 37,

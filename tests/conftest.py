@@ -196,14 +196,20 @@ def encode(
     given: str = "bgr24",
     milliseconds: Sequence[int] = (),
     bits: int = 0,
+    transfer: int = 0,
 ) -> Path:
-    """Write frames (in PyAV's format `given`) by any codec, at any time stamps; FFV1 gives back what went in."""
+    """Write frames (in PyAV's format `given`) by any codec, at any time stamps; FFV1 gives back what went in.
+
+    `transfer` is ITU-T H.273's number of how light follows from values; 0 leaves it unsaid.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=25)
         stream.pix_fmt = pixels
         if bits:
             stream.bit_rate = bits
+        if transfer:
+            stream.codec_context.color_trc = transfer
         for index, frame in enumerate(frames):
             video_frame = av.VideoFrame.from_ndarray(frame, format=given)
             if index == 0:

@@ -6,10 +6,12 @@ A press is where the picture differs from the untouched one by much more than th
 from __future__ import annotations
 
 import itertools
+import math
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import av
@@ -23,8 +25,9 @@ from pipeline.io import atomic, remove_rests, write_csv
 from pipeline.records import Record
 from pipeline.scenes.film import write_film
 from pipeline.videos.audit.files import FOUND
+from pipeline.videos.catalogue.csv_reader import read_rows
 from pipeline.videos.decoding import Decoder, Image, decode
-from pipeline.videos.files import is_video
+from pipeline.videos.files import LIST_FILE, SECTION, is_video
 from pipeline.videos.frames.reference import (
     LONGEST,
     contact_strength,
@@ -45,6 +48,14 @@ RATES = (1.0, 240.0)
 """Frames a second of a video, at least and at most."""
 SHORTEST = 3
 """Frames of a press; what is shorter is a flicker."""
+
+
+class Recorded(Record):
+    """A row of the `videos.csv` beside videos that were cut from a table's recordings."""
+
+    file: str
+    object_id: str
+    session: str
 
 
 class FrameTime(Record):
@@ -130,11 +141,47 @@ def _noting(pressed: Iterator[Shot], strengths: npt.NDArray[np.float64], rows: l
         yield shot.picture
 
 
-def film(path: Path, fps: float = 0.0) -> Iterator[Shot]:
+def cut_listed(listed: Path, out: Path, fps: float = 0.0) -> list[Path]:
+    """Write what each line of a table names as one video, with a `videos.csv` beside them where sessions are known.
+
+    Args:
+        listed: CSV with the columns `file` (from the table's folder), `object_id`, and, where wanted, `begin` and `end`
+            in seconds (empty: from the beginning, to the end) and `session`. One file may stand in many lines.
+        fps: As `film`'s.
+
+    Raises:
+        UserError: naming the line.
+    """
+    header, rows = read_rows(listed, ("file", "object_id"))
+    written, sessions = list[Path](), list[Recorded]()
+    for where, row in rows:
+        begin, end = (_seconds(where, column, row.get(column, "")) for column in SECTION)
+        read = partial(film, listed.parent / row["file"], fps, begin or 0.0, end)
+        (path,) = cut(read, where, out, row["object_id"], whole=True)
+        written.append(path)
+        sessions.append(Recorded(file=path.name, object_id=row["object_id"], session=row.get("session", "")))
+    if "session" in header:
+        write_csv(out / LIST_FILE, Recorded, sessions)
+    return written
+
+
+def _seconds(where: str, column: str, text: str) -> float | None:
+    try:
+        seconds = float(text) if text else None
+    except ValueError:
+        seconds = math.nan
+    if seconds is not None and not 0 <= seconds < math.inf:
+        raise UserError(f"{where}: {column} is {text!r}; write seconds from the file's beginning, such as 2.5")
+    return seconds
+
+
+def film(path: Path, fps: float = 0.0, begin: float = 0.0, end: float | None = None) -> Iterator[Shot]:
     """The pictures of a video, or of a folder of PNG or JPEG files by their names (2 before 10).
 
     Args:
         fps: Pictures a second; 0 for the video's own. A folder has none of its own.
+        begin: Seconds from the beginning from which on they are yielded.
+        end: Seconds at which it ends.
 
     Raises:
         UserError: where there is no picture, one cannot be read or has another size, or the rate is unknown.
@@ -162,7 +209,10 @@ def film(path: Path, fps: float = 0.0) -> Iterator[Shot]:
         if picture.shape != size:
             raise UserError(f"{where}: of another size than the first picture; record them in one size")
         at = round(number * 1e9 / rate)
-        yield Shot(np.asarray(picture, dtype=np.uint8), at, at)
+        if end is not None and at >= end * 1e9:
+            return
+        if at >= begin * 1e9:
+            yield Shot(np.asarray(picture, dtype=np.uint8), at, at)
     if size is None:
         what = f"no picture ({', '.join(PICTURES)}) in it" if path.is_dir() else "no frame decodes"
         raise UserError(f"{path}: {what}; name a video or a folder of pictures")

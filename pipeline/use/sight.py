@@ -71,6 +71,8 @@ def see(video: Video, frames: FramesConfig, *, subtracts: bool, quiet: float) ->
         notes.append(f"little touches the sensor: strength {probe.contact:.2f}, where noise alone has {quiet:.2f}")
     if probe.unsteady:
         notes.append(f"the light is {unsteady(probe)}")
+    if probe.hdr:
+        notes.append("recorded in HDR, which looks flat beside other videos; record or export it in SDR")
     if probe.header_frames > probe.frames:
         notes.append(f"damaged: only {probe.frames} of its {probe.header_frames} frames decode")
     touch = Touch(

@@ -31,6 +31,8 @@ PLANAR = frozenset(f"yuv{j}{kind}p" for j in ("", "j") for kind in ("420", "422"
 """Formats whose first plane is brightness and whose second and third are colour, 8 bits each."""
 FULL_RANGE, BT709 = 2, 1
 """As FFmpeg numbers colour ranges and colour spaces."""
+HDR = (16, 18)
+"""PQ and HLG, as ITU-T H.273 numbers transfer characteristics."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,8 @@ class Header:
     """Promised; from the duration where no number is given; 0 where neither is."""
     fps: float = 0.0
     """0 where unknown."""
+    hdr: bool = False
+    """Whether its brightness follows PQ or HLG, as telephones record by default."""
 
 
 class Decoder:
@@ -64,7 +68,8 @@ class Decoder:
         if promised and "mov" in self._container.format.name:
             # An edit list may show fewer frames than are stored.
             promised = sum(not entry.is_discard for entry in stream.index_entries)
-        self.header = Header(promised or (round(seconds * fps) if valid else 0), fps if valid else 0.0)
+        frames = promised or (round(seconds * fps) if valid else 0)
+        self.header = Header(frames, fps if valid else 0.0, stream.codec_context.color_trc in HDR)
 
     def __enter__(self) -> Self:
         return self

@@ -20,7 +20,8 @@ from pipeline.videos.decoding import SUFFIXES
 
 LIST_FILE = "videos.csv"
 """Optional, in the videos' folder: columns `file`, `object_id` and, where known, `session`."""
-
+SECTION = ("begin", "end")
+"""Columns of a table that `octopi import video` cuts by; the chain itself takes whole files."""
 
 PASSED = "passed over"
 """The check of what is no video."""
@@ -160,6 +161,9 @@ def _from_list(listed: Path, folder: Path, paths: Sequence[Path]) -> tuple[list[
         _, rows = read_rows(listed, ("file", "object_id"))
     except UserError as problem:
         return [], [_error(LIST_FILE, str(problem).removeprefix(str(listed)).lstrip(":, "))]
+    if any(row.get(column) for column in SECTION for _, row in rows):
+        message = f"names sections, but whole files are used; cut them: octopi import video {listed} --out FOLDER"
+        return [], [_error(LIST_FILE, message)]
     files: dict[str, VideoFile] = {}
     findings: list[Finding] = []
     numbers: Counter[str] = Counter()

@@ -22,7 +22,7 @@ from pipeline.scenes.film import write_film
 from pipeline.use.bags import shots
 from pipeline.use.presses import QUIET, RELEASED, ROUNDING, SHORTEST, FrameTime, cut, presses
 from pipeline.videos.audit.files import FOUND
-from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.decoding import Decoder, decode
 from pipeline.videos.files import list_videos
 from pipeline.videos.frames.reference import LONGEST
@@ -335,6 +335,37 @@ def test_a_long_video_and_a_folder_of_pictures_are_cut_as_a_bag_is(tmp_path: Pat
         error = CliRunner().invoke(app, [*command, str(name), *more]).exception
         assert isinstance(error, UserError), name
         assert words in str(error)
+
+
+def test_a_table_says_where_to_cut(tmp_path: Path, pictures: list[np.ndarray]) -> None:
+    write_film(tmp_path / "long.mp4", pictures, 25.0)
+    table, out = tmp_path / "videos.csv", tmp_path / "cut"
+    table.write_text(
+        "file,object_id,session,begin,end\nlong.mp4,rug,one,,0.4\nlong.mp4,rug,two,1.2,2\nlong.mp4,felt,two,,\n"
+    )
+    command = ["import", "video", str(table), "--out", str(out)]
+    said = CliRunner().invoke(app, command)
+    assert said.exit_code == 0, said.output
+    lengths = [len(list(decode(out / f"{name}.mp4"))) for name in ("rug_0", "rug_1", "felt_0")]
+    assert lengths == [10, 20, LENGTH]
+    assert [row.recorded_ns for row in read_csv(out / "rug_1.csv", FrameTime)] == [
+        (30 + i) * STEP_NS for i in range(20)
+    ]
+    catalogue = load_catalogue(Path("pipeline/physiclear"))
+    rug = catalogue.objects["rug"]
+    listing = list_videos(out, catalogue.model_copy(update={"objects": {"rug": rug, "felt": rug}}))
+    assert [(f.relative, f.session) for f in listing.files] == [
+        ("felt_0.mp4", "two"),
+        ("rug_0.mp4", "one"),
+        ("rug_1.mp4", "two"),
+    ]
+    (refused,) = (f for f in list_videos(tmp_path, catalogue).findings if f.severity is Severity.ERROR)
+    assert f"octopi import video {table} --out" in refused.measured, "the chain would take the whole file"
+    for cell in ("-1", "nan", "soon", "inf"):
+        table.write_text(f"file,object_id,begin\nlong.mp4,rug,{cell}\n")
+        error = CliRunner().invoke(app, command).exception
+        assert isinstance(error, UserError), cell
+        assert f"line 2: begin is '{cell}'" in str(error)
 
 
 def test_the_command_says_what_it_wrote(tmp_path: Path, pictures: list[np.ndarray]) -> None:

@@ -41,6 +41,7 @@ def test_flawless_videos_no_videos_and_a_single_one_give_no_warning(catalogue: C
         ({"brightness": 97.0}, "brightness", "97.0 of 255", "90.0 +- 1.0, as others at 25 frames/s"),
         ({"brightness_step": 9.0}, "brightness", "a step of 9.0 of 255", "at most 4"),
         ({"saturated": 0.2}, "saturation", "20 % of values at 0 or 255", "at most 5 %"),
+        ({"hdr": True}, "colours", "HDR, which looks flat beside other videos", "SDR; record or export it as such"),
         ({"rotation": 90}, "rotation", "90 degrees in the metadata, applied", "0"),
         ({"irregular": 2.0}, "frame rate", "varies by a factor of 2.0", "even"),
         ({"kept": 0}, "frames kept", "0", "5 or more, by frames.selection"),

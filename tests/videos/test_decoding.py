@@ -97,6 +97,16 @@ def test_pictures_of_motion_jpeg_are_opencvs_bit_for_bit(tmp_path: Path, count: 
     np.testing.assert_array_equal(views, [brightness(frame).copy() for frame in frames_of(path)], "views keep frames")
 
 
+@pytest.mark.parametrize(("transfer", "hdr"), [(0, False), (1, False), (16, True), (18, True)])
+@pytest.mark.parametrize(("codec", "pixels", "suffix"), [("libx264", "yuv420p", "mp4"), ("ffv1", "yuv444p", "mkv")])
+def test_a_recording_in_hdr_is_known(
+    tmp_path: Path, transfer: int, hdr: bool, codec: str, pixels: str, suffix: str
+) -> None:
+    path = encode(tmp_path / f"v.{suffix}", moving_square(3), codec, pixels, transfer=transfer)
+    with Decoder(path) as decoder:
+        assert decoder.header.hdr == hdr
+
+
 @every_format
 def test_pictures_and_fitted_frames_follow_range_and_format(
     tmp_path: Path, codec: str, pixels: str, suffix: str

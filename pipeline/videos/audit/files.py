@@ -112,6 +112,7 @@ def _each(probes: Sequence[Probe]) -> Iterator[Finding]:
         for check, odd, measured, expected in (
             ("frames that decode", _header_lies(p), str(p.frames), f"{p.header_frames}, by the header"),
             ("rotation", p.rotation, f"{p.rotation} degrees in the metadata, applied", "0"),
+            ("colours", p.hdr, "HDR, which looks flat beside other videos", "SDR; record or export it as such"),
             ("frame rate", p.irregular > IRREGULAR, f"varies by a factor of {p.irregular:.1f}", "even"),
             ("brightness", p.brightness_step > STEP, f"a step of {p.brightness_step:.1f} of 255", f"at most {STEP:g}"),
             (

@@ -90,6 +90,7 @@ def scan(file: VideoFile, config: FramesConfig) -> Scan | Finding:
         height=height,
         session=file.session,
         header_frames=found.header.frames,
+        hdr=found.header.hdr,
         rotation=found.rotation,
         irregular=_irregular(found.times),
         kept=len(found.kept),
