@@ -70,6 +70,7 @@ def costs(params: Params, uses: list[Use], card: str = "") -> list[str]:
         *disk(params, llama, embedding, videos),
         *describe(work(params, llama, lengths, tower, videos), params, card),
         *(fits(uses, known.gib) if known else ()),
+        *host(params, llama),
     ]
 
 
@@ -141,6 +142,17 @@ def describe(hours: list[Hours], params: Params, card: str) -> Iterator[str]:
     yield f"Hours {how}: " + ", ".join(f"{h.stage} {t:.2g} ({h.runs} runs)" for h, t in each) + "."
     rest = [*(s for s in REST if s not in {h.stage for h in hours})]
     yield f"Together {sum(t for _, t in each):.2g}. Not counted: {', '.join(rest)}, and the work on videos."
+
+
+def host(params: Params, llama: Llama | None) -> Iterator[str]:
+    """What sharded training needs of the machine itself: every process reads all weights before it keeps its share."""
+    devices, sharded = launched(params.runtime.launcher)
+    if llama and sharded:
+        each = llama.parameters * BYTES[params.language.dtype] / GB
+        yield (
+            f"Host memory: each of {devices} processes loads the whole language model ({each:.3g} GB) before it keeps "
+            f"its share, {devices * each:.3g} GB together."
+        )
 
 
 def measured_rate(side: int = 1024, seconds: float = 0.5) -> float:
