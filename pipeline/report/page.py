@@ -24,7 +24,7 @@ from pipeline.params import PARAMS_FILE, load_params
 from pipeline.report.dataset import dataset_tables
 from pipeline.report.drawing import draw_table, share, span
 from pipeline.report.load import KEYS, Report, cells, load_report, read_frame
-from pipeline.report.readme import OTHER_MODELS, PLUMBING, finding, looked_at, origin, stands_on
+from pipeline.report.readme import OTHER_MODELS, PLUMBING, at_random, finding, looked_at, origin, stands_on
 from pipeline.report.tables import (
     SHIPPED_TABLE,
     TABLES,
@@ -196,7 +196,7 @@ def _chapter(report: Report, gaps: list[Gap]) -> dict[str, Any]:
         "source": source,
         "finding": finding(report),
         "shipped": _shipped(report),
-        "plumbing": PLUMBING,
+        "plumbing": PLUMBING if at_random(report.provenance) else "",
         "looked_at": report.provenance["settings"] if looked_at(report.provenance) else "",
         "tasks": tasks,
         "effects": effects,

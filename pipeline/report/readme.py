@@ -10,6 +10,7 @@ from typing import Any
 
 import pandas as pd
 
+from pipeline.records import Shown
 from pipeline.report.load import Report
 from pipeline.report.tables import (
     FIVE_TASKS,
@@ -49,7 +50,8 @@ def render_readme(report: Report, figures: Sequence[str]) -> str:
     own = ["\n\n".join(finding(report)) + "\n", *([] if spoilt else tasks)]
     sections = [
         f"# {report.name}: what was measured\n",
-        *([first, f"<details><summary>{PLUMBING}</summary>\n", *own, "</details>\n"] if first else own),
+        *([first] if first else []),
+        *([f"<details><summary>{PLUMBING}</summary>\n", *own, "</details>\n"] if first and at_random(said) else own),
         "## What the figures stand on\n\n" + "".join(f"- {fact}\n" for fact in stands_on(said)),
         "## Where it comes from\n\n" + "".join(f"- {fact}\n" for fact in origin(said)),
         *([*spoilt, *tasks] if spoilt else []),
@@ -76,7 +78,7 @@ def shipped_first(report: Report) -> str:
     if not len(rows):
         return ""
     name, table = rows["encoder"].iloc[0], SHIPPED_TABLE.build(report.scores, report.effects, report.published)
-    said = " ".join(_against_chance(rows, f"`{name}`'s"))
+    said = " ".join(_against_chance(rows[rows["touch"] == Shown.TOUCH], f"`{name}`'s"))
     return f"## {SHIPPED_TABLE.title}\n\n{SHIPPED_TABLE.caption} {said}\n\n{markdown(table)}"
 
 
@@ -94,6 +96,11 @@ def finding(report: Report) -> list[str]:
 def looked_at(said: dict[str, Any]) -> bool:
     """Whether the test objects are those of the development split, which recipes were chosen by."""
     return bool(said["split"] == "development" and said["settings"])
+
+
+def at_random(said: dict[str, Any]) -> bool:
+    """Whether a base model is a random one, so that figures are chance."""
+    return any(is_tiny(model["folder"]) for model in said["base_models"].values())
 
 
 def five_tasks(report: Report) -> str:
@@ -198,7 +205,7 @@ def _who(report: Report) -> list[str]:
         if left := folds["of"] - len(folds["tested"]):
             under += f" ({left} of {folds['of']} folds {'is' if left == 1 else 'are'} still to be run)"
     about = f"Its tactile encoder was {encoder}; it answered about {source} videos of {objects}, {under}."
-    chance = [CHANCE] if any(is_tiny(model["folder"]) for model in said["base_models"].values()) else []
+    chance = [CHANCE] if at_random(said) else []
     return [*chance, f"{maker}.", about, *([said["settings"]] if said["settings"] else [])]
 
 

@@ -324,7 +324,7 @@ def test_the_shipped_models_answers_come_first_and_the_plumbing_is_folded(tmp_pa
         for words in ("The model that is shipped", "<details>", "The full system's interval", "</details>")
     ]
     assert places == sorted(places)
-    assert "| Property Comparison (PC) | 75.0 [" in text[: places[1]]
+    assert "| Property Comparison (PC) | octopi-small, as it is shipped | 75.0 [" in text[: places[1]]
     assert "`octopi-small`'s interval lies above chance in 1 of 1 task (PC)" in text
     assert len(report.scores) == len(usual.scores) + 2, "of its seed, and over all"
     page = write_page(tmp_path).read_text()
