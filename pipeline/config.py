@@ -153,6 +153,10 @@ class QuestionsConfig(Section):
     scenarios: Literal["published", "ours"] = "published"
     """Scenario questions (PSR): whose right and wrong objects. `published`: the published code's. `ours`: this
     project's reading of the situations, with clearer contrasts. A catalogue's own scenarios are asked in any case."""
+    wording: Literal["object", "class"] = "object"
+    """Whose the wording of a free description is. `object`: each object has one of its classes' phrases, as published.
+    `class`: all have their classes' first. A model that says the likeliest word splits what it knows of a class among
+    the class's phrases, and says the class with the fewest first words; few objects it knows by their phrases."""
     facts: bool = False
     """Begin matching questions with what the named objects are like, for a language model that has never heard of
     them: then touch and reasoning are asked for and no knowledge of the world. Tables say so."""

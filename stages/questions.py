@@ -13,7 +13,7 @@ from pipeline.videos.catalogue import load_catalogue
 def main() -> None:
     with stage("questions") as run:
         config = run.params.questions
-        catalogue = load_catalogue(Path(run.params.data.catalogue)).asking(config.scenarios)
+        catalogue = load_catalogue(Path(run.params.data.catalogue)).asking(config.scenarios, config.wording)
         for seed in run.params.ablation.seeds:
             assignments = read_table(DATA / "splits" / f"{seed}.parquet", Assignment)
             for name, part, counts, distinct in (

@@ -92,7 +92,7 @@ def provenance(
 
 
 BEYOND = {
-    "questions": ("restate", "two_turns", "plainly"),
+    "questions": ("wording", "restate", "two_turns", "plainly"),
     "language": ("start", "normalize_touch", "touch_noise"),
     "align": ("weighting", "begin_with_words"),
     "teach": ("samples",),

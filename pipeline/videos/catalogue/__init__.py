@@ -74,10 +74,22 @@ class Catalogue(Entry):
         """The splits that objects.csv has columns for, in the columns' order."""
         return tuple(next(iter(self.objects.values())).splits)
 
-    def asking(self, source: str) -> Catalogue:
-        """The catalogue with only those scenarios that are from `source` (`Scenario.source`) or from none."""
-        kept = tuple(s for s in self.language.scenarios if s.source in ("", source))
-        return self.model_copy(update={"language": self.language.model_copy(update={"scenarios": kept})})
+    def asking(self, source: str, wording: str = "object") -> Catalogue:
+        """The catalogue as questions take it.
+
+        Args:
+            source: Only those scenarios are kept that are from it (`Scenario.source`) or from none.
+            wording: `class` keeps only the first phrase of each class.
+        """
+        scenarios = tuple(s for s in self.language.scenarios if s.source in ("", source))
+        properties = self.language.properties
+        if wording == "class":
+            first = (tuple(level[:1] for level in p.phrases) for p in properties)
+            worded = zip(properties, first, strict=True)
+            properties = tuple(p.model_copy(update={"phrases": phrases}) for p, phrases in worded)
+        language = self.language.model_copy(update={"scenarios": scenarios, "properties": properties})
+        # Not a copy of this one: its cached properties would come along.
+        return Catalogue(language=language, objects=self.objects)
 
     def labels(self, object_id: str) -> tuple[int, ...]:
         """The class of each property of one object."""
