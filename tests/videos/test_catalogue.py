@@ -70,6 +70,21 @@ def test_descriptions_name_every_class_and_no_other(catalogue: Catalogue) -> Non
         assert len(set(phrases)) == len(phrases)
 
 
+def test_one_wording_a_class_tells_classes_and_nothing_of_the_object() -> None:
+    """Each property's first words then say its class, so that the likeliest word is that of the likeliest class."""
+    whole = load_catalogue(PHYSICLEAR)
+    assert whole.properties, "what was looked at before does not come along"
+    one = whole.asking("published", "class")
+    assert whole.asking("published").describe("rug") == whole.describe("rug") != one.describe("rug")
+    said = {whole.labels(o): set[str]() for o in whole.objects}
+    for object_id in whole.objects:
+        said[whole.labels(object_id)].add(one.unstructured(object_id))
+        for p, label in zip(whole.properties, whole.labels(object_id), strict=True):
+            assert p.phrases[label][0] in one.describe(object_id)
+    assert all(len(texts) == 1 for texts in said.values())
+    assert len(set.union(*said.values())) == len(said)
+
+
 HEADER = "object_id,name,material,part_of,part,split_paper,split_release,hardness,roughness,bumpiness"
 GOOD = "ball,a ball,rubber,,,train,train,1 1 2,0 0 0,0 0 1"
 SHORT = "object_id,name,hardness,roughness,bumpiness"
