@@ -351,22 +351,11 @@ class AlignConfig(TrainConfig):
     many more questions to read frames of one video apart from those of the next."""
 
 
-class AdapterConfig(TrainConfig):
-    """Training of the low-rank adapters, whose shape `lora` has."""
-
-    learning_rate: Rate = 2e-4
-
-
-class TeachConfig(AdapterConfig):
-    """Teaching a small language model in words alone: nothing but conclusions, before it meets touch."""
-
-    samples: Annotated[int, Field(ge=0)] = 0
-    """Conversations of some ten conclusions each; 0: nothing is taught."""
-
-
-class LoraTrainConfig(AdapterConfig):
+class LoraTrainConfig(TrainConfig):
     """End-to-end fine-tuning with low-rank adapters."""
 
+    learning_rate: Rate = 2e-4
+    """Of the adapters."""
     rank: Annotated[int, Field(ge=1, le=1024)] = 128
     alpha: Annotated[float, Field(gt=0)] = 256.0
     dropout: Annotated[float, Field(ge=0, lt=1)] = 0.05
@@ -473,7 +462,6 @@ class Params(Section):
     pretrain: PretrainConfig
     cross_validation: CrossValidationConfig
     language: LanguageConfig
-    teach: TeachConfig = TeachConfig()
     align: AlignConfig
     lora: LoraTrainConfig
     ablation: AblationConfig

@@ -74,7 +74,7 @@ def costs(params: Params, uses: list[Use], card: str = "") -> list[str]:
     ]
 
 
-REST = ("pretrain", "cross_validate", "finetune_encoder", "embed", "teach")
+REST = ("pretrain", "cross_validate", "finetune_encoder", "embed")
 """Stages that run a model and may not be counted: for want of shapes, videos, or a formula."""
 
 

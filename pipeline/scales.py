@@ -117,8 +117,6 @@ def check_inputs(params: Params) -> str:
     check_encoder_files(Path(params.encoder.weights), backbone)
     weights.check_language(Path(params.language.weights), "language.weights")
     check_language_files(Path(params.language.weights), "language.weights")
-    if params.language.start and params.teach.samples:
-        raise UserError("teach.samples: language.start brings an adapter of its own; set teach.samples=0, or start=")
     if params.language.start and not (Path(params.language.start) / LANGUAGE_DIR).is_dir():
         raise UserError(f"language.start: {params.language.start} holds no trained model; name a folder of models/")
     return lacking

@@ -30,9 +30,6 @@ REDUCED = (
     "encoder.epochs=1",
     "cross_validation.models=[probe]",
     "cross_validation.folds=2",
-    "teach.samples=4",
-    # AdamW's first step is a sign, of what rounding decides where an adapter's gradient is still none.
-    "teach.learning_rate=1e-9",
     "align.samples=16",
     "align.train_embeddings=all",
     "lora.samples=16",

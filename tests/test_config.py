@@ -163,7 +163,6 @@ def test_any_folder_may_hold_the_videos(name: str, tmp_path: Path) -> None:
         ("smoke encoder.weights=nowhere", "hf download timm"),
         ("smoke language.weights=nowhere", "hf download lmsys"),
         ("smoke language.start=models/nothing", "language.start: models/nothing holds no trained model"),
-        ("small language.start=models/nothing", "teach.samples: language.start brings an adapter of its own"),
         ("smoke scenes.objects=[unicorn]", "scenes.objects: unicorn"),
         ("smoke frames.pixels=48", "frames.pixels"),
         ("smoke cross_validation.models=[papers]", "papers is no model; did you mean paper"),

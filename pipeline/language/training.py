@@ -4,32 +4,27 @@ from __future__ import annotations
 
 import logging
 import random
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import groupby
 from pathlib import Path
 from typing import Self
 
-import torch
 from transformers import TrainerCallback
 
 from pipeline.card import write_card
 from pipeline.config import (
     LANGUAGE_DIR,
-    AdapterConfig,
     LanguageConfig,
     LoraTrainConfig,
     Params,
     RuntimeConfig,
-    TeachConfig,
     TrainConfig,
 )
 from pipeline.embeddings import TENSOR_FILE, EmbeddingStore
 from pipeline.errors import UserError
 from pipeline.io import fingerprint, read_jsonl
-from pipeline.language.base import ADAPTER_WEIGHTS, load_adapter
-from pipeline.language.chat import IGNORE_INDEX, encode_turns
+from pipeline.language.base import ADAPTER_WEIGHTS
 from pipeline.language.connector import CONFIG_FILE, read_config
 from pipeline.language.conversations import ConversationDataset, UpdateSampler, collate
 from pipeline.language.octopi import ADAPTER_DIR, OctopiForCausalLM
@@ -94,9 +89,9 @@ class Material:
     source: str = "videos"
     """`data.source`: whether the videos are synthetic."""
     files: tuple[Path, ...] = ()
-    """Of the questions, the embeddings, and what was taught or begun with."""
+    """Of the questions, the embeddings, and what is begun with."""
     adapter: Path | None = None
-    """Folder of the adapter that alignment begins with: the one that was taught, or that of `language.start`."""
+    """Folder of the adapter of `language.start`, which alignment leaves as it is."""
 
     @classmethod
     def load(cls, folder: Path, params: Params, encoder: Encoder, opd: Opd, seed: int) -> Self:
@@ -104,9 +99,8 @@ class Material:
         dtype, start = name_dtype(params.language.dtype, params.runtime.device), params.language.start
         asked = folder / "questions" / str(seed) / "train.jsonl"
         embedded = folder / "embeddings" / f"{encoder}-{seed}"
-        taught = folder / "taught" if params.teach.samples else None
-        begun = Path(start) / LANGUAGE_DIR if start else taught
-        adapter = begun / ADAPTER_DIR if begun and (begun / ADAPTER_DIR).is_dir() else None
+        begun = Path(start) / LANGUAGE_DIR / ADAPTER_DIR
+        adapter = begun if start and begun.is_dir() else None
         return cls(
             questions=read_jsonl(asked, Question),
             store=EmbeddingStore(embedded),
@@ -139,8 +133,7 @@ def assemble(
     Each OPD mode draws as many, from the questions that have a dialogue in it.
 
     Args:
-        aligned: Folder of a model to go on with; by default that of `language.start`, or a fresh one, with what was
-            taught.
+        aligned: Folder of a model to go on with; by default that of `language.start`, or a fresh one.
 
     Raises:
         UserError: where no question has this OPD mode, or `language.start` does not fit.
@@ -163,8 +156,6 @@ def assemble(
             quantization=language.quantization,
             normalize=language.normalize_touch,
         )
-        if material.adapter is not None:
-            model.llm = load_adapter(model.llm, material.adapter)
     else:
         model = OctopiForCausalLM.from_pretrained(
             aligned, base=language.weights, dtype=language.dtype, quantization=language.quantization
@@ -176,9 +167,7 @@ def assemble(
     if len(usable) < config.samples:
         logger.warning("%s: only %d training questions for %d samples", purpose, len(usable), config.samples)
     drawn, given = usable[: config.samples], set[str]()
-    if isinstance(config, TeachConfig):
-        given = {q.question_id for q in drawn}
-    elif isinstance(config, LoraTrainConfig) and config.given:
+    if isinstance(config, LoraTrainConfig) and config.given:
         drawn, given = with_given(drawn, material.opd, config.given, material.seed)
     data = ConversationDataset(
         drawn,
@@ -230,7 +219,7 @@ def fit(
     """Train the projection, the two new tokens and the word embeddings, if they are, and adapters at their own rate."""
     # The new tokens' vectors are word embeddings, wherever they are kept.
     trained = ("connector.projection", "connector.delimiters", *(("words",) if model.words is not None else ()))
-    adapters = {"llm": config.learning_rate} if isinstance(config, AdapterConfig) else {}
+    adapters = {"llm": config.learning_rate} if isinstance(config, LoraTrainConfig) else {}
     if runtime.gradient_checkpointing:
         model.llm.gradient_checkpointing_enable(gradient_checkpointing_kwargs={"use_reentrant": False})
     seed_everything(job.seed)
@@ -257,28 +246,6 @@ def fit(
         sampler=UpdateSampler(data.lengths, config.batch_size, job.seed, lambda: data.epoch, shared),
     )
     return train(trainer)
-
-
-@torch.inference_mode()
-def examine(model: OctopiForCausalLM, drills: Sequence[Question], language: LanguageConfig) -> dict[str, float]:
-    """Share of a drill's conclusions, by task, that the model would say word by word, each behind right ones."""
-    model.eval()
-    found: dict[str, list[bool]] = defaultdict(list)
-    for question in drills:
-        encoded = encode_turns(
-            question.dialogues[0].turns,
-            model.tokenizer,
-            system_prompt=language.system_prompt,
-            frames=0,
-            bos=language.bos,
-            descriptions=False,
-        )
-        ids = torch.tensor([encoded.input_ids], device=model.connector.delimiters.device)
-        said = model(ids, torch.zeros(1, 0, model.octopi_config.tactile_dim, device=ids.device)).logits[0].argmax(-1)
-        right = [IGNORE_INDEX, *said[:-1].tolist()]
-        spans = groupby(zip(right, encoded.labels, strict=True), lambda pair: pair[1] != IGNORE_INDEX)
-        found[question.task] += [all(a == b for a, b in span) for learnt, span in spans if learnt]
-    return {task: sum(own) / len(own) for task, own in sorted(found.items())}
 
 
 def write_model_card(folder: Path, material: Material, data: ConversationDataset, config: TrainConfig) -> None:

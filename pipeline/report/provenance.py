@@ -95,7 +95,6 @@ BEYOND = {
     "questions": ("wording", "restate", "two_turns", "plainly"),
     "language": ("start", "normalize_touch", "touch_noise"),
     "align": ("weighting", "begin_with_words"),
-    "teach": ("samples",),
     "lora": ("weighting", "target_modules", "dropout", "given"),
 }
 """Settings by which a small model is trained otherwise than the paper's."""

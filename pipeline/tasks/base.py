@@ -28,8 +28,6 @@ LETTER = (
 )
 CHOICE = rf"{LETTER}(?:,?\s*(?:or|nor|and|/)\s*{LETTER})?"
 """How answers name what they choose: "b)", "(b)", "option B", or "b" where nothing follows that "a" could belong to."""
-DRILL = 10
-"""Turns of a drill."""
 BEGUN = r"(?:^|[.,;:]\s+|\b(?:so|thus)\s+)"
 """Where a clause begins that nothing before it can doubt or deny."""
 
@@ -115,14 +113,6 @@ class TaskDefinition(ABC):
         """The question as people ask it, where they ask it otherwise."""
         return draft
 
-    def drill(self, catalogue: Catalogue, rng: random.Random) -> list[Turn]:
-        """A conversation in words that does nothing but conclude, as answers do behind their descriptions.
-
-        What each answer is given has no part in learning: `Turn.described` says where its conclusion begins. Empty for
-        a task that concludes nothing.
-        """
-        return []
-
     def as_choice(self, draft: Draft, catalogue: Catalogue) -> Draft | None:
         """The question as a choice in the form that scenarios ask for, where it leads to one; no scenario is in it."""
         return None
@@ -137,20 +127,10 @@ class TaskDefinition(ABC):
             return draft
         place = catalogue.property_index(draft.gold.properties[0])
         levels = [labels[place] for labels in draft.gold.labels]
-        told = restated_classes(catalogue.properties[place], self.listed, levels)
-        return before_concluding(draft, f"{told} {draft.finding}".strip())
-
-
-def restated_classes(prop: Property, names: Sequence[str], levels: Sequence[int]) -> str:
-    """What each object is in one property: "Hardness: a) soft, b) hard."."""
-    each = ", ".join(f"{name} {prop.levels[level]}" for name, level in zip(names, levels, strict=True))
-    return f"{prop.spoken.capitalize()}: {each}."
-
-
-def concluding(ask: str, told: str, finding: str) -> Turn:
-    """A turn of a drill: of "Hardness: a) soft, b) hard. Harder: b)." the last word or two are learnt."""
-    given = f"{told} {finding.partition(':')[0]}:"
-    return Turn(user=ask, assistant=f"{told} {finding}", described=len(given))
+        prop = catalogue.properties[place]
+        each = ", ".join(f"{name} {prop.levels[level]}" for name, level in zip(self.listed, levels, strict=True))
+        # "Hardness: a) soft, b) hard."
+        return before_concluding(draft, f"{prop.spoken.capitalize()}: {each}. {draft.finding}".strip())
 
 
 def before_concluding(draft: Draft, told: str) -> Draft:

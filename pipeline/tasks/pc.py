@@ -10,7 +10,6 @@ from typing import Literal
 from pipeline.records import Dialogue, Opd, Prediction, Question, Score, Turn
 from pipeline.tasks import psr
 from pipeline.tasks.base import (
-    DRILL,
     ORDINALS,
     Classes,
     Draft,
@@ -19,10 +18,8 @@ from pipeline.tasks.base import (
     begins_as_published,
     choice_score,
     concluded,
-    concluding,
     conclusion,
     draft_about,
-    restated_classes,
     single_turn,
 )
 from pipeline.videos.catalogue import Catalogue, Property
@@ -106,17 +103,6 @@ class PropertyComparison(TaskDefinition):
     def _finding(self, choice: Reading, comparative: str) -> str:
         found = {"yes": self.listed[0], "no": self.listed[1], "same": "neither"}[choice]
         return f"{comparative.capitalize()}: {found}."
-
-    def drill(self, catalogue: Catalogue, rng: random.Random) -> list[Turn]:
-        turns = []
-        for _ in range(DRILL):
-            prop, rising = rng.choice(catalogue.properties), rng.random() < 0.5
-            first, second = (rng.randrange(len(prop.levels)) for _ in range(2))
-            comparative = prop.more if rising else prop.less
-            told = restated_classes(prop, self.listed, (first, second))
-            finding = self._finding(compare(first, second, rising), comparative)
-            turns.append(concluding(f"Which is {comparative}?", told, finding))
-        return turns
 
     def plainly(self, draft: Draft, catalogue: Catalogue, rng: random.Random) -> Draft:
         """ "Which is softer?", videos in front or behind, which is answered by the name of one, or by "Both"."""

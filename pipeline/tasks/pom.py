@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
-from pipeline.records import Dialogue, Opd, Prediction, Question, Score, Turn
+from pipeline.records import Dialogue, Opd, Prediction, Question, Score
 from pipeline.tasks.base import (
     LETTERS,
     Classes,
@@ -53,11 +53,6 @@ def asked(opening: str, names: Iterable[str]) -> dict[Opd, str]:
     # Every property may tell the objects apart, so `needed` is `all`.
     whole = f"{opening} Describe the object in each video, then m{request}"
     return {Opd.NONE: f"{opening} M{request}", Opd.NEEDED: whole, Opd.ALL: whole}
-
-
-def _word(number: int) -> str:
-    """A word that means nothing, another one for each number below 70**3."""
-    return "".join(f"{'bdfgjklmprstvz'[n % 14]}{'aeiou'[n % 5]}" for n in (number, number // 70, number // 4900))
 
 
 def read(answer: str, names: Sequence[str]) -> dict[str, int] | None:
@@ -118,20 +113,6 @@ class PropertyObjectMatching(TaskDefinition):
         """The question whose answer, behind descriptions of everything, says of each video what a fact would."""
         told = zip(LETTERS, draft.objects, strict=True)
         return before_concluding(draft, " ".join(f"{x}) {''.join(fact(catalogue, o))}" for x, o in told))
-
-    def drill(self, catalogue: Catalogue, rng: random.Random) -> list[Turn]:
-        """Three facts about things whose names mean nothing, and then which fact each letter's classes have."""
-        combinations = list(itertools.product(*(p.levels for p in catalogue.properties)))
-        said = [", ".join(levels) for levels in rng.sample(combinations, len(LETTERS))]
-        numbers = rng.sample(range(10**5), len(LETTERS))
-        names = [f"object {n:05d}" if rng.random() < 0.5 else f"a {_word(n)}" for n in numbers]
-        facts = " ".join(f"{classes} is {name}." for classes, name in zip(said, names, strict=True))
-        turns: list[Turn] = []
-        for letter, place in zip(LETTERS, rng.sample(range(len(LETTERS)), len(LETTERS)), strict=True):
-            given = f"{letter}) {said[place]} is"
-            ask = f"{letter})?" if turns else f"{facts} {letter})?"
-            turns.append(Turn(user=ask, assistant=f"{given} {names[place]}.", described=len(given)))
-        return turns
 
     def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str:
         """The matching whose classes are off by the fewest steps; of those, the one whose mean classes are nearest."""

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import random
 
-from pipeline.records import Opd, Prediction, Question, Score, Turn
+from pipeline.records import Opd, Prediction, Question, Score
 from pipeline.tasks.base import (
-    DRILL,
     LETTERS,
     LISTED,
     Classes,
@@ -17,10 +16,8 @@ from pipeline.tasks.base import (
     choice_score,
     chosen_letter,
     concluded,
-    concluding,
     draft_about,
     lettered,
-    restated_classes,
     single_turn,
 )
 from pipeline.videos.catalogue import Catalogue
@@ -83,17 +80,6 @@ class PropertySuperlativeSelection(TaskDefinition):
             properties=[prop.name],
             finding=f"{superlative.capitalize()}: {LETTERS[position]}).",
         )
-
-    def drill(self, catalogue: Catalogue, rng: random.Random) -> list[Turn]:
-        turns: list[Turn] = []
-        while len(turns) < DRILL:
-            prop, most = rng.choice(catalogue.properties), rng.random() < 0.5
-            levels = [rng.randrange(len(prop.levels)) for _ in LISTED]
-            extreme, superlative = (max if most else min)(levels), prop.most if most else prop.least
-            if levels.count(extreme) == 1:
-                finding = f"{superlative.capitalize()}: {LISTED[levels.index(extreme)]}."
-                turns.append(concluding(f"Select the {superlative}.", restated_classes(prop, LISTED, levels), finding))
-        return turns
 
     def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str:
         place = catalogue.property_index(question.gold.properties[0])

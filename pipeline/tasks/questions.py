@@ -11,7 +11,7 @@ from typing import Literal
 
 from pipeline.config import QuestionsConfig
 from pipeline.errors import UserError, did_you_mean
-from pipeline.records import Assignment, Dialogue, Gold, Opd, Part, Question
+from pipeline.records import Assignment, Part, Question
 from pipeline.runtime import derive_seed
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Draft, Pool, TaskDefinition, in_turns
@@ -105,26 +105,6 @@ def build_questions(
             )
     random.Random(derive_seed(seed, pool.part, "order")).shuffle(questions)
     return questions
-
-
-def drills(catalogue: Catalogue, count: int, seed: int, part: Part) -> list[Question]:
-    """Drills of the tasks by turns (`TaskDefinition.drill`), as questions about no video."""
-    tasks = [name for name, task in TASKS.items() if task.drill(catalogue, random.Random(0))]
-    asked = []
-    for number in range(count):
-        task, rng = tasks[number % len(tasks)], random.Random(derive_seed(seed, "drill", part, number))
-        asked.append(
-            Question(
-                question_id=f"{task}-drill-{number:05d}",
-                task=task,
-                part=part,
-                videos=(),
-                objects=(),
-                dialogues=(Dialogue(opd=Opd.ALL, turns=tuple(TASKS[task].drill(catalogue, rng))),),
-                gold=Gold(choice="", labels=(), properties=()),
-            )
-        )
-    return asked
 
 
 def further(definition: TaskDefinition, pool: Pool, draft: Draft, rng: random.Random) -> list[Draft]:

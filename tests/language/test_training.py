@@ -17,20 +17,15 @@ import torch
 from safetensors.torch import load_file
 from torch.optim.optimizer import register_optimizer_step_pre_hook
 from transformers import TrainerCallback, TrainerState
-from transformers.modeling_outputs import CausalLMOutput
 
-from pipeline.config import LoraTrainConfig, RuntimeConfig, TeachConfig
+from pipeline.config import LoraTrainConfig, RuntimeConfig
 from pipeline.errors import UserError
 from pipeline.io import write_jsonl
-from pipeline.language.base import load_tokenizer, save_adapter
 from pipeline.language.chat import IGNORE_INDEX
 from pipeline.language.conversations import collate
-from pipeline.language.training import Job, Material, add_lora, assemble, examine, fit, write_model_card
-from pipeline.records import Part
+from pipeline.language.training import Job, Material, add_lora, assemble, fit, write_model_card
 from pipeline.runtime import derive_seed
-from pipeline.tasks.questions import drills
 from pipeline.training.trainer import Trained, training_arguments
-from pipeline.videos.catalogue import load_catalogue
 from tests.closure import ROOT
 from tests.conftest import Begun, refused
 from tests.language.shared import DIM, SMALL, adapted, assert_comes_back, embedded, taking, train, write_store
@@ -219,44 +214,6 @@ def test_training_goes_on_from_a_trained_model(held: Material, checkpoints: Path
         assemble(other, CONFIG, "align")
 
 
-class Right:
-    """Stands in for a model that would say the right token, but for the questions of one task."""
-
-    connector = type("Connector", (), {"delimiters": torch.zeros(1)})
-    octopi_config = type("Config", (), {"tactile_dim": DIM})
-
-    def __init__(self, tokenizer: object, wrong: list[str]) -> None:
-        self.tokenizer, self.wrong = tokenizer, wrong
-
-    def eval(self) -> Right:
-        return self
-
-    def __call__(self, ids: torch.Tensor, _: torch.Tensor) -> CausalLMOutput:
-        spoilt = any(word in self.tokenizer.decode(ids[0]) for word in self.wrong)  # type: ignore[attr-defined]
-        said = torch.nn.functional.one_hot(ids[0].roll(-1) * (not spoilt), 10**5)
-        return CausalLMOutput(logits=said[None].float())
-
-
-def test_what_was_taught_is_examined_by_conclusion(held: Material) -> None:
-    catalogue = load_catalogue(ROOT / "pipeline" / "physiclear")
-    asked = drills(catalogue, 30, 5, Part.TEST)
-    assert asked == drills(catalogue, 30, 5, Part.TEST) != drills(catalogue, 30, 5, Part.TRAIN)
-    tokenizer = load_tokenizer(Path(held.language.weights))
-    assert examine(Right(tokenizer, []), asked, held.language) == dict.fromkeys(("PC", "POM", "PSS"), 1.0)  # type: ignore[arg-type]
-    wrong = Right(tokenizer, ["Select the"])
-    assert examine(wrong, asked, held.language) == {"PC": 1.0, "POM": 1.0, "PSS": 0.0}  # type: ignore[arg-type]
-
-
-def test_alignment_begins_with_what_was_taught_and_leaves_it(held: Material, checkpoints: Path, tmp_path: Path) -> None:
-    taught = assemble(held, CONFIG, "test")[0]
-    save_adapter(adapted(taught, CONFIG).llm, tmp_path, taught.llm.state_dict())
-    model, data = assemble(replace(held, adapter=tmp_path), SMALL, "align")
-    fit(model, data, SMALL, CPU, Job("align", "x", 0))
-    own = dict(model.llm.named_parameters())
-    assert all(torch.equal(own[name], value) for name, value in taught.llm.named_parameters())
-    assert sum("lora_" in name for name in own) > 0
-
-
 @pytest.mark.parametrize("weighting", ["question", "token"])
 @pytest.mark.parametrize("micro", [4, 2, 1])
 def test_an_updates_gradient_is_that_of_its_questions_one_at_a_time(
@@ -266,7 +223,7 @@ def test_an_updates_gradient_is_that_of_its_questions_one_at_a_time(
     order = [7, 0, 1, 2, 8, 3, 4, 5, 6]
     monkeypatch.setattr("pipeline.language.training.UpdateSampler", lambda *_, **__: order)
     own = {"epochs": 1, "samples": 9, "max_grad_norm": 0.0, "weighting": weighting}
-    config = TeachConfig(**{**SMALL.model_dump(), **own})  # In which descriptions weigh nothing.
+    config = LoraTrainConfig(**{**SMALL.model_dump(), **own, "given": 1.0})  # Descriptions weigh nothing.
     model, data = assemble(held, config, "test")
     assert {bool(weights.eq(0).any()) for weights in data.weights} == {False, True}
     parameters, gaps, counts = list(model.double().connector.parameters()), [], []
