@@ -10,7 +10,7 @@ from pipeline.evaluation.grading import grade
 from pipeline.io import read_table, write_table
 from pipeline.language.generate import answer
 from pipeline.records import GradedVision, Part, Shown, Video
-from pipeline.runtime import track
+from pipeline.runtime import limit_threads, track
 from pipeline.stage import DATA, stage
 from pipeline.tasks.base import Pool
 from pipeline.tasks.questions import build_questions, counts_by_task
@@ -23,6 +23,8 @@ def main() -> None:
     with stage("shipped") as run:
         params, graded = run.params, list[GradedVision]()
         if params.shipped:
+            # As many on every machine, since sums depend on how they are shared out.
+            limit_threads(2)
             # Half precision on one processor and not on another would make the report depend on the machine.
             octopi = Octopi.from_pretrained(SHIPPED, device=params.runtime.device, dtype="float32")
             catalogue = load_catalogue(Path(params.data.catalogue)).asking(params.questions.scenarios)
