@@ -15,7 +15,7 @@ from pipeline.config import LANGUAGE_DIR, PRETRAINED, Params
 from pipeline.embeddings import STATISTICS_FILE, EmbeddingStore, Statistics
 from pipeline.errors import UserError
 from pipeline.evaluation.calibration import calibration_rows, fit_temperature
-from pipeline.io import atomic_folder, read_csv, read_table, save_tensors, sha256, write_json
+from pipeline.io import atomic_folder, read_csv, read_json, read_table, save_tensors, sha256, write_json
 from pipeline.language.base import load_tokenizer
 from pipeline.language.connector import CONFIG_FILE
 from pipeline.language.octopi import ADAPTER_DIR
@@ -70,7 +70,9 @@ def package(data: Path, params: Params, variant: Variant, base: Base, out: Path)
     temperatures = {
         name: fit_temperature([c for c in rows if c.part == Part.VALIDATION]) for name, rows in seen.items()
     }
-    scores = _scores(Path("reports") / params.report_name / "scores.csv", params, variant)
+    report, seed = Path("reports") / params.report_name, str(params.split.replicate_of(variant.seed))
+    scores = _scores(report / "scores.csv", (variant.encoder, variant.lora, variant.opd, Touch.REAL, seed))
+    ruled = _scores(report / "scores.csv", (variant.encoder, "", "", Touch.REAL, seed))
     with atomic_folder(out) as folder:
         _copy(data / "encoder" / str(variant.seed) / TRAINED, folder / ENCODER_DIR / TRAINED)
         files, card = backbone_files(params.encoder), Path(params.encoder.weights) / CARD_FILE
@@ -112,7 +114,8 @@ def package(data: Path, params: Params, variant: Variant, base: Base, out: Path)
             versions={"python": platform.python_version(), **{name: metadata.version(name) for name in LIBRARIES}},
         )
         write_json(folder / CONFIG, config.model_dump(mode="json"))
-        _write_card(folder, config, judged, scores, params)
+        known = read_json(report / "provenance.json")["settings"]
+        _write_card(folder, config, judged, scores, ruled, params, known)
     return config
 
 
@@ -145,11 +148,14 @@ class Score(NamedTuple):
     high: float
     chance: float
 
+    @property
+    def shown(self) -> str:
+        """In percent, with its interval."""
+        return f"{100 * self.accuracy:.1f} [{100 * self.low:.1f}, {100 * self.high:.1f}]"
 
-def _scores(file: Path, params: Params, variant: Variant) -> dict[str, Score]:
-    """The variant's scores on test questions that have an interval; with folds, those of all folds together."""
-    seed = str(params.split.replicate_of(variant.seed))
-    wanted = (variant.encoder, variant.lora, variant.opd, Touch.REAL, seed)
+
+def _scores(file: Path, wanted: tuple[str, ...]) -> dict[str, Score]:
+    """Scores on test questions that have an interval, of one encoder, lora, opd, touch and seed (of all folds)."""
     return {
         row.task: Score(row.n, row.accuracy, row.low, row.high, row.chance)
         for row in read_csv(file, ScoreRow)
@@ -186,8 +192,11 @@ def _write_card(
     config: ModelConfig,
     judged: Sequence[Classification],
     scores: Mapping[str, Score],
+    ruled: Mapping[str, Score],
     params: Params,
+    known: str,
 ) -> None:
+    """`ruled` are the scores of heads and rules; `known` says whether test objects were looked at before."""
     calibrated = calibration_rows([judged])
     bases = {"language model": Path(params.language.weights)}
     if (folder / ENCODER_DIR / BACKBONE_DIR).is_dir():
@@ -210,7 +219,8 @@ def _write_card(
         data={
             "videos": params.data.source,
             "catalogue": params.data.catalogue,
-            "split": f"{params.split.name}; scores are of its test objects, which nothing was trained or chosen on",
+            "split": f"{params.split.name}; scores are of its test objects, which nothing was trained on",
+            **({"test objects": " ".join(known.split())} if known else {}),
         },
         settings={
             **{f"{s}.{name}": v for s in ("frames", "encoder") for name, v in getattr(config, s).model_dump().items()},
@@ -223,7 +233,8 @@ def _write_card(
                 {
                     "Task": f"{TASKS[task].title} ({task})",
                     "n": s.n,
-                    "Accuracy, %": f"{100 * s.accuracy:.1f} [{100 * s.low:.1f}, {100 * s.high:.1f}]",
+                    "Accuracy, %": s.shown,
+                    "Heads and rules, %": ruled[task].shown if task in ruled else "",
                     "Chance, %": f"{100 * s.chance:.1f}",
                 }
                 for task, s in scores.items()

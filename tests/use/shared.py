@@ -15,7 +15,7 @@ from pipeline.embeddings import INDEX_FILE, STATISTICS_FILE, TENSOR, TENSOR_FILE
 from pipeline.encoder.clips import EncoderData, classify
 from pipeline.encoder.embed import Loaded, embed_videos, standardize, statistics
 from pipeline.encoder.recipes import base_encoder, property_classifier
-from pipeline.io import fingerprint, save_tensors, write_jsonl, write_table
+from pipeline.io import fingerprint, save_tensors, write_json, write_jsonl, write_table
 from pipeline.language.generate import answer
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import add_lora
@@ -133,6 +133,7 @@ def make(where: Path, variant: Variant, *overrides: str) -> Made:
     ]
     (where / "reports" / params.report_name).mkdir(parents=True)
     pd.DataFrame(rows).to_csv(where / "reports" / params.report_name / "scores.csv", index=False)
+    write_json(where / "reports" / params.report_name / "provenance.json", {"settings": "Looked at before."})
     out = where / "models" / variant.key
     package(data, params, variant, describe_base(Path("llama")), out)
     return Made(out, videos, questions, predictions, classified, params, variant)

@@ -45,6 +45,7 @@ def test_holds_safetensors_and_text_alone(made: Made) -> None:
 
 def test_the_card_says_what_it_stands_on(made: Made) -> None:
     text = (made.folder / "README.md").read_text()
+    assert "| test objects | Looked at before. |" in text, "what the report knows of them"
     front = yaml.safe_load(text.split("---\n")[1])
     assert front["base_model"][0] == "llama"
     metric = front["model-index"][0]["results"][0]["metrics"][0]

@@ -15,6 +15,7 @@ from safetensors.torch import load_file
 
 from pipeline.io import read_json
 from pipeline.language.base import ADAPTER_CONFIG, ADAPTER_WEIGHTS
+from pipeline.report.load import published
 from pipeline.use import folder
 from pipeline.use.folder import LANGUAGE_DIR, SHIPPED, Base, find_base, read_folder
 from tests.closure import ROOT
@@ -46,6 +47,22 @@ def test_the_card_has_the_licence_the_data_and_every_figure() -> None:
         assert f"{100 * accuracy:.1f} [{100 * low:.1f}, {100 * high:.1f}]" in card
     assert "license:" in card
     assert "data/invented" in card
+
+
+def test_the_readmes_first_table_has_its_figures() -> None:
+    config, _ = read_folder(SHIPPED)
+    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    begin = next(i for i, line in enumerate(lines) if line.startswith("| Asked about touches"))
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[begin + 2 : begin + 7]]
+    printed = published()
+    printed = printed[(printed["model"] == "7b") & (printed["encoder"] == "finetuned") & (printed["lora"] == "with")]
+    printed = printed[(printed["opd"] == "all") & printed["measure"].isin({"choice", "combined"})]
+    theirs = printed.set_index("task")["value"]
+    for (task, (accuracy, low, high)), row in zip(config.scores.items(), rows, strict=True):
+        assert row[1] == f"{100 * accuracy:.1f} [{100 * low:.1f}, {100 * high:.1f}]"
+        assert row[3] == f"{theirs[task]:.1f}"
+        assert float(row[2]) == pytest.approx({"OPD": 100 / 27, "POM": 100 / 6, "PSR": 50}.get(task, 100 / 3), abs=0.05)
+        assert task not in row[0], "in words"
 
 
 @pytest.fixture
