@@ -230,14 +230,14 @@ def test_prune_keeps_what_params_name_and_removes_the_rest(tmp_path: Path) -> No
         "answers/old",
         "encoder/3",
     )
-    for name in (*names, "cross_validation/trees", "cross_validation/paper"):
+    for name in (*names, "cross_validation/probe", "cross_validation/paper"):
         (tmp_path / name).mkdir(parents=True)
     (tmp_path / "answers" / ".DS_Store").touch()
     prune(params, tmp_path)
     assert (tmp_path / "answers" / ".DS_Store").is_file(), "it is no variant's"
     left = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_dir() and not list(p.iterdir())}
     assert left == {
-        "models/with/base-all-0", "models/without", "answers/finetuned-with-all-0", "encoder", "cross_validation/trees",
+        "models/with/base-all-0", "models/without", "answers/finetuned-with-all-0", "encoder", "cross_validation/probe",
     }  # fmt: skip
     shutil.rmtree(tmp_path)
     prune(params, tmp_path)

@@ -175,9 +175,9 @@ def test_what_the_figures_stand_on_is_said_in_words() -> None:
 
 def test_a_report_names_what_the_paper_does_not_train() -> None:
     assert beyond_paper(compose("paper-7b", [], ROOT / "conf")) == {}
-    found = beyond_paper(compose("small", ["teach.samples=7"], ROOT / "conf"))
+    found = beyond_paper(compose("small", ["lora.given=0.7"], ROOT / "conf"))
     assert found["questions.restate"] is True
-    assert found["teach.samples"] == 7
+    assert (found["lora.given"], found["questions.wording"]) == (0.7, "class")
     facts = "\n".join(stands_on(report([], beyond_paper=found).provenance))
     assert all(f"`{key}={value}`" in facts for key, value in found.items())
     assert "the paper has not" not in "\n".join(stands_on(report([], beyond_paper={}).provenance))
