@@ -19,6 +19,10 @@ from pipeline.use.model import Octopi
 from pipeline.videos.catalogue import load_catalogue
 
 
+BATCH = 64
+"""Answers at once: a gigabyte of keys and values."""
+
+
 def main() -> None:
     with stage("shipped") as run:
         params, graded = run.params, list[GradedVision]()
@@ -49,13 +53,15 @@ def main() -> None:
                 facts=octopi.config.facts,
             )
             ways, config = {Shown.TOUCH: torch.cat(felt)}, octopi.config
+            # A processor reads all weights for each token of a batch, however many answers are in it.
+            language = config.language.model_copy(update={"generation_batch_size": BATCH})
             if params.data.source == "videos":
                 # Another sensor shifts and scales embeddings; its videos tell by how much, without a label.
                 std, mean = torch.std_mean(ways[Shown.TOUCH], dim=0)
                 ways[Shown.STANDARDISED] = (ways[Shown.TOUCH] - mean) / std.clamp_min(1e-6)
             for shown, features in ways.items():
                 store = EmbeddingStore().with_rows(rows, features)
-                said = answer(octopi.llm, store, questions, config.opd, config.language, config.frames.per_video)
+                said = answer(octopi.llm, store, questions, config.opd, language, config.frames.per_video)
                 graded += [
                     GradedVision(**score.model_dump(), model=SHIPPED.name, shown=shown, seed=params.ablation.seeds[0])
                     for score in grade(questions, said, catalogue)
