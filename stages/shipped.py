@@ -18,7 +18,6 @@ from pipeline.use.folder import SHIPPED
 from pipeline.use.model import Octopi
 from pipeline.videos.catalogue import load_catalogue
 
-
 BATCH = 64
 """Answers at once: a gigabyte of keys and values."""
 

@@ -131,7 +131,7 @@ def test_the_finding_comes_first_and_real_videos_before_smoke(page: Page) -> Non
     chapters = [e.get("id") for e in page.all(kind="chapter")]
     assert chapters == ["together", "small-videos", "smoke-scenes", "speed", "stability", "missing"]
     parts = [e.attrib["id"].removeprefix("small-videos-") for e in page.named("small-videos").iter("h3")]
-    assert parts == ["tasks", "parts", "stands-on", "origin", "examples", "tables", "files"]
+    assert parts == ["shipped", "tasks", "parts", "stands-on", "origin", "examples", "tables", "files"]
     random = [words(e).startswith("The base models are tiny and random") for e in page.all(kind="finding")]
     assert random == [False, True]
 
