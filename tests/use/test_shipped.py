@@ -13,11 +13,12 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from pipeline.config import LANGUAGE_DIR
 from pipeline.io import read_json
 from pipeline.language.base import ADAPTER_CONFIG, ADAPTER_WEIGHTS
 from pipeline.report.load import published
 from pipeline.use import folder
-from pipeline.use.folder import LANGUAGE_DIR, SHIPPED, Base, find_base, read_folder
+from pipeline.use.folder import SHIPPED, Base, find_base, read_folder
 from tests.closure import ROOT
 from tests.models import model_folder
 
