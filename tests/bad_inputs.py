@@ -200,7 +200,7 @@ def bad_inputs() -> Iterator[BadInput]:
     for command in ("ask", "describe videos --csv t.csv", "export nothing there", "serve nothing", "demo nothing"):
         where = " --model nothing" if command.startswith(("ask", "describe")) else ""
         yield BadInput(f"{command}{where}", ["nothing: .*|holds no"])
-    yield BadInput("ask", ["models.*trained model"])
+    yield BadInput("ask --model stages", ["stages: holds no .*so it is no trained model"])
     yield BadInput("ask --model nothing --device gpu", ["allowed: auto, cpu, cuda, mps"])
     yield BadInput("ask params.yaml", ["is a file; write the question"])
     yield BadInput("ask --json", ["--json takes a question"])

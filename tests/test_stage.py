@@ -253,6 +253,29 @@ def test_a_command_in_a_wrong_folder_says_which_it_wants(
         assert words in str(error)
 
 
+@pytest.mark.parametrize("command", ["ask x", "describe . --csv a.csv", "serve", "demo"])
+def test_a_model_may_be_asked_wherever_the_package_is_installed(
+    clone: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    """Where no other is named, the one that is shipped: a clone's code, and a folder without a chain, are no matter."""
+    asked: list[Path | None] = []
+
+    def load(folder: Path | None, *_: object) -> None:
+        asked.append(folder)
+        raise UserError("reached")
+
+    monkeypatch.setattr("pipeline.cli._load", load)
+    # The server's and the demo's threads load it.
+    monkeypatch.setattr("pipeline.use.server.serve", lambda load, *_: load())
+    monkeypatch.setattr("pipeline.use.demo.serve_demo", lambda load, *_: load())
+    for folder in (clone, clone / "pipeline/encoder", clone.parent):
+        monkeypatch.chdir(folder)
+        error = CliRunner().invoke(app, command.split()).exception
+        assert isinstance(error, UserError), error
+        assert str(error) == "reached"
+    assert asked == [None] * 3
+
+
 def test_a_stage_in_a_wrong_folder_says_which_it_wants(clone: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(clone / "stages")
     with pytest.raises(SystemExit, match=f"go to {clone}, the project's folder"), stage("split"):
