@@ -14,13 +14,11 @@ from statistics import fmean, median
 
 import numpy as np
 
-from benchmarks.errors import WRONG, Error, cross_validated, mean_of
+from benchmarks.errors import WRONG, Error, mean_of
+from benchmarks.judge import features, heads_error, weights
 from benchmarks.table import Row, make_rows
 from benchmarks.timing import counting_ffts, interleaved, machine, milliseconds
 from pipeline.config import ScenesConfig
-from pipeline.encoder.baseline.features import video_features
-from pipeline.encoder.baseline.predictor import Labels, PropertyPredictor
-from pipeline.encoder.baseline.validation import Fold, Predict
 from pipeline.parallel import run_parallel
 from pipeline.params import load_params
 from pipeline.runtime import derive_seed
@@ -33,6 +31,7 @@ from pipeline.scenes.recipe import Recipe, load_recipes
 from pipeline.scenes.render import make_scene, render
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.frames.reference import reference_indices
+from pipeline.videos.frames.subtraction import subtract
 
 RADIUS, FORCES = 10.0, (0.8, 0.9, 1.0, 1.1, 1.2)
 """The ball, in mm, and forces in N on a body of 1 MPa: several, as one is as lucky as its circle fits the grid."""
@@ -70,8 +69,9 @@ def measure(
     catalogue = load_catalogue(root / data.catalogue)
     recipes = load_recipes(root / data.catalogue, catalogue, 0)
     names = sorted(recipes)[:: -(-len(recipes) // objects) if objects else 1]
-    jobs = [_Job(name, number, recipes[name]) for name in names for number in range(videos)]
-    seen = list(run_parallel(_look, jobs, "models of contact", "scene"))
+    with weights() as folder:
+        jobs = [_Job(name, number, recipes[name], folder) for name in names for number in range(videos)]
+        seen = list(run_parallel(_look, jobs, "models of contact", "scene"))
     return [*hertz(repeats), *_against_finest(seen), *_for_a_classifier(seen, catalogue, folds, deals)]
 
 
@@ -141,6 +141,7 @@ class _Job:
     object_id: str
     number: int
     recipe: Recipe
+    weights: Path
 
 
 @dataclass(frozen=True)
@@ -155,6 +156,7 @@ class _Seen:
     slopes: tuple[float, ...]
     pictures: tuple[float, ...]
     features: tuple[np.ndarray, ...]
+    """Frames x features."""
 
 
 def _look(job: _Job) -> _Seen:
@@ -181,14 +183,14 @@ def _look(job: _Job) -> _Seen:
         slopes=tuple(slope_error(s.imprint.skins[-1], finest, s.pitch) for s in scenes),
         # Noise is drawn from the seed alone, so that pictures of two models share it.
         pictures=tuple(float(np.sqrt(np.mean((f[hardest] - truth) ** 2))) for f in frames),
-        features=tuple(_features(f) for f in frames),
+        features=tuple(_features(f, job.weights) for f in frames),
     )
 
 
-def _features(frames: Sequence[Image]) -> np.ndarray:
-    reference = np.mean(np.stack([frames[i] for i in reference_indices(len(frames))]).astype(np.float32), axis=0)
+def _features(frames: Sequence[Image], weights: Path) -> np.ndarray:
+    reference = np.mean(np.stack([frames[i] for i in reference_indices(len(frames))]), axis=0).round().astype(np.uint8)
     chosen = np.linspace(0, len(frames) - 1, SHOWN + 2).round().astype(int)[1:-1]
-    return video_features([frames[i] for i in chosen], reference)
+    return features(subtract(np.stack([frames[i] for i in chosen]), reference), weights)
 
 
 def _question(question: str, seen: Sequence[_Seen], baseline: str, errors: Sequence[Error], error_of: str) -> list[Row]:
@@ -217,24 +219,10 @@ def _against_finest(seen: Sequence[_Seen]) -> list[Row]:
 
 
 def _for_a_classifier(seen: Sequence[_Seen], catalogue: Catalogue, folds: int, deals: int) -> list[Row]:
-    """Hand-made features with trees learn from the scenes of each model and are tested on those of the finest."""
+    """Heads on frozen features learn from the scenes of each model and are tested on those of the finest."""
     objects = [s.object_id for s in seen]
     labels = np.array([catalogue.labels(o) for o in objects])
     classes = [len(p.levels) for p in catalogue.properties]
-    tested = np.stack([s.features[0] for s in seen])
-
-    def learning_from(place: int) -> Predict:
-        features = np.stack([s.features[place] for s in seen])
-
-        def predict(fold: Fold) -> Labels:
-            trees = PropertyPredictor(classes, seed=derive_seed(0, "trees", fold.repeat, fold.number))
-            known = [o for o, trained in zip(objects, fold.trained, strict=True) if trained]
-            return trees.fit(features[fold.trained], labels[fold.trained], known).predict(tested[fold.tested])
-
-        return predict
-
-    errors = [
-        cross_validated(learning_from(i), labels, objects, classes, folds=folds, repeats=deals)
-        for i in range(len(models()))
-    ]
+    clips = [np.stack([s.features[i] for s in seen]) for i in range(len(models()))]
+    errors = [heads_error(learnt, clips[0], labels, objects, classes, folds, deals) for learnt in clips]
     return _question("contact, for a classifier", seen, "layer, every pixel", errors, WRONG)

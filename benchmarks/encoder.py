@@ -25,22 +25,19 @@ import torch
 from torch import nn
 
 from benchmarks.encoder_models import ALONE, FRAMES, SIDE, features, prompts, whole
-from benchmarks.errors import WRONG, Error, cross_validated
+from benchmarks.errors import WRONG, Error
 from benchmarks.frames import bench_videos
+from benchmarks.judge import heads_error
 from benchmarks.table import Row, make_rows
 from benchmarks.timing import flops_of, interleaved, machine, megabytes, one_thread
 from pipeline.config import FramesConfig, RuntimeConfig
-from pipeline.encoder.baseline.predictor import Labels
-from pipeline.encoder.baseline.validation import Fold
 from pipeline.encoder.clips import ClipDataset, LabelledVideo
 from pipeline.encoder.cross_validation import CrossValidationData
-from pipeline.encoder.frame_classifier import choose_strength, fit_frame_heads
 from pipeline.encoder.model import FrameEncoder, base_encoder
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.errors import UserError
 from pipeline.params import load_params
 from pipeline.records import Video
-from pipeline.runtime import derive_seed
 from pipeline.training.trainable import load_trainable
 from pipeline.videos.files import list_videos
 from pipeline.videos.frames.extract import extract_frames
@@ -70,6 +67,8 @@ class Size:
 class Bed(CrossValidationData):
     """What all encoders of a run share."""
 
+    recordings: Path
+    """Folder of the videos themselves."""
     pretrained: Path
     size: Size
 
@@ -211,11 +210,4 @@ def _clip(setting: Setting, bed: Bed, video: Video) -> Clip:
 def _error(encoder: FrameEncoder, setting: Setting, bed: Bed) -> Error:
     """Of the frozen encoder's heads, whose settings are chosen inside the training folds."""
     clips = np.stack([features(encoder, _clip(setting, bed, video)).numpy() for video in bed.videos])
-    labels, owners, classes = bed.labels, np.array(bed.objects), bed.classes
-
-    def predict(fold: Fold) -> Labels:
-        learnt, wanted, inner = clips[fold.trained], labels[fold.trained], owners[fold.trained].tolist()
-        strength, _ = choose_strength(learnt, wanted, inner, classes, derive_seed("votes", fold.repeat, fold.number))
-        return fit_frame_heads(learnt, wanted, inner, classes, strength).predict(clips[fold.tested])
-
-    return cross_validated(predict, labels, bed.objects, classes, folds=bed.size.folds, repeats=bed.size.deals)
+    return heads_error(clips, clips, bed.labels, bed.objects, bed.classes, bed.size.folds, bed.size.deals)

@@ -14,10 +14,6 @@ from benchmarks.errors import WRONG, Error, error_of, reported, share_of
 from benchmarks.table import Row, make_rows
 from benchmarks.timing import flops_of, interleaved, machine, megabytes
 from pipeline.config import EncoderConfig, FramesConfig, SplitConfig
-from pipeline.encoder.baseline.features import VIDEO_FEATURE_NAMES
-from pipeline.encoder.baseline.predictor import PropertyPredictor
-from pipeline.encoder.baseline.recordings import FRAMES as TREE_FRAMES
-from pipeline.encoder.baseline.recordings import Recording, describe
 from pipeline.encoder.candidates import CANDIDATES, Candidate
 from pipeline.encoder.clips import ClipDataset, EncoderData, LabelledVideo, classify
 from pipeline.encoder.finetune import train_classifier
@@ -39,7 +35,7 @@ if TYPE_CHECKING:
 
 SIDE, FRAMES = 120, 5
 """Pixels and frames a video, where these are not what differs."""
-WHOLE = ("trees", "probe", "paper", "scratch", "pretrained", "pretrained-one-frame", "pretrained-ten-frames")
+WHOLE = ("probe", "paper", "scratch", "pretrained", "pretrained-one-frame", "pretrained-ten-frames")
 ALONE = "ms a video, encoder alone"
 
 
@@ -55,9 +51,6 @@ def whole(bed: Bed, reports: Path) -> list[Row]:
     counts: dict[str, dict[str, float]] = {}
     for name in WHOLE:
         candidate = CANDIDATES[name]
-        if candidate.kind == "trees":
-            settings[name], counts[name] = _trees(bed), {"frames": TREE_FRAMES}
-            continue
         model, frames = _classifier(candidate, bed).eval(), candidate.frames or FRAMES
         settings[name] = partial(_decide, model, candidate.reference == "own", frames)
         clip = torch.zeros(1, frames, SIDE, SIDE, 3, dtype=torch.uint8), torch.zeros(1, frames, dtype=torch.int64)
@@ -107,19 +100,6 @@ def _decide(model: PropertyClassifier, differences: bool, frames: int, file: Vid
         pictures = subtract(pictures, found.reference)
     places = torch.tensor([[kept.index for kept in chosen]])
     return model.decide(model(torch.from_numpy(pictures)[None], places)["logits"])
-
-
-def _trees(bed: Bed) -> Callable[[VideoFile], object]:
-    """Trees that have grown on random features of as many videos; they decode a second time, whole frames."""
-    shape = len(bed.videos), len(VIDEO_FEATURE_NAMES)
-    features = np.random.default_rng(0).standard_normal(shape, dtype=np.float32)
-    predictor = PropertyPredictor(bed.classes).fit(features, bed.labels, bed.objects)
-
-    def said(file: VideoFile) -> object:
-        probe = _scan(file).probe
-        return predictor.predict(describe(Recording(file.path, probe.frames, probe.untouched))[None])
-
-    return said
 
 
 def prompts(bed: Bed) -> list[Row]:

@@ -9,8 +9,7 @@ from statistics import fmean, stdev
 
 import numpy as np
 
-from pipeline.encoder.baseline.predictor import Labels
-from pipeline.encoder.baseline.validation import Predict, cross_validate
+from pipeline.encoder.folds import Labels, Predict, cross_validate
 from pipeline.evaluation.intervals import accuracy_interval
 from pipeline.io import read_csv
 from pipeline.records import ScoreRow

@@ -2,7 +2,8 @@
 
 The published code (github.com/clear-nus/octopi, utils/process_dataset.py) decodes each video twice, in one process, and
 writes every chosen frame as a JPEG of its own. Bare decoding makes a picture of every frame and does nothing with it.
-Errors are those of hand-made features with trees, and costs the pass that selects and the features of what it selects.
+Errors are those of heads on a frozen EfficientNet-lite0, and costs the pass that selects and the features of what it
+selects.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from statistics import fmean
 from tempfile import TemporaryDirectory
@@ -18,13 +20,11 @@ from typing import get_args
 import cv2
 import numpy as np
 
-from benchmarks.errors import WRONG, cross_validated
+from benchmarks.errors import WRONG
+from benchmarks.judge import features, heads_error, weights
 from benchmarks.table import Row, make_rows
 from benchmarks.timing import interleaved, machine, milliseconds
 from pipeline.config import FramesConfig, Selection
-from pipeline.encoder.baseline.features import frame_features, pool_features
-from pipeline.encoder.baseline.recordings import mean
-from pipeline.encoder.baseline.validation import forest
 from pipeline.errors import UserError
 from pipeline.parallel import run_parallel
 from pipeline.params import load_params
@@ -35,6 +35,7 @@ from pipeline.videos.files import VideoFile, list_videos
 from pipeline.videos.frames.extract import extract_frames
 from pipeline.videos.frames.scan import Scan, scan
 from pipeline.videos.frames.selection import changed_pixels
+from pipeline.videos.frames.subtraction import subtract
 
 FRACTION, SMALL, LARGE = 0.3, 64, 224
 PUBLISHED = "published way"
@@ -140,6 +141,7 @@ class Sample:
 
     object_id: str
     features: tuple[np.ndarray, ...]
+    """Frames x features."""
     frames: tuple[int, ...]
     costs: tuple[float, ...]
     """Milliseconds of the pass that selects and of the chosen frames' features."""
@@ -148,14 +150,16 @@ class Sample:
 def selection(folder: Path, catalogue: Catalogue, folds: int, deals: int) -> list[Row]:
     """Frames against error: every setting on the same videos by the same folds, drawn as for evaluation."""
     files = list_videos(folder, catalogue).files
-    samples = [s for s in run_parallel(_sample, files, "frame selection", "video") if s is not None]
+    with weights() as folder:
+        found = run_parallel(partial(_sample, folder), files, "frame selection", "video")
+        samples = [s for s in found if s is not None]
     objects = [s.object_id for s in samples]
     labels = np.array([catalogue.labels(o) for o in objects])
     classes = [len(p.levels) for p in catalogue.properties]
     costs, errors, counts = {}, {}, {}
     for place, setting in enumerate(map(str, SETTINGS)):
-        predict = forest(np.stack([s.features[place] for s in samples]), labels, objects, classes)
-        errors[setting] = cross_validated(predict, labels, objects, classes, folds=folds, repeats=deals)
+        clips = np.stack([s.features[place] for s in samples])
+        errors[setting] = heads_error(clips, clips, labels, objects, classes, folds, deals)
         costs[setting] = [s.costs[place] for s in samples]
         counts[setting] = {"frames": fmean(s.frames[place] for s in samples)}
     return make_rows(
@@ -170,30 +174,25 @@ def selection(folder: Path, catalogue: Catalogue, folds: int, deals: int) -> lis
     )
 
 
-def _sample(file: VideoFile) -> Sample | None:
+def _sample(weights: Path, file: VideoFile) -> Sample | None:
     """None for a video that cannot be read or that the published rule leaves out."""
     passes: dict[Selection, tuple[Scan, float]] = {}
     for rule in get_args(Selection):
-        config = FramesConfig(selection=rule, fraction=FRACTION, pixels=SMALL)
-        found: list[object] = []
-        spent = milliseconds(lambda config=config, found=found: found.append(scan(file, config)))  # type: ignore[misc]
-        if not isinstance(found[0], Scan) or not found[0].kept:
+        config = FramesConfig(selection=rule, fraction=FRACTION, pixels=LARGE)
+        spent = milliseconds(partial(scan, file, config))
+        found = scan(file, config)
+        if not isinstance(found, Scan) or not found.kept:
             return None
-        passes[rule] = found[0], spent
-    chosen = [_chosen(passes[s.rule][0], s.count) for s in SETTINGS]
-    frames = list(decode(file.path))
-    reference = mean([frames[i] for i in passes["salient"][0].probe.untouched])
-    rows: dict[int, np.ndarray] = {}
-    wanted = sorted({i for indices in chosen for i in indices})
-    each = milliseconds(lambda: rows.update({i: frame_features(frames[i], reference) for i in wanted})) / len(wanted)
-    return Sample(
-        object_id=file.object_id,
-        features=tuple(pool_features([rows[i] for i in indices]) for indices in chosen),
-        frames=tuple(map(len, chosen)),
-        costs=tuple(passes[s.rule][1] + each * len(indices) for s, indices in zip(SETTINGS, chosen, strict=True)),
-    )
-
-
-def _chosen(found: Scan, count: int) -> list[int]:
-    """The chosen frames' numbers in the video, each once."""
-    return sorted({found.kept[p].index for p in sample_evaluation(len(found.kept), count)})
+        passes[rule] = found, spent
+    costs, clips, counts = [], [], []
+    for setting in SETTINGS:
+        chosen, spent = passes[setting.rule]
+        # Where fewer frames were kept than are asked for, some come twice: as in evaluation.
+        places = sample_evaluation(len(chosen.kept), setting.count)
+        once = sorted(set(places))
+        pictures = subtract(np.stack([chosen.kept[p].image for p in once]), chosen.reference)
+        rows = features(pictures, weights)
+        clips.append(rows[[once.index(p) for p in places]])
+        costs.append(spent + milliseconds(partial(features, pictures, weights)))
+        counts.append(len(once))
+    return Sample(file.object_id, tuple(clips), tuple(counts), tuple(costs))

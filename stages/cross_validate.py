@@ -21,7 +21,6 @@ def main() -> None:
             videos=read_table(DATA / "videos.parquet", Video),
             catalogue=catalogue,
             frames=DATA / "frames",
-            recordings=Path(params.data.dir),
             per_video=params.frames.per_video,
             encoder=params.encoder,
             runtime=params.runtime,

@@ -177,7 +177,7 @@ def bad_inputs() -> Iterator[BadInput]:
     ):
         yield BadInput(f"stages/{arguments}", [words, "python stages/"])
     for stage in (
-        *("split.py", "audit.py", "questions.py", "cross_validate.py trees", "grade.py"),
+        *("split.py", "audit.py", "questions.py", "cross_validate.py constant", "grade.py"),
         *("finetune_encoder.py 0", "embed.py", "align.py finetuned all 0", "lora.py finetuned all 0", "report.py"),
         *("answer.py finetuned with all 0", "package.py"),
     ):

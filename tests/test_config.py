@@ -167,7 +167,7 @@ def test_any_folder_may_hold_the_videos(name: str, tmp_path: Path) -> None:
         ("smoke frames.pixels=48", "frames.pixels"),
         ("smoke cross_validation.models=[papers]", "papers is no model; did you mean paper"),
         (
-            "smoke encoder.recipe=release cross_validation.models=[trees,paper]",
+            "smoke encoder.recipe=release cross_validation.models=[constant,paper]",
             "paper would be trained with the settings of encoder.recipe=release",
         ),
     ],
@@ -181,7 +181,7 @@ def test_missing_inputs_are_named(arguments: str, words: str, monkeypatch: pytes
 
 def test_a_recipe_may_be_compared_with_itself(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
-    check_inputs(compose("smoke", ["encoder.recipe=release", "cross_validation.models=[trees,release]"]))
+    check_inputs(compose("smoke", ["encoder.recipe=release", "cross_validation.models=[constant,release]"]))
 
 
 TRAINED = "baseball,pillow,rug,potato,millet"
@@ -273,7 +273,7 @@ def test_a_recipe_brings_its_settings_and_gives_way_to_yours() -> None:
         assert not needs_pretraining(composed.encoder, composed.cross_validation.models)
     scenes = compose("smoke", ["encoder.recipe=tuned", "encoder.backbone=[scenes]"], conf=CONF)
     assert needs_pretraining(scenes.encoder, ())
-    assert needs_pretraining(smoke.encoder, ("trees", "pretrained"))
+    assert needs_pretraining(smoke.encoder, ("constant", "pretrained"))
     clip = "encoder.backbone=[clip]"
     release = compose("small", ["encoder.recipe=release", clip], conf=CONF).encoder
     assert {name: getattr(release, name) for name in RELEASE} == RELEASE, "the candidate is the recipe"

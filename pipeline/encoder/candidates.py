@@ -11,7 +11,7 @@ from pipeline.config import EncoderConfig
 from pipeline.errors import UserError, did_you_mean
 from pipeline.weights import check_encoder
 
-Kind = Literal["constant", "trees", "frame_heads", "gradient", "tuned"]
+Kind = Literal["constant", "frame_heads", "gradient", "tuned"]
 
 
 @dataclass(frozen=True)
@@ -20,9 +20,8 @@ class Candidate:
 
     title: str
     kind: Kind
-    """`constant`: the training objects' most frequent combination. `trees`: hand-made features of whole frames and
-    tree ensembles. `frame_heads`: a per-frame classifier on frozen features. `gradient`: trained by the Trainer.
-    `tuned`: that recipe."""
+    """`constant`: the training objects' most frequent combination. `frame_heads`: a per-frame classifier on
+    frozen features. `gradient`: trained by the Trainer. `tuned`: that recipe."""
     backbone: tuple[str, ...] = ()
     """Whose features: names in `pipeline.weights.BACKBONES`; none stands for the chain's own `encoder.backbone`."""
     recipe: Literal["paper", "release", "scratch"] = "paper"
@@ -48,7 +47,6 @@ RELEASE = {"epochs": 40, "batch_size": 4, "learning_rate": 1e-3, "weight_decay":
 
 CANDIDATES: dict[str, Candidate] = {
     "constant": Candidate("the training objects' most frequent combination of classes", "constant"),
-    "trees": Candidate("hand-made features of five uniform frames, random trees, decided jointly", "trees"),
     "backbone": Candidate("the frozen backbones, frame classifier, decided jointly", "frame_heads", reference="chain"),
     "backbone-tuned": Candidate("the same tuned on the properties", "tuned", reference="chain"),
     "probe": Candidate("frozen CLIP, frame classifier, decided jointly", "frame_heads", ("clip",)),

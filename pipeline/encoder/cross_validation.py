@@ -1,6 +1,6 @@
 """Grouped cross-validation of any candidate over all videos: no model is tested on an object that it learnt from.
 
-What needs torch is imported where it is used: `constant` and `trees` need none.
+What needs torch is imported where it is used: `constant` needs none.
 """
 
 from __future__ import annotations
@@ -15,15 +15,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.config import CrossValidationConfig, EncoderConfig, RuntimeConfig
-from pipeline.encoder.baseline.predictor import Labels
-from pipeline.encoder.baseline.validation import Fold, Predict, cross_validate, deal, forest
 from pipeline.encoder.candidates import Candidate
+from pipeline.encoder.folds import Fold, Labels, Predict, cross_validate, deal
 from pipeline.errors import UserError
-from pipeline.io import code_of, fingerprint, read_json, read_table, write_json
-from pipeline.records import Assignment, OutOfFold, Part, Probe, Video
+from pipeline.io import code_of, fingerprint, read_json, write_json
+from pipeline.records import Assignment, OutOfFold, Part, Video
 from pipeline.runtime import CHECKPOINTS, derive_seed, limit_threads, progress, resolve_device, seed_everything
 from pipeline.videos.catalogue import Catalogue
-from pipeline.videos.frames.store import PROBES_FILE, REFERENCES_FILE, TABLE_FILE, FrameStore
+from pipeline.videos.frames.store import REFERENCES_FILE, TABLE_FILE, FrameStore
 from pipeline.weights import BACKBONES
 
 if TYPE_CHECKING:
@@ -43,8 +42,6 @@ class CrossValidationData:
     catalogue: Catalogue
     frames: Path
     """Folder of the kept frames."""
-    recordings: Path
-    """Folder of the videos themselves."""
     per_video: int
     encoder: EncoderConfig
     runtime: RuntimeConfig
@@ -142,16 +139,6 @@ def _constant(_: Candidate, data: CrossValidationData) -> Predict:
         return np.tile(combinations[counts.argmax()], (int(fold.tested.sum()), 1))
 
     return predict
-
-
-def _trees(_: Candidate, data: CrossValidationData) -> Predict:
-    from pipeline.encoder.baseline.recordings import Recording, recording_features
-
-    untouched = {p.video_id: p.untouched for p in read_table(data.frames / PROBES_FILE, Probe)}
-    features = recording_features(
-        [Recording(data.recordings / v.path, v.frames, untouched[v.video_id]) for v in data.videos]
-    )
-    return forest(features, data.labels, data.objects, data.classes)
 
 
 def _frame_heads(candidate: Candidate, data: CrossValidationData) -> Predict:
@@ -260,7 +247,6 @@ def _training(
 
 KINDS: dict[str, Callable[[Candidate, CrossValidationData], Predict]] = {
     "constant": _constant,
-    "trees": _trees,
     "frame_heads": _frame_heads,
     "gradient": _gradient,
     "tuned": _tuned,

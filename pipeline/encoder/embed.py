@@ -14,8 +14,7 @@ import torch
 
 from pipeline.config import EncoderConfig
 from pipeline.embeddings import FLIPS, Statistics
-from pipeline.encoder.baseline.predictor import Labels
-from pipeline.encoder.baseline.validation import deal
+from pipeline.encoder.folds import Labels, deal
 from pipeline.encoder.frame_classifier import FOLDS, Clips, choose_strength, fit_frame_heads
 from pipeline.encoder.model import FrameEncoder
 from pipeline.encoder.recipes import base_encoder, property_classifier

@@ -8,6 +8,8 @@ cross-validation inside the training objects.
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,9 +17,9 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from pipeline.encoder.baseline.predictor import Labels, decode_jointly, log_dependence
-from pipeline.encoder.baseline.validation import deal
+from pipeline.encoder.folds import Labels, deal
 from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
+from pipeline.errors import UserError
 from pipeline.records import Measurement
 from pipeline.runtime import derive_seed
 
@@ -31,6 +33,12 @@ ROUNDS = 500
 ABSENT = -10.0
 """Bias of a class that training lacks: a probability of some 5e-5."""
 
+SMOOTHING = 1 / 6
+"""Objects added to each combination of classes, so that none is impossible."""
+MOST_COMBINATIONS = 100_000
+"""More would be tables too large to decode with."""
+
+Probabilities = npt.NDArray[np.float64]
 Clips = npt.NDArray[np.float32]
 """Videos x frames x features."""
 
@@ -170,3 +178,45 @@ def choose_strength(
         reached.append(float(right.mean()))
     curve = [Measurement(step=i, name="inner_combined", value=value) for i, value in enumerate(reached)]
     return STRENGTHS[int(np.argmax(reached))], curve
+
+
+def log_dependence(labels: Labels, objects: Sequence[str], classes: Sequence[int]) -> Probabilities:
+    """log[P(a, b, ...) / (P(a) P(b) ...)] of each combination: an array with one axis a property.
+
+    The joint distribution counts every object once, plus `SMOOTHING` a cell; the single ones are its margins.
+
+    Raises:
+        UserError: for more than `MOST_COMBINATIONS`.
+    """
+    if (number := math.prod(classes)) > MOST_COMBINATIONS:
+        raise UserError(
+            f"{number} combinations of classes are too many to decide jointly ({MOST_COMBINATIONS} at most); name "
+            "fewer properties in properties.yaml, or set encoder.recipe=paper and cross_validation.models=[constant]"
+        )
+    joint = np.full(tuple(classes), SMOOTHING)
+    for row in dict(zip(objects, map(tuple, labels.tolist()), strict=True)).values():
+        joint[row] += 1
+    joint /= joint.sum()
+    result: Probabilities = np.log(joint)
+    for axis in range(joint.ndim):
+        others = tuple(a for a in range(joint.ndim) if a != axis)
+        result = result - np.log(joint.sum(axis=others, keepdims=True))
+    return result
+
+
+def decode_jointly(evidence: Sequence[Probabilities], dependence: Probabilities) -> Labels:
+    """The combination of each video that maximises the sum of log probabilities and the dependence.
+
+    This is Bayes' rule where the properties' evidence is independent given the classes. Of equal combinations the
+    one with the lower classes, read from the first property on, is taken.
+
+    Args:
+        evidence: Log probabilities, videos x classes for each property.
+        dependence: From `log_dependence`.
+    """
+    combinations = np.array(list(itertools.product(*map(range, dependence.shape))), dtype=np.int64)
+    scores = np.broadcast_to(dependence.ravel(), (len(evidence[0]), dependence.size)).copy()
+    for position, table in enumerate(evidence):
+        scores += table[:, combinations[:, position]]
+    best: Labels = combinations[scores.argmax(axis=1)]
+    return best

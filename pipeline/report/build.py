@@ -45,7 +45,7 @@ from pipeline.videos.split import read_splits
 
 MOST_METRICS = 12
 """Columns of `dvc metrics show` that a person still reads."""
-BASELINE = "trees"
+BASELINE = "backbone"
 """The cross-validated model that all others are compared with in encoder_effects.csv."""
 CONFUSION = ("seed", "video_id", "property", "rated", "predicted")
 CURVES = ("stage", "name", "step", "value")

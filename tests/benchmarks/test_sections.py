@@ -14,7 +14,6 @@ import yaml
 from benchmarks import contact, describing, encoder, encoder_models, frames, language, serving
 from benchmarks.table import Row, merge, read_rows
 from pipeline.encoder import frame_classifier
-from pipeline.encoder.baseline import predictor
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.io import write_csv, write_table
 from pipeline.records import Encoder, Graded, Lora, Opd, ScoreRow, Variant
@@ -56,9 +55,10 @@ def project(catalogue: Catalogue, tmp_path_factory: pytest.TempPathFactory) -> P
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The project's own videos, and three trees a property in place of two hundred."""
+    """The project's own videos, and few fits of the heads."""
     monkeypatch.delenv("OCTOPI_DATA_DIR", raising=False)
-    monkeypatch.setattr(predictor, "TREES", 3)
+    for name, value in (("STRENGTHS", (1e-3,)), ("FOLDS", 2), ("ROUNDS", 5)):
+        monkeypatch.setattr(frame_classifier, name, value)
 
 
 def by_question(rows: list[Row], folder: Path) -> dict[str, dict[str, Row]]:
@@ -102,9 +102,7 @@ def test_encoder(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     size = encoder.Size(videos=1, repeats=1, folds=2, deals=1, epochs=1, prompts=((2, 0), (1, 1)))
     with refused("repro pretrain"):
         encoder.measure(project, size)
-    for name, value in (("STRENGTHS", (1e-3,)), ("FOLDS", 2), ("ROUNDS", 5)):
-        monkeypatch.setattr(frame_classifier, name, value)
-    monkeypatch.setattr(encoder_models, "WHOLE", ("trees", "probe", "paper", "pretrained"))
+    monkeypatch.setattr(encoder_models, "WHOLE", ("probe", "paper", "pretrained"))
     torch.manual_seed(0)
     save_trainable(SceneEncoder(), project / encoder.PRETRAINED)
     report = project / "reports" / "any"

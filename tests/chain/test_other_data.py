@@ -169,7 +169,7 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
     write_catalogue(project.folder / "my catalogue")
     few = ("questions.train={opd:8,pc:24,pss:24,pom:6}", "questions.evaluation={opd:8,pc:24,pss:24,pom:6,psr:4}")
     timm = (
-        "cross_validation.models=[trees]",
+        "cross_validation.models=[constant]",
         "encoder.recipe=tuned",
         "encoder.backbone=[timm,scenes]",
         "pretrain.objects=16",

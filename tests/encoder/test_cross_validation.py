@@ -16,26 +16,19 @@ from pipeline.config import CrossValidationConfig, EncoderConfig, RuntimeConfig
 from pipeline.encoder import clips as clips_module
 from pipeline.encoder import cross_validation as module
 from pipeline.encoder import finetune, frame_classifier, tuned
-from pipeline.encoder.baseline.features import video_features
-from pipeline.encoder.baseline.predictor import PropertyPredictor
-from pipeline.encoder.baseline.recordings import Recording, describe, recording_features
-from pipeline.encoder.baseline.validation import Fold, Predict, cross_validate, deal
 from pipeline.encoder.candidates import CANDIDATES, Candidate, check_candidates
 from pipeline.encoder.clips import EncoderData, LabelledVideo
 from pipeline.encoder.cross_validation import CrossValidationData, cross_validate_candidate, frozen_encoder
+from pipeline.encoder.folds import Fold, Predict, cross_validate, deal
 from pipeline.encoder.frame_classifier import Clips, FittedHeads, JointFrameClassifier, fit_frame_heads
 from pipeline.encoder.model import FrameEncoder, PropertyClassifier
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.encoder.tuned import Trunks
 from pipeline.errors import UserError
-from pipeline.io import write_table
-from pipeline.records import Measurement, Part, Probe
+from pipeline.records import Measurement, Part
 from pipeline.runtime import derive_seed
 from pipeline.videos.catalogue import Catalogue
-from pipeline.videos.decoding import decode
-from pipeline.videos.frames.reference import reference_indices
-from tests.audit_records import probe
-from tests.conftest import encode, fake_videos, moving_square
+from tests.conftest import fake_videos
 from tests.encoder.conftest import Hook, killed_at
 from tests.encoders import config, write_frames, write_pretrained, write_timm
 
@@ -63,7 +56,6 @@ def data(weights: Path, catalogue: Catalogue, tmp_path: Path) -> CrossValidation
         videos=videos,
         catalogue=catalogue,
         frames=folder,
-        recordings=tmp_path,
         per_video=2,
         encoder=EncoderConfig(weights=str(weights), prompts=2, epochs=2, batch_size=4),
         runtime=RuntimeConfig(device="cpu"),
@@ -387,51 +379,6 @@ def test_a_killed_training_goes_on_only_with_its_own_objects(
     assert epochs == [left, 2]
 
 
-# Trees
-
-
-def test_features_of_a_recording_are_those_of_five_frames_at_equal_distances(tmp_path: Path) -> None:
-    for count in (1, 4, 13):
-        path = encode(tmp_path / f"{count}.mkv", moving_square(count, count))
-        frames = list(decode(path))
-        reference = np.mean([frames[i] for i in reference_indices(count)], axis=0, dtype=np.float64)
-        inner = [frames[round(k * (count - 1) / 6)] for k in range(1, 6)]
-        expected = video_features(inner, reference.astype(np.float32))
-        np.testing.assert_allclose(
-            describe(Recording(path, count, reference_indices(count))), expected, rtol=1e-4, atol=1e-5
-        )
-    back = encode(tmp_path / "back.mkv", moving_square(13, 13)[::-1])
-    turned = describe(Recording(back, 13, (12,)))
-    np.testing.assert_allclose(turned, expected, rtol=1e-4, atol=1e-5, err_msg="by what it is told is untouched")
-    assert not np.allclose(describe(Recording(back, 13, (0,))), turned)
-
-
-def test_trees_are_the_baseline_on_whole_recordings(
-    data: CrossValidationData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("pipeline.encoder.baseline.predictor.TREES", 10)
-    videos = [v.model_copy(update={"path": f"{v.video_id}.mkv", "frames": 6}) for v in data.videos[:8]]
-    for seed, video in enumerate(videos):
-        encode(tmp_path / video.path, moving_square(6, seed))
-    untouched = {v.video_id: (number % 6,) for number, v in enumerate(videos)}
-    probes = [probe(v.video_id, untouched=untouched[v.video_id]) for v in videos]
-    write_table(data.frames / "probes.parquet", Probe, probes)
-    found = {
-        r.video_id: r.predicted
-        for r in cross_validate_candidate(CANDIDATES["trees"], replace(data, videos=videos), SMALL)
-    }
-    recordings = [Recording(tmp_path / v.path, 6, untouched[v.video_id]) for v in videos]
-    features = np.stack([describe(recording) for recording in recordings])
-    np.testing.assert_array_equal(recording_features(recordings), features)
-    labels = np.array([data.catalogue.labels(v.object_id) for v in videos])
-    for number, held in enumerate(deal([v.object_id for v in videos], 2, derive_seed(4, "folds", 0))):
-        trained = [i for i, v in enumerate(videos) if v.object_id not in held]
-        model = PropertyPredictor((3, 3, 3), seed=derive_seed(0, "trees", 0, number))
-        model.fit(features[trained], labels[trained], [videos[i].object_id for i in trained])
-        tested = [i for i, v in enumerate(videos) if v.object_id in held]
-        assert [found[videos[i].video_id] for i in tested] == list(map(tuple, model.predict(features[tested]).tolist()))
-
-
 # Candidates
 
 
@@ -447,7 +394,7 @@ def test_a_candidate_that_cannot_be_trained_is_one_clear_line(weights: Path, tmp
         ):
             check_candidates(names, config(weights, setting), 32)
     folder = write_timm(tmp_path / "timm")
-    check_candidates(("trees", "backbone", "backbone-tuned"), config(folder, "tuned"), 32)
+    check_candidates(("constant", "backbone", "backbone-tuned"), config(folder, "tuned"), 32)
     for name in ("probe", "release"):
         with pytest.raises(
             UserError, match=rf"{name} needs clip; leave it out, or: .*timm.open_clip_config.json does not exist"

@@ -20,11 +20,11 @@ from transformers import TrainerCallback
 
 from pipeline.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore, Statistics
 from pipeline.encoder import finetune as training
-from pipeline.encoder.baseline.validation import deal
 from pipeline.encoder.clip import load_visual_tower
 from pipeline.encoder.clips import ClipDataset, EncoderData, LabelledVideo
 from pipeline.encoder.embed import logits_of, standardize, statistics, union
 from pipeline.encoder.finetune import accuracies, finetune, train_classifier, write_encoder_card
+from pipeline.encoder.folds import deal
 from pipeline.encoder.frame_classifier import STRENGTHS, JointFrameClassifier
 from pipeline.encoder.model import Heads, PropertyClassifier
 from pipeline.encoder.recipes import RECIPES, base_encoder, check_recipe, property_classifier

@@ -214,14 +214,14 @@ def out_of_fold(predicted: list[tuple[tuple[int, ...], ...]]) -> list[OutOfFold]
 
 ABOUT = [("a",), ("a",), ("b",), ("c",)]
 RIGHT, WRONG, HALF = (0, 0, 0), (2, 1, 1), (0, 0, 1)
-TREES = out_of_fold([(RIGHT, HALF, WRONG, RIGHT), (HALF, RIGHT, RIGHT, RIGHT)])
+FROZEN = out_of_fold([(RIGHT, HALF, WRONG, RIGHT), (HALF, RIGHT, RIGHT, RIGHT)])
 PROBE = out_of_fold([(WRONG, HALF, WRONG, RIGHT), (HALF, HALF, WRONG, RIGHT)])
 
 
 def test_cross_validation_is_the_mean_over_repeats() -> None:
-    rows = score_rows([], CATALOGUE, None, {"trees": TREES})
+    rows = score_rows([], CATALOGUE, None, {"backbone": FROZEN})
     assert {(r.task, r.encoder, r.lora, r.opd, r.touch, r.seed, r.n) for r in rows} == {
-        ("cross_validation", "trees", "", "", "", "all", 4)
+        ("cross_validation", "backbone", "", "", "", "all", 4)
     }
     combined = row(rows, measure="combined")
     shares = np.array([0.5, 0.5, 0.5, 1])
@@ -231,18 +231,18 @@ def test_cross_validation_is_the_mean_over_repeats() -> None:
 
 
 def test_encoders_are_compared_video_by_video() -> None:
-    (found,) = candidate_rows({"trees": TREES, "probe": PROBE}, "trees")
-    assert (found.part, found.change, found.n, found.objects, found.seeds) == ("encoder", "probe - trees", 4, 3, 2)
+    (found,) = candidate_rows({"backbone": FROZEN, "probe": PROBE}, "backbone")
+    assert (found.part, found.change, found.n, found.objects, found.seeds) == ("encoder", "probe - backbone", 4, 3, 2)
     gains = np.array([[-1, 0, 0, 0], [0, -1, -1, 0]], dtype=float)
     gap = paired(gains, ABOUT)
     expected = (gap.difference, gap.low, gap.high, gap.p)
     assert (found.difference, found.low, found.high, found.p) == pytest.approx(expected, abs=1e-6)
     assert found.p_holm == found.p
-    assert candidate_rows({"probe": PROBE}, "trees") == []
+    assert candidate_rows({"probe": PROBE}, "backbone") == []
 
 
 def test_errors_know_the_order_of_classes() -> None:
-    rows = error_rows({"trees": TREES}, CATALOGUE)
+    rows = error_rows({"backbone": FROZEN}, CATALOGUE)
     assert [(r.property, r.n) for r in rows] == [(name, 4) for name in CATALOGUE.property_names]
     assert [r.absolute_error for r in rows] == [2 / 8, 1 / 8, 3 / 8]
     assert rows[0].kappa == 0, "constant truth: no better than chance"

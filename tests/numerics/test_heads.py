@@ -19,8 +19,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from pipeline.encoder.baseline.predictor import decode_jointly, log_dependence
-from pipeline.encoder.frame_classifier import JointFrameClassifier
+from pipeline.encoder.frame_classifier import JointFrameClassifier, decode_jointly, log_dependence
 from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
 from pipeline.encoder.pretrain import PretrainingModel
 from pipeline.encoder.release import SHORTEST_FEATURE, PublishedHeads

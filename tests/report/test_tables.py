@@ -83,7 +83,7 @@ def test_tasks_stand_where_they_belong_whole_answers_first() -> None:
     rows = [score(task, variant="finetuned with all") for task in ("PSR", "POM", "PC")]
     rows += [score("OPD", m) for m in ("hardness", "combined")]
     rows += [score("heads", **heads), score("heads_validation", **heads)]
-    rows += [score("cross_validation", "combined", variant="trees  ")]
+    rows += [score("cross_validation", "combined", variant="backbone  ")]
     scores = scores_of(*rows)
     tasks = {key: list(dict.fromkeys(t.select(scores, NO_EFFECTS).get("task", []))) for key, t in BY_KEY.items()}
     assert tasks["understanding"] == ["PC", "POM"]

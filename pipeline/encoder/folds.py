@@ -8,8 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.encoder.baseline.predictor import Features, Labels, PropertyPredictor
 from pipeline.runtime import derive_seed
+
+Labels = npt.NDArray[np.int64]
+"""Videos x properties: classes from 0."""
 
 
 def deal(objects: Sequence[str], folds: int, seed: int) -> list[frozenset[str]]:
@@ -31,17 +33,6 @@ class Fold:
 
 Predict = Callable[[Fold], Labels]
 """Learns from the trained videos of a fold and predicts the tested ones, in their order: tested x properties."""
-
-
-def forest(features: Features, labels: Labels, objects: Sequence[str], classes: Sequence[int]) -> Predict:
-    """Predict by the baseline predictor, grown anew in each fold; all videos of an object have the same labels."""
-
-    def predict(fold: Fold) -> Labels:
-        model = PropertyPredictor(classes, seed=derive_seed(0, "trees", fold.repeat, fold.number))
-        model.fit(features[fold.trained], labels[fold.trained], np.asarray(objects)[fold.trained].tolist())
-        return model.predict(features[fold.tested])
-
-    return predict
 
 
 def cross_validate(

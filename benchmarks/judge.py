@@ -1,0 +1,66 @@
+"""What frames and contact models are judged by: a frozen EfficientNet-lite0 and the chain's own frame heads."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from benchmarks.errors import Error, cross_validated
+from pipeline.config import EncoderConfig
+from pipeline.encoder.folds import Fold, Labels
+from pipeline.encoder.frame_classifier import Clips, choose_strength, fit_frame_heads
+from pipeline.encoder.model import FrameEncoder, load_backbones
+from pipeline.runtime import derive_seed
+from pipeline.weights.make import make
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+@contextmanager
+def weights() -> Iterator[Path]:
+    """A folder of EfficientNet-lite0, as the chain makes it from an installed package, for as long as it is used."""
+    with TemporaryDirectory() as folder:
+        make("efficientnet-lite0", Path(folder) / "weights")
+        yield Path(folder) / "weights"
+
+
+@cache
+def _backbone(folder: Path) -> FrameEncoder:
+    torch.set_num_threads(1)
+    (loaded,) = load_backbones(EncoderConfig(recipe="tuned", backbone=("timm",), weights=str(folder)))
+    return loaded
+
+
+@torch.inference_mode()
+def features(pictures: np.ndarray, folder: Path) -> np.ndarray:
+    """float32, pictures x features, of difference pictures, uint8, pictures x height x width x RGB."""
+    found: torch.Tensor = _backbone(folder)(torch.from_numpy(pictures), torch.zeros(len(pictures), dtype=torch.int64))
+    rows: np.ndarray = found.numpy()
+    return rows
+
+
+def heads_error(
+    learnt: Clips, tested: Clips, labels: Labels, objects: Sequence[str], classes: Sequence[int], folds: int, deals: int
+) -> Error:
+    """Error of frame heads in grouped folds, their penalty chosen inside the training objects.
+
+    Args:
+        learnt: What the heads are trained on: videos x frames x features.
+        tested: What they are tested on, of the same videos in the same order.
+    """
+    owners = np.array(objects)
+
+    def predict(fold: Fold) -> Labels:
+        training = (learnt[fold.trained], labels[fold.trained], owners[fold.trained].tolist(), classes)
+        strength, _ = choose_strength(*training, derive_seed("votes", fold.repeat, fold.number))
+        return fit_frame_heads(*training, strength).predict(tested[fold.tested])
+
+    return cross_validated(predict, labels, objects, classes, folds=folds, repeats=deals)
