@@ -38,9 +38,7 @@ def main() -> None:
                 felt.append(octopi.sense.feel(Path(params.data.dir) / video.path).features)
                 rows[video.video_id] = range(sum(map(len, felt[:-1])), sum(map(len, felt)))
             if met := sorted(octopi.catalogue.objects.keys() & videos.keys()):
-                raise UserError(
-                    f"shipped: {SHIPPED.name} knows {met[0]}, so it is not asked; set it to 0 in params.yaml"
-                )
+                raise UserError(f"{SHIPPED.name} knows {met[0]}, so it is not asked; set shipped to 0 in params.yaml")
             # Half of them describe: those answers are short, and the others follow from what they say.
             asked = {task: count for task, count in counts_by_task(params.questions, "evaluation").items() if count}
             parts = {task: max(1, len(asked) - 1) if task == "OPD" else 1 for task in asked}

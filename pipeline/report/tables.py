@@ -284,7 +284,7 @@ FIVE_TASKS = Table(
 SHIPPED_TABLE = Table(
     "shipped",
     "The model that is shipped, on these videos",
-    "It was trained on synthetic touches of invented objects and has met none of these; whole answers.",
+    "It was trained on synthetic touches of invented objects, and has met none of these objects.",
     lambda f: shipped(f) & whole(f),
     ("task", "system", "measured", "n", "unread", "chance"),
 )

@@ -41,7 +41,7 @@ def answer_once(model: Octopi, question: str, videos: Sequence[str]) -> dict[str
     looked = [model.look(video) for video in videos]
     return {
         "notes": model.doubts,
-        "model": model.card["variant"],
+        "model": model.name,
         "question": question,
         "videos": [
             {"file": video, "frames": touch.numbers, "contact": touch.contact, "notes": touch.notes}

@@ -198,7 +198,7 @@ def make_app(room: Room) -> FastAPI:
     @app.get("/api/about")
     def about() -> dict[str, Any]:
         named = sorted(room.names.items(), key=lambda item: item[1])
-        return {"variant": room.model.card.get("variant", ""), "example": TEMPLATES[0], "scenes": named}
+        return {"model": room.model.name, "example": TEMPLATES[0], "scenes": named}
 
     @app.put("/api/touches/{name}")
     async def drop(name: str, request: Request) -> Any:

@@ -46,6 +46,7 @@ class Octopi:
     It remembers no conversation: the caller hands the earlier exchanges in. One call at a time.
 
     Attributes:
+        name: Of the folder that is shipped, else the variant's.
         card: What the folder's config.json says.
         properties: The catalogue's properties.
         names: The names of the catalogue's objects.
@@ -56,6 +57,7 @@ class Octopi:
         self, folder: Path, config: ModelConfig, catalogue: Catalogue, llm: OctopiForCausalLM, device: torch.device
     ) -> None:
         self.config, self.catalogue = config, catalogue
+        self.name = SHIPPED.name if folder == SHIPPED else config.variant
         self.llm = llm.to(device)
         self.card: Mapping[str, Any] = config.model_dump(mode="json")
         self.properties: tuple[str, ...] = catalogue.property_names
@@ -67,7 +69,7 @@ class Octopi:
     def __repr__(self) -> str:
         scores = ", ".join(f"{task} {100 * accuracy:.0f} %" for task, (accuracy, *_) in self.config.scores.items())
         base, source = self.config.base.folder, self.config.trained_on
-        return f"Octopi({self.config.variant}, base {base}, trained on {source}; {scores or 'no scores'})"
+        return f"Octopi({self.name}, base {base}, trained on {source}; {scores or 'no scores'})"
 
     @classmethod
     def from_pretrained(

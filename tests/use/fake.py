@@ -26,7 +26,7 @@ class FakeOctopi:
 
     def __init__(self, seconds: float = 0.0) -> None:
         self.seconds = seconds
-        self.card = {"variant": "fake"}
+        self.name = "fake"
         self.threads: set[int] = set()
         self.tokens: list[int | None] = []
         self.asked = 0

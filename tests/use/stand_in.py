@@ -25,7 +25,7 @@ LEVELS = {"hardness": ("soft", "hard"), "roughness": ("smooth", "slightly rough"
 class FakeOctopi:
     """`threads` are those that its work was done in; `heard` is every question with its files and history."""
 
-    card = {"variant": "finetuned-with-all-0"}  # noqa: RUF012
+    name = "finetuned-with-all-0"
 
     def __init__(self) -> None:
         self.threads: set[int] = set()

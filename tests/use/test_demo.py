@@ -239,7 +239,7 @@ def test_the_command_shows_it_until_it_is_interrupted(made: Made) -> None:
         address, _, rest = process.stdout.readline().partition(" ")
         assert rest == "shows the demo; Ctrl-C ends it\n"
         about = json.loads(call(f"{address}/api/about", "GET")[1])
-        assert (about["variant"], len(about["scenes"])) == ("finetuned-with-all-0", len(pd.read_csv(OBJECTS)))
+        assert (about["model"], len(about["scenes"])) == ("finetuned-with-all-0", len(pd.read_csv(OBJECTS)))
         taken = subprocess.run([*command, address.rpartition(":")[2]], capture_output=True, text=True, check=False)
         assert taken.returncode == 1
         assert taken.stderr.count("\n") == 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import runpy
 import subprocess
 import sys
 from hashlib import sha256
@@ -14,12 +15,17 @@ import torch
 from safetensors.torch import load_file
 
 from pipeline.config import LANGUAGE_DIR
-from pipeline.io import read_json
+from pipeline.io import read_json, read_table, write_table
 from pipeline.language.base import ADAPTER_CONFIG, ADAPTER_WEIGHTS
+from pipeline.records import GradedVision, Shown, Video
 from pipeline.report.load import published
+from pipeline.scales import compose, write_params
+from pipeline.tasks.base import find_level
 from pipeline.use import folder
 from pipeline.use.folder import SHIPPED, Base, find_base, read_folder
+from pipeline.use.model import Octopi
 from tests.closure import ROOT
+from tests.conftest import fake_videos
 from tests.models import model_folder
 
 EXAMPLES = ROOT / "examples"
@@ -118,3 +124,36 @@ def test_it_tells_two_touches_apart_from_any_folder(cache: Path, tmp_path: Path)
     assert "octopi-small answers" in said
     assert re.search(r"the first object is softer", one, re.IGNORECASE)
     assert re.search(r"the second object is softer", other, re.IGNORECASE)
+
+
+def test_a_runs_videos_are_asked_about_as_they_are_and_standardised(
+    cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What it says of them is what it says to a person who asks; an object that it was trained on stops the stage."""
+    cache.mkdir(parents=True)
+    (cache / "smollm2").symlink_to(model_folder("smollm2"))
+    changed = ["data.source=videos", f"data.dir={EXAMPLES}", f"data.catalogue={ROOT}/pipeline/physiclear", "shipped=8"]
+    write_params(compose("smoke", changed, ROOT / "conf"), tmp_path / "params.yaml")
+    monkeypatch.chdir(tmp_path)
+
+    def run(objects: dict[str, str]) -> list[GradedVision]:
+        videos = [
+            v.model_copy(update={"path": f"{objects[v.object_id]}.mp4"}) for v in fake_videos(objects, per_object=1)
+        ]
+        write_table(tmp_path / "data" / "videos.parquet", Video, videos)
+        runpy.run_path(str(ROOT / "stages" / "shipped.py"), run_name="__main__")
+        return read_table(tmp_path / "data" / "shipped.parquet", GradedVision)
+
+    objects = {"pillow": "soft", "baseball": "hard", "steel_wool": "rough"}
+    graded = run(objects)
+    ways = {way: [(r.question_id, r.measure) for r in graded if r.shown is way] for way in Shown}
+    assert ways[Shown.TOUCH] == ways[Shown.STANDARDISED]
+    assert {r.task for r in graded} >= {"OPD", "PC", "PSS", "POM"}
+    octopi = Octopi.from_pretrained(dtype="float32")
+    for row in graded:
+        if row.shown is Shown.TOUCH and row.measure == "hardness":
+            (said,) = octopi.describe_all([EXAMPLES / f"{objects[row.objects[0]]}.mp4"])
+            assert find_level(said.sentence, octopi.catalogue.properties[0]) is not None
+            assert f" {row.predicted} " in said.sentence
+    with pytest.raises(SystemExit, match=r"octopi-small knows object_\S+, so it is not asked; set shipped to 0"):
+        run({next(iter(octopi.catalogue.objects)): "soft"})

@@ -139,7 +139,7 @@ async function ask(event) {
 
 async function begin() {
   const about = await (await fetch("api/about")).json();
-  $("variant").textContent = about.variant;
+  $("model").textContent = about.model;
   $("question").placeholder = about.example;
   for (const [id, name] of about.scenes) $("scene").append(new Option(name, id));
 }
