@@ -14,8 +14,8 @@ from statistics import fmean, median
 
 import numpy as np
 
+from benchmarks.classifier import features, heads_error, weights
 from benchmarks.errors import WRONG, Error, mean_of
-from benchmarks.judge import features, heads_error, weights
 from benchmarks.table import Row, make_rows
 from benchmarks.timing import counting_ffts, interleaved, machine, milliseconds
 from pipeline.config import ScenesConfig
@@ -145,7 +145,7 @@ class _Job:
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _Scene:
     """One scene by every model, in the order of `models`."""
 
     object_id: str
@@ -159,7 +159,7 @@ class _Seen:
     """Frames x features."""
 
 
-def _look(job: _Job) -> _Seen:
+def _look(job: _Job) -> _Scene:
     seed = derive_seed("bench", job.object_id, job.number)
     sensor = make_sensor(WIDTH, HEIGHT, job.number % 3)
     scenes, frames, costs, ffts = [], [], [], []
@@ -176,7 +176,7 @@ def _look(job: _Job) -> _Seen:
         ffts.append(count.value / FRAMES)
     hardest = int(np.argmax(scenes[0].motion.force))
     finest, truth = scenes[0].imprint.skins[-1], frames[0][hardest].astype(np.float32)
-    return _Seen(
+    return _Scene(
         object_id=job.object_id,
         costs=tuple(costs),
         ffts=tuple(ffts),
@@ -193,7 +193,9 @@ def _features(frames: Sequence[Image], weights: Path) -> np.ndarray:
     return features(subtract(np.stack([frames[i] for i in chosen]), reference), weights)
 
 
-def _question(question: str, seen: Sequence[_Seen], baseline: str, errors: Sequence[Error], error_of: str) -> list[Row]:
+def _question(
+    question: str, seen: Sequence[_Scene], baseline: str, errors: Sequence[Error], error_of: str
+) -> list[Row]:
     names = list(models())
     return make_rows(
         question,
@@ -207,7 +209,7 @@ def _question(question: str, seen: Sequence[_Seen], baseline: str, errors: Seque
     )
 
 
-def _against_finest(seen: Sequence[_Seen]) -> list[Row]:
+def _against_finest(seen: Sequence[_Scene]) -> list[Row]:
     places, owners = range(len(models())), [s.object_id for s in seen]
     pictures = [mean_of([s.pictures[i] for s in seen], owners) for i in places]
     slopes = [mean_of([s.slopes[i] for s in seen], owners) for i in places]
@@ -218,7 +220,7 @@ def _against_finest(seen: Sequence[_Seen]) -> list[Row]:
     ]
 
 
-def _for_a_classifier(seen: Sequence[_Seen], catalogue: Catalogue, folds: int, deals: int) -> list[Row]:
+def _for_a_classifier(seen: Sequence[_Scene], catalogue: Catalogue, folds: int, deals: int) -> list[Row]:
     """Heads on frozen features learn from the scenes of each model and are tested on those of the finest."""
     objects = [s.object_id for s in seen]
     labels = np.array([catalogue.labels(o) for o in objects])

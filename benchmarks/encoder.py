@@ -24,10 +24,10 @@ import numpy as np
 import torch
 from torch import nn
 
+from benchmarks.classifier import heads_error
 from benchmarks.encoder_models import ALONE, FRAMES, SIDE, features, prompts, whole
 from benchmarks.errors import WRONG, Error
 from benchmarks.frames import bench_videos
-from benchmarks.judge import heads_error
 from benchmarks.table import Row, make_rows
 from benchmarks.timing import flops_of, interleaved, machine, megabytes, one_thread
 from pipeline.config import FramesConfig, RuntimeConfig
@@ -64,7 +64,7 @@ class Size:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Bed(CrossValidationData):
+class Setup(CrossValidationData):
     """What all encoders of a run share."""
 
     recordings: Path
@@ -101,7 +101,7 @@ def measure(root: Path, size: Size | None = None) -> list[Row]:
         frames = Path(made) / "frames"
         config = FramesConfig(selection="salient", pixels=SIDE)
         videos = extract_frames(folder, catalogue, config, frames, Path(made) / "partial").videos
-        bed = Bed(
+        setup = Setup(
             videos=videos,
             catalogue=catalogue,
             frames=frames,
@@ -112,7 +112,7 @@ def measure(root: Path, size: Size | None = None) -> list[Row]:
             pretrained=pretrained,
             size=size,
         )
-        return [*whole(bed, root / "reports"), *frozen(bed), *prompts(bed)]
+        return [*whole(setup, root / "reports"), *frozen(setup), *prompts(setup)]
 
 
 # --- Frozen encoders
@@ -147,17 +147,17 @@ QUESTIONS: dict[str, dict[str, Setting]] = {
 """Settings by name; the first of each question is its baseline."""
 
 
-def frozen(bed: Bed) -> list[Row]:
+def frozen(setup: Setup) -> list[Row]:
     """Cost and error of all settings of `QUESTIONS`, each measured once, all in turns."""
     distinct = {str(s): s for settings in QUESTIONS.values() for s in settings.values()}
-    encoders = {name: _encoder(setting, bed) for name, setting in distinct.items()}
-    shown = {name: [_clip(s, bed, video) for video in bed.timed()] for name, s in distinct.items()}
+    encoders = {name: _encoder(setting, setup) for name, setting in distinct.items()}
+    shown = {name: [_clip(s, setup, video) for video in setup.timed()] for name, s in distinct.items()}
     timed: dict[str, Callable[[int], object]] = {
         name: lambda i, name=name: features(encoders[name], shown[name][i])  # type: ignore[misc]
         for name in distinct
     }
-    costs = interleaved(timed, range(len(bed.timed())), bed.size.repeats)
-    errors = {name: _error(encoders[name], setting, bed) for name, setting in distinct.items()}
+    costs = interleaved(timed, range(len(setup.timed())), setup.size.repeats)
+    errors = {name: _error(encoders[name], setting, setup) for name, setting in distinct.items()}
     counts = {}
     for name, setting in distinct.items():
         counts[name] = {"frames": float(setting.frames), "megabytes": megabytes(encoders[name])}
@@ -179,10 +179,10 @@ def frozen(bed: Bed) -> list[Row]:
     return rows
 
 
-def _encoder(setting: Setting, bed: Bed) -> FrameEncoder:
-    encoder: FrameEncoder = SceneEncoder() if setting.encoder == "pretrained" else base_encoder(bed.encoder)
+def _encoder(setting: Setting, setup: Setup) -> FrameEncoder:
+    encoder: FrameEncoder = SceneEncoder() if setting.encoder == "pretrained" else base_encoder(setup.encoder)
     if setting.encoder == "pretrained":
-        load_trainable(encoder, bed.pretrained)
+        load_trainable(encoder, setup.pretrained)
     return formatted(encoder.eval(), setting.form)
 
 
@@ -196,9 +196,9 @@ def formatted(encoder: FrameEncoder, form: str) -> FrameEncoder:
     return changed.to(torch.bfloat16) if form == "bfloat16" else changed
 
 
-def _clip(setting: Setting, bed: Bed, video: Video) -> Clip:
+def _clip(setting: Setting, setup: Setup, video: Video) -> Clip:
     """A video's evaluation clip as the setting shows it: `frames` and `frame_indices`, as `ClipDataset` has them."""
-    store = FrameStore(bed.frames, "subtract" if setting.encoder == "pretrained" else "none")
+    store = FrameStore(setup.frames, "subtract" if setting.encoder == "pretrained" else "none")
     item = ClipDataset(store, [LabelledVideo(video.video_id, ())], per_video=setting.frames)[0]
     if setting.side == SIDE:
         return item
@@ -207,7 +207,7 @@ def _clip(setting: Setting, bed: Bed, video: Video) -> Clip:
     return {**item, "frames": torch.from_numpy(np.stack(smaller))}
 
 
-def _error(encoder: FrameEncoder, setting: Setting, bed: Bed) -> Error:
+def _error(encoder: FrameEncoder, setting: Setting, setup: Setup) -> Error:
     """Of the frozen encoder's heads, whose settings are chosen inside the training folds."""
-    clips = np.stack([features(encoder, _clip(setting, bed, video)).numpy() for video in bed.videos])
-    return heads_error(clips, clips, bed.labels, bed.objects, bed.classes, bed.size.folds, bed.size.deals)
+    clips = np.stack([features(encoder, _clip(setting, setup, video)).numpy() for video in setup.videos])
+    return heads_error(clips, clips, setup.labels, setup.objects, setup.classes, setup.size.folds, setup.size.deals)

@@ -31,7 +31,7 @@ from pipeline.videos.frames.subtraction import subtract
 from pipeline.videos.split import assign
 
 if TYPE_CHECKING:
-    from benchmarks.encoder import Bed
+    from benchmarks.encoder import Setup
 
 SIDE, FRAMES = 120, 5
 """Pixels and frames a video, where these are not what differs."""
@@ -45,24 +45,24 @@ def features(encoder: FrameEncoder, clip: Mapping[str, torch.Tensor]) -> torch.T
     return encoder.describe(clip["frames"], clip["frame_indices"]).float()
 
 
-def whole(bed: Bed, reports: Path) -> list[Row]:
+def whole(setup: Setup, reports: Path) -> list[Row]:
     """From the file to the classes."""
     settings: dict[str, Callable[[VideoFile], object]] = {}
     counts: dict[str, dict[str, float]] = {}
     for name in WHOLE:
         candidate = CANDIDATES[name]
-        model, frames = _classifier(candidate, bed).eval(), candidate.frames or FRAMES
+        model, frames = _classifier(candidate, setup).eval(), candidate.frames or FRAMES
         settings[name] = partial(_decide, model, candidate.reference == "own", frames)
         clip = torch.zeros(1, frames, SIDE, SIDE, 3, dtype=torch.uint8), torch.zeros(1, frames, dtype=torch.int64)
         flops = flops_of(partial(model, *clip))
         counts[name] = {"frames": frames, "megabytes": megabytes(model), "flops": flops}
-    files = [VideoFile(bed.recordings / v.path, v.path, v.object_id, v.video_id) for v in bed.timed()]
-    judged = reported(reports, task="cross_validation", measure="combined").values()
+    files = [VideoFile(setup.recordings / v.path, v.path, v.object_id, v.video_id) for v in setup.timed()]
+    measured = reported(reports, task="cross_validation", measure="combined").values()
     # The report that compares most of them, and of such the one over most videos.
-    scores = max(judged, key=lambda rows: (len(rows), rows[0].n), default=[])
+    scores = max(measured, key=lambda rows: (len(rows), rows[0].n), default=[])
     return make_rows(
         "encoder",
-        interleaved(settings, files, bed.size.repeats),
+        interleaved(settings, files, setup.size.repeats),
         unit="ms a video",
         baseline="pretrained",
         errors={row.encoder: error_of(row) for row in scores if row.encoder in WHOLE},
@@ -72,17 +72,17 @@ def whole(bed: Bed, reports: Path) -> list[Row]:
     )
 
 
-def _classifier(candidate: Candidate, bed: Bed) -> PropertyClassifier:
+def _classifier(candidate: Candidate, setup: Setup) -> PropertyClassifier:
     """A candidate with heads that have learnt nothing."""
     seed_everything(0)
     if candidate.kind == "frame_heads":
         return JointFrameClassifier(
-            base_encoder(bed.encoder) if "clip" in candidate.backbone else SceneEncoder(), bed.classes
+            base_encoder(setup.encoder) if "clip" in candidate.backbone else SceneEncoder(), setup.classes
         )
     if candidate.recipe == "scratch":
         encoder = SceneEncoder()
-        return PropertyClassifier(encoder, Heads(encoder.dim, bed.classes), bed.classes)
-    return property_classifier(bed.encoder, bed.classes)
+        return PropertyClassifier(encoder, Heads(encoder.dim, setup.classes), setup.classes)
+    return property_classifier(setup.encoder, setup.classes)
 
 
 def _scan(file: VideoFile) -> Scan:
@@ -102,22 +102,22 @@ def _decide(model: PropertyClassifier, differences: bool, frames: int, file: Vid
     return model.decide(model(torch.from_numpy(pictures)[None], places)["logits"])
 
 
-def prompts(bed: Bed) -> list[Row]:
+def prompts(setup: Setup) -> list[Row]:
     """The paper's recipe with other prompts."""
-    assignments = assign(bed.catalogue, bed.videos, SplitConfig(name="development"))
-    data = EncoderData(FrameStore(bed.frames), bed.catalogue, assignments, FRAMES)
-    shown = ClipDataset(data.store, [LabelledVideo(v.video_id, ()) for v in bed.timed()], per_video=FRAMES)
+    assignments = assign(setup.catalogue, setup.videos, SplitConfig(name="development"))
+    data = EncoderData(FrameStore(setup.frames), setup.catalogue, assignments, FRAMES)
+    shown = ClipDataset(data.store, [LabelledVideo(v.video_id, ()) for v in setup.timed()], per_video=FRAMES)
     clips = [shown[i] for i in range(len(shown))]
     timed: dict[str, Callable[[Mapping[str, torch.Tensor]], object]] = {}
     errors, counts = {}, {}
-    for count, layers in bed.size.prompts:
+    for count, layers in setup.size.prompts:
         name = f"{count} at {'the first layer' if layers == 1 else f'{layers} layers' if layers else 'all layers'}"
-        changed = {"prompts": count, "prompt_layers": layers, "epochs": bed.size.epochs}
-        config = bed.encoder.model_copy(update=changed)
+        changed = {"prompts": count, "prompt_layers": layers, "epochs": setup.size.epochs}
+        config = setup.encoder.model_copy(update=changed)
         seed_everything(0)
-        model = property_classifier(config, bed.classes)
+        model = property_classifier(config, setup.classes)
         inputs = ["bench", *(f"{a.video_id} {a.part}" for a in data.assignments)]
-        train_classifier(model, data, config, bed.runtime, seed=0, inputs=inputs)
+        train_classifier(model, data, config, setup.runtime, seed=0, inputs=inputs)
         errors[name] = _validation_error(model.eval(), data, config)
         timed[name] = partial(features, model.encoder)
         # Not in inference mode: the counter fails there at parameters that are put into a layer, as prompts are.
@@ -125,7 +125,7 @@ def prompts(bed: Bed) -> list[Row]:
         counts[name] = {"frames": float(FRAMES), "megabytes": megabytes(model), "flops": flops}
     return make_rows(
         "prompts",
-        interleaved(timed, clips, bed.size.repeats),
+        interleaved(timed, clips, setup.size.repeats),
         unit=ALONE,
         baseline=next(iter(timed)),
         errors=errors,

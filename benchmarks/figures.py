@@ -27,15 +27,15 @@ def draw(rows: Sequence[Row], reports: Path) -> list[Path]:
     drawn = []
     for question in dict.fromkeys(row.question for row in rows):
         own = [row for row in rows if row.question == question]
-        judged = [row for row in own if row.error is not None]
-        figure = Figure(figsize=(9, 6 if judged else 1.5 + 0.4 * len(own)), dpi=100, layout="constrained")
+        measured = [row for row in own if row.error is not None]
+        figure = Figure(figsize=(9, 6 if measured else 1.5 + 0.4 * len(own)), dpi=100, layout="constrained")
         FigureCanvasAgg(figure)
         axes = figure.add_subplot()
         base = next((row.setting for row in own if row.cost_ratio == 1), "")
         axes.set_title(question, pad=18)
         axes.set_xlabel(f"cost ({own[0].unit}), times that of: {base}")
-        if judged:
-            _trade(axes, judged)
+        if measured:
+            _trade(axes, measured)
         else:
             _bars(axes, own)
         path = reports / FOLDER / f"{re.sub(r'[^a-z0-9]+', '-', question.lower()).strip('-')}.png"

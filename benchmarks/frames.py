@@ -20,8 +20,8 @@ from typing import get_args
 import cv2
 import numpy as np
 
+from benchmarks.classifier import features, heads_error, weights
 from benchmarks.errors import WRONG
-from benchmarks.judge import features, heads_error, weights
 from benchmarks.table import Row, make_rows
 from benchmarks.timing import interleaved, machine, milliseconds
 from pipeline.config import FramesConfig, Selection

@@ -59,7 +59,7 @@ class Size:
 
 
 @dataclass(frozen=True)
-class Bed:
+class Setup:
     """Model, encoder and questions of a run."""
 
     model: OctopiForCausalLM
@@ -95,13 +95,13 @@ def measure(root: Path, size: Size | None = None) -> list[Row]:
     """All questions; how much to describe only where answers were graded and their report written."""
     described = describing(root)  # First, as it may be refused.
     with one_thread(), TemporaryDirectory() as folder:
-        bed = make_bed(root, size := size or Size(), Path(folder))
-        optimiser = torch.optim.AdamW(bed.model.connector.parameters(), lr=3e-3)
-        train(bed, WAYS["4 at a time, of like length"], bed.training, optimiser)
-        return [*training(bed, size), *answering(bed, size), *formats(bed, size), *described]
+        setup = make_setup(root, size := size or Size(), Path(folder))
+        optimiser = torch.optim.AdamW(setup.model.connector.parameters(), lr=3e-3)
+        train(setup, WAYS["4 at a time, of like length"], setup.training, optimiser)
+        return [*training(setup, size), *answering(setup, size), *formats(setup, size), *described]
 
 
-def make_bed(root: Path, size: Size, folder: Path) -> Bed:
+def make_setup(root: Path, size: Size, folder: Path) -> Setup:
     """The models of params.yaml, and questions about every third object of the catalogue.
 
     Args:
@@ -128,7 +128,7 @@ def make_bed(root: Path, size: Size, folder: Path) -> Bed:
         blocks = [encoder(pictures[v], torch.zeros(FRAMES)).repeat(len(FLIPS), 1) for v in names]
     save_tensors(folder / TENSOR_FILE, {TENSOR: torch.cat(blocks)})
     write_table(folder / INDEX_FILE, Embedding, index)
-    return Bed(model, encoder, EmbeddingStore(folder), pictures, training, asked)
+    return Setup(model, encoder, EmbeddingStore(folder), pictures, training, asked)
 
 
 # --- Training
@@ -157,16 +157,16 @@ WAYS = {
 """From the published way on, one thing more each; the last is beside them."""
 
 
-def training(bed: Bed, size: Size) -> list[Row]:
+def training(setup: Setup, size: Size) -> list[Row]:
     """Milliseconds a useful token; all ways compute the same loss, so there is no error to trade."""
-    questions = bed.training[: size.trained]
-    optimiser = torch.optim.AdamW(bed.model.connector.parameters(), lr=1e-6)
+    questions = setup.training[: size.trained]
+    optimiser = torch.optim.AdamW(setup.model.connector.parameters(), lr=1e-6)
     ways: dict[str, Callable[[object], object]] = {
-        name: lambda _, way=way: train(bed, way, questions, optimiser)  # type: ignore[misc]
+        name: lambda _, way=way: train(setup, way, questions, optimiser)  # type: ignore[misc]
         for name, way in WAYS.items()
     }
     flops = {name: flops_of(lambda run=run: run(None)) for name, run in ways.items()}  # type: ignore[misc]
-    tokens = sum(bed.conversations(questions).lengths)
+    tokens = sum(setup.conversations(questions).lengths)
     costs = interleaved(ways, [None], size.repeats, warm=False)
     return make_rows(
         "training",
@@ -178,37 +178,37 @@ def training(bed: Bed, size: Size) -> list[Row]:
     )
 
 
-def train(bed: Bed, way: Way, questions: Sequence[Question], optimiser: torch.optim.Optimizer) -> None:
+def train(setup: Setup, way: Way, questions: Sequence[Question], optimiser: torch.optim.Optimizer) -> None:
     """Train on all of the questions once, a step after every `UPDATE`."""
-    data = bed.conversations(questions)
+    data = setup.conversations(questions)
     order = list(UpdateSampler(data.lengths, UPDATE, 0, lambda: 0)) if way.buckets else list(range(len(data)))
     for start in range(0, len(data), UPDATE):
         chosen = order[start : start + UPDATE]
         labelled = sum(sum(label != IGNORE_INDEX for label in data.encoded[i].labels) for i in chosen)
         for first in range(0, len(chosen), way.batch):
             part = chosen[first : first + way.batch]
-            loss(bed, way, [data.questions[i] for i in part], [data[i] for i in part], labelled).backward()
+            loss(setup, way, [data.questions[i] for i in part], [data[i] for i in part], labelled).backward()
         optimiser.step()
         optimiser.zero_grad()
 
 
 def loss(
-    bed: Bed, way: Way, questions: Sequence[Question], samples: Sequence[dict[str, torch.Tensor]], labelled: int
+    setup: Setup, way: Way, questions: Sequence[Question], samples: Sequence[dict[str, torch.Tensor]], labelled: int
 ) -> torch.Tensor:
     """A batch's share of the loss of an update with so many labelled tokens."""
     batch = collate(samples)
     if way.encodes:
-        batch["features"] = torch.stack([bed.encode(q) for q in questions])
+        batch["features"] = torch.stack([setup.encode(q) for q in questions])
     if not way.all_logits:
-        found: torch.Tensor = bed.model(**batch, num_items_in_batch=labelled).loss
+        found: torch.Tensor = setup.model(**batch, num_items_in_batch=labelled).loss
         return found
-    embeddings, labels = bed.model.embed(batch["input_ids"], batch["features"]), batch["labels"]
+    embeddings, labels = setup.model.embed(batch["input_ids"], batch["features"]), batch["labels"]
     mask = torch.ones_like(labels)
     if way.padded:
         rest = max(0, CUTOFF - embeddings.shape[1])
         embeddings = F.pad(embeddings, (0, 0, 0, rest))
         labels, mask = F.pad(labels, (0, rest), value=IGNORE_INDEX), F.pad(mask, (0, rest))
-    logits = bed.model.llm(inputs_embeds=embeddings, attention_mask=mask).logits.float()
+    logits = setup.model.llm(inputs_embeds=embeddings, attention_mask=mask).logits.float()
     summed: torch.Tensor = F.cross_entropy(logits[:, :-1].flatten(0, 1), labels[:, 1:].flatten(), reduction="sum")
     return summed / labelled
 
@@ -216,41 +216,41 @@ def loss(
 # --- Answering
 
 
-def answering(bed: Bed, size: Size) -> list[Row]:
+def answering(setup: Setup, size: Size) -> list[Row]:
     """Milliseconds an answer, and whether all ways answer alike."""
 
     def one_by_one(**options: bool) -> Callable[[object], list[str]]:
-        return lambda _: [_answer(bed, size.limit, place, **options) for place in range(len(bed.asked))]
+        return lambda _: [_answer(setup, size.limit, place, **options) for place in range(len(setup.asked))]
 
     ways: dict[str, Callable[[object], list[str]]] = {
         PUBLISHED: one_by_one(reads=True),
         "without the published loop's forward pass": one_by_one(),
         "and without a cache of keys and values": one_by_one(cache=False),
         **{
-            f"the pipeline's way, {batch} at a time": partial(_texts, bed, bed.model, size.limit, batch)
+            f"the pipeline's way, {batch} at a time": partial(_texts, setup, setup.model, size.limit, batch)
             for batch in size.batches
         },
     }
-    return _asked("answering", ways, bed, size.repeats)
+    return _asked("answering", ways, setup, size.repeats)
 
 
-def formats(bed: Bed, size: Size) -> list[Row]:
+def formats(setup: Setup, size: Size) -> list[Row]:
     """The frozen weights in fewer bits; the connector stays in float32."""
     ways: dict[str, Callable[[object], list[str]]] = {}
     names: tuple[DtypeName, ...] = ("float32", "bfloat16")
     for name in names:
-        base = bed.model.octopi_config
+        base = setup.model.octopi_config
         model = OctopiForCausalLM.from_base(base.base_model, base.tactile_dim, dtype=name)
-        model.connector.load_state_dict(bed.model.connector.state_dict())
-        ways[name] = partial(_texts, bed, model, size.limit, size.batches[-1])
-    return _asked("number format, language model", ways, bed, size.repeats)
+        model.connector.load_state_dict(setup.model.connector.state_dict())
+        ways[name] = partial(_texts, setup, model, size.limit, size.batches[-1])
+    return _asked("number format, language model", ways, setup, size.repeats)
 
 
-def _asked(question: str, ways: Mapping[str, Callable[[object], list[str]]], bed: Bed, repeats: int) -> list[Row]:
+def _asked(question: str, ways: Mapping[str, Callable[[object], list[str]]], setup: Setup, repeats: int) -> list[Row]:
     said: dict[str, list[str]] = {}
     flops = {name: flops_of(lambda n=name, w=way: said.update({n: w(None)})) for name, way in ways.items()}  # type: ignore[misc]
-    first, objects, count = next(iter(ways)), [q.objects for q in bed.asked], len(bed.asked)
-    costs, tokenizer = interleaved(ways, [None], repeats, warm=False), bed.model.tokenizer
+    first, objects, count = next(iter(ways)), [q.objects for q in setup.asked], len(setup.asked)
+    costs, tokenizer = interleaved(ways, [None], repeats, warm=False), setup.model.tokenizer
     return make_rows(
         question,
         {name: [ms / count for ms in own] for name, own in costs.items()},
@@ -269,21 +269,25 @@ def _asked(question: str, ways: Mapping[str, Callable[[object], list[str]]], bed
     )
 
 
-def _texts(bed: Bed, model: OctopiForCausalLM, limit: int, batch: int, _: object) -> list[str]:
+def _texts(setup: Setup, model: OctopiForCausalLM, limit: int, batch: int, _: object) -> list[str]:
     """The pipeline's own way."""
     language = LanguageConfig(weights="", max_new_tokens=limit, generation_batch_size=batch)
-    return [prediction.outputs[0] for prediction in answer(model, bed.store, bed.asked, Opd.ALL, language, FRAMES)]
+    return [prediction.outputs[0] for prediction in answer(model, setup.store, setup.asked, Opd.ALL, language, FRAMES)]
 
 
 @torch.no_grad()
-def _answer(bed: Bed, limit: int, place: int, reads: bool = False, cache: bool = True) -> str:
+def _answer(setup: Setup, limit: int, place: int, reads: bool = False, cache: bool = True) -> str:
     """One question, its frames encoded; `reads`: after the reference answer, padded, as the published loop has it."""
-    data, model, tokenizer = bed.conversations(bed.asked[place : place + 1]), bed.model.eval(), bed.model.tokenizer
+    data, model, tokenizer = (
+        setup.conversations(setup.asked[place : place + 1]),
+        setup.model.eval(),
+        setup.model.tokenizer,
+    )
     question, sample = data.questions[0], data[0]
     if reads:
-        loss(bed, WAYS[PUBLISHED], [question], [sample], 1)
+        loss(setup, WAYS[PUBLISHED], [question], [sample], 1)
     ids = sample["input_ids"][: int((sample["labels"] != IGNORE_INDEX).nonzero()[0])][None]
-    embeddings = model.embed(ids, bed.encode(question)[None])
+    embeddings = model.embed(ids, setup.encode(question)[None])
     if cache:
         ends = {"eos_token_id": tokenizer.eos_token_id, "pad_token_id": tokenizer.pad_token_id}
         call = {"attention_mask": torch.ones_like(ids), "max_new_tokens": limit, "do_sample": False, **ends}

@@ -99,9 +99,9 @@ def make_rows(
 
 def with_front(rows: Sequence[Row]) -> list[Row]:
     """The rows of one question, each told whether it is on the front; None where it has no error."""
-    judged = [row for row in rows if row.error is not None]
-    ahead = front([row.cost_ratio for row in judged], [row.error or 0.0 for row in judged])
-    known = {row.setting: on for row, on in zip(judged, ahead, strict=True)}
+    measured = [row for row in rows if row.error is not None]
+    ahead = front([row.cost_ratio for row in measured], [row.error or 0.0 for row in measured])
+    known = {row.setting: on for row, on in zip(measured, ahead, strict=True)}
     return [row.model_copy(update={"front": known.get(row.setting)}) for row in rows]
 
 

@@ -32,11 +32,11 @@ def main() -> None:
             octopi = Octopi.from_pretrained(SHIPPED, device=params.runtime.device, dtype="float32")
             catalogue = load_catalogue(Path(params.data.catalogue)).asking(params.questions.scenarios)
             videos: dict[str, list[str]] = {}
-            rows, felt = dict[str, range](), [torch.zeros(0, octopi.llm.octopi_config.tactile_dim)]
+            rows, embedded = dict[str, range](), [torch.zeros(0, octopi.llm.octopi_config.tactile_dim)]
             for video in track(read_table(DATA / "videos.parquet", Video), "touches", "video"):
                 videos.setdefault(video.object_id, []).append(video.video_id)
-                felt.append(octopi.sense.feel(Path(params.data.dir) / video.path).features)
-                rows[video.video_id] = range(sum(map(len, felt[:-1])), sum(map(len, felt)))
+                embedded.append(octopi.encoder.encode(Path(params.data.dir) / video.path).features)
+                rows[video.video_id] = range(sum(map(len, embedded[:-1])), sum(map(len, embedded)))
             if met := sorted(octopi.catalogue.objects.keys() & videos.keys()):
                 raise UserError(f"{SHIPPED.name} knows {met[0]}, so it is not asked; set shipped to 0 in params.yaml")
             # Half of them describe: those answers are short, and the others follow from what they say.
@@ -49,7 +49,7 @@ def main() -> None:
                 distinct=True,
                 facts=octopi.config.facts,
             )
-            ways, config = {Shown.TOUCH: torch.cat(felt)}, octopi.config
+            ways, config = {Shown.TOUCH: torch.cat(embedded)}, octopi.config
             # A processor reads all weights for each token of a batch, however many answers are in it.
             language = config.language.model_copy(update={"generation_batch_size": BATCH})
             if params.data.source == "videos":

@@ -54,7 +54,7 @@ class EncoderSource:
     state: Path | None
     """What fine-tuning trained; None for the base encoder."""
     run: float = 0.0
-    """Of the stage, such as its start: what an earlier one trained lay at the same place."""
+    """When the stage began: a worker that outlives a run finds the next one's files at the same place."""
 
     def __call__(self) -> Loaded:
         """Load them.

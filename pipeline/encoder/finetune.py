@@ -164,7 +164,7 @@ def train_classifier(
         **(waves if config.recipe == "release" else {}),
     )
 
-    def judged(prediction: EvalPrediction) -> dict[str, float]:
+    def measures(prediction: EvalPrediction) -> dict[str, float]:
         logits, labels = cast(np.ndarray, prediction.predictions), cast(np.ndarray, prediction.label_ids)
         return accuracies(logits, labels, model.decide, data.catalogue)
 
@@ -174,7 +174,7 @@ def train_classifier(
         train_dataset=training,
         eval_dataset=show(chosen) if chosen else None,
         data_collator=default_collate,
-        compute_metrics=judged,
+        compute_metrics=measures,
         callbacks=[TrainingMonitor(), *callbacks],
     )
     history = train(trainer).history

@@ -171,9 +171,9 @@ class PropertyClassifier(nn.Module):
             properties' cross-entropies, so that the heads are trained simultaneously.
         """
         features = self.encoder.describe(frames.flatten(0, 1), frame_indices.flatten())
-        return self.judge(features.view(*frames.shape[:2], -1), labels, num_items_in_batch)
+        return self.from_features(features.view(*frames.shape[:2], -1), labels, num_items_in_batch)
 
-    def judge(
+    def from_features(
         self,
         features: torch.Tensor,
         labels: torch.Tensor | None = None,

@@ -87,7 +87,7 @@ def run_trunks(
 
 
 class AboveTrunks(nn.Module):
-    """What is trained: the classifier from the trunks' outputs on."""
+    """The trained part of the classifier: all that follows the frozen trunks, whose outputs are computed once."""
 
     _keys_to_ignore_on_save = None  # read by transformers' Trainer when it reloads a checkpoint
     accepts_loss_kwargs = True
@@ -103,7 +103,7 @@ class AboveTrunks(nn.Module):
         num_items_in_batch: torch.Tensor | int | None = None,
     ) -> dict[str, torch.Tensor]:
         """As `PropertyClassifier.forward`, of the trunks' outputs: each batch x frames x what its stage takes."""
-        return self.classifier.judge(self.features(outputs), labels, num_items_in_batch)
+        return self.classifier.from_features(self.features(outputs), labels, num_items_in_batch)
 
     def features(self, outputs: Sequence[torch.Tensor]) -> torch.Tensor:
         """The frames' features: batch x frames x dim."""
@@ -126,7 +126,7 @@ class AboveTrunks(nn.Module):
     def logits(self, trunks: Trunks, videos: Sequence[LabelledVideo], device: torch.device) -> torch.Tensor:
         """As `forward` gives them, of the videos' evaluation clips."""
         features = torch.from_numpy(self.describe(trunks, videos, device)).to(device)
-        return self.classifier.judge(features)["logits"].cpu()
+        return self.classifier.from_features(features)["logits"].cpu()
 
 
 class TrunkDataset(EpochDataset[dict[str, Any]]):

@@ -32,7 +32,7 @@ class ModelSource:
     quantization: Quantization
     device: DeviceName
     run: float = 0.0
-    """Of the stage, such as its start: what an earlier one trained lay at the same place."""
+    """When the stage began: a worker that outlives a run finds the next one's files at the same place."""
 
     def __call__(self) -> OctopiForCausalLM:
         """Load it, as `OctopiForCausalLM.from_pretrained` does."""

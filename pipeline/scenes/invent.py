@@ -1,4 +1,4 @@
-"""Objects that nobody made: recipes drawn from wide ranges, to learn from."""
+"""Invented objects: recipes drawn from wide ranges, as training data for an encoder."""
 
 from __future__ import annotations
 

@@ -195,7 +195,7 @@ def _done(out: Path, columns: Sequence[str], name: str) -> dict[str, str]:
     """Files that a CSV has already, each with its error; what a kill left of a last line is cut off."""
     if not out.is_file():
         return {}
-    # A kill may have cut a character in two; a stranger's file may have others.
+    # A kill may have cut a character in two; a file that was sent may have others.
     text = out.read_text(encoding="utf-8", errors="replace")
     whole, begun = text[: text.rfind("\n") + 1], _row(columns)
     rows = list(csv.DictReader(io.StringIO(whole)))

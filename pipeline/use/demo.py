@@ -65,7 +65,7 @@ class Asked(BaseModel):
     history: list[Turn] = []
 
 
-class Room:
+class Session:
     """The model, the touches that were shown to it, and one thread that all its work is done in."""
 
     def __init__(
@@ -172,13 +172,13 @@ def uri(picture: Pictures) -> str:
     return f"data:image/png;base64,{base64.b64encode(png.tobytes()).decode()}"
 
 
-def make_app(room: Room) -> FastAPI:
+def make_app(session: Session) -> FastAPI:
     """The page and what it asks for. Errors of the user come back as one line, with status 422."""
 
     @asynccontextmanager
     async def life(_: FastAPI) -> AsyncIterator[None]:
         yield
-        room.close()
+        session.close()
 
     app = FastAPI(lifespan=life, openapi_url=None)  # Its documentation page would load scripts from elsewhere.
     app.add_middleware(TrustedHostMiddleware, allowed_hosts=HOSTS)
@@ -192,18 +192,18 @@ def make_app(room: Room) -> FastAPI:
     @app.exception_handler(UserError)
     async def refuse(_: Request, error: UserError) -> Response:
         # A file is known to the user by its name, not by where it was put.
-        line = re.sub(rf"{re.escape(str(room.folder))}/([0-9a-f]{{32}}/)?", "", str(error))
+        line = re.sub(rf"{re.escape(str(session.folder))}/([0-9a-f]{{32}}/)?", "", str(error))
         return JSONResponse({"error": " ".join(line.split())}, 422)
 
     @app.get("/api/about")
     def about() -> dict[str, Any]:
-        named = sorted(room.names.items(), key=lambda item: item[1])
-        return {"model": room.model.name, "example": TEMPLATES[0], "scenes": named}
+        named = sorted(session.names.items(), key=lambda item: item[1])
+        return {"model": session.model.name, "example": TEMPLATES[0], "scenes": named}
 
     @app.put("/api/touches/{name}")
     async def drop(name: str, request: Request) -> Any:
         """The body is the file itself."""
-        file = room.folder / uuid4().hex / (Path(name).name or "video")
+        file = session.folder / uuid4().hex / (Path(name).name or "video")
         file.parent.mkdir()
         try:
             with file.open("wb") as stream:
@@ -211,20 +211,22 @@ def make_app(room: Room) -> FastAPI:
                     if stream.tell() + len(chunk) > MOST_BYTES:
                         raise UserError(f"{name}: more than {MOST_BYTES // 1_000_000} MB; drop a shorter video")
                     stream.write(chunk)
-            return await room.work(lambda: room.show(file.name, file))
+            return await session.work(lambda: session.show(file.name, file))
         except BaseException:
             shutil.rmtree(file.parent)
             raise
 
     @app.put("/api/scenes/{object_id}")
     async def scene(object_id: str) -> Any:
-        if object_id not in room.scenes:
+        if object_id not in session.scenes:
             raise UserError(f"{object_id}: no such scene")
-        return await room.work(lambda: room.show(f"{room.names[object_id]} (synthetic)", room.scene(object_id)))
+        return await session.work(
+            lambda: session.show(f"{session.names[object_id]} (synthetic)", session.scene(object_id))
+        )
 
     @app.post("/api/ask")
     async def ask(asked: Asked) -> StreamingResponse:
-        return StreamingResponse(await room.stream(asked), media_type="text/plain; charset=utf-8")
+        return StreamingResponse(await session.stream(asked), media_type="text/plain; charset=utf-8")
 
     app.mount("/", StaticFiles(directory=PAGE, html=True))
     return app
@@ -238,7 +240,7 @@ def serve_demo(load: Callable[[], Octopi], catalogue: Path, port: int) -> None:
     """
     with listen("127.0.0.1", port, "") as listening:
         known = load_catalogue(catalogue)
-        app = make_app(Room(load(), known, load_recipes(catalogue, known, seed=0)))
+        app = make_app(Session(load(), known, load_recipes(catalogue, known, seed=0)))
         print(f"http://127.0.0.1:{listening.getsockname()[1]} shows the demo; Ctrl-C ends it", flush=True)
         with suppress(KeyboardInterrupt):
             make_server(app).run(sockets=[listening])

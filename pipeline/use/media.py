@@ -1,4 +1,4 @@
-"""Videos from strangers: as base64 only, checked in a process of their own, handed on as files.
+"""Videos that clients send: as base64 only, checked in a process of their own, handed on as files.
 
 FFmpeg believes what a header says and takes memory for it. So a second process, whose memory and time are limited,
 reads and decodes each video first; what it cannot do there never reaches the process that holds the model. The model is

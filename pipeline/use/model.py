@@ -29,9 +29,9 @@ from pipeline.runtime import (
 )
 from pipeline.tasks import opd, pc, pom, psr, pss
 from pipeline.tasks.base import LETTERS
+from pipeline.use.encoding import EncodedVideo, VideoEncoder
 from pipeline.use.folder import SHIPPED, ModelConfig, chat_sample, find_base, read_folder
 from pipeline.use.results import Choice, Comparison, Description, Exchange, Matching, Ranking, Touch, Video
-from pipeline.use.touch import Felt, TactileSense
 from pipeline.videos.catalogue import Catalogue, Property
 from pipeline.weights import is_tiny
 
@@ -62,7 +62,7 @@ class Octopi:
         self.card: Mapping[str, Any] = config.model_dump(mode="json")
         self.properties: tuple[str, ...] = catalogue.property_names
         self.names: tuple[str, ...] = tuple(o.name for o in catalogue.objects.values())
-        self.sense = TactileSense(folder, config, catalogue, device)
+        self.encoder = VideoEncoder(folder, config, catalogue, device)
         bases = (config.base.folder, config.encoder.weights)
         self.doubts: tuple[str, ...] = (RANDOM,) if any(map(is_tiny, bases)) else ()
 
@@ -156,13 +156,13 @@ class Octopi:
 
     def look(self, video: Video) -> Touch:
         """What the model sees of a video; UserError for what is no video, or is too short."""
-        felt = self.sense.feel(video)
-        return felt.seen.touch.model_copy(update={"notes": felt.notes})
+        encoded = self.encoder.encode(video)
+        return encoded.prepared.touch.model_copy(update={"notes": encoded.notes})
 
     def notes(self, videos: Video | Sequence[Video] = ()) -> tuple[str, ...]:
         """What should make one doubt an answer: of the model itself, then of each video, behind its name."""
-        found = [self.sense.feel(video) for video in _listed(videos)]
-        return (*self.doubts, *(f"{felt.seen.name}: {note}" for felt in found for note in felt.notes))
+        found = [self.encoder.encode(video) for video in _listed(videos)]
+        return (*self.doubts, *(f"{encoded.prepared.name}: {note}" for encoded in found for note in encoded.notes))
 
     # ---- the tasks ----
 
@@ -205,7 +205,7 @@ class Octopi:
         notes: list[str] = []
         for video in videos:  # All of a video at once, as not all may be remembered.
             self._touched(video)
-            probabilities = self.sense.judge(video).probabilities[place]
+            probabilities = self.encoder.classify(video).probabilities[place]
             expected.append(sum(level * p for level, p in enumerate(probabilities)))
             notes += self.notes(video)[len(self.doubts) :]
         answer, most = "", None
@@ -293,26 +293,26 @@ class Octopi:
             )
         features = [torch.zeros(0, self.llm.octopi_config.tactile_dim)]
         for video in (v for exchange in conversation for v in exchange.videos):
-            felt = self.sense.feel(video) if untouched else self._touched(video)
-            features.append(felt.features)
+            encoded = self.encoder.encode(video) if untouched else self._touched(video)
+            features.append(encoded.features)
         return prompt, torch.cat(features)
 
-    def _touched(self, video: Video) -> Felt:
-        felt = self.sense.feel(video)
-        if not felt.seen.felt:
-            raise UserError(f"{felt.seen.name}: {felt.notes[0]}; record the sensor being pressed")
-        return felt
+    def _touched(self, video: Video) -> EncodedVideo:
+        encoded = self.encoder.encode(video)
+        if not encoded.prepared.touched:
+            raise UserError(f"{encoded.prepared.name}: {encoded.notes[0]}; record the sensor being pressed")
+        return encoded
 
     def _described(self, video: Video) -> Description:
-        felt, judged = self.sense.feel(video), self.sense.judge(video)
-        each = list(zip(self.catalogue.properties, judged.probabilities, judged.levels, strict=True))
+        encoded, classified = self.encoder.encode(video), self.encoder.classify(video)
+        each = list(zip(self.catalogue.properties, classified.probabilities, classified.levels, strict=True))
         silent = ("this variant was not trained to describe, so there is no sentence",)
         return Description(
             levels={p.name: p.levels[level] for p, _, level in each},
             probabilities={p.name: dict(zip(p.levels, found, strict=True)) for p, found, _ in each},
             sentence="",
-            frames=felt.seen.touch.numbers,
-            notes=(*self.doubts, *felt.notes, *(silent if self.config.opd is Opd.NONE else ())),
+            frames=encoded.prepared.touch.numbers,
+            notes=(*self.doubts, *encoded.notes, *(silent if self.config.opd is Opd.NONE else ())),
         )
 
     def _object(self, name: str) -> str:

@@ -64,9 +64,9 @@ def package(data: Path, params: Params, variant: Variant, base: Base, out: Path)
     """
     encoder, language = params.encoder, params.language
     catalogue = load_catalogue(Path(params.data.catalogue))
-    judged = read_table(data / "encoder" / str(variant.seed) / "classifications.parquet", Classification)
+    classified = read_table(data / "encoder" / str(variant.seed) / "classifications.parquet", Classification)
     embeddings = data / "embeddings" / f"{variant.encoder}-{variant.seed}"
-    seen = {p.name: [c for c in judged if c.property == p.name] for p in catalogue.properties}
+    seen = {p.name: [c for c in classified if c.property == p.name] for p in catalogue.properties}
     temperatures = {
         name: fit_temperature([c for c in rows if c.part == Part.VALIDATION]) for name, rows in seen.items()
     }
@@ -115,7 +115,7 @@ def package(data: Path, params: Params, variant: Variant, base: Base, out: Path)
         )
         write_json(folder / CONFIG, config.model_dump(mode="json"))
         known = read_json(report / "provenance.json")["settings"]
-        _write_card(folder, config, judged, scores, ruled, params, known)
+        _write_card(folder, config, classified, scores, ruled, params, known)
     return config
 
 
@@ -190,14 +190,14 @@ def _copy(source: Path, to: Path) -> None:
 def _write_card(
     folder: Path,
     config: ModelConfig,
-    judged: Sequence[Classification],
+    classified: Sequence[Classification],
     scores: Mapping[str, Score],
     ruled: Mapping[str, Score],
     params: Params,
     known: str,
 ) -> None:
     """`ruled` are the scores of heads and rules; `known` says whether test objects were looked at before."""
-    calibrated = calibration_rows([judged])
+    calibrated = calibration_rows([classified])
     bases = {"language model": Path(params.language.weights)}
     if (folder / ENCODER_DIR / BACKBONE_DIR).is_dir():
         bases["tactile encoder"] = Path(params.encoder.weights)

@@ -26,8 +26,8 @@ HEADER_SECONDS = 10.0
 """How long a client may take for a request's head."""
 
 
-class Patient(H11Protocol):
-    """Hangs up on a client that does not get a request's head sent in time, which uvicorn waits for without end."""
+class HeaderTimeout(H11Protocol):
+    """Closes the connection of a client that does not send a request's head in time; uvicorn waits without end."""
 
     _timer: asyncio.TimerHandle | None = None
 
@@ -55,7 +55,7 @@ class Patient(H11Protocol):
 def make_server(app: FastAPI) -> uvicorn.Server:
     """The server of the application; `run(sockets=[...])` returns when a signal came and all answers are sent."""
     config = uvicorn.Config(
-        app, http=Patient, ws="none", lifespan="on", access_log=False, log_level="warning", server_header=False
+        app, http=HeaderTimeout, ws="none", lifespan="on", access_log=False, log_level="warning", server_header=False
     )
     return uvicorn.Server(config)
 

@@ -70,8 +70,8 @@ def by_question(rows: list[Row], folder: Path) -> dict[str, dict[str, Row]]:
     for own in found.values():
         assert all(row.cost > 0 for row in own.values())
         assert 1 in [row.cost_ratio for row in own.values()]
-        judged = [row for row in own.values() if row.error is not None]
-        assert any(row.front for row in judged) == bool(judged)
+        measured = [row for row in own.values() if row.error is not None]
+        assert any(row.front for row in measured) == bool(measured)
     return found
 
 
@@ -137,16 +137,16 @@ def test_language(project: Path, tmp_path: Path) -> None:
 
 
 def test_all_ways_of_training_compute_one_loss(project: Path, tmp_path: Path) -> None:
-    bed = language.make_bed(project, TINY, tmp_path)
-    questions = bed.training[:4]
-    data = bed.conversations(questions)
+    setup = language.make_setup(project, TINY, tmp_path)
+    questions = setup.training[:4]
+    data = setup.conversations(questions)
     losses = {}
     for name, way in language.WAYS.items():
         # Frames and mirrors are drawn; the embeddings of what was drawn are compared, so all take the cached ones.
         cached = language.Way(way.batch, way.padded, False, way.all_logits, way.buckets)
         parts = [list(range(i, min(i + way.batch, 4))) for i in range(0, 4, way.batch)]
         losses[name] = sum(
-            float(language.loss(bed, cached, [questions[i] for i in p], [data[i] for i in p], 7)) for p in parts
+            float(language.loss(setup, cached, [questions[i] for i in p], [data[i] for i in p], 7)) for p in parts
         )
     expected = losses[language.PUBLISHED]
     assert losses == pytest.approx(dict.fromkeys(losses, expected), rel=1e-5)

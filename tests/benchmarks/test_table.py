@@ -116,10 +116,10 @@ def test_the_committed_table_is_consistent() -> None:
         own = [row for row in table if row.question == question]
         assert len({row.setting for row in own}) == len(own)
         assert 1 in [row.cost_ratio for row in own], question
-        judged = [row for row in own if row.error is not None]
-        expected = front([r.cost_ratio for r in judged], [r.error or 0.0 for r in judged])
-        assert [row.front for row in judged] == expected
-        assert all(row.error_of and row.n for row in judged)
+        measured = [row for row in own if row.error is not None]
+        expected = front([r.cost_ratio for r in measured], [r.error or 0.0 for r in measured])
+        assert [row.front for row in measured] == expected
+        assert all(row.error_of and row.n for row in measured)
     pictures = {p.name for p in (ROOT / CSV.parent / FOLDER).glob("*.png")}
     assert len(pictures) == len({row.question for row in table})
 

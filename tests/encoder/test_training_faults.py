@@ -97,9 +97,9 @@ def test_a_class_that_training_lacks_does_not_stop_it(
     model = classifier(kind, weights)
     history, _ = training(kind, weights, data, epochs=2)(model=model)
     assert all(np.isfinite(m.value) for m in history)
-    judged = classify(model, data, [Part.TEST], 4, DEVICE)
-    assert [r.expected for r in judged] == list(catalogue.labels("rug"))
-    assert all(np.isfinite(r.probabilities).all() and min(r.probabilities) > 0 for r in judged)
+    classified = classify(model, data, [Part.TEST], 4, DEVICE)
+    assert [r.expected for r in classified] == list(catalogue.labels("rug"))
+    assert all(np.isfinite(r.probabilities).all() and min(r.probabilities) > 0 for r in classified)
 
 
 # NaN

@@ -24,7 +24,7 @@ import pytest
 
 from pipeline.errors import UserError
 from pipeline.scenes.recipe import load_recipes
-from pipeline.use.demo import MOST_TOUCHES, Asked, Room, Turn, make_app, where
+from pipeline.use.demo import MOST_TOUCHES, Asked, Session, Turn, make_app, where
 from pipeline.use.model import Octopi
 from pipeline.use.results import Exchange
 from pipeline.use.worker import Failed
@@ -51,17 +51,17 @@ def press(file: Path, turned: bool = False) -> Path:
 
 
 @pytest.fixture(scope="module")
-def room(catalogue: Catalogue) -> Room:
+def session(catalogue: Catalogue) -> Session:
     recipes = load_recipes(ROOT / "pipeline" / "physiclear", catalogue, 0)
     model: Any = FakeOctopi()
-    return Room(model, catalogue, {o: recipes[o] for o in ("baseball", "pillow")})
+    return Session(model, catalogue, {o: recipes[o] for o in ("baseball", "pillow")})
 
 
 @pytest.fixture(scope="module")
-def site(room: Room) -> Iterator[str]:
-    with running(make_app(room)) as port:
+def site(session: Session) -> Iterator[str]:
+    with running(make_app(session)) as port:
         yield f"http://127.0.0.1:{port}"
-    assert not room.folder.exists(), "what was shown is forgotten"
+    assert not session.folder.exists(), "what was shown is forgotten"
 
 
 def call(address: str, method: str, body: bytes | dict[str, Any] | None = None, **headers: str) -> tuple[int, bytes]:
@@ -81,11 +81,11 @@ def picture(uri: str) -> np.ndarray:
     return cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1]
 
 
-def test_a_video_is_shown_as_the_model_sees_it(site: str, room: Room, tmp_path: Path) -> None:
+def test_a_video_is_shown_as_the_model_sees_it(site: str, session: Session, tmp_path: Path) -> None:
     video = press(tmp_path / "rug 1.mp4")
     status, body = call(f"{site}/api/touches/rug%201.mp4", "PUT", video.read_bytes())
     assert status == 200, body
-    shown, touch = json.loads(body), room.model.look(video)
+    shown, touch = json.loads(body), session.model.look(video)
     assert (shown["name"], tuple(shown["numbers"]), shown["contact"]) == ("rug 1.mp4", touch.numbers, touch.contact)
     np.testing.assert_array_equal([picture(f) for f in shown["frames"]], touch.frames)
     np.testing.assert_array_equal([picture(f) for f in shown["difference"]], touch.difference)
@@ -94,8 +94,8 @@ def test_a_video_is_shown_as_the_model_sees_it(site: str, room: Room, tmp_path: 
     assert shown["probabilities"]["roughness"] == {"smooth": 0.5, "slightly rough": 0.25, "rough": 0.125}
 
 
-def test_it_glows_where_it_touches_and_nowhere_else(room: Room, tmp_path: Path) -> None:
-    touch = room.model.look(press(tmp_path / "rug.mp4"))
+def test_it_glows_where_it_touches_and_nowhere_else(session: Session, tmp_path: Path) -> None:
+    touch = session.model.look(press(tmp_path / "rug.mp4"))
     change = np.abs(where(touch).astype(int) - touch.frames).max(axis=3)
     y, x = np.mgrid[:96, :96]  # The sides of 128 pixels are cropped away.
     distance = np.hypot(x - 48, y - 48)
@@ -105,12 +105,12 @@ def test_it_glows_where_it_touches_and_nowhere_else(room: Room, tmp_path: Path) 
     np.testing.assert_array_equal(where(still), still.frames)
 
 
-def test_an_answer_streams_with_its_history(site: str, room: Room, tmp_path: Path) -> None:
+def test_an_answer_streams_with_its_history(site: str, session: Session, tmp_path: Path) -> None:
     video = press(tmp_path / "rug.mp4").read_bytes()
     ids = [json.loads(call(f"{site}/api/touches/{n}.mp4", "PUT", video)[1])["id"] for n in "ab"]
     turn = {"question": "{tactile}?", "touches": ids[:1], "answer": "Soft."}
     asked = {"question": "And {tactile} wait", "touches": ids[1:], "history": [turn]}
-    model: Any = room.model
+    model: Any = session.model
     model.paused.clear()
     request = urllib.request.Request(
         f"{site}/api/ask", json.dumps(asked).encode(), {"Content-Type": "application/json"}, method="POST"
@@ -125,32 +125,32 @@ def test_an_answer_streams_with_its_history(site: str, room: Room, tmp_path: Pat
     assert len(model.threads - {threading.get_ident()}) == 1, "one thread does all that the model does"
 
 
-def said(room: Room, **asked: Any) -> str:
+def said(session: Session, **asked: Any) -> str:
     """A whole answer."""
 
     async def whole() -> str:
-        return "".join([piece async for piece in await room.stream(Asked(**asked))])
+        return "".join([piece async for piece in await session.stream(Asked(**asked))])
 
     return asyncio.run(whole())
 
 
-def test_an_answer_that_nobody_hears_ends(room: Room) -> None:
-    model: Any = room.model
+def test_an_answer_that_nobody_hears_ends(session: Session) -> None:
+    model: Any = session.model
 
     async def leave() -> None:
         model.paused.clear()
-        pieces: Any = await room.stream(Asked(question="wait " + "on " * 50))
+        pieces: Any = await session.stream(Asked(question="wait " + "on " * 50))
         await anext(pieces)
         await pieces.aclose()
         before = model.made
         model.paused.set()
-        assert await room.work(lambda: model.made) <= before + 1
+        assert await session.work(lambda: model.made) <= before + 1
 
     asyncio.run(leave())
 
 
-def test_an_answer_that_breaks_off_says_so(room: Room) -> None:
-    assert said(room, question="break") == f"break <b>0</b> \n[{Failed()}]"
+def test_an_answer_that_breaks_off_says_so(session: Session) -> None:
+    assert said(session, question="break") == f"break <b>0</b> \n[{Failed()}]"
 
 
 def test_what_is_wrong_comes_back_as_one_line(site: str, tmp_path: Path) -> None:
@@ -175,12 +175,12 @@ def test_what_is_wrong_comes_back_as_one_line(site: str, tmp_path: Path) -> None
     assert call(f"{site}/api/about", "GET")[0] == 200, "the server goes on"
 
 
-def test_a_video_beyond_the_limit_is_refused(site: str, room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_video_beyond_the_limit_is_refused(site: str, session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pipeline.use.demo.MOST_BYTES", 2_000_000)
-    before = set(room.folder.iterdir())
+    before = set(session.folder.iterdir())
     status, answer = call(f"{site}/api/touches/a.mp4", "PUT", bytes(2_000_001))
     assert (status, json.loads(answer)) == (422, {"error": "a.mp4: more than 2 MB; drop a shorter video"})
-    assert set(room.folder.iterdir()) == before, "nothing of it is kept"
+    assert set(session.folder.iterdir()) == before, "nothing of it is kept"
 
 
 def test_other_sites_are_not_let_in(site: str) -> None:
@@ -191,35 +191,35 @@ def test_other_sites_are_not_let_in(site: str) -> None:
 
 def test_old_touches_are_forgotten(tmp_path: Path) -> None:
     model: Any = FakeOctopi()
-    room = Room(model)
-    dropped = [room.folder / str(i) / "rug.mp4" for i in range(MOST_TOUCHES)]
+    session = Session(model)
+    dropped = [session.folder / str(i) / "rug.mp4" for i in range(MOST_TOUCHES)]
     videos = [press(tmp_path / "rug.mp4"), *dropped]
     for video in dropped:
         video.parent.mkdir()
         shutil.copy(videos[0], video)
-    ids = [room.show("rug", video)["id"] for video in videos]
+    ids = [session.show("rug", video)["id"] for video in videos]
     with pytest.raises(UserError, match="forgotten"):
-        said(room, question="{tactile}", touches=ids[:1])
-    assert said(room, question="{tactile}", touches=ids[1:2])
+        said(session, question="{tactile}", touches=ids[:1])
+    assert said(session, question="{tactile}", touches=ids[1:2])
     assert all(video.exists() for video in videos), "a file that the page was not given is not its own"
-    room.show("rug", videos[0])
+    session.show("rug", videos[0])
     assert [video.exists() for video in dropped] == [False] + [True] * (MOST_TOUCHES - 1)
-    room.close()
+    session.close()
 
 
 def test_a_trained_model_is_shown_and_asked(octopi: Octopi, files: list[Path]) -> None:
     """The class itself, of random weights: what the page is given is what it says by itself."""
-    room = Room(octopi)
-    shown = asyncio.run(room.work(lambda: room.show("ice block", files[0])))
+    session = Session(octopi)
+    shown = asyncio.run(session.work(lambda: session.show("ice block", files[0])))
     described = octopi.describe(files[0])
     assert (shown["levels"], shown["probabilities"]) == (described.levels, described.probabilities)
     assert len(shown["frames"]) == len(shown["touched"]) == len(described.frames)
-    first = said(room, question="Soft? {tactile}", touches=[shown["id"]])
+    first = said(session, question="Soft? {tactile}", touches=[shown["id"]])
     assert first == octopi.ask("Soft? {tactile}", files[:1])
     turn = Turn(question="Soft? {tactile}", touches=[shown["id"]], answer=first)
-    again = said(room, question="Why?", history=[turn])
+    again = said(session, question="Why?", history=[turn])
     assert again == octopi.ask("Why?", history=[Exchange("Soft? {tactile}", tuple(files[:1]), first)])
-    room.close()
+    session.close()
 
 
 def test_the_command_shows_it_until_it_is_interrupted(made: Made) -> None:

@@ -58,11 +58,11 @@ def test_the_card_says_what_it_stands_on(made: Made) -> None:
 
 def nudge(data: Path) -> None:
     """Move what was computed by as little as its number format has, as another processor's sums do."""
-    judged = data / "encoder" / "0" / "classifications.parquet"
-    rows = read_table(judged, Classification)
+    classified = data / "encoder" / "0" / "classifications.parquet"
+    rows = read_table(classified, Classification)
     moved = [tuple(np.nextafter(row.probabilities, i % 2).tolist()) for i, row in enumerate(rows)]
     pairs = zip(rows, moved, strict=True)
-    write_table(judged, Classification, [row.model_copy(update={"probabilities": p}) for row, p in pairs])
+    write_table(classified, Classification, [row.model_copy(update={"probabilities": p}) for row, p in pairs])
     (tensors,) = data.glob(f"embeddings/*/{TENSOR_FILE}")
     features = load_tensors(tensors)[TENSOR]
     save_tensors(tensors, {TENSOR: features.nextafter(features.flip(0))})

@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 
 from pipeline.config import FramesConfig
 from pipeline.errors import UserError
+from pipeline.use.frames import prepare_video
 from pipeline.use.media import Gate, Limits, Refused, from_base64
-from pipeline.use.sight import see
 from pipeline.videos.decoding import SUFFIXES, Decoder
 from pipeline.videos.files import video_files
 from tests.closure import ROOT
@@ -67,11 +67,11 @@ def test_a_video_is_one_for_the_server_for_ask_and_in_a_folder(gate: Gate, suffi
         path.write_bytes(videos[0])
     assert video_files(tmp_path)[0] == [named]
     with pytest.raises(UserError, match="no video by its name"):
-        see(other, FRAMES, subtracts=False, quiet=0)
-    asked = see(named, FRAMES, subtracts=False, quiet=0)
+        prepare_video(other, FRAMES, subtracts=False, quiet=0)
+    asked = prepare_video(named, FRAMES, subtracts=False, quiet=0)
     with gate.files(videos) as paths:
         assert [p.read_bytes() for p in paths] == videos
-        served = see(paths[0], FRAMES, subtracts=False, quiet=0)
+        served = prepare_video(paths[0], FRAMES, subtracts=False, quiet=0)
     assert not any(p.parent.exists() for p in paths)
     assert (served.pictures == asked.pictures).all()
 

@@ -15,11 +15,11 @@ from pipeline.encoder.timm_backbone import STAGES
 from pipeline.errors import UserError, readable
 from pipeline.io import tensor_shapes
 from pipeline.records import Encoder, Lora, Opd, Part, Variant
-from pipeline.use import touch
+from pipeline.use import encoding
+from pipeline.use.encoding import VideoEncoder
+from pipeline.use.frames import prepare_video
 from pipeline.use.model import Octopi, with_marks
 from pipeline.use.results import Exchange
-from pipeline.use.sight import see
-from pipeline.use.touch import TactileSense
 from pipeline.videos.decoding import decode
 from tests.conftest import moving_square, refused, write_video
 from tests.use.shared import Made, make, replay
@@ -87,13 +87,15 @@ def test_each_video_is_decoded_once_a_call(
 ) -> None:
     """However many there are, and however little of them is remembered; where they are, one call takes all."""
     seen: list[str] = []
-    monkeypatch.setattr(touch, "see", lambda video, *a, **k: (seen.append(str(video)), see(video, *a, **k))[1])
+    monkeypatch.setattr(
+        encoding, "prepare_video", lambda video, *a, **k: (seen.append(str(video)), prepare_video(video, *a, **k))[1]
+    )
     videos = [tmp_path / f"{i}.avi" for i in range(40)]
     for number, video in enumerate(videos):
         video.write_bytes(files[number % 3].read_bytes())
     octopi.ask_all([("Describe {tactile}.", video) for video in (*videos, *videos)], max_new_tokens=1)
     assert seen == list(map(str, videos))
-    monkeypatch.setattr(touch, "REMEMBERED", 0)
+    monkeypatch.setattr(encoding, "REMEMBERED", 0)
     octopi.look(files[0])
     for call in (octopi.describe_all, lambda given: octopi.rank(given, "hardness")):
         seen.clear()
@@ -296,8 +298,8 @@ def test_a_little_touch_and_a_damaged_video_are_noted(
     assert octopi.look(files[0]).notes == ()
     strength = octopi.look(files[0]).strength
     quiet = octopi.config.model_copy(update={"quiet": 0.8 * strength})
-    weak = TactileSense(made.folder, quiet, octopi.catalogue, octopi.sense.device)
-    assert [n.partition(":")[0] for n in weak.feel(files[0]).notes] == ["little touches the sensor"]
+    weak = VideoEncoder(made.folder, quiet, octopi.catalogue, octopi.encoder.device)
+    assert [n.partition(":")[0] for n in weak.encode(files[0]).notes] == ["little touches the sensor"]
     compared = octopi.compare(files[0], cut, "hardness")
     assert [n.partition(": ")[0] for n in compared.notes] == [str(cut)]
     assert "damaged" in compared.notes[0]
@@ -307,7 +309,7 @@ def test_a_model_on_random_weights_says_so(octopi: Octopi, made: Made, files: li
     assert octopi.notes(files[:2]) == octopi.doubts == ()
     base = octopi.config.base.model_copy(update={"folder": "data/weights/tiny-llama"})
     config = octopi.config.model_copy(update={"base": base})
-    random = Octopi(made.folder, config, octopi.catalogue, octopi.llm, octopi.sense.device)
+    random = Octopi(made.folder, config, octopi.catalogue, octopi.llm, octopi.encoder.device)
     assert random.notes(files[:1]) == random.describe(files[0]).notes == random.doubts
     assert "tiny and random" in random.doubts[0]
     assert repr(random).startswith("Octopi(finetuned-with-all-0, base data/weights/tiny-llama, trained on ")

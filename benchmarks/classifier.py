@@ -1,4 +1,4 @@
-"""What frames and contact models are judged by: a frozen EfficientNet-lite0 and the chain's own frame heads."""
+"""What frames and contact models are compared by: a frozen EfficientNet-lite0 and the chain's own frame heads."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a trained model feels of a video: embeddings for its language model, and what its property heads say."""
+"""The encoder of a trained model: from a video to embeddings for its language model, and to classes by its heads."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from pipeline.io import fingerprint
 from pipeline.records import Encoder
 from pipeline.training.trainable import load_trainable
 from pipeline.use.folder import BACKBONE_DIR, CONFIG, ENCODER_DIR, SCENES, TRAINED, ModelConfig, distance
+from pipeline.use.frames import PreparedVideo, prepare_video
 from pipeline.use.results import Video
-from pipeline.use.sight import Seen, see
 from pipeline.videos.catalogue import Catalogue
 
 REMEMBERED = 2**28
 """Bytes of pictures that are kept, so that a conversation about them goes on at once: some 150 videos at 224 pixels."""
 
 
-class Felt(NamedTuple):
+class EncodedVideo(NamedTuple):
     """A video as the language model is given it."""
 
-    seen: Seen
+    prepared: PreparedVideo
     features: torch.Tensor
     """float32, frames x dim."""
     notes: tuple[str, ...]
@@ -42,11 +42,11 @@ class Felt(NamedTuple):
     @property
     def size(self) -> int:
         """Bytes of its pictures."""
-        touch = self.seen.touch
+        touch = self.prepared.touch
         return touch.frames.nbytes + touch.reference.nbytes + touch.difference.nbytes
 
 
-class Judgement(NamedTuple):
+class Classified(NamedTuple):
     """What the heads say, each by the catalogue's order of properties."""
 
     probabilities: tuple[tuple[float, ...], ...]
@@ -55,7 +55,7 @@ class Judgement(NamedTuple):
     """The classes that they take."""
 
 
-class TactileSense:
+class VideoEncoder:
     """The tactile encoder and heads of a folder, with what embeddings are standardised by."""
 
     def __init__(self, folder: Path, config: ModelConfig, catalogue: Catalogue, device: torch.device) -> None:
@@ -65,36 +65,38 @@ class TactileSense:
             raise UserError(
                 f"{folder / CONFIG}: its frame settings are not those of training; copy the whole folder again"
             )
-        self._felt: OrderedDict[str, Felt] = OrderedDict()
+        self._encoded: OrderedDict[str, EncodedVideo] = OrderedDict()
 
     @torch.inference_mode()
-    def feel(self, video: Video) -> Felt:
+    def encode(self, video: Video) -> EncodedVideo:
         """A video's frames and their embeddings; UserError for what is no video, is damaged as a whole or too short."""
         name, config = _name(video), self.config
-        if name not in self._felt:
-            seen = see(video, config.frames, subtracts=config.encoder.reference == "subtract", quiet=config.quiet)
-            raw = self._encoder(*self._frames(seen)).float().cpu()
+        if name not in self._encoded:
+            prepared = prepare_video(
+                video, config.frames, subtracts=config.encoder.reference == "subtract", quiet=config.quiet
+            )
+            raw = self._encoder(*self._frames(prepared)).float().cpu()
             if not raw.isfinite().all():
-                raise UserError(f"{seen.name}: its embedding is not finite; check the video")
+                raise UserError(f"{prepared.name}: its embedding is not finite; check the video")
             standard = standardize(raw, self.statistics)
             features = standard if config.encoder.standardize else raw
-            self._felt[name] = Felt(seen, features, (*seen.touch.notes, *self._unlike(standard)))
-        self._felt.move_to_end(name)
-        while len(self._felt) > 1 and sum(felt.size for felt in self._felt.values()) > REMEMBERED:
-            self._felt.popitem(last=False)
-        return self._felt[name]
+            self._encoded[name] = EncodedVideo(prepared, features, (*prepared.touch.notes, *self._unlike(standard)))
+        self._encoded.move_to_end(name)
+        while len(self._encoded) > 1 and sum(encoded.size for encoded in self._encoded.values()) > REMEMBERED:
+            self._encoded.popitem(last=False)
+        return self._encoded[name]
 
     @torch.inference_mode()
-    def judge(self, video: Video) -> Judgement:
+    def classify(self, video: Video) -> Classified:
         """What the property heads say of a video."""
-        frames, numbers = self._frames(self.feel(video).seen)
+        frames, numbers = self._frames(self.encode(video).prepared)
         logits = self._classifier(frames[None], numbers[None])["logits"].cpu()
         parts = logits.double().split([len(p.levels) for p in self.catalogue.properties], dim=1)
         probabilities = (
             rescale(part.softmax(1)[0].numpy(), self.config.temperatures[p.name]).tolist()
             for part, p in zip(parts, self.catalogue.properties, strict=True)
         )
-        return Judgement(tuple(map(tuple, probabilities)), tuple(self._classifier.decide(logits)[0].tolist()))
+        return Classified(tuple(map(tuple, probabilities)), tuple(self._classifier.decide(logits)[0].tolist()))
 
     def _unlike(self, standard: torch.Tensor) -> tuple[str, ...]:
         far, usual = distance(standard.double().numpy()), self.config.usual
@@ -102,8 +104,10 @@ class TactileSense:
             return ()
         return (f"unlike training: {far:.1f} deviations from its mean, where its own videos reach {usual:.1f}",)
 
-    def _frames(self, seen: Seen) -> tuple[torch.Tensor, torch.Tensor]:
-        return torch.from_numpy(seen.pictures).to(self.device), torch.tensor(seen.touch.numbers, device=self.device)
+    def _frames(self, prepared: PreparedVideo) -> tuple[torch.Tensor, torch.Tensor]:
+        return torch.from_numpy(prepared.pictures).to(self.device), torch.tensor(
+            prepared.touch.numbers, device=self.device
+        )
 
     @property
     def _own(self) -> EncoderConfig:

@@ -31,18 +31,18 @@ FPS = 25
 
 
 @dataclass(frozen=True)
-class Seen:
+class PreparedVideo:
     """A video as it is shown to a model."""
 
     name: str
     touch: Touch
     pictures: Pictures
     """What the encoder takes: the frames, or their differences to the reference."""
-    felt: bool
+    touched: bool
     """Whether anything touches the sensor."""
 
 
-def see(video: Video, frames: FramesConfig, *, subtracts: bool, quiet: float) -> Seen:
+def prepare_video(video: Video, frames: FramesConfig, *, subtracts: bool, quiet: float) -> PreparedVideo:
     """Decode a video, choose its frames and say what they show.
 
     Args:
@@ -64,8 +64,8 @@ def see(video: Video, frames: FramesConfig, *, subtracts: bool, quiet: float) ->
     difference = subtract(pictures, found.reference)
     beyond = np.abs(difference.astype(np.int16) - MIDDLE).max(axis=3) > GAIN * TOUCHED
     notes, probe = [], found.probe
-    felt = probe.contact > quiet
-    if not felt:
+    touched = probe.contact > quiet
+    if not touched:
         notes.append(f"nothing touches the sensor: strength {probe.contact:.2f}, where noise alone has {quiet:.2f}")
     elif probe.contact <= FOUND * quiet:
         notes.append(f"little touches the sensor: strength {probe.contact:.2f}, where noise alone has {quiet:.2f}")
@@ -84,7 +84,7 @@ def see(video: Video, frames: FramesConfig, *, subtracts: bool, quiet: float) ->
         strength=probe.contact,
         notes=tuple(notes),
     )
-    return Seen(name, touch, difference if subtracts else pictures, felt)
+    return PreparedVideo(name, touch, difference if subtracts else pictures, touched)
 
 
 @contextmanager
