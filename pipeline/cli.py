@@ -54,7 +54,8 @@ def octopi(version: Annotated[bool, typer.Option("--version", help="Say the vers
 @app.command()
 def scale(
     name: Annotated[
-        str, typer.Argument(help="smoke, small, invented, paper-7b or paper-13b (or a file you added to conf/).")
+        str,
+        typer.Argument(help="smoke, small, invented, finetune, paper-7b or paper-13b (or a file you added to conf/)."),
     ],
     overrides: Annotated[list[str] | None, typer.Argument(help="key=value, for example split.name=kfold.")] = None,
     plan: Annotated[bool, typer.Option("--plan", help="Say what it would take, and write nothing.")] = False,
