@@ -230,6 +230,8 @@ def left_to_users(reports: Iterable[Report]) -> list[Gap]:
 
 
 def _paper(reports: dict[str, Report], *, every: bool) -> Markup:
+    if not reports:
+        return Markup()
     frame, title = side_by_side(reports, every=every), f"{'Every row' if every else 'Five tasks'} of the paper"
     return draw_table(frame, title, "*/scores.csv", at_lines=False) if len(frame) else Markup()
 
