@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args
 import typer
 from typer.core import TyperGroup
 
-from pipeline.errors import UserError
+from pipeline.errors import UserError, counted
 
 if TYPE_CHECKING:
     from pipeline.records import Finding
@@ -220,7 +220,7 @@ def video(
         written = cut_listed(file, out, fps)
     else:
         written = cut(lambda: film(file, fps), str(file), out, object_id or file.stem, times, whole=whole)
-    typer.echo(f"{len(written)} videos in {out}: {', '.join(path.name for path in written)}")
+    typer.echo(f"{counted(len(written), 'video')} in {out}: {', '.join(path.name for path in written)}")
 
 
 def _show(findings: Sequence[Finding]) -> None:
@@ -319,12 +319,12 @@ def ask(
         for piece in asked.stream(question, videos or ()):
             say(piece)
         say("\n")
-        _doubt(asked.notes(videos or ()))
+        _doubt(asked.notes(videos or (), question))
 
 
 @app.command()
 def describe(
-    videos: Annotated[Path, typer.Argument(help="A video, or a folder with videos.")],
+    videos: Annotated[list[Path], typer.Argument(help="Videos, or folders with videos.")],
     csv: Annotated[
         Path | None, typer.Option(help="Write a row each to this file; a second call goes on in it.")
     ] = None,
@@ -332,7 +332,7 @@ def describe(
     base: Annotated[Path | None, BASE] = None,
     device: Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")] = "auto",
 ) -> None:
-    """Describe a video, or every video of a folder: classes with probabilities, the model's sentence, notes."""
+    """Describe videos, and every video of folders: classes with probabilities, the model's sentence, notes."""
     from pipeline.use.ask import describe_folder, described
 
     asked = _load(model, base, device)
@@ -345,7 +345,9 @@ def describe(
         return
     rows, failed = describe_folder(asked, videos, csv)
     lacking = f", {failed} of them not described (column error; delete their rows to try them again)" if failed else ""
-    typer.echo(f"{csv}: {rows} videos{lacking}")
+    typer.echo(f"{csv}: {counted(rows, 'video')}{lacking}")
+    if failed == rows:
+        raise typer.Exit(1)
 
 
 @app.command()
@@ -371,8 +373,10 @@ def rank(
     base: Annotated[Path | None, BASE] = None,
     device: Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")] = "auto",
 ) -> None:
-    """Order videos by a property, least first, each with its expected class (0 is the lowest)."""
+    """Order videos by a property, least first, each with its expected class, and ask the model about two or three."""
     found = _load(model, base, device).rank(videos, property)
+    classes = ", ".join(f"{number} {level}" for number, level in enumerate(found.levels))
+    typer.echo(f"{found.property} by the property heads: {classes}")
     for place in found.order:
         typer.echo(f"{found.expected[place]:.2f}  {videos[place]}")
     if found.answer:
@@ -383,16 +387,24 @@ def rank(
 @app.command()
 def match(
     videos: Annotated[list[str], typer.Argument(help="Two or three videos.")],
-    names: Annotated[str, typer.Option(help="As many objects of the model's catalogue, names or ids, with commas.")],
+    names: Annotated[
+        str,
+        typer.Option(
+            help="As many objects: 'a mug: hard, smooth, no bumps; a rug: soft, rough, no bumps', "
+            "or names or ids of the model's catalogue, with commas."
+        ),
+    ],
     model: Annotated[Path | None, MODEL] = None,
     base: Annotated[Path | None, BASE] = None,
     device: Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")] = "auto",
 ) -> None:
-    """Say which video is of which object."""
-    found = _load(model, base, device).match(videos, [name.strip() for name in names.split(",")])
+    """Say which video is of which object: by the property heads, and in the model's own words."""
+    from pipeline.use.ask import named_objects
+
+    found = _load(model, base, device).match(videos, named_objects(names))
+    for video, name in zip(videos, found.heads, strict=True):
+        typer.echo(f"{video}: {name} (by the property heads)")
     typer.echo(found.answer)
-    for video, name in zip(videos, found.names or (), strict=False):
-        typer.echo(f"{video}: {name}")
     _doubt(found.notes)
 
 

@@ -38,6 +38,11 @@ def readable(text: str) -> str:
     return text.encode("utf-8", "backslashreplace").decode()
 
 
+def counted(number: int, noun: str) -> str:
+    """ "1 video", "2 videos"."""
+    return f"{number} {noun}{'s' * (number != 1)}"
+
+
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """A question about the closest known name, with a blank behind it; empty where none is close."""
     close = difflib.get_close_matches(name, list(known), n=1)

@@ -67,6 +67,24 @@ def read(answer: str, names: Sequence[str]) -> dict[str, int] | None:
     return found if whole else None
 
 
+def nearest(classes: Classes, catalogue: Catalogue, objects: Iterable[str] | None = None) -> tuple[str, ...]:
+    """The ids, one a video, whose classes are off by the fewest steps; of those, whose mean classes are nearest.
+
+    Args:
+        objects: Ids to match, as many as there are videos; by default all of the catalogue.
+    """
+
+    def distance(order: Sequence[str]) -> tuple[float, ...]:
+        pairs = [
+            (said, label)
+            for video, o in zip(classes, order, strict=True)
+            for said, label in zip(video, catalogue.labels(o), strict=True)
+        ]
+        return tuple(sum(abs(said[i] - label) for said, label in pairs) for i in (0, 1))
+
+    return min(itertools.permutations(sorted(catalogue.objects if objects is None else objects)), key=distance)
+
+
 def verdict(catalogue: Catalogue, objects: Sequence[str]) -> str:
     """The conclusion in words, for three object ids in the order of their videos."""
     names = [f"{letter}) is {catalogue.objects[o].name}" for letter, o in zip(LETTERS, objects, strict=True)]
@@ -115,17 +133,8 @@ class PropertyObjectMatching(TaskDefinition):
         return before_concluding(draft, " ".join(f"{x}) {''.join(fact(catalogue, o))}" for x, o in told))
 
     def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str:
-        """The matching whose classes are off by the fewest steps; of those, the one whose mean classes are nearest."""
-
-        def distance(objects: Sequence[str]) -> tuple[float, ...]:
-            pairs = [
-                (said, label)
-                for video, o in zip(classes, objects, strict=True)
-                for said, label in zip(video, catalogue.labels(o), strict=True)
-            ]
-            return tuple(sum(abs(said[i] - label) for said, label in pairs) for i in (0, 1))
-
-        return verdict(catalogue, min(itertools.permutations(sorted(question.objects)), key=distance))
+        """The matching that `nearest` finds."""
+        return verdict(catalogue, nearest(classes, catalogue, question.objects))
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         """Read from "a) is NAME": each letter must name exactly one option, and no option twice."""

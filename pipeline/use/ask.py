@@ -40,7 +40,7 @@ def answer_once(model: Octopi, question: str, videos: Sequence[str]) -> dict[str
     answer = model.ask(question, videos)
     looked = [model.look(video) for video in videos]
     return {
-        "notes": model.doubts,
+        "notes": model.doubts_about(question, len(videos)),
         "model": model.name,
         "question": question,
         "videos": [
@@ -132,8 +132,16 @@ class Chat:
             self.say("no video yet: /add FILE\n")
 
 
-def describe_folder(model: Octopi, folder: Path, out: Path) -> tuple[int, int]:
-    """Describe a video, or every one of a folder and its subfolders, in a CSV file, a row each; a second call goes on.
+def named_objects(text: str) -> list[str] | dict[str, list[str]]:
+    """What `--names` says: "NAME, NAME" of a catalogue, or names with classes, "NAME: CLASS, CLASS; NAME: ..."."""
+    if ":" not in text:
+        return [name.strip() for name in text.split(",")]
+    told = [part.partition(":") for part in text.split(";") if part.strip()]
+    return {name.strip(): [c.strip() for c in classes.split(",")] for name, _, classes in told}
+
+
+def describe_folder(model: Octopi, paths: Sequence[Path], out: Path) -> tuple[int, int]:
+    """Describe videos, and every one of folders and their subfolders, in a CSV file, a row each; a second call goes on.
 
     Returns:
         How many rows the file has, and how many of them are videos that could not be described (column `error`).
@@ -141,18 +149,18 @@ def describe_folder(model: Octopi, folder: Path, out: Path) -> tuple[int, int]:
     Raises:
         UserError: for a folder without videos, or a file that another model or something else wrote.
     """
-    files, folder = _files(folder)
+    files = _files(paths)
     levels = {p.name: p.levels for p in model.catalogue.properties}
     probabilities = [f"{name}: {level}" for name, known in levels.items() for level in known]
     columns = ["file", *levels, *probabilities, "sentence", "frames", "notes", "error", "model"]
     done = _done(out, columns, model.config.name)
-    rest = [f for f in files if _named(f, folder) not in done]
+    rest = [(file, name) for file, name in files if name not in done]
     failed = sum(bool(error) for error in done.values())
     if not out.is_file() or not done:
         write_text(out, _row(columns))
     with progress(len(rest), "describe", "video") as advance:
         for start in range(0, len(rest), BATCH):
-            rows = _describe(model, folder, rest[start : start + BATCH])
+            rows = _describe(model, rest[start : start + BATCH])
             with out.open("a", encoding="utf-8", newline="") as stream:
                 stream.write("".join(_row([row.get(column, "") for column in columns]) for row in rows))
             failed += sum(bool(row.get("error")) for row in rows)
@@ -161,34 +169,43 @@ def describe_folder(model: Octopi, folder: Path, out: Path) -> tuple[int, int]:
     return len(done) + len(rest), failed
 
 
-def described(model: Octopi, folder: Path) -> tuple[Table, list[str]]:
-    """A table for a terminal, of a video or of all of a folder: each class with its probability, and the sentence.
+def described(model: Octopi, paths: Sequence[Path]) -> tuple[Table, list[str]]:
+    """A table for a terminal, of videos and all those of folders: each class with its probability, and the sentence.
 
     Returns:
         The table, and what should make one doubt it: notes, and errors of videos that could not be described.
+
+    Raises:
+        UserError: the first video's error, where none could be described.
     """
-    files, folder = _files(folder)
+    files = _files(paths)
     table = Table("video", *model.properties, "in words")
-    notes = [*model.doubts]
+    notes, errors = [*model.doubts], list[str]()
     for start in range(0, len(files), BATCH):
-        for row in _describe(model, folder, files[start : start + BATCH]):
+        for row in _describe(model, files[start : start + BATCH]):
             found = [(row.get(p), row.get(f"{p}: {row.get(p)}")) for p in model.properties]
             cells = [f"{level} ({share:.0%})" if level else "" for level, share in found]
             table.add_row(*map(escape, (str(row["file"]), *cells, str(row.get("sentence", "")))))
-            notes += [f"{row['file']}: {row[key]}" for key in ("error", "notes") if row.get(key)]
-    return table, notes
+            notes += [f"{row['file']}: {row['notes']}"] if row.get("notes") else []
+            errors += [str(row["error"])] if row.get("error") else []
+    if len(errors) == len(files):
+        raise UserError(f"{errors[0]}{f' (nor was any of {len(errors) - 1} more described)' if errors[1:] else ''}")
+    return table, [*errors, *notes]
 
 
-def _files(folder: Path) -> tuple[list[Path], Path]:
-    """The videos that a path names, and the folder that their names are told from."""
-    if folder.is_file():
-        return [folder], folder.parent
-    files, findings = video_files(folder)
-    for finding in findings:
-        log.warning("%s: %s", finding.item, finding.measured)
-    if not files:
-        raise UserError(f"{folder}: holds no video ({', '.join(SUFFIXES)}); name another folder")
-    return files, folder
+def _files(paths: Sequence[Path]) -> list[tuple[Path, str]]:
+    """The videos that paths name, each as a row calls it: from the one folder that is named, else by its whole path."""
+    found: list[tuple[Path, str]] = []
+    for path in paths:
+        files, findings = ([path], []) if path.is_file() else video_files(path)
+        for finding in findings:
+            log.warning("%s: %s", finding.item, finding.measured)
+        if not files:
+            raise UserError(f"{path}: holds no video ({', '.join(SUFFIXES)}); name another folder")
+        start = path.parent if path.is_file() else path
+        named = files if paths[1:] else [file.relative_to(start) for file in files]
+        found += zip(files, [readable(name.as_posix()) for name in named], strict=True)
+    return found
 
 
 def _done(out: Path, columns: Sequence[str], name: str) -> dict[str, str]:
@@ -206,11 +223,11 @@ def _done(out: Path, columns: Sequence[str], name: str) -> dict[str, str]:
     return {row["file"]: row["error"] for row in rows}
 
 
-def _describe(model: Octopi, folder: Path, files: Sequence[Path]) -> list[dict[str, object]]:
+def _describe(model: Octopi, files: Sequence[tuple[Path, str]]) -> list[dict[str, object]]:
     rows: list[dict[str, object]] = []
     good = []
-    for file in files:
-        row: dict[str, object] = {"file": _named(file, folder), "model": model.config.name}
+    for file, name in files:
+        row: dict[str, object] = {"file": name, "model": model.config.name}
         rows.append(row)
         try:
             model.look(file)
@@ -224,10 +241,6 @@ def _describe(model: Octopi, folder: Path, files: Sequence[Path]) -> list[dict[s
         row |= {"sentence": " ".join(found.sentence.split()), "frames": " ".join(map(str, found.frames))}
         row["notes"] = "; ".join(note for note in found.notes if note not in model.doubts)
     return rows
-
-
-def _named(file: Path, folder: Path) -> str:
-    return readable(file.relative_to(folder).as_posix())
 
 
 def _row(cells: Iterable[object]) -> str:

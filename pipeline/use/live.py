@@ -132,7 +132,7 @@ def run(model: Octopi, camera: str, question: str, say: Callable[[str], object],
         rate = f"{(len(press) - 1) / seconds:.1f} a second" if seconds > 0 else "at once"
         try:
             if question:
-                said, notes = model.ask(question, [video]), model.notes([video])
+                said, notes = model.ask(question, [video]), model.notes([video], question)
             else:
                 found = model.describe(video)
                 levels = (

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from pipeline.config import LANGUAGE_DIR, LanguageConfig
-from pipeline.errors import UserError, did_you_mean, readable
+from pipeline.errors import UserError, counted, did_you_mean, readable
 from pipeline.language.chat import TACTILE, TACTILE_TOKENS
 from pipeline.language.generate import reply, stream, write_prompt
 from pipeline.language.octopi import OctopiForCausalLM
@@ -32,9 +32,11 @@ from pipeline.tasks.base import LETTERS
 from pipeline.use.encoding import EncodedVideo, VideoEncoder
 from pipeline.use.folder import SHIPPED, ModelConfig, chat_sample, find_base, read_folder
 from pipeline.use.results import Choice, Comparison, Description, Exchange, Matching, Ranking, Touch, Video
-from pipeline.videos.catalogue import Catalogue, Property
+from pipeline.videos.catalogue import Catalogue, Object, Property
 from pipeline.weights import is_tiny
 
+ALONE = "the question compares, but there is one video: what it says of another is made up"
+APART = "the sentence and the property heads disagree; heads alone are right more often (the card has both)"
 RANDOM = "its base models are tiny and random, made to test the chain: no answer of it means anything"
 
 logger = logging.getLogger(__name__)
@@ -159,10 +161,17 @@ class Octopi:
         encoded = self.encoder.encode(video)
         return encoded.prepared.touch.model_copy(update={"notes": encoded.notes})
 
-    def notes(self, videos: Video | Sequence[Video] = ()) -> tuple[str, ...]:
-        """What should make one doubt an answer: of the model itself, then of each video, behind its name."""
+    def notes(self, videos: Video | Sequence[Video] = (), question: str = "") -> tuple[str, ...]:
+        """What should make one doubt an answer: of the model itself, of the question, then of each named video."""
         found = [self.encoder.encode(video) for video in _listed(videos)]
-        return (*self.doubts, *(f"{encoded.prepared.name}: {note}" for encoded in found for note in encoded.notes))
+        seen = (f"{encoded.prepared.name}: {note}" for encoded in found for note in encoded.notes)
+        return (*self.doubts_about(question, len(found)), *seen)
+
+    def doubts_about(self, question: str, videos: int) -> tuple[str, ...]:
+        """`doubts`, and that a question compares where there is only one video."""
+        words = {word for p in self.catalogue.properties for word in (p.more, p.less, p.most, p.least)}
+        compares = any(word in question.lower() for word in ("which", *words))
+        return (*self.doubts, *((ALONE,) if compares and videos == 1 else ()))
 
     # ---- the tasks ----
 
@@ -198,15 +207,14 @@ class Octopi:
             UserError: for fewer than two videos, or one in which nothing is touched.
         """
         if len(videos) < 2:
-            raise UserError(f"{len(videos)} videos: two or more can be ranked")
+            raise UserError(f"{counted(len(videos), 'video')}: two or more can be ranked")
         known = self._property(property)
         place = self.properties.index(known.name)
         expected: list[float] = []
         notes: list[str] = []
         for video in videos:  # All of a video at once, as not all may be remembered.
             self._touched(video)
-            probabilities = self.encoder.classify(video).probabilities[place]
-            expected.append(sum(level * p for level, p in enumerate(probabilities)))
+            expected.append(self._classes(video)[place][1])
             notes += self.notes(video)[len(self.doubts) :]
         answer, most = "", None
         if len(videos) == 3:
@@ -218,8 +226,11 @@ class Octopi:
             answer = compared.answer
             most = {"yes": 0, "no": 1}.get(compared.choice or "")
         order = sorted(range(len(videos)), key=expected.__getitem__)
+        if most is not None and most != order[-1]:
+            notes.append(APART)
         return Ranking(
             property=known.name,
+            levels=known.levels,
             order=tuple(order),
             expected=tuple(expected),
             answer=answer,
@@ -227,39 +238,44 @@ class Octopi:
             notes=(*self.doubts, *notes),
         )
 
-    def match(self, videos: Sequence[Video], names: Sequence[str]) -> Matching:
-        """Which of two or three videos is of which of as many objects of the catalogue, by their names or ids.
+    def match(self, videos: Sequence[Video], names: Sequence[str] | Mapping[str, Sequence[str]]) -> Matching:
+        """Which of two or three videos is of which of as many objects.
 
         It was trained to match three; for two a note says so.
+
+        Args:
+            names: Names or ids of objects of the catalogue; or any names, each with its class of every property.
         """
         if len(videos) != len(names) or len(videos) not in (2, 3):
-            raise UserError(f"{len(videos)} videos and {len(names)} names: two or three of each can be matched")
-        found = [self._object(name) for name in names]
-        if len(set(found)) < len(found):
+            given = f"{counted(len(videos), 'video')} and {counted(len(names), 'name')}"
+            raise UserError(f"{given}: two or three of each can be matched")
+        if isinstance(names, Mapping):
+            objects = [self._told(name, classes) for name, classes in names.items()]
+        else:
+            objects = [self._object(name) for name in names]
+        found = {o.object_id: o for o in sorted(objects, key=lambda o: o.name.lower())}
+        if len(found) < len(names):
             raise UserError(f"{', '.join(names)}: a name is given twice; name {len(names)} objects")
-        known = {
-            i: self.catalogue.objects[i].name
-            for i in sorted(found, key=lambda i: self.catalogue.objects[i].name.lower())
-        }
-        listed = list(known.values())
+        listed = [o.name for o in found.values()]
+        catalogue = Catalogue(language=self.catalogue.language, objects=found)
         question = pom.asked(pom.OPENINGS[len(listed) == 2], listed)[self.config.opd]
-        if self.config.facts:
-            told = pom.facts(self.catalogue, known, random.Random(derive_seed("facts", *listed)))
-            question = f"{told} {question}"
+        if self.config.facts or isinstance(names, Mapping):
+            facts = pom.facts(catalogue, found, random.Random(derive_seed("facts", *listed)))
+            question = f"{facts} {question}"
         answer = self.ask(question, videos)
         read = pom.read(answer, listed)
+        said = None if read is None else tuple(listed[read[letter]] for letter in LETTERS[: len(listed)])
+        nearest = pom.nearest([self._classes(video) for video in videos], catalogue)
+        heads = tuple(found[i].name for i in nearest)
         untrained = () if len(listed) == 3 else ("it was trained to match three videos, not two",)
-        return Matching(
-            question=question,
-            answer=answer,
-            names=None if read is None else tuple(listed[read[letter]] for letter in LETTERS[: len(listed)]),
-            notes=(*untrained, *self.notes(videos)),
-        )
+        apart = (APART,) if said not in (None, heads) else ()
+        notes = (*untrained, *apart, *self.notes(videos))
+        return Matching(question=question, answer=answer, names=said, heads=heads, notes=notes)
 
     def scenario(self, question: str, videos: Sequence[Video]) -> Choice:
         """Which of two videos suits a situation better, described first where the variant describes."""
         if len(videos) != 2:
-            raise UserError(f"{len(videos)} videos: a situation chooses between two")
+            raise UserError(f"{counted(len(videos), 'video')}: a situation chooses between two")
         aspects = " and ".join(p.spoken for p in self.catalogue.properties)
         history: list[Exchange] = []
         for number, turn in enumerate(psr.asked(question, aspects)[self.config.opd]):
@@ -291,6 +307,8 @@ class Octopi:
                 f"the conversation takes {len(prompt)} tokens, but the language model reads {positions} with the "
                 "answer; shorten the question, or begin a new conversation"
             )
+        if not any(exchange.videos for exchange in conversation):
+            raise UserError("the question comes without a video, so any touch would be made up; give one or more")
         features = [torch.zeros(0, self.llm.octopi_config.tactile_dim)]
         for video in (v for exchange in conversation for v in exchange.videos):
             encoded = self.encoder.encode(video) if untouched else self._touched(video)
@@ -315,15 +333,34 @@ class Octopi:
             notes=(*self.doubts, *encoded.notes, *(silent if self.config.opd is Opd.NONE else ())),
         )
 
-    def _object(self, name: str) -> str:
-        """The id of an object that is named by its name or its id."""
-        if name in self.catalogue.objects:
-            return name
-        ids = {o.name.lower(): i for i, o in self.catalogue.objects.items()}
-        if name.lower() not in ids:
-            hint = did_you_mean(name.lower(), [*ids, *self.catalogue.objects])
-            raise UserError(f"{name}: the catalogue has no such object; {hint}its objects.csv lists all")
-        return ids[name.lower()]
+    def _classes(self, video: Video) -> list[tuple[int, float]]:
+        """What the heads take a video for: a class and a mean class of each property."""
+        found = self.encoder.classify(video)
+        means = (sum(level * p for level, p in enumerate(each)) for each in found.probabilities)
+        return list(zip(found.levels, means, strict=True))
+
+    def _object(self, name: str) -> Object:
+        """The object of the catalogue that is named by its name or its id."""
+        objects = self.catalogue.objects
+        known = {o.name.lower(): o for o in objects.values()} | objects
+        for key in (name, name.lower()):
+            if key in known:
+                return known[key]
+        hint = did_you_mean(name.lower(), known)
+        raise UserError(
+            f"{name}: the model's catalogue has no such object; {hint}tell what it is like ({self._example()})"
+        )
+
+    def _told(self, name: str, classes: Sequence[str]) -> Object:
+        """An object of the caller's, by its classes in the order of the properties."""
+        levels = [p.levels for p in self.catalogue.properties]
+        if len(classes) != len(levels) or any(c not in known for c, known in zip(classes, levels, strict=True)):
+            raise UserError(f"{name} ({', '.join(classes)}): write a class of every property ({self._example()})")
+        ratings = tuple((known.index(c),) for c, known in zip(classes, levels, strict=True))
+        return Object(object_id=name.lower(), name=name, splits={}, ratings=ratings)
+
+    def _example(self) -> str:
+        return "NAME: " + ", ".join("|".join(p.levels) for p in self.catalogue.properties)
 
     def _property(self, name: str) -> Property:
         for known in self.catalogue.properties:
@@ -354,7 +391,8 @@ def with_marks(question: str, videos: int) -> str:
         raise UserError("the question is no text in UTF-8; write it anew")
     if marks != videos:
         raise UserError(
-            f"the question has {marks} {TACTILE} for {videos} videos; write one for each, in their order, or none"
+            f"the question has {marks} {TACTILE} for {counted(videos, 'video')}; write one for each, in their order, "
+            "or none"
         )
     for token in TACTILE_TOKENS:
         if token in question:

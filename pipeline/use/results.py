@@ -75,6 +75,8 @@ class Ranking(Record):
     """Videos from least to most of a property."""
 
     property: str
+    levels: tuple[str, ...]
+    """The property's classes, least first."""
     order: tuple[int, ...]
     """Places in the list of videos, from 0, by the heads' expected class, smallest first."""
     expected: tuple[float, ...]
@@ -93,6 +95,8 @@ class Matching(Record):
     answer: str
     names: tuple[str, ...] | None
     """The name that the answer gives each video, in the videos' order; None where it cannot be read."""
+    heads: tuple[str, ...]
+    """The names by the property heads and no language model: the matching whose classes are off by the fewest steps."""
     notes: tuple[str, ...]
 
 

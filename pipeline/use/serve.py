@@ -110,7 +110,7 @@ class Service:
             pieces = self.model.stream(last.question, last.videos, history=history, max_new_tokens=most)
             notes.extend(
                 PLACE.sub(r"video \1", note)
-                for note in self.model.notes([v for e in (*history, last) for v in e.videos])
+                for note in self.model.notes([v for e in (*history, last) for v in e.videos], last.question)
             )
             return pieces
 

@@ -54,7 +54,7 @@ class Tab:
         """Wait until an expression is true."""
         end = time.monotonic() + HUNG
         while not self.run(f"!!({script})"):
-            said = self.run("document.body.innerText")
+            said = self.run("document.body?.innerText")
             assert time.monotonic() < end, f"never true: {script}; the page says {said!r}"
             time.sleep(0.1)
 

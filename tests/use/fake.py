@@ -32,7 +32,7 @@ class FakeOctopi:
         self.asked = 0
         self.gate: threading.Event | None = None
 
-    def notes(self, videos: Sequence[Any]) -> tuple[str, ...]:
+    def notes(self, videos: Sequence[Any], question: str = "") -> tuple[str, ...]:
         """As the real one's: behind the name of a file."""
         return tuple(f"{video}: little touches the sensor" for video in videos)
 

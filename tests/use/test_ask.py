@@ -21,6 +21,7 @@ from tests.report.shared import rows_of
 from tests.use.shared import Made
 
 QUESTION = "Describe {tactile}."
+OWN = "mug: hard, smooth, no bumps; rug: soft, rough, no bumps"
 
 
 def test_an_answer_for_machines_however_long_it_takes(
@@ -41,11 +42,13 @@ def test_an_answer_for_machines_however_long_it_takes(
     assert (said.out, said.err) == ("", "work: piece 1 of 1, 0 s left\n")
 
 
-def test_a_question_may_be_longer_than_a_files_name(made: Made, octopi: Octopi) -> None:
-    question = "Why? " * 60
-    said = CliRunner().invoke(app, ["ask", question, "--model", str(made.folder), "--device", "cpu"])
+def test_a_question_may_be_longer_than_a_files_name(made: Made, octopi: Octopi, files: list[Path]) -> None:
+    question = "Which is it? " * 20
+    said = CliRunner().invoke(app, ["ask", question, str(files[0]), "--model", str(made.folder), "--device", "cpu"])
     assert said.exit_code == 0, said.output
-    assert said.stdout == octopi.ask(question) + "\n"
+    assert said.stdout == octopi.ask(question, files[:1]) + "\n"
+    assert "compares, but there is one video" in said.stderr
+    assert octopi.doubts_about(question, 2) == octopi.doubts_about("Describe it.", 1) == octopi.doubts
 
 
 def test_a_chat_from_standard_input(made: Made, octopi: Octopi, files: list[Path]) -> None:
@@ -67,7 +70,7 @@ def test_a_chat(octopi: Octopi, files: list[Path]) -> None:
     assert "no video yet" in type_("/frames")
     assert "1 for the next question" in type_(f"/add {files[0]}")
     assert "nothing.avi: no such file" in type_("/add nothing.avi")
-    assert "2 {tactile} for 1 videos" in type_("Is {tactile} softer than {tactile}?"), "the chat goes on"
+    assert "2 {tactile} for 1 video;" in type_("Is {tactile} softer than {tactile}?"), "the chat goes on"
     first = octopi.ask("{tactile} How soft is it?", files[:1])
     assert type_("How soft is it?") == first + "\n", "without marks they stand in front"
     assert type_("And now?") == octopi.ask("And now?", history=chat.history[:1]) + "\n"
@@ -93,7 +96,7 @@ def test_a_stopped_answer_is_forgotten(octopi: Octopi, monkeypatch: pytest.Monke
 
 def test_a_folder_without_videos_is_refused(octopi: Octopi, tmp_path: Path) -> None:
     with refused("holds no video"):
-        describe_folder(octopi, tmp_path / "nothing", tmp_path / "out.csv")
+        describe_folder(octopi, [tmp_path / "nothing"], tmp_path / "out.csv")
 
 
 @pytest.fixture
@@ -112,7 +115,7 @@ def folder(files: list[Path], tmp_path: Path) -> Path:
 def test_a_folder_is_described(
     octopi: Octopi, folder: Path, files: list[Path], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    assert describe_folder(octopi, folder, tmp_path / "out.csv") == (5, 2)
+    assert describe_folder(octopi, [folder], tmp_path / "out.csv") == (5, 2)
     found = {row["file"]: row for row in rows_of(tmp_path / "out.csv")}
     assert set(found) == {f"a,  b/{name}" for name in ("broken.avi", "gone.mov", *(f.name for f in files))}
     assert "no frame decodes" in found["a,  b/broken.avi"]["error"]
@@ -134,10 +137,10 @@ def test_names_that_are_no_text_are_described_once(
     broken = next(folder.rglob("broken.avi"))
     broken.rename(not_utf8(broken.parent, "?.avi"))
     out = tmp_path / "out.csv"
-    assert describe_folder(octopi, folder, out) == (5, 2), "one is broken, one a dead link"
+    assert describe_folder(octopi, [folder], out) == (5, 2), "one is broken, one a dead link"
     assert r"a\udcffb/\udcff.avi" in {row["file"] for row in rows_of(out)}
     monkeypatch.setattr(octopi, "describe_all", lambda _: pytest.fail("described again"))
-    assert describe_folder(octopi, folder, out) == (5, 2), "one is broken, one a dead link"
+    assert describe_folder(octopi, [folder], out) == (5, 2), "one is broken, one a dead link"
 
 
 def test_a_folder_is_described_and_a_model_copied_by_command(
@@ -151,7 +154,11 @@ def test_a_folder_is_described_and_a_model_copied_by_command(
     assert CliRunner().invoke(app, ["describe", str(files[0]), "--csv", str(alone), *model]).exit_code == 0
     assert [row["file"] for row in rows_of(alone)] == [files[0].name]
     assert CliRunner().invoke(app, ["export", str(made.folder), str(tmp_path / "copy"), "--with-base"]).exit_code == 0
-    assert Octopi.from_pretrained(tmp_path / "copy", device="cpu").ask("Why?") == octopi.ask("Why?")
+    copied = Octopi.from_pretrained(tmp_path / "copy", device="cpu")
+    assert copied.ask(QUESTION, files[:1]) == octopi.ask(QUESTION, files[:1])
+    (broken := tmp_path / "broken.avi").touch()
+    for given in ([str(broken)], [str(broken), str(broken), "--csv", str(tmp_path / "broken.csv")]):
+        assert CliRunner().invoke(app, ["describe", *given, *model]).exit_code == 1
 
 
 def test_videos_described_compared_ranked_and_matched_by_command(
@@ -171,14 +178,24 @@ def test_videos_described_compared_ranked_and_matched_by_command(
     level, *_ = (known := octopi.describe(one)).levels.values()
     for word in (files[0].name, *known.levels, level, f"({max(known.probabilities['hardness'].values()):.0%})"):
         assert word in table
+    assert "in words" in said("describe", one, two, str(files[2].parent))
     assert said("compare", one, two, "hardness") == octopi.compare(one, two, "hardness").answer + "\n"
     ranked = octopi.rank([three, one, two], "roughness")
-    *lines, answer = said("rank", "roughness", three, one, two).rstrip("\n").split("\n")
+    scale, *lines, answer = said("rank", "roughness", three, one, two).rstrip("\n").split("\n")
     assert [line.split("  ")[1] for line in lines] == [[three, one, two][i] for i in ranked.order]
     assert answer == ranked.answer
+    assert scale.endswith("0 smooth, 1 slightly rough, 2 rough")
     names = "rug, a fuzzy rug" if "rug" not in octopi.catalogue.objects else "rug, millet"
     ids = [name.strip() for name in names.split(",")]
-    assert said("match", one, two, "--names", names).startswith(octopi.match([one, two], ids).answer)
+    own = {"mug": ["hard", "smooth", "no bumps"], "rug": ["soft", "rough", "no bumps"]}
+    for named, given in (
+        (names, ids),
+        (OWN, own),
+    ):
+        matched = octopi.match([one, two], given)
+        *lines, answer = said("match", one, two, "--names", named).rstrip("\n").split("\n")
+        assert answer == matched.answer
+        assert [line.partition(": ")[2].partition(" (")[0] for line in lines] == list(matched.heads)
 
 
 def test_a_killed_description_goes_on(
@@ -186,14 +203,14 @@ def test_a_killed_description_goes_on(
 ) -> None:
     monkeypatch.setattr(asking, "BATCH", 1)
     whole, out = tmp_path / "whole.csv", tmp_path / "out.csv"
-    describe_folder(octopi, folder, whole)
+    describe_folder(octopi, [folder], whole)
     text = whole.read_text()
     for end in (0, 5, len(text) // 2, len(text) - 1, len(text)):
         out.write_text(text[:end])
         looked: list[object] = []
         real = octopi.describe_all
         monkeypatch.setattr(octopi, "describe_all", lambda videos: looked.extend(videos) or real(videos))  # noqa: B023
-        assert describe_folder(octopi, folder, out) == (5, 2)
+        assert describe_folder(octopi, [folder], out) == (5, 2)
         monkeypatch.undo()
         monkeypatch.setattr(asking, "BATCH", 1)
         assert out.read_text() == text
@@ -203,11 +220,11 @@ def test_a_killed_description_goes_on(
 def test_another_trainings_table_is_left_alone(
     octopi: Octopi, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    describe_folder(octopi, folder, out := tmp_path / "out.csv")
+    describe_folder(octopi, [folder], out := tmp_path / "out.csv")
     text = out.read_text()
     monkeypatch.setattr(octopi, "config", octopi.config.model_copy(update={"files": {}}))
     with refused("is no description by finetuned-with-all-0"):
-        describe_folder(octopi, folder, out)
+        describe_folder(octopi, [folder], out)
     assert out.read_text() == text
 
 
@@ -218,5 +235,5 @@ def test_what_somebody_else_wrote_stays(content: bytes, octopi: Octopi, folder: 
     out = tmp_path / "notes.txt"
     out.write_bytes(content)
     with refused("is no description by .*name another file with --csv"):
-        describe_folder(octopi, folder, out)
+        describe_folder(octopi, [folder], out)
     assert out.read_bytes() == content

@@ -168,7 +168,7 @@ def test_what_goes_wrong_is_one_line_of_the_server(node: Any, tmp_path: Path, mo
     (notes := tmp_path / "notes.mp4").write_text("no video")
     for goal, told in (
         (Goal("Soft?", notes), "video"),
-        (Goal("{tactile} {tactile}?", press(tmp_path / "a.mp4")), "2 {tactile} for 1 videos"),
+        (Goal("{tactile} {tactile}?", press(tmp_path / "a.mp4")), "2 {tactile} for 1 video;"),
         (Goal("Soft?", tmp_path / "none.mp4"), "none.mp4"),
     ):
         result = node.server.execute(goal)
