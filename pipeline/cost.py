@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from pipeline.config import Params
-from pipeline.errors import UserError, did_you_mean
+from pipeline.errors import UserError, counted, did_you_mean
 from pipeline.memory import BYTES, GIB, Lengths, Use, embedding_length, launched, longest
 from pipeline.scenes.invented import catalogue_of
 from pipeline.shapes import FULL, Llama, Vision
@@ -139,9 +139,16 @@ def describe(hours: list[Hours], params: Params, card: str) -> Iterator[str]:
         flops, bandwidth = measured_rate(), None
         how = f"on this processor, at the {flops / 1e9:.0f} GFLOP/s that it reaches now (name a GPU with --card)"
     each = [(h, h.on(flops * (devices if h.stage in ("align", "lora") else 1), bandwidth)) for h in hours]
-    yield f"Hours {how}: " + ", ".join(f"{h.stage} {t:.2g} ({h.runs} runs)" for h, t in each) + "."
+    yield f"Hours {how}: " + ", ".join(f"{h.stage} {_round(t)} ({counted(h.runs, 'run')})" for h, t in each) + "."
     rest = [*(s for s in REST if s not in {h.stage for h in hours})]
-    yield f"Together {sum(t for _, t in each):.2g}. Not counted: {', '.join(rest)}, and the work on videos."
+    yield (
+        f"At least {_round(sum(t for _, t in each))} together: small batches reach less, and the paper's training took "
+        f"20 times what is counted so. Not counted: {', '.join(rest)}, and the work on videos."
+    )
+
+
+def _round(number: float) -> str:
+    return f"{number:.0f}" if number >= 10 else f"{number:.2g}"
 
 
 def host(params: Params, llama: Llama | None) -> Iterator[str]:
@@ -191,7 +198,8 @@ def disk(params: Params, llama: Llama | None, embedding: int, videos: int) -> It
     """What the chain writes of its own: embeddings, trained models, and the checkpoints of the one that trains."""
     shown = videos * params.frames.per_video * FULL * embedding * (4 if params.encoder.flip_probability else 1)
     embedded = shown * len(params.ablation.encoders) * len(params.ablation.seeds)
-    parts = [f"embeddings {embedded / GB:.2g}" if videos else "embeddings not known without the videos"]
+    parts = [f"embeddings {_round(embedded / GB)}" if videos else "embeddings not known without the videos"]
+    total = embedded
     if llama:
         hidden = llama.hidden_size
         words = llama.vocab_size * hidden if params.align.train_embeddings == "all" else 0
@@ -200,8 +208,13 @@ def disk(params: Params, llama: Llama | None, embedding: int, videos: int) -> It
         variants = params.ablation.variants()
         aligned = len({(v.encoder, v.opd, v.seed) for v in variants})
         models = FULL * (trained * sum(v.lora == "with" for v in variants) + connector * aligned)
-        parts += [f"data/models {models / GB:.2g}", f"checkpoints {3 * FULL * trained / GB:.2g} while one trains"]
-    yield f"Disk in GB: {', '.join(parts)}; DVC's cache links to the same files where the disk allows."
+        checkpoints = 3 * FULL * trained
+        parts += [f"data/models {_round(models / GB)}", f"checkpoints {_round(checkpoints / GB)} while one trains"]
+        total += models + checkpoints
+    yield (
+        f"Disk in GB: {_round(total / GB)} besides videos and downloads ({', '.join(parts)}); DVC's cache links to the "
+        "same files where the disk allows."
+    )
 
 
 def fits(uses: list[Use], gib: float) -> Iterator[str]:

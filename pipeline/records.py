@@ -77,6 +77,8 @@ class Shown(StrEnum):
     """Photos of the question's objects."""
     TOUCH = "touch"
     """The videos of the run, that the shipped model feels: it alone is shown this."""
+    CLASSES = "classes"
+    """What the shipped model's property heads take these videos for, by which plain rules answer."""
     STANDARDISED = "touch, standardised"
     """The same, their embeddings standardised by all videos of the run, which takes no label."""
 

@@ -136,6 +136,8 @@ def system(row: dict[str, Any]) -> str:
     """A variant by what it leaves out of the full system; another model by its name."""
     if row["touch"] == Shown.TOUCH:
         return f"{row['encoder']}, as it is shipped"
+    if row["touch"] == Shown.CLASSES:
+        return f"{row['encoder']}'s {_told(row)}"
     if row["touch"] == Shown.STANDARDISED:
         return f"{row['encoder']}, embeddings standardised by these videos"
     if row["task"] in (HEADS, VALIDATION_HEADS):
@@ -145,9 +147,14 @@ def system(row: dict[str, Any]) -> str:
     if row["touch"] in SHOWN_WORDS:
         return f"{row['encoder']}, {SHOWN_WORDS[row['touch']]}"
     if not row["lora"]:
-        return ", ".join(filter(None, (RULES_WORDS, TASKS[row["task"]].told if row["task"] in TASKS else "")))
+        return _told(row)
     words = [SYSTEM_WORDS[row[axis]] for axis in FULL if row[axis] in SYSTEM_WORDS]
     return ", ".join(words) or "Octopi (full system)"
+
+
+def _told(row: dict[str, Any]) -> str:
+    """Rules on the heads' classes, and what these are told of the question that the language model is not."""
+    return ", ".join(filter(None, (RULES_WORDS, TASKS[row["task"]].told if row["task"] in TASKS else "")))
 
 
 def _count(name: str, digits: int = 0) -> Cell:
@@ -217,8 +224,8 @@ def rules(frame: pd.DataFrame) -> pd.Series[bool]:
 
 
 def shipped(frame: pd.DataFrame) -> pd.Series[bool]:
-    """Answers of the model that is shipped, to the videos of the run."""
-    return frame["touch"].isin({Shown.TOUCH, Shown.STANDARDISED}) & (frame["seed"] == ALL_SEEDS)
+    """Answers of the model that is shipped, to the videos of the run, and by rule from its heads."""
+    return frame["touch"].isin({Shown.TOUCH, Shown.STANDARDISED, Shown.CLASSES}) & (frame["seed"] == ALL_SEEDS)
 
 
 def whole(frame: pd.DataFrame) -> pd.Series[bool]:

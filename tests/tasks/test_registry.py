@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 from pathlib import Path
 
 import pytest
@@ -10,39 +9,20 @@ import pytest
 from pipeline.config import QuestionsConfig
 from pipeline.evaluation.grading import grade
 from pipeline.io import read_jsonl, write_jsonl
-from pipeline.records import Dialogue, Opd, Prediction, Question, Score
+from pipeline.records import Dialogue, Opd, Question
 from pipeline.tasks import TASKS, psr
-from pipeline.tasks.base import Draft, Pool, TaskDefinition, choice_score, draft_about, single_turn
+from pipeline.tasks.base import TaskDefinition
 from pipeline.tasks.pom import fact
 from pipeline.tasks.questions import CHOICES, build_questions, counts_by_task
-from pipeline.videos.catalogue import Catalogue
-from tests.conftest import refused
+from tests.conftest import ROOT, refused
 from tests.tasks.shared import CATALOGUE, POOL, predicted
 
 
-class Hardest(TaskDefinition):
-    """A whole task as somebody would add it: is this object hard?"""
-
-    name = "HARD"
-    title = "Hard or not"
-
-    def strata(self, catalogue: Catalogue) -> int:
-        return 2
-
-    def draft(self, pool: Pool, stratum: int, rng: random.Random) -> Draft | None:
-        object_id = rng.choice(pool.objects)
-        choice = "yes" if pool.catalogue.labels(object_id)[0] == 2 else "no"
-        if choice != ("no", "yes")[stratum]:
-            return None
-        turns = single_turn({Opd.NONE: "Is {tactile} hard?"}, {Opd.NONE: choice})
-        return draft_about(pool, [object_id], rng, turns=turns, choice=choice, properties=["hardness"])
-
-    def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
-        said = prediction.outputs[0]
-        return choice_score(question, prediction, said if said in ("yes", "no") else None)
-
-    def chance(self, catalogue: Catalogue) -> dict[str, float]:
-        return {"choice": 1 / 2}
+def own_task() -> TaskDefinition:
+    """The task that docs/tasks.md shows whole."""
+    names: dict[str, TaskDefinition] = {}
+    exec((ROOT / "docs" / "tasks.md").read_text().split("```python\n")[1].split("```")[0], names)
+    return names["TASK"]
 
 
 def config(train: dict[str, int], evaluation: dict[str, int]) -> QuestionsConfig:
@@ -50,7 +30,7 @@ def config(train: dict[str, int], evaluation: dict[str, int]) -> QuestionsConfig
 
 
 def test_a_registered_task_is_counted_built_stored_and_graded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setitem(TASKS, "HARD", Hardest())
+    monkeypatch.setitem(TASKS, "HARD", own_task())
     counts = counts_by_task(config({}, {"hard": 6, "pc": 2}), "evaluation")
     assert counts == {"OPD": 0, "PC": 2, "PSS": 0, "POM": 0, "PSR": 0, "RIPE": 0, "HARD": 6}
     built = build_questions(POOL, counts, seed=0, distinct=True, facts=True)
@@ -60,12 +40,17 @@ def test_a_registered_task_is_counted_built_stored_and_graded(monkeypatch: pytes
     scores = grade(questions, [predicted(q, "yes") for q in questions], CATALOGUE)
     assert [s.correct for s in scores] == [CATALOGUE.labels(s.objects[0])[0] == 2 for s in scores]
     assert sum(s.correct for s in scores) == 3
+    for question in questions:
+        classes = [[(level, float(level)) for level in CATALOGUE.labels(question.objects[0])]]
+        concluded = TASKS["HARD"].conclude(question, classes, CATALOGUE)
+        assert concluded is not None
+        assert grade([question], [predicted(question, concluded)], CATALOGUE)[0].correct
 
 
 def test_another_task_changes_no_question_of_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     wanted = config({}, dict.fromkeys(("opd", "pc", "pss", "pom", "psr"), 4))
     before = build_questions(POOL, counts_by_task(wanted, "evaluation"), seed=0, distinct=True)
-    monkeypatch.setitem(TASKS, "HARD", Hardest())
+    monkeypatch.setitem(TASKS, "HARD", own_task())
     assert build_questions(POOL, counts_by_task(wanted, "evaluation"), seed=0, distinct=True) == before
 
 

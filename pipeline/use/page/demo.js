@@ -107,7 +107,9 @@ function say(who, text) {
 async function ask(event) {
   event.preventDefault();
   let question = $("question").value.trim();
-  if (!question || $("send").disabled) return;
+  if ($("send").disabled) return;
+  if (!touches.length && !turns.length) return tell("Choose a video or a synthetic scene first.");
+  if (!question) question = $("question").placeholder;
   if (!question.includes("{tactile}") && fresh.length) question = `${"{tactile} ".repeat(fresh.length)}${question}`;
   const places = question.split("{tactile}").length - 1;
   // A question is about the new touches first, else about those on the page.
@@ -141,6 +143,7 @@ async function begin() {
   const about = await (await fetch("api/about")).json();
   $("model").textContent = about.model;
   $("question").placeholder = about.example;
+  tell("Begin with a video of yours, or pick a synthetic scene; then press Ask.");
   for (const [id, name] of about.scenes) $("scene").append(new Option(name, id));
 }
 
