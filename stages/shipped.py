@@ -65,11 +65,12 @@ def main() -> None:
                 # Another sensor shifts and scales embeddings; its videos tell by how much, without a label.
                 std, mean = torch.std_mean(ways[Shown.TOUCH], dim=0)
                 ways[Shown.STANDARDISED] = (ways[Shown.TOUCH] - mean) / std.clamp_min(1e-6)
-            scored = {Shown.CLASSES: conclude(questions, classified, catalogue)}
+            scored = {}
             for shown, features in ways.items():
                 store = EmbeddingStore().with_rows(rows, features)
                 said = answer(octopi.llm, store, questions, config.opd, language, config.frames.per_video)
                 scored[shown] = grade(questions, said, catalogue)
+            scored[Shown.CLASSES] = conclude(questions, classified, catalogue)
             graded = [
                 GradedVision(**score.model_dump(), model=SHIPPED.name, shown=shown, seed=params.ablation.seeds[0])
                 for shown, scores in scored.items()

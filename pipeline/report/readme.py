@@ -25,6 +25,8 @@ from pipeline.report.tables import (
 from pipeline.weights import is_tiny
 
 MOST_LINES = 150
+MOST_NAMED = 12
+"""Test objects that are named; dataset.csv has all."""
 CHANCE = (
     "The base models are tiny and random, drawn from a seed and taught nothing: these figures are chance and prove "
     "only that the chain runs."
@@ -117,7 +119,7 @@ def stands_on(said: dict[str, Any]) -> list[str]:
     """What a figure is worth: models with their size, test objects, seeds, whether they were looked at before."""
     language, encoder = said["base_models"]["language"], said["base_models"]["encoder"]
     objects = said["test_objects"]
-    named = f" ({', '.join(objects)})" if objects else ""
+    named = f" ({', '.join(objects)})" if 0 < len(objects) <= MOST_NAMED else ""
     facts = [
         f"**Language model:** {model_words(language)}.",
         f"**Tactile encoder:** {said['encoder']}. Base encoder of the ablation: {model_words(encoder)}.",
