@@ -30,7 +30,7 @@ from benchmarks.errors import WRONG, Error
 from benchmarks.frames import bench_videos
 from benchmarks.table import Row, make_rows
 from benchmarks.timing import flops_of, interleaved, machine, megabytes, one_thread
-from pipeline.config import FramesConfig, RuntimeConfig
+from pipeline.config import PRETRAINED, FramesConfig, RuntimeConfig
 from pipeline.encoder.clips import ClipDataset, LabelledVideo
 from pipeline.encoder.cross_validation import CrossValidationData
 from pipeline.encoder.model import FrameEncoder, base_encoder
@@ -43,8 +43,6 @@ from pipeline.videos.files import list_videos
 from pipeline.videos.frames.extract import extract_frames
 from pipeline.videos.frames.store import FrameStore
 from pipeline.weights import CLIP_CONFIG
-
-PRETRAINED = Path("data") / "pretrained" / "encoder.safetensors"
 
 Clip = Mapping[str, torch.Tensor]
 

@@ -14,7 +14,7 @@ from pipeline.records import Assignment, Part, Video
 from pipeline.report.load import published
 from pipeline.videos.catalogue import Catalogue
 
-PARTS = (Part.TRAIN, Part.VALIDATION, Part.TEST)
+SPLIT_PARTS = (Part.TRAIN, Part.VALIDATION, Part.TEST)
 COLUMNS = ("table", "row", "objects", "with_videos", "train", "validation", "test", "frames", "published")
 AGREEMENT = "agreement, ICC(3,k)"
 """What the audit calls its check of the annotators."""
@@ -57,7 +57,7 @@ def dataset_frame(
             "row": row,
             "objects": len(members),
             "with_videos": len(members & filmed),
-            **{str(part): sum((o, part) in parts for o in members) for part in PARTS},
+            **{str(part): sum((o, part) in parts for o in members) for part in SPLIT_PARTS},
             "published": values.get((table, printed_as)),
         }
         for table, row, printed_as, members in groups

@@ -54,7 +54,7 @@ EXPECTED = {
     "confusion.csv": OLDER,
 }
 """Files of a report, and why it may lack one."""
-PARTS = {"language": "Language model", "encoder": "Encoder", "lora": "LoRA", "opd": "OPD", "touch": "Touch"}
+FACTORS = {"language": "Language model", "encoder": "Encoder", "lora": "LoRA", "opd": "OPD", "touch": "Touch"}
 RANK = {"error": 0, "warning": 1, "info": 2}
 BESIDE = (
     (
@@ -272,7 +272,7 @@ def _effects(report: Report) -> tuple[dict[str, list[Line]], float]:
         source = f"{report.name}/effects.csv:{index + 2}"
         p = number(row["p_holm"], 3)
         line = Line(row["task"], task_title(row["task"]), source, difference(row), p, value, low, high)
-        groups.setdefault(f"{PARTS.get(row['part'], row['part'])}: {row['change']}", []).append(line)
+        groups.setdefault(f"{FACTORS.get(row['part'], row['part'])}: {row['change']}", []).append(line)
     return groups, points
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from pipeline.records import Opd, Prediction, Question, Score
 from pipeline.tasks import TASKS
-from pipeline.tasks.examples import EXAMPLES, PARTS, grade_example
+from pipeline.tasks.examples import EXAMPLES, LEAST_KNOWN_FIRST, grade_example
 from pipeline.videos.catalogue import Catalogue
 
 RULE = (
@@ -45,7 +45,7 @@ def choose_examples(answered: Iterable[tuple[Question, Prediction]], catalogue: 
             about objects of the test part, or else of validation, or else of training.
     """
     examples: dict[str, dict[str, Any]] = {}
-    for question, said in sorted(answered, key=lambda pair: PARTS.index(pair[0].part)):
+    for question, said in sorted(answered, key=lambda pair: LEAST_KNOWN_FIRST.index(pair[0].part)):
         if question.question_id not in examples:
             sample = _sample(question, said, grade_example(question, said))
             examples[question.question_id] = {**sample, "part": question.part}

@@ -30,7 +30,7 @@ from pipeline.scenes.elastic.winkler import Heights, hang_skin, press_springs, s
 
 Tier = Literal["winkler", "layer", "half_space"]
 GEL = Gel()
-LEVELS = 6
+FORCES = 6
 """Forces at which a body is pressed. Between them slopes were off by .13 on average at a tenth of the largest force, by
 .03 or less from a fifth (15 objects of the catalogue); with eight levels by .09 and .05."""
 VISIBLE_SLOPE = 0.01
@@ -61,7 +61,7 @@ class Imprint:
     """A body pressed at forces from 0 to the largest; all in the body's own frame."""
 
     skins: npt.NDArray[np.float32]
-    """How far the gel's skin is pushed in, in mm, (LEVELS + 1) x side x side; the first is 0."""
+    """How far the gel's skin is pushed in, in mm, (FORCES + 1) x side x side; the first is 0."""
     radii: npt.NDArray[np.float64]
     """Of the circle with the contact's area, in mm."""
     force: float
@@ -88,8 +88,8 @@ class Imprint:
 
     def _between(self, force: float) -> tuple[int, float]:
         # A ball sinks as F^(2/3) (Hertz): in that measure skins change almost evenly.
-        measure = LEVELS * min(1.0, force / self.force) ** (2 / 3) if self.force > 0 and force > 0 else 0.0
-        place = min(int(measure), LEVELS)
+        measure = FORCES * min(1.0, force / self.force) ** (2 / 3) if self.force > 0 and force > 0 else 0.0
+        place = min(int(measure), FORCES)
         return place, measure - place
 
 
@@ -113,7 +113,7 @@ def press(
         tolerance: Relative error of the skin's slopes, which are what the light shows.
     """
     body = Body(heights, modulus, pitch)
-    forces = force * (np.arange(1, LEVELS + 1) / LEVELS) ** 1.5
+    forces = force * (np.arange(1, FORCES + 1) / FORCES) ** 1.5
     error = None
     if method is None:
         method, error, last = choose(body, force, tolerance)

@@ -30,7 +30,7 @@ from pipeline.videos.catalogue import OBJECTS, PROPERTIES, Catalogue, Object, lo
 WORDS = Path(__file__).parents[1] / "physiclear"
 """Catalogue whose words for the properties are taken; nothing of its objects is."""
 DATASET = "invented objects"
-LEVELS = 3
+CLASSES = 3
 """Classes of each of the three properties; hardness, roughness and bumpiness are the digits of an object's number."""
 TEXTURE: tuple[Range, ...] = (
     (0.0, ROUGH_MM[0] / 1.5),
@@ -55,7 +55,7 @@ METHOD = Method("layer", 64)
 
 def classes_of(number: int) -> tuple[int, int, int]:
     """Hardness, roughness and bumpiness of object `number`: any 27 in a row have all combinations."""
-    return number % LEVELS, number // LEVELS % LEVELS, number // LEVELS**2 % LEVELS
+    return number % CLASSES, number // CLASSES % CLASSES, number // CLASSES**2 % CLASSES
 
 
 def invented_catalogue(config: InventConfig) -> Catalogue:
@@ -68,7 +68,7 @@ def invented_catalogue(config: InventConfig) -> Catalogue:
             object_id=object_id,
             name=f"object {n}",
             splits={},
-            stated=(None,) * LEVELS,
+            stated=(None,) * CLASSES,
             ratings=tuple((level,) for level in classes_of(n)),
         )
         for n in range(config.objects)

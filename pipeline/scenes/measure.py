@@ -37,7 +37,7 @@ HALF, CAP = 0.5, math.sqrt(2)
 as wide."""
 WIDEST_SHARE = 0.6
 """What is wider is the body's shape, as a share of the image's height."""
-TOUCHED = 0.3
+FITTED = 0.3
 """Where the skin is pressed in by this share of its deepest place, the body's shape is fitted."""
 REACH_MM = 4.0
 """Length over which a fingertip averages what it rests on; valleys below that are not reached."""
@@ -113,7 +113,7 @@ def bump_share(skin: Heights, pitch: float) -> float:
     rows, columns = skin.shape
     height = min(rows, ROWS)
     coarse: Heights = cv2.resize(skin, (round(columns * height / rows), height), interpolation=cv2.INTER_AREA)
-    touched = np.asarray(coarse > TOUCHED * float(coarse.max()))
+    touched = np.asarray(coarse > FITTED * float(coarse.max()))
     if not touched.any():
         return 0.0
     smooth = _smooth(coarse, TEXTURE_MM, pitch * rows / height)

@@ -22,10 +22,10 @@ SLOW_SHARE = 0.18
 """Share of the videos at 10 frames a second."""
 FORCE_N = (0.5, 4.0)
 """Range of the peak force. Not measured, but such that frames differ from the reference as much as real ones do."""
-LEVELS = (0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95)
+QUANTILES = (0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95)
 """Levels of the quantiles below, which are over 205 videos whose contact stands out of the noise. Times are shares of
 the video."""
-TOUCHED = (0.152, 0.163, 0.184, 0.224, 0.272, 0.320, 0.342)
+BEGUN = (0.152, 0.163, 0.184, 0.224, 0.272, 0.320, 0.342)
 """When contact first reaches a tenth of its peak."""
 RISE = (0.041, 0.044, 0.061, 0.080, 0.096, 0.144, 0.176)
 """From a tenth to nine tenths of the peak."""
@@ -80,7 +80,7 @@ def make_motion(frames: int, rng: np.random.Generator, *, twist: bool = True) ->
     # Even a video of two frames has one in its very middle, while the object is held.
     time = np.arange(frames) / (2 * (frames // 2))
     rise, fall = _draw(RISE, rng) / (_ramp_inverse(0.9) - _ramp_inverse(0.1)), _draw(FALL, rng)
-    touch = max(0.05, _draw(TOUCHED, rng) - _ramp_inverse(0.1) * rise)
+    touch = max(0.05, _draw(BEGUN, rng) - _ramp_inverse(0.1) * rise)
     hold = min(touch + rise, 0.49)
     kept = _draw(KEPT, rng)
     if not twist:
@@ -105,8 +105,8 @@ def make_motion(frames: int, rng: np.random.Generator, *, twist: bool = True) ->
 
 
 def _draw(quantiles: Sequence[float], rng: np.random.Generator) -> float:
-    """A value from a distribution known by its quantiles at `LEVELS`; nothing beyond the outermost two."""
-    return float(np.interp(rng.random(), LEVELS, quantiles))
+    """A value from a distribution known by its quantiles at `QUANTILES`; nothing beyond the outermost two."""
+    return float(np.interp(rng.random(), QUANTILES, quantiles))
 
 
 def _ramp(time: Track, start: float, stop: float) -> Track:

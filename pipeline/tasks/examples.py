@@ -22,7 +22,7 @@ from pipeline.tasks.base import (
 from pipeline.tasks.opd import TEMPLATES
 from pipeline.videos.catalogue import Catalogue
 
-PARTS = (Part.TEST, Part.VALIDATION, Part.TRAIN)
+LEAST_KNOWN_FIRST = (Part.TEST, Part.VALIDATION, Part.TRAIN)
 """The parts of a split, what a model knows least of first."""
 
 
@@ -55,11 +55,11 @@ def build_examples(assignments: Sequence[Assignment], catalogue: Catalogue, *, s
     A question's part is the most familiar one of its objects: `train` where the model was trained on one of them.
     """
     rng, questions = random.Random(derive_seed(seed, "examples")), []
-    parts = {a.object_id: a.part for a in assignments if a.part in PARTS}
+    parts = {a.object_id: a.part for a in assignments if a.part in LEAST_KNOWN_FIRST}
     for example in EXAMPLES:
         if not parts.keys() >= {*example.objects}:
             continue
-        part = max((parts[o] for o in example.objects), key=PARTS.index)
+        part = max((parts[o] for o in example.objects), key=LEAST_KNOWN_FIRST.index)
         videos = {o: [a.video_id for a in assignments if a.object_id == o] for o in example.objects}
         pool = Pool(part, catalogue, videos)
         for letter, step in zip(LETTERS, (1, -1), strict=False):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import torch
 
-PARTS = {
+LAYER_NAMES = {
     "layer_norm1": "ln_1",
     "layer_norm2": "ln_2",
     "mlp.fc1": "mlp.c_fc",
@@ -79,8 +79,8 @@ def renamed(state: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
             continue
         tower, layer, part, leaf = place.groups()
         there = f"{'visual.' if tower == 'vision' else ''}transformer.resblocks.{layer}"
-        if part in PARTS:
-            found[f"{there}.{PARTS[part]}.{leaf}"] = value
+        if part in LAYER_NAMES:
+            found[f"{there}.{LAYER_NAMES[part]}.{leaf}"] = value
         elif part == "self_attn.q_proj":
             maps = [state[name.replace("q_proj", other)] for other in ("q_proj", "k_proj", "v_proj")]
             found[f"{there}.attn.in_proj_{leaf}"] = torch.cat(maps)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.scenes import contact
-from pipeline.scenes.contact import LEVELS, Body, Imprint, Method, choose, press, slope_error
+from pipeline.scenes.contact import FORCES, Body, Imprint, Method, choose, press, slope_error
 from pipeline.scenes.elastic.kernels import Gel
 from pipeline.scenes.elastic.solver import NotConverged
 from pipeline.scenes.elastic.winkler import hang_skin, press_springs, series
@@ -110,7 +110,7 @@ def test_harder_objects_and_larger_forces_press_deeper(method: Method) -> None:
     assert all(less < more for less, more in itertools.pairwise(depths))
     assert not press(bumpy(), 0.0, 1.0, PITCH, method).skins.any()
     imprint = press(bumpy(), 8.0, 1.0, PITCH, method)
-    assert imprint.skins.shape == (LEVELS + 1, SIDE, SIDE)
+    assert imprint.skins.shape == (FORCES + 1, SIDE, SIDE)
     assert imprint.skins.dtype == np.float32
     assert all(a < b for a, b in itertools.pairwise(s.max() for s in imprint.skins))
     assert all(a <= b for a, b in itertools.pairwise(imprint.radii))
@@ -132,7 +132,7 @@ def test_frames_between_two_forces_are_near_what_pressing_gives() -> None:
 @given(st.floats(0, 20), st.floats(1e-3, 10))
 def test_the_radius_grows_with_the_force(force: float, more: float) -> None:
     imprint = Imprint(
-        np.zeros((LEVELS + 1, 2, 2), np.float32), np.sqrt(np.arange(LEVELS + 1.0)), 10.0, FINEST, None, 0.0
+        np.zeros((FORCES + 1, 2, 2), np.float32), np.sqrt(np.arange(FORCES + 1.0)), 10.0, FINEST, None, 0.0
     )
     assert imprint.radius(force) <= imprint.radius(force + more) + 1e-9
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from pipeline.scenes import motion
 from pipeline.scenes.motion import (
+    BEGUN,
     CENTRE_MM,
     FORCE_N,
     LINGER,
@@ -16,7 +17,6 @@ from pipeline.scenes.motion import (
     RECORDED,
     RELEASED,
     SLOW_SHARE,
-    TOUCHED,
     TRAVEL_MM,
     TWIST_DEGREES,
     draw_length,
@@ -53,7 +53,7 @@ def test_times_and_places_are_those_that_were_measured() -> None:
     first = (force >= 0.1).argmax(axis=1) / 500
     gone = hands_that_let_go = force[:, -1] < 0.05
     last = 1 - (force[hands_that_let_go, ::-1] >= 0.3).argmax(axis=1) / 500
-    assert np.median(first) == pytest.approx(TOUCHED[MEDIAN], abs=0.01)
+    assert np.median(first) == pytest.approx(BEGUN[MEDIAN], abs=0.01)
     assert np.median(last) == pytest.approx(RELEASED[MEDIAN], abs=0.02)
     assert 1 - gone.mean() == pytest.approx(LINGER, abs=0.03)
     assert np.median([np.ptp(h.angle) for h in hands]) == pytest.approx(TWIST_DEGREES[MEDIAN], rel=0.15)

@@ -21,7 +21,7 @@ MOST_FRAMES = 4
 """Of these, at equal distances: neighbours of a video without motion are copies of each other."""
 THUMB = 80
 """Longer side of the small picture that contact is measured on, in pixels."""
-TOUCHED = 1.12
+DETAILED = 1.12
 """Detail of the first picture over that of the last, from which the video counts as starting in contact: contact adds
 detail. Untouched real videos lie between .95 and 1.08 (99 % of them)."""
 UNSTEADY = 1.0
@@ -104,4 +104,4 @@ def detail(thumb: Image) -> float:
 
 def starts_touching(first: Image, last: Image) -> bool:
     """Whether a video that begins with `first` and ends with `last` (thumbnails) begins in contact and ends without."""
-    return detail(first) > TOUCHED * max(detail(last), 1e-6)
+    return detail(first) > DETAILED * max(detail(last), 1e-6)
