@@ -194,6 +194,8 @@ def _who(report: Report) -> list[str]:
     maker += f", {language['taught']}," if language["taught"] else ""
     maker += " made these figures"
     maker += " in place of the paper's Vicuna" if language["parameters"] < VICUNA else ""
+    if start := said.get("beyond_paper", {}).get("language.start"):
+        maker += f"; its training went on from `{start.rpartition('/')[2]}`, which was trained before"
     clip = said["base_models"]["encoder"]
     encoder = said["encoder"].replace("the base CLIP", f"a {size_words(clip['parameters'])} {clip['kind']}")
     source = {"scenes": "synthetic", "videos": "real"}.get(said["source"], "")
