@@ -3,8 +3,8 @@
 The published code (github.com/clear-nus/octopi, train_llm.py and utils/model.py) takes one conversation at a time,
 encodes its videos anew, pads the embeddings to 512 tokens, computes logits for all of them, and steps after 16. To
 answer it first reads the reference answer likewise, and then calls `generate` with the question alone. That it opens a
-JPEG for each frame is left out, in its favour. All ways take the same model (of params.yaml, aligned a little, so that
-answers are as long as answers are), the pipeline's own questions, and pictures of noise: no cost depends on them.
+JPEG for each frame is left out, in its favour. All ways use the same model (from params.yaml, aligned briefly so that
+answers have realistic lengths), the pipeline's own questions, and noise pictures, as no cost depends on content.
 """
 
 from __future__ import annotations

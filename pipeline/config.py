@@ -154,9 +154,9 @@ class QuestionsConfig(Section):
     """Scenario questions (PSR): whose right and wrong objects. `published`: the published code's. `ours`: this
     project's reading of the situations, with clearer contrasts. A catalogue's own scenarios are asked in any case."""
     wording: Literal["object", "class"] = "object"
-    """Whose the wording of a free description is. `object`: each object has one of its classes' phrases, as published.
-    `class`: all have their classes' first. A model that says the likeliest word splits what it knows of a class among
-    the class's phrases, and says the class with the fewest first words; few objects it knows by their phrases."""
+    """Wording of free descriptions. `object`: each object has one phrase per class, as published. `class`: every object
+    has its class's first phrase. Several phrases split a class's probability in greedy decoding, which favours the
+    class with the fewest first words; they also let a model recognise objects where there are few."""
     facts: bool = False
     """Begin matching questions with what the named objects are like, for a language model that has never heard of
     them: then touch and reasoning are asked for and no knowledge of the world. Tables say so."""
@@ -363,8 +363,8 @@ class LoraTrainConfig(TrainConfig):
     """Linear layers that get an adapter (the paper does not say; the published code: q_proj and k_proj); `all-linear`:
     all but the one that gives the logits."""
     given: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Share of the questions about several videos whose descriptions are given and not learnt, beside the touches of
-    another question: so that it learns to conclude from what it said, and not from touch."""
+    """Share of the questions about several videos whose descriptions are left out of the loss, with another question's
+    videos: the model must then conclude from the description and not from touch."""
 
 
 class AblationConfig(Section):
@@ -466,7 +466,7 @@ class Params(Section):
     lora: LoraTrainConfig
     ablation: AblationConfig
     shipped: Annotated[int, Field(ge=0)] = 0
-    """Questions about this run's videos that the model is asked which is shipped (`pipeline/pretrained`)."""
+    """Number of questions about this run's videos for the shipped model (`pipeline/pretrained`)."""
     packaged: Literal["full", "all"] = "full"
     """Which variants get a folder in models/: the full system of each seed, or all. Each holds the whole encoder."""
     tracking: TrackingConfig

@@ -27,7 +27,7 @@ from pipeline.weights.check import TOKENIZER, read_tokenizer
 
 GIB = 2**30
 BYTES = {"auto": 4, "float32": 4, "bfloat16": 2, "float16": 2}
-"""Of a value; `auto` may be less, which only the device knows that it will run on."""
+"""Bytes a value; for `auto` the most, since its format depends on the device."""
 NF4 = 0.5 + 1 / 64 + 4 / (64 * 256)
 """Bytes a value: four bits, a byte of scale for 64 of them, and a float32 for 256 such bytes (Dettmers et al. 2023)."""
 ADAM = 3 * FULL

@@ -21,7 +21,7 @@ RENAMED = {"frames.size": "frames.pixels"}
 
 
 def project_above() -> str:
-    """The project's folder, where this is one within; empty where it is in none, or is it."""
+    """The nearest parent folder with a dvc.yaml; empty where none has, or this folder has."""
     above = (folder for folder in Path.cwd().parents if (folder / CHAIN).is_file())
     return "" if CHAIN.is_file() else str(next(above, ""))
 

@@ -80,7 +80,7 @@ class Shown(StrEnum):
     CLASSES = "classes"
     """What the shipped model's property heads take these videos for, by which plain rules answer."""
     STANDARDISED = "touch, standardised"
-    """The same, their embeddings standardised by all videos of the run, which takes no label."""
+    """As `TOUCH`, with embeddings standardised over the run's videos (without labels)."""
 
 
 class Variant(NamedTuple):

@@ -161,8 +161,8 @@ def standardize(embeddings: torch.Tensor, known: Statistics) -> torch.Tensor:
 def logits_of(
     embeddings: torch.Tensor, index: Sequence[Embedding], split: Sequence[Assignment], catalogue: Catalogue, seed: int
 ) -> tuple[torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
-    """Logits of property heads in place of each frame's embedding: a passage that a small language model cannot
-    recognise single training objects through.
+    """Replace each frame's embedding by property heads' logits: a bottleneck through which a small language model
+    cannot recognise training objects.
 
     Heads know the labels of the objects that they were fitted to. A language model that learnt from such logits would
     believe them more than it should on new objects. So the training objects are dealt into `FOLDS` parts, and each

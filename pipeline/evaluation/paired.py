@@ -137,11 +137,10 @@ def sign_flip(values: Values, design: Design) -> Values:
 def flip_units(design: Design) -> Values:
     """Units x questions: what each unit that is flipped takes of each question's difference; columns sum to 1 in total.
 
-    For questions about one object a unit is the object's sum. Questions about several have no such sum: an object's
-    takes in what the others do, and flipping these as if they were independent finds differences where there are none.
-    So each difference is first taken as the mean of its objects' effects, which least squares find, and these are
-    flipped. That is conservative where objects differ little. Where the questions cannot tell the objects apart, what
-    hangs together by questions is flipped as a whole.
+    For questions about one object a unit is the object's sum. With several objects a question, the objects' sums
+    overlap, and flipping them as if independent gives false positives. So each difference is modelled as the mean of
+    its objects' effects, estimated by least squares, and these are flipped. That is conservative where objects differ
+    little. Where effects cannot be estimated, each connected component of objects is flipped as a whole.
     """
     shares = design.membership / design.membership.sum(axis=1, keepdims=True)
     if np.linalg.matrix_rank(shares) == design.objects:

@@ -163,9 +163,8 @@ class OctopiForCausalLM(nn.Module):
     def train_words(self) -> nn.Embedding:
         """Have all word embeddings trained: a copy in float32, which begins as the language model's own.
 
-        The base stays as it is, and so does its head. Where the two are one matrix (SmolLM2), it is the head's alone
-        from here on: the layer that reads words is trained, as in Vicuna, whose head is another, and the one that says
-        them is not.
+        The base model and its output head stay unchanged. Where head and input embeddings are tied (SmolLM2), this
+        unties them: the input embeddings are trained and the head is not, as in Vicuna, whose head is separate.
         """
         words: nn.Embedding = copy.deepcopy(self.llm.get_input_embeddings()).float().requires_grad_(True)
         # The end token pads some models, whose own layer would then leave it out; padding itself has no gradient here.

@@ -16,10 +16,10 @@ NOISE = 0.3
 
 
 def begin_with_words(model: OctopiForCausalLM, data: ConversationDataset, catalogue: Catalogue, seed: int) -> None:
-    """Fit the projection so that a frame is read as the classes of its object are: as their words' mean embedding.
+    """Fit the projection so that each frame maps to the mean word embedding of its object's class names.
 
-    Frames of a drawn projection mean nothing to the language model. What it learns of them first is by heart, object by
-    object, and not which video of a question they belong to. What reads like words it can find by the label before it,
+    Frames of a random projection mean nothing to the language model: it first memorises them object by object, and
+    does not learn which video of a question they belong to. Word-like frames it can find by the label before them,
     as in a list.
 
     Args:

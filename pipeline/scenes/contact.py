@@ -134,10 +134,9 @@ def press(
 def choose(body: Body, force: float, tolerance: float) -> tuple[Method, float, Pressed]:
     """The cheapest method whose slopes under the largest force are near enough to those of the next finer one.
 
-    An error is estimated as the distance to the next finer grid, which is larger than that to the truth as long as
-    grids converge; springs are held against the finest grid that had to be solved. Nothing finer than a method whose
-    estimate is good enough is computed but the one that it is held against; the finest, which is held against nothing,
-    is given half the error of the one before.
+    A grid's error is estimated as its distance to the next finer grid, which exceeds the true error as long as
+    grids converge; springs are compared with the finest grid solved so far. The search stops at the first method
+    whose estimate is within the tolerance. The finest grid has no reference: it gets half the error of the one before.
 
     Returns:
         The method, its error as estimated, and the body by it under the largest force.

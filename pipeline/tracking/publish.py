@@ -110,7 +110,7 @@ class _Publication:
         # The end of a curve is no point at its step 0.
         logged |= {m.name for m in curve}
         points += [(name, float(value), ended, 0) for name, value in stage.metrics.items() if name not in logged]
-        # What it ran with stays, where settings of no result changed since.
+        # Keep what a live run logged: settings may have changed since.
         own = {} if run else settings(self.params, stage.axes)
         self.store.log(run_id, points, own)
         self.store.log(run_id, tags={LOCK: stage.lock})

@@ -28,10 +28,10 @@ T = TypeVar("T", covariant=True)
 
 
 class EpochDataset(Dataset[T], Generic[T]):
-    """Knows the epoch that it is drawn from; 0 until it follows a training.
+    """A dataset that knows the current epoch; 0 until `follow` is called.
 
-    It asks, and is not told: a data loader that begins in the middle of an epoch, as where a killed training goes on,
-    tells its dataset that this is the first one.
+    It asks the training for the epoch, because a data loader that starts in mid-epoch, as when a killed training
+    resumes, would tell it that this is the first one.
     """
 
     def __init__(self) -> None:

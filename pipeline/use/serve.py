@@ -1,7 +1,7 @@
 """`octopi serve`: a model behind OpenAI's chat completions, for machines that know no more than HTTP.
 
-One thread holds the model. A request has a place from its first byte to its answer, and there are few places: who
-comes when all are taken is told to come later, before anything of the request is read.
+One thread holds the model. A request holds one of a few places from its first byte to its answer; while all are
+taken, a new one is answered with status 429 before its body is read.
 """
 
 from __future__ import annotations
