@@ -26,6 +26,7 @@ def main() -> None:
                     seed=config.seed,
                     distinct=distinct,
                     facts=config.facts,
+                    inexact=config.inexact if part is Part.TRAIN else 0.0,
                     restate=config.restate,
                     two_turns=config.two_turns if part is Part.TRAIN else 0.0,
                     plainly=config.plainly if part is Part.TRAIN else 0.0,

@@ -105,8 +105,12 @@ class TaskDefinition(ABC):
         """Accuracy of a uniform guess, 0 to 1, by measure."""
         return {"choice": 1 / self.choices}
 
-    def with_facts(self, draft: Draft, catalogue: Catalogue, rng: random.Random) -> Draft:
-        """The question for a language model that knows nothing of the objects: as it is, unless it names objects."""
+    def with_facts(self, draft: Draft, catalogue: Catalogue, rng: random.Random, inexact: float = 0.0) -> Draft:
+        """The question for a language model that knows nothing of the objects: as it is, unless it names objects.
+
+        Args:
+            inexact: Chance that a class told is a neighbour of the right one.
+        """
         return draft
 
     def plainly(self, draft: Draft, catalogue: Catalogue, rng: random.Random) -> Draft:

@@ -30,19 +30,48 @@ from pipeline.videos.catalogue.wording import unmarked
 OPENINGS = ("Given three tactile videos: {videos}.", "You have tactile videos of one object each: {videos}.")
 REQUEST = "atch each video to one of the following objects in alphabetical order: {options}."
 ORDERS = tuple("".join(order) for order in itertools.permutations("123"))
+TRIES = 60
+"""Draws of inexact facts before they are told as they are."""
 
 
-def fact(catalogue: Catalogue, object_id: str) -> tuple[str, str]:
-    """What an object is like, cut before its name: "hard, smooth, no bumps is" and " a ruler."."""
-    labels = catalogue.labels(object_id)
+def fact(catalogue: Catalogue, object_id: str, labels: Sequence[int] | None = None) -> str:
+    """What an object is like: "hard, smooth, no bumps is a ruler."; by these classes in place of its own, if given."""
+    labels = labels or catalogue.labels(object_id)
     classes = ", ".join(p.levels[level] for p, level in zip(catalogue.properties, labels, strict=True))
-    return f"{classes} is", f" {catalogue.objects[object_id].name}."
+    return f"{classes} is {catalogue.objects[object_id].name}."
 
 
-def facts(catalogue: Catalogue, objects: Iterable[str], rng: random.Random) -> str:
-    """What each object is like, in random order."""
-    told = ["".join(fact(catalogue, o)) for o in objects]
-    return " ".join(rng.sample(told, len(told)))
+def facts(catalogue: Catalogue, objects: Sequence[str], rng: random.Random, inexact: float = 0.0) -> str:
+    """What each object is like, in random order.
+
+    Args:
+        inexact: Chance that the class of a property is a neighbour of the right one. The right matching stays nearer
+            than any other.
+    """
+    right = [catalogue.labels(o) for o in objects]
+    told = right
+    for _ in range(TRIES if inexact else 0):
+        told = [
+            tuple(
+                rng.choice([n for n in (level - 1, level + 1) if 0 <= n < len(p.levels)] or [level])
+                if rng.random() < inexact
+                else level
+                for p, level in zip(catalogue.properties, labels, strict=True)
+            )
+            for labels in right
+        ]
+        others = (steps(told, order) for order in itertools.permutations(right) if list(order) != right)
+        if steps(told, right) < min(others):
+            break
+        told = right
+    sentences = [fact(catalogue, o, labels) for o, labels in zip(objects, told, strict=True)]
+    return " ".join(rng.sample(sentences, len(sentences)))
+
+
+def steps(some: Iterable[Sequence[float]], others: Iterable[Sequence[float]]) -> float:
+    """By how many classes two lists of objects differ, pair by pair, over all properties."""
+    pairs = zip(some, others, strict=True)
+    return sum(abs(a - b) for one, other in pairs for a, b in zip(one, other, strict=True))
 
 
 def asked(opening: str, names: Iterable[str]) -> dict[Opd, str]:
@@ -75,12 +104,8 @@ def nearest(classes: Classes, catalogue: Catalogue, objects: Iterable[str] | Non
     """
 
     def distance(order: Sequence[str]) -> tuple[float, ...]:
-        pairs = [
-            (said, label)
-            for video, o in zip(classes, order, strict=True)
-            for said, label in zip(video, catalogue.labels(o), strict=True)
-        ]
-        return tuple(sum(abs(said[i] - label) for said, label in pairs) for i in (0, 1))
+        labels = [catalogue.labels(o) for o in order]
+        return tuple(steps([[said[i] for said in video] for video in classes], labels) for i in (0, 1))
 
     return min(itertools.permutations(sorted(catalogue.objects if objects is None else objects)), key=distance)
 
@@ -116,9 +141,9 @@ class PropertyObjectMatching(TaskDefinition):
         turns = single_turn(user, concluded(catalogue, objects, verdict(catalogue, objects)))
         return draft_about(pool, objects, rng, turns=turns, choice=order, properties=catalogue.property_names)
 
-    def with_facts(self, draft: Draft, catalogue: Catalogue, rng: random.Random) -> Draft:
+    def with_facts(self, draft: Draft, catalogue: Catalogue, rng: random.Random, inexact: float = 0.0) -> Draft:
         """The same question after the facts about its objects; touch and reasoning remain to be asked for."""
-        told = facts(catalogue, draft.objects, rng)
+        told = facts(catalogue, draft.objects, rng, inexact)
 
         def begin(dialogue: Dialogue) -> Dialogue:
             first, *rest = dialogue.turns
@@ -130,7 +155,7 @@ class PropertyObjectMatching(TaskDefinition):
     def restated(self, draft: Draft, catalogue: Catalogue) -> Draft:
         """The question whose answer, behind descriptions of everything, says of each video what a fact would."""
         told = zip(LETTERS, draft.objects, strict=True)
-        return before_concluding(draft, " ".join(f"{x}) {''.join(fact(catalogue, o))}" for x, o in told))
+        return before_concluding(draft, " ".join(f"{x}) {fact(catalogue, o)}" for x, o in told))
 
     def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str:
         """The matching that `nearest` finds."""

@@ -56,6 +56,7 @@ def build_questions(
     seed: int,
     distinct: bool,
     facts: bool = False,
+    inexact: float = 0.0,
     restate: bool = False,
     two_turns: float = 0.0,
     plainly: float = 0.0,
@@ -65,10 +66,10 @@ def build_questions(
 
     Fewer come back where the pool has no more to ask (too few objects, a class without objects): strata that yield
     nothing after `ATTEMPTS` draws are left out, and with `distinct` no question is asked twice. With `facts` the same
-    questions come as each task's `with_facts` makes them, with `restate` as its `restated` does. A share of `two_turns`
-    is asked as `in_turns` does, with all further questions about the same videos, and of the others a share of
-    `plainly` as the task's method of that name does. The questions of a `fold` carry it in
-    their ids, which are so unique over all folds.
+    questions come as each task's `with_facts` makes them, with that chance of `inexact` classes, and with `restate` as
+    its `restated` does. A share of `two_turns` is asked as `in_turns` does, with all further questions about the same
+    videos, and of the others a share of `plainly` as the task's method of that name does. The questions of a `fold`
+    carry it in their ids, which are so unique over all folds.
     """
     place = str(pool.part) if fold is None else f"{pool.part}-fold{fold}"
     questions: list[Question] = []
@@ -91,7 +92,7 @@ def build_questions(
                 more += islice(filter(None, choices), CHOICES)
                 draft = in_turns(draft, turns.sample(more, len(more)))
             if facts:
-                draft = definition.with_facts(draft, pool.catalogue, order)
+                draft = definition.with_facts(draft, pool.catalogue, order, inexact)
             questions.append(
                 Question(
                     question_id=f"{task}-{place}-{number:05d}",

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 
+import numpy as np
 import pytest
 
 from pipeline.config import SplitConfig
@@ -128,6 +130,32 @@ def test_facts_stand_before_the_same_matching_questions() -> None:
         first = [facts.index(f" {CATALOGUE.objects[o].name}.") for o in question.objects]
         orders.add(tuple(sorted(range(3), key=first.__getitem__)))
     assert len(orders) == 6, "the order of the facts gives nothing away"
+
+
+def test_inexact_facts_leave_the_right_matching_the_nearest() -> None:
+    exact, told = (
+        build_questions(POOLS[Part.TRAIN], {"POM": 200}, seed=1, distinct=True, facts=True, inexact=chance)
+        for chance in (0.0, 0.35)
+    )
+    levels = [p.levels for p in CATALOGUE.properties]
+    off = Counter[int]()
+    for before, question in zip(exact, told, strict=True):
+        assert (question.videos, question.gold) == (before.videos, before.gold)
+        said = {}
+        for object_id in question.objects:
+            name = CATALOGUE.objects[object_id].name
+            words = question.dialogues[0].turns[0].user.split(f" is {name}.")[0].split(". ")[-1].split(", ")
+            said[object_id] = np.array([own.index(word) for own, word in zip(levels, words, strict=True)])
+        right = [np.array(CATALOGUE.labels(o)) for o in question.objects]
+        distance = {
+            order: sum(int(np.abs(said[o] - own).sum()) for o, own in zip(order, right, strict=True))
+            for order in itertools.permutations(question.objects)
+        }
+        assert sorted(distance.values())[1] > distance[question.objects] == min(distance.values())
+        assert all(np.abs(said[o] - own).max() <= 1 for o, own in zip(question.objects, right, strict=True))
+        off[sum(int(np.abs(said[o] - own).sum()) for o, own in zip(question.objects, right, strict=True))] += 1
+    # Of nine classes a question, where .35 of each are drawn off and some drawings are refused.
+    assert 1.5 < sum(n * count for n, count in off.items()) / 200 < 9 * 0.35
 
 
 def test_few_objects_give_few_questions_and_none_give_none() -> None:

@@ -133,7 +133,7 @@ def test_classes_are_restated_before_a_conclusion() -> None:
     for question, restated in changed:
         if question.task == "POM":
             (turn,), (bare,) = (q.dialogue(Opd.ALL).turns for q in (restated, question))  # type: ignore[union-attr]
-            facts = [f"{x}) {''.join(fact(CATALOGUE, o))}" for x, o in zip("abc", question.objects, strict=True)]
+            facts = [f"{x}) {fact(CATALOGUE, o)}" for x, o in zip("abc", question.objects, strict=True)]
             assert turn.assistant.replace(" ".join((*facts, "")), "", 1) == bare.assistant
             assert turn.assistant.index(facts[0]) == bare.described + 1
             continue
