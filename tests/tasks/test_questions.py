@@ -7,7 +7,7 @@ from collections import Counter
 import pytest
 
 from pipeline.config import SplitConfig
-from pipeline.records import Part, Question
+from pipeline.core.records import Part, Question
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool
 from pipeline.tasks.questions import build_questions, pool_of
