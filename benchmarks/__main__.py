@@ -9,7 +9,7 @@ from pathlib import Path
 
 from benchmarks.figures import draw
 from benchmarks.table import CSV, Row, merge
-from pipeline.errors import UserError
+from pipeline.core.errors import UserError
 
 SECTIONS = ("frames", "encoder", "language", "contact", "serving")
 """Modules beside this one with a `measure(root)` that gives rows. Another section is a module and its name here."""

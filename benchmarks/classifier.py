@@ -14,10 +14,10 @@ import torch
 
 from benchmarks.errors import Error, cross_validated
 from pipeline.config import EncoderConfig
+from pipeline.core.runtime import derive_seed
 from pipeline.encoder.folds import Fold, Labels
 from pipeline.encoder.frame_classifier import Clips, choose_strength, fit_frame_heads
 from pipeline.encoder.model import FrameEncoder, load_backbones
-from pipeline.runtime import derive_seed
 from pipeline.weights.make import make
 
 if TYPE_CHECKING:

@@ -19,9 +19,9 @@ from benchmarks.errors import WRONG, Error, mean_of
 from benchmarks.table import Row, make_rows
 from benchmarks.timing import counting_ffts, interleaved, machine, milliseconds
 from pipeline.config import ScenesConfig
-from pipeline.parallel import run_parallel
-from pipeline.params import load_params
-from pipeline.runtime import derive_seed
+from pipeline.config.params import load_params
+from pipeline.core.parallel import run_parallel
+from pipeline.core.runtime import derive_seed
 from pipeline.scenes.contact import GEL, slope_error
 from pipeline.scenes.elastic.kernels import Kernel, half_space_table, make_kernel
 from pipeline.scenes.elastic.solver import solve

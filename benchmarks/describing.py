@@ -7,9 +7,9 @@ from statistics import fmean
 
 from benchmarks.errors import Error, error_of
 from benchmarks.table import Row, make_rows
-from pipeline.io import read_csv, read_table
-from pipeline.params import load_params
-from pipeline.records import Graded, ScoreRow
+from pipeline.config.params import load_params
+from pipeline.core.io import read_csv, read_table
+from pipeline.core.records import Graded, ScoreRow
 
 DESCRIBED = ("PC", "PSS", "POM")
 """Tasks that can be answered without describing, over which errors are averaged."""

@@ -31,13 +31,13 @@ from benchmarks.frames import bench_videos
 from benchmarks.table import Row, make_rows
 from benchmarks.timing import flops_of, interleaved, machine, megabytes, one_thread
 from pipeline.config import PRETRAINED, FramesConfig, RuntimeConfig
+from pipeline.config.params import load_params
+from pipeline.core.errors import UserError
+from pipeline.core.records import Video
 from pipeline.encoder.clips import ClipDataset, LabelledVideo
 from pipeline.encoder.cross_validation import CrossValidationData
 from pipeline.encoder.model import FrameEncoder, base_encoder
 from pipeline.encoder.scene_encoder import SceneEncoder
-from pipeline.errors import UserError
-from pipeline.params import load_params
-from pipeline.records import Video
 from pipeline.training.trainable import load_trainable
 from pipeline.videos.files import list_videos
 from pipeline.videos.frames.extract import extract_frames

@@ -14,6 +14,8 @@ from benchmarks.errors import WRONG, Error, error_of, reported, share_of
 from benchmarks.table import Row, make_rows
 from benchmarks.timing import flops_of, interleaved, machine, megabytes
 from pipeline.config import EncoderConfig, FramesConfig, SplitConfig
+from pipeline.core.records import Part
+from pipeline.core.runtime import seed_everything
 from pipeline.encoder.candidates import CANDIDATES, Candidate
 from pipeline.encoder.clips import ClipDataset, EncoderData, LabelledVideo, classify
 from pipeline.encoder.finetune import train_classifier
@@ -21,8 +23,6 @@ from pipeline.encoder.frame_classifier import JointFrameClassifier
 from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier, base_encoder
 from pipeline.encoder.recipes import property_classifier
 from pipeline.encoder.scene_encoder import SceneEncoder
-from pipeline.records import Part
-from pipeline.runtime import seed_everything
 from pipeline.training.sampling import sample_evaluation
 from pipeline.videos.files import VideoFile
 from pipeline.videos.frames.scan import Scan, scan

@@ -9,10 +9,10 @@ from statistics import fmean, stdev
 
 import numpy as np
 
+from pipeline.core.io import read_csv
+from pipeline.core.records import ScoreRow
 from pipeline.encoder.folds import Labels, Predict, cross_validate
 from pipeline.evaluation.intervals import accuracy_interval
-from pipeline.io import read_csv
-from pipeline.records import ScoreRow
 
 WRONG = "share of videos of unseen objects of which not every property is right"
 

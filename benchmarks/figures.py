@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from benchmarks.table import Row
-from pipeline.io import atomic
+from pipeline.core.io import atomic
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -25,9 +25,9 @@ from benchmarks.errors import WRONG
 from benchmarks.table import Row, make_rows
 from benchmarks.timing import interleaved, machine, milliseconds
 from pipeline.config import FramesConfig, Selection
-from pipeline.errors import UserError
-from pipeline.parallel import run_parallel
-from pipeline.params import load_params
+from pipeline.config.params import load_params
+from pipeline.core.errors import UserError
+from pipeline.core.parallel import run_parallel
 from pipeline.training.sampling import sample_evaluation
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.decoding import Image, decode

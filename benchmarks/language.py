@@ -25,16 +25,16 @@ from benchmarks.errors import share_of
 from benchmarks.table import Row, make_rows
 from benchmarks.timing import flops_of, interleaved, machine, one_thread
 from pipeline.config import EncoderConfig, LanguageConfig
-from pipeline.embeddings import FLIPS, INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
+from pipeline.config.params import load_params
+from pipeline.core.embeddings import FLIPS, INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
+from pipeline.core.io import save_tensors, write_table
+from pipeline.core.records import Assignment, Embedding, Opd, Part, Question
+from pipeline.core.runtime import DtypeName, seed_everything
 from pipeline.encoder.model import FrameEncoder, base_encoder
-from pipeline.io import save_tensors, write_table
 from pipeline.language.chat import IGNORE_INDEX
 from pipeline.language.conversations import ConversationDataset, UpdateSampler, collate
 from pipeline.language.generate import answer
 from pipeline.language.octopi import OctopiForCausalLM
-from pipeline.params import load_params
-from pipeline.records import Assignment, Embedding, Opd, Part, Question
-from pipeline.runtime import DtypeName, seed_everything
 from pipeline.tasks.questions import build_questions, pool_of
 from pipeline.videos.catalogue import load_catalogue
 

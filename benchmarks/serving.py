@@ -20,8 +20,8 @@ import numpy as np
 
 from benchmarks.table import Row, make_rows
 from benchmarks.timing import machine, milliseconds
-from pipeline.errors import UserError
-from pipeline.params import load_params
+from pipeline.config.params import load_params
+from pipeline.core.errors import UserError
 from pipeline.use.folder import SHIPPED
 from pipeline.videos.files import video_files
 

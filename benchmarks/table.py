@@ -10,9 +10,9 @@ from statistics import median
 from pydantic import Field, ValidationError, model_validator
 
 from benchmarks.errors import Error
-from pipeline.errors import UserError, first_problem
-from pipeline.io import write_csv
-from pipeline.records import Record
+from pipeline.core.errors import UserError, first_problem
+from pipeline.core.io import write_csv
+from pipeline.core.records import Record
 
 CSV = Path("reports") / "speed_error.csv"
 

@@ -13,7 +13,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any, TypeVar
 from unittest import mock
 
-from pipeline.runtime import cores
+from pipeline.core.runtime import cores
 
 if TYPE_CHECKING:
     from torch import nn

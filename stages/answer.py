@@ -2,14 +2,14 @@
 
 from dataclasses import replace
 
-from pipeline.embeddings import EmbeddingStore
-from pipeline.io import read_jsonl, write_jsonl
+from pipeline.core.embeddings import EmbeddingStore
+from pipeline.core.io import read_jsonl, write_jsonl
+from pipeline.core.parallel import device_here
+from pipeline.core.records import Encoder, Lora, Opd, Question, Touch, Variant
+from pipeline.core.runtime import name_dtype
+from pipeline.core.stage import DATA, matrix_key, stage
 from pipeline.language.generate import ModelSource, answer
 from pipeline.language.input_ablation import ablate_input
-from pipeline.parallel import device_here
-from pipeline.records import Encoder, Lora, Opd, Question, Touch, Variant
-from pipeline.runtime import name_dtype
-from pipeline.stage import DATA, matrix_key, stage
 
 
 def main() -> None:

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from pipeline.io import read_table, write_csv, write_text
-from pipeline.records import Finding, Probe
-from pipeline.stage import DATA, stage
+from pipeline.core.io import read_table, write_csv, write_text
+from pipeline.core.records import Finding, Probe
+from pipeline.core.stage import DATA, stage
 from pipeline.videos.audit.run import AUDIT_FILE, audit_chain, stop_on_errors, summary
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.frames.store import PROBES_FILE

@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
+from pipeline.core.io import read_table, write_table
+from pipeline.core.records import OutOfFold, Video
+from pipeline.core.stage import DATA, matrix_key, stage
 from pipeline.encoder.candidates import CANDIDATES
 from pipeline.encoder.cross_validation import CrossValidationData, cross_validate_candidate
-from pipeline.io import read_table, write_table
-from pipeline.records import OutOfFold, Video
-from pipeline.stage import DATA, matrix_key, stage
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.weights import check_encoder
 

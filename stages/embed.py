@@ -6,12 +6,12 @@ from pathlib import Path
 
 import torch
 
-from pipeline.embeddings import INDEX_FILE, STATISTICS_FILE, TENSOR, TENSOR_FILE
+from pipeline.core.embeddings import INDEX_FILE, STATISTICS_FILE, TENSOR, TENSOR_FILE
+from pipeline.core.io import fingerprint, read_table, save_tensors, write_table
+from pipeline.core.parallel import device_here
+from pipeline.core.records import Assignment, Embedding, Encoder, Part
+from pipeline.core.stage import DATA, Stage, stage
 from pipeline.encoder.embed import EncoderSource, embed_videos, logits_of, standardize, statistics, union
-from pipeline.io import fingerprint, read_table, save_tensors, write_table
-from pipeline.parallel import device_here
-from pipeline.records import Assignment, Embedding, Encoder, Part
-from pipeline.stage import DATA, Stage, stage
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.weights import check_encoder
 

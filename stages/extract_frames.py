@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from pipeline.io import write_table
-from pipeline.records import Video
-from pipeline.runtime import CHECKPOINTS
-from pipeline.stage import DATA, stage
+from pipeline.core.io import write_table
+from pipeline.core.records import Video
+from pipeline.core.runtime import CHECKPOINTS
+from pipeline.core.stage import DATA, stage
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.frames.extract import extract_frames
 

@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
+from pipeline.core.io import read_table, write_table
+from pipeline.core.records import Assignment, Classification, Measurement, Part
+from pipeline.core.runtime import resolve_device
+from pipeline.core.stage import DATA, matrix_key, stage
 from pipeline.encoder.clips import EncoderData, classify
 from pipeline.encoder.finetune import finetune, write_encoder_card
-from pipeline.io import read_table, write_table
-from pipeline.records import Assignment, Classification, Measurement, Part
-from pipeline.runtime import resolve_device
-from pipeline.stage import DATA, matrix_key, stage
 from pipeline.tracking.live import live
 from pipeline.training.trainable import save_trainable
 from pipeline.videos.catalogue import load_catalogue

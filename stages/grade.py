@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
+from pipeline.core.io import read_jsonl, write_table
+from pipeline.core.records import Graded, GradedVision, Prediction, Question, Touch
+from pipeline.core.stage import DATA, stage
 from pipeline.evaluation.grading import EXTERNAL, grade, grade_vision_models
-from pipeline.io import read_jsonl, write_table
-from pipeline.records import Graded, GradedVision, Prediction, Question, Touch
-from pipeline.stage import DATA, stage
 from pipeline.videos.catalogue import load_catalogue
 
 

@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from pipeline.config import INVENTED
+from pipeline.core.stage import stage
 from pipeline.scenes.invented import write_catalogue
-from pipeline.stage import stage
 
 
 def main() -> None:

@@ -1,9 +1,9 @@
 """Fine-tune the aligned model end to end, the language model through low-rank adapters."""
 
-from pipeline.io import write_table
-from pipeline.records import Encoder, Measurement, Opd
-from pipeline.runtime import limit_threads
-from pipeline.stage import DATA, matrix_key, stage
+from pipeline.core.io import write_table
+from pipeline.core.records import Encoder, Measurement, Opd
+from pipeline.core.runtime import limit_threads
+from pipeline.core.stage import DATA, matrix_key, stage
 from pipeline.tracking.live import live
 
 

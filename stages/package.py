@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from pipeline.stage import DATA, stage
+from pipeline.core.stage import DATA, stage
 from pipeline.use.package import describe_base, package
 
 MODELS = Path("models")

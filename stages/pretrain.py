@@ -1,10 +1,10 @@
 """Pretrain the backbone `scenes` on pictures of invented objects, where the encoder or a compared model has it."""
 
 from pipeline.config import PRETRAINED
+from pipeline.core.io import write_table
+from pipeline.core.records import Measurement
+from pipeline.core.stage import DATA, stage
 from pipeline.encoder.candidates import needs_pretraining
-from pipeline.io import write_table
-from pipeline.records import Measurement
-from pipeline.stage import DATA, stage
 from pipeline.tracking.live import live
 
 

@@ -3,8 +3,8 @@
 import logging
 from pathlib import Path
 
+from pipeline.core.stage import stage
 from pipeline.report.page import write_page
-from pipeline.stage import stage
 from pipeline.tracking.publish import publish
 from pipeline.tracking.store import TrackingError
 

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
+from pipeline.core.stage import stage
 from pipeline.report.build import write_report
-from pipeline.stage import stage
 
 
 def main() -> None:

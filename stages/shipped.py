@@ -4,14 +4,14 @@ from pathlib import Path
 
 import torch
 
-from pipeline.embeddings import EmbeddingStore
-from pipeline.errors import UserError
+from pipeline.core.embeddings import EmbeddingStore
+from pipeline.core.errors import UserError
+from pipeline.core.io import read_table, write_table
+from pipeline.core.records import Classification, GradedVision, Part, Shown, Video
+from pipeline.core.runtime import limit_threads, track
+from pipeline.core.stage import DATA, stage
 from pipeline.evaluation.grading import conclude, grade
-from pipeline.io import read_table, write_table
 from pipeline.language.generate import answer
-from pipeline.records import Classification, GradedVision, Part, Shown, Video
-from pipeline.runtime import limit_threads, track
-from pipeline.stage import DATA, stage
 from pipeline.tasks.base import Pool
 from pipeline.tasks.questions import build_questions, counts_by_task
 from pipeline.use.folder import SHIPPED

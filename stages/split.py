@@ -3,9 +3,9 @@
 import logging
 from pathlib import Path
 
-from pipeline.io import read_table, write_table
-from pipeline.records import Assignment, Part, Video
-from pipeline.stage import DATA, stage
+from pipeline.core.io import read_table, write_table
+from pipeline.core.records import Assignment, Part, Video
+from pipeline.core.stage import DATA, stage
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.split import assign, assign_objects, without_videos
 

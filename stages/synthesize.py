@@ -3,10 +3,10 @@
 from pathlib import Path
 
 from pipeline.config import SCENES_DIR
-from pipeline.io import write_csv
+from pipeline.core.io import write_csv
+from pipeline.core.stage import stage
 from pipeline.scenes.recipe import load_recipes
 from pipeline.scenes.video import SceneRow, share_as_labelled, synthesize
-from pipeline.stage import stage
 from pipeline.videos.catalogue import load_catalogue
 
 

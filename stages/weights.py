@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from pipeline.stage import stage
+from pipeline.core.stage import stage
 from pipeline.weights import MADE_DIR, made
 from pipeline.weights.make import make
 

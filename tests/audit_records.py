@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.config import FramesConfig, ScenesConfig
-from pipeline.records import Assignment, Finding, Part, Probe, Severity
-from pipeline.runtime import derive_seed
+from pipeline.core.records import Assignment, Finding, Part, Probe, Severity
+from pipeline.core.runtime import derive_seed
 from pipeline.scenes.light import make_sensor
 from pipeline.scenes.recipe import recipe_of
 from pipeline.scenes.render import make_scene, render

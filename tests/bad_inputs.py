@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 from unittest import mock
 
 from pipeline.cli import main
-from pipeline.params import PARAMS_FILE, load_params, validate
+from pipeline.config.params import PARAMS_FILE, load_params, validate
 from pipeline.scales import write_params
 from tests import test_config
 from tests.checkpoints import write_clip, write_llama

@@ -11,11 +11,11 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from pipeline.config import PRETRAINED, EncoderConfig, Recipe, RuntimeConfig
+from pipeline.core.io import write_table
+from pipeline.core.records import Assignment, Frame, Part
 from pipeline.encoder.clips import EncoderData
 from pipeline.encoder.frame_classifier import FittedHeads
 from pipeline.encoder.scene_encoder import SceneEncoder
-from pipeline.io import write_table
-from pipeline.records import Assignment, Frame, Part
 from pipeline.training.trainable import save_trainable
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FRAMES_FILE, REFERENCES_FILE, TABLE_FILE, FrameStore

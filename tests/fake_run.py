@@ -9,9 +9,8 @@ from pathlib import Path
 import yaml
 
 from pipeline.config import Params
-from pipeline.evaluation.grading import grade
-from pipeline.io import write_csv, write_jsonl, write_table
-from pipeline.records import (
+from pipeline.core.io import write_csv, write_jsonl, write_table
+from pipeline.core.records import (
     Assignment,
     Classification,
     Finding,
@@ -25,6 +24,7 @@ from pipeline.records import (
     Touch,
     Video,
 )
+from pipeline.evaluation.grading import grade
 from pipeline.scales import compose
 from pipeline.tasks.examples import build_examples
 from pipeline.tasks.questions import build_questions, counts_by_task, pool_of

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from filelock import FileLock
 
-from pipeline.io import fingerprint
+from pipeline.core.io import fingerprint
 from pipeline.weights.make import CATALOGUE, make
 from tests.closure import ROOT
 

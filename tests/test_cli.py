@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pipeline.cli import app
-from pipeline.params import load_params
+from pipeline.config.params import load_params
 from pipeline.scales import compose, write_params
 from tests.closure import ROOT
 from tests.conftest import moving_square, not_utf8, write_video
@@ -70,7 +70,7 @@ def test_scale_names_the_objects_that_nothing_can_be_asked_about(project: Path) 
     ("command", "inner"),
     [
         ("scale smoke", "pipeline.scales.compose"),
-        ("repro", "pipeline.reproduce.outdated"),
+        ("repro", "pipeline.cli.reproduce.outdated"),
         ("data audit .", "pipeline.videos.audit.run.audit_folder"),
         ("answer-with --endpoint http://a/v1 --model b --input frames", "pipeline.evaluation.answer_with.ask_all"),
         *((f"{use} --model .", "pipeline.use.model.Octopi.from_pretrained") for use in ("ask a", "describe . --csv a")),

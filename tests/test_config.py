@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.config.params import load_params
+from pipeline.core.errors import UserError, without_secrets
 from pipeline.encoder.candidates import RELEASE, needs_pretraining
 from pipeline.encoder.recipes import RECIPES
-from pipeline.errors import UserError, without_secrets
-from pipeline.params import load_params
 from pipeline.scales import check_inputs, compose, prune, shipped_scales, write_params
 from tests.closure import ROOT
 from tests.conftest import refused

@@ -11,11 +11,11 @@ from transformers import LlamaForCausalLM
 from typer.testing import CliRunner
 
 from pipeline.cli import app
-from pipeline.cost import Hours, costs, measured_rate, work
-from pipeline.errors import UserError
-from pipeline.memory import Lengths, count
+from pipeline.core.errors import UserError
 from pipeline.scales import compose
-from pipeline.shapes import Llama
+from pipeline.scales.cost import Hours, costs, measured_rate, work
+from pipeline.scales.memory import Lengths, count
+from pipeline.weights.shapes import Llama
 from tests.checkpoints import write_llama
 
 ONE = (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from pipeline.runtime import name_dtype, resolve_dtype
+from pipeline.core.runtime import name_dtype, resolve_dtype
 
 
 def flags() -> set[str]:

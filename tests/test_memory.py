@@ -17,12 +17,12 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 from transformers import DynamicCache, LlamaConfig, LlamaForCausalLM
 
+from pipeline.core.errors import UserError
 from pipeline.encoder.vpt import VisualPrompts
-from pipeline.errors import UserError
 from pipeline.language.octopi import OctopiForCausalLM
-from pipeline.memory import ADAM, GIB, Lengths, Use, count, language_saved, launched, table
 from pipeline.scales import compose
-from pipeline.shapes import PUBLISHED_LANGUAGE, PUBLISHED_VISION, Llama, Vision
+from pipeline.scales.memory import ADAM, GIB, Lengths, Use, count, language_saved, launched, table
+from pipeline.weights.shapes import PUBLISHED_LANGUAGE, PUBLISHED_VISION, Llama, Vision
 from tests.checkpoints import write_clip, write_llama
 from tests.closure import ROOT
 

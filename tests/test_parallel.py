@@ -16,13 +16,13 @@ from pathlib import Path
 import psutil
 import pytest
 
-from pipeline import parallel
+from pipeline.core import parallel
+from pipeline.core.errors import UserError
+from pipeline.core.parallel import _loaded, use_backend
+from pipeline.core.records import Encoder, Lora, Opd, Variant
+from pipeline.core.stage import stage
 from pipeline.encoder.embed import EncoderSource
-from pipeline.errors import UserError
-from pipeline.parallel import _loaded, use_backend
-from pipeline.records import Encoder, Lora, Opd, Variant
 from pipeline.scales import check_inputs, compose, write_params
-from pipeline.stage import stage
 from tests.closure import ROOT
 from tests.conftest import wait_until_ended
 from tests.use.shared import make
@@ -30,10 +30,10 @@ from tests.use.shared import make
 SCRIPT = """
 import os, sys, time
 from pathlib import Path
-from pipeline import parallel
+from pipeline.core import parallel
 from pipeline.config import FramesConfig
-from pipeline.errors import UserError
-from pipeline.parallel import run_parallel, use_backend
+from pipeline.core.errors import UserError
+from pipeline.core.parallel import run_parallel, use_backend
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.frames.extract import extract_frames
 
@@ -76,13 +76,13 @@ MODELS = """
 import os, sys
 from pathlib import Path
 import torch
-from pipeline.embeddings import EmbeddingStore
+from pipeline.core.embeddings import EmbeddingStore
 from pipeline.encoder.embed import EncoderSource, embed_videos
-from pipeline import parallel
-from pipeline.io import read_table
+from pipeline.core import parallel
+from pipeline.core.io import read_table
 from pipeline.language import generate
-from pipeline.parallel import use_backend
-from pipeline.records import Assignment, Encoder, Lora, Opd, Variant
+from pipeline.core.parallel import use_backend
+from pipeline.core.records import Assignment, Encoder, Lora, Opd, Variant
 from tests.use.shared import make
 
 def main():

@@ -23,8 +23,8 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from pipeline.cli import app
-from pipeline.errors import UserError
-from pipeline.io import (
+from pipeline.core.errors import UserError
+from pipeline.core.io import (
     atomic,
     atomic_folder,
     load_tensors,
@@ -35,10 +35,10 @@ from pipeline.io import (
     write_jsonl,
     write_table,
 )
-from pipeline.parallel import _there
-from pipeline.records import Assignment, Measurement, Part, Score, Video
+from pipeline.core.parallel import _there
+from pipeline.core.records import Assignment, Measurement, Part, Score, Video
+from pipeline.core.stage import running_stages, stage
 from pipeline.scales import compose, write_params
-from pipeline.stage import running_stages, stage
 from tests.closure import ROOT
 
 
@@ -111,8 +111,10 @@ stages:
   slow: {cmd: python stages/slow.py, deps: [first.txt]}
 """
 IMPORTING = "import pipeline\nprint('now', flush=True)\ntime.sleep(600)"
-RUNNING = "from pipeline.stage import stage\nwith stage('slow'):\n    print('now', flush=True)\n    time.sleep(600)"
-WORKERS = "from pipeline.parallel import run_parallel\n"
+RUNNING = (
+    "from pipeline.core.stage import stage\nwith stage('slow'):\n    print('now', flush=True)\n    time.sleep(600)"
+)
+WORKERS = "from pipeline.core.parallel import run_parallel\n"
 SLEEPING = f"{WORKERS}print('now', flush=True)\nlist(run_parallel(time.sleep, [600] * 64, '', ''))"
 # So much to hand over that a worker is always in the middle of it.
 TELLING = (
@@ -176,7 +178,7 @@ def test_parameters_that_change_while_a_stage_runs_are_no_silent_matter(here: Pa
 @pytest.mark.parametrize("code", ["import torch; limit_threads(1)", "limit_threads(1); import torch"])
 def test_threads_are_limited_before_and_after_torch_is_imported(code: str) -> None:
     """Some stages import it when they need it."""
-    code = f"from pipeline.runtime import limit_threads; {code}; print(torch.get_num_threads())"
+    code = f"from pipeline.core.runtime import limit_threads; {code}; print(torch.get_num_threads())"
     environment = {**os.environ, "OMP_NUM_THREADS": "2", "PYTHONPATH": str(ROOT)}
     assert subprocess.check_output([sys.executable, "-c", code], text=True, env=environment) == "1\n"
 
@@ -296,8 +298,8 @@ def test_no_scale_is_chosen_while_a_stage_runs(here: Path) -> None:
 STARTED = """
 import os, sys, time
 from pathlib import Path
-from pipeline.errors import UserError
-from pipeline.stage import stage
+from pipeline.core.errors import UserError
+from pipeline.core.stage import stage
 with stage("align", "x", launched=True) as run:
     Path("started").write_text(str(os.getpid()))
     while sys.argv[1] == "waits":
@@ -394,7 +396,7 @@ SCORE = Score(
 
 
 def test_a_stage_removes_what_killed_ones_were_writing(here: Path) -> None:
-    kill = "import os; from pathlib import Path; from pipeline.io import atomic"
+    kill = "import os; from pathlib import Path; from pipeline.core.io import atomic"
     kill += "; t = atomic(Path('data/graded.parquet')).__enter__(); t.write_text('half'); os.kill(os.getpid(), 9)"
     assert subprocess.run([sys.executable, "-c", kill], cwd=here, check=False).returncode == -9
     (rest,) = (here / "data").iterdir()
@@ -417,7 +419,7 @@ def test_a_stage_removes_what_killed_ones_were_writing(here: Path) -> None:
 
 
 def test_a_folder_that_was_killed_is_made_anew_and_one_in_the_making_left_alone(tmp_path: Path) -> None:
-    kill = "import os; from pathlib import Path; from pipeline.io import atomic_folder"
+    kill = "import os; from pathlib import Path; from pipeline.core.io import atomic_folder"
     kill += "; making = atomic_folder(Path('[a]')); (making.__enter__() / 'half').touch(); os.kill(os.getpid(), 9)"
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
     assert subprocess.run([sys.executable, "-c", kill], cwd=tmp_path, env=env, check=False).returncode == -9

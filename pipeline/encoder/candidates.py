@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from pipeline.config import EncoderConfig
-from pipeline.errors import UserError, did_you_mean
+from pipeline.core.errors import UserError, did_you_mean
 from pipeline.weights import check_encoder
 
 Kind = Literal["constant", "frame_heads", "gradient", "tuned"]

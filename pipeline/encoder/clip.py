@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.errors import UserError
-from pipeline.io import read_json
+from pipeline.core.errors import UserError
+from pipeline.core.io import read_json
 from pipeline.weights import CLIP_CONFIG, GET_CLIP, check_finite, frame_side
 
 if TYPE_CHECKING:

@@ -12,10 +12,10 @@ import torch
 from torch.nn import functional as F
 from torch.utils.data import DataLoader
 
+from pipeline.core.errors import UserError
+from pipeline.core.records import Assignment, Classification, Part
+from pipeline.core.runtime import derive_seed
 from pipeline.encoder.model import FrameEncoder, PropertyClassifier
-from pipeline.errors import UserError
-from pipeline.records import Assignment, Classification, Part
-from pipeline.runtime import derive_seed
 from pipeline.training.sampling import EpochDataset, sample_evaluation, sample_training
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore

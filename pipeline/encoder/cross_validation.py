@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.config import CrossValidationConfig, EncoderConfig, RuntimeConfig
+from pipeline.core.errors import UserError
+from pipeline.core.io import code_of, fingerprint, read_json, write_json
+from pipeline.core.records import Assignment, OutOfFold, Part, Video
+from pipeline.core.runtime import CHECKPOINTS, derive_seed, limit_threads, progress, resolve_device, seed_everything
 from pipeline.encoder.candidates import Candidate
 from pipeline.encoder.folds import Fold, Labels, Predict, cross_validate, deal
-from pipeline.errors import UserError
-from pipeline.io import code_of, fingerprint, read_json, write_json
-from pipeline.records import Assignment, OutOfFold, Part, Video
-from pipeline.runtime import CHECKPOINTS, derive_seed, limit_threads, progress, resolve_device, seed_everything
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import REFERENCES_FILE, TABLE_FILE, FrameStore
 from pipeline.weights import BACKBONES

@@ -17,15 +17,15 @@ import numpy.typing as npt
 import torch
 from torch.utils.data import default_collate
 
-from pipeline.card import write_card
 from pipeline.config import EncoderConfig, RuntimeConfig
+from pipeline.core.card import write_card
+from pipeline.core.records import Measurement, Part
+from pipeline.core.runtime import resolve_device, seed_everything
 from pipeline.encoder.clips import ClipDataset, EncoderData
 from pipeline.encoder.frame_classifier import JointFrameClassifier, choose_strength, fit_frame_heads
 from pipeline.encoder.model import PropertyClassifier, SideBySide
 from pipeline.encoder.recipes import property_classifier
 from pipeline.encoder.tuned import FLIPS, AboveTrunks, TrunkDataset, Trunks, run_trunks
-from pipeline.records import Measurement, Part
-from pipeline.runtime import resolve_device, seed_everything
 from pipeline.training.sampling import EpochDataset
 from pipeline.training.trainable import trainable_state
 from pipeline.videos.catalogue import Catalogue

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.runtime import derive_seed
+from pipeline.core.runtime import derive_seed
 
 Labels = npt.NDArray[np.int64]
 """Videos x properties: classes from 0."""

@@ -17,11 +17,11 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from pipeline.core.errors import UserError
+from pipeline.core.records import Measurement
+from pipeline.core.runtime import derive_seed
 from pipeline.encoder.folds import Labels, deal
 from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
-from pipeline.errors import UserError
-from pipeline.records import Measurement
-from pipeline.runtime import derive_seed
 
 FARTHEST = 5.0
 """Standardised features are held within: one wild frame must not outweigh all others."""

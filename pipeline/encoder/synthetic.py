@@ -18,9 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.config import FramesConfig, PretrainConfig
-from pipeline.io import atomic
-from pipeline.parallel import run_parallel
-from pipeline.runtime import derive_seed
+from pipeline.core.io import atomic
+from pipeline.core.parallel import run_parallel
+from pipeline.core.runtime import derive_seed
 from pipeline.scenes.contact import Body, Method
 from pipeline.scenes.geometry import IMAGE_MM, Heights, heights
 from pipeline.scenes.invent import LAYERS, invent

@@ -16,9 +16,9 @@ from torch import nn
 from torch.nn import functional as F
 
 from pipeline.config import EncoderConfig
+from pipeline.core.errors import UserError
+from pipeline.core.io import load_tensors
 from pipeline.encoder.model import FrameEncoder, mean_and_deviation
-from pipeline.errors import UserError
-from pipeline.io import load_tensors
 from pipeline.weights import check_finite, frame_side
 
 STAGES = "stages.safetensors"

@@ -20,10 +20,10 @@ import torch
 from torch import nn
 
 from pipeline.config import EncoderConfig
+from pipeline.core.runtime import derive_seed, track
 from pipeline.encoder.clips import ClipDataset, EncoderData, LabelledVideo, check_finite
 from pipeline.encoder.frame_classifier import Clips, JointFrameClassifier
 from pipeline.encoder.model import SideBySide, load_backbones
-from pipeline.runtime import derive_seed, track
 from pipeline.training.sampling import EpochDataset
 
 FLIPS: tuple[tuple[int, ...], ...] = ((), (2,), (1,), (1, 2))

@@ -26,12 +26,12 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.config import Params
-from pipeline.errors import UserError
+from pipeline.core.errors import UserError
+from pipeline.core.io import fingerprint, read_jsonl, write_json, write_jsonl
+from pipeline.core.records import Opd, Prediction, Question, Record, Shown, VisionModel
+from pipeline.core.runtime import track
+from pipeline.core.stage import DATA, alone
 from pipeline.evaluation.grading import EXTERNAL, SOURCE_FILE
-from pipeline.io import fingerprint, read_jsonl, write_json, write_jsonl
-from pipeline.records import Opd, Prediction, Question, Record, Shown, VisionModel
-from pipeline.runtime import track
-from pipeline.stage import DATA, alone
 from pipeline.training.sampling import sample_evaluation
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.frames.store import FrameStore

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from pipeline.records import Classification, Optional, Part, Record, Share
-from pipeline.runtime import derive_seed
+from pipeline.core.records import Classification, Optional, Part, Record, Share
+from pipeline.core.runtime import derive_seed
 
 Floats = npt.NDArray[np.float64]
 

@@ -9,9 +9,9 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from pipeline.errors import UserError
-from pipeline.io import fingerprint, read_json, read_jsonl
-from pipeline.records import Classification, GradedVision, Prediction, Question, Score, VisionModel
+from pipeline.core.errors import UserError
+from pipeline.core.io import fingerprint, read_json, read_jsonl
+from pipeline.core.records import Classification, GradedVision, Prediction, Question, Score, VisionModel
 from pipeline.tasks import TASKS
 from pipeline.videos.catalogue import Catalogue
 

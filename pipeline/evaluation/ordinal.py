@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from pipeline.records import Optional, OutOfFold, Record, Share
+from pipeline.core.records import Optional, OutOfFold, Record, Share
 from pipeline.videos.catalogue import Catalogue
 
 

@@ -14,9 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.evaluation.intervals import Objects, accuracy_interval
-from pipeline.evaluation.paired import Difference, holm, paired
-from pipeline.records import (
+from pipeline.core.records import (
     ALL_SEEDS,
     CROSS_VALIDATION,
     HEADS,
@@ -34,6 +32,8 @@ from pipeline.records import (
     ScoreRow,
     Touch,
 )
+from pipeline.evaluation.intervals import Objects, accuracy_interval
+from pipeline.evaluation.paired import Difference, holm, paired
 from pipeline.tasks import TASKS
 from pipeline.videos.catalogue import Catalogue
 

@@ -21,11 +21,11 @@ from transformers import (
     PreTrainedTokenizerBase,
 )
 
-from pipeline.errors import UserError
-from pipeline.io import read_json, tensor_shapes, write_json
+from pipeline.core.errors import UserError
+from pipeline.core.io import read_json, tensor_shapes, write_json
+from pipeline.core.records import Turn
+from pipeline.core.runtime import Quantization
 from pipeline.language.chat import add_tactile_tokens, render
-from pipeline.records import Turn
-from pipeline.runtime import Quantization
 from pipeline.weights import GET_LLM, again, check_finite, check_language
 
 ADAPTER_CONFIG = "adapter_config.json"

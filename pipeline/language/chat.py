@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 from jinja2 import TemplateError
 
-from pipeline.errors import UserError
-from pipeline.records import Turn
+from pipeline.core.errors import UserError
+from pipeline.core.records import Turn
 
 if TYPE_CHECKING:
     from transformers import PreTrainedTokenizerBase

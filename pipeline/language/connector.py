@@ -9,10 +9,10 @@ from pydantic import Field, ValidationError
 from torch import nn
 
 from pipeline.config import TrainedEmbeddings
-from pipeline.errors import UserError, first_problem
-from pipeline.io import read_json
+from pipeline.core.errors import UserError, first_problem
+from pipeline.core.io import read_json
+from pipeline.core.records import Record
 from pipeline.language.chat import TACTILE_TOKENS
-from pipeline.records import Record
 
 CONFIG_FILE = "config.json"
 

@@ -8,10 +8,10 @@ from itertools import accumulate, chain, pairwise
 
 import torch
 
-from pipeline.embeddings import EmbeddingStore
-from pipeline.errors import UserError
-from pipeline.records import Question, Touch
-from pipeline.runtime import derive_seed
+from pipeline.core.embeddings import EmbeddingStore
+from pipeline.core.errors import UserError
+from pipeline.core.records import Question, Touch
+from pipeline.core.runtime import derive_seed
 
 
 def ablate_input(store: EmbeddingStore, touch: Touch, questions: Sequence[Question], seed: int) -> EmbeddingStore:

@@ -14,13 +14,13 @@ from torch.nn import functional as F
 from transformers import DynamicCache, PreTrainedModel, PreTrainedTokenizerBase
 from transformers.modeling_outputs import CausalLMOutput
 
-from pipeline.errors import UserError
-from pipeline.io import save_tensors, write_json
+from pipeline.core.errors import UserError
+from pipeline.core.io import save_tensors, write_json
+from pipeline.core.runtime import DtypeName, Quantization, resolve_dtype
 from pipeline.language.base import load_adapter, load_llm, load_tokenizer, save_adapter
 from pipeline.language.cache import extendable
 from pipeline.language.chat import IGNORE_INDEX, TACTILE_TOKENS
 from pipeline.language.connector import CONFIG_FILE, Connector, OctopiConfig, read_config
-from pipeline.runtime import DtypeName, Quantization, resolve_dtype
 from pipeline.training.trainable import load_trainable
 
 CONNECTOR_FILE, WORDS_FILE = "connector.safetensors", "words.safetensors"

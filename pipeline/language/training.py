@@ -12,7 +12,6 @@ from typing import Self
 
 from transformers import TrainerCallback
 
-from pipeline.card import write_card
 from pipeline.config import (
     LANGUAGE_DIR,
     LanguageConfig,
@@ -21,15 +20,16 @@ from pipeline.config import (
     RuntimeConfig,
     TrainConfig,
 )
-from pipeline.embeddings import TENSOR_FILE, EmbeddingStore
-from pipeline.errors import UserError
-from pipeline.io import fingerprint, read_jsonl
+from pipeline.core.card import write_card
+from pipeline.core.embeddings import TENSOR_FILE, EmbeddingStore
+from pipeline.core.errors import UserError
+from pipeline.core.io import fingerprint, read_jsonl
+from pipeline.core.records import Encoder, Opd, Question
+from pipeline.core.runtime import derive_seed, name_dtype, seed_everything
 from pipeline.language.base import ADAPTER_WEIGHTS
 from pipeline.language.connector import CONFIG_FILE, read_config
 from pipeline.language.conversations import ConversationDataset, UpdateSampler, collate
 from pipeline.language.octopi import ADAPTER_DIR, OctopiForCausalLM
-from pipeline.records import Encoder, Opd, Question
-from pipeline.runtime import derive_seed, name_dtype, seed_everything
 from pipeline.training.trainer import (
     TrainableTrainer,
     Trained,

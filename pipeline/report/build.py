@@ -9,13 +9,9 @@ from pathlib import Path
 import pandas as pd
 
 from pipeline.config import AblationConfig, Params
-from pipeline.evaluation.calibration import CalibrationRow, calibrated, calibration_rows
-from pipeline.evaluation.grading import EXTERNAL, conclude, vision_models
-from pipeline.evaluation.ordinal import ErrorRow, error_rows
-from pipeline.evaluation.scores import candidate_rows, effect_rows, score_rows
-from pipeline.io import read_csv, read_jsonl, read_table, write_csv, write_json, write_text
-from pipeline.params import PARAMS_FILE
-from pipeline.records import (
+from pipeline.config.params import PARAMS_FILE
+from pipeline.core.io import read_csv, read_jsonl, read_table, write_csv, write_json, write_text
+from pipeline.core.records import (
     HEADS,
     Classification,
     EffectRow,
@@ -33,6 +29,10 @@ from pipeline.records import (
     Variant,
     Video,
 )
+from pipeline.evaluation.calibration import CalibrationRow, calibrated, calibration_rows
+from pipeline.evaluation.grading import EXTERNAL, conclude, vision_models
+from pipeline.evaluation.ordinal import ErrorRow, error_rows
+from pipeline.evaluation.scores import candidate_rows, effect_rows, score_rows
 from pipeline.report.dataset import dataset_frame
 from pipeline.report.figures import draw_figures
 from pipeline.report.load import load_report

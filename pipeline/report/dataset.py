@@ -10,7 +10,7 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.records import Assignment, Part, Video
+from pipeline.core.records import Assignment, Part, Video
 from pipeline.report.load import published
 from pipeline.videos.catalogue import Catalogue
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from pipeline.io import atomic
+from pipeline.core.io import atomic
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

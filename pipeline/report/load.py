@@ -10,8 +10,8 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.errors import UserError
-from pipeline.records import EffectRow, ScoreRow
+from pipeline.core.errors import UserError
+from pipeline.core.records import EffectRow, ScoreRow
 
 KEYS = ("task", "measure", "encoder", "lora", "opd")
 """What a published cell and a measured row share; "" stands for "does not apply"."""

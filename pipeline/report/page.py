@@ -18,9 +18,9 @@ import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from pipeline.errors import UserError
-from pipeline.io import write_text
-from pipeline.params import PARAMS_FILE, load_params
+from pipeline.config.params import PARAMS_FILE, load_params
+from pipeline.core.errors import UserError
+from pipeline.core.io import write_text
 from pipeline.report.dataset import dataset_tables
 from pipeline.report.drawing import draw_table, share, span
 from pipeline.report.load import KEYS, Report, cells, load_report, read_frame

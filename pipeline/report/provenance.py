@@ -14,12 +14,12 @@ from typing import Any
 
 import yaml
 
-from pipeline.card import front_matter
 from pipeline.config import EncoderConfig, Params
+from pipeline.config.params import PARAMS_FILE
+from pipeline.core.card import front_matter
+from pipeline.core.io import sha256, tensor_shapes
+from pipeline.core.records import Assignment, Part, Video
 from pipeline.evaluation.intervals import coverage_note
-from pipeline.io import sha256, tensor_shapes
-from pipeline.params import PARAMS_FILE
-from pipeline.records import Assignment, Part, Video
 from pipeline.videos.catalogue import Catalogue
 from pipeline.weights import BACKBONES
 

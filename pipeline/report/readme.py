@@ -10,7 +10,7 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.records import Shown
+from pipeline.core.records import Shown
 from pipeline.report.load import Report
 from pipeline.report.tables import (
     FIVE_TASKS,

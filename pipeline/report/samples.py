@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from pipeline.records import Opd, Prediction, Question, Score
+from pipeline.core.records import Opd, Prediction, Question, Score
 from pipeline.tasks import TASKS
 from pipeline.tasks.examples import EXAMPLES, LEAST_KNOWN_FIRST, grade_example
 from pipeline.videos.catalogue import Catalogue
@@ -15,7 +15,7 @@ RULE = (
     "seed, to real touch."
 )
 TACTILE = "{tactile}"
-"""Where a video goes in a question's text (`pipeline.records.Turn`)."""
+"""Where a video goes in a question's text (`pipeline.core.records.Turn`)."""
 
 
 def choose_samples(

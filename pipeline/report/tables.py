@@ -11,7 +11,7 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.records import ALL_SEEDS, CROSS_VALIDATION, HEADS, VALIDATION_HEADS, Shown
+from pipeline.core.records import ALL_SEEDS, CROSS_VALIDATION, HEADS, VALIDATION_HEADS, Shown
 from pipeline.report.load import DATASET, KEYS, Report, cells, published, published_datasets
 from pipeline.tasks import TASKS
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import av
 
-from pipeline.errors import UserError
+from pipeline.core.errors import UserError
 from pipeline.scenes.light import Image
 
 KEY_EVERY = 12

@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 
 from pipeline.config import INVENTED, InventConfig, Params
-from pipeline.io import atomic_folder, code_of, fingerprint, write_text
-from pipeline.parallel import run_parallel
-from pipeline.runtime import CHECKPOINTS, derive_seed
+from pipeline.core.io import atomic_folder, code_of, fingerprint, write_text
+from pipeline.core.parallel import run_parallel
+from pipeline.core.runtime import CHECKPOINTS, derive_seed
 from pipeline.scenes.contact import Body, Method
 from pipeline.scenes.geometry import IMAGE_MM, heights
 from pipeline.scenes.invent import invent

@@ -14,9 +14,9 @@ from typing import Annotated
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from pipeline.errors import UserError
-from pipeline.params import OneKeyLoader
-from pipeline.runtime import derive_seed
+from pipeline.config.params import OneKeyLoader
+from pipeline.core.errors import UserError
+from pipeline.core.runtime import derive_seed
 from pipeline.scenes.bumps import Domes, Ridges
 from pipeline.scenes.geometry import IMAGE_MM, Body, Flat, Round
 from pipeline.scenes.relief import AnyLayer, Rough

@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 
 from pipeline.config import ScenesConfig
-from pipeline.errors import UserError
-from pipeline.parallel import run_parallel
-from pipeline.records import Record
-from pipeline.runtime import derive_seed
+from pipeline.core.errors import UserError
+from pipeline.core.parallel import run_parallel
+from pipeline.core.records import Record
+from pipeline.core.runtime import derive_seed
 from pipeline.scenes.film import write_film
 from pipeline.scenes.light import make_sensor
 from pipeline.scenes.motion import draw_length

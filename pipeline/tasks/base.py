@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from pipeline.records import Dialogue, Gold, Opd, Part, Prediction, Question, Score, Turn
+from pipeline.core.records import Dialogue, Gold, Opd, Part, Prediction, Question, Score, Turn
 from pipeline.videos.catalogue import Catalogue, Property
 from pipeline.videos.catalogue.wording import mentioned, plain, unmarked
 

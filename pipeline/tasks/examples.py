@@ -7,8 +7,8 @@ import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from pipeline.records import Assignment, Dialogue, Opd, Part, Prediction, Question, Score, Turn
-from pipeline.runtime import derive_seed
+from pipeline.core.records import Assignment, Dialogue, Opd, Part, Prediction, Question, Score, Turn
+from pipeline.core.runtime import derive_seed
 from pipeline.tasks.base import (
     LETTERS,
     Pool,

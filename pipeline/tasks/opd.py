@@ -7,7 +7,7 @@ import random
 import re
 from string import Formatter
 
-from pipeline.records import Opd, Prediction, Question, Score
+from pipeline.core.records import Opd, Prediction, Question, Score
 from pipeline.tasks.base import Classes, Draft, Pool, TaskDefinition, draft_about, find_level, scored, single_turn
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.catalogue.wording import OPENING, unmarked

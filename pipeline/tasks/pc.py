@@ -7,7 +7,7 @@ import re
 from dataclasses import replace
 from typing import Literal
 
-from pipeline.records import Dialogue, Opd, Prediction, Question, Score, Turn
+from pipeline.core.records import Dialogue, Opd, Prediction, Question, Score, Turn
 from pipeline.tasks import psr
 from pipeline.tasks.base import (
     ORDINALS,

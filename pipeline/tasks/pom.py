@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
-from pipeline.records import Dialogue, Opd, Prediction, Question, Score
+from pipeline.core.records import Dialogue, Opd, Prediction, Question, Score
 from pipeline.tasks.base import (
     LETTERS,
     Classes,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Mapping, Sequence
 
-from pipeline.records import Opd, Prediction, Question, Score, Turn
+from pipeline.core.records import Opd, Prediction, Question, Score, Turn
 from pipeline.tasks.base import (
     BEGUN,
     LETTERS,

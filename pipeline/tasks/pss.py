@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 
-from pipeline.records import Opd, Prediction, Question, Score
+from pipeline.core.records import Opd, Prediction, Question, Score
 from pipeline.tasks.base import (
     LETTERS,
     LISTED,

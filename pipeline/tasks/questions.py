@@ -10,9 +10,9 @@ from itertools import islice
 from typing import Literal
 
 from pipeline.config import QuestionsConfig
-from pipeline.errors import UserError, did_you_mean
-from pipeline.records import Assignment, Part, Question
-from pipeline.runtime import derive_seed
+from pipeline.core.errors import UserError, did_you_mean
+from pipeline.core.records import Assignment, Part, Question
+from pipeline.core.runtime import derive_seed
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Draft, Pool, TaskDefinition, in_turns
 from pipeline.videos.catalogue import Catalogue

@@ -9,7 +9,7 @@ import random
 import re
 from collections.abc import Sequence
 
-from pipeline.records import Opd, Prediction, Question, Score, Turn
+from pipeline.core.records import Opd, Prediction, Question, Score, Turn
 from pipeline.tasks.base import (
     BEGUN,
     LETTERS,

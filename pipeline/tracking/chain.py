@@ -19,11 +19,11 @@ from typing import Any
 import yaml
 
 from pipeline.config import Params
-from pipeline.errors import UserError
-from pipeline.io import read_json, read_table
-from pipeline.params import CHAIN, PARAMS_FILE
-from pipeline.records import Encoder, Graded, Lora, Part, Touch, Variant, Video
-from pipeline.stage import DATA, RUNS
+from pipeline.config.params import CHAIN, PARAMS_FILE
+from pipeline.core.errors import UserError
+from pipeline.core.io import read_json, read_table
+from pipeline.core.records import Encoder, Graded, Lora, Part, Touch, Variant, Video
+from pipeline.core.stage import DATA, RUNS
 from pipeline.tasks import TASKS
 
 REPORTS, CHAIN_LOCK = Path("reports"), Path("dvc.lock")

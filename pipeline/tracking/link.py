@@ -2,7 +2,7 @@
 
 import sys
 
-from pipeline.params import load_params
+from pipeline.config.params import load_params
 from pipeline.tracking.publish import TABLE
 from pipeline.tracking.store import Store
 

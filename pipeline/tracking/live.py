@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 from pipeline.config import TrackingConfig
-from pipeline.stage import Stage
+from pipeline.core.stage import Stage
 from pipeline.tracking.chain import milliseconds, read_stages, settings
 from pipeline.tracking.store import PARENT, STAGE, Store, attempt
 

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.config import Params
-from pipeline.errors import UserError
-from pipeline.io import read_json, read_table
-from pipeline.records import Measurement, Variant
+from pipeline.core.errors import UserError
+from pipeline.core.io import read_json, read_table
+from pipeline.core.records import Measurement, Variant
 from pipeline.tasks import TASKS
 from pipeline.tracking.chain import (
     CHAIN_LOCK,

@@ -11,12 +11,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from pipeline.card import front_matter
 from pipeline.config import Params
-from pipeline.io import read_table
-from pipeline.params import PACKAGE
-from pipeline.records import Classification, Part, Variant, Video
-from pipeline.stage import DATA
+from pipeline.config.params import PACKAGE
+from pipeline.core.card import front_matter
+from pipeline.core.io import read_table
+from pipeline.core.records import Classification, Part, Variant, Video
+from pipeline.core.stage import DATA
 
 MODELS = Path("models")
 NAME, ALIAS = "octopi", "best"

@@ -17,8 +17,8 @@ from threading import Event
 from typing import Any, ParamSpec, TypeVar
 
 from pipeline.config import Params, TrackingConfig
-from pipeline.errors import UserError, without_secrets
-from pipeline.params import main_folder
+from pipeline.config.params import main_folder
+from pipeline.core.errors import UserError, without_secrets
 from pipeline.tracking.chain import ChainStage, git
 
 logger = logging.getLogger(__name__)

@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from torch import nn
 
-from pipeline.errors import UserError
-from pipeline.io import load_tensors, save_tensors
+from pipeline.core.errors import UserError
+from pipeline.core.io import load_tensors, save_tensors
 
 
 def trainable_state(module: nn.Module) -> dict[str, torch.Tensor]:

@@ -26,10 +26,10 @@ from transformers.trainer_utils import get_last_checkpoint
 from transformers.utils import SAFE_WEIGHTS_NAME
 
 from pipeline.config import Accumulated, EncoderConfig, PretrainConfig, RuntimeConfig
-from pipeline.errors import UserError
-from pipeline.io import code_of, fingerprint
-from pipeline.records import Measurement
-from pipeline.runtime import CHECKPOINTS, LogLines, limit_threads, resolve_device
+from pipeline.core.errors import UserError
+from pipeline.core.io import code_of, fingerprint
+from pipeline.core.records import Measurement
+from pipeline.core.runtime import CHECKPOINTS, LogLines, limit_threads, resolve_device
 from pipeline.training.sampling import EpochDataset
 from pipeline.training.trainable import load_trainable, whole_state
 

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 from rich.markup import escape
 from rich.table import Table
 
-from pipeline.errors import UserError, readable
-from pipeline.io import write_text
-from pipeline.runtime import progress
+from pipeline.core.errors import UserError, readable
+from pipeline.core.io import write_text
+from pipeline.core.runtime import progress
 from pipeline.use.results import Exchange, Video
 from pipeline.videos.decoding import SUFFIXES
 from pipeline.videos.files import video_files

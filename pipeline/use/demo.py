@@ -24,7 +24,7 @@ from pydantic import BaseModel, Field
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from pipeline.config import ScenesConfig
-from pipeline.errors import UserError
+from pipeline.core.errors import UserError
 from pipeline.scenes.film import write_film
 from pipeline.scenes.light import make_sensor
 from pipeline.scenes.recipe import Recipe, load_recipes

@@ -13,8 +13,8 @@ import av
 import numpy as np
 
 from pipeline.config import FramesConfig
-from pipeline.errors import UserError
-from pipeline.records import Finding
+from pipeline.core.errors import UserError
+from pipeline.core.records import Finding
 from pipeline.training.sampling import sample_evaluation
 from pipeline.use.results import Pictures, Touch, Video
 from pipeline.videos.audit.files import FOUND, unsteady

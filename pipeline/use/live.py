@@ -12,7 +12,7 @@ import av
 import cv2
 import numpy as np
 
-from pipeline.errors import UserError
+from pipeline.core.errors import UserError
 from pipeline.use.model import with_marks
 from pipeline.use.presses import RELEASED, ROUNDING, SHORTEST, Shot, film, mean
 from pipeline.videos.audit.files import FOUND

@@ -25,7 +25,7 @@ from pathlib import Path
 
 import av
 
-from pipeline.errors import UserError
+from pipeline.core.errors import UserError
 from pipeline.videos.decoding import CONTAINERS, SUFFIXES
 
 DATA_URI = re.compile(r"data:[\w.+/-]*(?:;[\w.+/=-]+)*;base64,", re.ASCII)

@@ -17,7 +17,7 @@ from mlflow.exceptions import MlflowException
 from mlflow.protos.databricks_pb2 import INVALID_PARAMETER_VALUE
 from mlflow.pyfunc import PythonModel
 
-from pipeline.errors import UserError
+from pipeline.core.errors import UserError
 from pipeline.use.media import PLACE, Gate, Limits, Refused, from_base64
 
 logger = logging.getLogger(__name__)

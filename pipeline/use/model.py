@@ -13,12 +13,9 @@ import numpy as np
 import torch
 
 from pipeline.config import LANGUAGE_DIR, LanguageConfig
-from pipeline.errors import UserError, counted, did_you_mean, readable
-from pipeline.language.chat import TACTILE, TACTILE_TOKENS
-from pipeline.language.generate import reply, stream, write_prompt
-from pipeline.language.octopi import OctopiForCausalLM
-from pipeline.records import Opd, Turn
-from pipeline.runtime import (
+from pipeline.core.errors import UserError, counted, did_you_mean, readable
+from pipeline.core.records import Opd, Turn
+from pipeline.core.runtime import (
     DeviceName,
     DtypeName,
     Quantization,
@@ -27,6 +24,9 @@ from pipeline.runtime import (
     quiet_libraries,
     resolve_device,
 )
+from pipeline.language.chat import TACTILE, TACTILE_TOKENS
+from pipeline.language.generate import reply, stream, write_prompt
+from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.tasks import opd, pc, pom, psr, pss
 from pipeline.tasks.base import LETTERS
 from pipeline.use.encoding import EncodedVideo, VideoEncoder

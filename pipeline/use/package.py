@@ -10,16 +10,16 @@ from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
 
-from pipeline.card import CARD_FILE, write_card
 from pipeline.config import LANGUAGE_DIR, PRETRAINED, Params
-from pipeline.embeddings import STATISTICS_FILE, EmbeddingStore, Statistics
-from pipeline.errors import UserError
+from pipeline.core.card import CARD_FILE, write_card
+from pipeline.core.embeddings import STATISTICS_FILE, EmbeddingStore, Statistics
+from pipeline.core.errors import UserError
+from pipeline.core.io import atomic_folder, read_csv, read_json, read_table, save_tensors, sha256, write_json
+from pipeline.core.records import Assignment, Classification, Part, Probe, ScoreRow, Touch, Variant
 from pipeline.evaluation.calibration import calibration_rows, fit_temperature
-from pipeline.io import atomic_folder, read_csv, read_json, read_table, save_tensors, sha256, write_json
 from pipeline.language.base import load_tokenizer
 from pipeline.language.connector import CONFIG_FILE
 from pipeline.language.octopi import ADAPTER_DIR
-from pipeline.records import Assignment, Classification, Part, Probe, ScoreRow, Touch, Variant
 from pipeline.tasks import TASKS
 from pipeline.training.sampling import sample_evaluation
 from pipeline.use.folder import (

@@ -20,9 +20,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from pipeline.errors import UserError
-from pipeline.io import atomic, remove_rests, write_csv
-from pipeline.records import Record
+from pipeline.core.errors import UserError
+from pipeline.core.io import atomic, remove_rests, write_csv
+from pipeline.core.records import Record
 from pipeline.scenes.film import write_film
 from pipeline.videos.audit.files import FOUND
 from pipeline.videos.catalogue.csv_reader import read_rows

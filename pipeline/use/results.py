@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ConfigDict
 
-from pipeline.records import Record
+from pipeline.core.records import Record
 
 Pictures = npt.NDArray[np.uint8]
 Video = str | os.PathLike[str] | Pictures

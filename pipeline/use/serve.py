@@ -23,7 +23,7 @@ from starlette.exceptions import HTTPException as AnyHTTPException
 from starlette.requests import ClientDisconnect
 from starlette.types import Message, Receive, Scope, Send
 
-from pipeline.errors import UserError
+from pipeline.core.errors import UserError
 from pipeline.use.media import PLACE, Gate, Limits, Refused
 from pipeline.use.protocol import Reply, error_body, model_entry, read_conversation, read_request
 from pipeline.use.results import Exchange

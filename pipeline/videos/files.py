@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
-from pipeline.errors import UserError, readable
-from pipeline.records import Finding, Severity, finding
+from pipeline.core.errors import UserError, readable
+from pipeline.core.records import Finding, Severity, finding
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.catalogue.csv_reader import read_rows
 from pipeline.videos.decoding import SUFFIXES

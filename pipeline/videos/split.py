@@ -9,10 +9,10 @@ from operator import eq
 from pathlib import Path
 
 from pipeline.config import SplitConfig
-from pipeline.errors import UserError
-from pipeline.io import read_table
-from pipeline.records import Assignment, Part, Video
-from pipeline.runtime import derive_seed
+from pipeline.core.errors import UserError
+from pipeline.core.io import read_table
+from pipeline.core.records import Assignment, Part, Video
+from pipeline.core.runtime import derive_seed
 from pipeline.videos.catalogue import RULED_SPLITS, Catalogue
 
 CANDIDATES = 2000

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from pipeline.config import EncoderConfig
-from pipeline.errors import UserError, did_you_mean
-from pipeline.io import tensor_shapes
+from pipeline.core.errors import UserError, did_you_mean
+from pipeline.core.io import tensor_shapes
 
 if TYPE_CHECKING:
     import torch
@@ -47,7 +47,7 @@ class Downloaded(NamedTuple):
     repository: str
     """Where it is published, on the Hugging Face hub."""
     folder: str
-    """Below weights/, as conf/ names it; `pipeline.shapes` has the published values under this name."""
+    """Below weights/, as conf/ names it; `pipeline.weights.shapes` has the published values under this name."""
 
 
 DOWNLOADED = {

@@ -6,10 +6,10 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.errors import UserError
-from pipeline.io import tensor_shapes
-from pipeline.shapes import LIKE_LLAMA, LLM_CONFIG, Llama, Vision, read_form
+from pipeline.core.errors import UserError
+from pipeline.core.io import tensor_shapes
 from pipeline.weights import BACKBONES, CLIP_CONFIG, again
+from pipeline.weights.shapes import LIKE_LLAMA, LLM_CONFIG, Llama, Vision, read_form
 
 if TYPE_CHECKING:
     from tokenizers import Tokenizer

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import yaml
 
-from pipeline.errors import UserError
-from pipeline.io import atomic_folder, write_text
+from pipeline.core.errors import UserError
+from pipeline.core.io import atomic_folder, write_text
 from pipeline.weights import DOWNLOADED, efficientnet, smollm2, tiny
 from pipeline.weights.source import Given, Origin
 

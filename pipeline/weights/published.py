@@ -1,7 +1,7 @@
 """Base models that the user downloads: brought into the form that the chain reads, or checked where they lie.
 
-Published values are those of `pipeline.shapes`. A pickle is read on the user's word alone, and then for its tensors: no
-code of it is run.
+Published values are those of `pipeline.weights.shapes`. A pickle is read on the user's word alone, and then for its
+tensors: no code of it is run.
 """
 
 from __future__ import annotations
@@ -12,9 +12,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.errors import UserError
-from pipeline.io import atomic_folder, load_tensors, save_tensors, sha256, write_json, write_text
-from pipeline.shapes import LLM_CONFIG, PUBLISHED_LANGUAGE, PUBLISHED_VISION, Llama, Vision, read_form
+from pipeline.core.errors import UserError
+from pipeline.core.io import atomic_folder, load_tensors, save_tensors, sha256, write_json, write_text
 from pipeline.weights import CLIP_CONFIG, CLIP_WEIGHTS, DOWNLOADED, check_language, clip_file
 from pipeline.weights.check import (
     LLM_WEIGHTS,
@@ -26,6 +25,7 @@ from pipeline.weights.check import (
     stored,
     weight_files,
 )
+from pipeline.weights.shapes import LLM_CONFIG, PUBLISHED_LANGUAGE, PUBLISHED_VISION, Llama, Vision, read_form
 
 if TYPE_CHECKING:
     import torch

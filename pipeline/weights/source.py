@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
-from pipeline.errors import UserError
-from pipeline.io import sha256
+from pipeline.core.errors import UserError
+from pipeline.core.io import sha256
 from pipeline.weights import installed
 
 

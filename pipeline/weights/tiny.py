@@ -6,9 +6,9 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.errors import UserError
-from pipeline.io import save_tensors, write_json
-from pipeline.runtime import derive_seed
+from pipeline.core.errors import UserError
+from pipeline.core.io import save_tensors, write_json
+from pipeline.core.runtime import derive_seed
 from pipeline.weights import CLIP_CONFIG, CLIP_WEIGHTS, MADE
 from pipeline.weights.source import Given
 

@@ -13,10 +13,10 @@ import yaml
 
 from benchmarks import contact, describing, encoder, encoder_models, frames, language, serving
 from benchmarks.table import Row, merge, read_rows
+from pipeline.core.io import write_csv, write_table
+from pipeline.core.records import Encoder, Graded, Lora, Opd, ScoreRow, Variant
 from pipeline.encoder import frame_classifier
 from pipeline.encoder.scene_encoder import SceneEncoder
-from pipeline.io import write_csv, write_table
-from pipeline.records import Encoder, Graded, Lora, Opd, ScoreRow, Variant
 from pipeline.scenes.film import write_film
 from pipeline.scenes.light import make_sensor, shade
 from pipeline.training.trainable import save_trainable

@@ -18,8 +18,8 @@ from benchmarks.errors import Error, error_of, mean_of, reported, share_of
 from benchmarks.figures import FOLDER, draw
 from benchmarks.table import CSV, Row, front, make_rows, merge, read_rows
 from benchmarks.timing import counting_ffts, flops_of, interleaved, megabytes
-from pipeline.io import write_csv
-from pipeline.records import ScoreRow
+from pipeline.core.io import write_csv
+from pipeline.core.records import ScoreRow
 from tests.conftest import ROOT, refused
 
 POINTS = st.lists(st.tuples(st.integers(1, 6), st.integers(0, 6)), min_size=1, max_size=12)

@@ -9,8 +9,8 @@ import torch
 import yaml
 from safetensors.torch import load_file
 
-from pipeline.io import read_json, read_jsonl
-from pipeline.records import Opd, Prediction, Question
+from pipeline.core.io import read_json, read_jsonl
+from pipeline.core.records import Opd, Prediction, Question
 from pipeline.use.model import Octopi
 from tests.project import REDUCED, Project, copy_project
 from tests.use.shared import replay

@@ -15,9 +15,9 @@ import pytest
 import yaml
 from safetensors.numpy import load_file
 
-from pipeline.errors import UserError
-from pipeline.io import read_jsonl, read_table
-from pipeline.records import Assignment, Opd, Part, Prediction, Question
+from pipeline.core.errors import UserError
+from pipeline.core.io import read_jsonl, read_table
+from pipeline.core.records import Assignment, Opd, Part, Prediction, Question
 from pipeline.report.build import write_report
 from pipeline.scenes.recipe import recipe_of
 from pipeline.tasks import TASKS

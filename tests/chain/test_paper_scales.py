@@ -18,8 +18,8 @@ import torch
 import yaml
 from safetensors.torch import load_file
 
-from pipeline.io import read_jsonl
-from pipeline.records import Prediction
+from pipeline.core.io import read_jsonl
+from pipeline.core.records import Prediction
 from tests.checkpoints import write_clip, write_vicuna
 from tests.closure import ROOT
 from tests.conftest import moving_square

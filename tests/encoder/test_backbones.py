@@ -17,6 +17,9 @@ from pydantic import ValidationError
 from torch.nn import functional as F
 
 from pipeline.config import EncoderConfig
+from pipeline.core.errors import UserError
+from pipeline.core.records import Part
+from pipeline.core.runtime import seed_everything
 from pipeline.encoder import finetune as training
 from pipeline.encoder import tuned
 from pipeline.encoder.clips import EncoderData, classify
@@ -28,10 +31,7 @@ from pipeline.encoder.recipes import base_encoder, property_classifier
 from pipeline.encoder.scene_encoder import SIDE, SceneEncoder
 from pipeline.encoder.timm_backbone import TimmBackbone
 from pipeline.encoder.tuned import FLIPS, AboveTrunks, TrunkDataset, run_trunks
-from pipeline.errors import UserError
-from pipeline.records import Part
 from pipeline.report.provenance import encoder_words
-from pipeline.runtime import seed_everything
 from pipeline.training.trainable import load_trainable, save_trainable, trainable_state
 from pipeline.weights import BACKBONES, Backbone, backbone_files, check_encoder
 from pipeline.weights.check import check_encoder_files

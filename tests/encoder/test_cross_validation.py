@@ -13,6 +13,9 @@ import pytest
 import torch
 
 from pipeline.config import CrossValidationConfig, EncoderConfig, RuntimeConfig
+from pipeline.core.errors import UserError
+from pipeline.core.records import Measurement, Part
+from pipeline.core.runtime import derive_seed
 from pipeline.encoder import clips as clips_module
 from pipeline.encoder import cross_validation as module
 from pipeline.encoder import finetune, frame_classifier, tuned
@@ -24,9 +27,6 @@ from pipeline.encoder.frame_classifier import Clips, FittedHeads, JointFrameClas
 from pipeline.encoder.model import FrameEncoder, PropertyClassifier
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.encoder.tuned import Trunks
-from pipeline.errors import UserError
-from pipeline.records import Measurement, Part
-from pipeline.runtime import derive_seed
 from pipeline.videos.catalogue import Catalogue
 from tests.conftest import fake_videos
 from tests.encoder.conftest import Hook, killed_at

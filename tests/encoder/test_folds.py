@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.core.errors import UserError
 from pipeline.encoder.folds import Fold, Labels, cross_validate, deal
 from pipeline.encoder.frame_classifier import SMOOTHING, decode_jointly, fit_frame_heads, log_dependence
-from pipeline.errors import UserError
 
 
 def test_the_prior_counts_each_object_once() -> None:

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from scipy.special import log_softmax, logsumexp
 from sklearn.linear_model import LogisticRegression
 
+from pipeline.core.records import Part
 from pipeline.encoder import frame_classifier
 from pipeline.encoder.clips import EncoderData
 from pipeline.encoder.finetune import finetune
@@ -24,7 +25,6 @@ from pipeline.encoder.frame_classifier import (
     fit_frame_heads,
 )
 from pipeline.encoder.scene_encoder import SceneEncoder
-from pipeline.records import Part
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
 from tests.encoders import CPU, OBJECTS, Floats, config, encoder_data, float64, random_heads, write_pretrained

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import UserError
+from pipeline.core.errors import UserError
 from pipeline.training.sampling import sample_evaluation, sample_training
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.extract import extract_frames

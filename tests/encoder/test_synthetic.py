@@ -15,8 +15,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import expit
 
-import pipeline.parallel
+import pipeline.core.parallel
 from pipeline.config import FramesConfig, PretrainConfig
+from pipeline.core.errors import UserError
+from pipeline.core.runtime import seed_everything
 from pipeline.encoder import pretrain as pretraining
 from pipeline.encoder import synthetic as module
 from pipeline.encoder.pretrain import STRENGTH, PretrainingDataset, held_out, pretraining_model, vary
@@ -35,8 +37,6 @@ from pipeline.encoder.synthetic import (
     draw_pictures,
     sensors,
 )
-from pipeline.errors import UserError
-from pipeline.runtime import seed_everything
 from pipeline.scenes.geometry import heights
 from pipeline.scenes.invent import LAYERS, MODULUS_MPA, invent
 from pipeline.scenes.light import Sensor
@@ -111,7 +111,7 @@ def test_a_killed_drawing_keeps_what_is_finished_and_ends_the_same(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(pipeline.parallel, "cores", lambda: 1)
+    monkeypatch.setattr(pipeline.core.parallel, "cores", lambda: 1)
     monkeypatch.setattr(module, "CHUNK", 4)
     with monkeypatch.context() as patch:
 

@@ -18,7 +18,11 @@ from sklearn.linear_model import LogisticRegression
 from sklearn.preprocessing import StandardScaler
 from transformers import TrainerCallback
 
-from pipeline.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore, Statistics
+from pipeline.core.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore, Statistics
+from pipeline.core.errors import UserError
+from pipeline.core.io import save_tensors, write_table
+from pipeline.core.records import Assignment, Embedding, Part
+from pipeline.core.runtime import derive_seed, seed_everything
 from pipeline.encoder import finetune as training
 from pipeline.encoder.clip import load_visual_tower
 from pipeline.encoder.clips import ClipDataset, EncoderData, LabelledVideo
@@ -29,10 +33,6 @@ from pipeline.encoder.frame_classifier import STRENGTHS, JointFrameClassifier
 from pipeline.encoder.model import Heads, PropertyClassifier
 from pipeline.encoder.recipes import RECIPES, base_encoder, check_recipe, property_classifier
 from pipeline.encoder.scene_encoder import SceneEncoder
-from pipeline.errors import UserError
-from pipeline.io import save_tensors, write_table
-from pipeline.records import Assignment, Embedding, Part
-from pipeline.runtime import derive_seed, seed_everything
 from pipeline.training.trainable import load_trainable, save_trainable, trainable_state
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore

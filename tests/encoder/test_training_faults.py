@@ -13,6 +13,9 @@ import torch
 from safetensors.torch import load_file
 
 from pipeline.config import EncoderConfig, FramesConfig, PretrainConfig, RuntimeConfig
+from pipeline.core.errors import UserError
+from pipeline.core.records import Measurement, Part
+from pipeline.core.runtime import seed_everything
 from pipeline.encoder import pretrain as pretraining
 from pipeline.encoder.clips import EncoderData, classify, describe_clips
 from pipeline.encoder.embed import Loaded, embed_videos
@@ -23,9 +26,6 @@ from pipeline.encoder.pretrain import WEIGHTS, PretrainingModel, pretrain
 from pipeline.encoder.recipes import property_classifier
 from pipeline.encoder.scene_encoder import CHANNELS, SceneEncoder
 from pipeline.encoder.synthetic import SyntheticPictures
-from pipeline.errors import UserError
-from pipeline.records import Measurement, Part
-from pipeline.runtime import seed_everything
 from pipeline.scales import compose
 from pipeline.training.trainable import trainable_state
 from pipeline.videos.catalogue import Catalogue

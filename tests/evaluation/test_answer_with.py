@@ -25,12 +25,12 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from pipeline.cli import app, main
-from pipeline.errors import UserError
+from pipeline.core.errors import UserError
+from pipeline.core.io import read_jsonl, read_table, write_jsonl, write_table
+from pipeline.core.records import Assignment, Frame, GradedVision, Opd, Part, Prediction, Question, Shown, Turn
+from pipeline.core.stage import alone
 from pipeline.evaluation.answer_with import instruction
-from pipeline.io import read_jsonl, read_table, write_jsonl, write_table
-from pipeline.records import Assignment, Frame, GradedVision, Opd, Part, Prediction, Question, Shown, Turn
 from pipeline.report.load import Report, load_report
-from pipeline.stage import alone
 from pipeline.tasks.questions import build_questions, pool_of
 from pipeline.videos.catalogue import Catalogue
 from tests.closure import ROOT, closure

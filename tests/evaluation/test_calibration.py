@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 from scipy.special import softmax
 
+from pipeline.core.records import Classification, Part
 from pipeline.evaluation.calibration import (
     calibration_error,
     calibration_rows,
@@ -17,7 +18,6 @@ from pipeline.evaluation.calibration import (
     reliability,
     rescale,
 )
-from pipeline.records import Classification, Part
 
 
 def said(expected: int, *probabilities: float, object_id: str = "rug") -> Classification:

@@ -16,11 +16,11 @@ from dvc.repo import Repo
 from typer.testing import CliRunner
 
 from pipeline.cli import app
-from pipeline.diff import compare, describe
-from pipeline.errors import UserError
+from pipeline.cli.diff import compare, describe
+from pipeline.core.errors import UserError
+from pipeline.core.io import write_csv, write_table
+from pipeline.core.records import Graded, ScoreRow
 from pipeline.evaluation.scores import score_rows
-from pipeline.io import write_csv, write_table
-from pipeline.records import Graded, ScoreRow
 from tests.evaluation.test_scores import CATALOGUE, graded
 
 REPORT = "reports/smoke-scenes"

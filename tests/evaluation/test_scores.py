@@ -10,12 +10,23 @@ import numpy as np
 import pytest
 from sklearn.metrics import cohen_kappa_score
 
+from pipeline.core.io import read_csv, write_csv
+from pipeline.core.records import (
+    Classification,
+    EffectRow,
+    Encoder,
+    Graded,
+    Lora,
+    Opd,
+    OutOfFold,
+    Part,
+    ScoreRow,
+    Touch,
+)
 from pipeline.evaluation.intervals import accuracy_interval
 from pipeline.evaluation.ordinal import error_rows, quadratic_kappa
 from pipeline.evaluation.paired import paired
 from pipeline.evaluation.scores import candidate_rows, effect_rows, score_rows
-from pipeline.io import read_csv, write_csv
-from pipeline.records import Classification, EffectRow, Encoder, Graded, Lora, Opd, OutOfFold, Part, ScoreRow, Touch
 from pipeline.tasks import TASKS
 from pipeline.videos.catalogue import load_catalogue
 from tests.closure import ROOT

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from pipeline.config import LanguageConfig
-from pipeline.embeddings import FLIPS, EmbeddingStore
+from pipeline.core.embeddings import FLIPS, EmbeddingStore
+from pipeline.core.records import Assignment, Part, Question
+from pipeline.core.runtime import seed_everything
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import Material
-from pipeline.records import Assignment, Part, Question
-from pipeline.runtime import seed_everything
 from pipeline.tasks.questions import build_questions, pool_of
 from pipeline.videos.catalogue import load_catalogue
 from tests.checkpoints import write_llama

@@ -10,12 +10,12 @@ from torch.nn import functional as F
 from transformers import MistralConfig, MistralForCausalLM
 
 from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig, TrainConfig
-from pipeline.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
-from pipeline.io import save_tensors, write_table
+from pipeline.core.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
+from pipeline.core.io import save_tensors, write_table
+from pipeline.core.records import Embedding, Opd, Question
 from pipeline.language.chat import encode, render
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import Job, Material, add_lora, assemble, fit
-from pipeline.records import Embedding, Opd, Question
 from pipeline.training import trainer
 from pipeline.training.trainer import Trained
 

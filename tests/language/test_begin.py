@@ -10,9 +10,9 @@ import torch
 from torch.nn import functional as F
 
 from pipeline.config import LanguageConfig
+from pipeline.core.records import Question
 from pipeline.language.training import assemble
 from pipeline.language.words import begin_with_words
-from pipeline.records import Question
 from pipeline.videos.catalogue import load_catalogue
 from tests.closure import ROOT
 from tests.language.shared import DIM, material, taking, write_store

@@ -15,13 +15,13 @@ from hypothesis import strategies as st
 from torch.utils.data import BatchSampler
 from transformers import PreTrainedTokenizerBase
 
+from pipeline.core.records import Turn
+from pipeline.core.runtime import derive_seed
 from pipeline.language.base import load_tokenizer
 from pipeline.language.chat import IGNORE_INDEX, encode, render
 from pipeline.language.conversations import FILLER, UpdateSampler, collate
 from pipeline.language.generate import write_prompt
 from pipeline.language.training import Material, assemble
-from pipeline.records import Turn
-from pipeline.runtime import derive_seed
 from tests.checkpoints import write_llama
 from tests.language.shared import DIM, FRAMES, generation, taking
 from tests.models import model_folder

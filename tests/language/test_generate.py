@@ -10,15 +10,15 @@ import torch
 from transformers import DynamicCache
 
 from pipeline.config import LanguageConfig
-from pipeline.embeddings import EmbeddingStore
-from pipeline.errors import UserError
+from pipeline.core.embeddings import EmbeddingStore
+from pipeline.core.errors import UserError
+from pipeline.core.records import Opd, Question
 from pipeline.language.cache import AHEAD, roomy_cache
 from pipeline.language.chat import TACT_FRAME
 from pipeline.language.conversations import evaluation_features
 from pipeline.language.generate import answer
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import assemble
-from pipeline.records import Opd, Question
 from tests.checkpoints import write_llama
 from tests.language.shared import DIM, FRAMES, by_transformers, generation, material, mistral, prompt, taking
 

@@ -10,11 +10,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.embeddings import EmbeddingStore
-from pipeline.errors import UserError
+from pipeline.core.embeddings import EmbeddingStore
+from pipeline.core.errors import UserError
+from pipeline.core.records import Dialogue, Gold, Opd, Part, Question, Touch, Turn
 from pipeline.language.conversations import evaluation_features
 from pipeline.language.input_ablation import _ring, ablate_input
-from pipeline.records import Dialogue, Gold, Opd, Part, Question, Touch, Turn
 from tests.language.shared import DIM, write_store
 
 

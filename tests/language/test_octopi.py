@@ -13,15 +13,15 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from pipeline.config import LanguageConfig, LoraTrainConfig
-from pipeline.embeddings import EmbeddingStore
-from pipeline.errors import UserError
+from pipeline.core.embeddings import EmbeddingStore
+from pipeline.core.errors import UserError
+from pipeline.core.records import Opd, Question
 from pipeline.language.base import load_llm, load_tokenizer
 from pipeline.language.chat import IGNORE_INDEX
 from pipeline.language.conversations import collate
 from pipeline.language.generate import answer
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import Material, add_lora, assemble
-from pipeline.records import Opd, Question
 from tests.checkpoints import write_llama
 from tests.conftest import refused
 from tests.language.shared import DIM, FRAMES, LORA, adapted, assert_comes_back, call, generation, material, taking

@@ -22,8 +22,8 @@ import torch
 import yaml
 from safetensors.torch import load_file
 
-from pipeline.errors import UserError
-from pipeline.io import write_jsonl
+from pipeline.core.errors import UserError
+from pipeline.core.io import write_jsonl
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import Material
 from tests.closure import ROOT

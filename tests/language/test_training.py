@@ -19,12 +19,12 @@ from torch.optim.optimizer import register_optimizer_step_pre_hook
 from transformers import TrainerCallback, TrainerState
 
 from pipeline.config import LoraTrainConfig, RuntimeConfig
-from pipeline.errors import UserError
-from pipeline.io import write_jsonl
+from pipeline.core.errors import UserError
+from pipeline.core.io import write_jsonl
+from pipeline.core.runtime import derive_seed
 from pipeline.language.chat import IGNORE_INDEX
 from pipeline.language.conversations import collate
 from pipeline.language.training import Job, Material, add_lora, assemble, fit, write_model_card
-from pipeline.runtime import derive_seed
 from pipeline.training.trainer import Trained, training_arguments
 from tests.closure import ROOT
 from tests.conftest import Begun, refused
@@ -41,9 +41,9 @@ import os, signal, sys
 from pathlib import Path
 import torch
 from torch.optim.optimizer import register_optimizer_step_pre_hook
-from pipeline.io import read_jsonl
-from pipeline.embeddings import EmbeddingStore
-from pipeline.records import Question
+from pipeline.core.io import read_jsonl
+from pipeline.core.embeddings import EmbeddingStore
+from pipeline.core.records import Question
 from pipeline.config import LanguageConfig
 from tests.language.shared import material
 from tests.language.test_training import run

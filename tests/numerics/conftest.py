@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from pipeline.io import atomic
+from pipeline.core.io import atomic
 from tests.numerics.harness import Check, Row, table
 
 ROWS = pytest.StashKey[list[Row]]()

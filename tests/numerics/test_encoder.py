@@ -16,14 +16,14 @@ import torch
 from torch.nn import functional as F
 
 from pipeline.config import EncoderConfig
+from pipeline.core.records import Part
+from pipeline.core.runtime import seed_everything
 from pipeline.encoder.clips import ClipDataset, LabelledVideo, classify
 from pipeline.encoder.frame_classifier import JointFrameClassifier
 from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier, SideBySide, mean_and_deviation
 from pipeline.encoder.recipes import RECIPES, base_encoder, property_classifier
 from pipeline.encoder.release import sinusoid
 from pipeline.encoder.scene_encoder import CHANNELS, SceneEncoder
-from pipeline.records import Part
-from pipeline.runtime import seed_everything
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
 from tests.encoders import PARTS, config, encoder_data, write_frames, write_timm, write_tower

@@ -19,12 +19,12 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
+from pipeline.core.runtime import seed_everything
 from pipeline.encoder.frame_classifier import JointFrameClassifier, decode_jointly, log_dependence
 from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
 from pipeline.encoder.pretrain import PretrainingModel
 from pipeline.encoder.release import SHORTEST_FEATURE, PublishedHeads
 from pipeline.encoder.scene_encoder import SceneEncoder
-from pipeline.runtime import seed_everything
 from tests.numerics.bounds import summing
 from tests.numerics.cross_entropy import STEPS, TARGETS, logits, mean_loss, rounded_loss
 from tests.numerics.harness import BFLOAT16, FLOAT64, NETWORKS, SOLVED, Check, Floats, Format, formats

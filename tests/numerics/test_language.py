@@ -19,11 +19,11 @@ from torch.nn import functional as F
 from transformers.modeling_outputs import CausalLMOutput
 
 from pipeline.config import LoraTrainConfig
+from pipeline.core.runtime import seed_everything
 from pipeline.language.cache import AHEAD, roomy_cache
 from pipeline.language.chat import IGNORE_INDEX
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import add_lora
-from pipeline.runtime import seed_everything
 from tests.models import model_folder
 from tests.numerics.bounds import longest_sum, magnification, rounded, summing
 from tests.numerics.cross_entropy import TARGETS, logits, mean_loss, rounded_loss

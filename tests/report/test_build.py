@@ -17,11 +17,11 @@ from safetensors.numpy import save_file
 from safetensors.torch import load_file
 
 from pipeline.config import EncoderConfig
-from pipeline.errors import UserError
+from pipeline.config.params import load_params
+from pipeline.core.errors import UserError
+from pipeline.core.io import read_jsonl, read_table, write_table
+from pipeline.core.records import Classification, Graded, GradedVision, Part, Prediction, Question, Shown
 from pipeline.evaluation.calibration import fit_temperature
-from pipeline.io import read_jsonl, read_table, write_table
-from pipeline.params import load_params
-from pipeline.records import Classification, Graded, GradedVision, Part, Prediction, Question, Shown
 from pipeline.report.build import MOST_METRICS, finish_report, without_places, write_report
 from pipeline.report.dataset import dataset_tables
 from pipeline.report.load import DATASET, load_report

@@ -9,9 +9,9 @@ from statistics import fmean
 import pandas as pd
 import pytest
 
+from pipeline.core.io import read_table
+from pipeline.core.records import Assignment, Graded, Part
 from pipeline.evaluation.scores import effect_rows
-from pipeline.io import read_table
-from pipeline.records import Assignment, Graded, Part
 from pipeline.report.build import write_report
 from pipeline.report.load import load_report
 from pipeline.report.provenance import settings_note

@@ -16,7 +16,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pipeline.cli import app
-from pipeline.errors import UserError
+from pipeline.core.errors import UserError
 from pipeline.report import page as module
 from pipeline.report.drawing import span
 from pipeline.report.load import Report, published

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from pipeline.config import InventConfig, ScenesConfig
-from pipeline.io import code_of, fingerprint
-from pipeline.runtime import CHECKPOINTS
+from pipeline.core.io import code_of, fingerprint
+from pipeline.core.runtime import CHECKPOINTS
 from pipeline.scales import check_inputs, compose
 from pipeline.scenes import invented
 from pipeline.scenes.elastic import solver

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.errors import UserError
+from pipeline.core.errors import UserError
 from pipeline.scenes.bumps import Domes, Ridges
 from pipeline.scenes.geometry import IMAGE_MM
 from pipeline.scenes.measure import HARD_ABOVE_MPA, SOFT_BELOW_MPA

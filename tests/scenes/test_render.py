@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.config import FramesConfig, ScenesConfig
-from pipeline.errors import UserError
+from pipeline.core.errors import UserError
 from pipeline.scenes.contact import GEL
 from pipeline.scenes.geometry import IMAGE_MM, Round
 from pipeline.scenes.light import make_sensor

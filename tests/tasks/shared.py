@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pipeline.records import Part, Prediction, Question, Score
+from pipeline.core.records import Part, Prediction, Question, Score
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool
 from pipeline.videos.catalogue import Catalogue, load_catalogue

@@ -11,10 +11,10 @@ import pytest
 import yaml
 
 from pipeline.config import Params
+from pipeline.core.records import Part
 from pipeline.encoder.release import DROPOUT, HIDDEN
 from pipeline.encoder.vpt import PUBLISHED_DEVIATION, VisualPrompts
 from pipeline.language.connector import Connector
-from pipeline.records import Part
 from pipeline.scales import compose
 from pipeline.tasks import TASKS
 from pipeline.videos.catalogue import load_catalogue

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pipeline.records import Assignment, Part, Prediction, Question
+from pipeline.core.records import Assignment, Part, Prediction, Question
 from pipeline.report.samples import choose_examples
 from pipeline.tasks import TASKS
 from pipeline.tasks.examples import build_examples, grade_example

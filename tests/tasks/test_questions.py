@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.config import SplitConfig
-from pipeline.records import Part, Question
+from pipeline.core.records import Part, Question
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool
 from pipeline.tasks.questions import build_questions, pool_of

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from pipeline.config import QuestionsConfig
+from pipeline.core.io import read_jsonl, write_jsonl
+from pipeline.core.records import Dialogue, Opd, Question
 from pipeline.evaluation.grading import grade
-from pipeline.io import read_jsonl, write_jsonl
-from pipeline.records import Dialogue, Opd, Question
 from pipeline.tasks import TASKS, psr
 from pipeline.tasks.base import TaskDefinition
 from pipeline.tasks.pom import fact

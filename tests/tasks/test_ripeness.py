@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.errors import UserError
-from pipeline.records import Opd, Part, Question
+from pipeline.core.errors import UserError
+from pipeline.core.records import Opd, Part, Question
 from pipeline.scenes.motion import make_motion
 from pipeline.scenes.recipe import load_recipes
 from pipeline.tasks.base import Pool

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.core.records import Classification, Part
 from pipeline.evaluation.grading import conclude
 from pipeline.evaluation.scores import RULES, effect_rows, score_rows
-from pipeline.records import Classification, Part
 from pipeline.tasks import TASKS
 from pipeline.tasks.questions import build_questions
 from pipeline.videos.catalogue import Catalogue

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import pytest
 
-from pipeline.records import Part
+from pipeline.core.records import Part
 from pipeline.tasks.base import Pool
 from pipeline.tasks.questions import build_questions
 from pipeline.videos.catalogue import Catalogue, load_catalogue

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.records import Opd, Question, Score
+from pipeline.core.records import Opd, Question, Score
 from pipeline.tasks import TASKS
 from pipeline.tasks.opd import as_published
 from pipeline.tasks.questions import build_questions

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.core.records import Opd, Part, Question, Score
 from pipeline.language.chat import TACTILE
-from pipeline.records import Opd, Part, Question, Score
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool, conclusion, find_level
 from pipeline.tasks.questions import build_questions

@@ -14,8 +14,8 @@ import pytest
 import yaml
 
 from pipeline.config import Params, TrackingConfig
-from pipeline.io import write_json, write_table
-from pipeline.records import Assignment, Measurement, Part, Video
+from pipeline.core.io import write_json, write_table
+from pipeline.core.records import Assignment, Measurement, Part, Video
 from pipeline.scales import compose, write_params
 from pipeline.tracking.publish import publish
 from pipeline.tracking.store import Store, out_of_reach

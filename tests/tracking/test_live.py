@@ -30,9 +30,9 @@ from torch.nn import functional as F
 from transformers.integrations import MLflowCallback
 
 from pipeline.config import Params
-from pipeline.io import read_table, write_table
-from pipeline.records import Measurement
-from pipeline.stage import Stage
+from pipeline.core.io import read_table, write_table
+from pipeline.core.records import Measurement
+from pipeline.core.stage import Stage
 from pipeline.tracking import live as live_module
 from pipeline.tracking.chain import settings
 from pipeline.tracking.live import live
@@ -185,7 +185,7 @@ def test_an_unfinished_reproduction_of_another_scale_ends(chain: FakeChain) -> N
 def test_without_live_logging_mlflow_is_not_imported(chain: FakeChain) -> None:
     shutil.rmtree("mlruns")
     code = (
-        "import sys; from pipeline.params import load_params; from pipeline.stage import Stage\n"
+        "import sys; from pipeline.config.params import load_params; from pipeline.core.stage import Stage\n"
         f"from pipeline.tracking.live import live\nwith live(Stage('{ALIGN}', load_params())) as callbacks: pass\n"
         "assert callbacks == [] and 'mlflow' not in sys.modules"
     )

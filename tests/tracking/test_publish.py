@@ -15,8 +15,8 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from pipeline.io import write_table
-from pipeline.records import Graded
+from pipeline.core.io import write_table
+from pipeline.core.records import Graded
 from pipeline.scales import compose, write_params
 from pipeline.tracking.chain import accuracies, datasets, read_stages
 from pipeline.tracking.publish import publish
@@ -229,7 +229,7 @@ def test_the_command_says_in_one_line_why_it_could_not(chain: FakeChain, monkeyp
 
 
 PUBLISH = """\
-from pipeline.stage import stage
+from pipeline.core.stage import stage
 from pipeline.tracking.publish import publish
 with stage("publish") as run:
     print(publish(run.params))

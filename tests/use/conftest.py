@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.records import Encoder, Lora, Opd, Variant
+from pipeline.core.records import Encoder, Lora, Opd, Variant
 from pipeline.use.model import Octopi
 from tests.use.shared import Made, make
 

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import UserError
+from pipeline.core.errors import UserError
 from pipeline.use.model import with_marks
 from pipeline.use.server import listen, make_server
 from tests.conftest import HUNG

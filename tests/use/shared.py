@@ -11,15 +11,9 @@ import pandas as pd
 import torch
 
 from pipeline.config import Params
-from pipeline.embeddings import INDEX_FILE, STATISTICS_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
-from pipeline.encoder.clips import EncoderData, classify
-from pipeline.encoder.embed import Loaded, embed_videos, standardize, statistics
-from pipeline.encoder.recipes import base_encoder, property_classifier
-from pipeline.io import fingerprint, save_tensors, write_json, write_jsonl, write_table
-from pipeline.language.generate import answer
-from pipeline.language.octopi import OctopiForCausalLM
-from pipeline.language.training import add_lora
-from pipeline.records import (
+from pipeline.core.embeddings import INDEX_FILE, STATISTICS_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
+from pipeline.core.io import fingerprint, save_tensors, write_json, write_jsonl, write_table
+from pipeline.core.records import (
     Assignment,
     Classification,
     Embedding,
@@ -32,7 +26,13 @@ from pipeline.records import (
     Question,
     Variant,
 )
-from pipeline.runtime import seed_everything
+from pipeline.core.runtime import seed_everything
+from pipeline.encoder.clips import EncoderData, classify
+from pipeline.encoder.embed import Loaded, embed_videos, standardize, statistics
+from pipeline.encoder.recipes import base_encoder, property_classifier
+from pipeline.language.generate import answer
+from pipeline.language.octopi import OctopiForCausalLM
+from pipeline.language.training import add_lora
 from pipeline.tasks import TASKS
 from pipeline.tasks.questions import build_questions, pool_of
 from pipeline.training.trainable import save_trainable

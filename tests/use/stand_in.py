@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.config import FramesConfig
-from pipeline.errors import UserError
+from pipeline.core.errors import UserError
 from pipeline.use.model import with_marks
 from pipeline.use.results import Description, Exchange, Touch, Video
 from pipeline.videos.files import VideoFile

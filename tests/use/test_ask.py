@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from pipeline import runtime
 from pipeline.cli import app, main
+from pipeline.core import runtime
 from pipeline.use import ask as asking
 from pipeline.use import model as model_code
 from pipeline.use.ask import Chat, describe_folder

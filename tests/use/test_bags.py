@@ -15,9 +15,9 @@ from typer.testing import CliRunner
 
 from pipeline.cli import app
 from pipeline.config import FramesConfig
-from pipeline.errors import UserError
-from pipeline.io import read_csv
-from pipeline.records import Severity
+from pipeline.core.errors import UserError
+from pipeline.core.io import read_csv
+from pipeline.core.records import Severity
 from pipeline.scenes.film import write_film
 from pipeline.use.bags import shots
 from pipeline.use.presses import QUIET, RELEASED, ROUNDING, SHORTEST, FrameTime, cut, presses

@@ -22,7 +22,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipeline.errors import UserError
+from pipeline.core.errors import UserError
 from pipeline.scenes.recipe import load_recipes
 from pipeline.use.demo import MOST_TOUCHES, Asked, Session, Turn, make_app, where
 from pipeline.use.model import Octopi

@@ -10,8 +10,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from pipeline.io import read_jsonl, read_table
-from pipeline.records import Assignment, Part, Question
+from pipeline.core.io import read_jsonl, read_table
+from pipeline.core.records import Assignment, Part, Question
 from pipeline.videos.catalogue import load_catalogue
 from tests.closure import ROOT
 from tests.project import copy_project

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.embeddings import TENSOR, TENSOR_FILE
-from pipeline.io import load_tensors, read_table, save_tensors, write_table
-from pipeline.records import Classification, Part, Probe
+from pipeline.core.embeddings import TENSOR, TENSOR_FILE
+from pipeline.core.io import load_tensors, read_table, save_tensors, write_table
+from pipeline.core.records import Classification, Part, Probe
 from pipeline.use.folder import FORMAT, read_folder
 from pipeline.use.model import Octopi
 from pipeline.use.package import describe_base, export, package

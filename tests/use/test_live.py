@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pipeline.cli import app
-from pipeline.errors import UserError
+from pipeline.core.errors import UserError
 from pipeline.scenes.film import write_film
 from pipeline.use import live
 from pipeline.use.presses import Shot

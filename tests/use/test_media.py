@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.config import FramesConfig
-from pipeline.errors import UserError
+from pipeline.core.errors import UserError
 from pipeline.use.frames import prepare_video
 from pipeline.use.media import Gate, Limits, Refused, from_base64
 from pipeline.videos.decoding import SUFFIXES, Decoder

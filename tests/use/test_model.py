@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import BaseModel
 
+from pipeline.core.errors import UserError, readable
+from pipeline.core.io import tensor_shapes
+from pipeline.core.records import Encoder, Lora, Opd, Part, Variant
 from pipeline.encoder.timm_backbone import STAGES
-from pipeline.errors import UserError, readable
-from pipeline.io import tensor_shapes
-from pipeline.records import Encoder, Lora, Opd, Part, Variant
 from pipeline.use import encoding
 from pipeline.use import model as model_code
 from pipeline.use.encoding import VideoEncoder

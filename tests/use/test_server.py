@@ -23,7 +23,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pipeline.cli import app as cli
-from pipeline.errors import UserError
+from pipeline.core.errors import UserError
 from pipeline.use import serve, server
 from pipeline.use.media import Limits
 from pipeline.use.serve import make_app

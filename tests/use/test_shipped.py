@@ -15,9 +15,9 @@ import torch
 from safetensors.torch import load_file
 
 from pipeline.config import LANGUAGE_DIR
-from pipeline.io import read_json, read_table, write_table
+from pipeline.core.io import read_json, read_table, write_table
+from pipeline.core.records import ALL_SEEDS, GradedVision, Shown, Video
 from pipeline.language.base import ADAPTER_CONFIG, ADAPTER_WEIGHTS
-from pipeline.records import ALL_SEEDS, GradedVision, Shown, Video
 from pipeline.report.load import load_report, published
 from pipeline.report.tables import measured
 from pipeline.scales import compose, write_params

@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 
 from pipeline.config import SplitConfig
-from pipeline.io import read_csv, write_table
-from pipeline.records import Assignment, Finding, Part, Probe, Video
+from pipeline.core.io import read_csv, write_table
+from pipeline.core.records import Assignment, Finding, Part, Probe, Video
 from pipeline.scales import compose, write_params
 from pipeline.videos.audit import leakage
 from pipeline.videos.audit.files import quiet_level, touches

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.records import Finding, Part, Probe
+from pipeline.core.records import Finding, Part, Probe
 from pipeline.videos.audit.files import FOUND, by_rate, check_files
 from pipeline.videos.audit.labels import check_labels, similar_names
 from pipeline.videos.audit.leakage import check_leakage, sessions

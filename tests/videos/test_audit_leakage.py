@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from pipeline.records import Part, Probe, Severity
+from pipeline.core.records import Part, Probe, Severity
 from pipeline.videos.audit import leakage
 from pipeline.videos.audit.leakage import sessions
 from tests import audit_records as made

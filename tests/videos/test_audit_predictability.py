@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from pipeline.records import Probe
+from pipeline.core.records import Probe
 from pipeline.videos.audit import leakage
 from pipeline.videos.audit.leakage import predictability
 from pipeline.videos.catalogue import Catalogue

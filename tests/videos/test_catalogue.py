@@ -15,8 +15,8 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import UserError
-from pipeline.records import Part
+from pipeline.core.errors import UserError
+from pipeline.core.records import Part
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.catalogue.wording import contradiction, levels_named, mentioned, plain
 from tests.conftest import ROOT

@@ -19,11 +19,11 @@ import numpy as np
 import psutil
 import pytest
 
-import pipeline.parallel
+import pipeline.core.parallel
 from pipeline.config import FramesConfig
-from pipeline.errors import UserError
-from pipeline.io import read_table
-from pipeline.records import Finding, Frame, Probe
+from pipeline.core.errors import UserError
+from pipeline.core.io import read_table
+from pipeline.core.records import Finding, Frame, Probe
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import VideoFile
 from pipeline.videos.frames import extract
@@ -86,7 +86,7 @@ def test_files_hold_what_the_table_says(place: Place) -> None:
 def test_the_number_of_processes_changes_nothing(
     place: Place, whole: list[bytes], cores: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pipeline.parallel, "cores", lambda: cores)
+    monkeypatch.setattr(pipeline.core.parallel, "cores", lambda: cores)
     place.extract()
     assert place.bytes() == whole
 
@@ -200,7 +200,7 @@ def test_a_process_that_dies_is_an_error_that_names_the_place(place: Place, monk
         return scan(file, config)
 
     monkeypatch.setattr(extract, "scan", dying)
-    monkeypatch.setattr(pipeline.parallel, "cores", lambda: 1)
+    monkeypatch.setattr(pipeline.core.parallel, "cores", lambda: 1)
     with refused(r"a process died at or soon after [a-z_0-9]+\.avi; .*Run again"):
         place.extract()
     monkeypatch.setattr(extract, "scan", scan)
@@ -211,7 +211,7 @@ def test_a_process_that_dies_is_an_error_that_names_the_place(place: Place, monk
 def test_no_worker_outlives_its_parent(tmp_path: Path, signal_number: int) -> None:
     script = tmp_path / "work.py"
     script.write_text(
-        "import os, sys, time\nfrom pathlib import Path\nfrom pipeline.parallel import run_parallel\n"
+        "import os, sys, time\nfrom pathlib import Path\nfrom pipeline.core.parallel import run_parallel\n"
         "def work(i):\n    (Path(sys.argv[1]) / f'{os.getpid()}.pid').touch()\n    time.sleep(10**6)\n"
         "if __name__ == '__main__':\n    list(run_parallel(work, range(4), 'x', 'y'))\n"
     )

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from pipeline.config import FramesConfig
-from pipeline.records import Probe
+from pipeline.core.records import Probe
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.decoding import Decoder, Header
 from pipeline.videos.files import VideoFile

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.config import SplitConfig
-from pipeline.errors import UserError
-from pipeline.records import Assignment, Part
+from pipeline.core.errors import UserError
+from pipeline.core.records import Assignment, Part
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.split import VALIDATION, assign, check_split, without_videos
 from tests.conftest import ROOT, fake_videos, refused

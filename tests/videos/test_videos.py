@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.errors import UserError
-from pipeline.records import Severity
+from pipeline.core.errors import UserError
+from pipeline.core.records import Severity
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import LIST_FILE, Listing, list_videos, raise_errors
 from tests.conftest import refused

@@ -12,10 +12,10 @@ from safetensors import safe_open
 from transformers import AutoModelForCausalLM, AutoTokenizer, PreTrainedTokenizerBase
 from typer.testing import CliRunner
 
-from pipeline.card import front_matter
 from pipeline.cli import app
+from pipeline.core.card import front_matter
+from pipeline.core.errors import UserError
 from pipeline.encoder.clip import load_visual_tower
-from pipeline.errors import UserError
 from pipeline.weights import check_encoder, check_language, efficientnet, smollm2
 from pipeline.weights.make import CATALOGUE, RECIPES, make
 from pipeline.weights.source import Origin

@@ -20,11 +20,11 @@ from pipeline.cli import app
 from pipeline.encoder.clip import load_visual_tower
 from pipeline.language.base import load_llm, load_tokenizer
 from pipeline.scales import compose
-from pipeline.shapes import PUBLISHED_LANGUAGE, PUBLISHED_VISION
 from pipeline.weights import DOWNLOADED
 from pipeline.weights.check import check_encoder_files, check_language_files
 from pipeline.weights.make import CATALOGUE
 from pipeline.weights.published import PICTURES
+from pipeline.weights.shapes import PUBLISHED_LANGUAGE, PUBLISHED_VISION
 from tests.checkpoints import CLIP_CONFIG, contents, cut, edit, replace, write_clip
 from tests.closure import ROOT
 from tests.conftest import refused

@@ -19,14 +19,14 @@ from transformers import LlamaConfig, LlamaForCausalLM
 from typer.testing import CliRunner
 
 from pipeline.cli import app
+from pipeline.core.errors import UserError
+from pipeline.core.io import tensor_shapes
 from pipeline.encoder.clip import load_visual_tower
 from pipeline.encoder.timm_backbone import load_backbone
-from pipeline.errors import UserError
-from pipeline.io import tensor_shapes
 from pipeline.language.base import load_llm, load_tokenizer
-from pipeline.shapes import Llama, Vision
 from pipeline.weights import check_encoder, check_finite, check_language
 from pipeline.weights.check import check_encoder_files, check_language_files
+from pipeline.weights.shapes import Llama, Vision
 from tests.checkpoints import cut, edit, replace, write_clip, write_llama
 from tests.closure import ROOT
 from tests.encoders import config, write_timm

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from statistics import fmean, median
 
-from pipeline.records import Finding, Probe, Severity, finding
+from pipeline.core.records import Finding, Probe, Severity, finding
 from pipeline.videos.catalogue import Catalogue
 
 SHORT = 0.5

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from difflib import get_close_matches
 from statistics import fmean
 
-from pipeline.records import Finding, Part, Severity, finding
+from pipeline.core.records import Finding, Part, Severity, finding
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.catalogue.wording import contradiction
 

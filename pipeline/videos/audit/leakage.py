@@ -9,8 +9,8 @@ from statistics import fmean, pstdev
 
 import numpy as np
 
-from pipeline.records import Assignment, Finding, Part, Probe, Severity, finding
-from pipeline.runtime import derive_seed
+from pipeline.core.records import Assignment, Finding, Part, Probe, Severity, finding
+from pipeline.core.runtime import derive_seed
 from pipeline.videos.audit.files import by_rate, quiet_level, touches
 from pipeline.videos.catalogue import Catalogue
 

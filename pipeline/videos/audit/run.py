@@ -8,9 +8,9 @@ from functools import partial
 from pathlib import Path
 
 from pipeline.config import FramesConfig, SplitConfig
-from pipeline.errors import UserError
-from pipeline.parallel import run_parallel
-from pipeline.records import Assignment, Finding, Probe, Severity, finding
+from pipeline.core.errors import UserError
+from pipeline.core.parallel import run_parallel
+from pipeline.core.records import Assignment, Finding, Probe, Severity, finding
 from pipeline.videos.audit.files import check_files
 from pipeline.videos.audit.labels import check_labels, similar_names
 from pipeline.videos.audit.leakage import check_leakage, check_split

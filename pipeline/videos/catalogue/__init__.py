@@ -16,9 +16,9 @@ from pathlib import Path
 import yaml
 from pydantic import ValidationError
 
-from pipeline.errors import UserError, first_problem
-from pipeline.records import Part
-from pipeline.runtime import derive_seed
+from pipeline.core.errors import UserError, first_problem
+from pipeline.core.records import Part
+from pipeline.core.runtime import derive_seed
 from pipeline.videos.catalogue.csv_reader import Row, read_rows
 from pipeline.videos.catalogue.wording import Entry, Language, Property, Scenario
 

@@ -13,10 +13,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from pipeline.config import FramesConfig
-from pipeline.errors import UserError
-from pipeline.io import atomic, code_of, fingerprint, write_table
-from pipeline.parallel import run_parallel
-from pipeline.records import Finding, Frame, Probe, Record, Severity, Video
+from pipeline.core.errors import UserError
+from pipeline.core.io import atomic, code_of, fingerprint, write_table
+from pipeline.core.parallel import run_parallel
+from pipeline.core.records import Finding, Frame, Probe, Record, Severity, Video
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import VideoFile, list_videos, raise_errors
 from pipeline.videos.frames.scan import scan

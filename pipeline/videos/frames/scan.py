@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 
 from pipeline.config import FramesConfig
-from pipeline.io import sha256
-from pipeline.records import Finding, Probe, Severity, finding
+from pipeline.core.io import sha256
+from pipeline.core.records import Finding, Probe, Severity, finding
 from pipeline.videos.decoding import Decoder, Image
 from pipeline.videos.files import VideoFile
 from pipeline.videos.frames.reference import (

@@ -9,9 +9,9 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.errors import UserError
-from pipeline.io import read_table
-from pipeline.records import Frame
+from pipeline.core.errors import UserError
+from pipeline.core.io import read_table
+from pipeline.core.records import Frame
 from pipeline.videos.frames.subtraction import Pictures, subtract
 
 FRAMES_FILE = "frames.npy"

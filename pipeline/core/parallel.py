@@ -22,9 +22,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from pipeline.config import Backend
-from pipeline.errors import UserError
-from pipeline.params import check_code
-from pipeline.runtime import DeviceName, cores, progress, track
+from pipeline.config.params import check_code
+from pipeline.core.errors import UserError
+from pipeline.core.runtime import DeviceName, cores, progress, track
 
 J = TypeVar("J")
 M = TypeVar("M")

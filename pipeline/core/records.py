@@ -1,6 +1,6 @@
 """The typed records that stages hand to each other.
 
-Each table or JSON-lines file holds one kind of record; `pipeline.io` writes and reads them and
+Each table or JSON-lines file holds one kind of record; `pipeline.core.io` writes and reads them and
 checks every row against the model.
 """
 
@@ -11,7 +11,7 @@ from typing import Annotated, Literal, NamedTuple
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
-from pipeline.errors import readable
+from pipeline.core.errors import readable
 
 Share = Annotated[float, AfterValidator(lambda value: round(value, 6))]
 """A figure of a report."""

@@ -13,7 +13,7 @@ from typing import Any
 
 import yaml
 
-from pipeline.io import sha256, write_text
+from pipeline.core.io import sha256, write_text
 
 CARD_FILE = "README.md"
 

@@ -1,6 +1,6 @@
 """The schema of params.yaml: every key with its range and meaning.
 
-`conf/` holds the scales and `octopi scale` composes one of them into params.yaml; `pipeline.params` reads it. A
+`conf/` holds the scales and `octopi scale` composes one of them into params.yaml; `pipeline.config.params` reads it. A
 function receives its own section, never the root.
 """
 
@@ -11,9 +11,9 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from pipeline.errors import without_secrets
-from pipeline.records import Encoder, Lora, Opd, Touch, Variant
-from pipeline.runtime import DeviceName, DtypeName, Quantization
+from pipeline.core.errors import without_secrets
+from pipeline.core.records import Encoder, Lora, Opd, Touch, Variant
+from pipeline.core.runtime import DeviceName, DtypeName, Quantization
 
 Fraction = Annotated[float, Field(gt=0, le=1)]
 Positive = Annotated[int, Field(ge=1)]

@@ -20,12 +20,12 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from pipeline.config import Params
-from pipeline.errors import UserError
-from pipeline.io import remove_rests, write_json
-from pipeline.parallel import end_with_parent, use_backend
-from pipeline.params import PARAMS_FILE, load_params
-from pipeline.records import Measurement
-from pipeline.runtime import CHECKPOINTS, limit_threads, quiet_libraries
+from pipeline.config.params import PARAMS_FILE, load_params
+from pipeline.core.errors import UserError
+from pipeline.core.io import remove_rests, write_json
+from pipeline.core.parallel import end_with_parent, use_backend
+from pipeline.core.records import Measurement
+from pipeline.core.runtime import CHECKPOINTS, limit_threads, quiet_libraries
 
 DATA = Path("data")
 RUNS = Path("runs")

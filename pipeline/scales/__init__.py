@@ -13,14 +13,14 @@ import yaml
 
 from pipeline import weights
 from pipeline.config import LANGUAGE_DIR, Params
+from pipeline.config.params import PARAMS_FILE, kind_of, validate
+from pipeline.core.errors import UserError
+from pipeline.core.io import write_text
+from pipeline.core.parallel import check_backend
+from pipeline.core.records import Part, Touch
 from pipeline.encoder.candidates import check_candidates
 from pipeline.encoder.recipes import check_recipe
-from pipeline.errors import UserError
-from pipeline.io import write_text
-from pipeline.memory import launched
-from pipeline.parallel import check_backend
-from pipeline.params import PARAMS_FILE, kind_of, validate
-from pipeline.records import Part, Touch
+from pipeline.scales.memory import launched
 from pipeline.scenes.invented import catalogue_of
 from pipeline.tasks.questions import counts_by_task
 from pipeline.videos.catalogue import Catalogue

@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-from pipeline.errors import UserError
-from pipeline.params import load_params
+from pipeline.config.params import load_params
+from pipeline.core.errors import UserError
 
 CHAIN, LOCK = "dvc.yaml", "dvc.lock"
 INTERRUPTED = ("exited with 130", "exited with -2")

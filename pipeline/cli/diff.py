@@ -13,10 +13,10 @@ from typing import Any
 import pandas as pd
 import pyarrow.parquet as pq
 
-from pipeline.errors import UserError, without_secrets
+from pipeline.cli.revisions import State, find_state
+from pipeline.core.errors import UserError, without_secrets
+from pipeline.core.records import EffectRow, Graded
 from pipeline.evaluation.scores import difference, grouped, with_holm
-from pipeline.records import EffectRow, Graded
-from pipeline.revisions import State, find_state
 from pipeline.tasks import TASKS
 
 GRADED, QUESTIONS = "data/graded.parquet", "data/questions"

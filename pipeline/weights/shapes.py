@@ -13,7 +13,7 @@ from math import prod
 from pathlib import Path
 from typing import Any, Literal, Self
 
-from pipeline.errors import UserError
+from pipeline.core.errors import UserError
 
 Targets = Sequence[str] | Literal["all-linear"]
 """`lora.target_modules`."""

@@ -12,10 +12,10 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from pipeline.config import Params
-from pipeline.errors import UserError, did_you_mean
+from pipeline.core.errors import UserError, did_you_mean
 
 PARAMS_FILE, CHAIN = Path("params.yaml"), Path("dvc.yaml")
-PACKAGE = Path(__file__).parent
+PACKAGE = Path(__file__).parents[1]
 RENAMED = {"frames.size": "frames.pixels"}
 """What a parameter was called before, and what it is called now."""
 
@@ -29,7 +29,7 @@ def project_above() -> str:
 def check_code(folder: Path) -> None:
     """Raise UserError where a folder has a `pipeline` of its own, which dvc.lock records, and another one runs."""
     own = folder / PACKAGE.name
-    if (own / "stage.py").is_file() and not own.samefile(PACKAGE):
+    if (own / "core" / "stage.py").is_file() and not own.samefile(PACKAGE):
         raise UserError(
             f"{PACKAGE} would run, but dvc.lock records {own.resolve()}; activate the environment of that folder "
             "(`make install` there makes it)"

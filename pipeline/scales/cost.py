@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from pipeline.config import Params
-from pipeline.errors import UserError, counted, did_you_mean
-from pipeline.memory import BYTES, GIB, Lengths, Use, embedding_length, launched, longest
+from pipeline.core.errors import UserError, counted, did_you_mean
+from pipeline.scales.memory import BYTES, GIB, Lengths, Use, embedding_length, launched, longest
 from pipeline.scenes.invented import catalogue_of
-from pipeline.shapes import FULL, Llama, Vision
 from pipeline.tasks.questions import counts_by_task
 from pipeline.videos.files import list_videos
 from pipeline.weights import DOWNLOADED
+from pipeline.weights.shapes import FULL, Llama, Vision
 
 GB = 1e9
 

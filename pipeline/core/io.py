@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from pipeline.errors import UserError, first_problem
-from pipeline.records import Record
+from pipeline.core.errors import UserError, first_problem
+from pipeline.core.records import Record
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -247,7 +247,7 @@ def code_of(stage: str) -> list[Path]:
     """All files of code that dvc.yaml lists for a stage, or `stage@key`: which version unfinished work is of."""
     import yaml
 
-    root = Path(__file__).parents[1]
+    root = Path(__file__).parents[2]
     stages = yaml.safe_load((root / "dvc.yaml").read_text(encoding="utf-8"))["stages"]
     listed = [root / d for d in stages[stage.partition("@")[0]]["deps"] if d.startswith(("pipeline/", "stages/"))]
     files = [f for path in listed for f in ([path] if path.is_file() else sorted(path.rglob("*")))]

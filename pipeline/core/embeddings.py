@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import torch
 
-from pipeline.errors import UserError
-from pipeline.io import load_tensors, read_table, save_tensors
-from pipeline.records import Embedding, Flip
+from pipeline.core.errors import UserError
+from pipeline.core.io import load_tensors, read_table, save_tensors
+from pipeline.core.records import Embedding, Flip
 
 FLIPS: tuple[Flip, ...] = ("none", "horizontal", "vertical", "both")
 TENSOR = "embeddings"

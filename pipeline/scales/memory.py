@@ -16,14 +16,14 @@ from pathlib import Path
 import yaml
 
 from pipeline.config import EncoderConfig, LoraTrainConfig, Params, TrainConfig
-from pipeline.errors import UserError
-from pipeline.records import Dialogue, Part, Question, Turn
+from pipeline.core.errors import UserError
+from pipeline.core.records import Dialogue, Part, Question, Turn
 from pipeline.scenes.invented import catalogue_of
-from pipeline.shapes import FULL, Llama, Vision
 from pipeline.tasks.base import Pool
 from pipeline.tasks.questions import build_questions, counts_by_task
 from pipeline.videos.catalogue import Catalogue
 from pipeline.weights.check import TOKENIZER, read_tokenizer
+from pipeline.weights.shapes import FULL, Llama, Vision
 
 GIB = 2**30
 BYTES = {"auto": 4, "float32": 4, "bfloat16": 2, "float16": 2}

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args
 import typer
 from typer.core import TyperGroup
 
-from pipeline.errors import UserError, counted
+from pipeline.core.errors import UserError, counted
 
 if TYPE_CHECKING:
-    from pipeline.records import Finding
+    from pipeline.core.records import Finding
     from pipeline.use.model import Octopi
 
 
@@ -62,11 +62,11 @@ def scale(
     card: Annotated[str, typer.Option(help="GPU to count hours for: rtx3090, rtx4090, a6000, a100 or h100.")] = "",
 ) -> None:
     """Choose what `dvc repro` runs: write params.yaml from conf/NAME.yaml and the overrides."""
-    from pipeline.cost import costs
-    from pipeline.memory import count, table
-    from pipeline.params import in_project
+    from pipeline.config.params import in_project
+    from pipeline.core.stage import running_stages
     from pipeline.scales import check_inputs, compose, prune, write_params
-    from pipeline.stage import running_stages
+    from pipeline.scales.cost import costs
+    from pipeline.scales.memory import count, table
 
     in_project()
     if not plan and (running := running_stages()):
@@ -105,7 +105,7 @@ def weights(
     ] = False,
 ) -> None:
     """Make a base model as a folder of safetensors, or convert or check a downloaded one."""
-    from pipeline.runtime import quiet_libraries
+    from pipeline.core.runtime import quiet_libraries
     from pipeline.weights import DOWNLOADED, MADE
     from pipeline.weights.make import make
     from pipeline.weights.published import SUMS, adopt, new_folder
@@ -128,7 +128,7 @@ def weights(
 @app.command()
 def page() -> None:
     """Write reports/index.html, one page over all reports that opens from disk."""
-    from pipeline.params import in_project
+    from pipeline.config.params import in_project
     from pipeline.report.page import write_page
 
     in_project()
@@ -139,14 +139,14 @@ def page() -> None:
 @app.command()
 def publish() -> None:
     """Show what lies in data/ and reports/ in MLflow, as `dvc repro` does at its end; a second call adds nothing."""
-    from pipeline.params import load_params
+    from pipeline.config.params import load_params
     from pipeline.tracking.publish import publish as to_mlflow
 
     typer.echo(to_mlflow(load_params()))
 
 
 CATALOGUE = typer.Option(help="Folder with objects.csv and properties.yaml.")
-PHYSICLEAR = Path(__file__).parent / "physiclear"
+PHYSICLEAR = Path(__file__).parents[1] / "physiclear"
 
 
 @data_app.command()
@@ -170,8 +170,8 @@ def audit(
 ) -> None:
     """Measure what can be trusted: files, contact, labels, copies, sessions, leaks; status 1 where errors are found."""
     from pipeline.config import SplitConfig
-    from pipeline.io import write_csv
-    from pipeline.records import Finding
+    from pipeline.core.io import write_csv
+    from pipeline.core.records import Finding
     from pipeline.videos.audit.run import audit_folder
     from pipeline.videos.catalogue import load_catalogue
 
@@ -247,9 +247,9 @@ def answer_with(
     timeout: Annotated[float, typer.Option(min=0.1, help="Seconds that a reply may take.")] = 120.0,
 ) -> None:
     """Let a model behind an endpoint answer the evaluation questions about pictures; OPENAI_API_KEY holds its key."""
+    from pipeline.config.params import load_params
+    from pipeline.core.records import Shown
     from pipeline.evaluation.answer_with import Endpoint, ask_all
-    from pipeline.params import load_params
-    from pipeline.records import Shown
 
     if folder is None and shown == "photos":
         raise UserError("DIR: name the folder with photos, as in `--input photos DIR`")
@@ -260,7 +260,7 @@ def answer_with(
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
 def repro(context: typer.Context) -> None:
     """Run `dvc repro`: say how many stages will run, and write the page of all reports behind it."""
-    from pipeline.reproduce import reproduce
+    from pipeline.cli.reproduce import reproduce
 
     raise typer.Exit(reproduce(Path(), context.args))
 
@@ -272,9 +272,9 @@ def diff(
     json: Annotated[Path | None, typer.Option(help="Also write everything to this file, for machines.")] = None,
 ) -> None:
     """Say what differs between two revisions: parameters, stages, figures, and whether accuracies really changed."""
-    from pipeline.diff import compare, describe
-    from pipeline.io import write_json
-    from pipeline.params import in_project
+    from pipeline.cli.diff import compare, describe
+    from pipeline.config.params import in_project
+    from pipeline.core.io import write_json
 
     in_project()
     found = compare(Path(), old, new)
@@ -477,7 +477,7 @@ def _doubt(notes: Sequence[str]) -> None:
 
 
 def _load(folder: Path | None, base: Path | None, device: str) -> Octopi:
-    from pipeline.runtime import DeviceName, quiet_libraries
+    from pipeline.core.runtime import DeviceName, quiet_libraries
 
     if device not in get_args(DeviceName):
         raise UserError(f"--device is {device}; allowed: {', '.join(get_args(DeviceName))}")
@@ -495,7 +495,7 @@ def main() -> None:
     try:
         app()
     except Exception as error:
-        from pipeline.stage import disk_error
+        from pipeline.core.stage import disk_error
 
         if (line := str(error) if isinstance(error, UserError) else disk_error(error)) is None:
             raise
