@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import random
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
@@ -35,6 +36,7 @@ from pipeline.use.results import Choice, Comparison, Description, Exchange, Matc
 from pipeline.videos.catalogue import Catalogue, Object, Property
 from pipeline.weights import is_tiny
 
+NUMBERED = re.compile(r"object \d+")
 ALONE = "the question compares, but there is one video: what it says of another is made up"
 APART = "the sentence and the property heads disagree; heads alone are right more often (the card has both)"
 RANDOM = "its base models are tiny and random, made to test the chain: no answer of it means anything"
@@ -244,13 +246,19 @@ class Octopi:
         It was trained to match three; for two a note says so.
 
         Args:
-            names: Names or ids of objects of the catalogue; or any names, each with its class of every property.
+            names: Names or ids of objects of the catalogue; or any names, each with its class of every property. Of
+                those a model of invented objects is asked as "object 1", ...; its answer has the names.
         """
+        called: dict[str, str] = {}
         if len(videos) != len(names) or len(videos) not in (2, 3):
             given = f"{counted(len(videos), 'video')} and {counted(len(names), 'name')}"
             raise UserError(f"{given}: two or three of each can be matched")
         if isinstance(names, Mapping):
             objects = [self._told(name, classes) for name, classes in names.items()]
+            if all(map(NUMBERED.fullmatch, self.names)):
+                # It has heard of numbered objects alone, and copies no other name.
+                called = {f"object {number}": o.name for number, o in enumerate(objects, 1)}
+                objects = [o.model_copy(update={"name": name}) for o, name in zip(objects, called, strict=True)]
         else:
             objects = [self._object(name) for name in names]
         found = {o.object_id: o for o in sorted(objects, key=lambda o: o.name.lower())}
@@ -260,13 +268,16 @@ class Octopi:
         catalogue = Catalogue(language=self.catalogue.language, objects=found)
         question = pom.asked(pom.OPENINGS[len(listed) == 2], listed)[self.config.opd]
         if self.config.facts or isinstance(names, Mapping):
-            facts = pom.facts(catalogue, found, random.Random(derive_seed("facts", *listed)))
+            facts = pom.facts(catalogue, list(found), random.Random(derive_seed("facts", *listed)))
             question = f"{facts} {question}"
         answer = self.ask(question, videos)
         read = pom.read(answer, listed)
         said = None if read is None else tuple(listed[read[letter]] for letter in LETTERS[: len(listed)])
         nearest = pom.nearest([self._classes(video) for video in videos], catalogue)
         heads = tuple(found[i].name for i in nearest)
+        answer = NUMBERED.sub(lambda name: called.get(name[0], name[0]), answer)
+        said = said and tuple(called.get(name, name) for name in said)
+        heads = tuple(called.get(name, name) for name in heads)
         untrained = () if len(listed) == 3 else ("it was trained to match three videos, not two",)
         apart = (APART,) if said not in (None, heads) else ()
         notes = (*untrained, *apart, *self.notes(videos))

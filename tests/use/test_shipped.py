@@ -139,7 +139,7 @@ def test_a_runs_videos_are_asked_about_as_they_are_and_standardised(
     """What it says of them is what it says to a person who asks; an object that it was trained on stops the stage."""
     cache.mkdir(parents=True)
     (cache / "smollm2").symlink_to(model_folder("smollm2"))
-    changed = ["data.source=videos", f"data.dir={EXAMPLES}", f"data.catalogue={ROOT}/pipeline/physiclear", "shipped=5"]
+    changed = ["data.source=videos", f"data.dir={EXAMPLES}", f"data.catalogue={ROOT}/pipeline/physiclear", "shipped=8"]
     write_params(compose("smoke", changed, ROOT / "conf"), tmp_path / "params.yaml")
     monkeypatch.chdir(tmp_path)
 
@@ -157,6 +157,11 @@ def test_a_runs_videos_are_asked_about_as_they_are_and_standardised(
     assert ways[Shown.TOUCH] == ways[Shown.STANDARDISED] == ways[Shown.CLASSES]
     assert {r.task for r in graded} >= {"OPD", "PC", "PSS", "POM"}
     octopi = Octopi.from_pretrained(dtype="float32")
+    told = {"a tile": "hard, smooth, no bumps", "a rug": "soft, rough, no bumps", "a bun": "soft, smooth, small bumps"}
+    named = {name: classes.split(", ") for name, classes in told.items()}
+    matched = octopi.match([EXAMPLES / f"{name}.mp4" for name in ("soft", "hard", "rough")], named)
+    assert matched.names == matched.heads == ("a bun", "a tile", "a rug")
+    assert "b) is a tile" in matched.answer
     for row in graded:
         if row.shown in (Shown.TOUCH, Shown.CLASSES) and row.measure == "hardness":
             (said,) = octopi.describe_all([EXAMPLES / f"{objects[row.objects[0]]}.mp4"])
