@@ -143,7 +143,7 @@ async function begin() {
   const about = await (await fetch("api/about")).json();
   $("model").textContent = about.model;
   $("question").placeholder = about.example;
-  tell("Begin with a video of yours, or pick a synthetic scene; then press Ask.");
+  tell("Begin with a video of yours, or pick a synthetic scene; then press Ask.", true);
   for (const [id, name] of about.scenes) $("scene").append(new Option(name, id));
 }
 
