@@ -54,6 +54,7 @@ class Octopi:
         card: What the folder's config.json says.
         properties: The catalogue's properties.
         names: The names of the catalogue's objects.
+        numbered: Whether it has heard of "object 1" and the like alone; then it copies no other name.
         doubts: What should make one doubt every answer; empty for a model that was trained from real weights.
     """
 
@@ -66,6 +67,7 @@ class Octopi:
         self.card: Mapping[str, Any] = config.model_dump(mode="json")
         self.properties: tuple[str, ...] = catalogue.property_names
         self.names: tuple[str, ...] = tuple(o.name for o in catalogue.objects.values())
+        self.numbered = all(map(NUMBERED.fullmatch, self.names))
         self.encoder = VideoEncoder(folder, config, catalogue, device)
         bases = (config.base.folder, config.encoder.weights)
         self.doubts: tuple[str, ...] = (RANDOM,) if any(map(is_tiny, bases)) else ()
@@ -255,8 +257,7 @@ class Octopi:
             raise UserError(f"{given}: two or three of each can be matched")
         if isinstance(names, Mapping):
             objects = [self._told(name, classes) for name, classes in names.items()]
-            if all(map(NUMBERED.fullmatch, self.names)):
-                # It has heard of numbered objects alone, and copies no other name.
+            if self.numbered:
                 called = {f"object {number}": o.name for number, o in enumerate(objects, 1)}
                 objects = [o.model_copy(update={"name": name}) for o, name in zip(objects, called, strict=True)]
         else:

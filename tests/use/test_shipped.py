@@ -156,6 +156,7 @@ def test_a_runs_videos_are_asked_about_as_they_are_and_standardised(
     ways = {way: [(r.question_id, r.measure) for r in graded if r.shown is way] for way in Shown}
     assert ways[Shown.TOUCH] == ways[Shown.STANDARDISED] == ways[Shown.CLASSES]
     assert {r.task for r in graded} >= {"OPD", "PC", "PSS", "POM"}
+    assert all(r.parsed for r in graded if r.task == "POM"), "it is asked under names as in training"
     octopi = Octopi.from_pretrained(dtype="float32")
     told = {"a tile": "hard, smooth, no bumps", "a rug": "soft, rough, no bumps", "a bun": "soft, smooth, small bumps"}
     named = {name: classes.split(", ") for name, classes in told.items()}
