@@ -133,7 +133,7 @@ def versions(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monke
     for part in ("pipeline", "stages"):
         shutil.copytree(ROOT / part, copy / part, ignore=shutil.ignore_patterns("__pycache__", ".*.part"))
     shutil.copy(ROOT / "dvc.yaml", copy)
-    monkeypatch.setattr("pipeline.core.io.__file__", str(copy / "pipeline" / "io.py"))
+    monkeypatch.setattr("pipeline.core.io.__file__", str(copy / "pipeline" / "core" / "io.py"))
 
     def change(path: str) -> None:
         content = (copy / path).read_bytes()
