@@ -137,7 +137,7 @@ def system(row: dict[str, Any]) -> str:
     if row["touch"] == Shown.TOUCH:
         return f"{row['encoder']}, as it is shipped"
     if row["touch"] == Shown.CLASSES:
-        return f"{row['encoder']}'s {_told(row)}"
+        return _told(row).replace(RULES_WORDS, "its heads and rules alone")
     if row["touch"] == Shown.STANDARDISED:
         return f"{row['encoder']}, embeddings standardised by these videos"
     if row["task"] in (HEADS, VALIDATION_HEADS):
