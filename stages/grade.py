@@ -11,7 +11,7 @@ from pipeline.videos.catalogue import load_catalogue
 
 def main() -> None:
     with stage("grade") as run:
-        catalogue = load_catalogue(Path(run.params.data.catalogue))
+        catalogue = load_catalogue(Path(run.params.data.catalogue)).called(run.params.questions.names)
         graded = []
         for variant in run.params.ablation.variants():
             questions = read_jsonl(DATA / "questions" / str(variant.seed) / "evaluation.jsonl", Question)

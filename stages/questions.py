@@ -14,6 +14,7 @@ def main() -> None:
     with stage("questions") as run:
         config = run.params.questions
         catalogue = load_catalogue(Path(run.params.data.catalogue)).asking(config.scenarios, config.wording)
+        catalogue = catalogue.called(config.names)
         for seed in run.params.ablation.seeds:
             assignments = read_table(DATA / "splits" / f"{seed}.parquet", Assignment)
             for name, part, counts, distinct in (

@@ -16,7 +16,7 @@ from pipeline.tasks.base import Pool
 from pipeline.tasks.questions import build_questions, counts_by_task
 from pipeline.use.folder import SHIPPED
 from pipeline.use.model import Octopi
-from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.videos.catalogue import load_catalogue
 
 BATCH = 64
 """Answers at once: a gigabyte of keys and values."""
@@ -31,10 +31,7 @@ def main() -> None:
             # Half precision on one processor and not on another would make the report depend on the machine.
             octopi = Octopi.from_pretrained(SHIPPED, device=params.runtime.device, dtype="float32")
             catalogue = load_catalogue(Path(params.data.catalogue)).asking(params.questions.scenarios)
-            if octopi.numbered:
-                named = enumerate(sorted(catalogue.objects.items()))
-                objects = {key: o.model_copy(update={"name": f"object {number}"}) for number, (key, o) in named}
-                catalogue = Catalogue(language=catalogue.language, objects=objects)
+            catalogue = catalogue.called("number" if octopi.numbered else "catalogue")
             videos = read_table(DATA / "videos.parquet", Video)
             of_object: dict[str, list[str]] = {}
             for video in videos:

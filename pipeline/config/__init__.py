@@ -160,6 +160,9 @@ class QuestionsConfig(Section):
     facts: bool = False
     """Begin matching questions with what the named objects are like, for a language model that has never heard of
     them: then touch and reasoning are asked for and no knowledge of the world. Tables say so."""
+    names: Literal["catalogue", "number"] = "catalogue"
+    """What objects are called. `number`: "object 7", as the objects are that the shipped model has learnt from; it
+    copies no other name. With `facts`, a name says nothing about its object."""
     inexact: Annotated[float, Field(ge=0, le=1)] = 0.0
     """`facts` in training: chance that a class told is a neighbour of the right one, the right matching staying the
     nearest. An encoder's errors are of this kind, and exact facts teach to look for equal classes alone."""

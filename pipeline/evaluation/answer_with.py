@@ -114,7 +114,7 @@ def ask_all(params: Params, endpoint: Endpoint, shown: Shown, folder: Path, limi
 def _ask_all(params: Params, endpoint: Endpoint, shown: Shown, folder: Path, limit: int | None, place: Path) -> str:
     files = {seed: DATA / "questions" / str(seed) / "evaluation.jsonl" for seed in params.ablation.seeds}
     asked = {seed: read_jsonl(file, Question) for seed, file in files.items()}
-    catalogue = load_catalogue(Path(params.data.catalogue))
+    catalogue = load_catalogue(Path(params.data.catalogue)).called(params.questions.names)
     objects = sorted({o for questions in asked.values() for q in questions for o in q.objects})
     most = params.frames.per_video
     show = _frames(folder, most) if shown is Shown.FRAMES else _photos(folder, objects, most)

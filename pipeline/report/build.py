@@ -91,7 +91,8 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     concluded: dict[int, list[Score]] = {}
     for seed, classified in by_encoder.items():
         asked = read_jsonl(data / "questions" / str(seed) / "evaluation.jsonl", Question)
-        scored = conclude(asked, classified, catalogue.asking(params.questions.scenarios))
+        taken = catalogue.asking(params.questions.scenarios).called(params.questions.names)
+        scored = conclude(asked, classified, taken)
         concluded.setdefault(params.split.replicate_of(seed), []).extend(scored)
     scores = score_rows(graded, catalogue, said, out_of_fold, seen, concluded)
     origin = provenance(params, catalogue, videos, splits, [g.objects for g in graded], root)

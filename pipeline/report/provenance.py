@@ -92,7 +92,7 @@ def provenance(
 
 
 BEYOND = {
-    "questions": ("wording", "inexact", "restate", "two_turns", "plainly"),
+    "questions": ("wording", "names", "inexact", "restate", "two_turns", "plainly"),
     "language": ("start", "normalize_touch", "touch_noise"),
     "align": ("weighting", "begin_with_words"),
     "lora": ("weighting", "target_modules", "dropout", "given"),

@@ -16,7 +16,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -72,6 +72,8 @@ class ModelConfig(Record):
     """`data.source`: whether its videos were synthetic."""
     facts: bool
     """Whether matching questions tell it what the named objects are like."""
+    names: Literal["catalogue", "number"] = "catalogue"
+    """`questions.names`: what it was trained to call objects."""
     frames: FramesConfig
     encoder: EncoderConfig
     language: LanguageConfig

@@ -54,7 +54,7 @@ class Octopi:
         card: What the folder's config.json says.
         properties: The catalogue's properties.
         names: The names of the catalogue's objects.
-        numbered: Whether it has heard of "object 1" and the like alone; then it copies no other name.
+        numbered: Whether training called objects "object 1" and the like alone; then it copies no other name.
         doubts: What should make one doubt every answer; empty for a model that was trained from real weights.
     """
 
@@ -67,7 +67,7 @@ class Octopi:
         self.card: Mapping[str, Any] = config.model_dump(mode="json")
         self.properties: tuple[str, ...] = catalogue.property_names
         self.names: tuple[str, ...] = tuple(o.name for o in catalogue.objects.values())
-        self.numbered = all(map(NUMBERED.fullmatch, self.names))
+        self.numbered = config.names == "number" or all(map(NUMBERED.fullmatch, self.names))
         self.encoder = VideoEncoder(folder, config, catalogue, device)
         bases = (config.base.folder, config.encoder.weights)
         self.doubts: tuple[str, ...] = (RANDOM,) if any(map(is_tiny, bases)) else ()
@@ -248,8 +248,8 @@ class Octopi:
         It was trained to match three; for two a note says so.
 
         Args:
-            names: Names or ids of objects of the catalogue; or any names, each with its class of every property. Of
-                those a model of invented objects is asked as "object 1", ...; its answer has the names.
+            names: Names or ids of objects of the catalogue; or any names, each with its class of every property. A
+                model that knows numbers alone is asked about "object 1", ...; its answer has the names.
         """
         called: dict[str, str] = {}
         if len(videos) != len(names) or len(videos) not in (2, 3):
@@ -257,11 +257,11 @@ class Octopi:
             raise UserError(f"{given}: two or three of each can be matched")
         if isinstance(names, Mapping):
             objects = [self._told(name, classes) for name, classes in names.items()]
-            if self.numbered:
-                called = {f"object {number}": o.name for number, o in enumerate(objects, 1)}
-                objects = [o.model_copy(update={"name": name}) for o, name in zip(objects, called, strict=True)]
         else:
             objects = [self._object(name) for name in names]
+        if self.numbered:
+            called = {f"object {number}": o.name for number, o in enumerate(objects, 1)}
+            objects = [o.model_copy(update={"name": name}) for o, name in zip(objects, called, strict=True)]
         found = {o.object_id: o for o in sorted(objects, key=lambda o: o.name.lower())}
         if len(found) < len(names):
             raise UserError(f"{', '.join(names)}: a name is given twice; name {len(names)} objects")

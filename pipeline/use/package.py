@@ -101,6 +101,7 @@ def package(data: Path, params: Params, variant: Variant, base: Base, out: Path)
             opd=variant.opd,
             trained_on=params.data.source,
             facts=params.questions.facts,
+            names=params.questions.names,
             frames=params.frames,
             encoder=encoder,
             language=language,

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 import random
+import re
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -51,6 +53,18 @@ def shuffled(seed: int) -> dict[str, tuple[int, ...]]:
     labels = list(TRUE.values())
     random.Random(seed).shuffle(labels)
     return dict(zip(TRUE, labels, strict=True))
+
+
+def test_objects_called_by_number_are_matched_like_others() -> None:
+    numbered = CATALOGUE.called("number")
+    questions = build_questions(replace(POOL, catalogue=numbered), {"POM": 40}, seed=1, distinct=True, facts=True)
+    for question in questions:
+        said = question.dialogues[0].turns[0].user
+        assert set(re.findall(r"object \d+", said)) == {numbered.objects[o].name for o in question.objects}
+        assert not any(CATALOGUE.objects[o].name in said for o in question.objects)
+    assert all(s.correct for s in conclude(questions, heads(TRUE), numbered))
+    # Options are listed by name, so a grader that takes other names reads another order.
+    assert not all(s.correct for s in conclude(questions, heads(TRUE), CATALOGUE))
 
 
 def test_right_classes_lead_to_right_answers_in_the_words_of_right_answers() -> None:

@@ -192,6 +192,11 @@ def test_typed_tasks(octopi: Octopi, files: list[Path], monkeypatch: pytest.Monk
     assert [told[name] for name in own.heads] == list(told.values())
     assert all(f"{', '.join(classes)} is {name}." in own.question for name, classes in told.items())
     assert (model_code.APART in own.notes) == (own.heads != own.names)
+    monkeypatch.setattr(octopi, "numbered", True)
+    said["match"] = "Conclusion: a) is object 1, b) is object 3 and c) is object 2."
+    matched = octopi.match(files, names)
+    assert matched.names == (names[0], names[2], names[1])
+    assert not any(name in matched.question for name in names)
     chosen = octopi.scenario("I must sleep.", files[:2])
     assert chosen.choice == 1
     assert [q.count("{tactile}") for q in asked[-2:]] == [2, 0], "described first"

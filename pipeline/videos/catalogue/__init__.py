@@ -12,6 +12,7 @@ import re
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 import yaml
 from pydantic import ValidationError
@@ -90,6 +91,14 @@ class Catalogue(Entry):
         language = self.language.model_copy(update={"scenarios": scenarios, "properties": properties})
         # Not a copy of this one: its cached properties would come along.
         return Catalogue(language=language, objects=self.objects)
+
+    def called(self, names: Literal["catalogue", "number"]) -> Catalogue:
+        """The catalogue with its objects' names as `questions.names` has them; numbers in the order of ids."""
+        if names == "catalogue":
+            return self
+        numbered = enumerate(sorted(self.objects.items()))
+        objects = {key: o.model_copy(update={"name": f"object {number}"}) for number, (key, o) in numbered}
+        return Catalogue(language=self.language, objects=objects)
 
     def labels(self, object_id: str) -> tuple[int, ...]:
         """The class of each property of one object."""
