@@ -285,6 +285,8 @@ def diff(
 
 MODEL = typer.Option(help="Folder of a trained model; by default the one that is shipped.")
 BASE = typer.Option(help="Folder of its language model, where it lies in none of the known places.")
+MEMORY = typer.Option(help="Folder of remembered touches.")
+TOUCHES = Path("touches")
 
 
 @app.command()
@@ -297,6 +299,9 @@ def ask(
     base: Annotated[Path | None, BASE] = None,
     device: Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")] = "auto",
     json: Annotated[bool, typer.Option("--json", help="Print the answer with what it stands on.")] = False,
+    memory: Annotated[
+        Path | None, typer.Option(help="Folder of remembered touches: what each video is most like is told with it.")
+    ] = None,
 ) -> None:
     """Ask a trained model about touch; without a question, talk to it (/add FILE, /frames, /reset, /quit)."""
     from json import dumps
@@ -308,7 +313,11 @@ def ask(
         raise UserError(f"{question}: is a file; write the question before it")
     if json and not question:
         raise UserError("--json takes a question")
+    if memory and not question:
+        raise UserError("--memory takes a question")
     asked = _load(model, base, device)
+    if memory:
+        question = asked.reminded(question, videos or (), memory)
 
     say = partial(typer.echo, nl=False)
     if not question:
@@ -405,6 +414,38 @@ def match(
     for video, name in zip(videos, found.heads, strict=True):
         typer.echo(f"{video}: {name} (by the property heads)")
     typer.echo(found.answer)
+    _doubt(found.notes)
+
+
+@app.command()
+def remember(
+    name: Annotated[str, typer.Argument(help="What the object is called, such as 'my mug'.")],
+    videos: Annotated[list[str], typer.Argument(help="Videos of it being touched; one is enough.")],
+    memory: Annotated[Path, MEMORY] = TOUCHES,
+    model: Annotated[Path | None, MODEL] = None,
+    base: Annotated[Path | None, BASE] = None,
+    device: Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")] = "auto",
+) -> None:
+    """Keep touches of an object, by which it is recognised later, without training."""
+    loaded = _load(model, base, device)
+    for video in videos:
+        known = loaded.remember(name, video, memory)
+        _doubt(loaded.notes(video))
+    typer.echo(f"{memory}: remembers {counted(known, 'video')}")
+
+
+@app.command()
+def recognise(
+    video: Annotated[str, typer.Argument(help="A video.")],
+    memory: Annotated[Path, MEMORY] = TOUCHES,
+    model: Annotated[Path | None, MODEL] = None,
+    base: Annotated[Path | None, BASE] = None,
+    device: Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")] = "auto",
+) -> None:
+    """Say which remembered objects a touch is like, the most similar first."""
+    found = _load(model, base, device).recognise(video, memory)
+    for known in found.objects[:5]:
+        typer.echo(f"{known.similarity:.3f}  {known.name} ({', '.join(known.classes)})")
     _doubt(found.notes)
 
 

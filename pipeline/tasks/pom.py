@@ -37,8 +37,13 @@ TRIES = 60
 def fact(catalogue: Catalogue, object_id: str, labels: Sequence[int] | None = None) -> str:
     """What an object is like: "hard, smooth, no bumps is a ruler."; by these classes in place of its own, if given."""
     labels = labels or catalogue.labels(object_id)
-    classes = ", ".join(p.levels[level] for p, level in zip(catalogue.properties, labels, strict=True))
-    return f"{classes} is {catalogue.objects[object_id].name}."
+    classes = [p.levels[level] for p, level in zip(catalogue.properties, labels, strict=True)]
+    return sentence(classes, catalogue.objects[object_id].name)
+
+
+def sentence(classes: Iterable[str], name: str) -> str:
+    """A fact of any object."""
+    return f"{', '.join(classes)} is {name}."
 
 
 def facts(catalogue: Catalogue, objects: Sequence[str], rng: random.Random, inexact: float = 0.0) -> str:

@@ -38,6 +38,8 @@ class EncodedVideo(NamedTuple):
     """float32, frames x dim."""
     notes: tuple[str, ...]
     """What should make one doubt an answer."""
+    embedding: torch.Tensor
+    """float32, dim: the mean over its frames, before property heads and as the encoder has it."""
 
     @property
     def size(self) -> int:
@@ -80,7 +82,9 @@ class VideoEncoder:
                 raise UserError(f"{prepared.name}: its embedding is not finite; check the video")
             standard = standardize(raw, self.statistics)
             features = standard if config.encoder.standardize else raw
-            self._encoded[name] = EncodedVideo(prepared, features, (*prepared.touch.notes, *self._unlike(standard)))
+            self._encoded[name] = EncodedVideo(
+                prepared, features, (*prepared.touch.notes, *self._unlike(standard)), raw.mean(0)
+            )
         self._encoded.move_to_end(name)
         while len(self._encoded) > 1 and sum(encoded.size for encoded in self._encoded.values()) > REMEMBERED:
             self._encoded.popitem(last=False)

@@ -15,6 +15,7 @@ import torch
 
 from pipeline.config import LANGUAGE_DIR, LanguageConfig
 from pipeline.core.errors import UserError, counted, did_you_mean, readable
+from pipeline.core.io import fingerprint
 from pipeline.core.records import Opd, Turn
 from pipeline.core.runtime import (
     DeviceName,
@@ -31,8 +32,19 @@ from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.tasks import opd, pc, pom, psr, pss
 from pipeline.tasks.base import LETTERS
 from pipeline.use.encoding import EncodedVideo, VideoEncoder
-from pipeline.use.folder import SHIPPED, ModelConfig, chat_sample, find_base, read_folder
-from pipeline.use.results import Choice, Comparison, Description, Exchange, Matching, Ranking, Touch, Video
+from pipeline.use.folder import ENCODER_DIR, SHIPPED, ModelConfig, chat_sample, find_base, read_folder
+from pipeline.use.memory import Remembered, most_similar, recall, remember
+from pipeline.use.results import (
+    Choice,
+    Comparison,
+    Description,
+    Exchange,
+    Matching,
+    Ranking,
+    Recognition,
+    Touch,
+    Video,
+)
 from pipeline.videos.catalogue import Catalogue, Object, Property
 from pipeline.weights import is_tiny
 
@@ -69,6 +81,8 @@ class Octopi:
         self.names: tuple[str, ...] = tuple(o.name for o in catalogue.objects.values())
         self.numbered = config.names == "number" or all(map(NUMBERED.fullmatch, self.names))
         self.encoder = VideoEncoder(folder, config, catalogue, device)
+        files = sorted((name, known) for name, known in config.files.items() if name.startswith(ENCODER_DIR))
+        self._encoder_name = fingerprint(config.frames, *(part for file in files for part in file))
         bases = (config.base.folder, config.encoder.weights)
         self.doubts: tuple[str, ...] = (RANDOM,) if any(map(is_tiny, bases)) else ()
 
@@ -127,6 +141,7 @@ class Octopi:
         *,
         history: Sequence[Exchange] = (),
         max_new_tokens: int | None = None,
+        memory: Path | str | None = None,
     ) -> str:
         """Answer a question.
 
@@ -135,10 +150,14 @@ class Octopi:
             videos: Files, or arrays of uint8, frames x height x width x RGB; one, or several in a list.
             history: Earlier exchanges of the conversation.
             max_new_tokens: Of the answer; by default those of the evaluation.
+            memory: A folder of remembered touches: the question begins with what the object that each video is most
+                like was called, and felt like.
 
         Raises:
             UserError: for a question that does not fit its videos or is too long, or a video that cannot be used.
         """
+        if memory is not None:
+            question = self.reminded(question, _listed(videos), memory)
         return self._reply([self._prompt((*history, Exchange(question, _listed(videos), "")))], max_new_tokens)[0]
 
     def stream(
@@ -283,6 +302,39 @@ class Octopi:
         apart = (APART,) if said not in (None, heads) else ()
         notes = (*untrained, *apart, *self.notes(videos))
         return Matching(question=question, answer=answer, names=said, heads=heads, notes=notes)
+
+    def remember(self, name: str, video: Video, memory: Path | str) -> int:
+        """Keep a touch of a named object in a folder, which is made where there is none; how many it has now.
+
+        Raises:
+            UserError: for a video in which nothing is touched, or a memory that is broken or another encoder's.
+        """
+        encoded = self._touched(video)
+        levels = self._described(video).levels
+        return remember(
+            Path(memory),
+            Remembered(
+                name=name,
+                classes=tuple(levels[p] for p in self.properties),
+                encoder=self._encoder_name,
+                embedding=tuple(encoded.embedding.tolist()),
+            ),
+        )
+
+    def recognise(self, video: Video, memory: Path | str) -> Recognition:
+        """Which remembered objects a touch is like, the most similar first. An object that was never remembered is like
+        one, too: similarities tell apart, and are no probabilities."""
+        encoded = self._touched(video)
+        touches = recall(Path(memory), self._encoder_name)
+        objects = most_similar(encoded.embedding.double().numpy(), touches)
+        return Recognition(objects=objects, touches=len(touches), notes=self.notes(video))
+
+    def reminded(self, question: str, videos: Sequence[Video], memory: Path | str) -> str:
+        """The question, behind what is remembered of the object that each video is most like: "soft, rough, no bumps is
+        my rug. ...", as matching tells it."""
+        nearest = [self.recognise(video, memory).objects[0] for video in videos]
+        facts = dict.fromkeys(pom.sentence(known.classes, known.name) for known in nearest)
+        return " ".join([*facts, with_marks(question, len(videos))])
 
     def scenario(self, question: str, videos: Sequence[Video]) -> Choice:
         """Which of two videos suits a situation better, described first where the variant describes."""

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from pydantic import ConfigDict
 
 from pipeline.core.records import Record
+from pipeline.use.memory import Similar
 
 Pictures = npt.NDArray[np.uint8]
 Video = str | os.PathLike[str] | Pictures
@@ -107,4 +108,14 @@ class Choice(Record):
     answer: str
     choice: int | None
     """Place in the list of videos, from 0; None where the answer cannot be read."""
+    notes: tuple[str, ...]
+
+
+class Recognition(Record):
+    """What a touch is like, of all that is remembered."""
+
+    objects: tuple[Similar, ...]
+    """Most similar first."""
+    touches: int
+    """How many are remembered."""
     notes: tuple[str, ...]
