@@ -197,6 +197,8 @@ def _files(paths: Sequence[Path]) -> list[tuple[Path, str]]:
     """The videos that paths name, each as a row calls it: from the one folder that is named, else by its whole path."""
     found: list[tuple[Path, str]] = []
     for path in paths:
+        if not path.exists():
+            raise UserError(f"{path}: no such file or folder; name a video, or a folder of videos")
         files, findings = ([path], []) if path.is_file() else video_files(path)
         for finding in findings:
             log.warning("%s: %s", finding.item, finding.measured)
