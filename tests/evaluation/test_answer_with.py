@@ -330,16 +330,6 @@ def test_a_failing_endpoint_is_one_line_and_loses_nothing(project: Path, server:
     assert all(s.correct for s in graded())
 
 
-def test_what_passes_is_asked_again_by_the_client(project: Path, server: Server) -> None:
-    """Twice 429, once 503, then the answer: four requests arrive for two of ours."""
-    hiccups = {0: 429, 1: 429, 4: 503}
-    order = iter(range(100))
-    server.step = lambda n: soon(hiccups[n]) if n in hiccups else right(next(order))
-    assert "12 requests; 10 of 10" in run(server)
-    assert len(server.bodies) == 12 + len(hiccups)
-    assert all(s.correct for s in graded())
-
-
 def test_a_server_that_is_silent_or_gone(project: Path, server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("openai._base_client.INITIAL_RETRY_DELAY", 0.01)
     asleep = threading.Event()

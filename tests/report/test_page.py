@@ -113,9 +113,7 @@ def test_published_figures_stand_only_beside_their_data(page: Page, changed: Pat
     assert all("so none stand here" in words(other.named(name)) for name in ("small-videos", "together"))
 
 
-def test_the_finding_comes_first_and_real_videos_before_smoke_but_for_the_current_run(
-    page: Page, tmp_path: Path
-) -> None:
+def test_the_current_run_comes_first_then_real_videos_then_smoke(page: Page, tmp_path: Path) -> None:
     chapters = [e.get("id") for e in page.all(kind="chapter")]
     assert chapters == ["together", "small-videos", "smoke-scenes", "speed", "stability", "missing"]
     parts = [e.attrib["id"].removeprefix("small-videos-") for e in page.named("small-videos").iter("h3")]
