@@ -18,12 +18,13 @@ from datetime import UTC, datetime
 from functools import lru_cache
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field
 
 from pipeline.config import Params
 from pipeline.core.errors import UserError
@@ -36,11 +37,6 @@ from pipeline.training.sampling import sample_evaluation
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.frames.store import FrameStore
 
-if TYPE_CHECKING:
-    from openai.types.chat import ChatCompletion
-
-Picture = npt.NDArray[np.uint8]
-"""Rows x columns x BGR, as OpenCV has them."""
 Show = Callable[[str, str], list[str]]
 """The pictures of a video, or of its object, as data URLs."""
 
@@ -78,14 +74,14 @@ class Reply(Record):
 
     request: str
     """SHA-256 of what was sent and where."""
-    text: str
-    """Empty where nothing was said."""
     ended: str
     """As in `VisionModel.ended`."""
-    tokens: int
-    model: str
+    text: str = ""
+    """Empty where nothing was said."""
+    tokens: int = 0
+    model: str = ""
     """As the endpoint calls it."""
-    day: str
+    day: str = Field(default_factory=lambda: datetime.now(UTC).date().isoformat())
 
 
 def ask_all(params: Params, endpoint: Endpoint, shown: Shown, folder: Path, limit: int | None = None) -> str:
@@ -104,51 +100,36 @@ def ask_all(params: Params, endpoint: Endpoint, shown: Shown, folder: Path, limi
     """
     _check(endpoint)
     name = re.sub(r"[^\w.-]+", "-", f"{endpoint.model}-{shown}")
+    place = EXTERNAL / params.report_name / name
     try:
         with alone(f"answer-with@{name}"):
-            return _ask_all(params, endpoint, shown, folder, limit, EXTERNAL / params.report_name / name)
+            files = {seed: DATA / "questions" / str(seed) / "evaluation.jsonl" for seed in params.ablation.seeds}
+            asked = {seed: read_jsonl(file, Question) for seed, file in files.items()}
+            objects = sorted({o for questions in asked.values() for q in questions for o in q.objects})
+            most = params.frames.per_video
+            show = _frames(folder, most) if shown is Shown.FRAMES else _photos(folder, objects, most)
+            catalogue = load_catalogue(Path(params.data.catalogue)).called(params.questions.names)
+            asker, answered = _Asker(endpoint, place / CACHE_FILE, limit), {}
+            for seed, questions in asked.items():
+                training = read_jsonl(files[seed].with_name("train.jsonl"), Question)
+                tasks = {q.task for q in questions}
+                told = {t: instruction(catalogue, shown, choose_examples(training, t)) for t in tasks}
+                said = (_answer(q, told[q.task], asker, show) for q in track(questions, name, "question"))
+                answered[seed] = [prediction for prediction in said if prediction]
+            done, total = (sum(map(len, each.values())) for each in (answered, asked))
+            if done:
+                for seed, predictions in answered.items():
+                    write_jsonl(place / f"{seed}.jsonl", predictions)
+                # Last: it says of what stands beside it that it belongs to these questions.
+                hashes = {str(seed): fingerprint(file) for seed, file in files.items()}
+                source = asker.source(shown=shown, per_video=most, questions=hashes)
+                write_json(place / SOURCE_FILE, source.model_dump(mode="json"))
+            state = f"{done} of {total} questions are answered"
+            if asker.failure:
+                raise UserError(f"{asker.failure}; {state}, run it again to go on")
     except UserError as error:
         raise UserError(f"answer-with@{name}: {error}") from None
-
-
-def _ask_all(params: Params, endpoint: Endpoint, shown: Shown, folder: Path, limit: int | None, place: Path) -> str:
-    files = {seed: DATA / "questions" / str(seed) / "evaluation.jsonl" for seed in params.ablation.seeds}
-    asked = {seed: read_jsonl(file, Question) for seed, file in files.items()}
-    catalogue = load_catalogue(Path(params.data.catalogue)).called(params.questions.names)
-    objects = sorted({o for questions in asked.values() for q in questions for o in q.objects})
-    most = params.frames.per_video
-    show = _frames(folder, most) if shown is Shown.FRAMES else _photos(folder, objects, most)
-    asker, answered = _Asker(endpoint, place / CACHE_FILE, limit), {}
-    for seed, questions in asked.items():
-        training = read_jsonl(files[seed].with_name("train.jsonl"), Question)
-        told = {t: instruction(catalogue, shown, choose_examples(training, t)) for t in {q.task for q in questions}}
-        said = (_answer(q, told[q.task], asker, show) for q in track(questions, place.name, "question"))
-        answered[seed] = [prediction for prediction in said if prediction]
-    ended = Counter(reply.ended for reply in asker.used.values())
-    done, total = (sum(map(len, each.values())) for each in (answered, asked))
-    if done:
-        days = sorted(reply.day for reply in asker.used.values())
-        source = VisionModel(
-            model=endpoint.model,
-            served_as=tuple(sorted({reply.model for reply in asker.used.values()})),
-            endpoint=endpoint.url,
-            shown=shown,
-            per_video=most,
-            temperature=endpoint.temperature,
-            max_tokens=endpoint.max_tokens,
-            first=days[0],
-            last=days[-1],
-            ended=dict(sorted(ended.items())),
-            questions={str(seed): fingerprint(file) for seed, file in files.items()},
-        )
-        for seed, predictions in answered.items():
-            write_jsonl(place / f"{seed}.jsonl", predictions)
-        # Last: it says of what stands beside it that it belongs to these questions.
-        write_json(place / SOURCE_FILE, source.model_dump(mode="json"))
-    state = f"{done} of {total} questions are answered"
-    if asker.failure:
-        raise UserError(f"{asker.failure}; {state}, run it again to go on")
-    unusual = [f"{count} ended with {how}" for how, count in sorted(ended.items()) if how != "stop"]
+    unusual = [f"{count} ended with {how}" for how, count in asker.ended().items() if how != "stop"]
     then = "`dvc repro` grades them" if done == total else "run it again for the others"
     return f"{place}: {'; '.join([f'{asker.sent} requests', *unusual, state, then])}"
 
@@ -175,10 +156,11 @@ def instruction(catalogue: Catalogue, shown: Shown, examples: Sequence[Question]
         KINDS[shown],
         f"Objects have these properties, each in one of the classes in brackets: {classes}.",
         f'A description of an object ends with a sentence of exactly this form: "{form}"',
-        *(["Answer in the form of these examples, whose pictures are left out."] if turns else []),
-        *(f"Question: {turn.user}\nAnswer: {turn.assistant}" for turn in turns),
-        *(["Now the question:"] if turns else []),
     ]
+    if turns:
+        lines.append("Answer in the form of these examples, whose pictures are left out.")
+        lines += [f"Question: {turn.user}\nAnswer: {turn.assistant}" for turn in turns]
+        lines.append("Now the question:")
     return "\n".join(lines).replace("{tactile}", "[pictures]") + "\n\n"
 
 
@@ -190,11 +172,11 @@ def _answer(question: Question, told: str, asker: _Asker, show: Show) -> Predict
     replies: list[Reply] = []
     touched = iter(zip(question.videos, question.objects, strict=True))
     for turn in dialogue.turns:
-        first, *others = (told + turn.user if not messages else turn.user).split("{tactile}")
-        content = [_text(first)]
+        first, *others = (turn.user if messages else told + turn.user).split("{tactile}")
+        content: list[dict[str, Any]] = [{"type": "text", "text": first}]
         for text in others:
             content += [{"type": "image_url", "image_url": {"url": url}} for url in show(*next(touched))]
-            content += [_text(text)] if text else []
+            content += [{"type": "text", "text": text}] if text else []
         messages.append({"role": "user", "content": content})
         reply = asker.ask(messages)
         if reply is None:
@@ -214,16 +196,8 @@ def _answer(question: Question, told: str, asker: _Asker, show: Show) -> Predict
     )
 
 
-def _text(text: str) -> dict[str, Any]:
-    return {"type": "text", "text": text}
-
-
 class _Asker:
-    """Replies by what was asked: from the cache, else from the endpoint until it fails or the budget is spent.
-
-    Args:
-        limit: Most requests; None: no limit.
-    """
+    """Replies by what was asked: from the cache, else from the endpoint until it fails or the budget is spent."""
 
     def __init__(self, endpoint: Endpoint, cache: Path, limit: int | None) -> None:
         import openai
@@ -231,7 +205,7 @@ class _Asker:
         self._key = os.environ.get("OPENAI_API_KEY", "").strip()
         if not (self._key.isascii() and self._key.isprintable()):
             raise UserError("OPENAI_API_KEY: has characters that no key has; set it again")
-        self._endpoint, self._cache, self._limit = endpoint, cache, limit
+        self.endpoint, self._cache, self._limit = endpoint, cache, limit
         # A server of one's own wants no key, but the client does.
         self._client = openai.OpenAI(base_url=endpoint.url, api_key=self._key or "none", timeout=endpoint.timeout)
         self._known = _read_cache(cache)
@@ -240,84 +214,92 @@ class _Asker:
         self.failure = ""
         """Why the endpoint is asked no more."""
 
+    def ended(self) -> dict[str, int]:
+        """How many of the replies that were used ended in each way."""
+        return dict(sorted(Counter(reply.ended for reply in self.used.values()).items()))
+
+    def source(self, **asked: Any) -> VisionModel:
+        """Who gave the replies that were used, and how; `asked` is what the other fields hold."""
+        days = sorted(reply.day for reply in self.used.values())
+        return VisionModel(
+            model=self.endpoint.model,
+            served_as=tuple(sorted({reply.model for reply in self.used.values()})),
+            endpoint=self.endpoint.url,
+            temperature=self.endpoint.temperature,
+            max_tokens=self.endpoint.max_tokens,
+            first=days[0],
+            last=days[-1],
+            ended=self.ended(),
+            **asked,
+        )
+
     def ask(self, messages: Sequence[dict[str, Any]]) -> Reply | None:
         """The reply to a conversation; None where it is not known and may not be asked for."""
-        sent = json.dumps([self._endpoint.url, self._request(messages)], sort_keys=True)
-        request = hashlib.sha256(sent.encode()).hexdigest()
-        reply = self._known.get(request)
-        if reply is None:
+        body = {
+            "model": self.endpoint.model,
+            "messages": list(messages),
+            "temperature": self.endpoint.temperature,
+            "max_completion_tokens": self.endpoint.max_tokens,
+        }
+        request = hashlib.sha256(json.dumps([self.endpoint.url, body], sort_keys=True).encode()).hexdigest()
+        if request not in self._known:
             if self.failure or self.sent == self._limit:
                 return None
             self.sent += 1
-            reply = self._send(request, messages)
-            if reply is None:
+            try:
+                reply = self._send(request, body)
+            except UserError as error:
+                # In one short line; an endpoint may quote the key.
+                why = " ".join(str(error).split())
+                why = why.replace(self._key, "[key]") if self._key else why
+                self.failure = f"{self.endpoint.url}: {why}"[:400]
                 return None
             self._cache.parent.mkdir(parents=True, exist_ok=True)
             with self._cache.open("a", encoding="utf-8") as stream:
                 stream.write(reply.model_dump_json() + "\n")
             self._known[request] = reply
-        self.used[request] = reply
-        return reply
+        self.used[request] = self._known[request]
+        return self.used[request]
 
-    def _request(self, messages: Sequence[dict[str, Any]]) -> dict[str, Any]:
-        return {
-            "model": self._endpoint.model,
-            "messages": list(messages),
-            "temperature": self._endpoint.temperature,
-            "max_completion_tokens": self._endpoint.max_tokens,
-        }
-
-    def _send(self, request: str, messages: Sequence[dict[str, Any]]) -> Reply | None:
+    def _send(self, request: str, body: dict[str, Any]) -> Reply:
+        """What the endpoint says; a refusal to answer this question is a reply, too."""
         import openai
 
         try:
-            completion = self._client.chat.completions.create(**self._request(messages))
-            if isinstance(getattr(completion, "choices", None), list):
-                return _read(completion, request)
-            self._fail(
+            completion = self._client.chat.completions.create(**body)
+        except openai.APIStatusError as error:
+            if error.status_code == 400 and error.code in FILTERS:
+                return Reply(request=request, ended=FILTERS[0])
+            keyless = error.status_code in (401, 403) and not self._key
+            raise UserError(f"{'OPENAI_API_KEY is not set: ' if keyless else ''}{error.message}") from None
+        except openai.APITimeoutError:
+            raise UserError(f"no answer within {self.endpoint.timeout:g} s") from None
+        except openai.APIConnectionError as error:
+            raise UserError(f"cannot be reached ({error.__cause__ or error})") from None
+        except (openai.OpenAIError, ValueError) as error:
+            raise UserError(f"its answer is no JSON ({error}); is the URL right?") from None
+        # The client checks no types: any part may be missing or be something else.
+        choices = getattr(completion, "choices", None)
+        if not isinstance(choices, list):
+            raise UserError(
                 f"its answer has no choices ({getattr(completion, 'error', None) or completion}); is the URL right?"
             )
-        except openai.BadRequestError as error:
-            if error.code in FILTERS:
-                return Reply(request=request, text="", ended=FILTERS[0], tokens=0, model="", day=_today())
-            self._fail(error.message)
-        except openai.APIStatusError as error:
-            keyless = error.status_code in (401, 403) and not self._key
-            self._fail(f"{'OPENAI_API_KEY is not set: ' if keyless else ''}{error.message}")
-        except openai.APITimeoutError:
-            self._fail(f"no answer within {self._endpoint.timeout:g} s")
-        except openai.APIConnectionError as error:
-            self._fail(f"cannot be reached ({error.__cause__ or error})")
-        except (openai.OpenAIError, ValueError) as error:
-            self._fail(f"its answer is no JSON ({error}); is the URL right?")
-        return None
-
-    def _fail(self, why: str) -> None:
-        """Keep the reason in one short line; an endpoint may quote the key."""
-        words = " ".join(why.split())
-        self.failure = f"{self._endpoint.url}: {words.replace(self._key, '[key]') if self._key else words}"[:400]
-
-
-def _read(completion: ChatCompletion, request: str) -> Reply:
-    """What a completion says, whatever of it is missing or of another type: the client checks no types."""
-    choice: Any = next(iter(completion.choices), None)
-    message, ended = (getattr(choice, name, None) for name in ("message", "finish_reason"))
-    content, refused = (getattr(message, name, None) for name in ("content", "refusal"))
-    # Half a character, which JSON can hold, cannot be written to a file.
-    text = content.encode(errors="replace").decode().strip() if isinstance(content, str) and not refused else ""
-    if refused:
-        ended = "refusal"
-    elif not text and ended in (None, "stop"):
-        ended = "nothing"
-    tokens = getattr(completion.usage, "completion_tokens", None)
-    return Reply(
-        request=request,
-        text=text,
-        ended=str(ended or "unsaid"),
-        tokens=tokens if isinstance(tokens, int) else 0,
-        model=str(getattr(completion, "model", None) or ""),
-        day=_today(),
-    )
+        choice = next(iter(choices), None)
+        message, ended = getattr(choice, "message", None), getattr(choice, "finish_reason", None)
+        content, tokens = getattr(message, "content", None), getattr(completion.usage, "completion_tokens", None)
+        # Half a character, which JSON can hold, cannot be written to a file.
+        text = content.encode(errors="replace").decode().strip() if isinstance(content, str) else ""
+        if getattr(message, "refusal", None):
+            text, ended = "", "refusal"
+        elif not text and ended in (None, "stop"):
+            ended = "nothing"
+        return Reply(
+            request=request,
+            text=text,
+            ended=str(ended or "unsaid"),
+            tokens=tokens if isinstance(tokens, int) else 0,
+            model=str(getattr(completion, "model", None) or ""),
+        )
 
 
 def _read_cache(file: Path) -> dict[str, Reply]:
@@ -380,27 +362,23 @@ def _photos(folder: Path, objects: Sequence[str], most: int) -> Show:
     @lru_cache(maxsize=64)
     def of_object(object_id: str) -> list[str]:
         files = found[object_id]
-        return [_url(_read_photo(files[i]), "jpg") for i in sorted(set(sample_evaluation(len(files), most)))]
+        return [_url(_read_photo(files[i]), "jpeg") for i in sorted(set(sample_evaluation(len(files), most)))]
 
     return lambda video_id, object_id: of_object(object_id)
 
 
-def _read_photo(file: Path) -> Picture:
+def _read_photo(file: Path) -> npt.NDArray[np.uint8]:
     data = np.fromfile(file, np.uint8)
     # OpenCV turns it as its camera noted that it was held.
-    photo: Picture | None = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    photo: npt.NDArray[np.uint8] | None = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
     if photo is None:
         raise UserError(f"{file}: not a picture that can be read; replace it")
     scale = min(1.0, LONGEST / max(photo.shape[:2]))
-    shrunk: Picture = cv2.resize(photo, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    shrunk: npt.NDArray[np.uint8] = cv2.resize(photo, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     return shrunk
 
 
-def _url(picture: Picture, kind: str) -> str:
-    done, data = cv2.imencode(f".{kind}", picture)
-    assert done, "a picture of 8 bits can be encoded"
-    return f"data:image/{'jpeg' if kind == 'jpg' else kind};base64,{base64.b64encode(data.tobytes()).decode()}"
-
-
-def _today() -> str:
-    return datetime.now(UTC).date().isoformat()
+def _url(picture: npt.NDArray[np.uint8], kind: str) -> str:
+    """A picture of rows x columns x BGR as a data URL."""
+    _, data = cv2.imencode(f".{kind}", picture)
+    return f"data:image/{kind};base64,{base64.b64encode(data.tobytes()).decode()}"

@@ -10,7 +10,7 @@ import pandas as pd
 
 from pipeline.config import AblationConfig, Params
 from pipeline.config.params import PARAMS_FILE
-from pipeline.core.io import read_csv, read_jsonl, read_table, write_csv, write_json, write_text
+from pipeline.core.io import R, read_csv, read_jsonl, read_table, write_csv, write_json, write_text
 from pipeline.core.records import (
     HEADS,
     Classification,
@@ -39,7 +39,7 @@ from pipeline.report.load import load_report
 from pipeline.report.provenance import provenance
 from pipeline.report.readme import render_readme
 from pipeline.report.samples import choose_examples, choose_samples
-from pipeline.report.tables import headline
+from pipeline.report.tables import headline, over_seeds
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.split import read_splits
 
@@ -72,46 +72,44 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     videos = read_table(data / "videos.parquet", Video)
     splits = list(read_splits(data, params.split, params.ablation.seeds).values())
     graded = read_table(data / "graded.parquet", Graded)
+    seen = [*_read(data / "graded_vision.parquet", GradedVision), *_read(data / "shipped.parquet", GradedVision)]
     # By the lists in params.yaml and not by what lies there: a narrowed ablation leaves the others' files behind.
-    said: dict[int, list[Classification]] = {}
+    models = params.cross_validation.models
+    found = {name: _read(data / "cross_validation" / name / "out_of_fold.parquet", OutOfFold) for name in models}
+    out_of_fold = {name: records for name, records in found.items() if records}
     by_encoder: dict[int, list[Classification]] = {}
-    for seed in sorted(params.ablation.seeds):
-        if (file := data / "encoder" / str(seed) / "classifications.parquet").is_file():
-            by_encoder[seed] = read_table(file, Classification)
-            said.setdefault(params.split.replicate_of(seed), []).extend(by_encoder[seed])
-    out_of_fold = {
-        name: read_table(data / "cross_validation" / name / "out_of_fold.parquet", OutOfFold)
-        for name in params.cross_validation.models
-        if (data / "cross_validation" / name / "out_of_fold.parquet").is_file()
-    }
-    vision = data / "graded_vision.parquet"
-    seen = read_table(vision, GradedVision) if vision.is_file() else []
-    asked_too = data / "shipped.parquet"
-    seen += read_table(asked_too, GradedVision) if asked_too.is_file() else []
+    said: dict[int, list[Classification]] = {}
     concluded: dict[int, list[Score]] = {}
-    for seed, classified in by_encoder.items():
-        asked = read_jsonl(data / "questions" / str(seed) / "evaluation.jsonl", Question)
-        taken = catalogue.asking(params.questions.scenarios).called(params.questions.names)
-        scored = conclude(asked, classified, taken)
-        concluded.setdefault(params.split.replicate_of(seed), []).extend(scored)
-    scores = score_rows(graded, catalogue, said, out_of_fold, seen, concluded)
+    for seed in sorted(params.ablation.seeds):
+        if classified := _read(data / "encoder" / str(seed) / "classifications.parquet", Classification):
+            asked = read_jsonl(data / "questions" / str(seed) / "evaluation.jsonl", Question)
+            taken = catalogue.asking(params.questions.scenarios).called(params.questions.names)
+            replicate = params.split.replicate_of(seed)
+            by_encoder[seed] = classified
+            said.setdefault(replicate, []).extend(classified)
+            concluded.setdefault(replicate, []).extend(conclude(asked, classified, taken))
     origin = provenance(params, catalogue, videos, splits, [g.objects for g in graded], root)
     # Not those whose answers are to other questions, which were not graded.
     rated = {(g.model, g.shown) for g in seen}
     sources = vision_models(root / EXTERNAL / params.report_name).values()
     origin["vision"] = [s.model_dump(mode="json") for s in sources if (s.model, s.shown) in rated]
+    scores = score_rows(graded, catalogue, said, out_of_fold, seen, concluded)
     write_csv(folder / "scores.csv", ScoreRow, scores)
     write_csv(folder / "effects.csv", EffectRow, effect_rows(graded, catalogue, concluded))
     write_csv(folder / "encoder_effects.csv", EffectRow, candidate_rows(out_of_fold, BASELINE))
     write_csv(folder / "encoder_errors.csv", ErrorRow, error_rows(out_of_fold, catalogue))
     write_csv(folder / "calibration.csv", CalibrationRow, calibration_rows(list(by_encoder.values())))
-    write_json(folder / "samples.json", _samples(params, data, graded, catalogue))
     audit = data / "audit" / "audit.csv"
     write_csv(folder / "audit.csv", Finding, read_csv(audit, Finding) if audit.is_file() else [])
-    _write(folder / "dataset.csv", dataset_frame(catalogue, videos, splits))
-    _write(folder / "confusion.csv", confusion_frame(said, catalogue))
-    _write(folder / "described.csv", described_frame(by_encoder, params, data, catalogue))
-    _write(folder / "curves.csv", curves_frame(data, params.ablation))
+    frames = {
+        "dataset.csv": dataset_frame(catalogue, videos, splits),
+        "confusion.csv": confusion_frame(said, catalogue),
+        "described.csv": described_frame(by_encoder, params, data, catalogue),
+        "curves.csv": curves_frame(data, params.ablation),
+    }
+    for name, frame in frames.items():
+        write_text(folder / name, frame.to_csv(index=False, lineterminator="\n"))
+    write_json(folder / "samples.json", _samples(params, data, graded, catalogue))
     write_text(folder / "params.yaml", without_places((root / PARAMS_FILE).read_text(encoding="utf-8")))
     write_json(folder / "provenance.json", origin)
     return finish_report(folder)
@@ -138,12 +136,11 @@ def finish_report(folder: Path) -> dict[str, float]:
 
 def summary(scores: pd.DataFrame) -> dict[str, float]:
     """At most `MOST_METRICS` accuracies by name: the full system's tasks, then the encoder's heads on test videos."""
-    tasks = {row["task"]: row["accuracy"] for row in headline(scores).to_dict("records")}
-    heads = scores[(scores["task"] == HEADS) & (scores["seed"] == "all")]
-    encoder = {f"encoder_{row['measure']}": row["accuracy"] for row in heads.to_dict("records")}
-    order = sorted(encoder, key=lambda name: name != "encoder_combined")
-    found = {**tasks, **{name: encoder[name] for name in order}}
-    return {name: round(float(value), 6) for name, value in list(found.items())[:MOST_METRICS]}
+    tasks = headline(scores)
+    heads = over_seeds(scores[scores["task"] == HEADS])
+    heads = heads.sort_values("measure", key=lambda measure: measure != "combined", kind="stable")
+    found = pd.concat([tasks.set_index("task"), heads.set_index("encoder_" + heads["measure"])])["accuracy"]
+    return {str(name): round(float(value), 6) for name, value in found.head(MOST_METRICS).items()}
 
 
 def confusion_frame(said: dict[int, list[Classification]], catalogue: Catalogue) -> pd.DataFrame:
@@ -169,10 +166,9 @@ def described_frame(
     levels = {p.name: p.levels for p in catalogue.properties}
     sentences: dict[tuple[int, str], str] = {}
     for variant in (v for v in params.ablation.variants() if v.full):
-        asked, answers = _answered(data, variant, "evaluation", Touch.REAL)
-        about = {q.question_id: q.videos[0] for q in asked if q.task == "OPD"}
-        for said in (a for a in answers if a.question_id in about):
-            sentences[variant.seed, about[said.question_id]] = " ".join(said.outputs[-1].split())
+        for asked, answer in _answered(data, variant, "evaluation", Touch.REAL):
+            if asked.task == "OPD":
+                sentences[variant.seed, asked.videos[0]] = " ".join(answer.outputs[-1].split())
     rows: dict[tuple[int, str], dict[str, object]] = {}
     for seed, found in by_encoder.items():
         for _, c in calibrated(found):
@@ -187,19 +183,18 @@ def described_frame(
 
 def curves_frame(data: Path, ablation: AblationConfig) -> pd.DataFrame:
     """The histories of this ablation's trainings below data/, with `CURVES`; a stage is named as DVC names it."""
+    seeds = sorted(map(str, ablation.seeds))
     trained = sorted({f"{v.encoder}-{v.opd}-{v.seed}" for v in ablation.variants()})
-    places = [
-        ("pretrain", [data / "pretrained"]),
-        ("finetune_encoder", [data / "encoder" / seed for seed in sorted(map(str, ablation.seeds))]),
-        ("align", [data / "models" / "without" / key for key in trained]),
-        ("lora", [data / "models" / "with" / key for key in trained]),
-    ]
+    places = {
+        "pretrain": data / "pretrained",
+        **{f"finetune_encoder@{seed}": data / "encoder" / seed for seed in seeds},
+        **{f"align@{key}": data / "models" / "without" / key for key in trained},
+        **{f"lora@{key}": data / "models" / "with" / key for key in trained},
+    }
     rows = [
-        (stage if stage == "pretrain" else f"{stage}@{folder.name}", m.name, m.step, m.value)
-        for stage, folders in places
-        for folder in folders
-        if (file := folder / "history.parquet").is_file()
-        for m in sorted(read_table(file, Measurement), key=lambda m: (m.name, m.step))
+        (stage, m.name, m.step, m.value)
+        for stage, folder in places.items()
+        for m in sorted(_read(folder / "history.parquet", Measurement), key=lambda m: (m.name, m.step))
         if m.name in LOGGED
     ]
     return pd.DataFrame(rows, columns=list(CURVES))
@@ -208,19 +203,21 @@ def curves_frame(data: Path, ablation: AblationConfig) -> pd.DataFrame:
 def _samples(params: Params, data: Path, graded: list[Graded], catalogue: Catalogue) -> dict[str, object]:
     full = [variant for variant in params.ablation.variants() if variant.full]
     scores = [g for g in graded if g.variant == full[0] and g.touch is Touch.REAL]
-    examples = [pair for v in full for pair in zip(*_answered(data, v, "examples", "examples"), strict=True)]
-    chosen = choose_samples(*_answered(data, full[0], "evaluation", Touch.REAL), scores)
+    examples = [pair for v in full for pair in _answered(data, v, "examples", "examples")]
+    chosen = choose_samples(_answered(data, full[0], "evaluation", Touch.REAL), scores)
     return {**chosen, **choose_examples(examples, catalogue)}
 
 
-def _answered(data: Path, variant: Variant, asked: str, said: str) -> tuple[list[Question], list[Prediction]]:
-    """A variant's questions and answers, by the names of their files; none where either file is missing."""
+def _answered(data: Path, variant: Variant, asked: str, said: str) -> list[tuple[Question, Prediction]]:
+    """A variant's questions with its answers, by the names of their files; none where either file is missing."""
     questions = data / "questions" / str(variant.seed) / f"{asked}.jsonl"
     answers = data / "answers" / variant.key / f"{said}.jsonl"
     if not questions.is_file() or not answers.is_file():
-        return [], []
-    return read_jsonl(questions, Question), read_jsonl(answers, Prediction)
+        return []
+    by_id = {q.question_id: q for q in read_jsonl(questions, Question)}
+    return [(by_id[p.question_id], p) for p in read_jsonl(answers, Prediction) if p.question_id in by_id]
 
 
-def _write(path: Path, frame: pd.DataFrame) -> None:
-    write_text(path, frame.to_csv(index=False, lineterminator="\n"))
+def _read(path: Path, model: type[R]) -> list[R]:
+    """The records of a table that a run may lack."""
+    return read_table(path, model) if path.is_file() else []

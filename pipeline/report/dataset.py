@@ -38,15 +38,17 @@ def dataset_frame(
     """
     printed = published(catalogue.language.dataset)
     values = {(row["task"], row["measure"]): row["value"] for row in printed.to_dict("records") if not row["model"]}
-    classes = {o: catalogue.labels(o) for o in catalogue.objects}
+    levels = [p.levels for p in catalogue.properties]
+    classes = {
+        o: tuple(names[n] for names, n in zip(levels, catalogue.labels(o), strict=True)) for o in catalogue.objects
+    }
     groups = [
-        ("property_counts", f"{p.name}: {level}", level, {o for o, own in classes.items() if own[index] == number})
-        for index, p in enumerate(catalogue.properties)
-        for number, level in enumerate(p.levels)
+        ("property_counts", f"{p.name}: {level}", level, {o for o, own in classes.items() if own[place] == level})
+        for place, p in enumerate(catalogue.properties)
+        for level in p.levels
     ]
-    for labels in itertools.product(*(range(len(p.levels)) for p in catalogue.properties)):
-        words = ", ".join(p.levels[level] for p, level in zip(catalogue.properties, labels, strict=True))
-        members = {o for o, own in classes.items() if own == labels}
+    for labels in itertools.product(*levels):
+        words, members = ", ".join(labels), {o for o, own in classes.items() if own == labels}
         if members or ("property_combinations", words) in values:
             groups.append(("property_combinations", words, words, members))
     filmed = {v.object_id for v in videos}
@@ -81,10 +83,8 @@ def dataset_tables(folder: Path, dataset: str) -> dict[str, pd.DataFrame]:
         found = pd.read_csv(folder / "audit.csv", dtype=str).fillna("")
         rows = found[found["check"] == AGREEMENT]
         printed = published(dataset)
-        values = printed[printed["task"] == "annotator_agreement"].set_index("measure")["value"].to_dict()
+        values = printed[printed["task"] == "annotator_agreement"].set_index("measure")["value"].map("{:.3f}".format)
         if len(rows):
-            columns = {"": rows["item"], "Measured": rows["measured"]}
-            if values:
-                columns["Published"] = rows["item"].map(values).map("{:.3f}".format)
-            tables[TITLES["annotator_agreement"]] = pd.DataFrame(columns)
+            shown = {"": rows["item"], "Measured": rows["measured"], "Published": rows["item"].map(values)}
+            tables[TITLES["annotator_agreement"]] = pd.DataFrame(shown).dropna(axis="columns", how="all")
     return tables

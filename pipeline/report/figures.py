@@ -48,12 +48,12 @@ def draw_figures(
         drawn["confusion.png"] = draw_confusion(confusion, properties)
     if (curves["name"] == "loss").any():
         drawn["curves.png"] = draw_curves(curves)
-    folder.mkdir(parents=True, exist_ok=True)
     for old in folder.glob("*.png"):
         if old.name not in drawn:
             old.unlink()
     for name, figure in drawn.items():
-        save(figure, folder / name)
+        with atomic(folder / name) as temporary:
+            figure.savefig(temporary, format="png", dpi=DPI, metadata={"Software": None})
     return list(drawn)
 
 
@@ -63,7 +63,7 @@ def draw_effects(effects: pd.DataFrame) -> Figure:
 
     parts = list(dict.fromkeys(zip(effects["part"], effects["change"], strict=True)))
     labels = list(dict.fromkeys(zip(effects["task"], effects["measure"], strict=True)))
-    figure, places = panels(len(parts), 2.7, 1.1 + 0.3 * len(labels), across=4, left=1.3)
+    figure, places = _panels(len(parts), 2.7, 1.1 + 0.3 * len(labels), left=1.3)
     reach = 100 * max(1e-3, float(effects[["difference", "low", "high"]].abs().max().max()))
     for number, (axes, (part, change)) in enumerate(zip(places, parts, strict=True)):
         rows = effects[(effects["part"] == part) & (effects["change"] == change)]
@@ -92,7 +92,7 @@ def draw_confusion(confusion: pd.DataFrame, properties: Mapping[str, Sequence[st
     from sklearn.metrics import ConfusionMatrixDisplay
 
     names = list(dict.fromkeys(confusion["property"]))
-    figure, places = panels(len(names), 3.6, 3.4)
+    figure, places = _panels(len(names), 3.6, 3.4)
     for axes, name in zip(places, names, strict=True):
         rows = confusion[confusion["property"] == name]
         levels = properties[name]
@@ -116,7 +116,7 @@ def draw_curves(curves: pd.DataFrame) -> Figure:
     losses = curves[curves["name"].isin(["loss", "validation_loss"])]
     stages = losses["stage"].str.split("@").str[0]
     names = list(dict.fromkeys(stages))
-    figure, places = panels(len(names), 3.4, 3.1)
+    figure, places = _panels(len(names), 3.4, 3.1)
     for axes, name in zip(places, names, strict=True):
         lines = list(losses[stages == name].groupby(["stage", "name"], sort=False))
         labels: dict[str, int] = {}
@@ -137,25 +137,18 @@ def draw_curves(curves: pd.DataFrame) -> Figure:
     return figure
 
 
-def panels(count: int, width: float, height: float, across: int = 4, left: float = 0.0) -> tuple[Figure, list[Axes]]:
-    """A figure of so many panels, each of this width and height in inches, with room for labels at the left."""
+def _panels(count: int, width: float, height: float, left: float = 0.0) -> tuple[Figure, list[Axes]]:
+    """A figure of so many panels, four in a row, each of this width and height in inches, with room at the left."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    across = min(count, across)
-    down = -(-count // across)
+    across, down = min(count, 4), -(-count // 4)
     figure = Figure(figsize=(width * across + left, height * down), layout="constrained")
     FigureCanvasAgg(figure)
     grid = list(figure.subplots(down, across, squeeze=False).flat)
     for unused in grid[count:]:
         unused.remove()
     return figure, grid[:count]
-
-
-def save(figure: Figure, path: Path) -> None:
-    """Write a figure; equal bytes for equal figures."""
-    with atomic(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=DPI, metadata={"Software": None})
 
 
 def _quiet(axes: Axes) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import pandas as pd
 
 from pipeline.core.errors import UserError
+from pipeline.core.io import read_json
 from pipeline.core.records import EffectRow, ScoreRow
 
 KEYS = ("task", "measure", "encoder", "lora", "opd")
@@ -45,14 +45,14 @@ def load_report(folder: Path) -> Report:
     """Read a report that `write_report` wrote; raise UserError where its scores.csv or provenance.json is missing."""
     if not (folder / "scores.csv").is_file() or not (folder / "provenance.json").is_file():
         raise UserError(f"{folder}: no report (scores.csv, provenance.json); `dvc repro report` writes one")
-    provenance = _json(folder / "provenance.json")
+    provenance, samples = read_json(folder / "provenance.json"), folder / "samples.json"
     return Report(
         folder=folder,
         scores=read_frame(folder / "scores.csv", SCORE_COLUMNS),
         effects=read_frame(folder / "effects.csv", EFFECT_COLUMNS),
         published=published(str(provenance.get("dataset", ""))),
         provenance=provenance,
-        samples=_json(folder / "samples.json"),
+        samples=read_json(samples) if samples.is_file() else {},
     )
 
 
@@ -97,7 +97,3 @@ def cells(published: pd.DataFrame) -> dict[tuple[str, ...], tuple[float, float]]
     """Published value and n by (task, measure, encoder, lora, opd, model)."""
     keys = zip(*(published[k] for k in (*KEYS, "model")), strict=True)
     return dict(zip(keys, zip(published["value"], published["n"], strict=True), strict=True))
-
-
-def _json(file: Path) -> dict[str, Any]:
-    return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}

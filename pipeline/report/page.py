@@ -9,22 +9,22 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import math
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pandas as pd
-from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup, escape
+from markupsafe import Markup
 
 from pipeline.config.params import PARAMS_FILE, load_params
 from pipeline.core.errors import UserError
 from pipeline.core.io import write_text
 from pipeline.report.dataset import dataset_tables
-from pipeline.report.drawing import draw_table, share, span
 from pipeline.report.load import KEYS, Report, cells, load_report, read_frame
 from pipeline.report.readme import OTHER_MODELS, PLUMBING, at_random, finding, looked_at, origin, stands_on
+from pipeline.report.render import draw_table, render
 from pipeline.report.tables import (
     SHIPPED_TABLE,
     TABLES,
@@ -45,17 +45,9 @@ SPEED = ("question", "setting", "cost", "unit", "cost_ratio", "error", "error_of
 STABILITY = ("part", "case", "format", "finite", "error", "bound", "verdict")
 MODELS = ("7b", "13b")
 AUDIT = ("check", "item", "measured", "expected", "severity")
+EXPECTED = ("effects.csv", "audit.csv", "samples.json", "curves.csv", "confusion.csv")
 OLDER = "the report is older than this file: `dvc repro report` at its scale writes it"
-EXPECTED = {
-    "effects.csv": f"no two of its variants differ in one part alone, or {OLDER}",
-    "audit.csv": OLDER,
-    "samples.json": OLDER,
-    "curves.csv": f"its trainings kept no histories, or {OLDER}",
-    "confusion.csv": OLDER,
-}
-"""Files of a report, and why it may lack one."""
 FACTORS = {"language": "Language model", "encoder": "Encoder", "lora": "LoRA", "opd": "OPD", "touch": "Touch"}
-RANK = {"error": 0, "warning": 1, "info": 2}
 BESIDE = (
     (
         "encoder_errors.csv",
@@ -87,35 +79,6 @@ BY_USER = (
 set and what was there in place of touch), what it is, and what it needs."""
 
 
-class Line(NamedTuple):
-    """A figure with its interval, drawn on a line; places are percent of that line's width."""
-
-    task: str
-    title: str
-    source: str
-    """File and line that it comes from."""
-    said: str
-    note: str = ""
-    value: float | None = None
-    low: float | None = None
-    high: float | None = None
-    chance: float | None = None
-    published: dict[str, tuple[str, str, float]] = {}  # noqa: RUF012
-    """By size of its model what the paper printed, of how many questions, and its place."""
-
-
-class Block(NamedTuple):
-    """A table under its heading."""
-
-    key: str
-    title: str
-    caption: str
-    html: Markup
-    file: str
-    """Below reports/."""
-    open: bool = False
-
-
 def write_page(root: Path) -> Path:
     """Write the page over all reports below `root`; equal files give an equal page.
 
@@ -131,16 +94,17 @@ def write_page(root: Path) -> Path:
     gaps += left_to_users([c["report"] for c in chapters])
     # What random models answer is chance, and nothing to hold against the paper.
     reports = {c["name"] + ("†" if c["looked_at"] else ""): c["report"] for c in chapters if not c["plumbing"]}
-    environment = Environment(
-        loader=PackageLoader("pipeline.report"), autoescape=True, trim_blocks=True, undefined=StrictUndefined
-    )
-    environment.filters["inline"] = inline
-    style = " ".join(environment.get_template("style.css").render().split())
-    text = environment.get_template("page.html").render(
+    paper = []
+    for title, every in (("Five tasks of the paper", False), ("Every row of the paper", True)):
+        if reports and len(frame := side_by_side(reports, every=every)):
+            paper.append(draw_table(frame, title, "*/scores.csv", at_lines=False))
+    style = " ".join(render("style.css").split())
+    text = render(
+        "page.html",
         style=Markup(style),
         digest=base64.b64encode(hashlib.sha256(style.encode()).digest()).decode(),
         chapters=chapters,
-        paper=[_paper(reports, every=every) for every in (False, True)],
+        paper=paper,
         other_models=OTHER_MODELS,
         speed=list(_speed(folder, gaps)),
         stability=_stability(folder, gaps),
@@ -153,14 +117,6 @@ def write_page(root: Path) -> Path:
     return root / PAGE
 
 
-def inline(text: str, folder: str = "") -> Markup:
-    """A sentence of a README: its bold words, code and links, relative to a folder, as HTML; all else as it is."""
-    html = re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", str(escape(text)))
-    html = re.sub(r"\*(\w[^*]*)\*", r"<em>\1</em>", html)
-    html = re.sub(r"`(.+?)`", r"<code>\1</code>", html)
-    return Markup(re.sub(r"\[([^]]+)\]\(([\w./-]+)\)", rf'<a href="{escape(folder)}\2">\1</a>', html))
-
-
 def _chapters(folder: Path, gaps: list[Gap], current: str) -> list[dict[str, Any]]:
     """The current report, then real videos, scenes, looked-at test objects, smoke; a broken report is a gap."""
     found: list[dict[str, Any]] = []
@@ -171,54 +127,44 @@ def _chapters(folder: Path, gaps: list[Gap], current: str) -> list[dict[str, Any
             gaps.append((place.name, "the whole report", str(error).replace(f"{folder}/", "")))
         except KeyError as error:
             gaps.append((place.name, "the whole report", f"its provenance.json lacks {error}: {OLDER}"))
-    for chapter in found:
-        chapter["current"] = chapter["name"] == current
-
-    def order(chapter: dict[str, Any]) -> tuple[bool, bool, bool, bool, str]:
-        smoke, filmed = chapter["scale"] == "smoke", chapter["source"] == "videos"
-        return not chapter["current"], smoke, bool(chapter["looked_at"]), not filmed, str(chapter["name"])
-
-    return sorted(found, key=order)
+    for c in found:
+        c["current"] = c["name"] == current
+    return sorted(
+        found,
+        key=lambda c: (
+            not c["current"],
+            c["scale"] == "smoke",
+            c["looked_at"] != "",
+            c["source"] != "videos",
+            c["name"],
+        ),
+    )
 
 
 def _chapter(report: Report, gaps: list[Gap]) -> dict[str, Any]:
     """What the template shows of one report."""
-    name, scale, source = report.name, report.provenance["scale"], report.provenance["source"]
-    tasks, (effects, points) = list(_tasks(report)), _effects(report)
-    asked = {line.task for line in tasks}
-    printed = [task for task in TASKS if task in {*report.published["task"]} - asked]
-    gaps += [(name, task_title(task), "the full system was not asked") for task in printed]
-    gaps += [(name, file, why) for file, why in EXPECTED.items() if not (report.folder / file).is_file()]
-    files = sorted(p.relative_to(report.folder.parent).as_posix() for p in report.folder.rglob("*.*") if p.is_file())
+    name, said = report.name, report.provenance
+    tasks, (effects, points) = _tasks(report), _effects(report)
+    unasked = {*report.published["task"]} - {line["task"] for line in tasks}
+    gaps += [(name, task_title(task), "the full system was not asked") for task in TASKS if task in unasked]
+    gaps += [(name, file, OLDER) for file in EXPECTED if not (report.folder / file).is_file()]
     return {
         "report": report,
         "name": name,
-        "scale": scale,
-        "source": source,
+        "scale": said["scale"],
+        "source": said["source"],
         "finding": finding(report),
-        "shipped": _shipped(report),
-        "plumbing": PLUMBING if at_random(report.provenance) else "",
-        "looked_at": report.provenance["settings"] if looked_at(report.provenance) else "",
+        "shipped": _block(name, SHIPPED_TABLE.title, SHIPPED_TABLE.caption, SHIPPED_TABLE.build(report), "scores.csv"),
+        "plumbing": PLUMBING if at_random(said) else "",
+        "looked_at": said["settings"] if looked_at(said) else "",
         "tasks": tasks,
         "effects": effects,
         "points": points,
-        "stands_on": stands_on(report.provenance),
-        "origin": origin(report.provenance),
-        "blocks": list(_tables(report, scale != "smoke", gaps)),
-        "samples": report.samples,
-        "examples": report.samples.get("examples", []),
-        "not_asked": _not_asked(report.samples),
-        "files": files,
+        "stands_on": stands_on(said),
+        "origin": origin(said),
+        "blocks": list(_blocks(report, gaps)),
+        "files": sorted(p.relative_to(report.folder).as_posix() for p in report.folder.rglob("*.*") if p.is_file()),
     }
-
-
-def _shipped(report: Report) -> list[Any]:
-    """Heading, caption and table of the shipped model's answers, where it was asked."""
-    shown = SHIPPED_TABLE.build(report.scores, report.effects, report.published)
-    if not len(shown):
-        return []
-    table = draw_table(shown, SHIPPED_TABLE.title, f"{report.name}/scores.csv")
-    return [SHIPPED_TABLE.title, SHIPPED_TABLE.caption, table]
 
 
 def left_to_users(reports: Iterable[Report]) -> list[Gap]:
@@ -229,99 +175,96 @@ def left_to_users(reports: Iterable[Report]) -> list[Gap]:
     return [("paper", what, why) for name, what, why in BY_USER if name not in known]
 
 
-def _paper(reports: dict[str, Report], *, every: bool) -> Markup:
-    if not reports:
-        return Markup()
-    frame, title = side_by_side(reports, every=every), f"{'Every row' if every else 'Five tasks'} of the paper"
-    return draw_table(frame, title, "*/scores.csv", at_lines=False) if len(frame) else Markup()
+def _line(row: dict[str, Any], file: str, index: int, said: str, note: str, **places: float) -> dict[str, Any]:
+    """A figure that is drawn on a line, at places in percent of its width; None where there is none."""
+    found = {name: None if pd.isna(place) else round(float(place), 2) for name, place in places.items()}
+    title = task_title(row["task"]).removesuffix(f" ({row['task']})")
+    words = {"task": row["task"], "title": title, "source": f"{file}:{index + 2}", "said": said, "note": note}
+    return {"chance": None, "published": {}, **words, **found}
 
 
-def _not_asked(samples: dict[str, Any]) -> str:
-    if "not_asked" not in samples:
-        return "Not asked: the report is older than these questions."
-    rest = [f"{name} (of {' and '.join(objects)})" for name, objects in samples["not_asked"].items()]
-    return f"Not asked, for want of videos: {', '.join(rest)}." if rest else ""
-
-
-def _tasks(report: Report) -> Iterator[Line]:
+def _tasks(report: Report) -> list[dict[str, Any]]:
     """The tasks that were asked, with the full system's accuracy on real touch over all seeds."""
-    printed, rows = cells(report.published), headline(report.scores)
+    printed, rows, lines = cells(report.published), headline(report.scores), []
     for index, row in zip(rows.index, rows.to_dict("records"), strict=True):
+        places = {name: 100 * row[name] for name in ("low", "high", "chance")}
+        note, value = f"{row['right']:g} of {row['n']:g} right", 100 * row["accuracy"]
+        line = _line(row, f"{report.name}/scores.csv", index, measured(row), note, value=value, **places)
         found = {model: printed.get((*(row[k] for k in KEYS), model)) for model in MODELS}
-        yield Line(
-            row["task"],
-            task_title(row["task"]).removesuffix(f" ({row['task']})"),
-            f"{report.name}/scores.csv:{index + 2}",
-            measured(row),
-            f"{row['right']:g} of {row['n']:g} right",
-            share(row["accuracy"]),
-            share(row["low"]),
-            share(row["high"]),
-            share(row["chance"]),
-            {m: (f"{c[0]:.1f}", f"n {c[1]:.0f}", c[0]) for m, c in found.items() if c},
-        )
+        line["published"] = {m: (f"{c[0]:.1f}", f"n {c[1]:.0f}", c[0]) for m, c in found.items() if c}
+        lines.append(line)
+    return lines
 
 
-def _effects(report: Report) -> tuple[dict[str, list[Line]], float]:
-    """The effects on whole answers by part, and half the width of their line in points."""
+def _effects(report: Report) -> tuple[dict[str, list[dict[str, Any]]], float]:
+    """The effects on whole answers by part, and half the width of their line in points: the next 25, at most 100."""
     rows = report.effects[whole(report.effects)]
-    points = span(100 * rows[["difference", "low", "high"]].abs().max(axis=None)) if len(rows) else 0.0
-    groups: dict[str, list[Line]] = {}
+    largest = 100 * rows[["difference", "low", "high"]].abs().max(axis=None) if len(rows) else 0.0
+    points = min(100.0, 25.0 * max(1, math.ceil(largest / 25)))
+    groups: dict[str, list[dict[str, Any]]] = {}
     for index, row in zip(rows.index, rows.to_dict("records"), strict=True):
-        value, low, high = (share(0.5 + 50 * row[name] / points) for name in ("difference", "low", "high"))
-        source = f"{report.name}/effects.csv:{index + 2}"
-        p = number(row["p_holm"], 3)
-        line = Line(row["task"], task_title(row["task"]), source, difference(row), p, value, low, high)
+        places = {
+            n: 50 + 5000 * row[c] / points for n, c in (("value", "difference"), ("low", "low"), ("high", "high"))
+        }
+        line = _line(row, f"{report.name}/effects.csv", index, difference(row), number(row["p_holm"], 3), **places)
         groups.setdefault(f"{FACTORS.get(row['part'], row['part'])}: {row['change']}", []).append(line)
     return groups, points
 
 
-def _tables(report: Report, unfold: bool, gaps: list[Gap]) -> Iterator[Block]:
+def _blocks(report: Report, gaps: list[Gap]) -> Iterator[dict[str, Any]]:
     """The registry's tables, then those about data and encoders; one of the registry without a row is a gap."""
+    name = report.name
     for table in TABLES:
-        file, frame = f"{table.source}.csv", table.build(report.scores, report.effects, report.published)
+        file, frame = f"{table.source}.csv", table.build(report)
         if len(frame):
-            shown = unfold and not table.folded
-            yield _block(report, table.key, table.title, table.caption, frame, file)._replace(open=shown)
+            unfolded = report.provenance["scale"] != "smoke" and not table.folded
+            yield _block(name, table.title, table.caption, frame, file, table.key, unfolded=unfolded)
         else:
-            gaps.append((report.name, table.title, f"no row of its {file} belongs there: nothing such was run"))
-    for name, title, caption in BESIDE:
-        path = report.folder / name
+            gaps.append((name, table.title, f"no row of its {file} belongs there: nothing such was run"))
+    for file, title, caption in BESIDE:
+        path = report.folder / file
         if path.is_file() and len(frame := _shown(pd.read_csv(path))):
-            yield _block(report, path.stem, title, caption, frame, name)
+            yield _block(name, title, caption, frame, file, path.stem)
     for title, frame in dataset_tables(report.folder, report.provenance["dataset"]).items():
         file = "audit.csv" if "Measured" in frame else "dataset.csv"
-        yield _block(report, re.split("[:,]", title)[0].replace(" ", "-").lower(), title, "", frame, file)
+        yield _block(name, title, "", frame, file, re.split("[:,]", title)[0].replace(" ", "-").lower())
     audit = read_frame(report.folder / "audit.csv", AUDIT)
     if len(audit):
-        yield _audit(report, audit.sort_values("severity", key=lambda s: s.map(RANK).fillna(3), kind="stable"))
-
-
-def _audit(report: Report, audit: pd.DataFrame) -> Block:
-    """The audit's findings, counted by check; what needs attention first."""
-    groups = audit.groupby(["severity", "check"], sort=False)
-    first = groups.first()
-    cells = {
-        "Findings": groups.size().astype(str),
-        "The first of them": first["item"] + ": " + first["measured"].astype(str),
-    }
-    frame = pd.DataFrame(cells).reset_index().rename(columns=str.capitalize)
-    caption = ", ".join(f"{n} {severity}" for severity, n in audit["severity"].value_counts(sort=False).items())
-    return _block(report, "audit", "Data audit", f"{caption}; counted by check.", frame, "audit.csv", at_lines=False)
+        # Counted by check, with what needs attention first.
+        rank = {"error": 0, "warning": 1, "info": 2}
+        audit = audit.sort_values("severity", key=lambda s: s.map(rank).fillna(3), kind="stable")
+        checks = audit.assign(first=audit["item"] + ": " + audit["measured"].astype(str)).groupby(
+            ["severity", "check"], sort=False
+        )
+        columns = {"Findings": checks.size().astype(str), "The first of them": checks["first"].first()}
+        frame = pd.DataFrame(columns).reset_index().rename(columns=str.capitalize)
+        counts = ", ".join(f"{n} {severity}" for severity, n in audit["severity"].value_counts(sort=False).items())
+        caption = f"{counts}; counted by check."
+        yield _block(name, "Data audit", caption, frame, "audit.csv", "audit", at_lines=False)
 
 
 def _block(
-    report: Report, key: str, title: str, caption: str, frame: pd.DataFrame, file: str, at_lines: bool = True
-) -> Block:
-    file = f"{report.name}/{file}"
-    return Block(f"{report.name}-{key}", title, caption, draw_table(frame, title, file, at_lines), file)
+    report: str,
+    title: str,
+    caption: str,
+    frame: pd.DataFrame,
+    file: str,
+    key: str = "",
+    *,
+    at_lines: bool = True,
+    unfolded: bool = False,
+) -> dict[str, Any]:
+    """A table under its heading; nothing where it has no row."""
+    if not len(frame):
+        return {}
+    file = f"{report}/{file}"
+    words = {"key": f"{report}-{key}", "title": title, "caption": caption, "file": file, "open": unfolded}
+    return {**words, "html": draw_table(frame, title, file, at_lines)}
 
 
 def _speed(folder: Path, gaps: list[Gap]) -> Iterator[dict[str, Any]]:
     """Each question of speed_error.csv: its figure, as `make bench` drew it, its front in words, its table."""
-    rows = _measured(folder / "speed_error.csv", SPEED, gaps)
-    if rows.empty:
-        gaps.append(("speed", "speed_error.csv", "nothing was measured yet: `make bench` measures it"))
+    rows = _measured(folder / "speed_error.csv", SPEED, "make bench", gaps)
     rows["front"] = rows["front"].astype(str).eq("True")
     for question, group in rows.groupby("question", sort=False):
         figure = f"speed_error/{re.sub(r'[^a-z0-9]+', '-', str(question).lower()).strip('-')}.png"
@@ -338,28 +281,30 @@ def _speed(folder: Path, gaps: list[Gap]) -> Iterator[dict[str, Any]]:
 
 def _stability(folder: Path, gaps: list[Gap]) -> dict[str, Any]:
     """How many cases passed by part and number format, and the cases that failed."""
-    rows = _measured(folder / "stability.csv", STABILITY, gaps)
+    rows = _measured(folder / "stability.csv", STABILITY, "make stability", gaps)
     if rows.empty:
-        gaps.append(("stability", "stability.csv", "nothing was measured yet: `make stability` measures it"))
         return {"cases": 0}
     failed = rows[rows["verdict"].ne("pass")]
     groups = rows.assign(passed=rows["verdict"].eq("pass")).groupby(["part", "format"])["passed"]
-    cells = (groups.sum().astype(str) + "/" + groups.size().astype(str)).unstack(fill_value="")
-    cells.insert(0, "Part", cells.index)
+    counts = (groups.sum().astype(str) + "/" + groups.size().astype(str)).unstack(fill_value="")
+    counts.insert(0, "Part", counts.index)
     return {
         "cases": len(rows),
         "failed": len(failed),
         "failures": draw_table(_shown(failed), "Cases that failed", "stability.csv") if len(failed) else "",
-        "table": draw_table(cells, "Cases that passed, by part and number format", "stability.csv", at_lines=False),
+        "table": draw_table(counts, "Cases that passed, by part and number format", "stability.csv", at_lines=False),
     }
 
 
-def _measured(file: Path, columns: tuple[str, ...], gaps: list[Gap]) -> pd.DataFrame:
+def _measured(file: Path, columns: tuple[str, ...], command: str, gaps: list[Gap]) -> pd.DataFrame:
+    """The rows of a file of reports/; where it has none or is broken, that is a gap."""
     try:
-        return read_frame(file, columns)
+        rows, why = read_frame(file, columns), f"nothing was measured yet: `{command}` measures it"
     except UserError as error:
-        gaps.append((file.stem, file.name, str(error)))
-        return pd.DataFrame(columns=list(columns))
+        rows, why = pd.DataFrame(columns=list(columns)), str(error)
+    if rows.empty:
+        gaps.append((file.stem.partition("_")[0], file.name, why))
+    return rows
 
 
 def _shown(rows: pd.DataFrame) -> pd.DataFrame:

@@ -87,7 +87,7 @@ def provenance(
             "language": base_model(root, params.language.weights),
         },
         "python": platform.python_version(),
-        "packages": {name: _version(name) for name in PACKAGES},
+        "packages": {name: metadata.version(name) for name in PACKAGES},
     }
 
 
@@ -102,12 +102,11 @@ BEYOND = {
 
 def beyond_paper(params: Params) -> dict[str, Any]:
     """Those of `BEYOND` that are not as the paper has them, by their keys in params.yaml."""
-    sections = {name: getattr(params, name) for name in BEYOND}
     return {
         f"{name}.{key}": getattr(section, key)
-        for name, section in sections.items()
-        for key in BEYOND[name]
-        if getattr(section, key) != type(section).model_fields[key].default
+        for name, keys in BEYOND.items()
+        for key in keys
+        if getattr(section := getattr(params, name), key) != type(section).model_fields[key].default
     }
 
 
@@ -126,26 +125,17 @@ def base_model(root: Path, folder: str) -> dict[str, Any]:
     """Folder, kind, size in parameters, hash of a base model, and what its card says that it was taught.
 
     `parameters` are counted from the headers of its safetensors files. Where files are missing, they are 0 and the
-    hash is "unknown".
+    hash is "unknown". Of a place of this machine the last part alone is named.
     """
     where = root / folder
+    elsewhere = folder.startswith("~") or Path(folder).is_absolute()
     return {
-        "folder": _shown(folder),
+        "folder": Path(folder).name if elsewhere else folder,
         "kind": _kind(where),
-        "parameters": sum(parameters(file) for file in sorted(where.glob("*.safetensors"))),
+        "parameters": sum(prod(s) for file in where.glob("*.safetensors") for s in tensor_shapes(file).values()),
         "sha256": digest(where),
         "taught": str(front_matter(where).get("taught", "")),
     }
-
-
-def _shown(folder: str) -> str:
-    """A folder as a report names it: of a place of this machine the last part alone."""
-    return Path(folder).name if folder.startswith("~") or Path(folder).is_absolute() else folder
-
-
-def parameters(file: Path) -> int:
-    """Numbers in a safetensors file, counted from its header."""
-    return sum(prod(shape) for shape in tensor_shapes(file).values())
 
 
 def digest(folder: Path) -> str:
@@ -180,10 +170,3 @@ def _git(root: Path, *arguments: str) -> str:
     except (OSError, subprocess.SubprocessError):
         return ""
     return done.stdout.strip()
-
-
-def _version(package: str) -> str:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return UNKNOWN

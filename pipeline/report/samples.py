@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import itertools
+import re
+from collections.abc import Iterable
 from typing import Any
 
 from pipeline.core.records import Opd, Prediction, Question, Score
@@ -14,27 +16,17 @@ RULE = (
     "Of each task the first right and the first wrong answer, by the question's id, of the full system under its first "
     "seed, to real touch."
 )
-TACTILE = "{tactile}"
-"""Where a video goes in a question's text (`pipeline.core.records.Turn`)."""
 
 
-def choose_samples(
-    questions: Iterable[Question], predictions: Iterable[Prediction], scores: Iterable[Score]
-) -> dict[str, Any]:
+def choose_samples(answered: Iterable[tuple[Question, Prediction]], scores: Iterable[Score]) -> dict[str, Any]:
     """The content of samples.json of one variant: what `RULE` says, in the order of tasks, the right answer first."""
-    asked = {q.question_id: q for q in questions}
-    said = {p.question_id: p for p in predictions}
-    graded = sorted(
-        (s for s in scores if s.question_id in said and s.question_id in asked), key=lambda s: s.question_id
-    )
-    samples = []
-    for name, task in TASKS.items():
-        for right in (True, False):
-            wanted = (name, task.measure, right)
-            score = next((s for s in graded if (s.task, s.measure, s.correct) == wanted), None)
-            if score is not None:
-                samples.append(_sample(asked[score.question_id], said[score.question_id], score))
-    return {"rule": RULE, "samples": samples}
+    told = {question.question_id: (question, said) for question, said in answered}
+    first: dict[tuple[str, bool], Score] = {}
+    for score in sorted(scores, key=lambda score: score.question_id):
+        if score.question_id in told and score.measure == TASKS[score.task].measure:
+            first.setdefault((score.task, score.correct), score)
+    wanted = [first[key] for key in itertools.product(TASKS, (True, False)) if key in first]
+    return {"rule": RULE, "samples": [_sample(*told[score.question_id], score) for score in wanted]}
 
 
 def choose_examples(answered: Iterable[tuple[Question, Prediction]], catalogue: Catalogue) -> dict[str, Any]:
@@ -56,13 +48,15 @@ def choose_examples(answered: Iterable[tuple[Question, Prediction]], catalogue: 
 
 
 def _sample(question: Question, said: Prediction, score: Score) -> dict[str, Any]:
+    # A video's name stands where the video goes in a question's text.
     dialogue = question.dialogue(Opd.ALL) or question.dialogues[0]
     names = [f"video {chr(ord('A') + place)}" for place in range(len(question.videos))]
+    waiting = iter(names)
     return {
         "task": question.task,
         "question_id": question.question_id,
         "right": score.correct,
-        "asked": _named([turn.user for turn in dialogue.turns], names),
+        "asked": [re.sub(r"\{tactile\}", lambda _: f"[{next(waiting)}]", turn.user) for turn in dialogue.turns],
         "answered": list(said.outputs),
         "reference": [turn.assistant for turn in dialogue.turns],
         "expected": score.expected,
@@ -70,10 +64,3 @@ def _sample(question: Question, said: Prediction, score: Score) -> dict[str, Any
         "truncated": said.truncated,
         "videos": dict(zip(names, question.videos, strict=True)),
     }
-
-
-def _named(texts: Sequence[str], names: Sequence[str]) -> list[str]:
-    """The texts with a name in brackets where a video goes, in the order of the question's videos."""
-    waiting = iter(names)
-    pieces = [text.split(TACTILE) for text in texts]
-    return ["".join(p if i == 0 else f"[{next(waiting)}]{p}" for i, p in enumerate(parts)) for parts in pieces]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any
 
 import pandas as pd
@@ -23,7 +24,6 @@ NOT_ANSWERED = (HEADS, VALIDATION_HEADS, CROSS_VALIDATION)
 """Tasks of scores.csv that no language model with touch answered."""
 PUBLISHED_MODELS = ("7b", "13b", "CLIP", "PG-InstructBLIP")
 SYSTEM_WORDS = {"base": "base encoder", "without": "without LoRA", "none": "without OPD", "needed": "OPD as needed"}
-RULES_WORDS = "heads and rules, no language model"
 SHOWN_WORDS = {"frames": "frames of the videos", "photos": "photos of the objects"}
 """What vision-only models were shown, in the place where others have their touch."""
 ENCODERS = {"finetuned": "fine-tuned", "base": "base"}
@@ -38,6 +38,7 @@ class Table:
     caption: str
     """Plain sentences: what the rows are, and what to mind."""
     rows: Select
+    """Of scores.csv it is given the rows over all seeds."""
     columns: tuple[str, ...]
     """Names of `COLUMNS`; "published" stands for a column a published model."""
     source: str = "scores"
@@ -45,31 +46,36 @@ class Table:
     folded: bool = True
     """Whether the page shows it only when asked."""
 
-    def select(self, scores: pd.DataFrame, effects: pd.DataFrame) -> pd.DataFrame:
+    def select(self, report: Report) -> pd.DataFrame:
         """The rows of the table as the CSV has them, in the order of tasks, measures and systems."""
-        frame = effects if self.source == "effects" else scores
+        frame = report.effects if self.source == "effects" else over_seeds(report.scores)
         return ordered(frame[self.rows(frame).astype(bool)]) if len(frame) else frame
 
-    def build(self, scores: pd.DataFrame, effects: pd.DataFrame, published: pd.DataFrame) -> pd.DataFrame:
+    def build(self, report: Report) -> pd.DataFrame:
         """The table as it is shown: text in every cell, headings as column names; no row where nothing was measured.
 
-        Frames are as `load_report` gives them. What is published is joined by `KEYS`, in columns of their own.
+        What is published is joined by `KEYS`, in columns of their own.
         """
-        rows = self.select(scores, effects)
-        records = rows.to_dict("records")
+        rows = self.select(report)
         shown: dict[str, list[str]] = {}
         for name in self.columns:
             if name == "published":
-                shown |= _beside(rows, published)
+                shown |= _beside(rows, report.published)
             else:
                 heading, cell = COLUMNS[name]
-                shown[heading] = [cell(row) for row in records]
+                shown[heading] = [cell(row) for row in rows.to_dict("records")]
         return pd.DataFrame(shown, index=rows.index, dtype=object)
+
+
+def over_seeds(scores: pd.DataFrame) -> pd.DataFrame:
+    """The rows of scores.csv that are over all seeds."""
+    return scores[scores["seed"] == ALL_SEEDS]
 
 
 def headline(scores: pd.DataFrame) -> pd.DataFrame:
     """The full system's rows of scores.csv, a row a task that was asked."""
-    return ordered(scores[answers(scores) & whole(scores) & _differs(scores)])
+    rows = over_seeds(scores)
+    return ordered(rows[answers(rows) & whole(rows) & _differs(rows)])
 
 
 def side_by_side(reports: Mapping[str, Report], *, every: bool) -> pd.DataFrame:
@@ -80,25 +86,24 @@ def side_by_side(reports: Mapping[str, Report], *, every: bool) -> pd.DataFrame:
         every: also the ablations, single properties and the encoder's heads, and not only whole answers of the
             full system.
     """
-    figures = {r.provenance["dataset"]: r.published for r in reports.values()}
-    if every and DATASET in figures:
-        figures |= {dataset: published(dataset) for dataset in published_datasets()}
+    about = {r.provenance["dataset"]: r.published for r in reports.values()}
+    if every and DATASET in about:
+        about |= {dataset: published(dataset) for dataset in published_datasets()}
     place, blocks = [*KEYS, "touch"], []
-    for dataset, printed in sorted(figures.items(), key=lambda pair: pair[0] != DATASET):
+    for dataset, printed in sorted(about.items(), key=lambda pair: pair[0] != DATASET):
         rows = ordered(printed[printed["model"].isin(PUBLISHED_MODELS)].assign(touch="real").drop_duplicates(place))
         rows = rows if every else rows[whole(rows) & _differs(rows)]
-        records, about = rows.to_dict("records"), "" if dataset == DATASET else f", {dataset}"
-        shown = {"Task": [task_title(row["task"]) + about for row in records]}
+        other = "" if dataset == DATASET else f", {dataset}"
+        shown = {"Task": [task_title(task) + other for task in rows["task"]]}
         if every:
-            parts = ["" if row["measure"] == CHOICE else f": {COLUMNS['measure'][1](row)}" for row in records]
-            shown["System"] = [system(row) + part for row, part in zip(records, parts, strict=True)]
+            named = [(row, COLUMNS["measure"][1](row)) for row in rows.to_dict("records")]
+            shown["System"] = [system(row) + (f": {part}" if part != CHOICE else "") for row, part in named]
         shown |= _beside(rows, printed)
         for name, report in reports.items():
-            over = report.scores[(report.scores["seed"] == ALL_SEEDS) & (report.provenance["dataset"] == dataset)]
-            known = {
-                tuple(row[k] for k in place): f"{measured(row)} ({row['n']:.0f})" for row in over.to_dict("records")
-            }
-            shown[f"Measured {name} % [95 %] (n)"] = [known.get(tuple(row[k] for k in place), "") for row in records]
+            own = over_seeds(report.scores).to_dict("records") if report.provenance["dataset"] == dataset else []
+            known = {tuple(row[k] for k in place): f"{measured(row)} ({row['n']:.0f})" for row in own}
+            keys = rows[place].itertuples(index=False, name=None)
+            shown[f"Measured {name} % [95 %] (n)"] = [known.get(key, "") for key in keys]
         blocks.append(pd.DataFrame(shown, dtype=object))
     table = pd.concat(blocks, ignore_index=True).fillna("")
     return table[sorted(table, key=lambda name: name.startswith("Measured"))]
@@ -134,35 +139,25 @@ def task_title(task: str) -> str:
 
 def system(row: dict[str, Any]) -> str:
     """A variant by what it leaves out of the full system; another model by its name."""
-    if row["touch"] == Shown.TOUCH:
-        return f"{row['encoder']}, as it is shipped"
-    if row["touch"] == Shown.CLASSES:
-        return _told(row).replace(RULES_WORDS, "its heads and rules alone")
-    if row["touch"] == Shown.STANDARDISED:
-        return f"{row['encoder']}, embeddings standardised by these videos"
-    if row["task"] in (HEADS, VALIDATION_HEADS):
+    task, encoder, touch = row["task"], row["encoder"], row["touch"]
+    # Rules on the heads' classes are told of some questions what the language model is not.
+    told = f", {TASKS[task].told}" if task in TASKS and TASKS[task].told else ""
+    others: dict[str, str] = {
+        Shown.TOUCH: f"{encoder}, as it is shipped",
+        Shown.CLASSES: f"its heads and rules alone{told}",
+        Shown.STANDARDISED: f"{encoder}, embeddings standardised by these videos",
+        **{shown: f"{encoder}, {words}" for shown, words in SHOWN_WORDS.items()},
+    }
+    if touch in others:
+        return others[touch]
+    if task in (HEADS, VALIDATION_HEADS):
         return "property heads, no language model"
-    if row["task"] == CROSS_VALIDATION:
-        return str(row["encoder"])
-    if row["touch"] in SHOWN_WORDS:
-        return f"{row['encoder']}, {SHOWN_WORDS[row['touch']]}"
+    if task == CROSS_VALIDATION:
+        return str(encoder)
     if not row["lora"]:
-        return _told(row)
+        return f"heads and rules, no language model{told}"
     words = [SYSTEM_WORDS[row[axis]] for axis in FULL if row[axis] in SYSTEM_WORDS]
     return ", ".join(words) or "Octopi (full system)"
-
-
-def _told(row: dict[str, Any]) -> str:
-    """Rules on the heads' classes, and what these are told of the question that the language model is not."""
-    return ", ".join(filter(None, (RULES_WORDS, TASKS[row["task"]].told if row["task"] in TASKS else "")))
-
-
-def _count(name: str, digits: int = 0) -> Cell:
-    return lambda row: number(row[name], digits)
-
-
-def _text(name: str) -> Cell:
-    return lambda row: str(row[name])
 
 
 COLUMNS: dict[str, tuple[str, Cell]] = {
@@ -170,16 +165,22 @@ COLUMNS: dict[str, tuple[str, Cell]] = {
     "measure": ("Measure", lambda row: "all properties right" if row["measure"] == COMBINED else row["measure"]),
     "system": ("System", system),
     "encoder": ("Encoder", lambda row: str(ENCODERS.get(row["encoder"], row["encoder"]))),
-    **{name: (title, _text(name)) for name, title in (("lora", "LoRA"), ("opd", "OPD"), ("touch", "Touch"))},
+    "lora": ("LoRA", itemgetter("lora")),
+    "opd": ("OPD", itemgetter("opd")),
+    "touch": ("Touch", itemgetter("touch")),
     "measured": ("Measured % [95 %]", measured),
     "strict": ("As published %", lambda row: number(row["strict"], scale=100)),
     "chance": ("Chance %", lambda row: number(row["chance"], scale=100)),
     "unread": ("Unread %", lambda row: number(row["unread"] / row["n"], scale=100)),
-    **{name: (name.capitalize(), _text(name)) for name in ("part", "change")},
+    "part": ("Part", itemgetter("part")),
+    "change": ("Change", itemgetter("change")),
     "difference": ("Difference, points [95 %]", difference),
-    **{name: (title, _count(name, 3)) for name, title in (("p", "p"), ("p_holm", "p, Holm"))},
+    "p": ("p", lambda row: number(row["p"], 3)),
+    "p_holm": ("p, Holm", lambda row: number(row["p_holm"], 3)),
     "smallest": ("Smallest that could be found, before Holm", lambda row: number(row["smallest_effect"], scale=100)),
-    **{name: (title, _count(name)) for name, title in (("n", "n"), ("objects", "Objects"), ("seeds", "Seeds"))},
+    "n": ("n", lambda row: number(row["n"], 0)),
+    "objects": ("Objects", lambda row: number(row["objects"], 0)),
+    "seeds": ("Seeds", lambda row: number(row["seeds"], 0)),
 }
 """Heading of a column, and how its cell is written."""
 
@@ -206,26 +207,14 @@ def _beside(rows: pd.DataFrame, published: pd.DataFrame) -> dict[str, list[str]]
     return columns
 
 
-def vision(frame: pd.DataFrame) -> pd.Series[bool]:
-    """Answers of vision-only models, over all seeds."""
-    return frame["touch"].isin(SHOWN_WORDS) & (frame["seed"] == ALL_SEEDS)
-
-
 def answers(frame: pd.DataFrame) -> pd.Series[bool]:
-    """Answers of the language model to real touch, over all seeds."""
-    over = ~frame["task"].isin(NOT_ANSWERED) & (frame["seed"] == ALL_SEEDS)
-    return over & (frame["touch"] == "real") & (frame["lora"] != "")
+    """Answers of the language model to real touch."""
+    return ~frame["task"].isin(NOT_ANSWERED) & (frame["touch"] == "real") & (frame["lora"] != "")
 
 
 def rules(frame: pd.DataFrame) -> pd.Series[bool]:
-    """What follows by rule from the property heads' classes, over all seeds."""
-    over = ~frame["task"].isin(NOT_ANSWERED) & (frame["seed"] == ALL_SEEDS)
-    return over & (frame["touch"] == "real") & (frame["lora"] == "")
-
-
-def shipped(frame: pd.DataFrame) -> pd.Series[bool]:
-    """Answers of the model that is shipped, to the videos of the run, and by rule from its heads."""
-    return frame["touch"].isin({Shown.TOUCH, Shown.STANDARDISED, Shown.CLASSES}) & (frame["seed"] == ALL_SEEDS)
+    """What follows by rule from the property heads' classes."""
+    return ~frame["task"].isin(NOT_ANSWERED) & (frame["touch"] == "real") & (frame["lora"] == "")
 
 
 def whole(frame: pd.DataFrame) -> pd.Series[bool]:
@@ -241,40 +230,31 @@ def _differs(frame: pd.DataFrame, *axes: str) -> pd.Series[bool]:
     return same
 
 
-def _variants(*axes: str, described: bool | None = None, trained: bool | None = None, seen: bool = False) -> Select:
-    """Answers of variants that differ in these axes; only descriptions, or only tasks that were trained, or not.
+def _variants(*axes: str, described: bool, trained: bool | None = None) -> Select:
+    """Answers of variants that differ in these axes, beside those of vision-only models and, of choices, by rule.
 
-    Beside whole answers stands what follows by rule from the heads; with `seen` those of vision-only models, too.
+    Only descriptions or only choices; with `trained` only of tasks that are trained, or of those that are not.
     """
 
     def select(frame: pd.DataFrame) -> pd.Series[bool]:
-        rows = answers(frame) & _differs(frame, *axes)
+        rows = answers(frame) & _differs(frame, *axes) | frame["touch"].isin(SHOWN_WORDS)
         if not described:
             rows |= rules(frame)
-        if seen:
-            rows |= vision(frame)
-        if described is not None:
-            rows &= (frame["measure"] != CHOICE) == described
         if trained is not None:
-            never = [name for name, task in TASKS.items() if not task.trained]
-            rows &= ~frame["task"].isin(never) == trained
-        return rows
+            rows &= frame["task"].isin([name for name, task in TASKS.items() if not task.trained]) != trained
+        return rows & ((frame["measure"] != CHOICE) == described)
 
     return select
 
 
 def _ablated(axis: str, *, described: bool) -> Select:
-    """Variants that differ in an axis; none where nothing was varied in it."""
+    """Variants that differ in an axis, beside the rules; none where nothing was varied in it."""
 
     def select(frame: pd.DataFrame) -> pd.Series[bool]:
-        rows = _variants(axis, described=described)(frame)
+        rows = _variants(axis, described=described)(frame) & ~frame["touch"].isin(SHOWN_WORDS)
         return rows & (frame.loc[rows & answers(frame), axis].nunique() > 1)
 
     return select
-
-
-def _over_seeds(*tasks: str) -> Select:
-    return lambda frame: frame["task"].isin(tasks) & (frame["seed"] == ALL_SEEDS)
 
 
 SHOWN = ("system", "measured", "n", "chance", "unread")
@@ -292,7 +272,7 @@ SHIPPED_TABLE = Table(
     "shipped",
     "The model that is shipped, on these videos",
     "It was trained on synthetic touches of invented objects, and has met none of these objects.",
-    lambda f: shipped(f) & whole(f),
+    lambda f: f["touch"].isin({Shown.TOUCH, Shown.STANDARDISED, Shown.CLASSES}) & whole(f),
     ("task", "system", "measured", "n", "unread", "chance"),
 )
 """Before all else where it was asked."""
@@ -301,7 +281,7 @@ TABLES: tuple[Table, ...] = (
         "understanding",
         "Physical understanding",
         "Questions about what was touched, with descriptions before the conclusion (OPD) and without.",
-        _variants("opd", described=False, trained=True, seen=True),
+        _variants("opd", described=False, trained=True),
         PAPER,
         folded=False,
     ),
@@ -309,7 +289,7 @@ TABLES: tuple[Table, ...] = (
         "reasoning",
         "Scenario reasoning",
         "Which of two objects fits a scenario: asked of every system, never trained.",
-        _variants("opd", described=False, trained=False, seen=True),
+        _variants("opd", described=False, trained=False),
         PAPER,
         folded=False,
     ),
@@ -317,7 +297,7 @@ TABLES: tuple[Table, ...] = (
         "description",
         "Object property description",
         "Describing one object, as a language model's answer and by the encoder's property heads on the same videos.",
-        lambda f: _variants(described=True, seen=True)(f) | _over_seeds(HEADS)(f),
+        lambda f: _variants(described=True)(f) | f["task"].eq(HEADS),
         PROPERTIES,
         folded=False,
     ),
@@ -361,7 +341,7 @@ TABLES: tuple[Table, ...] = (
         "touch",
         "Input ablations",
         "The full system with its touch, and with another object's (swapped), none (removed) or noise.",
-        lambda f: ~f["task"].isin(NOT_ANSWERED) & (f["seed"] == ALL_SEEDS) & whole(f) & _differs(f),
+        lambda f: ~f["task"].isin(NOT_ANSWERED) & whole(f) & _differs(f),
         ("task", "touch", "measured", "n", "chance", "unread"),
     ),
     Table(
@@ -375,14 +355,14 @@ TABLES: tuple[Table, ...] = (
         "strict",
         "How answers are read",
         "Measured: by rules. As published: the right text must stand there. Scenarios were graded by hand.",
-        lambda f: answers(f) & _differs(f, "encoder", "lora", "opd") & f["strict"].notna(),
+        lambda f: answers(f) & _differs(f, *FULL) & f["strict"].notna(),
         ("task", "measure", "system", "measured", "strict", "n"),
     ),
     Table(
         "heads",
         "Property heads of the tactile encoder",
         "What the encoder's heads say of test and validation videos, without a language model.",
-        _over_seeds(HEADS, VALIDATION_HEADS),
+        lambda f: f["task"].isin((HEADS, VALIDATION_HEADS)),
         ("task", "measure", "encoder", "measured", "n", "chance", "published"),
     ),
     Table(
@@ -390,7 +370,7 @@ TABLES: tuple[Table, ...] = (
         "Encoders and baselines over all objects",
         "Grouped cross-validation: a model judges only videos of objects that it never saw. With few test objects this "
         "is the main evidence about encoders.",
-        _over_seeds(CROSS_VALIDATION),
+        lambda f: f["task"].eq(CROSS_VALIDATION),
         ("measure", "system", "measured", "n", "chance"),
     ),
 )

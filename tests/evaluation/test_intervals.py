@@ -13,32 +13,10 @@ from hypothesis import strategies as st
 from scipy import stats
 from statsmodels.stats.proportion import proportion_confint
 
-from pipeline.evaluation.intervals import (
-    Objects,
-    accuracy_interval,
-    components,
-    coverage_note,
-    design_of,
-    variance,
-    wilson,
-)
-
-About = tuple[Objects, ...]
-
-
-@st.composite
-def designs(draw: st.DrawFn) -> About:
-    """Questions about one to three of up to seven objects."""
-    names = "abcdefg"[: draw(st.integers(2, 7))]
-    sets = st.lists(st.sampled_from(names), min_size=1, max_size=min(3, len(names)), unique=True)
-    return tuple(tuple(row) for row in draw(st.lists(sets, min_size=2, max_size=24)))
-
+from pipeline.evaluation.intervals import accuracy_interval, components, coverage_note, design_of, variance, wilson
+from tests.evaluation.conftest import About, designs, single
 
 RIGHT = st.lists(st.booleans(), min_size=24, max_size=24)
-
-
-def single(objects: int, each: int) -> About:
-    return tuple((f"{o:02}",) for o in range(objects) for _ in range(each))
 
 
 def ordinary(values: np.ndarray, about: About) -> float:
@@ -53,26 +31,12 @@ def test_single_objects_have_the_ordinary_cluster_robust_variance(seed: int) -> 
     rng = np.random.default_rng(seed)
     about = single(7, 5)
     values = (np.repeat(rng.random(7), 5) > rng.random(35)).astype(float)
-    found, reference, independent = (
-        float(variance(values, design_of(about))),
-        ordinary(values, about),
-        values.var(ddof=1) / 35,
-    )
+    found, reference = float(variance(values, design_of(about))), ordinary(values, about)
+    independent = values.var(ddof=1) / 35
     if reference >= independent:
         assert found == pytest.approx(reference, rel=1e-9)
     else:
         assert found >= independent * (1 - 1e-12)
-
-
-@given(about=designs())
-@settings(deadline=None, max_examples=40)
-def test_moments_are_what_the_model_expects(about: About) -> None:
-    design = design_of(about)
-    centre = np.eye(len(about)) - 1 / len(about)
-    for i, a in enumerate(design.factors):
-        for j, b in enumerate(design.factors):
-            assert design.moments[i, j] == pytest.approx(np.trace(centre @ a @ a.T @ centre @ b @ b.T), abs=1e-9)
-            assert design.totals[j] == pytest.approx((b @ b.T).sum())
 
 
 def test_components_are_found_on_average() -> None:

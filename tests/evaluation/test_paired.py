@@ -16,7 +16,7 @@ from scipy.integrate import quad
 
 from pipeline.evaluation.intervals import design_of
 from pipeline.evaluation.paired import DRAWS, flip_units, holm, paired, sign_flip, smallest_effect
-from tests.evaluation.test_intervals import About, designs, single
+from tests.evaluation.conftest import About, designs, single
 
 GAINS = st.lists(st.integers(-1, 1), min_size=24, max_size=24)
 
@@ -84,11 +84,7 @@ def test_properties(about: About, gains: list[int], more: list[int], seed: int) 
         units = flip_units(design_of(about))
         assert 2 / 2 ** len(units) <= gap.p <= 1
         # What is flipped adds up to what is tested.
-
         assert float((units @ values[0]).sum()) == pytest.approx(values[0].sum(), abs=1e-9)
-
-
-# Sign flips
 
 
 def test_sign_flip_of_darwins_maize() -> None:
@@ -126,16 +122,6 @@ def test_pairs_are_split_by_least_squares_and_all_signs_gone_through() -> None:
     assert float(sign_flip(values, design_of(about))) == pytest.approx(fmean(far), abs=1e-12)
 
 
-@pytest.mark.parametrize("about", [1, 2, 3])
-def test_flips_have_at_least_the_variance_that_chance_has(about: int) -> None:
-    """Objects' own effects exactly; questions' own chance at least as often as they have objects."""
-    rows = tuple(itertools.combinations("abcdefg", about)) * 2
-    design = design_of(rows)
-    units = flip_units(design)
-    assert units @ design.membership / about == pytest.approx(np.diag(design.membership.sum(axis=0) / about), abs=1e-9)
-    assert (units**2).sum() >= about * len(rows) - 1e-9
-
-
 def test_equal_settings_are_told_apart_no_more_often_than_said() -> None:
     """Triples of seven objects, two settings that share half of what makes a question right; 2 % are usual."""
     rng = np.random.default_rng(3)
@@ -156,9 +142,6 @@ def test_what_questions_cannot_tell_apart_is_flipped_together() -> None:
     assert float(sign_flip(np.ones(4), pairs)) == 2 / 8
     chain = design_of((("a", "b"), ("b", "c"), ("c", "d")))
     assert float(sign_flip(np.ones(3), chain)) == 1, "one part has one sign"
-
-
-# Seeds
 
 
 def test_several_seeds_are_one_comparison_of_their_means() -> None:
@@ -185,9 +168,6 @@ def test_the_interval_covers_new_seeds() -> None:
         without += alone.low <= 0 <= alone.high  # type: ignore[operator]
     assert covered / 150 >= 0.93
     assert without / 150 <= 0.88
-
-
-# What a design can find, and families
 
 
 def test_smallest_effect_of_known_designs() -> None:

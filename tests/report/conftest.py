@@ -1,7 +1,8 @@
-"""One report for the tests that only read it, and a small scores.csv whose figures are known by hand."""
+"""A report that tests only read, and small reports whose figures are known by hand."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import pandas as pd
 import pytest
 
 from pipeline.report.build import write_report
-from pipeline.report.load import EFFECT_COLUMNS, SCORE_COLUMNS
+from pipeline.report.load import DATASET, EFFECT_COLUMNS, SCORE_COLUMNS, Report, published
 from tests.fake_run import fake_params, write_run
 
 
@@ -46,3 +47,25 @@ def scores_of(*rows: dict[str, Any]) -> pd.DataFrame:
 def effects_of(*rows: dict[str, Any]) -> pd.DataFrame:
     frame = pd.DataFrame(list(rows), columns=list(EFFECT_COLUMNS))
     return frame.astype(dict.fromkeys(EFFECT_COLUMNS[4:], float))
+
+
+def report(
+    scores: Sequence[dict[str, Any]] = (),
+    effects: Sequence[dict[str, Any]] = (),
+    *,
+    name: str = "small-videos",
+    dataset: str = DATASET,
+    **said: Any,
+) -> Report:
+    """A report on real videos with these rows; `said` is of its provenance, `language` of its language model."""
+    base = {"folder": "weights/x", "taught": "taught by hand", "sha256": "ab" * 32}
+    models = {
+        "language": {**base, "kind": "Llama", "parameters": 2_200_000, **said.pop("language", {})},
+        "encoder": {**base, "kind": "CLIP", "parameters": 1_100_000},
+    }
+    data = {"source": "videos", "dataset": dataset, "videos": 9, "data_sha256": "d" * 64}
+    tested = {"split": "paper", "test_objects": ["a", "b"], "test_videos": 4, "seeds": [0], "settings": ""}
+    run = {"scale": "small", "command": "dvc repro", "commit": "c" * 40, "changed": False, "python": "3"}
+    system = {"encoder": "the base CLIP with visual prompt tuning", "base_models": models, "facts_told": False}
+    facts = {**data, **tested, **run, **system, "packages": {"torch": "2"}, "intervals": "", "properties": {}, **said}
+    return Report(Path("reports") / name, scores_of(*scores), effects_of(*effects), published(dataset), facts, {})

@@ -19,8 +19,7 @@ from pipeline.report.readme import render_readme
 from pipeline.videos.catalogue import load_catalogue
 from tests.closure import ROOT
 from tests.fake_run import fake_params, write_run
-from tests.report.conftest import score
-from tests.report.test_readme import report
+from tests.report.conftest import report, score
 
 CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")
 
@@ -89,16 +88,8 @@ def test_one_fold_of_three_is_reported_as_one(tmp_path: Path) -> None:
     assert (counts["train"] + counts["validation"] + counts["test"] == counts["with_videos"]).all()
 
 
-def test_without_folds_seeds_are_replicates(written: Path) -> None:
-    graded = read_table(written.parents[1] / "data" / "graded.parquet", Graded)
-    assert all(g.seed == g.trained for g in graded)
-    assert load_report(written).provenance["folds"] is None
-    assert "folds" not in (written / "README.md").read_text().split("## What the figures stand on")[0]
-
-
-@pytest.mark.parametrize("name", ["small-videos", "paper-7b-videos"])
-def test_spoilt_test_objects_are_no_headline(name: str) -> None:
-    note = settings_note(name, "development")
+def test_spoilt_test_objects_are_no_headline() -> None:
+    note = settings_note("small-videos", "development")
     assert "looked at four times while recipes changed" in note
     spoilt = render_readme(report([score()], split="development", settings=note), ["effects.png"])
     head, _, rest = spoilt.partition("## On test objects that were looked at")

@@ -2,33 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from pipeline.report.load import Report, published
 from pipeline.report.provenance import beyond_paper
-from pipeline.report.readme import MOST_LINES, finding, render_readme, stands_on
+from pipeline.report.readme import CHANCE, MOST_LINES, finding, render_readme, stands_on
 from pipeline.scales import compose
 from tests.closure import ROOT
-from tests.report.conftest import effect, effects_of, score, scores_of
-
-
-def model(**other: Any) -> dict[str, Any]:
-    facts = {"folder": "weights/x", "kind": "Llama", "parameters": 2_200_000, "taught": "taught by hand"}
-    return {**facts, "sha256": "ab" * 32, **other}
-
-
-def report(scores: list[dict[str, Any]], effects: list[dict[str, Any]] | None = None, **said: Any) -> Report:
-    models = {"language": model(**said.pop("language", {})), "encoder": model(kind="CLIP", parameters=1_100_000)}
-    data = {"source": "videos", "dataset": "PhysiCLeAR", "videos": 9, "data_sha256": "d" * 64}
-    tested = {"split": "paper", "test_objects": ["a", "b"], "test_videos": 4, "seeds": [0], "settings": ""}
-    run = {"scale": "small", "command": "dvc repro", "commit": "c" * 40, "changed": False, "python": "3"}
-    system = {"encoder": "the base CLIP with visual prompt tuning", "base_models": models, "facts_told": False}
-    facts = {**data, **tested, **run, **system, "packages": {"torch": "2"}, "intervals": "", "properties": {}, **said}
-    frames = scores_of(*scores), effects_of(*effects or []), published()
-    return Report(Path("reports/small-videos"), *frames, facts, {})
+from tests.report.conftest import effect, report, score
 
 
 def test_who_made_the_figures_comes_first_with_size_and_teaching() -> None:
@@ -64,10 +46,13 @@ def test_above_and_below_chance_are_said_only_where_the_whole_interval_is() -> N
     assert "best in PC with 60.0 [50.0, 70.0] % (chance 30.0)" in said
     assert "worst in POM with 10.0 [5.0, 15.0] %" in said
     assert finding(report([rows[1]]))[1] == "The full system's interval lies above chance in 0 of 1 task."
-    assert finding(report([score("PC", low=None, high=None)]))[1].startswith(
-        "The full system's interval lies above chance in 0"
-    )
+    assert "above chance in 0 of 1" in finding(report([score("PC", low=None, high=None)]))[1]
     assert finding(report([]))[1] == "No answer of the full system was graded."
+    # Nothing is best that is no better than a guess.
+    nothing = [score(task, accuracy=0.0, low=0.0, high=0.3) for task in ("PC", "PSS")]
+    assert "best" not in finding(report(nothing))[1]
+    some = finding(report([*nothing, score("POM", accuracy=0.9, low=0.8, high=1.0)]))[1]
+    assert "Against chance it is best in POM with 90.0 [80.0, 100.0] %" in some
 
 
 TOUCH = {"part": "touch", "change": "real - swapped"}
@@ -144,23 +129,13 @@ def test_a_readme_stays_short_whatever_is_measured() -> None:
     assert "## Physical understanding" not in text
 
 
-def test_nothing_is_best_that_is_no_better_than_a_guess() -> None:
-    nothing = [score(task, accuracy=0.0, low=0.0, high=0.3) for task in ("PC", "PSS")]
-    assert "best" not in finding(report(nothing))[1]
-    some = [*nothing, score("POM", accuracy=0.9, low=0.8, high=1.0)]
-    assert "Against chance it is best in POM with 90.0 [80.0, 100.0] %" in finding(report(some))[1]
-
-
 @pytest.mark.parametrize("part", ["language", "encoder"])
 def test_random_base_models_are_said_to_be_chance_first(part: str) -> None:
     """By what the models are, whatever the scale is called."""
     said = report([score()])
     said.provenance["base_models"][part]["folder"] = "data/weights/tiny-llama"
     first = render_readme(said, []).splitlines()[2]
-    assert first.startswith(
-        "The base models are tiny and random, drawn from a seed and taught nothing: these figures are"
-    )
-    assert "chance and prove only that the chain runs. A 2.2 M-parameter Llama" in first
+    assert first.startswith(f"{CHANCE} A 2.2 M-parameter Llama")
     for folder in ("data/weights/smollm2", "weights/tiny-llama", "elsewhere/data/weights/tiny-clip", "data/taught"):
         said.provenance["base_models"][part]["folder"] = folder
         assert "tiny and random" not in render_readme(said, [])
@@ -168,7 +143,10 @@ def test_random_base_models_are_said_to_be_chance_first(part: str) -> None:
 
 
 def test_what_the_figures_stand_on_is_said_in_words() -> None:
-    facts = "\n".join(stands_on(report([], settings="", facts_told=True, intervals="Known to be narrow.").provenance))
+    went_on = {"language.start": "pipeline/pretrained/octopi-small"}
+    said = report([], settings="", facts_told=True, intervals="Known to be narrow.", beyond_paper=went_on)
+    assert "its training went on from `octopi-small`, which was trained before" in finding(said)[0]
+    facts = "\n".join(stands_on(said.provenance))
     for words in ("2 (a, b), 4 videos, split `paper`", "Nothing is noted", "Known to be narrow.", "ask for touch"):
         assert words in facts
 

@@ -7,24 +7,21 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from pipeline.report import load
 from pipeline.report.dataset import dataset_frame
-from pipeline.report.load import KEYS, Report, load_report, published, read_frame
+from pipeline.report.load import KEYS, load_report, published, read_frame
 from pipeline.report.tables import TABLES, Table, headline, side_by_side, task_title
 from pipeline.tasks import TASKS
 from pipeline.videos.catalogue import Catalogue
 from tests.conftest import refused
-from tests.report.conftest import effect, effects_of, score, scores_of
+from tests.report.conftest import effect, report, score
 
 BY_KEY = {table.key: table for table in TABLES}
-NO_EFFECTS = effects_of()
 
 
 def build(key: str, *rows: dict[str, object], dataset: str = load.DATASET) -> pd.DataFrame:
-    return BY_KEY[key].build(scores_of(*rows), NO_EFFECTS, published(dataset))
+    return BY_KEY[key].build(report(rows, dataset=dataset))
 
 
 def test_a_row_is_written_as_by_hand_with_published_figures_in_their_own_columns() -> None:
@@ -39,6 +36,7 @@ def test_a_row_is_written_as_by_hand_with_published_figures_in_their_own_columns
         "Published 7b % (n)": "48.10 (158)",
         "Published 13b % (n)": "55.06 (158)",
     }
+    assert list(build("touch", score(unread=None))["Unread %"]) == [""], "it was not counted"
 
 
 def test_all_of_the_papers_combinations_stand_beside_the_ratings(catalogue: Catalogue) -> None:
@@ -53,14 +51,12 @@ def test_all_of_the_papers_combinations_stand_beside_the_ratings(catalogue: Cata
 
 
 def test_effects_are_written_in_points_and_what_is_unknown_is_empty() -> None:
-    rows = effects_of(
-        effect(difference=-0.125, low=-0.3, high=0.05), effect("opd", "all - none", low=None, high=None, p=None)
-    )
-    shown = BY_KEY["effects"].build(scores_of(), rows, published())
+    rows = effect(difference=-0.125, low=-0.3, high=0.05), effect("opd", "all - none", low=None, high=None, p=None)
+    shown = BY_KEY["effects"].build(report(effects=rows))
     assert list(shown["Difference, points [95 %]"]) == ["-12.5 [-30.0, +5.0]", "+10.0"]
     assert list(shown["p"]) == ["0.200", ""]
     assert list(shown["Smallest that could be found, before Holm"]) == ["25.0", "25.0"]
-    assert BY_KEY["touch_effects"].build(scores_of(), rows, published()).empty
+    assert BY_KEY["touch_effects"].build(report(effects=rows)).empty
 
 
 @pytest.mark.parametrize(
@@ -84,49 +80,23 @@ def test_tasks_stand_where_they_belong_whole_answers_first() -> None:
     rows += [score("OPD", m) for m in ("hardness", "combined")]
     rows += [score("heads", **heads), score("heads_validation", **heads)]
     rows += [score("cross_validation", "combined", variant="backbone  ")]
-    scores = scores_of(*rows)
-    tasks = {key: list(dict.fromkeys(t.select(scores, NO_EFFECTS).get("task", []))) for key, t in BY_KEY.items()}
+    whole_report = report(rows)
+    tasks = {key: list(dict.fromkeys(t.select(whole_report).get("task", []))) for key, t in BY_KEY.items()}
     assert tasks["understanding"] == ["PC", "POM"]
     assert tasks["reasoning"] == ["PSR"]
     assert tasks["description"] == ["OPD", "heads"]
     whole = ["OPD", "PC", "POM", "PSR"]
-    assert tasks["variants"] == tasks["touch"] == list(headline(scores)["task"]) == whole
+    assert tasks["variants"] == tasks["touch"] == list(headline(whole_report.scores)["task"]) == whole
     assert (tasks["heads"], tasks["cross_validation"]) == (["heads", "heads_validation"], ["cross_validation"])
     assert list(build("description", *rows)["Measure"])[:2] == ["all properties right", "hardness"]
     assert list(build("description", *rows)["Published CLIP % (n)"]) == ["", "", "57.89 (38)"]
 
 
-def test_the_heads_have_no_unread_answers_where_it_was_not_counted() -> None:
-    assert list(build("touch", score(touch="removed", unread=None))["Unread %"]) == [""]
-
-
 @pytest.mark.parametrize("table", TABLES, ids=lambda t: t.key)
 def test_nothing_measured_is_an_empty_table_and_a_key_is_used_once(table: Table) -> None:
-    assert len(table.build(scores_of(), NO_EFFECTS, published())) == 0
+    assert table.build(report()).empty
     assert table.caption.endswith(".")
     assert len(BY_KEY) == len(TABLES)
-
-
-VARIANTS = st.tuples(
-    st.sampled_from([*TASKS, "a task of tomorrow"]),
-    st.sampled_from(["finetuned", "base"]),
-    st.sampled_from(["with", "without"]),
-    st.sampled_from(["all", "needed", "none"]),
-)
-
-
-@settings(max_examples=5)
-@given(st.lists(VARIANTS, unique=True, min_size=6, max_size=12))
-def test_every_variant_is_in_the_table_of_all_once_and_no_table_invents_one(
-    rows: list[tuple[str, str, str, str]],
-) -> None:
-    frame = scores_of(*(score(task, variant=f"{e} {lora} {opd}") for task, e, lora, opd in rows))
-    keys = ["task", "encoder", "lora", "opd"]
-    assert sorted(BY_KEY["variants"].select(frame, NO_EFFECTS)[keys].itertuples(index=False, name=None)) == sorted(rows)
-    for table in TABLES:
-        found = list(table.select(frame, NO_EFFECTS).get(keys, pd.DataFrame()).itertuples(index=False, name=None))
-        assert set(found) <= set(rows)
-        assert len(found) == len(set(found))
 
 
 def test_read_and_compared_answers_stand_side_by_side() -> None:
@@ -145,20 +115,17 @@ def test_each_data_set_has_the_papers_figures_about_it() -> None:
     assert not any("Published" in name for name in build("reasoning", score("RIPE")))
 
 
-def one(name: str, *rows: dict[str, object], dataset: str = load.DATASET) -> Report:
-    return Report(Path(name), scores_of(*rows), NO_EFFECTS, published(dataset), {"dataset": dataset}, {})
-
-
 def test_reports_stand_side_by_side_with_every_row_of_the_paper() -> None:
     """7b measured two rows, 13b three others and, by seed and with other touch, what belongs to no row."""
-    small = one("paper-7b-videos", score("PC"), score("OPD", "combined"))
-    large = one(
-        "paper-13b-videos",
-        score("PC", accuracy=0.6, low=0.4, high=0.8, n=150),
-        score("PC", variant="base with all"),
-        score("heads", "hardness", variant="finetuned  "),
-        score("PSS", seed="0"),
-        score("PSS", touch="swapped"),
+    small = report([score("PC"), score("OPD", "combined")])
+    large = report(
+        [
+            score("PC", accuracy=0.6, low=0.4, high=0.8, n=150),
+            score("PC", variant="base with all"),
+            score("heads", "hardness", variant="finetuned  "),
+            score("PSS", seed="0"),
+            score("PSS", touch="swapped"),
+        ]
     )
     reports = {"7b here": small, "13b here": large}
     few = side_by_side(reports, every=False).set_index("Task")
@@ -183,9 +150,9 @@ def test_reports_stand_side_by_side_with_every_row_of_the_paper() -> None:
 
 
 def test_reports_about_other_data_stand_beside_what_is_published_of_these() -> None:
-    fruit = one("f", score("RIPE"), score("PC"), dataset="avocados")
-    own = one("o", score("PC"), dataset="Other")
-    rows = side_by_side({"fruit": fruit, "own": own, "paper": one("p", score("PC"))}, every=False).set_index("Task")
+    fruit, paper = report([score("RIPE"), score("PC")], dataset="avocados"), report([score("PC")])
+    own = report([score("PC")], dataset="Other")
+    rows = side_by_side({"fruit": fruit, "own": own, "paper": paper}, every=False).set_index("Task")
     printed = [f"Published {m} % (n)" for m in ("7b", "13b", "PG-InstructBLIP")]
     heads, here = [f"Measured {name} % [95 %] (n)" for name in ("fruit", "own", "paper")], "50.0 [35.0, 65.0] (40)"
     assert list(rows.columns) == [*printed, *heads]

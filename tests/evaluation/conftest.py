@@ -1,0 +1,65 @@
+"""Made-up questions and answers that several tests of evaluation share."""
+
+from __future__ import annotations
+
+import itertools
+
+from hypothesis import strategies as st
+
+from pipeline.core.records import Encoder, Graded, Lora, Opd, Touch
+from pipeline.evaluation.intervals import Objects
+from pipeline.videos.catalogue import load_catalogue
+from tests.closure import ROOT
+
+About = tuple[Objects, ...]
+CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")
+OBJECTS = [f"object{i}" for i in range(6)]
+PAIRS = list(itertools.combinations(OBJECTS, 2))
+
+
+@st.composite
+def designs(draw: st.DrawFn) -> About:
+    """Questions about one to three of up to seven objects."""
+    names = "abcdefg"[: draw(st.integers(2, 7))]
+    sets = st.lists(st.sampled_from(names), min_size=1, max_size=min(3, len(names)), unique=True)
+    return tuple(tuple(row) for row in draw(st.lists(sets, min_size=2, max_size=24)))
+
+
+def single(objects: int, each: int) -> About:
+    """So many questions about each of so many objects."""
+    return tuple((f"{o:02}",) for o in range(objects) for _ in range(each))
+
+
+def graded(
+    task: str,
+    right: list[bool],
+    *,
+    encoder: str = "finetuned",
+    lora: str = "with",
+    opd: str = "all",
+    seed: int = 0,
+    touch: str = "real",
+    measure: str = "choice",
+    unread: int = 0,
+    objects: list[tuple[str, ...]] | None = None,
+) -> list[Graded]:
+    """One answer a question; the last `unread` could not be read."""
+    about = objects or (PAIRS if measure == "choice" else [(o,) for o in OBJECTS] * 3)
+    variant = {"encoder": Encoder(encoder), "lora": Lora(lora), "opd": Opd(opd), "touch": Touch(touch)}
+    return [
+        Graded(
+            question_id=f"{task}-{i:03}",
+            task=task,
+            measure=measure,
+            correct=correct,
+            parsed=i < len(right) - unread,
+            truncated=False,
+            expected="a",
+            predicted="",
+            objects=about[i],
+            seed=seed,
+            trained=seed,
+            **variant,
+        )
+        for i, correct in enumerate(right)
+    ]
