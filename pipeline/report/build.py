@@ -79,7 +79,7 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
         if (file := data / "encoder" / str(seed) / "classifications.parquet").is_file():
             by_encoder[seed] = read_table(file, Classification)
             said.setdefault(params.split.replicate_of(seed), []).extend(by_encoder[seed])
-    out_of_fold = {
+    out_of_fold: dict[str, list[OutOfFold]] = {
         name: read_table(data / "cross_validation" / name / "out_of_fold.parquet", OutOfFold)
         for name in params.cross_validation.models
         if (data / "cross_validation" / name / "out_of_fold.parquet").is_file()
