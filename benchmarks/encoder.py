@@ -1,9 +1,7 @@
-"""Encoders on one core: whole candidates, then number and side of frames, number formats and visual prompts.
+"""Encoders on one core: number and side of frames, number formats and visual prompts.
 
-A candidate's cost is a video's from the file to the decided classes; weights are random where cost depends on no
-training, and errors are those of the report with most candidates in its cross-validation. The other encoders are
-frozen, have seen no label and are timed alone; each is judged by a grouped cross-validation of its heads. Prompts
-are trained for a few epochs and judged on the development split's validation videos, which also choose the epoch.
+Frozen encoders have seen no label; each is judged by a grouped cross-validation of its heads. Prompts are trained for
+a few epochs and judged on the development split's validation videos, which also choose the epoch.
 
 `int8` is torch's dynamic quantisation of linear layers, of which the pretrained encoder has none.
 """
@@ -25,26 +23,32 @@ import torch
 from torch import nn
 
 from benchmarks.classifier import heads_error
-from benchmarks.encoder_models import ALONE, FRAMES, SIDE, features, prompts, whole
-from benchmarks.errors import WRONG, Error
+from benchmarks.errors import WRONG, Error, share_of
 from benchmarks.frames import bench_videos
 from benchmarks.table import Row, make_rows
 from benchmarks.timing import flops_of, interleaved, machine, megabytes, one_thread
-from pipeline.config import PRETRAINED, FramesConfig, RuntimeConfig
+from pipeline.config import PRETRAINED, EncoderConfig, FramesConfig, RuntimeConfig, SplitConfig
 from pipeline.config.params import load_params
 from pipeline.core.errors import UserError
-from pipeline.core.records import Video
-from pipeline.encoder.clips import ClipDataset, LabelledVideo
+from pipeline.core.records import Part, Video
+from pipeline.core.runtime import seed_everything
+from pipeline.encoder.clips import ClipDataset, EncoderData, LabelledVideo, classify
 from pipeline.encoder.cross_validation import CrossValidationData
-from pipeline.encoder.model import FrameEncoder, base_encoder
+from pipeline.encoder.finetune import train_classifier
+from pipeline.encoder.model import FrameEncoder, PropertyClassifier, base_encoder
+from pipeline.encoder.recipes import property_classifier
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.training.trainable import load_trainable
 from pipeline.videos.files import list_videos
 from pipeline.videos.frames.extract import extract_frames
 from pipeline.videos.frames.store import FrameStore
+from pipeline.videos.split import assign
 from pipeline.weights import CLIP_CONFIG
 
 Clip = Mapping[str, torch.Tensor]
+SIDE, FRAMES = 120, 5
+"""Pixels and frames a video, where these are not what differs."""
+ALONE = "ms a video, encoder alone"
 
 
 @dataclass(frozen=True)
@@ -65,8 +69,6 @@ class Size:
 class Setup(CrossValidationData):
     """What all encoders of a run share."""
 
-    recordings: Path
-    """Folder of the videos themselves."""
     pretrained: Path
     size: Size
 
@@ -103,17 +105,22 @@ def measure(root: Path, size: Size | None = None) -> list[Row]:
             videos=videos,
             catalogue=catalogue,
             frames=frames,
-            recordings=folder,
             per_video=FRAMES,
             encoder=params.model_copy(update=changed),
             runtime=RuntimeConfig(device="cpu", threads=1),
             pretrained=pretrained,
             size=size,
         )
-        return [*whole(setup, root / "reports"), *frozen(setup), *prompts(setup)]
+        return [*frozen(setup), *prompts(setup)]
 
 
 # --- Frozen encoders
+
+
+@torch.inference_mode()
+def features(encoder: FrameEncoder, clip: Clip) -> torch.Tensor:
+    """What the heads are given of a clip: float32, frames x features."""
+    return encoder.describe(clip["frames"], clip["frame_indices"]).float()
 
 
 @dataclass(frozen=True)
@@ -209,3 +216,48 @@ def _error(encoder: FrameEncoder, setting: Setting, setup: Setup) -> Error:
     """Of the frozen encoder's heads, whose settings are chosen inside the training folds."""
     clips = np.stack([features(encoder, _clip(setting, setup, video)).numpy() for video in setup.videos])
     return heads_error(clips, clips, setup.labels, setup.objects, setup.classes, setup.size.folds, setup.size.deals)
+
+
+# --- Visual prompts
+
+
+def prompts(setup: Setup) -> list[Row]:
+    """The paper's recipe with other prompts."""
+    assignments = assign(setup.catalogue, setup.videos, SplitConfig(name="development"))
+    data = EncoderData(FrameStore(setup.frames), setup.catalogue, assignments, FRAMES)
+    shown = ClipDataset(data.store, [LabelledVideo(v.video_id, ()) for v in setup.timed()], per_video=FRAMES)
+    clips = [shown[i] for i in range(len(shown))]
+    timed: dict[str, Callable[[Clip], object]] = {}
+    errors, counts = {}, {}
+    for count, layers in setup.size.prompts:
+        name = f"{count} at {'the first layer' if layers == 1 else f'{layers} layers' if layers else 'all layers'}"
+        changed = {"prompts": count, "prompt_layers": layers, "epochs": setup.size.epochs}
+        config = setup.encoder.model_copy(update=changed)
+        seed_everything(0)
+        model = property_classifier(config, setup.classes)
+        inputs = ["bench", *(f"{a.video_id} {a.part}" for a in data.assignments)]
+        train_classifier(model, data, config, setup.runtime, seed=0, inputs=inputs)
+        errors[name] = _validation_error(model.eval(), data, config)
+        timed[name] = partial(features, model.encoder)
+        # Not in inference mode: the counter fails there at parameters that are put into a layer, as prompts are.
+        flops = flops_of(partial(model.encoder.describe, clips[0]["frames"], clips[0]["frame_indices"]))
+        counts[name] = {"frames": float(FRAMES), "megabytes": megabytes(model), "flops": flops}
+    return make_rows(
+        "prompts",
+        interleaved(timed, clips, setup.size.repeats),
+        unit=ALONE,
+        baseline=next(iter(timed)),
+        errors=errors,
+        error_of="share of validation videos, which also chose the epoch, of which not every property is right",
+        counts=counts,
+        machine=machine("1 thread"),
+    )
+
+
+def _validation_error(model: PropertyClassifier, data: EncoderData, config: EncoderConfig) -> Error:
+    wrong: dict[str, bool] = {}
+    objects: dict[str, tuple[str, ...]] = {}
+    for found in classify(model, data, [Part.VALIDATION], config.batch_size, torch.device("cpu")):
+        wrong[found.video_id] = wrong.get(found.video_id, False) or found.predicted != found.expected
+        objects[found.video_id] = (found.object_id,)
+    return share_of([float(w) for w in wrong.values()], list(objects.values()))

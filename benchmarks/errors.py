@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import fmean, stdev
 
 import numpy as np
 
-from pipeline.core.io import read_csv
 from pipeline.core.records import ScoreRow
 from pipeline.encoder.folds import Labels, Predict, cross_validate
 from pipeline.evaluation.intervals import accuracy_interval
@@ -78,16 +76,6 @@ def cross_validated(
     predicted = cross_validate(predict, objects, classes, folds=folds, repeats=repeats)
     wrong = (predicted != labels[:, None]).any(axis=2).mean(axis=1)
     return share_of(wrong.tolist(), [(o,) for o in objects])
-
-
-def reported(reports: Path, **keys: str) -> dict[Path, list[ScoreRow]]:
-    """Rows of every report's scores.csv that have these values, by report, reports without any left out."""
-    tables = {path.parent: read_csv(path, ScoreRow) for path in sorted(reports.glob("*/scores.csv"))}
-    chosen = {
-        report: [row for row in rows if all(getattr(row, key) == value for key, value in keys.items())]
-        for report, rows in tables.items()
-    }
-    return {report: rows for report, rows in chosen.items() if rows}
 
 
 def error_of(score: ScoreRow) -> Error:

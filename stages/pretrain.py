@@ -1,10 +1,9 @@
-"""Pretrain the backbone `scenes` on pictures of invented objects, where the encoder or a compared model has it."""
+"""Pretrain the backbone `scenes` on pictures of invented objects, where the encoder has it."""
 
 from pipeline.config import PRETRAINED
 from pipeline.core.io import write_table
 from pipeline.core.records import Measurement
 from pipeline.core.stage import DATA, stage
-from pipeline.encoder.candidates import needs_pretraining
 from pipeline.tracking.live import live
 
 
@@ -12,7 +11,7 @@ def main() -> None:
     with stage("pretrain") as run:
         params = run.params
         out = DATA / "pretrained"
-        if not needs_pretraining(params.encoder, params.cross_validation.models):
+        if "scenes" not in params.encoder.backbone:
             write_table(out / "history.parquet", Measurement, [])
             return
         # Imported here, since most runs end above and need no torch.

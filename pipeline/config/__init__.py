@@ -30,6 +30,7 @@ CLIP_RECIPES = ("paper", "release")
 """Recipes that are for `encoder.backbone=[clip]` alone."""
 TrainedEmbeddings = Literal["all", "new"]
 Selection = Literal["salient", "release", "contact"]
+Compared = Literal["constant", "backbone", "backbone-tuned"]
 
 INVENTED = Path("data/invented")
 """Where the chain puts the catalogue of invented objects; `data.catalogue` names it to have them."""
@@ -270,10 +271,12 @@ class PretrainConfig(Section):
 
 
 class CrossValidationConfig(Section):
-    """Grouped cross-validation of encoders and their rivals over all objects with videos."""
+    """Grouped cross-validation of the encoder over all objects with videos."""
 
-    models: tuple[str, ...] = Field(default=("constant",), min_length=1)
-    """Which, of those that `pipeline.encoder.candidates` lists; each is a stage."""
+    models: tuple[Compared, ...] = Field(default=("constant",), min_length=1)
+    """`constant`: the training objects' most frequent combination of classes. `backbone`: a frame classifier on the
+    frozen `encoder.backbone`, decided jointly. `backbone-tuned`: the same, fine-tuned by `encoder.recipe`. Each is a
+    stage."""
     folds: Annotated[int, Field(ge=2, le=50)] = 5
     """Parts that objects are dealt into; all videos of an object are in one."""
     repeats: Positive = 3

@@ -46,12 +46,14 @@ def finetune(
     seed: int,
     inputs: Sequence[Path],
     callbacks: Sequence[TrainerCallback] = (),
+    trunks: Trunks | None = None,
 ) -> tuple[PropertyClassifier, list[Measurement]]:
     """Train the classifier of the recipe.
 
     Args:
         inputs: Files that a training by gradients depends on, for its checkpoints' fingerprint.
         callbacks: Further callbacks for its Trainer, such as tracking.
+        trunks: Of the recipe `tuned`, where they have been run over these videos before.
 
     Returns:
         The classifier, and its training's curve.
@@ -59,10 +61,11 @@ def finetune(
     seed_everything(seed)
     model = property_classifier(config, data.classes)
     if isinstance(model, JointFrameClassifier):
-        assert isinstance(model.encoder, SideBySide)
-        videos = [*data.videos(Part.TRAIN), *data.videos(Part.VALIDATION)]
-        flips = len(FLIPS) if config.flip_probability else 1
-        trunks = run_trunks(model.encoder, data, videos, resolve_device(runtime.device), flips=flips)
+        if trunks is None:
+            assert isinstance(model.encoder, SideBySide)
+            videos = [*data.videos(Part.TRAIN), *data.videos(Part.VALIDATION)]
+            flips = len(FLIPS) if config.flip_probability else 1
+            trunks = run_trunks(model.encoder, data, videos, resolve_device(runtime.device), flips=flips)
         return model, tune(model, trunks, data, config, runtime, seed=seed, inputs=inputs, callbacks=callbacks)
     return model, train_classifier(model, data, config, runtime, seed=seed, inputs=inputs, callbacks=callbacks)
 

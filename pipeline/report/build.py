@@ -76,7 +76,7 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     # By the lists in params.yaml and not by what lies there: a narrowed ablation leaves the others' files behind.
     models = params.cross_validation.models
     found = {name: _read(data / "cross_validation" / name / "out_of_fold.parquet", OutOfFold) for name in models}
-    out_of_fold = {name: records for name, records in found.items() if records}
+    out_of_fold: dict[str, list[OutOfFold]] = {name: records for name, records in found.items() if records}
     by_encoder: dict[int, list[Classification]] = {}
     said: dict[int, list[Classification]] = {}
     concluded: dict[int, list[Score]] = {}

@@ -18,7 +18,6 @@ from pipeline.core.errors import UserError
 from pipeline.core.io import write_text
 from pipeline.core.parallel import check_backend
 from pipeline.core.records import Part, Touch
-from pipeline.encoder.candidates import check_candidates
 from pipeline.encoder.recipes import check_recipe
 from pipeline.scales.memory import launched
 from pipeline.scenes.invented import catalogue_of
@@ -92,7 +91,6 @@ def check_inputs(params: Params) -> str:
     """Raise UserError where videos, catalogue, objects, tasks or weights are not there; return as `check_objects`."""
     catalogue = catalogue_of(params)
     check_recipe(params.encoder.recipe)
-    check_candidates(params.cross_validation.models, params.encoder, params.frames.pixels)
     counts_by_task(params.questions, "train")
     counts_by_task(params.questions, "evaluation")
     launcher = shlex.split(params.runtime.launcher)
@@ -197,7 +195,7 @@ def prune(params: Params, data: Path) -> None:
     """
     variants, ablation = params.ablation.variants(), params.ablation
     trained = {f"{v.encoder}-{v.opd}-{v.seed}" for v in variants}
-    keep = {
+    keep: dict[str, set[str]] = {
         "cross_validation": set(params.cross_validation.models),
         "encoder": {str(seed) for seed in ablation.seeds},
         "models/without": trained,

@@ -14,11 +14,10 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from benchmarks import __main__ as command
-from benchmarks.errors import Error, error_of, mean_of, reported, share_of
+from benchmarks.errors import Error, error_of, mean_of, share_of
 from benchmarks.figures import FOLDER, draw
 from benchmarks.table import CSV, Row, front, make_rows, merge, read_rows
 from benchmarks.timing import counting_ffts, flops_of, interleaved, megabytes
-from pipeline.core.io import write_csv
 from pipeline.core.records import ScoreRow
 from tests.conftest import ROOT, refused
 
@@ -165,14 +164,10 @@ def test_errors_have_intervals_over_objects() -> None:
     assert share.low < share.value == 0.5 < share.high
 
 
-def test_errors_come_from_the_reports_that_have_them(tmp_path: Path) -> None:
+def test_an_error_is_what_a_score_lacks() -> None:
     shared = {"measure": "m", "encoder": "e", "seed": "all", "right": 4, "unread": 0, "chance": 0.1, "n": 9}
-    for name, task in (("one", "heads"), ("two", "other")):
-        row = ScoreRow.model_validate({**shared, "task": task, "accuracy": 0.5, "low": 0.4, "high": 0.7})
-        write_csv(tmp_path / name / "scores.csv", ScoreRow, [row, row.model_copy(update={"low": None})])
-    found = reported(tmp_path, task="heads")
-    assert list(found) == [tmp_path / "one"]
-    whole, half = map(error_of, found[tmp_path / "one"])
+    row = ScoreRow.model_validate({**shared, "task": "heads", "accuracy": 0.5, "low": 0.4, "high": 0.7})
+    whole, half = error_of(row), error_of(row.model_copy(update={"low": None}))
     assert whole.columns == pytest.approx({"error": 0.5, "low": 0.3, "high": 0.6, "n": 9})
     assert half.columns == {"error": 0.5, "n": 9}
 

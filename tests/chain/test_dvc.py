@@ -198,6 +198,7 @@ NONE = {
     "data.dir": "stands in the paths of dependencies",
     **dict.fromkeys(("tracking.uri", "tracking.experiment", "tracking.live", "tracking.timeout_seconds"), "only shows"),
     "packaged": "which variants are copied",
+    "cross_validation.models": "the stages themselves",
     "runtime.parallel": "every backend gives the same bytes",
     "runtime.save_steps": "a resumed training ends as one that was not",
     # Sums are added in another order, as on another processor; dvc.lock is to hold on the next machine.

@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from pydantic import ValidationError
 from torch.nn import functional as F
 
@@ -22,23 +21,24 @@ from pipeline.core.records import Part
 from pipeline.core.runtime import seed_everything
 from pipeline.encoder import finetune as training
 from pipeline.encoder import tuned
-from pipeline.encoder.clips import EncoderData, classify
+from pipeline.encoder.clips import ClipDataset, EncoderData, classify
 from pipeline.encoder.embed import EncoderSource, Loaded, embed_videos
-from pipeline.encoder.finetune import finetune, tune, write_encoder_card
+from pipeline.encoder.finetune import finetune, train_classifier, tune, write_encoder_card
 from pipeline.encoder.frame_classifier import JointFrameClassifier
-from pipeline.encoder.model import FrameEncoder, SideBySide, load_backbones, mean_and_deviation
+from pipeline.encoder.model import FrameEncoder, SideBySide, load_backbones
 from pipeline.encoder.recipes import base_encoder, property_classifier
 from pipeline.encoder.scene_encoder import SIDE, SceneEncoder
 from pipeline.encoder.timm_backbone import TimmBackbone
-from pipeline.encoder.tuned import FLIPS, AboveTrunks, TrunkDataset, run_trunks
+from pipeline.encoder.tuned import AboveTrunks, TrunkDataset, run_trunks
 from pipeline.report.provenance import encoder_words
 from pipeline.training.trainable import load_trainable, save_trainable, trainable_state
+from pipeline.videos.frames.store import FrameStore
 from pipeline.weights import BACKBONES, Backbone, backbone_files, check_encoder
 from pipeline.weights.check import check_encoder_files
 from tests.checkpoints import edit
 from tests.closure import ROOT
 from tests.conftest import refused
-from tests.encoders import CPU, close, config, float64, write_pretrained, write_timm
+from tests.encoders import CPU, close, config, float64, write_frames, write_pretrained, write_timm
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
 
@@ -168,15 +168,6 @@ def test_several_backbones_stand_side_by_side_in_their_order(timm_folder: Path) 
             assert not any(p.requires_grad for p in both.parameters()), "the base is frozen"
 
 
-@given(st.integers(0, 10**6), st.sampled_from([1, 2, 49]), st.sampled_from([0.0, 1e-3, 1.0, 1e4]))
-def test_pooling_against_numpy(seed: int, places: int, scale: float) -> None:
-    maps = (scale * np.random.default_rng(seed).normal(size=(2, 3, places)) + 7).astype(np.float32)
-    found = float64(mean_and_deviation(torch.from_numpy(maps)))
-    exact = maps.astype(np.float64)
-    bound = 1e-6 * np.abs(exact).max()
-    np.testing.assert_allclose(found, np.concatenate([exact.mean(2), exact.std(2)], axis=1), rtol=1e-5, atol=bound)
-
-
 # What is tuned
 
 
@@ -206,64 +197,51 @@ def test_a_clip_among_several_backbones_gets_prompts(weights: Path, data: Encode
 # Training above cached trunks
 
 
-def test_training_above_trunks_is_training_through_the_whole_network(timm_folder: Path, data: EncoderData) -> None:
-    """Two epochs of AdamW on mirrored clips, against the classifier on the frames themselves.
+def test_training_above_trunks_is_training_through_the_whole_network(
+    timm_folder: Path, data: EncoderData, tmp_path: Path
+) -> None:
+    """Two epochs, against the classifier on the frames themselves; each video has just the frames of a clip.
 
     Statistics of batch normalisation stay those of the pretraining.
     """
     write_pretrained()
-    setting = config(timm_folder, "tuned", backbone=("timm", "scenes"), feature_stage=2)
-    videos = data.videos(Part.TRAIN)
-    states, fresh = [], base_encoder(setting).state_dict()
+    changes = {"backbone": ("timm", "scenes"), "feature_stage": 2, "epochs": 2, "batch_size": 2, "flip_probability": 0}
+    setting, videos = config(timm_folder, "tuned", **changes), data.videos(Part.TRAIN) + data.videos(Part.VALIDATION)
+    data = replace(data, store=FrameStore(write_frames(tmp_path / "two", {v.video_id: 2 for v in videos})))
+    fresh, states = base_encoder(setting).state_dict(), []
     running = [name for name in fresh if "running" in name]
     assert {name[:11] for name in running} == {"backbones.0", "backbones.1"}
     for cached in (True, False):
         seed_everything(0)
-        model = property_classifier(setting, CLASSES).train()
-        assert isinstance(model, JointFrameClassifier)
-        assert isinstance(model.encoder, SideBySide)
-        optimiser = torch.optim.AdamW([p for p in model.parameters() if p.requires_grad], lr=1e-3)
-        trunks = run_trunks(model.encoder, data, videos, DEVICE)
-        items = TrunkDataset(trunks, videos, seed=3, flip_probability=0.5)
-        for epoch in range(2):
-            items.follow(lambda epoch=epoch: epoch)  # type: ignore[misc]
-            for index, video in enumerate(videos):
-                item = items[index]
-                labels = item["labels"][None]
-                if cached:
-                    output = AboveTrunks(model)([o[None] for o in item["outputs"]], labels)
-                else:
-                    flip = flip_of(trunks.of, video.video_id, item["outputs"])
-                    rows = data.store.rows(video.video_id)
-                    places = [i * len(rows) // 2 for i in range(2)]
-                    shown = np.flip(data.store.pictures(video.video_id, places), FLIPS[flip]).copy()
-                    output = model(torch.from_numpy(shown)[None], torch.zeros(1, 2), labels)
-                optimiser.zero_grad()
-                output["loss"].backward()
-                optimiser.step()
+        model = property_classifier(setting, CLASSES)
+        trunks = run_trunks(model.encoder, data, videos, DEVICE, flips=1) if cached else None  # type: ignore[arg-type]
+        train_classifier(model, data, setting, CPU, seed=0, inputs=[], trunks=trunks)
         states.append(trainable_state(model))
         assert all(torch.equal(model.encoder.state_dict()[name], fresh[name]) for name in running)
     torch.testing.assert_close(states[0], states[1], rtol=1e-4, atol=1e-5)
 
 
-def flip_of(of: Callable[[str, int], list[torch.Tensor]], video_id: str, outputs: list[torch.Tensor]) -> int:
-    return next(f for f in range(4) if all(map(torch.equal, of(video_id, f), outputs)))
-
-
 def test_flips_are_drawn_by_seed_epoch_and_video(timm_folder: Path, data: EncoderData) -> None:
     """Each of the four a quarter of the time; without a seed none."""
-    videos = data.videos(Part.TRAIN)
-    trunks = run_trunks(side_by_side(timm_folder), data, videos, DEVICE)
-    items = TrunkDataset(trunks, videos, seed=3, flip_probability=0.5)
-    drawn = []
+    videos, encoder = data.videos(Part.TRAIN), side_by_side(timm_folder)
+    trunks = run_trunks(encoder, data, videos, DEVICE)
+    frames = ClipDataset(data.store, videos, per_video=2)[0]["frames"]
+    with torch.no_grad():
+        for flip, axes in enumerate(([], [2], [1], [1, 2])):
+            (expected,), (found,) = encoder.trunks(frames.flip(axes)), trunks.of(videos[0].video_id, flip)
+            assert torch.equal(found, expected)
+
+    def drawn(items: TrunkDataset) -> list[int]:
+        shown = ((v.video_id, items[i]["outputs"]) for i, v in enumerate(videos))
+        return [next(f for f in range(4) if all(map(torch.equal, trunks.of(v, f), o))) for v, o in shown]
+
+    items, epochs = TrunkDataset(trunks, videos, seed=3, flip_probability=0.5), []
     for epoch in range(80):
         items.follow(lambda epoch=epoch: epoch)  # type: ignore[misc]
-        drawn.append([flip_of(trunks.of, v.video_id, items[i]["outputs"]) for i, v in enumerate(videos)])
-    counts = np.bincount(np.ravel(drawn), minlength=4)
-    assert counts.min() > 400 / 4 * 0.7
-    assert len(set(map(tuple, drawn))) > 40
-    plain = TrunkDataset(trunks, videos)
-    assert all(flip_of(trunks.of, v.video_id, plain[i]["outputs"]) == 0 for i, v in enumerate(videos))
+        epochs.append(drawn(items))
+    assert np.bincount(np.ravel(epochs), minlength=4).min() > 400 / 4 * 0.7
+    assert len(set(map(tuple, epochs))) > 40
+    assert not any(drawn(TrunkDataset(trunks, videos)))
 
 
 def test_trunks_too_large_for_memory_are_kept_in_float16(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -13,16 +15,20 @@ from hypothesis import strategies as st
 from scipy.special import log_softmax, logsumexp
 from sklearn.linear_model import LogisticRegression
 
+from pipeline.core.errors import UserError
 from pipeline.core.records import Part
 from pipeline.encoder import frame_classifier
 from pipeline.encoder.clips import EncoderData
 from pipeline.encoder.finetune import finetune
 from pipeline.encoder.frame_classifier import (
+    SMOOTHING,
     STRENGTHS,
     FittedHeads,
     JointFrameClassifier,
     choose_strength,
+    decode_jointly,
     fit_frame_heads,
+    log_dependence,
 )
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.videos.catalogue import Catalogue
@@ -225,3 +231,39 @@ def test_tuning_begins_with_heads_fitted_to_evaluation_clips(
     np.testing.assert_array_equal(float64(model.dependence), heads.dependence)
     own = model.encoder.get_submodule("backbones.0").state_dict()
     assert all(torch.equal(v, own[n]) for n, v in pretrained.state_dict().items()), "the network itself stays"
+
+
+# Joint decisions
+
+
+def test_the_prior_counts_each_object_once() -> None:
+    labels = np.array([[0, 0], [0, 0], [0, 0], [1, 2], [1, 0]])
+    dependence = log_dependence(labels, ["a", "a", "a", "b", "c"], (2, 3))
+    total = 3 + 6 * SMOOTHING
+    joint = {(0, 0): 1 + SMOOTHING, (1, 2): 1 + SMOOTHING, (1, 0): 1 + SMOOTHING}
+    for i, j in itertools.product(range(2), range(3)):
+        first = sum(joint.get((i, b), SMOOTHING) for b in range(3)) / total
+        second = sum(joint.get((a, j), SMOOTHING) for a in range(2)) / total
+        assert dependence[i, j] == pytest.approx(math.log(joint.get((i, j), SMOOTHING) / total / first / second))
+    assert log_dependence(np.zeros((1, 1), np.int64), ["a"], (4,)) == pytest.approx(np.zeros(4))
+
+
+@given(st.integers(0, 10**6), st.lists(st.integers(1, 4), min_size=1, max_size=4))
+def test_joint_decoding_against_brute_force(seed: int, classes: list[int]) -> None:
+    rng = np.random.default_rng(seed)
+    tables = [rng.dirichlet(np.ones(count), size=5) for count in classes]
+    dependence = rng.normal(size=tuple(classes))
+    decoded = decode_jointly([np.log(table) for table in tables], dependence)
+    for video in range(5):
+        best, highest = None, -math.inf
+        for combination in itertools.product(*map(range, classes)):
+            score = float(dependence[combination])
+            score += sum(math.log(t[video, c]) for t, c in zip(tables, combination, strict=True))
+            if score > highest:
+                best, highest = combination, score
+        assert tuple(decoded[video]) == best
+
+
+def test_too_many_combinations_are_one_line() -> None:
+    with pytest.raises(UserError, match=r"\A1000000 combinations of classes are too many to decide[^\n]*\Z"):
+        log_dependence(np.zeros((1, 2), np.int64), ["a"], (1000, 1000))

@@ -9,8 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from safetensors.torch import load_file
 from scipy.special import log_softmax
 from scipy.stats import kstest, norm, uniform
@@ -18,7 +16,7 @@ from scipy.stats import kstest, norm, uniform
 from pipeline.core.runtime import seed_everything
 from pipeline.encoder.model import Heads, TactileEncoder
 from pipeline.encoder.recipes import base_encoder, property_classifier
-from pipeline.encoder.release import DROPOUT, PublishedHeads, sinusoid
+from pipeline.encoder.release import DROPOUT, PublishedHeads
 from pipeline.encoder.vpt import VisualPrompts
 from tests.checkpoints import CLIP_CONFIG
 from tests.encoders import FRAME_INDICES, Floats, close, config, float64, write_tower
@@ -239,11 +237,3 @@ def test_heads_of_release_ignore_length_and_drop_half_of_the_units() -> None:
     assert DROPOUT == 0.5
     assert np.abs(drawn.mean(axis=0) - mean).max() < 5 * np.sqrt(variance.max() / count)
     np.testing.assert_allclose(drawn.var(axis=0), variance, rtol=0.06)
-
-
-@given(st.lists(st.integers(0, 10**6), min_size=1, max_size=5), st.sampled_from([1, 2, 7, 32, 33, 1024]))
-def test_sinusoid_against_its_formula(indices: list[int], dim: int) -> None:
-    """Late neighbours stay apart: in float32 their waves would differ by rounding errors alone."""
-    found = sinusoid(torch.tensor([*indices, 10**6, 10**6 + 1]), dim)
-    assert found.dtype == torch.float32
-    np.testing.assert_allclose(float64(found), waves(np.array([*indices, 10**6, 10**6 + 1]), dim), rtol=0, atol=1e-7)

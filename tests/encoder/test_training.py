@@ -18,6 +18,7 @@ from sklearn.linear_model import LogisticRegression
 from sklearn.preprocessing import StandardScaler
 from transformers import TrainerCallback
 
+from pipeline.config import PRETRAINED
 from pipeline.core.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore, Statistics
 from pipeline.core.errors import UserError
 from pipeline.core.io import save_tensors, write_table
@@ -213,47 +214,32 @@ def test_an_unknown_recipe_is_one_line() -> None:
         check_recipe("papr")
 
 
-def test_the_card_names_weights_by_hash_data_and_settings_and_is_the_same_again(
-    weights: Path, data: EncoderData, tmp_path: Path
-) -> None:
-    setting = config(weights, "paper")
-    (weights / "README.md").write_text("---\nlicense: mit\n---\n")
-    texts = []
-    for folder in (tmp_path / "a", tmp_path / "b"):
-        write_encoder_card(folder, data, setting, 3, "scenes")
-        texts.append((folder / "README.md").read_text())
-    (weights / "README.md").unlink()
-    assert texts[0] == texts[1]
-    front = yaml.safe_load(texts[0].split("---\n")[1])
-    assert (front["license"], front["base_model"]) == ("mit", [weights.as_posix()])
+def test_the_card_names_weights_by_hash_data_and_settings(weights: Path, data: EncoderData, tmp_path: Path) -> None:
+    write_encoder_card(tmp_path / "a", data, config(weights, "paper"), 3, "scenes")
+    text = (tmp_path / "a" / "README.md").read_text()
+    assert yaml.safe_load(text.split("---\n")[1])["base_model"] == [weights.as_posix()]
     digest = hashlib.sha256((weights / "open_clip_model.safetensors").read_bytes()).hexdigest()
     lines = [digest, "| learning_rate | 0.001 |", "| seed | 3 |", "| training videos (scenes) | 5 |", "hardness"]
-    assert all(line in texts[0] for line in lines)
+    assert all(line in text for line in lines)
 
 
 # What is saved, and what is refused
 
 
-def test_a_network_reloads_exactly_with_its_running_statistics(tmp_path: Path) -> None:
-    seed_everything(0)
-    model = PropertyClassifier(SceneEncoder(), Heads(256, [3, 2]), [3, 2]).train()
-    frames = torch.randint(0, 256, (4, 2, 32, 32, 3), dtype=torch.uint8)
-    labels, indices = torch.tensor([[0, 1], [2, 0], [1, 1], [0, 0]]), torch.zeros(4, 2, dtype=torch.int64)
-    optimiser = torch.optim.AdamW(model.parameters(), lr=1e-2)
-    model(frames, indices, labels)["loss"].backward()
-    optimiser.step()
-    state = trainable_state(model)
-    assert state.keys() == model.state_dict().keys(), "nothing is frozen, so everything is there"
-    assert sum("running_" in name for name in state) == 2 * 7
-    save_trainable(model, tmp_path / "model.safetensors")
-    other = PropertyClassifier(SceneEncoder(), Heads(256, [3, 2]), [3, 2])
-    load_trainable(other, tmp_path / "model.safetensors")
-    assert torch.equal(model.eval()(frames, indices)["logits"], other.eval()(frames, indices)["logits"])
-    encoder = SceneEncoder().requires_grad_(False)
-    assert trainable_state(encoder) == {}, "statistics of frozen layers are not trained"
-    next(layer for layer in encoder.layers if isinstance(layer, torch.nn.BatchNorm2d)).requires_grad_(True)
+def test_running_statistics_are_saved_with_what_is_trained_alone(tmp_path: Path) -> None:
+    """As stage `pretrain` saves the whole network, and `tuned` its last layers."""
+    made = write_pretrained(1)
+    state = trainable_state(made)
+    assert state.keys() == made.state_dict().keys(), "nothing is frozen, so everything is there"
+    other = SceneEncoder().eval()
+    load_trainable(other, PRETRAINED)
+    frames = torch.randint(0, 256, (4, 32, 32, 3), dtype=torch.uint8)
+    assert torch.equal(made(frames, torch.zeros(4)), other(frames, torch.zeros(4)))
+    other.requires_grad_(False)
+    assert trainable_state(other) == {}, "statistics of frozen layers are not trained"
+    next(layer for layer in other.layers if isinstance(layer, torch.nn.BatchNorm2d)).requires_grad_(True)
     names = {"bias", "num_batches_tracked", "running_mean", "running_var", "weight"}
-    assert {n.split(".")[-1] for n in trainable_state(encoder)} == names
+    assert {n.split(".")[-1] for n in trainable_state(other)} == names
 
 
 OWN = {

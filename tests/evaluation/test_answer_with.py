@@ -122,7 +122,7 @@ def made(tmp_path_factory: pytest.TempPathFactory, catalogue: Catalogue) -> Path
         root,
         fake_params(
             *("ablation.encoders=[finetuned]", "ablation.lora=[with]", "ablation.opd=[all]", "ablation.touch=[]"),
-            *("questions.evaluation={opd:2,pc:2,pss:2,pom:2,psr:2}", "cross_validation.models=[probe]"),
+            *("questions.evaluation={opd:2,pc:2,pss:2,pom:2,psr:2}", "cross_validation.models=[backbone]"),
         ),
     )
     assert params.frames.per_video == 5

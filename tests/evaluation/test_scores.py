@@ -165,7 +165,7 @@ def out_of_fold(predicted: list[tuple[tuple[int, ...], ...]]) -> list[OutOfFold]
 ABOUT = [("a",), ("a",), ("b",), ("c",)]
 RIGHT, WRONG, HALF = (0, 0, 0), (2, 1, 1), (0, 0, 1)
 FROZEN = out_of_fold([(RIGHT, HALF, WRONG, RIGHT), (HALF, RIGHT, RIGHT, RIGHT)])
-PROBE = out_of_fold([(WRONG, HALF, WRONG, RIGHT), (HALF, HALF, WRONG, RIGHT)])
+CONSTANT = out_of_fold([(WRONG, HALF, WRONG, RIGHT), (HALF, HALF, WRONG, RIGHT)])
 
 
 def test_cross_validation_is_the_mean_over_repeats() -> None:
@@ -181,14 +181,20 @@ def test_cross_validation_is_the_mean_over_repeats() -> None:
 
 
 def test_encoders_are_compared_video_by_video() -> None:
-    (found,) = candidate_rows({"backbone": FROZEN, "probe": PROBE}, "backbone")
-    assert (found.part, found.change, found.n, found.objects, found.seeds) == ("encoder", "probe - backbone", 4, 3, 2)
+    (found,) = candidate_rows({"backbone": FROZEN, "constant": CONSTANT}, "backbone")
+    assert (found.part, found.change, found.n, found.objects, found.seeds) == (
+        "encoder",
+        "constant - backbone",
+        4,
+        3,
+        2,
+    )
     gains = np.array([[-1, 0, 0, 0], [0, -1, -1, 0]], dtype=float)
     gap = paired(gains, ABOUT)
     expected = (gap.difference, gap.low, gap.high, gap.p)
     assert (found.difference, found.low, found.high, found.p) == pytest.approx(expected, abs=1e-6)
     assert found.p_holm == found.p
-    assert candidate_rows({"probe": PROBE}, "backbone") == []
+    assert candidate_rows({"constant": CONSTANT}, "backbone") == []
 
 
 def test_errors_know_the_order_of_classes() -> None:

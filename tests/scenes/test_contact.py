@@ -10,9 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.scenes import contact
-from pipeline.scenes.contact import FORCES, Body, Imprint, Method, choose, press, slope_error
+from pipeline.scenes.contact import FORCES, Body, Method, choose, press, slope_error
 from pipeline.scenes.elastic.kernels import Gel
-from pipeline.scenes.elastic.solver import NotConverged
 from pipeline.scenes.elastic.winkler import hang_skin, press_springs, series
 
 SIDE, PITCH = 121, 30.0 / 121
@@ -129,14 +128,6 @@ def test_frames_between_two_forces_are_near_what_pressing_gives() -> None:
     assert imprint.radius(8.0) == pytest.approx(imprint.radii[-1])
 
 
-@given(st.floats(0, 20), st.floats(1e-3, 10))
-def test_the_radius_grows_with_the_force(force: float, more: float) -> None:
-    imprint = Imprint(
-        np.zeros((FORCES + 1, 2, 2), np.float32), np.sqrt(np.arange(FORCES + 1.0)), 10.0, FINEST, None, 0.0
-    )
-    assert imprint.radius(force) <= imprint.radius(force + more) + 1e-9
-
-
 # --- Hard cases
 
 
@@ -145,20 +136,7 @@ def test_a_contact_over_the_whole_patch() -> None:
     assert imprint.radii[-1] == pytest.approx(30 / np.sqrt(np.pi), rel=0.01)
 
 
-def test_what_does_not_converge_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.scenes.contact.RESIDUAL", 1e-12)
-    with pytest.warns(NotConverged, match="residual"):
-        assert press(rough(0.02), 8.0, 1.0, PITCH, Method("layer", 32)).residual > 0
-
-
 # --- Springs
-
-
-@given(st.floats(1e-4, 1e4), st.floats(1e-4, 1e4))
-def test_springs_in_series(first: float, second: float) -> None:
-    both = series(first, second)
-    assert both == pytest.approx(1 / (1 / first + 1 / second))
-    assert both <= min(first, second)
 
 
 @settings(max_examples=25, deadline=None)
@@ -166,7 +144,9 @@ def test_springs_in_series(first: float, second: float) -> None:
 def test_springs_carry_the_force(body: str, force: float, modulus: float) -> None:
     gel, heights = Gel(), BODIES[body]
     springs = press_springs(heights.max() - heights, force, modulus, PITCH, gel)
-    pressure = series(gel.modulus, modulus) / gel.thickness * springs.overlap.astype(np.float64)
+    together = 1 / (1 / gel.modulus + 1 / modulus)
+    assert series(gel.modulus, modulus) == pytest.approx(together)
+    pressure = together / gel.thickness * springs.overlap.astype(np.float64)
     assert pressure.sum() * PITCH**2 == pytest.approx(force, rel=0.01)
     assert np.isfinite(hang_skin(springs, modulus, PITCH, gel)).all()
 

@@ -26,17 +26,10 @@ def test_what_is_written_is_read(tmp_path: Path, count: int, fps: float) -> None
         kinds = [frame.key_frame for frame in decoder.frames()]
         assert (decoder.header.frames, decoder.header.fps) == (count, fps)
     assert kinds == [n % KEY_EVERY == 0 for n in range(count)]
+    with av.open(str(path)) as container:
+        assert container.streams.video[0].codec_context.name == "mpeg4"
     error = np.stack(list(decode(path))).astype(int) - np.stack(frames(count))
     assert np.abs(error).mean() < 3, "colour is coded at half the resolution"
-
-
-def test_equal_frames_give_equal_files(tmp_path: Path) -> None:
-    paths = [tmp_path / name for name in ("a.avi", "b.avi")]
-    for path in paths:
-        write_film(path, frames(20), 25.0)
-    assert paths[0].read_bytes() == paths[1].read_bytes()
-    with av.open(str(paths[0])) as container:
-        assert container.streams.video[0].codec_context.name == "mpeg4"
 
 
 def test_an_unwritable_place_is_one_line(tmp_path: Path) -> None:

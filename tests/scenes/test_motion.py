@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.scenes import motion
 from pipeline.scenes.motion import (
     BEGUN,
     CENTRE_MM,
@@ -66,8 +65,7 @@ def test_times_and_places_are_those_that_were_measured() -> None:
 def test_the_force_falls_while_the_hand_twists() -> None:
     hand = make_motion(1000, np.random.default_rng(3))
     turning = np.flatnonzero(np.diff(hand.angle))
-    steps = np.diff(hand.force)[turning]
-    assert (steps <= 1e-12).all()
+    assert (np.diff(hand.force)[turning] <= 1e-12).all()
 
 
 def test_lengths_are_drawn_as_recorded() -> None:
@@ -75,9 +73,3 @@ def test_lengths_are_drawn_as_recorded() -> None:
     drawn = [draw_length(rng) for _ in range(2000)]
     assert set(drawn) == set(RECORDED)
     assert drawn.count(RECORDED[1]) / 2000 == pytest.approx(SLOW_SHARE, abs=0.03)
-
-
-@given(st.floats(0, 1))
-def test_a_ramp_and_its_inverse(share: float) -> None:
-    time = motion._ramp_inverse(share)
-    assert motion._ramp(np.array([time]), 0.0, 1.0)[0] == pytest.approx(share, abs=1e-9)

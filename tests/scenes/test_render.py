@@ -13,7 +13,6 @@ from pipeline.scenes.contact import GEL
 from pipeline.scenes.geometry import IMAGE_MM, Round
 from pipeline.scenes.light import make_sensor
 from pipeline.scenes.recipe import Recipe, load_recipes
-from pipeline.scenes.relief import Rough
 from pipeline.scenes.render import Scene, make_scene, measure_scene, render
 from pipeline.scenes.video import share_as_labelled, synthesize
 from pipeline.videos.catalogue import Catalogue
@@ -47,20 +46,6 @@ def test_every_tier_shows_a_contact(recipes: dict[str, Recipe], tier: str) -> No
     strongest = int(scene.motion.force.argmax())
     change = np.abs(frames.astype(int) - frames[0]).mean((1, 2, 3))
     assert change[strongest] > 2 * np.median(change[scene.motion.force == 0])
-
-
-def strongest_change(recipe: Recipe) -> np.ndarray:
-    """The fullest contact of a video less its first frame, in 8-bit steps."""
-    scene, frames = film(recipe, ScenesConfig(frames=12, width=160, height=120), 4)
-    return frames[int(scene.motion.force.argmax())].astype(int) - frames[0]
-
-
-def test_classes_look_different() -> None:
-    plain = strongest_change(PLAIN)
-    soft = strongest_change(PLAIN.model_copy(update={"modulus": 0.03}))
-    rough = strongest_change(PLAIN.model_copy(update={"relief": (Rough(kind="rough", rms=0.04, longest=0.8),)}))
-    assert np.abs(plain).mean() > 2 * np.abs(soft).mean()
-    assert np.abs(np.diff(rough, axis=1)).mean() > 1.6 * np.abs(np.diff(plain, axis=1)).mean()
 
 
 def test_a_scene_is_the_same_at_other_resolutions(recipes: dict[str, Recipe]) -> None:
@@ -104,17 +89,6 @@ def test_files_are_equal_for_equal_seeds(recipes: dict[str, Recipe], catalogue: 
         assert (video.frames, video.width, video.height, video.fps) == (8, 64, 48, 25.0)
 
 
-def test_a_file_shows_what_was_rendered(recipes: dict[str, Recipe], tmp_path: Path) -> None:
-    config = ScenesConfig(objects=("basket",), videos_per_object=1, frames=10, width=96, height=72)
-    (row,) = synthesize(recipes, config, tmp_path)
-    frames = np.stack(list(decode(tmp_path / row.video))).astype(int)
-    assert frames.shape == (10, 72, 96, 3)
-    change = np.abs(frames - frames[0]).mean((1, 2, 3))
-    assert change.max() > 3 * max(change[1], 0.5)
-    assert row.force > 0
-    assert row.error is not None
-
-
 def test_recorded_lengths_are_those_of_the_public_videos(recipes: dict[str, Recipe], tmp_path: Path) -> None:
     config = SMALL.model_copy(update={"frames": "recorded", "videos_per_object": 9, "width": 32, "height": 24})
     rows = synthesize(recipes, config, tmp_path)
@@ -126,7 +100,11 @@ def test_rows_say_what_scenes_measure_as(recipes: dict[str, Recipe], catalogue: 
     config = ScenesConfig(objects=("egg", "potato", "basket"), videos_per_object=1, frames=2, width=96, height=72)
     rows = synthesize(recipes, config, tmp_path)
     for row in rows:
-        assert len(list(decode(tmp_path / row.video))) == row.frames == 2, "two frames are enough"
+        first, last = (frame.astype(int) for frame in decode(tmp_path / row.video))  # Two frames are enough.
+        assert first.shape == (72, 96, 3)
+        assert np.abs(last - first).mean() > 1, "the press is seen"
+        assert (row.frames, row.error is None) == (2, False)
+        assert row.force > 0
         assert row.hardness == catalogue.labels(row.object_id)[catalogue.property_index("hardness")]
     share = share_as_labelled(rows, catalogue)
     agreeing = [(r.hardness, r.roughness, r.bumpiness) == catalogue.labels(r.object_id) for r in rows]

@@ -107,13 +107,6 @@ def test_pressure_and_gap_exclude_each_other(thickness: float | None) -> None:
     assert found.converged.all()
 
 
-def test_a_symmetric_body_has_a_symmetric_pressure() -> None:
-    solution, _ = press_ball(48, 1.0)
-    p = solution.pressure[0]
-    for other in (p.T, p[::-1], p[:, ::-1], np.rot90(p)):
-        np.testing.assert_allclose(p, other, atol=1e-6 * p.max())
-
-
 def test_moving_and_turning_the_body_moves_and_turns_the_pressure() -> None:
     side, pitch = 64, 0.1
     x, y = grid(side, pitch)
@@ -157,14 +150,15 @@ def test_stopping_early_is_said_with_the_residual() -> None:
     assert found.pressure[1].sum() * pitch**2 == pytest.approx(3.0)
 
 
-@pytest.mark.parametrize("force", [-1.0, float("nan"), float("inf")])
-def test_impossible_forces_are_refused(force: float) -> None:
-    with pytest.raises(ValueError, match="forces must be finite"):
-        solve(ball(8, 1.0), force, half_space(8, 1.0), 1.0)
-
-
-def test_a_gap_that_is_not_finite_is_refused() -> None:
-    gap = ball(8, 1.0)
-    gap[3, 3] = np.nan
-    with pytest.raises(ValueError, match="not finite"):
-        solve(gap, 1.0, half_space(8, 1.0), 1.0)
+@pytest.mark.parametrize(
+    ("force", "gap", "words"),
+    [
+        (-1.0, 0.0, "forces must be"),
+        (np.nan, 0.0, "forces must be"),
+        (np.inf, 0.0, "forces must be"),
+        (1.0, np.nan, "gap"),
+    ],
+)
+def test_impossible_forces_and_gaps_are_refused(force: float, gap: float, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        solve(ball(8, 1.0) + gap, force, half_space(8, 1.0), 1.0)
