@@ -27,12 +27,12 @@ def read_tower(folder: Path) -> VisionTransformer | None:
     Raises:
         UserError: for a broken configuration.
     """
-    import open_clip
-    import torch
-
     file = folder / CLIP_CONFIG
     if not file.is_file() and folder.name not in PUBLISHED_CLIP:
         return None
+    import open_clip
+    import torch
+
     form = read_form(file) if file.is_file() else {"model_cfg": open_clip.get_model_config(PUBLISHED_CLIP[folder.name])}
     try:
         model = form["model_cfg"]
@@ -54,12 +54,12 @@ def read_language(folder: Path) -> PreTrainedModel | None:
     Raises:
         UserError: for a broken configuration.
     """
-    import torch
-    from transformers import AutoConfig, AutoModelForCausalLM, LlamaConfig
-
     file = folder / LLM_CONFIG
     if not file.is_file() and folder.name not in PUBLISHED_LANGUAGE:
         return None
+    import torch
+    from transformers import AutoConfig, AutoModelForCausalLM, LlamaConfig
+
     try:
         if file.is_file():
             config = AutoConfig.from_pretrained(folder, local_files_only=True, trust_remote_code=False)
@@ -113,7 +113,7 @@ def first_words(error: object) -> str:
 
 PUBLISHED_CLIP = {"clip-vit-large-patch14": "ViT-L-14-quickgelu"}
 """By the folder's name: what open_clip calls OpenAI's model, whose configuration it ships."""
-VICUNA = {
+VICUNA: dict[str, Any] = {
     "model_type": "llama",
     "vocab_size": 32000,
     "max_position_embeddings": 4096,
@@ -122,8 +122,8 @@ VICUNA = {
 }
 SIZES = ("hidden_size", "intermediate_size", "num_hidden_layers", "num_attention_heads")
 PUBLISHED_LANGUAGE: dict[str, dict[str, Any]] = {
-    "vicuna-7b-v1.5": {**VICUNA, **dict(zip(SIZES, (4096, 11008, 32, 32), strict=True))},
-    "vicuna-13b-v1.5": {**VICUNA, **dict(zip(SIZES, (5120, 13824, 40, 40), strict=True))},
+    "vicuna-7b-v1.5": dict(zip(SIZES, (4096, 11008, 32, 32), strict=True)) | VICUNA,
+    "vicuna-13b-v1.5": dict(zip(SIZES, (5120, 13824, 40, 40), strict=True)) | VICUNA,
     "smollm2": {
         **dict(zip(SIZES, (576, 1536, 30, 9), strict=True)),
         "num_key_value_heads": 3,
