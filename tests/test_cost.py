@@ -15,7 +15,7 @@ from pipeline.core.errors import UserError
 from pipeline.scales import compose
 from pipeline.scales.cost import Hours, costs, measured_rate, work
 from pipeline.scales.memory import Lengths, count
-from pipeline.weights.shapes import Llama
+from pipeline.weights.shapes import read_language
 from tests.checkpoints import write_llama
 
 ONE = (
@@ -33,14 +33,13 @@ def test_a_training_s_operations_are_torch_s_own_count(tmp_path: Path) -> None:
     folder = write_llama(tmp_path / "llama", hidden_size=128, intermediate_size=320, num_hidden_layers=3)
     model = LlamaForCausalLM.from_pretrained(folder, dtype=torch.float32)
     model.requires_grad_(False)
-    llama = Llama.read(folder)
-    assert llama is not None
+    shapes = read_language(folder)
     tokens = 24
     embedded = model.get_input_embeddings()(torch.zeros(1, tokens, dtype=torch.long)).requires_grad_()
     with FlopCounterMode(display=False) as counter:
         model.model(inputs_embeds=embedded).last_hidden_state.sum().backward()
     lengths = Lengths(tokens, 0, 0, mean_training=tokens, mean_answer=0, mean_prompt=0)
-    found = work(compose("smoke", ONE), llama, lengths, None, 0)
+    found = work(compose("smoke", ONE), shapes, lengths, None, 0)
     aligned = next(h for h in found if h.stage == "align")
     assert aligned.work == pytest.approx(counter.get_total_flops(), rel=0.1)
 

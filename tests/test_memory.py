@@ -15,19 +15,29 @@ from peft import LoraConfig, get_peft_model
 from torch import nn
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
-from transformers import DynamicCache, LlamaConfig, LlamaForCausalLM
+from transformers import DynamicCache, LlamaForCausalLM
 
 from pipeline.core.errors import UserError
 from pipeline.encoder.vpt import VisualPrompts
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.scales import compose
-from pipeline.scales.memory import ADAM, GIB, Lengths, Use, count, language_saved, launched, table
-from pipeline.weights.shapes import PUBLISHED_LANGUAGE, PUBLISHED_VISION, Llama, Vision
+from pipeline.scales.memory import (
+    ADAM,
+    GIB,
+    Lengths,
+    Use,
+    adapted,
+    adapters,
+    count,
+    language_kept,
+    language_uses,
+    launched,
+    table,
+    tower_kept,
+)
+from pipeline.weights.shapes import parameters, read_language, read_tower
 from tests.checkpoints import write_clip, write_llama
 from tests.closure import ROOT
-
-LINEAR = ("q_proj", "k_proj", "v_proj", "o_proj", "gate_proj", "up_proj", "down_proj")
-ROWS, LENGTH, RANK = 2, 60, 8
 
 
 @pytest.fixture(autouse=True)
@@ -51,134 +61,118 @@ def kept(run: Callable[[], torch.Tensor], modules: Iterable[nn.Module]) -> int:
     return sum(tensor.untyped_storage().nbytes() for tensor in seen.values())
 
 
-def llama(keys: int) -> tuple[LlamaForCausalLM, Llama]:
-    form = LlamaConfig(
-        hidden_size=64,
-        intermediate_size=160,
-        num_hidden_layers=3,
-        num_attention_heads=4,
-        num_key_value_heads=keys,
-        vocab_size=100,
-    )
-    return LlamaForCausalLM(form).requires_grad_(False), Llama(64, 160, 3, 4, 100, keys, 16)
-
-
-def tower_of(shape: Vision) -> open_clip.transformer.VisionTransformer:
-    """Frozen, with fresh weights."""
+def tower_of(layers: int, width: int, heads: int, *, quick: bool = True, **sides: int) -> Any:
+    """open_clip's, frozen, with fresh weights."""
     tower = open_clip.transformer.VisionTransformer(
-        image_size=shape.image_size,
-        patch_size=shape.patch_size,
-        width=shape.width,
-        layers=shape.layers,
-        heads=shape.width // shape.head_width,
+        width=width,
+        layers=layers,
+        heads=heads,
         mlp_ratio=4.0,
-        output_dim=shape.embed_dim,
-        act_layer=open_clip.transformer.QuickGELU if shape.quick_gelu else nn.GELU,
+        act_layer=open_clip.transformer.QuickGELU if quick else nn.GELU,
+        **sides,
     )
     return tower.requires_grad_(False).eval()
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-@pytest.mark.parametrize("dropout", [0.0, 0.1])
-@pytest.mark.parametrize("targets", [(), LINEAR[:2], LINEAR[3:], LINEAR])
-@pytest.mark.parametrize("keys", [4, 2])
-def test_a_llama_keeps_what_is_counted(keys: int, targets: tuple[str, ...], dropout: float, dtype: torch.dtype) -> None:
-    model, shape = llama(keys)
-    assert shape.parameters == sum(p.numel() for p in model.parameters())
-    body: nn.Module = model.to(dtype)
-    size = dtype.itemsize
-    expected = 3 * shape.saved_layer(size)
-    if targets:
-        body = get_peft_model(model, LoraConfig(r=RANK, lora_dropout=dropout, target_modules=list(targets)))
-        adapters = [p for p in body.parameters() if p.requires_grad]
-        assert shape.adapters(targets, RANK) == sum(p.numel() for p in adapters)
-        for parameter in adapters:
-            parameter.data = parameter.data.float()
-        expected += 3 * shape.saved_adapters(targets, RANK, size, dropout > 0)
-        if dropout:
-            # A GPU remembers what is dropped in one byte, a CPU in four.
-            expected += 3 * 3 * sum(shape.linear[t][0] for t in targets)
-    start = torch.randn(ROWS, LENGTH, 64, dtype=dtype, requires_grad=True)
-    found = kept(lambda: model.model(inputs_embeds=start * 1, use_cache=False).last_hidden_state, [body.train()])
-    assert found == pytest.approx(ROWS * LENGTH * (expected + 4 * 65), rel=0.01)
 
 
 @pytest.mark.parametrize("quick", [True, False])
 @pytest.mark.parametrize("autocast", [False, True])
 def test_a_tower_with_prompts_keeps_what_is_counted(autocast: bool, quick: bool) -> None:
-    shape = Vision(3, 64, patch_size=4, image_size=32, embed_dim=24, head_width=16, quick_gelu=quick)
-    tower = tower_of(shape)
-    assert shape.parameters == sum(p.numel() for p in tower.parameters())
+    tower = tower_of(3, 64, 4, quick=quick, patch_size=4, image_size=32, output_dim=24)
     prompts = VisualPrompts(3, 5, 64, 48)
     prompts.attach(tower)
 
     def run() -> torch.Tensor:
         with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
-            return tower(torch.randn(6, 3, 32, 32))
+            found: torch.Tensor = tower(torch.randn(6, 3, 32, 32))
+        return found
 
-    expected = shape.saved(6, 5, 2 if autocast else 4)
+    expected, _ = tower_kept(tower, 6, 5, 2 if autocast else 4)
     if autocast:
         # A GPU's autocast normalises in float32, a CPU's in the format that comes.
-        expected -= 6 * (shape.tokens + 5) * 64 * 2 * (2 * 3 + 1)
+        expected -= 6 * (65 + 5) * 64 * 2 * (2 * 3 + 1)
     assert kept(run, [tower, prompts]) == pytest.approx(expected, rel=0.015)
 
 
-@pytest.mark.parametrize(("stage", "words"), [("align", False), ("align", True), ("lora", False), ("lora", True)])
-def test_a_whole_training_step_keeps_what_is_counted(stage: str, words: bool, tmp_path: Path) -> None:
-    weights = write_llama(tmp_path, hidden_size=64, intermediate_size=160, num_hidden_layers=3)
-    params = compose(
-        "smoke",
-        [f"language.weights={weights}", "lora.rank=8", "lora.dropout=0", "align.micro_batch_size=2"],
-        ROOT / "conf",
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+@pytest.mark.parametrize(
+    ("stage", "words", "targets", "dropout", "keys"),
+    [
+        ("align", False, "all-linear", 0.0, 2),
+        ("align", True, "all-linear", 0.0, 4),
+        ("lora", False, "[q_proj,k_proj]", 0.0, 2),
+        ("lora", False, "[q_proj,k_proj]", 0.1, 4),
+        ("lora", False, "[o_proj,up_proj]", 0.0, 4),
+        ("lora", False, "all-linear", 0.1, 2),
+        ("lora", True, "all-linear", 0.0, 2),
+    ],
+)
+def test_a_training_step_keeps_what_is_counted(
+    stage: str, words: bool, targets: str, dropout: float, keys: int, dtype: str, tmp_path: Path
+) -> None:
+    weights = write_llama(
+        tmp_path, hidden_size=64, intermediate_size=160, num_hidden_layers=3, num_key_value_heads=keys
     )
-    config, shape = getattr(params, stage), Llama.read(weights)
-    assert shape is not None
-    model = OctopiForCausalLM.from_base(weights, 6)
+    lora = [f"lora.target_modules={targets}", "lora.rank=8", f"lora.dropout={dropout}"]
+    params = compose(
+        "smoke", [f"language.weights={weights}", f"language.dtype={dtype}", "align.micro_batch_size=2", *lora]
+    )
+    config, shapes = getattr(params, stage), read_language(weights)
+    assert shapes is not None
+    model = OctopiForCausalLM.from_base(weights, 6, dtype=params.language.dtype)
+    assert parameters(shapes) == parameters(model.llm)
+    rows, length, learnt = config.micro_batch_size, 120, 40
+    expected = language_kept(params, shapes, config, Lengths(length, learnt, 0))
     if words:
         model.train_words()
     if stage == "lora":
-        model.llm = get_peft_model(model.llm, LoraConfig(r=8, target_modules=list(config.target_modules)))
-    rows, learnt = config.micro_batch_size, 40
-    ids = torch.randint(4, 200, (rows, 120), generator=torch.manual_seed(0))
+        wanted = targets if targets == "all-linear" else list(config.target_modules)
+        form = LoraConfig(r=8, lora_dropout=dropout, target_modules=wanted, task_type="CAUSAL_LM")
+        model.llm = get_peft_model(model.llm, form)
+        trained = [p for name, p in model.llm.named_parameters() if "lora_" in name]
+        assert adapters(shapes, config) == sum(p.numel() for p in trained)
+        for parameter in trained:
+            parameter.data = parameter.data.float()
+        # A GPU remembers what is dropped in one byte, a CPU in four.
+        ends = adapted(shapes, config.target_modules).values()
+        expected += 3 * rows * length * 3 * sum(a for a, _ in ends) if dropout else 0
+    ids = torch.randint(4, 200, (rows, length), generator=torch.manual_seed(0))
     ids[:, 5:10] = model.frame_id
     labels = torch.full_like(ids, -100)
     labels[:, -learnt:] = ids[:, -learnt:]
     found = kept(lambda: model.train()(ids, torch.randn(rows, 5, 6), labels=labels).loss, [model])
-    assert found == pytest.approx(language_saved(params, shape, config, Lengths(120, learnt, 0)), rel=0.03)
+    assert found == pytest.approx(expected, rel=0.03)
 
 
-def test_an_optimizer_and_a_cache_hold_what_is_counted() -> None:
-    model, shape = llama(2)
+def test_an_optimizer_and_a_cache_hold_what_is_counted(tmp_path: Path) -> None:
+    weights = write_llama(tmp_path)
+    model = LlamaForCausalLM.from_pretrained(weights, dtype=torch.float32)
     part = model.model.layers[0].requires_grad_(True)
-    model(torch.ones(ROWS, 7, dtype=torch.long)).logits.sum().backward()
+    model(torch.ones(2, 7, dtype=torch.long)).logits.sum().backward()
     optimizer = torch.optim.AdamW(part.parameters())
     optimizer.step()
     means = [v for s in optimizer.state.values() for k, v in s.items() if k != "step"]
     tensors = [*means, *(p.grad for p in part.parameters() if p.grad is not None)]
     assert sum(t.nbytes for t in tensors) == ADAM * sum(p.numel() for p in part.parameters())
     cache = DynamicCache(config=model.config)
-    model(torch.ones(ROWS, 7, dtype=torch.long), past_key_values=cache)
-    assert sum(layer.keys.nbytes + layer.values.nbytes for layer in cache.layers) == shape.cache(ROWS * 7, 4)
+    model(torch.ones(2, 7 + 8, dtype=torch.long), past_key_values=cache)
+    params = compose("smoke", ["language.generation_batch_size=2", "language.max_new_tokens=8"])
+    *_, answer = language_uses(params, model, 6, Lengths(0, 0, prompt=7))
+    assert sum(layer.keys.nbytes + layer.values.nbytes for layer in cache.layers) == answer.cache
 
 
 def test_published_models_have_their_published_sizes() -> None:
-    towers = {name: Vision(**form) for name, form in PUBLISHED_VISION.items()}
-    (large,) = towers.values()
+    large = read_tower(Path("nowhere/clip-vit-large-patch14"))
+    assert large is not None
     # transformers' CLIPVisionModelWithProjection of openai/clip-vit-large-patch14.
-    assert large.parameters == 303_966_208
+    assert parameters(large) == 303_966_208
     # Counted before, by hooks, at true shapes: 32 videos of five frames with eight prompts.
-    assert large.saved(160, 8, 4) / GIB == pytest.approx(54.6, rel=0.01)
-    sizes = {}
-    for name in PUBLISHED_LANGUAGE:
-        shape = Llama.read(Path("nowhere") / name)
-        assert shape is not None
-        sizes[name] = shape.parameters
+    assert tower_kept(large, 160, 8, 4)[0] / GIB == pytest.approx(54.6, rel=0.01)
     # Those of Llama 2 (Touvron et al. 2023), which Vicuna v1.5 was tuned from; and of what data/weights/smollm2 holds.
-    assert sizes == {
-        "vicuna-7b-v1.5": 6_738_415_616,
-        "vicuna-13b-v1.5": 13_015_864_320,
-        "smollm2": 134_515_008,
-    }
+    sizes = {"vicuna-7b-v1.5": 6_738_415_616, "vicuna-13b-v1.5": 13_015_864_320, "smollm2": 134_515_008}
+    for name, size in sizes.items():
+        model = read_language(Path("nowhere") / name)
+        assert model is not None
+        assert parameters(model) == size
 
 
 class Held(TorchDispatchMode):
@@ -205,26 +199,24 @@ class Held(TorchDispatchMode):
 
 def test_what_passes_is_counted_too() -> None:
     """Forward and backward through a tower: the largest sum of all tensors that exist at once, its weights aside."""
-    shape = Vision(8, 256, patch_size=16, image_size=224, embed_dim=64, head_width=64, quick_gelu=True)
-    tower = tower_of(shape)
+    tower = tower_of(8, 256, 4, patch_size=16, image_size=224, output_dim=64)
     VisualPrompts(8, 8, 256, 768).attach(tower)
     with Held() as held:
         for parameter in tower.parameters():
             parameter.view(-1)
         weights = held.now
         tower(torch.zeros(8, 3, 224, 224)).sum().backward()
-    expected = shape.saved(8, 8, 4) + shape.passing(8, 8, 4)
-    assert held.most - weights == pytest.approx(expected, rel=0.05)
-    assert shape.saved(8, 8, 4) * 1.05 < held.most - weights, "what is kept alone is less"
+    alone, passing = tower_kept(tower, 8, 8, 4)
+    assert held.most - weights == pytest.approx(alone + passing, rel=0.05)
+    assert alone * 1.05 < held.most - weights, "what is kept alone is less"
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 @pytest.mark.parametrize("autocast", [False, True])
 def test_a_gpu_takes_what_is_counted(autocast: bool) -> None:
     """CLIP ViT-L/14 at its true shapes, four videos of five frames."""
-    shape, size = Vision(**PUBLISHED_VISION["clip-vit-large-patch14"]), 2 if autocast else 4
     with torch.device("cuda"):
-        tower = tower_of(shape)
+        tower = tower_of(24, 1024, 16, patch_size=14, image_size=224, output_dim=768)
         prompts = VisualPrompts(24, 8, 1024, 588)
         frames = torch.zeros(20, 3, 224, 224)
     prompts.attach(tower)
@@ -233,16 +225,8 @@ def test_a_gpu_takes_what_is_counted(autocast: bool) -> None:
     with torch.autocast("cuda", torch.bfloat16, enabled=autocast):
         loss = tower(frames).sum()
     loss.backward()
-    expected = shape.saved(20, 8, size) + shape.passing(20, 8, size)
+    expected = sum(tower_kept(tower, 20, 8, 2 if autocast else 4))
     assert torch.cuda.max_memory_allocated() - before == pytest.approx(expected, rel=0.15)
-
-
-def test_all_linear_maps_are_those_that_peft_adapts() -> None:
-    model, shape = llama(2)
-    adapted = get_peft_model(model, LoraConfig(r=RANK, target_modules="all-linear", task_type="CAUSAL_LM"))
-    assert shape.adapters("all-linear", RANK) == sum(p.numel() for p in adapted.parameters() if p.requires_grad) > 0
-    for dropout in (True, False):
-        assert shape.saved_adapters("all-linear", RANK, 4, dropout) == shape.saved_adapters(LINEAR, RANK, 4, dropout)
 
 
 def test_launchers_are_read() -> None:

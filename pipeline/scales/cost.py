@@ -9,16 +9,31 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from pipeline.config import Params
 from pipeline.core.errors import UserError, counted, did_you_mean
-from pipeline.scales.memory import BYTES, GIB, Lengths, Use, embedding_length, launched, longest
+from pipeline.scales.memory import (
+    BYTES,
+    FULL,
+    GIB,
+    Lengths,
+    Use,
+    adapters,
+    connector_parameters,
+    embedding_length,
+    launched,
+    longest,
+)
 from pipeline.scenes.invented import catalogue_of
 from pipeline.tasks.questions import counts_by_task
 from pipeline.videos.files import list_videos
 from pipeline.weights import DOWNLOADED
-from pipeline.weights.shapes import FULL, Llama, Vision
+from pipeline.weights.shapes import layers, parameters, read_language, read_tower
+
+if TYPE_CHECKING:
+    from open_clip.transformer import VisionTransformer
+    from transformers import PreTrainedModel
 
 GB = 1e9
 
@@ -55,22 +70,23 @@ def costs(params: Params, uses: list[Use], card: str = "") -> list[str]:
     """
     known = find_card(card) if card else None
     catalogue, place = catalogue_of(params), Path(params.data.dir)
-    tower, llama = Vision.read(Path(params.encoder.weights)), Llama.read(Path(params.language.weights))
-    lengths = longest(params, catalogue, Path(params.language.weights)) if llama else None
+    tower, llm = read_tower(Path(params.encoder.weights)), read_language(Path(params.language.weights))
+    lengths = longest(params, catalogue, Path(params.language.weights)) if llm is not None else None
     if params.data.source == "scenes":
         videos = len(params.scenes.objects or catalogue.objects) * params.scenes.videos_per_object
     else:
         videos = len(list_videos(place, catalogue).files) if place.is_dir() else 0
-    hidden = llama.hidden_size if llama else 0
-    embedding = embedding_length(params.encoder, tower) if tower else hidden
+    embedding = 0 if llm is None else llm.config.hidden_size
+    if tower is not None:
+        embedding = embedding_length(params.encoder, tower)
     if params.encoder.embedding == "logits":
         embedding = sum(len(p.levels) for p in catalogue.properties)
     return [
         *downloads(params),
-        *disk(params, llama, embedding, videos),
-        *describe(work(params, llama, lengths, tower, videos), params, card),
+        *disk(params, llm, embedding, videos),
+        *describe(work(params, llm, lengths, tower, videos), params, card),
         *(fits(uses, known.gib) if known else ()),
-        *host(params, llama),
+        *host(params, llm),
     ]
 
 
@@ -94,34 +110,35 @@ class Hours(NamedTuple):
 
 
 def work(
-    params: Params, llama: Llama | None, lengths: Lengths | None, tower: Vision | None, videos: int
+    params: Params, llm: PreTrainedModel | None, lengths: Lengths | None, tower: VisionTransformer | None, videos: int
 ) -> list[Hours]:
     """Count the stages' operations; `videos` is how many there are, 0 where that is not known."""
     found = []
     encoder, seeds, variants = params.encoder, len(params.ablation.seeds), params.ablation.variants()
-    if tower and videos:
-        picture = 2 * tower.parameters * (tower.tokens + encoder.prompts)
+    if tower is not None and videos:
+        picture = 2 * parameters(tower) * (len(tower.positional_embedding) + encoder.prompts)
         shown = videos * params.frames.per_video
         if encoder.recipe in ("paper", "release"):
             found.append(Hours("finetune_encoder", seeds, 2 * seeds * encoder.epochs * shown * picture))
         flips = 4 if encoder.flip_probability else 1
         found.append(Hours("embed", seeds, seeds * len(params.ablation.encoders) * flips * shown * picture))
-    if llama and lengths:
-        forward = 2 * (llama.parameters - llama.words)
+    if llm is not None and lengths:
+        inside = parameters(layers(llm))
+        forward, outside = 2 * inside, parameters(llm) - inside
         back = forward * (2 if params.runtime.gradient_checkpointing else 1)
         aligned = len({(v.encoder, v.opd, v.seed) for v in variants})
         adapted = sum(v.lora == "with" for v in variants)
         for stage, runs, config in (("align", aligned, params.align), ("lora", adapted, params.lora)):
             tokens = runs * config.samples * config.epochs * lengths.mean_training
             learnt = runs * config.samples * config.epochs * lengths.mean_answer
-            found.append(Hours(stage, runs, tokens * (forward + back) + learnt * 6 * llama.words))
+            found.append(Hours(stage, runs, tokens * (forward + back) + learnt * 6 * outside))
         asked = len(variants) * sum(counts_by_task(params.questions, "evaluation").values())
         asked += len(params.ablation.touch) * seeds * sum(counts_by_task(params.questions, "evaluation").values())
         said = asked * lengths.mean_answer
-        weights = llama.parameters * BYTES[params.language.dtype]
+        weights = parameters(llm) * BYTES[params.language.dtype]
         batch = params.language.generation_batch_size
         tokens = asked * lengths.mean_prompt + said
-        found.append(Hours("answer", len(variants), tokens * forward + 2 * said * llama.words, said / batch * weights))
+        found.append(Hours("answer", len(variants), tokens * forward + 2 * said * outside, said / batch * weights))
     return found
 
 
@@ -151,11 +168,11 @@ def _round(number: float) -> str:
     return f"{number:.0f}" if number >= 10 else f"{number:.2g}"
 
 
-def host(params: Params, llama: Llama | None) -> Iterator[str]:
+def host(params: Params, llm: PreTrainedModel | None) -> Iterator[str]:
     """What sharded training needs of the machine itself: every process reads all weights before it keeps its share."""
     devices, sharded = launched(params.runtime.launcher)
-    if llama and sharded:
-        each = llama.parameters * BYTES[params.language.dtype] / GB
+    if llm is not None and sharded:
+        each = parameters(llm) * BYTES[params.language.dtype] / GB
         yield (
             f"Host memory: each of {devices} processes loads the whole language model ({each:.3g} GB) before it keeps "
             f"its share, {devices * each:.3g} GB together."
@@ -187,24 +204,22 @@ def downloads(params: Params) -> Iterator[str]:
     for folder in (Path(params.encoder.weights), Path(params.language.weights)):
         found = next((d for d in DOWNLOADED.values() if d.folder == folder.name), None)
         if found and not folder.is_dir():
-            llama = Llama.read(folder)
-            size = f", {llama.parameters * 2 / GB:.0f} GB" if llama else ", 1.7 GB, its text tower included"
+            llm = read_language(folder)
+            size = f", {parameters(llm) * 2 / GB:.0f} GB" if llm is not None else ", 1.7 GB, its text tower included"
             yield f"Download: {found.repository}{size}, to {folder} (README, section Real weights)."
     if params.data.source == "videos" and not Path(params.data.dir).is_dir():
         yield f"Videos: {params.data.dir} is not there (README, section Real videos)."
 
 
-def disk(params: Params, llama: Llama | None, embedding: int, videos: int) -> Iterator[str]:
+def disk(params: Params, llm: PreTrainedModel | None, embedding: int, videos: int) -> Iterator[str]:
     """What the chain writes of its own: embeddings, trained models, and the checkpoints of the one that trains."""
     shown = videos * params.frames.per_video * FULL * embedding * (4 if params.encoder.flip_probability else 1)
     embedded = shown * len(params.ablation.encoders) * len(params.ablation.seeds)
     parts = [f"embeddings {_round(embedded / GB)}" if videos else "embeddings not known without the videos"]
     total = embedded
-    if llama:
-        hidden = llama.hidden_size
-        words = llama.vocab_size * hidden if params.align.train_embeddings == "all" else 0
-        connector = (embedding + 1) * hidden + (hidden + 1) * hidden + words
-        trained = connector + llama.adapters(params.lora.target_modules, params.lora.rank)
+    if llm is not None:
+        connector = sum(connector_parameters(params, llm, embedding))
+        trained = connector + adapters(llm, params.lora)
         variants = params.ablation.variants()
         aligned = len({(v.encoder, v.opd, v.seed) for v in variants})
         models = FULL * (trained * sum(v.lora == "with" for v in variants) + connector * aligned)

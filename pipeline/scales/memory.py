@@ -2,7 +2,7 @@
 
 Counted are weights, what training adds to them, the values that a backward pass reads again, the widest passing values,
 and the keys and values of an answer in the making. Not counted are the CUDA context, fragments, and the kernels' own
-rooms: a GiB or two on a card.
+rooms: a GiB or two on a card. Tests hold what is kept to what autograd keeps.
 """
 
 from __future__ import annotations
@@ -10,22 +10,29 @@ from __future__ import annotations
 import argparse
 import shlex
 from collections.abc import Iterator, Sequence
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import yaml
 
 from pipeline.config import EncoderConfig, LoraTrainConfig, Params, TrainConfig
 from pipeline.core.errors import UserError
-from pipeline.core.records import Dialogue, Part, Question, Turn
+from pipeline.core.records import Part, Question, Turn
 from pipeline.scenes.invented import catalogue_of
 from pipeline.tasks.base import Pool
 from pipeline.tasks.questions import build_questions, counts_by_task
 from pipeline.videos.catalogue import Catalogue
 from pipeline.weights.check import TOKENIZER, read_tokenizer
-from pipeline.weights.shapes import FULL, Llama, Vision
+from pipeline.weights.shapes import layers, linear, parameters, read_language, read_tower
+
+if TYPE_CHECKING:
+    from open_clip.transformer import VisionTransformer
+    from transformers import PreTrainedModel
 
 GIB = 2**30
+FULL = 4
+"""Bytes of a float32 value."""
 BYTES = {"auto": 4, "float32": 4, "bfloat16": 2, "float16": 2}
 """Bytes a value; for `auto` the most, since its format depends on the device."""
 NF4 = 0.5 + 1 / 64 + 4 / (64 * 256)
@@ -34,6 +41,8 @@ ADAM = 3 * FULL
 """Bytes a trained value besides its own: its gradient, and Adam's two means."""
 GATHERED = 2
 """Layers whose weights a sharded training holds whole: the one that computes and the one that is fetched."""
+READ_TOGETHER = ({"q_proj", "k_proj", "v_proj"}, {"gate_proj", "up_proj"}, {"down_proj"})
+"""Linear maps that read one tensor, which a frozen layer does not keep; what `o_proj` reads, attention keeps anyway."""
 ASKED = 30
 """Questions of each task that the longest is looked for among."""
 LETTERS = 4
@@ -59,8 +68,7 @@ class Use:
         return self.parameters + self.optimizer + self.activations + self.cache
 
 
-@dataclass(frozen=True)
-class Lengths:
+class Lengths(NamedTuple):
     """Tokens of the longest conversations, and the mean over all."""
 
     training: int
@@ -77,121 +85,172 @@ class Lengths:
 def count(params: Params) -> tuple[list[Use], list[str]]:
     """Count all stages that run a base model; the sentences say what was assumed or left out."""
     catalogue = catalogue_of(params)
+    encoder, language = Path(params.encoder.weights), Path(params.language.weights)
+    tower, llm = read_tower(encoder), read_language(language)
     uses: list[Use] = []
-    notes: list[str] = ["language.dtype is auto: counted as float32."] if params.language.dtype == "auto" else []
-    tower, encoder = Vision.read(Path(params.encoder.weights)), Path(params.encoder.weights)
-    if tower is None:
-        notes.append(f"{encoder}: no open_clip model whose shapes are known; the encoder's stages are not counted.")
-    else:
-        if not encoder.is_dir():
-            notes.append(f"{encoder} is not there: counted with the shapes that are published for {encoder.name}.")
+    notes = ["language.dtype is auto: counted as float32."] if params.language.dtype == "auto" else []
+    for folder, model, kind, stages in (
+        (encoder, tower, "open_clip model", "encoder's"),
+        (language, llm, "Llama", "language model's"),
+    ):
+        if model is None:
+            notes.append(f"{folder}: no {kind} whose shapes are known; the {stages} stages are not counted.")
+        elif not folder.is_dir():
+            notes.append(f"{folder} is not there: counted with the shapes that are published for {folder.name}.")
+    if tower is not None:
         uses += encoder_uses(params, tower, sum(len(p.levels) for p in catalogue.properties))
-    language = Path(params.language.weights)
-    llama = Llama.read(language)
-    if llama is None:
-        notes.append(f"{language}: no Llama whose shapes are known; the language model's stages are not counted.")
-        return uses, notes
-    if not language.is_dir():
-        notes.append(f"{language} is not there: counted with the shapes that are published for {language.name}.")
-    lengths = longest(params, catalogue, language)
-    if not (language / TOKENIZER).is_file():
-        notes.append(f"Without its tokenizer, a token is taken for {LETTERS} letters.")
-    notes.append(
-        f"Longest conversation {lengths.training} tokens, {lengths.answer} of them learnt; longest question "
-        f"{lengths.prompt}, answered in at most {params.language.max_new_tokens}."
-    )
-    embedding = embedding_length(params.encoder, tower) if tower else llama.hidden_size
-    return [*uses, *language_uses(params, llama, embedding, lengths)], notes
+    if llm is not None:
+        lengths = longest(params, catalogue, language)
+        if not (language / TOKENIZER).is_file():
+            notes.append(f"Without its tokenizer, a token is taken for {LETTERS} letters.")
+        notes.append(
+            f"Longest conversation {lengths.training} tokens, {lengths.answer} of them learnt; longest question "
+            f"{lengths.prompt}, answered in at most {params.language.max_new_tokens}."
+        )
+        embedding = llm.config.hidden_size if tower is None else embedding_length(params.encoder, tower)
+        uses += language_uses(params, llm, embedding, lengths)
+    return uses, notes
 
 
-def embedding_length(config: EncoderConfig, tower: Vision) -> int:
+def embedding_length(config: EncoderConfig, tower: VisionTransformer) -> int:
     """Values of a frame's embedding as the language model gets it."""
     whole = config.recipe == "release" or (config.recipe == "paper" and config.embedding == "class_token")
-    return tower.width if whole else tower.embed_dim
+    return int(tower.transformer.width if whole else tower.output_dim)
 
 
-def encoder_uses(params: Params, tower: Vision, classes: int) -> Iterator[Use]:
+def layer_kept(width: int, heads: int, keys: int, queries: int, wide: int, statistics: int, size: int) -> int:
+    """Bytes a token that autograd keeps of a frozen transformer layer; `size` is that of a computed value.
+
+    Two norms keep what they read and their statistics, in float32; attention its queries and its outcome, its keys and
+    values, and a sum a head; the wide part its factors.
+    """
+    return 2 * (width + statistics) * FULL + 2 * (queries + keys) * size + heads * FULL + wide * size
+
+
+def tower_kept(tower: VisionTransformer, frames: int, prompts: int, size: int) -> tuple[int, int]:
+    """Bytes that a training forward through a frozen tower keeps, and those that come and go at its widest place.
+
+    Args:
+        frames: Pictures at a time.
+        prompts: Tokens beside a picture's own at each layer.
+        size: Bytes of the value that linear layers compute in; below 4 it is autocast.
+    """
+    from open_clip.transformer import QuickGELU
+
+    blocks, width = layers(tower), tower.transformer.width
+    first: Any = blocks[0]
+    wide, tokens = int(first.mlp.c_fc.out_features), frames * (len(tower.positional_embedding) + prompts)
+    # x sigmoid(1.702 x) is a product: both factors are kept.
+    factors = 2 if isinstance(first.mlp.gelu, QuickGELU) else 1
+    layer = layer_kept(width, first.attn.num_heads, width, width, factors * wide, 2, size)
+    # Autocast makes copies of the frozen weights, and the derivatives keep them.
+    copies = size * sum(p.numel() for p in blocks.parameters() if p.ndim > 1) if size < FULL else 0
+    return tokens * (len(blocks) * layer + (width + 2) * FULL) + copies, 4 * tokens * wide * size
+
+
+def encoder_uses(params: Params, tower: VisionTransformer, classes: int) -> Iterator[Use]:
     """Fine-tuning by gradients (recipes `paper` and `release`), and embedding; `classes` counts all properties'."""
-    config, frames = params.encoder, params.frames.per_video
+    config, frames, width = params.encoder, params.frames.per_video, tower.transformer.width
     if config.recipe in ("paper", "release"):
-        layers = min(tower.layers, config.prompt_layers or tower.layers)
-        trained = layers * config.prompts * tower.width
+        trained = min(len(layers(tower)), config.prompt_layers or len(layers(tower))) * config.prompts * width
         if config.recipe == "paper":
-            trained += (tower.width + 1) * tower.width + (embedding_length(config, tower) + 1) * classes
+            trained += (width + 1) * width + (embedding_length(config, tower) + 1) * classes
         else:
-            trained += (tower.width + 1) * 512 + 513 * classes
+            trained += (width + 1) * 512 + 513 * classes
         pictures = frames * min(config.micro_batch_size or config.batch_size, config.batch_size)
         size = BYTES["bfloat16" if config.autocast == "bfloat16" else "float32"]
         yield Use(
             "finetune_encoder",
             1,
-            parameters=FULL * (tower.parameters + trained),
+            parameters=FULL * (parameters(tower) + trained),
             optimizer=ADAM * trained,
-            activations=tower.saved(pictures, config.prompts, size) + tower.passing(pictures, config.prompts, size),
+            activations=sum(tower_kept(tower, pictures, config.prompts, size)),
         )
-    passing = tower.passing(config.embed_batch_size, config.prompts, FULL)
-    yield Use("embed", 1, parameters=FULL * tower.parameters, optimizer=0, activations=passing)
+    _, passing = tower_kept(tower, config.embed_batch_size, config.prompts, FULL)
+    yield Use("embed", 1, parameters=FULL * parameters(tower), optimizer=0, activations=passing)
 
 
-def language_uses(params: Params, llama: Llama, embedding: int, lengths: Lengths) -> Iterator[Use]:
+def language_uses(params: Params, llm: PreTrainedModel, embedding: int, lengths: Lengths) -> Iterator[Use]:
     """Alignment, LoRA and answering; `embedding` is the length of a tactile one."""
-    language, hidden = params.language, llama.hidden_size
-    size = BYTES[language.dtype]
-    linear = llama.num_hidden_layers * llama.layer_linear
+    language, hidden, maps = params.language, llm.config.hidden_size, linear(llm)
+    size, middle, blocks = BYTES[language.dtype], maps["down_proj"][0], len(layers(llm))
     held = NF4 if language.quantization == "nf4" else size
-    frozen = linear * held + (llama.parameters - linear) * size
-    connector = (embedding + 1) * hidden + (hidden + 1) * hidden + 2 * hidden
-    adapters = llama.adapters(params.lora.target_modules, params.lora.rank)
-    # A copy beside the frozen ones, which a tied head still needs.
-    words = llama.vocab_size * hidden if params.align.train_embeddings == "all" else 0
+    # Linear maps alone are held in four bits.
+    layer = sum(a * b for a, b in maps.values())
+    frozen = blocks * layer * held + (parameters(llm) - blocks * layer) * size
+    connector, words = connector_parameters(params, llm, embedding)
+    adapted = adapters(llm, params.lora)
     devices, sharded = launched(params.runtime.launcher)
+    shards = devices if sharded else 1
     trainings: tuple[tuple[str, TrainConfig, int], ...] = (
         ("align", params.align, connector + words),
-        ("lora", params.lora, connector + words + adapters),
+        ("lora", params.lora, connector + words + adapted),
     )
+    outside = parameters(llm) - parameters(layers(llm))
+    gathered = GATHERED * layer * held + outside * size + FULL * (connector + words) if shards > 1 else 0.0
     for stage, config, trained in trainings:
-        whole, layer = frozen + FULL * trained, llama.layer_linear * held
-        shards = devices if sharded else 1
-        gathered = GATHERED * layer + llama.words * size + FULL * (connector + words) if shards > 1 else 0.0
-        rows = config.micro_batch_size
         # What comes and goes at the widest place: the logits and their gradient, or three of a layer's middle.
-        middle = 3 * rows * lengths.training * llama.intermediate_size * size
-        passing = max(2 * llama.saved_loss(rows * lengths.answer), middle)
+        tokens, logits = config.micro_batch_size * lengths.training, config.micro_batch_size * lengths.answer
+        passing = max(2 * logits * llm.config.vocab_size * FULL, 3 * tokens * middle * size)
         yield Use(
             stage,
             devices,
-            parameters=whole / shards + gathered,
+            parameters=(frozen + FULL * trained) / shards + gathered,
             # Gradients are shared among devices at the end of an update; until then each adds up its own.
             optimizer=FULL * trained + (ADAM - FULL) * trained / shards,
             # The newest gradient of all words, when what the layers kept is gone.
-            activations=max(language_saved(params, llama, config, lengths) + passing, FULL * words),
+            activations=max(language_kept(params, llm, config, lengths) + passing, FULL * words),
         )
     rows = language.generation_batch_size
-    read = rows * lengths.prompt
     yield Use(
         "answer",
         1,
-        parameters=frozen + FULL * (connector + words + adapters),
+        parameters=frozen + FULL * (connector + words + adapted),
         optimizer=0,
         # The prompts are read at once: the widest maps' outcomes, and a mask for each pair of tokens.
-        activations=read * (3 * llama.intermediate_size + 2 * hidden + lengths.prompt) * size,
-        cache=llama.cache(rows * (lengths.prompt + language.max_new_tokens), size),
+        activations=rows * lengths.prompt * (3 * middle + 2 * hidden + lengths.prompt) * size,
+        cache=2 * rows * (lengths.prompt + language.max_new_tokens) * blocks * maps["k_proj"][1] * size,
     )
 
 
-def language_saved(params: Params, llama: Llama, config: TrainConfig, lengths: Lengths) -> int:
+def connector_parameters(params: Params, llm: PreTrainedModel, embedding: int) -> tuple[int, int]:
+    """What alignment trains: the connector with the two tactile tokens, and all words where they are trained.
+
+    Words are a copy beside the frozen ones, which a tied head still needs.
+    """
+    hidden = llm.config.hidden_size
+    words = llm.config.vocab_size * hidden if params.align.train_embeddings == "all" else 0
+    return (embedding + 1) * hidden + (hidden + 1) * hidden + 2 * hidden, words
+
+
+def adapted(llm: PreTrainedModel, targets: Sequence[str] | Literal["all-linear"]) -> dict[str, tuple[int, int]]:
+    """The linear maps of a layer that get an adapter."""
+    return {name: ends for name, ends in linear(llm).items() if targets == "all-linear" or name in targets}
+
+
+def adapters(llm: PreTrainedModel, config: LoraTrainConfig) -> int:
+    """Parameters of the low-rank adapters."""
+    return len(layers(llm)) * config.rank * sum(map(sum, adapted(llm, config.target_modules).values()))
+
+
+def language_kept(params: Params, llm: PreTrainedModel, config: TrainConfig, lengths: Lengths) -> int:
     """Bytes that a training's forward keeps: a batch of the longest conversations."""
     size, tokens = BYTES[params.language.dtype], config.micro_batch_size * lengths.training
-    layer = llama.saved_layer(size)
+    hidden, maps, blocks = llm.config.hidden_size, linear(llm), len(layers(llm))
+    queries, keys, middle = maps["q_proj"][1], maps["k_proj"][1], maps["down_proj"][0]
+    layer = layer_kept(hidden, llm.config.num_attention_heads, keys, queries, 3 * middle, 1, size)
     if isinstance(config, LoraTrainConfig):
-        layer += llama.saved_adapters(config.target_modules, config.rank, size, config.dropout > 0)
-    if params.runtime.gradient_checkpointing:
-        # Of each layer what it reads is kept; one at a time is computed again.
-        kept = llama.num_hidden_layers * tokens * llama.hidden_size * size + tokens * layer
-    else:
-        kept = llama.num_hidden_layers * tokens * layer
-    loss = llama.saved_loss(config.micro_batch_size * lengths.answer)
-    return kept + tokens * (llama.hidden_size + 1) * FULL + loss
+        own = adapted(llm, config.target_modules)
+        # Each map casts or drops what it reads for itself; a GPU remembers in a byte whether a value was dropped.
+        read = sum(ends[0] for ends in own.values()) * (FULL + (config.dropout > 0))
+        if size == FULL and not config.dropout:
+            read = FULL * sum(maps[min(each)][0] for each in READ_TOGETHER if each & own.keys())
+        layer += len(own) * config.rank * FULL + read
+    # With checkpointing, of each layer what it reads is kept; one at a time is computed again.
+    each = blocks * hidden * size + layer if params.runtime.gradient_checkpointing else blocks * layer
+    # The last norm, and logarithms of all words' probabilities.
+    loss = config.micro_batch_size * lengths.answer * llm.config.vocab_size * FULL
+    return int(tokens * (each + (hidden + 1) * FULL) + loss)
 
 
 def launched(launcher: str) -> tuple[int, bool]:
@@ -217,6 +276,7 @@ def launched(launcher: str) -> tuple[int, bool]:
 def longest(params: Params, catalogue: Catalogue, language: Path) -> Lengths:
     """Look for the longest conversations among questions on all objects, in tokens of the folder's language model."""
     known = read_tokenizer(language) if (language / TOKENIZER).is_file() else None
+    config = params.questions
 
     def tokens(text: str) -> int:
         return len(known.encode(text).ids) if known else -(-len(text) // LETTERS)
@@ -226,43 +286,32 @@ def longest(params: Params, catalogue: Catalogue, language: Path) -> Lengths:
         # A video is its frames and two delimiters.
         return tokens(text.replace("{tactile}", "")) + len(question.videos) * (params.frames.per_video + 2)
 
-    training = [
-        (length(q, d.turns), sum(tokens(t.assistant) + 1 for t in d.turns))
-        for q, d in _dialogues(params, catalogue, Part.TRAIN)
-    ]
-    prompts = [
-        length(q, [*d.turns[:-1], Turn(user=d.turns[-1].user, assistant="")])
-        for q, d in _dialogues(params, catalogue, Part.TEST)
-    ]
-    most, learnt = max(training, default=(0, 0))
+    training, prompts = [(0, 0)], [0]
+    for part in (Part.TRAIN, Part.TEST):
+        wanted = counts_by_task(config, "train" if part == Part.TRAIN else "evaluation")
+        questions = build_questions(
+            Pool(part, catalogue, {o: [f"{o}_0"] for o in catalogue.objects}),
+            {task: min(number, ASKED) for task, number in wanted.items()},
+            seed=config.seed,
+            distinct=False,
+            facts=config.facts,
+            restate=config.restate,
+            two_turns=config.two_turns if part == Part.TRAIN else 0.0,
+        )
+        for question, turns in ((q, d.turns) for q in questions for d in q.dialogues if d.opd in params.ablation.opd):
+            if part == Part.TRAIN:
+                training.append((length(question, turns), sum(tokens(t.assistant) + 1 for t in turns)))
+            else:
+                prompts.append(length(question, [*turns[:-1], Turn(user=turns[-1].user, assistant="")]))
     columns = ([t for t, _ in training], [a for _, a in training], prompts)
-    means = (sum(numbers) / max(1, len(numbers)) for numbers in columns)
-    return Lengths(most, learnt, max(prompts, default=0), *means)
-
-
-def _dialogues(params: Params, catalogue: Catalogue, part: Part) -> Iterator[tuple[Question, Dialogue]]:
-    """Questions to train or evaluate with on all objects, under each OPD mode that is trained."""
-    config, trained = params.questions, part == Part.TRAIN
-    wanted = counts_by_task(config, "train" if trained else "evaluation")
-    questions = build_questions(
-        Pool(part, catalogue, {o: [f"{o}_0"] for o in catalogue.objects}),
-        {task: min(number, ASKED) for task, number in wanted.items()},
-        seed=config.seed,
-        distinct=False,
-        facts=config.facts,
-        restate=config.restate,
-        two_turns=config.two_turns if trained else 0.0,
-    )
-    return ((q, d) for q in questions for d in q.dialogues if d.opd in params.ablation.opd)
+    means = (sum(numbers) / max(1, len(numbers) - 1) for numbers in columns)
+    return Lengths(*max(training), max(prompts), *means)
 
 
 def table(uses: Sequence[Use]) -> str:
     """The stages as lines of text, in GiB on each device."""
-    names = [f.name for f in fields(Use)]
-    rows = [[*names, "total"]]
-    for use in uses:
-        stage, devices, *sizes = astuple(use)
-        rows.append([stage, str(devices), *(f"{s / GIB:.2f}" for s in (*sizes, use.total))])
-    first, *widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ([row[0].ljust(first), *map(str.rjust, row[1:], widths)] for row in rows)
-    return "\n".join("  ".join(cells) for cells in lines)
+    line = "{:<16}  {:>7}  {:>10}  {:>9}  {:>11}  {:>5}  {:>5}".format
+    rows = [(use.parameters, use.optimizer, use.activations, use.cache, use.total) for use in uses]
+    figures = [[f"{size / GIB:.2f}" for size in row] for row in rows]
+    heads = line("stage", "devices", "parameters", "optimizer", "activations", "cache", "total")
+    return "\n".join([heads, *(line(u.stage, u.devices, *row) for u, row in zip(uses, figures, strict=True))])

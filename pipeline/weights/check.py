@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pipeline.core.errors import UserError
 from pipeline.core.io import tensor_shapes
-from pipeline.weights import BACKBONES, CLIP_CONFIG, again
-from pipeline.weights.shapes import LIKE_LLAMA, LLM_CONFIG, Llama, Vision, read_form
+from pipeline.core.runtime import quiet_libraries
+from pipeline.weights import BACKBONES, again
+from pipeline.weights.shapes import CLIP_CONFIG, LLM_CONFIG, first_words, read_form, read_tower
 
 if TYPE_CHECKING:
     from tokenizers import Tokenizer
+    from transformers import PreTrainedModel
 
-LLM_WEIGHTS, TOKENIZER = "model.safetensors", "tokenizer.json"
-PLAIN_TOWER = {"layers", "width", "patch_size", "image_size", "head_width"}
-"""Keys of `vision_cfg` that `Vision.tensors` follows from; with others, open_clip alone knows the shapes."""
-Found = Mapping[str, tuple[Path, tuple[int, ...]]]
-"""The file and the shape of each tensor."""
+TOKENIZER = "tokenizer.json"
 
 
 def check_language_files(folder: Path, key: str = "language.weights") -> None:
@@ -32,23 +30,50 @@ def check_language_files(folder: Path, key: str = "language.weights") -> None:
     """
     if not folder.is_dir():
         return
-    file = folder / LLM_CONFIG
-    form = read_form(file)
-    if not isinstance(form.get("model_type"), str):
-        raise UserError(f"{key}: {file} names no model_type; {again(folder)}")
+    config = read_form(folder / LLM_CONFIG)
     read_form(folder / "tokenizer_config.json")
-    words = read_tokenizer(folder).get_vocab(with_added_tokens=False)
-    found = stored(weight_files(folder, LLM_WEIGHTS, key), key, again(folder))
-    if form["model_type"] not in LIKE_LLAMA or "quantization_config" in form:
-        return
-    llama = Llama.read(folder)
-    assert llama is not None
-    check_shapes(found, llama.tensors, file, key)
-    if (last := max(words.values(), default=0)) >= llama.vocab_size:
+    last = max(read_tokenizer(folder).get_vocab(with_added_tokens=False).values(), default=0)
+    shapes_of(folder.glob("*.safetensors"), key)
+    if "quantization_config" in config:
+        return  # Its tensors are in the form of a quantizer, which may not be installed.
+    words = check_fit(folder, key).get_input_embeddings().num_embeddings
+    if last >= words:
         raise UserError(
-            f"{key}: {folder / TOKENIZER} has words up to number {last}, but vocab_size of {file} is "
-            f"{llama.vocab_size}; take both from one model"
+            f"{key}: {folder / TOKENIZER} has words up to number {last}, but vocab_size of {folder / LLM_CONFIG} is "
+            f"{words}; take both from one model"
         )
+
+
+def check_fit(folder: Path, key: str, *, safe: bool = True) -> PreTrainedModel:
+    """The language model of a folder on the meta device, for which transformers reads names and shapes alone.
+
+    Args:
+        safe: Whether it lies in safetensors; in pickles else, of which no code is run.
+
+    Raises:
+        UserError: where shards, index or configuration are broken, or a tensor is missing or of another shape.
+    """
+    from transformers import AutoModelForCausalLM
+
+    quiet_libraries()
+    try:
+        model, told = AutoModelForCausalLM.from_pretrained(
+            folder,
+            device_map="meta",
+            use_safetensors=safe,
+            output_loading_info=True,
+            ignore_mismatched_sizes=True,
+            local_files_only=True,
+            trust_remote_code=False,
+        )
+    except Exception as error:  # transformers and what it asks for raise nearly any of them.
+        raise UserError(f"{key}: {folder} cannot be loaded ({first_words(error)}); {again(folder)}") from None
+    wrong = [f"{name} is missing" for name in sorted(told["missing_keys"])]
+    wrong += [f"{name} is {[*own]}, not {[*wanted]}" for name, own, wanted in sorted(told["mismatched_keys"])]
+    if wrong:
+        raise UserError(f"{key}: {folder} does not fit its {LLM_CONFIG} ({wrong[0]}); take both from one model")
+    loaded: PreTrainedModel = model
+    return loaded
 
 
 def check_encoder_files(folder: Path, backbone: Collection[str], key: str = "encoder.weights") -> None:
@@ -62,17 +87,33 @@ def check_encoder_files(folder: Path, backbone: Collection[str], key: str = "enc
         backbone: `encoder.backbone`.
         key: The parameter that names the folder.
     """
+    import torch
+
     if not folder.is_dir():
         return
     read = [BACKBONES[name] for name in backbone if BACKBONES[name].key == "weights"]
-    files = {file for each in read for file in each.files(folder) if file.suffix == ".safetensors"}
-    found = stored(files, key, again(folder))
-    if "clip" in backbone:
-        tower = Vision.read(folder)
-        if tower is None:
-            raise UserError(f"{key}: {folder} is no vision transformer; visual prompts need one such as ViT-L/14")
-        if read_form(folder / CLIP_CONFIG)["model_cfg"]["vision_cfg"].keys() <= PLAIN_TOWER:
-            check_shapes(found, tower.tensors, folder / CLIP_CONFIG, key)
+    found = shapes_of({f for each in read for f in each.files(folder) if f.suffix == ".safetensors"}, key)
+    if "clip" not in backbone:
+        return
+    tower = read_tower(folder)
+    if tower is None:
+        raise UserError(f"{key}: {folder} is no vision transformer; visual prompts need one such as ViT-L/14")
+    visual = {name.removeprefix("visual."): shape for name, shape in found.items() if name.startswith("visual.")}
+    try:
+        tower.load_state_dict({name: torch.empty(shape, device="meta") for name, shape in visual.items()}, assign=True)
+    except RuntimeError as error:  # torch names what is missing or of another shape.
+        reason = first_words(str(error).partition("\n")[2])
+        raise UserError(
+            f"{key}: {folder} does not fit its {CLIP_CONFIG} ({reason}); take both from one model"
+        ) from None
+
+
+def shapes_of(files: Iterable[Path], key: str) -> dict[str, tuple[int, ...]]:
+    """The tensors of safetensors files, by their headers; raises UserError where one is broken or cut off."""
+    try:
+        return {name: shape for f in sorted(files) for name, shape in tensor_shapes(f, again(f.parent)).items()}
+    except UserError as error:
+        raise UserError(f"{key}: {error}") from None
 
 
 def read_tokenizer(folder: Path) -> Tokenizer:
@@ -83,47 +124,3 @@ def read_tokenizer(folder: Path) -> Tokenizer:
         return Tokenizer.from_file(str(folder / TOKENIZER))
     except Exception as error:  # The library raises nothing narrower.
         raise UserError(f"{folder / TOKENIZER} is no fast tokenizer ({error}); {again(folder)}") from None
-
-
-def weight_files(folder: Path, name: str, key: str) -> list[Path]:
-    """The file of this name, or the shards that its index names, as transformers looks for them.
-
-    Raises:
-        UserError: where there is neither, the index is broken, or a shard is missing.
-    """
-    file, index = folder / name, folder / f"{name}.index.json"
-    if file.is_file():
-        return [file]
-    if not index.is_file():
-        raise UserError(f"{key}: {folder} has neither {name} nor {index.name} beside its shards; {again(folder)}")
-    places: Any = read_form(index).get("weight_map")
-    if not isinstance(places, dict) or not places or not all(isinstance(p, str) for p in places.values()):
-        raise UserError(f"{key}: {index} maps no tensors to files (weight_map); {again(folder)}")
-    shards = [folder / shard for shard in sorted(set(places.values()))]
-    for shard in shards:
-        if not shard.is_file():
-            raise UserError(f"{key}: {shard} does not exist, but {index.name} names it; {again(folder)}")
-    return shards
-
-
-def stored(files: Collection[Path], key: str, mend: str) -> Found:
-    """The tensors of safetensors files, by their headers; raises UserError where one is broken or cut off."""
-    try:
-        return {name: (file, shape) for file in files for name, shape in tensor_shapes(file, mend).items()}
-    except UserError as error:
-        raise UserError(f"{key}: {error}") from None
-
-
-def check_shapes(found: Found, wanted: Mapping[str, tuple[int, ...]], config: Path, key: str) -> None:
-    """Raise UserError where a tensor is missing or of another shape than its configuration says."""
-    mend = f"take it and {config.name} from one model"
-    for name, shape in wanted.items():
-        if name not in found:
-            raise UserError(f"{key}: {config.parent} has no tensor {name}, which {config} asks for; {mend}")
-        file, own = found[name]
-        if own != shape:
-            raise UserError(f"{key}: {name} in {file} is {_by(own)}, but {config} makes it {_by(shape)}; {mend}")
-
-
-def _by(shape: tuple[int, ...]) -> str:
-    return " x ".join(map(str, shape)) or "one number"

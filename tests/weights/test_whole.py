@@ -5,30 +5,26 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
-from math import prod
 from pathlib import Path
 from shutil import copyfile
 from typing import Any
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from safetensors.torch import load_file, save_file
-from transformers import LlamaConfig, LlamaForCausalLM
+from transformers import AutoConfig, AutoModelForCausalLM
 from typer.testing import CliRunner
 
 from pipeline.cli import app
 from pipeline.core.errors import UserError
-from pipeline.core.io import tensor_shapes
 from pipeline.encoder.clip import load_visual_tower
 from pipeline.encoder.timm_backbone import load_backbone
 from pipeline.language.base import load_llm, load_tokenizer
 from pipeline.weights import check_encoder, check_finite, check_language
 from pipeline.weights.check import check_encoder_files, check_language_files
-from pipeline.weights.shapes import Llama, Vision
 from tests.checkpoints import cut, edit, replace, write_clip, write_llama
 from tests.closure import ROOT
+from tests.conftest import refused
 from tests.encoders import config, write_timm
 
 
@@ -51,25 +47,25 @@ LANGUAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "settings cut": (lambda f: cut(f / "config.json", 9), "/config.json is not a JSON object"),
     "settings in UTF-16": (lambda f: (f / "config.json").write_bytes("{}".encode("utf-16")), "is not a JSON object"),
     "settings are a list": (lambda f: (f / "config.json").write_text("[]"), "/config.json is not a JSON object"),
-    "no kind": (lambda f: edit(f / "config.json", model_type=None), "/config.json names no model_type"),
+    "no kind": (lambda f: edit(f / "config.json", model_type=None), "cannot be loaded .*model_type"),
     "no hidden_size": (
         lambda f: edit(f / "config.json", hidden_size=None),
-        "/config.json: hidden_size must be a whole number of 1 or more and is missing",
+        r"lm_head.weight is \[260, 32\], not \[260, 40",
     ),
-    "a size that is a text": (lambda f: edit(f / "config.json", vocab_size="260"), "vocab_size must be .* is '260'"),
-    "a size that is true": (
-        lambda f: edit(f / "config.json", num_hidden_layers=True),
-        "num_hidden_layers .* True",
+    "a size that is a text": (
+        lambda f: edit(f / "config.json", vocab_size="260"),
+        "'vocab_size' expected int, got str",
     ),
-    "no heads": (lambda f: edit(f / "config.json", num_attention_heads=0), "num_attention_heads must .* is 0"),
-    "heads of a text": (lambda f: edit(f / "config.json", num_key_value_heads="2"), "num_key_value_heads must .* '2'"),
-    "more words": (
-        lambda f: edit(f / "config.json", vocab_size=261),
-        "model.embed_tokens.weight in .*/model.safetensors is 260 x 32, but .*/config.json makes it 261 x 32; take it",
+    "no heads": (lambda f: edit(f / "config.json", num_attention_heads=0), "cannot be loaded .*zero"),
+    "wider": (
+        lambda f: edit(f / "config.json", intermediate_size=65),
+        r"mlp.down_proj.weight is \[32, 64\], not .*; take",
     ),
-    "wider": (lambda f: edit(f / "config.json", intermediate_size=65), "mlp.gate_proj.weight in .* is 64 x 32, but"),
-    "deeper": (lambda f: edit(f / "config.json", num_hidden_layers=3), "has no tensor model.layers.2.self_attn.q_proj"),
-    "a tensor under another name": (lambda f: renamed(f / ONE, "lm_head.weight", "x"), "has no tensor lm_head.weight"),
+    "deeper": (
+        lambda f: edit(f / "config.json", num_hidden_layers=3),
+        "model.layers.2.input_layernorm.weight is missing",
+    ),
+    "a tensor under another name": (lambda f: renamed(f / ONE, "lm_head.weight", "x"), "lm_head.weight is missing"),
     "fewer words than the tokenizer": (
         lambda f: (
             edit(f / "config.json", vocab_size=259),
@@ -78,19 +74,21 @@ LANGUAGE: dict[str, tuple[Callable[[Path], object], str]] = {
         "tokenizer.json has words up to number 259, but vocab_size of .*/config.json is 259",
     ),
     "neither file nor index": (
-        lambda f: (f / ONE).rename(f / "model-00001-of-00001.safetensors"),
-        "has neither model.safetensors nor model.safetensors.index.json",
+        lambda f: (f / ONE).rename(f / "model-1-of-1.safetensors"),
+        "no file named model.safete",
     ),
 }
 SHARDS: dict[str, tuple[Callable[[Path], object], str]] = {
-    "no shard": (lambda f: (f / "model-00002-of-00007.safetensors").unlink(), "model-00002-of-00007.safetensors does"),
+    "no shard": (
+        lambda f: (f / "model-00002-of-00007.safetensors").unlink(),
+        "No such file.*model-00002-of-00007",
+    ),
     "a shard cut by a byte": (lambda f: cut(f / "model-00003-of-00007.safetensors"), "model-00003-of-00007.* is cut"),
-    "a broken index": (lambda f: cut(f / INDEX, 9), "index.json is not a JSON object"),
-    "an empty index": (lambda f: edit(f / INDEX, weight_map={}), "index.json maps no tensors to files"),
-    "an index of numbers": (lambda f: edit(f / INDEX, weight_map={"a": 1}), "index.json maps no tensors to files"),
+    "a broken index": (lambda f: cut(f / INDEX, 9), "llama cannot be loaded"),
+    "an empty index": (lambda f: edit(f / INDEX, weight_map={}), "llama cannot be loaded"),
     "a shard twice": (
         lambda f: copyfile(f / "model-00003-of-00007.safetensors", f / "model-00004-of-00007.safetensors"),
-        "has no tensor model.layers",
+        r"model.layers\S+ is missing",
     ),
 }
 CLIP_FILE, CLIP_FORM = "open_clip_model.safetensors", "open_clip_config.json"
@@ -105,12 +103,13 @@ def vision(folder: Path, **changes: Any) -> None:
 
 CLIP: dict[str, tuple[Callable[[Path], object], str]] = {
     "cut by a byte": (lambda f: cut(f / CLIP_FILE), "open_clip_model.safetensors is cut off"),
-    "deeper": (lambda f: vision(f, layers=3), "has no tensor visual.transformer.resblocks.2"),
-    "wider": (lambda f: vision(f, width=48), "visual.class_embedding in .* is 32, but .*config.json makes it 48"),
-    "other patches": (lambda f: vision(f, patch_size=8), "visual.positional_embedding .* is 5 x 32, but .* 17 x 32"),
-    "no width": (lambda f: vision(f, width=None), "open_clip_config.json: width must be a whole number"),
+    "deeper": (lambda f: vision(f, layers=3), 'Missing key.* "transformer.resblocks.2'),
+    "wider": (lambda f: vision(f, width=48), "does not fit its open_clip_config.json .*mismatch for class_embedding"),
+    "other patches": (lambda f: vision(f, patch_size=8), "mismatch for positional_embedding"),
+    "a narrower middle": (lambda f: vision(f, mlp_ratio=2.0), "mismatch for transformer.resblocks.0.mlp.c_fc.weight"),
+    "a width of letters": (lambda f: vision(f, width="x"), "open_clip_config.json is no configuration of open_clip's"),
     "a ResNet": (lambda f: vision(f, layers=[3, 4, 6, 3]), "is no vision transformer"),
-    "a network of timm's": (lambda f: vision(f, layers=None, timm_model_name="x"), "is no vision transformer"),
+    "a network of timm's": (lambda f: vision(f, timm_model_name="test_vit"), "is no vision transformer"),
     "settings cut": (lambda f: cut(f / CLIP_FORM, 9), "open_clip_config.json"),
     "no settings": (lambda f: (f / CLIP_FORM).write_text("{}"), "open_clip_config.json"),
 }
@@ -134,38 +133,32 @@ def scale(*overrides: str) -> str | None:
     return str(result.exception)
 
 
-def check_both(folder: Path) -> None:
-    """What `octopi scale` asks of a language model's folder."""
-    check_language(folder)
-    check_language_files(folder)
+def check(folder: Path) -> None:
+    """What `octopi scale` asks of a folder."""
+    if folder.name == "clip":
+        check_encoder(folder, 32, ("clip",))
+        check_encoder_files(folder, ("clip",))
+    else:
+        check_language(folder)
+        check_language_files(folder)
 
 
-def check_tower(folder: Path) -> None:
-    """What `octopi scale` asks of a CLIP's folder."""
-    check_encoder(folder, 32, ("clip",))
-    check_encoder_files(folder, ("clip",))
-
-
-@pytest.mark.parametrize("name", [*LANGUAGE, *SHARDS])
-def test_a_broken_language_model_is_one_line(name: str) -> None:
-    folder = write_llama(Path("llama"), shard="20KB" if name in SHARDS else "5GB")
-    check_both(folder)
-    damage, words = (LANGUAGE | SHARDS)[name]
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [*(("llama", name) for name in LANGUAGE), *(("shards", name) for name in SHARDS), *(("clip", n) for n in CLIP)],
+)
+def test_a_broken_folder_is_one_line(kind: str, name: str) -> None:
+    tables = {"llama": LANGUAGE, "shards": SHARDS, "clip": CLIP}
+    if kind == "clip":
+        folder = write_clip(Path("clip"))
+    else:
+        folder = write_llama(Path("llama"), shard="20KB" if kind == "shards" else "5GB")
+    check(folder)
+    damage, words = tables[kind][name]
     damage(folder)
-    with pytest.raises(UserError, match=r"\A[^\n]*llama(/| has)[^\n]*\Z") as caught:
-        check_both(folder)
-    assert re.search(words, str(caught.value)), caught.value
-
-
-@pytest.mark.parametrize("name", CLIP)
-def test_a_broken_clip_is_one_line(name: str) -> None:
-    folder = write_clip(Path("clip"))
-    check_tower(folder)
-    damage, words = CLIP[name]
-    damage(folder)
-    with pytest.raises(UserError, match=r"\A[^\n]*clip[^\n]*\Z") as caught:
-        check_tower(folder)
-    assert re.search(words, str(caught.value)), caught.value
+    with refused(words) as caught:
+        check(folder)
+    assert str(folder) in str(caught.value)
 
 
 def test_the_command_names_what_is_broken_before_it_writes() -> None:
@@ -175,7 +168,7 @@ def test_the_command_names_what_is_broken_before_it_writes() -> None:
         folder = write_llama(Path(name))
         damage(folder)
         assert re.search(words, scale(f"language.weights={folder}") or "")
-    for name in ("cut by a byte", "no width"):
+    for name in ("cut by a byte", "a width of letters"):
         damage, words = CLIP[name]
         folder = write_clip(Path(name) / "clip")
         damage(folder)
@@ -193,40 +186,15 @@ def test_a_timm_file_that_is_cut_off_is_named_when_the_scale_is_chosen() -> None
         check_encoder_files(folder, ("timm", "scenes"))
 
 
-@settings(max_examples=30, deadline=None)
-@given(data=st.data())
-def test_a_file_of_any_other_length_is_refused(data: st.DataObject, tmp_path_factory: pytest.TempPathFactory) -> None:
-    file = tmp_path_factory.mktemp("any") / "x.safetensors"
-    shapes = data.draw(
-        st.dictionaries(st.text(min_size=1, max_size=3), st.lists(st.integers(0, 3), max_size=3), min_size=1)
-    )
-    save_file({name: torch.zeros(shape) for name, shape in shapes.items()}, file)
-    assert tensor_shapes(file) == {name: tuple(shape) for name, shape in shapes.items()}
-    content = file.read_bytes()
-    at = data.draw(st.integers(0, len(content) - 1))
-    file.write_bytes(content[:at])
-    with pytest.raises(UserError, match="x.safetensors is cut off"):
-        tensor_shapes(file)
-
-
 # What is right is not refused.
 
 
 @pytest.mark.parametrize("tied", [True, False])
 @pytest.mark.parametrize("kind", ["llama", "mistral", "qwen2", "gpt_neox"])
 def test_whole_models_of_several_kinds_pass(kind: str, tied: bool) -> None:
-    from transformers import AutoConfig, AutoModelForCausalLM
-
     folder = write_llama(Path("llama"))
-    form = AutoConfig.for_model(
-        kind,
-        hidden_size=32,
-        intermediate_size=64,
-        num_hidden_layers=2,
-        num_attention_heads=4,
-        vocab_size=260,
-        tie_word_embeddings=tied,
-    )
+    sizes = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 4}
+    form = AutoConfig.for_model(kind, **sizes, vocab_size=260, tie_word_embeddings=tied)
     AutoModelForCausalLM.from_config(form).save_pretrained(folder)
     check_language_files(folder)
 
@@ -239,38 +207,6 @@ def test_a_padding_token_beyond_the_words_passes() -> None:
     form["added_tokens"].append(form["added_tokens"][0] | {"id": 260, "content": "[PAD]"})
     file.write_text(json.dumps(form))
     check_language_files(folder)
-
-
-def test_what_only_open_clip_knows_passes() -> None:
-    folder = write_clip(Path("clip"))
-    vision(folder, mlp_ratio=2.0)
-    check_encoder_files(folder, ("clip",))
-
-
-@pytest.mark.parametrize("keys", [4, 2])
-@pytest.mark.parametrize("tied", [True, False])
-def test_tensors_are_those_that_transformers_makes(keys: int, tied: bool) -> None:
-    form = LlamaConfig(
-        hidden_size=32,
-        intermediate_size=48,
-        num_hidden_layers=3,
-        num_attention_heads=4,
-        num_key_value_heads=keys,
-        vocab_size=100,
-        tie_word_embeddings=tied,
-    )
-    made = {name: tuple(p.shape) for name, p in LlamaForCausalLM(form).named_parameters()}
-    llama = Llama(32, 48, 3, 4, 100, keys, 8, tied)
-    assert llama.tensors == made
-    assert llama.parameters == sum(map(prod, made.values()))
-
-
-def test_tensors_are_those_that_open_clip_makes() -> None:
-    stored = tensor_shapes(write_clip(Path("clip")) / CLIP_FILE)
-    tower = Vision.read(Path("clip"))
-    assert tower is not None
-    assert tower.tensors == {name: shape for name, shape in stored.items() if name.startswith("visual.")}
-    assert tower.parameters == sum(map(prod, tower.tensors.values()))
 
 
 # At loading
