@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.classifier import features, heads_error, weights
 from benchmarks.errors import WRONG, Error, mean_of
 from benchmarks.table import Row, make_rows
-from benchmarks.timing import counting_ffts, interleaved, machine, milliseconds
+from benchmarks.timing import counting_ffts, interleaved, machine, timed
 from pipeline.config import ScenesConfig
 from pipeline.config.params import load_params
 from pipeline.core.parallel import run_parallel
@@ -172,7 +172,7 @@ def _look(job: _Job) -> _Scene:
             frames.append(list(render(scenes[-1], config, sensor, seed)))
 
         with counting_ffts() as count:
-            costs.append(milliseconds(make) / FRAMES)
+            costs.append(timed(make)[1] / FRAMES)
         ffts.append(count.value / FRAMES)
     hardest = int(np.argmax(scenes[0].motion.force))
     finest, truth = scenes[0].imprint.skins[-1], frames[0][hardest].astype(np.float32)

@@ -6,6 +6,7 @@ import platform
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from math import prod
 from pathlib import Path
 from statistics import median
@@ -18,14 +19,15 @@ from pipeline.core.runtime import cores
 if TYPE_CHECKING:
     from torch import nn
 
+R = TypeVar("R")
 T = TypeVar("T")
 
 
-def milliseconds(run: Callable[[], object]) -> float:
-    """What one call takes."""
+def timed(run: Callable[[], R]) -> tuple[R, float]:
+    """What one call gives, and the milliseconds that it takes."""
     started = perf_counter()
-    run()
-    return 1000 * (perf_counter() - started)
+    found = run()
+    return found, 1000 * (perf_counter() - started)
 
 
 def interleaved(
@@ -45,7 +47,7 @@ def interleaved(
         spent: dict[str, list[float]] = {name: [] for name in settings}
         for item in items:
             for name, run in settings.items():
-                spent[name].append(milliseconds(lambda run=run, item=item: run(item)))  # type: ignore[misc]
+                spent[name].append(timed(partial(run, item))[1])
         for name, own in spent.items():
             found[name].append(median(own))
     return found
