@@ -1,50 +1,55 @@
-"""Encoders on one core: whole candidates, then number and side of frames, number formats and visual prompts.
+"""Encoders on one core: whole candidates, then number and side of the frames that the pretrained one is shown.
 
 A candidate's cost is a video's from the file to the decided classes; weights are random where cost depends on no
-training, and errors are those of the report with most candidates in its cross-validation. The other encoders are
-frozen, have seen no label and are timed alone; each is judged by a grouped cross-validation of its heads. Prompts
-are trained for a few epochs and judged on the development split's validation videos, which also choose the epoch.
-
-`int8` is torch's dynamic quantisation of linear layers, of which the pretrained encoder has none.
+training, and errors are those of the report with most candidates in its cross-validation. For number and side of frames
+the pretrained encoder, frozen, is timed alone, and judged by a grouped cross-validation of its heads.
 """
 
 from __future__ import annotations
 
-import copy
-import warnings
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Literal, cast
 
 import cv2
 import numpy as np
 import torch
-from torch import nn
 
 from benchmarks.classifier import heads_error
-from benchmarks.encoder_models import ALONE, FRAMES, SIDE, features, prompts, whole
-from benchmarks.errors import WRONG, Error
+from benchmarks.errors import WRONG, error_of
 from benchmarks.frames import bench_videos
 from benchmarks.table import Row, make_rows
-from benchmarks.timing import flops_of, interleaved, machine, megabytes, one_thread
-from pipeline.config import PRETRAINED, FramesConfig, RuntimeConfig
+from benchmarks.timing import counted, interleaved, machine, megabytes, one_thread
+from pipeline.config import PRETRAINED, EncoderConfig, FramesConfig
 from pipeline.config.params import load_params
 from pipeline.core.errors import UserError
-from pipeline.core.records import Video
+from pipeline.core.io import read_csv
+from pipeline.core.records import ScoreRow, Video
+from pipeline.core.runtime import seed_everything
+from pipeline.encoder.candidates import CANDIDATES, Candidate
 from pipeline.encoder.clips import ClipDataset, LabelledVideo
-from pipeline.encoder.cross_validation import CrossValidationData
-from pipeline.encoder.model import FrameEncoder, base_encoder
+from pipeline.encoder.frame_classifier import JointFrameClassifier
+from pipeline.encoder.model import Heads, PropertyClassifier, base_encoder
+from pipeline.encoder.recipes import property_classifier
 from pipeline.encoder.scene_encoder import SceneEncoder
+from pipeline.training.sampling import sample_evaluation
 from pipeline.training.trainable import load_trainable
-from pipeline.videos.files import list_videos
+from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.files import VideoFile, list_videos
 from pipeline.videos.frames.extract import extract_frames
+from pipeline.videos.frames.scan import Scan, scan
 from pipeline.videos.frames.store import FrameStore
+from pipeline.videos.frames.subtraction import subtract
 from pipeline.weights import CLIP_CONFIG
 
-Clip = Mapping[str, torch.Tensor]
+SIDE, FRAMES = 120, 5
+"""Pixels and frames a video, where these are not what differs."""
+CONFIG = FramesConfig(selection="salient", pixels=SIDE)
+Clip = tuple[torch.Tensor, torch.Tensor]
+"""Difference pictures, uint8, k x side x side x RGB, and the frames' places in the video, k."""
+WHOLE = ("probe", "paper", "scratch", "pretrained", "pretrained-one-frame", "pretrained-ten-frames")
 
 
 @dataclass(frozen=True)
@@ -56,156 +61,153 @@ class Size:
     repeats: int = 5
     folds: int = 5
     deals: int = 3
-    epochs: int = 8
-    prompts: tuple[tuple[int, int], ...] = ((8, 0), (1, 0), (32, 0), (8, 1))
-    """Prompts a layer, and layers from the first (0: all); the first is the baseline, the paper's."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Setup(CrossValidationData):
-    """What all encoders of a run share."""
-
-    recordings: Path
-    """Folder of the videos themselves."""
-    pretrained: Path
-    size: Size
-
-    def timed(self) -> list[Video]:
-        """At equal distances in the order of the videos, which is by object."""
-        count = min(self.size.videos, len(self.videos))
-        return [self.videos[i * len(self.videos) // count] for i in range(count)]
 
 
 def measure(root: Path, size: Size | None = None) -> list[Row]:
     """All questions, over the videos that `frames.bench_videos` finds.
 
     Raises:
-        UserError: without pretrained weights, or where there are too few objects for folds.
+        UserError: without pretrained weights or a CLIP, or where there are too few objects for folds.
     """
     size = size or Size()
     folder, catalogue = bench_videos(root)
     pretrained = root / PRETRAINED
     if not pretrained.is_file():
         raise UserError(f"{pretrained}: no such file; `octopi scale small`, `dvc repro pretrain` make it")
-    if len({f.object_id for f in list_videos(folder, catalogue).files}) < 2 * size.folds:
+    files = list_videos(folder, catalogue).files
+    if len({f.object_id for f in files}) < 2 * size.folds:
         raise UserError(f"{folder}: bench encoder needs videos of {2 * size.folds} objects or more")
     params = load_params(root / "params.yaml").encoder
-    changed = {"recipe": "paper", "backbone": ("clip",), "reference": "none", "weights": str(root / params.weights)}
-    if not (root / params.weights / CLIP_CONFIG).is_file():
-        raise UserError(
-            f"{root / params.weights}: bench encoder compares with a CLIP; name its folder in encoder.weights"
-        )
-    with one_thread(), TemporaryDirectory() as made:
-        frames = Path(made) / "frames"
-        config = FramesConfig(selection="salient", pixels=SIDE)
-        videos = extract_frames(folder, catalogue, config, frames, Path(made) / "partial").videos
-        setup = Setup(
-            videos=videos,
-            catalogue=catalogue,
-            frames=frames,
-            recordings=folder,
-            per_video=FRAMES,
-            encoder=params.model_copy(update=changed),
-            runtime=RuntimeConfig(device="cpu", threads=1),
-            pretrained=pretrained,
-            size=size,
-        )
-        return [*whole(setup, root / "reports"), *frozen(setup), *prompts(setup)]
+    clip = root / params.weights
+    if not (clip / CLIP_CONFIG).is_file():
+        raise UserError(f"{clip}: bench encoder compares with a CLIP; name its folder in encoder.weights")
+    changed = {"recipe": "paper", "backbone": ("clip",), "reference": "none", "weights": str(clip)}
+    # At equal distances in the order of the videos, which is by object.
+    count = min(size.videos, len(files))
+    timed = [files[i * len(files) // count] for i in range(count)]
+    with one_thread():
+        rows = whole(timed, params.model_copy(update=changed), catalogue, root / "reports", size.repeats)
+        return [*rows, *frozen(folder, [f.video_id for f in timed], catalogue, pretrained, size)]
 
 
-# --- Frozen encoders
+def whole(
+    files: Sequence[VideoFile], encoder: EncoderConfig, catalogue: Catalogue, reports: Path, repeats: int
+) -> list[Row]:
+    """Candidates from the file to the classes."""
+    settings: dict[str, Callable[[VideoFile], object]] = {}
+    counts: dict[str, dict[str, float]] = {}
+    for name in WHOLE:
+        candidate = CANDIDATES[name]
+        frames = candidate.frames or FRAMES
+        model = _classifier(candidate, encoder, [len(p.levels) for p in catalogue.properties]).eval()
+        settings[name] = partial(_decide, model, candidate.reference == "own", frames)
+        clip = torch.zeros(1, frames, SIDE, SIDE, 3, dtype=torch.uint8), torch.zeros(1, frames, dtype=torch.int64)
+        counts[name] = {"frames": frames, "megabytes": megabytes(model), "flops": counted(partial(model, *clip))[1]}
+    # Of the report that compares most of them, and of such the one over most videos.
+    tables = [read_csv(path, ScoreRow) for path in sorted(reports.glob("*/scores.csv"))]
+    scores = [[row for row in table if (row.task, row.measure) == ("cross_validation", "combined")] for table in tables]
+    chosen = max(filter(None, scores), key=lambda rows: (len(rows), rows[0].n), default=[])
+    return make_rows(
+        "encoder",
+        interleaved(settings, files, repeats),
+        unit="ms a video",
+        baseline="pretrained",
+        errors={row.encoder: error_of(row) for row in chosen if row.encoder in WHOLE},
+        error_of=WRONG,
+        counts=counts,
+        machine=machine("1 thread"),
+    )
+
+
+def _classifier(candidate: Candidate, config: EncoderConfig, classes: Sequence[int]) -> PropertyClassifier:
+    """A candidate with heads that have learnt nothing."""
+    seed_everything(0)
+    if candidate.kind == "frame_heads":
+        return JointFrameClassifier(base_encoder(config) if "clip" in candidate.backbone else SceneEncoder(), classes)
+    if candidate.recipe == "scratch":
+        encoder = SceneEncoder()
+        return PropertyClassifier(encoder, Heads(encoder.dim, classes), classes)
+    return property_classifier(config, classes)
+
+
+@torch.inference_mode()
+def _decide(model: PropertyClassifier, differences: bool, frames: int, file: VideoFile) -> torch.Tensor:
+    found = scan(file, CONFIG)
+    if not isinstance(found, Scan):
+        raise UserError(f"{file}: {found.measured}")
+    chosen = [found.kept[p] for p in sample_evaluation(len(found.kept), frames)]
+    pictures = np.stack([kept.image for kept in chosen])
+    if differences:
+        pictures = subtract(pictures, found.reference)
+    places = torch.tensor([[kept.index for kept in chosen]])
+    return model.decide(model(torch.from_numpy(pictures)[None], places)["logits"])
 
 
 @dataclass(frozen=True)
-class Setting:
-    """A frozen encoder and what it is shown."""
+class Shown:
+    """What the pretrained encoder is shown of a video."""
 
-    encoder: Literal["pretrained", "clip"] = "pretrained"
-    side: int = SIDE
-    """Pixels; frames, or their differences to the reference, are resized by area."""
     frames: int = FRAMES
-    form: Literal["float32", "bfloat16", "int8"] = "float32"
+    side: int = SIDE
+    """Pixels; difference pictures are resized by area."""
 
 
-USUAL, CLIP = Setting(), Setting("clip")
-QUESTIONS: dict[str, dict[str, Setting]] = {
-    "encoder frames": {
-        "5 frames": USUAL,
-        "1 frame": replace(USUAL, frames=1),
-        **{f"{n} frames": replace(USUAL, frames=n) for n in (2, 3, 10)},
-    },
-    "frame size": {f"{side} pixels": replace(USUAL, side=side) for side in (SIDE, 90, 60, 30)},
-    "number format, pretrained encoder": {"float32": USUAL, "bfloat16": replace(USUAL, form="bfloat16")},
-    "number format, CLIP": {
-        "float32": CLIP,
-        "bfloat16": replace(CLIP, form="bfloat16"),
-        "int8": replace(CLIP, form="int8"),
-    },
+QUESTIONS: dict[str, dict[str, Shown]] = {
+    "encoder frames": {f"{n} frame{'s' * (n > 1)}": Shown(frames=n) for n in (FRAMES, 1, 2, 3, 10)},
+    "frame size": {f"{side} pixels": Shown(side=side) for side in (SIDE, 90, 60, 30)},
 }
 """Settings by name; the first of each question is its baseline."""
 
 
-def frozen(setup: Setup) -> list[Row]:
-    """Cost and error of all settings of `QUESTIONS`, each measured once, all in turns."""
-    distinct = {str(s): s for settings in QUESTIONS.values() for s in settings.values()}
-    encoders = {name: _encoder(setting, setup) for name, setting in distinct.items()}
-    shown = {name: [_clip(s, setup, video) for video in setup.timed()] for name, s in distinct.items()}
-    timed: dict[str, Callable[[int], object]] = {
-        name: lambda i, name=name: features(encoders[name], shown[name][i])  # type: ignore[misc]
-        for name in distinct
-    }
-    costs = interleaved(timed, range(len(setup.timed())), setup.size.repeats)
-    errors = {name: _error(encoders[name], setting, setup) for name, setting in distinct.items()}
-    counts = {}
-    for name, setting in distinct.items():
-        counts[name] = {"frames": float(setting.frames), "megabytes": megabytes(encoders[name])}
-        if setting.form != "int8":
-            clip = shown[name][0]
-            counts[name]["flops"] = flops_of(partial(encoders[name].describe, clip["frames"], clip["frame_indices"]))
+def frozen(folder: Path, timed: Sequence[str], catalogue: Catalogue, pretrained: Path, size: Size) -> list[Row]:
+    """Cost and error of the pretrained encoder under all settings of `QUESTIONS`."""
+    encoder = SceneEncoder()
+    load_trainable(encoder, pretrained)
+    encoder.eval()
+
+    @torch.inference_mode()
+    def describe(clips: Sequence[Clip], video: int) -> np.ndarray:
+        found: np.ndarray = encoder.describe(*clips[video]).numpy()
+        return found
+
     rows = []
-    for question, settings in QUESTIONS.items():
-        rows += make_rows(
-            question,
-            {name: costs[str(setting)] for name, setting in settings.items()},
-            unit=ALONE,
-            baseline=next(iter(settings)),
-            errors={name: errors[str(setting)] for name, setting in settings.items()},
-            error_of=WRONG,
-            counts={name: counts[str(setting)] for name, setting in settings.items()},
-            machine=machine("1 thread"),
+    with TemporaryDirectory() as made:
+        videos = extract_frames(folder, catalogue, CONFIG, Path(made) / "frames", Path(made) / "partial").videos
+        places = [i for i, video in enumerate(videos) if video.video_id in timed]
+        objects = [video.object_id for video in videos]
+        labels, classes = (
+            np.array([catalogue.labels(o) for o in objects]),
+            [len(p.levels) for p in catalogue.properties],
         )
+        for question, settings in QUESTIONS.items():
+            runs, errors, counts = {}, {}, {}
+            for name, shown in settings.items():
+                runs[name] = partial(describe, _clips(Path(made) / "frames", videos, shown))
+                seen = np.stack([runs[name](video) for video in range(len(videos))])
+                errors[name] = heads_error(seen, seen, labels, objects, classes, size.folds, size.deals)
+                flops = counted(partial(runs[name], 0))[1]
+                counts[name] = {"frames": float(shown.frames), "megabytes": megabytes(encoder), "flops": flops}
+            rows += make_rows(
+                question,
+                interleaved(runs, places, size.repeats),
+                unit="ms a video, encoder alone",
+                baseline=next(iter(settings)),
+                errors=errors,
+                error_of=WRONG,
+                counts=counts,
+                machine=machine("1 thread"),
+            )
     return rows
 
 
-def _encoder(setting: Setting, setup: Setup) -> FrameEncoder:
-    encoder: FrameEncoder = SceneEncoder() if setting.encoder == "pretrained" else base_encoder(setup.encoder)
-    if setting.encoder == "pretrained":
-        load_trainable(encoder, setup.pretrained)
-    return formatted(encoder.eval(), setting.form)
-
-
-def formatted(encoder: FrameEncoder, form: str) -> FrameEncoder:
-    """A copy that computes in another number format."""
-    changed = copy.deepcopy(encoder)
-    if form == "int8":
-        with warnings.catch_warnings():  # Its successor is a package of its own, which is not needed for this.
-            warnings.simplefilter("ignore")
-            return cast(FrameEncoder, torch.ao.quantization.quantize_dynamic(changed, {nn.Linear}, torch.qint8))
-    return changed.to(torch.bfloat16) if form == "bfloat16" else changed
-
-
-def _clip(setting: Setting, setup: Setup, video: Video) -> Clip:
-    """A video's evaluation clip as the setting shows it: `frames` and `frame_indices`, as `ClipDataset` has them."""
-    store = FrameStore(setup.frames, "subtract" if setting.encoder == "pretrained" else "none")
-    item = ClipDataset(store, [LabelledVideo(video.video_id, ())], per_video=setting.frames)[0]
-    if setting.side == SIDE:
-        return item
-    size = (setting.side, setting.side)
-    smaller = [cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in item["frames"].numpy()]
-    return {**item, "frames": torch.from_numpy(np.stack(smaller))}
-
-
-def _error(encoder: FrameEncoder, setting: Setting, setup: Setup) -> Error:
-    """Of the frozen encoder's heads, whose settings are chosen inside the training folds."""
-    clips = np.stack([features(encoder, _clip(setting, setup, video)).numpy() for video in setup.videos])
-    return heads_error(clips, clips, setup.labels, setup.objects, setup.classes, setup.size.folds, setup.size.deals)
+def _clips(frames: Path, videos: Sequence[Video], shown: Shown) -> list[Clip]:
+    """Each video's evaluation clip, resized."""
+    labelled = [LabelledVideo(video.video_id, ()) for video in videos]
+    dataset = ClipDataset(FrameStore(frames, "subtract"), labelled, per_video=shown.frames)
+    clips = []
+    for number in range(len(dataset)):
+        item = dataset[number]
+        size = (shown.side, shown.side)
+        smaller = [cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in item["frames"].numpy()]
+        clips.append((torch.from_numpy(np.stack(smaller)), item["frame_indices"]))
+    return clips

@@ -28,13 +28,11 @@ class Row(Record):
     cost_ratio: float = Field(ge=0)
     """Median over the repeats of the cost over that of the question's baseline, whose ratio is 1."""
     frames: float | None = None
-    """A video. This and the next four count what the unit is about, and are the same on every machine."""
+    """A video. This and the next three count what the unit is about, and are the same on every machine."""
     tokens: float | None = None
-    """Generated for an answer, or useful ones (no padding) of a conversation that is trained on."""
+    """Generated for an answer."""
     flops: float | None = None
     """Floating-point operations of matrix products, convolutions and attention."""
-    ffts: float | None = None
-    """Fourier transforms of one grid."""
     megabytes: float | None = None
     """Weights and buffers, in 10^6 bytes."""
     error: float | None = None
@@ -86,11 +84,10 @@ def make_rows(
     errors, counts = errors or {}, counts or {}
     rows = []
     for name, own in costs.items():
-        error = errors.get(name)
         ratio = median(c / b for c, b in zip(own, costs[baseline], strict=True))
         values = {"cost": median(own), "cost_ratio": ratio, **counts.get(name, {})}
-        if error is not None:
-            values |= error.columns
+        if name in errors:
+            values |= errors[name].columns
         rounded = {column: float(f"{value:.4g}") for column, value in values.items()}
         named = {"question": question, "setting": name, "unit": unit, "machine": machine}
         rows.append(Row.model_validate({**named, "error_of": error_of if errors else "", **rounded}))
@@ -100,9 +97,8 @@ def make_rows(
 def with_front(rows: Sequence[Row]) -> list[Row]:
     """The rows of one question, each told whether it is on the front; None where it has no error."""
     measured = [row for row in rows if row.error is not None]
-    ahead = front([row.cost_ratio for row in measured], [row.error or 0.0 for row in measured])
-    known = {row.setting: on for row, on in zip(measured, ahead, strict=True)}
-    return [row.model_copy(update={"front": known.get(row.setting)}) for row in rows]
+    ahead = iter(front([row.cost_ratio for row in measured], [row.error or 0.0 for row in measured]))
+    return [row.model_copy(update={"front": None if row.error is None else next(ahead)}) for row in rows]
 
 
 def read_rows(path: Path) -> list[Row]:
