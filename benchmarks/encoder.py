@@ -1,8 +1,8 @@
-"""Encoders on one core: whole candidates, then number and side of the frames that the pretrained one is shown.
+"""Encoders on one core: whole candidates, then the side of the frames that the pretrained one is shown.
 
 A candidate's cost is a video's from the file to the decided classes; weights are random where cost depends on no
-training, and errors are those of the report with most candidates in its cross-validation. For number and side of frames
-the pretrained encoder, frozen, is timed alone, and judged by a grouped cross-validation of its heads.
+training, and errors are those of the report with most candidates in its cross-validation. On frames of each side the
+pretrained encoder, frozen, is timed alone, and judged by a grouped cross-validation of its heads.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from benchmarks.classifier import heads_error
 from benchmarks.errors import WRONG, error_of
 from benchmarks.frames import bench_videos
 from benchmarks.table import Row, make_rows
-from benchmarks.timing import counted, interleaved, machine, megabytes, one_thread
+from benchmarks.timing import counted, interleaved, machine, megabytes
 from pipeline.config import PRETRAINED, EncoderConfig, FramesConfig
 from pipeline.config.params import load_params
 from pipeline.core.errors import UserError
 from pipeline.core.io import read_csv
-from pipeline.core.records import ScoreRow, Video
+from pipeline.core.records import ScoreRow
 from pipeline.core.runtime import seed_everything
 from pipeline.encoder.candidates import CANDIDATES, Candidate
 from pipeline.encoder.clips import ClipDataset, LabelledVideo
@@ -46,9 +46,10 @@ from pipeline.weights import CLIP_CONFIG
 
 SIDE, FRAMES = 120, 5
 """Pixels and frames a video, where these are not what differs."""
+SIDES = (SIDE, 90, 60, 30)
 CONFIG = FramesConfig(selection="salient", pixels=SIDE)
 Clip = tuple[torch.Tensor, torch.Tensor]
-"""Difference pictures, uint8, k x side x side x RGB, and the frames' places in the video, k."""
+"""Difference pictures and the frames' places in the video."""
 WHOLE = ("probe", "paper", "scratch", "pretrained", "pretrained-one-frame", "pretrained-ten-frames")
 
 
@@ -64,7 +65,7 @@ class Size:
 
 
 def measure(root: Path, size: Size | None = None) -> list[Row]:
-    """All questions, over the videos that `frames.bench_videos` finds.
+    """Both questions, over the videos that `frames.bench_videos` finds.
 
     Raises:
         UserError: without pretrained weights or a CLIP, or where there are too few objects for folds.
@@ -85,9 +86,9 @@ def measure(root: Path, size: Size | None = None) -> list[Row]:
     # At equal distances in the order of the videos, which is by object.
     count = min(size.videos, len(files))
     timed = [files[i * len(files) // count] for i in range(count)]
-    with one_thread():
-        rows = whole(timed, params.model_copy(update=changed), catalogue, root / "reports", size.repeats)
-        return [*rows, *frozen(folder, [f.video_id for f in timed], catalogue, pretrained, size)]
+    torch.set_num_threads(1)
+    rows = whole(timed, params.model_copy(update=changed), catalogue, root / "reports", size.repeats)
+    return [*rows, *frame_size(folder, [f.video_id for f in timed], catalogue, pretrained, size)]
 
 
 def whole(
@@ -143,24 +144,8 @@ def _decide(model: PropertyClassifier, differences: bool, frames: int, file: Vid
     return model.decide(model(torch.from_numpy(pictures)[None], places)["logits"])
 
 
-@dataclass(frozen=True)
-class Shown:
-    """What the pretrained encoder is shown of a video."""
-
-    frames: int = FRAMES
-    side: int = SIDE
-    """Pixels; difference pictures are resized by area."""
-
-
-QUESTIONS: dict[str, dict[str, Shown]] = {
-    "encoder frames": {f"{n} frame{'s' * (n > 1)}": Shown(frames=n) for n in (FRAMES, 1, 2, 3, 10)},
-    "frame size": {f"{side} pixels": Shown(side=side) for side in (SIDE, 90, 60, 30)},
-}
-"""Settings by name; the first of each question is its baseline."""
-
-
-def frozen(folder: Path, timed: Sequence[str], catalogue: Catalogue, pretrained: Path, size: Size) -> list[Row]:
-    """Cost and error of the pretrained encoder under all settings of `QUESTIONS`."""
+def frame_size(folder: Path, timed: Sequence[str], catalogue: Catalogue, pretrained: Path, size: Size) -> list[Row]:
+    """Cost and error of the frozen pretrained encoder on frames of several sides."""
     encoder = SceneEncoder()
     load_trainable(encoder, pretrained)
     encoder.eval()
@@ -170,44 +155,39 @@ def frozen(folder: Path, timed: Sequence[str], catalogue: Catalogue, pretrained:
         found: np.ndarray = encoder.describe(*clips[video]).numpy()
         return found
 
-    rows = []
     with TemporaryDirectory() as made:
         videos = extract_frames(folder, catalogue, CONFIG, Path(made) / "frames", Path(made) / "partial").videos
-        places = [i for i, video in enumerate(videos) if video.video_id in timed]
-        objects = [video.object_id for video in videos]
-        labels, classes = (
-            np.array([catalogue.labels(o) for o in objects]),
-            [len(p.levels) for p in catalogue.properties],
+        dataset = ClipDataset(
+            FrameStore(Path(made) / "frames", "subtract"),
+            [LabelledVideo(video.video_id, ()) for video in videos],
+            per_video=FRAMES,
         )
-        for question, settings in QUESTIONS.items():
-            runs, errors, counts = {}, {}, {}
-            for name, shown in settings.items():
-                runs[name] = partial(describe, _clips(Path(made) / "frames", videos, shown))
-                seen = np.stack([runs[name](video) for video in range(len(videos))])
-                errors[name] = heads_error(seen, seen, labels, objects, classes, size.folds, size.deals)
-                flops = counted(partial(runs[name], 0))[1]
-                counts[name] = {"frames": float(shown.frames), "megabytes": megabytes(encoder), "flops": flops}
-            rows += make_rows(
-                question,
-                interleaved(runs, places, size.repeats),
-                unit="ms a video, encoder alone",
-                baseline=next(iter(settings)),
-                errors=errors,
-                error_of=WRONG,
-                counts=counts,
-                machine=machine("1 thread"),
-            )
-    return rows
+        items = [dataset[number] for number in range(len(dataset))]
+    objects = [video.object_id for video in videos]
+    labels, classes = np.array([catalogue.labels(o) for o in objects]), [len(p.levels) for p in catalogue.properties]
+    runs, errors, counts = {}, {}, {}
+    for side in SIDES:
+        name = f"{side} pixels"
+        clips = [(_resized(item["frames"], side), item["frame_indices"]) for item in items]
+        runs[name] = partial(describe, clips)
+        seen = np.stack([runs[name](video) for video in range(len(videos))])
+        errors[name] = heads_error(seen, seen, labels, objects, classes, size.folds, size.deals)
+        flops = counted(partial(runs[name], 0))[1]
+        counts[name] = {"frames": float(FRAMES), "megabytes": megabytes(encoder), "flops": flops}
+    places = [place for place, video in enumerate(videos) if video.video_id in timed]
+    return make_rows(
+        "frame size",
+        interleaved(runs, places, size.repeats),
+        unit="ms a video, encoder alone",
+        baseline=f"{SIDE} pixels",
+        errors=errors,
+        error_of=WRONG,
+        counts=counts,
+        machine=machine("1 thread"),
+    )
 
 
-def _clips(frames: Path, videos: Sequence[Video], shown: Shown) -> list[Clip]:
-    """Each video's evaluation clip, resized."""
-    labelled = [LabelledVideo(video.video_id, ()) for video in videos]
-    dataset = ClipDataset(FrameStore(frames, "subtract"), labelled, per_video=shown.frames)
-    clips = []
-    for number in range(len(dataset)):
-        item = dataset[number]
-        size = (shown.side, shown.side)
-        smaller = [cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in item["frames"].numpy()]
-        clips.append((torch.from_numpy(np.stack(smaller)), item["frame_indices"]))
-    return clips
+def _resized(pictures: torch.Tensor, side: int) -> torch.Tensor:
+    """Difference pictures, uint8, k x side x side x RGB, by area."""
+    smaller = [cv2.resize(picture, (side, side), interpolation=cv2.INTER_AREA) for picture in pictures.numpy()]
+    return torch.from_numpy(np.stack(smaller))

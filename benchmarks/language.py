@@ -23,7 +23,7 @@ from torch.nn import functional as F
 from benchmarks.describing import describing
 from benchmarks.errors import share_of
 from benchmarks.table import Row, make_rows
-from benchmarks.timing import counted, interleaved, machine, one_thread
+from benchmarks.timing import counted, interleaved, machine
 from pipeline.config import EncoderConfig, LanguageConfig
 from pipeline.config.params import load_params
 from pipeline.core.embeddings import FLIPS, INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
@@ -32,7 +32,7 @@ from pipeline.core.records import Assignment, Embedding, Opd, Part, Question
 from pipeline.core.runtime import DtypeName, seed_everything
 from pipeline.encoder.model import FrameEncoder, base_encoder
 from pipeline.language.chat import IGNORE_INDEX
-from pipeline.language.conversations import ConversationDataset, collate
+from pipeline.language.conversations import ConversationDataset, UpdateSampler, collate
 from pipeline.language.generate import answer
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.tasks.questions import build_questions, pool_of
@@ -94,7 +94,8 @@ class Setup:
 def measure(root: Path, size: Size | None = None) -> list[Row]:
     """All questions; how much to describe only where answers were graded and their report written."""
     described = describing(root)  # First, as it may be refused.
-    with one_thread(), TemporaryDirectory() as folder:
+    torch.set_num_threads(1)
+    with TemporaryDirectory() as folder:
         setup = make_setup(root, size := size or Size(), Path(folder))
         align(setup)
         return [*answering(setup, size), *formats(setup, size), *described]
@@ -133,10 +134,11 @@ def make_setup(root: Path, size: Size, folder: Path) -> Setup:
 def align(setup: Setup) -> None:
     """Train the connector on each of its conversations once."""
     data = setup.conversations(setup.aligned)
+    # In random order: questions are built task by task.
+    order = list(UpdateSampler(data.lengths, UPDATE, seed=0, epoch=lambda: 0))
     optimiser = torch.optim.AdamW(setup.model.connector.parameters(), lr=3e-3)
-    for start in range(0, len(data), UPDATE):
-        batch = collate([data[i] for i in range(start, min(start + UPDATE, len(data)))])
-        setup.model(**batch).loss.backward()
+    for start in range(0, len(order), UPDATE):
+        setup.model(**collate([data[i] for i in order[start : start + UPDATE]])).loss.backward()
         optimiser.step()
         optimiser.zero_grad()
 
