@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from benchmarks.errors import Error, cross_validated
+from benchmarks.errors import Error, share_of
 from pipeline.config import EncoderConfig
 from pipeline.core.runtime import derive_seed
-from pipeline.encoder.folds import Fold, Labels
+from pipeline.encoder.folds import Fold, Labels, cross_validate
 from pipeline.encoder.frame_classifier import Clips, choose_strength, fit_frame_heads
 from pipeline.encoder.model import FrameEncoder, load_backbones
 from pipeline.weights.make import make
@@ -50,11 +50,15 @@ def features(pictures: np.ndarray, folder: Path) -> np.ndarray:
 def heads_error(
     learnt: Clips, tested: Clips, labels: Labels, objects: Sequence[str], classes: Sequence[int], folds: int, deals: int
 ) -> Error:
-    """Error of frame heads in grouped folds, their penalty chosen inside the training objects.
+    """`errors.WRONG` of frame heads in grouped folds, their penalty chosen inside the training objects.
 
     Args:
         learnt: What the heads are trained on: videos x frames x features.
         tested: What they are tested on, of the same videos in the same order.
+        labels: Videos x properties.
+        objects: Each video's object; folds depend on these alone.
+        classes: How many classes each property has.
+        deals: How often the folds are dealt.
     """
     owners = np.array(objects)
 
@@ -63,4 +67,5 @@ def heads_error(
         strength, _ = choose_strength(*training, derive_seed("votes", fold.repeat, fold.number))
         return fit_frame_heads(*training, strength).predict(tested[fold.tested])
 
-    return cross_validated(predict, labels, objects, classes, folds=folds, repeats=deals)
+    predicted = cross_validate(predict, objects, classes, folds=folds, repeats=deals)
+    return share_of((predicted != labels[:, None]).any(axis=2).mean(axis=1), [(o,) for o in objects])

@@ -25,27 +25,22 @@ def describing(root: Path) -> list[Row]:
     ends: as wide as if all tasks erred together.
     """
     graded, report = root / "data" / "graded.parquet", root / "reports" / load_params(root / "params.yaml").report_name
-    full = ("finetuned", "with", "real")
-    ways = {opd: (*full, opd) for opd in ("all", "needed", "none")} | {RULES: ("finetuned", "", "real", "")}
     if not (graded.is_file() and (report / "scores.csv").is_file()):
         return []
-    scores = [row for row in read_csv(report / "scores.csv", ScoreRow) if (row.measure, row.seed) == ("choice", "all")]
-    answers = [a for a in read_table(graded, Graded) if (a.encoder, a.lora, a.touch) == full]
-    costs: dict[str, list[float]] = {}
-    errors = {}
-    for opd, way in ways.items():
-        own = [
-            error_of(row)
-            for row in scores
-            if (row.encoder, row.lora, row.touch, row.opd) == way and row.task in DESCRIBED
-        ]
-        tokens = [0] if opd == RULES else [a.tokens for a in answers if a.opd == opd and a.task in DESCRIBED]
-        if len(own) == len(DESCRIBED) and tokens:
-            lows, highs = ([e for e in ends if e is not None] for ends in ([x.low for x in own], [x.high for x in own]))
-            whole = len(lows) == len(highs) == len(own)
-            low, high = (fmean(lows), fmean(highs)) if whole else (None, None)
-            errors[opd] = Error(fmean(e.value for e in own), low, high, sum(e.n or 0 for e in own))
-            costs[opd] = [fmean(tokens)]
+    full = ("finetuned", "with", "real")
+    ways = {opd: (*full, opd) for opd in ("all", "needed", "none")} | {RULES: ("finetuned", "", "real", "")}
+    scores = [r for r in read_csv(report / "scores.csv", ScoreRow) if (r.measure, r.seed) == ("choice", "all")]
+    answers = [a for a in read_table(graded, Graded) if (a.encoder, a.lora, a.touch) == full and a.task in DESCRIBED]
+    costs, errors = {}, {}
+    for name, way in ways.items():
+        rows = [r for r in scores if (r.encoder, r.lora, r.touch, r.opd) == way and r.task in DESCRIBED]
+        tokens = [0] if name == RULES else [a.tokens for a in answers if a.opd == name]
+        if len(rows) == len(DESCRIBED) and tokens:
+            own = [error_of(row) for row in rows]
+            lows, highs = [e.low for e in own if e.low is not None], [e.high for e in own if e.high is not None]
+            low, high = (fmean(lows), fmean(highs)) if len(lows) == len(highs) == len(own) else (None, None)
+            errors[name] = Error(fmean(e.value for e in own), low, high, sum(e.n or 0 for e in own))
+            costs[name] = [fmean(tokens)]
     if len(costs) < 2 or "all" not in costs:
         return []
     return make_rows(
@@ -55,5 +50,5 @@ def describing(root: Path) -> list[Row]:
         baseline="all",
         errors=errors,
         error_of=f"error of the full system, mean over {', '.join(DESCRIBED)}",
-        counts={opd: {"tokens": own[0]} for opd, own in costs.items()},
+        counts={name: {"tokens": own[0]} for name, own in costs.items()},
     )

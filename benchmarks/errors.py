@@ -9,7 +9,6 @@ from statistics import fmean, stdev
 import numpy as np
 
 from pipeline.core.records import ScoreRow
-from pipeline.encoder.folds import Labels, Predict, cross_validate
 from pipeline.evaluation.intervals import accuracy_interval
 
 WRONG = "share of videos of unseen objects of which not every property is right"
@@ -32,17 +31,17 @@ class Error:
         return {name: value for name, value in columns.items() if value is not None}
 
 
-def share_of(wrong: Sequence[float], objects: Sequence[tuple[str, ...]]) -> Error:
+def share_of(wrong: Sequence[float] | np.ndarray, objects: Sequence[tuple[str, ...]]) -> Error:
     """The share of what is wrong, with the interval of the reports.
 
     Args:
         wrong: From 0 (right) to 1, of each question or video.
         objects: What each is about.
     """
-    interval = accuracy_interval(np.array(wrong, dtype=np.float64), objects)
-    if interval is None:
-        return Error(fmean(wrong), n=len(wrong))
-    return Error(fmean(wrong), interval.low, interval.high, len(wrong))
+    values = np.array(wrong, dtype=np.float64)
+    interval = accuracy_interval(values, objects)
+    low, high = (interval.low, interval.high) if interval else (None, None)
+    return Error(float(values.mean()), low, high, len(values))
 
 
 def mean_of(values: Sequence[float], objects: Sequence[str]) -> Error:
@@ -56,30 +55,7 @@ def mean_of(values: Sequence[float], objects: Sequence[str]) -> Error:
     return Error(fmean(means), max(fmean(means) - half, 0.0), fmean(means) + half, len(values))
 
 
-def cross_validated(
-    predict: Predict,
-    labels: Labels,
-    objects: Sequence[str],
-    classes: Sequence[int],
-    *,
-    folds: int = 5,
-    repeats: int = 3,
-) -> Error:
-    """`WRONG`, by grouped cross-validation whose folds depend on the objects alone.
-
-    Args:
-        predict: Learns from the trained videos of a fold and predicts the tested ones.
-        labels: Videos x properties.
-        objects: Each video's object.
-        classes: How many classes each property has.
-    """
-    predicted = cross_validate(predict, objects, classes, folds=folds, repeats=repeats)
-    wrong = (predicted != labels[:, None]).any(axis=2).mean(axis=1)
-    return share_of(wrong.tolist(), [(o,) for o in objects])
-
-
 def error_of(score: ScoreRow) -> Error:
     """One less the accuracy of a row of scores.csv."""
-    if score.low is None or score.high is None:
-        return Error(1 - score.accuracy, n=score.n)
-    return Error(1 - score.accuracy, 1 - score.high, 1 - score.low, score.n)
+    low, high = (None if end is None else 1 - end for end in (score.high, score.low))
+    return Error(1 - score.accuracy, low, high, score.n)

@@ -23,7 +23,7 @@ import numpy as np
 from benchmarks.classifier import features, heads_error, weights
 from benchmarks.errors import WRONG
 from benchmarks.table import Row, make_rows
-from benchmarks.timing import interleaved, machine, milliseconds
+from benchmarks.timing import interleaved, machine, timed
 from pipeline.config import FramesConfig, Selection
 from pipeline.config.params import load_params
 from pipeline.core.errors import UserError
@@ -179,8 +179,7 @@ def _sample(weights: Path, file: VideoFile) -> Sample | None:
     passes: dict[Selection, tuple[Scan, float]] = {}
     for rule in get_args(Selection):
         config = FramesConfig(selection=rule, fraction=FRACTION, pixels=LARGE)
-        spent = milliseconds(partial(scan, file, config))
-        found = scan(file, config)
+        found, spent = timed(partial(scan, file, config))
         if not isinstance(found, Scan) or not found.kept:
             return None
         passes[rule] = found, spent
@@ -191,8 +190,8 @@ def _sample(weights: Path, file: VideoFile) -> Sample | None:
         places = sample_evaluation(len(chosen.kept), setting.count)
         once = sorted(set(places))
         pictures = subtract(np.stack([chosen.kept[p].image for p in once]), chosen.reference)
-        rows = features(pictures, weights)
+        rows, described = timed(partial(features, pictures, weights))
         clips.append(rows[[once.index(p) for p in places]])
-        costs.append(spent + milliseconds(partial(features, pictures, weights)))
+        costs.append(spent + described)
         counts.append(len(once))
     return Sample(file.object_id, tuple(clips), tuple(counts), tuple(costs))

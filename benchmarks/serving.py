@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.table import Row, make_rows
-from benchmarks.timing import machine, milliseconds
+from benchmarks.timing import machine, timed
 from pipeline.config.params import load_params
 from pipeline.core.errors import UserError
 from pipeline.use.folder import SHIPPED
@@ -43,21 +43,20 @@ def measure(root: Path, clients: int = CLIENTS, each: int = EACH) -> list[Row]:
     if not videos:
         raise UserError(f"{place}: holds no video to ask about; `dvc repro` makes or finds some")
     ask = [*COMMAND, "ask", QUESTION, str(videos[0]), "--model", str(folder)]
-    done: list[subprocess.CompletedProcess[str]] = []
-    first = milliseconds(lambda: done.append(subprocess.run(ask, capture_output=True, text=True, check=False)))
-    if done[0].returncode:
-        raise UserError(done[0].stderr.strip() or "octopi ask failed")
+    done, first = timed(partial(subprocess.run, ask, capture_output=True, text=True, check=False))
+    if done.returncode:
+        raise UserError(str(done.stderr).strip() or "octopi ask failed")
     with served(folder) as address:
         bodies = [body(folder.name, video) for video in videos]
         alone = {b: post(address, b) for b in bodies}
-        once = [milliseconds(partial(post, address, b)) for b in bodies]
+        once = [timed(partial(post, address, b))[1] for b in bodies]
 
         def again(data: bytes) -> None:
             if post(address, data) != alone[data]:
                 raise UserError("an answer under load is not the one given alone")
 
         def client(number: int) -> list[float]:
-            return [milliseconds(partial(again, bodies[(number + i) % len(bodies)])) for i in range(each)]
+            return [timed(partial(again, bodies[(number + i) % len(bodies)]))[1] for i in range(each)]
 
         with ThreadPoolExecutor(clients) as pool:
             loaded = [spent for found in pool.map(client, range(clients)) for spent in found]

@@ -28,13 +28,11 @@ class Row(Record):
     cost_ratio: float = Field(ge=0)
     """Median over the repeats of the cost over that of the question's baseline, whose ratio is 1."""
     frames: float | None = None
-    """A video. This and the next four count what the unit is about, and are the same on every machine."""
+    """A video. This and the next three count what the unit is about, and are the same on every machine."""
     tokens: float | None = None
-    """Generated for an answer, or useful ones (no padding) of a conversation that is trained on."""
+    """Generated for an answer."""
     flops: float | None = None
     """Floating-point operations of matrix products, convolutions and attention."""
-    ffts: float | None = None
-    """Fourier transforms of one grid."""
     megabytes: float | None = None
     """Weights and buffers, in 10^6 bytes."""
     error: float | None = None
@@ -75,7 +73,7 @@ def make_rows(
     counts: Mapping[str, Mapping[str, float]] | None = None,
     machine: str = "",
 ) -> list[Row]:
-    """The rows of a question.
+    """The rows of a question, each told whether it is on the front.
 
     Args:
         costs: Of each setting in turn one figure a repeat, in `unit`; the n-th figures of all settings belong together.
@@ -86,23 +84,16 @@ def make_rows(
     errors, counts = errors or {}, counts or {}
     rows = []
     for name, own in costs.items():
-        error = errors.get(name)
         ratio = median(c / b for c, b in zip(own, costs[baseline], strict=True))
         values = {"cost": median(own), "cost_ratio": ratio, **counts.get(name, {})}
-        if error is not None:
-            values |= error.columns
+        if name in errors:
+            values |= errors[name].columns
         rounded = {column: float(f"{value:.4g}") for column, value in values.items()}
         named = {"question": question, "setting": name, "unit": unit, "machine": machine}
         rows.append(Row.model_validate({**named, "error_of": error_of if errors else "", **rounded}))
-    return with_front(rows)
-
-
-def with_front(rows: Sequence[Row]) -> list[Row]:
-    """The rows of one question, each told whether it is on the front; None where it has no error."""
     measured = [row for row in rows if row.error is not None]
-    ahead = front([row.cost_ratio for row in measured], [row.error or 0.0 for row in measured])
-    known = {row.setting: on for row, on in zip(measured, ahead, strict=True)}
-    return [row.model_copy(update={"front": known.get(row.setting)}) for row in rows]
+    ahead = iter(front([row.cost_ratio for row in measured], [row.error or 0.0 for row in measured]))
+    return [row.model_copy(update={"front": None if row.error is None else next(ahead)}) for row in rows]
 
 
 def read_rows(path: Path) -> list[Row]:
@@ -126,12 +117,9 @@ def merge(path: Path, rows: Sequence[Row]) -> list[Row]:
 
     Other questions keep their rows and their place; new ones come last.
     """
-    fresh: dict[str, list[Row]] = {}
-    for row in [*read_rows(path), *rows]:
-        fresh.setdefault(row.question, [])
-    answered = {row.question for row in rows}
-    for row in [*(r for r in read_rows(path) if r.question not in answered), *rows]:
-        fresh[row.question].append(row)
-    table = [row for question in fresh.values() for row in question]
+    old, answered = read_rows(path), {row.question for row in rows}
+    merged = [row for row in old if row.question not in answered] + [*rows]
+    places = list(dict.fromkeys(row.question for row in [*old, *rows]))
+    table = sorted(merged, key=lambda row: places.index(row.question))
     write_csv(path, Row, table)
     return table

@@ -3,29 +3,27 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
-from math import prod
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from statistics import median
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, TypeVar
-from unittest import mock
+from typing import TYPE_CHECKING, TypeVar
 
 from pipeline.core.runtime import cores
 
 if TYPE_CHECKING:
     from torch import nn
 
+R = TypeVar("R")
 T = TypeVar("T")
 
 
-def milliseconds(run: Callable[[], object]) -> float:
-    """What one call takes."""
+def timed(run: Callable[[], R]) -> tuple[R, float]:
+    """What one call gives, and the milliseconds that it takes."""
     started = perf_counter()
-    run()
-    return 1000 * (perf_counter() - started)
+    found = run()
+    return found, 1000 * (perf_counter() - started)
 
 
 def interleaved(
@@ -45,23 +43,10 @@ def interleaved(
         spent: dict[str, list[float]] = {name: [] for name in settings}
         for item in items:
             for name, run in settings.items():
-                spent[name].append(milliseconds(lambda run=run, item=item: run(item)))  # type: ignore[misc]
+                spent[name].append(timed(partial(run, item))[1])
         for name, own in spent.items():
             found[name].append(median(own))
     return found
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Keep torch to one thread."""
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def machine(threads: str) -> str:
@@ -72,11 +57,11 @@ def machine(threads: str) -> str:
     return f"{name}, {cores()} cores, {threads}"
 
 
-def flops_of(run: Callable[[], object]) -> float:
-    """Operations of matrix products, convolutions and attention in a call, two for a multiplication and an addition.
+def counted(run: Callable[[], R]) -> tuple[R, float]:
+    """What a call gives, and its operations: two for a multiplication and an addition.
 
-    torch counts them. Fused kernels of attention, which the counter does not see into, are off meanwhile; quantised
-    layers it does not see at all.
+    torch counts those of matrix products, convolutions and attention. Fused kernels of attention, which its counter
+    does not see into, are off meanwhile.
     """
     import torch
     from torch.utils.flop_counter import FlopCounterMode
@@ -85,48 +70,12 @@ def flops_of(run: Callable[[], object]) -> float:
     torch.backends.mha.set_fastpath_enabled(False)
     try:
         with FlopCounterMode(display=False) as counter:
-            run()
+            found = run()
     finally:
         torch.backends.mha.set_fastpath_enabled(fused)
-    return float(counter.get_total_flops())
-
-
-@dataclass
-class Count:
-    """How many there were."""
-
-    value: int = 0
-
-
-@contextmanager
-def counting_ffts() -> Iterator[Count]:
-    """Count scipy's real Fourier transforms, forth and back, of two-dimensional grids; a stack of n counts as n."""
-    import scipy.fft
-
-    count = Count()
-
-    def counted(transform: Callable[..., Any]) -> Callable[..., Any]:
-        def run(field: Any, *args: Any, **options: Any) -> Any:
-            count.value += prod(field.shape[:-2])
-            return transform(field, *args, **options)
-
-        return run
-
-    with (
-        mock.patch.object(scipy.fft, "rfft2", counted(scipy.fft.rfft2)),
-        mock.patch.object(scipy.fft, "irfft2", counted(scipy.fft.irfft2)),
-    ):
-        yield count
+    return found, float(counter.get_total_flops())
 
 
 def megabytes(module: nn.Module) -> float:
-    """Parameters and buffers as they lie in memory, 8-bit ones included, in 10^6 bytes."""
-    import torch
-
-    def size(value: object) -> int:
-        if isinstance(value, torch.Tensor):
-            return value.numel() * value.element_size()
-        # Quantised layers keep tuples in the tensors' place.
-        return sum(map(size, value)) if isinstance(value, tuple) else 0
-
-    return sum(map(size, module.state_dict().values())) / 1e6
+    """Parameters and buffers as they lie in memory, in 10^6 bytes."""
+    return float(sum(value.numel() * value.element_size() for value in module.state_dict().values())) / 1e6

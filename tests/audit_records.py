@@ -91,7 +91,7 @@ def of(findings: Sequence[Finding] | Iterator[Finding], check: str) -> list[Find
 
 def leaks(found: Sequence[Probe], parts: dict[str, Part], catalogue: Catalogue, **sha256: str) -> list[Finding]:
     found = [p.model_copy(update={"sha256": sha256.get(p.video_id, p.sha256)}) for p in found]
-    return list(check_leakage(found, assigned(found, parts), catalogue))
+    return list(check_leakage(found, [assigned(found, parts)], catalogue))
 
 
 def relabelled(catalogue: Catalogue, **changes: object) -> Catalogue:

@@ -1,6 +1,6 @@
 """Work on many files in processes of this machine and on a local cluster of Ray's: the same bytes come out.
 
-That a worker of this machine dies or outlives nothing is tests/videos/test_extract.py's.
+That no worker outlives a parent that is killed is tests/videos/test_extract.py's.
 """
 
 from __future__ import annotations

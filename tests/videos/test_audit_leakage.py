@@ -218,16 +218,6 @@ def test_copies_are_found_whatever_is_compared_at_a_time(
     assert list(leakage._near_copies(found, {})) == whole
 
 
-def test_drifting_brightness_is_one_session() -> None:
-    rng = np.random.default_rng(2)
-    look = rng.normal(90, 8, 144)
-    found_videos = [probe(f"rug_{i}", thumbnail=tuple(look + 2.0 * i + rng.normal(0, 0.5, 144))) for i in range(15)]
-    assert set(sessions(found_videos)) == {"25 frames/s, 320x240, look 1"}
-    assert set(sessions([probe(f"rug_{i}", thumbnail=(90.0,) * 144) for i in range(5)])) == {
-        "25 frames/s, 320x240, look 1"
-    }, "equal to the last bit"
-
-
 def test_formats_and_names_are_sessions_of_their_own() -> None:
     look = tuple(np.linspace(50, 130, 144))
     found_videos = [

@@ -193,20 +193,6 @@ def test_an_error_names_its_video_and_keeps_what_is_finished(place: Place) -> No
     assert not {*NAMES[:4]} & {*place.decoded()}, "what stands before it is finished, and perhaps more"
 
 
-def test_a_process_that_dies_is_an_error_that_names_the_place(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    def dying(file: VideoFile, config: FramesConfig) -> Scan | Finding:
-        if file.video_id == "potato_0":
-            os._exit(9)
-        return scan(file, config)
-
-    monkeypatch.setattr(extract, "scan", dying)
-    monkeypatch.setattr(pipeline.core.parallel, "cores", lambda: 1)
-    with refused(r"a process died at or soon after [a-z_0-9]+\.avi; .*Run again"):
-        place.extract()
-    monkeypatch.setattr(extract, "scan", scan)
-    assert len(place.extract().videos) == 7
-
-
 @pytest.mark.parametrize("signal_number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
 def test_no_worker_outlives_its_parent(tmp_path: Path, signal_number: int) -> None:
     script = tmp_path / "work.py"

@@ -149,14 +149,3 @@ def test_files_that_are_no_good_are_named(
     make(folder / name, tiny_videos / "rug_0.avi")
     with refused(f"^{re.escape(str(folder / name))}: .*{re.escape(words)}"):
         Place(folder, tmp_path, catalogue).extract()
-
-
-@pytest.mark.real
-def test_real_videos(real_data: Path, tmp_path: Path, catalogue: Catalogue) -> None:
-    place = Place(tmp_path / "v", tmp_path, catalogue)
-    place.folder.mkdir()
-    for name in ("hairbrush_bristles_side_4", "tv_remote_back_3"):
-        (place.folder / f"{name}.mov").symlink_to(real_data / f"{name}.mov")
-    found = place.extract(FramesConfig())
-    assert [(v.frames, p.kept) for v, p in zip(found.videos, found.probes, strict=True)] == [(3, 1), (7, 2)]
-    assert np.load(place.out / "frames.npy", mmap_mode="r").shape == (3, 224, 224, 3)

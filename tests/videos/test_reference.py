@@ -20,9 +20,7 @@ from pipeline.videos.frames.fit import fit
 from pipeline.videos.frames.reference import (
     LONGEST,
     MOST_FRAMES,
-    contact_strength,
     reference_indices,
-    starts_touching,
     thumbnail,
 )
 from pipeline.videos.frames.scan import Scan, scan
@@ -191,38 +189,6 @@ def test_a_light_that_never_settles_is_named_and_measured_as_before(tmp_path: Pa
     assert (found.probe.unsteady, found.probe.untouched) == (60, reference_indices(60))
 
 
-thumbs = st.tuples(st.integers(1, 12), st.integers(1, 12), st.integers(0, 2**32)).map(
-    lambda case: np.random.default_rng(case[2]).integers(0, 256, (2, case[0], case[1], 3), np.uint8)
-)
-
-
-@given(thumbs)
-def test_strength_is_its_definition(pair: np.ndarray) -> None:
-    one, other = pair.astype(np.float64)
-    change = one - other
-    expected = np.abs(change).mean() - np.abs(change.mean(axis=(0, 1))).mean()
-    assert contact_strength(pair[0], pair[1]) == pytest.approx(expected, abs=1e-9)
-    assert contact_strength(pair[0], pair[1]) == contact_strength(pair[1], pair[0]) >= 0
-    assert contact_strength(pair[0], pair[0]) == 0
-
-
-@given(thumbs, st.tuples(*[st.integers(-60, 60)] * 3), st.integers(0, 60))
-def test_light_alone_has_no_strength(pair: np.ndarray, shift: tuple[int, int, int], depth: int) -> None:
-    still = (60 + pair[0] % 130).astype(np.uint8)
-    assert contact_strength((still.astype(int) + shift).astype(np.uint8), still) == pytest.approx(0, abs=1e-9)
-    touched = still.copy()
-    touched[0, 0, 0] += depth
-    assert contact_strength(touched, still) <= depth / still[..., 0].size + 1e-9
-
-
-def test_detail_starts_the_decision() -> None:
-    flat, dotted = np.full((60, 80, 3), 90, np.uint8), np.full((60, 80, 3), 90, np.uint8)
-    dotted[::6, ::6] = 160
-    assert starts_touching(dotted, flat)
-    for first, last in ((flat, dotted), (flat, flat), (dotted, dotted), (dotted, dotted + np.uint8(20))):
-        assert not starts_touching(first, last)
-
-
 @pytest.mark.parametrize(("height", "width"), [(240, 320), (17, 97), (1, 9), (1, 1), (600, 4), (13, 17)])
 def test_thumbnails_keep_the_shape(tmp_path: Path, height: int, width: int) -> None:
     (frame,) = frames_of(encode(tmp_path / "v.mkv", [np.full((height, width, 3), 128, np.uint8)], "ffv1", "yuv420p"))
@@ -260,11 +226,3 @@ def test_subtraction_equals_the_slow_one(pictures: np.ndarray) -> None:
     for frame, shown in zip(pictures[:2], found, strict=True):
         np.testing.assert_array_equal(shown, slow(frame, pictures[2]))
     assert subtract(pictures[:0], pictures[2]).shape == pictures[:0].shape
-
-
-@given(pairs, st.tuples(*[st.integers(-50, 50)] * 3))
-def test_a_change_of_the_light_changes_no_picture(pictures: np.ndarray, shift: tuple[int, int, int]) -> None:
-    dim = (60 + pictures % 140).astype(np.uint8)
-    brighter = (dim[:2].astype(int) + shift).astype(np.uint8)
-    np.testing.assert_array_equal(subtract(brighter, dim[2]), subtract(dim[:2], dim[2]))
-    assert (subtract(pictures[2:], pictures[2]) == 128).all(), "what does not differ is exactly grey"

@@ -32,12 +32,11 @@ DEVIATION = 1.4826
 
 def check_files(probes: Sequence[Probe], catalogue: Catalogue) -> Iterator[Finding]:
     """All checks of this module, over videos that decode."""
-    if not probes:
-        return
-    yield from _overview(probes, catalogue)
-    for rate, group in by_rate(probes).items():
-        yield from _beside_others(rate, group)
-    yield from _each(probes)
+    if probes:
+        yield from _overview(probes, catalogue)
+        for rate, group in by_rate(probes).items():
+            yield from _beside_others(rate, group)
+        yield from _each(probes)
 
 
 def quiet_level(probes: Sequence[Probe]) -> float:
@@ -59,22 +58,19 @@ def unsteady(probe: Probe) -> str:
 
 def _overview(probes: Sequence[Probe], catalogue: Catalogue) -> Iterator[Finding]:
     videos = Counter(p.object_id for p in probes)
-    frames = [p.frames for p in probes]
-    measured = f"{len(probes)} videos of {len(videos)} objects"
-    yield finding("videos", "all", measured)
-    counts = Counter(videos.values())
-    spread = ", ".join(f"{n} objects with {count}" for count, n in sorted(counts.items()))
-    yield finding("videos per object", "all", spread)
+    yield finding("videos", "all", f"{len(probes)} videos of {len(videos)} objects")
+    spread = sorted(Counter(videos.values()).items())
+    yield finding("videos per object", "all", ", ".join(f"{n} objects with {count}" for count, n in spread))
     absent = sorted(catalogue.objects.keys() - videos)
     if absent:
         yield finding("videos", ", ".join(absent), "no video", "one or more an object", Severity.WARNING)
-    mean = fmean(frames)
-    yield finding("length", "all", f"{min(frames)} to {max(frames)} frames, mean {mean:.1f}")
+    frames = [p.frames for p in probes]
+    yield finding("length", "all", f"{min(frames)} to {max(frames)} frames, mean {fmean(frames):.1f}")
     for check, groups in (
         ("frame rate", {f"{rate:.4g} frames/s": len(group) for rate, group in by_rate(probes).items()}),
         ("resolution", Counter(f"{p.width}x{p.height}" for p in probes)),
     ):
-        usual = max(groups.items(), key=lambda item: (item[1], item[0]))[0]
+        usual = max(groups, key=lambda name: (groups[name], name))
         for name, count in sorted(groups.items()):
             yield finding(check, name, f"{count} videos", *(() if name == usual else (usual, Severity.WARNING)))
 
@@ -105,9 +101,10 @@ def _beside_others(rate: float, group: Sequence[Probe]) -> Iterator[Finding]:
 
 def _each(probes: Sequence[Probe]) -> Iterator[Finding]:
     """What is odd about a video by itself, or by the quiet level of its data set."""
-    level = quiet_level(probes)
+    level, bright = quiet_level(probes), f"at most {100 * SATURATED:g} %"
     for p in probes:
-        touched, end = touches(p, level), f"still {p.contact_end:.2f} of {p.contact:.2f}"
+        touched, released = touches(p, level), STILL * p.contact
+        pressed = touched and p.contact_end > max(FOUND * level, released)
         from_end = "touched from the first frame: the reference comes from the end"
         for check, odd, measured, expected in (
             ("frames that decode", _header_lies(p), str(p.frames), f"{p.header_frames}, by the header"),
@@ -115,18 +112,12 @@ def _each(probes: Sequence[Probe]) -> Iterator[Finding]:
             ("colours", p.hdr, "HDR, which looks flat beside other videos", "SDR; record or export it as such"),
             ("frame rate", p.irregular > IRREGULAR, f"varies by a factor of {p.irregular:.1f}", "even"),
             ("brightness", p.brightness_step > STEP, f"a step of {p.brightness_step:.1f} of 255", f"at most {STEP:g}"),
-            (
-                *("saturation", p.saturated > SATURATED, f"{100 * p.saturated:.0f} % of values at 0 or 255"),
-                f"at most {100 * SATURATED:g} %",
-            ),
+            ("saturation", p.saturated > SATURATED, f"{100 * p.saturated:.0f} % of values at 0 or 255", bright),
             ("frames kept", p.kept == 0, "0", "5 or more, by frames.selection"),
             ("light at the start", p.unsteady, unsteady(p), "steady"),
             ("contact at the start", p.starts_touching, from_end, "untouched"),
             ("contact", not touched, f"not found: strength {p.contact:.2f}", f"over {FOUND * level:.2f}"),
-            (
-                *("contact at the end", touched and p.contact_end > max(FOUND * level, STILL * p.contact), end),
-                f"under {STILL * p.contact:.2f}",
-            ),
+            ("contact at the end", pressed, f"still {p.contact_end:.2f} of {p.contact:.2f}", f"under {released:.2f}"),
         ):
             if odd:
                 yield finding(check, p.path, measured, expected, Severity.WARNING)

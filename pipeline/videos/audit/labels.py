@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from difflib import get_close_matches
+from itertools import product
 from statistics import fmean
 
 from pipeline.core.records import Finding, Part, Severity, finding
@@ -18,9 +19,13 @@ TINY = 1e-12
 def check_labels(catalogue: Catalogue) -> Iterator[Finding]:
     """All checks of this module; none needs a video."""
     yield from _agreement(catalogue)
-    yield from _counts(catalogue)
+    for place, prop in enumerate(catalogue.properties):
+        counts = Counter(o.labels[place] for o in catalogue.objects.values())
+        for level, name in enumerate(prop.levels):
+            severity = Severity.INFO if counts[level] else Severity.WARNING
+            yield finding("objects of a class", f"{prop.name}: {name}", str(counts[level]), "", severity)
     yield from _stated(catalogue)
-    yield from _descriptions(catalogue)
+    yield from _described(catalogue)
     yield from _splits(catalogue)
 
 
@@ -43,24 +48,23 @@ def icc3k(ratings: Sequence[Sequence[float]]) -> tuple[float, float, float] | No
     if table.ndim != 2 or min(table.shape) < 2:
         return None
     targets, raters = table.shape
-    free, free_error = targets - 1, (targets - 1) * (raters - 1)
+    free = (targets - 1, (targets - 1) * (raters - 1))
     between = float(raters * table.mean(axis=1).var(ddof=1))
     rest = table - table.mean(axis=1, keepdims=True) - table.mean(axis=0) + table.mean()
     if between <= TINY:
         return None
-    unlike = float((rest**2).sum()) / free_error / between
+    unlike = float((rest**2).sum()) / free[1] / between
     if unlike <= TINY:
         return 1.0, 1.0, 1.0
-    low, high = float(f.ppf(0.975, free, free_error)), 1 / float(f.ppf(0.975, free_error, free))
-    return 1 - unlike, 1 - unlike * low, 1 - unlike * high
+    low, high = (1 - unlike * float(f.ppf(tail, *free)) for tail in (0.975, 0.025))
+    return 1 - unlike, low, high
 
 
 def similar_names(unknown: Sequence[str], catalogue: Catalogue) -> Iterator[Finding]:
     """Objects of the folder that the catalogue lacks, but nearly has."""
     for name in unknown:
-        close = get_close_matches(name, catalogue.objects, n=1, cutoff=0.9)
-        if close:
-            yield finding("spelling", name, "not in the catalogue", f"{close[0]}?", Severity.WARNING)
+        for close in get_close_matches(name, catalogue.objects, n=1, cutoff=0.9):
+            yield finding("spelling", name, "not in the catalogue", f"{close}?", Severity.WARNING)
 
 
 def _agreement(catalogue: Catalogue) -> Iterator[Finding]:
@@ -78,29 +82,19 @@ def _agreement(catalogue: Catalogue) -> Iterator[Finding]:
         yield finding("disputed ratings", prop.name, f"{disputed} of {len(ratings)} objects")
 
 
-def _counts(catalogue: Catalogue) -> Iterator[Finding]:
-    for place, prop in enumerate(catalogue.properties):
-        counts = Counter(o.labels[place] for o in catalogue.objects.values())
-        for level, name in enumerate(prop.levels):
-            severity = Severity.INFO if counts[level] else Severity.WARNING
-            yield finding("objects of a class", f"{prop.name}: {name}", str(counts[level]), "", severity)
-
-
 def _stated(catalogue: Catalogue) -> Iterator[Finding]:
     for o in catalogue.objects.values():
-        for place, stated in enumerate(o.stated):
-            if stated is not None and stated != o.labels[place]:
-                prop, ratings = catalogue.properties[place], o.ratings[place]
-                measured = f"{prop.levels[o.labels[place]]} (mean rating {fmean(ratings):.2f})"
+        for prop, stated, label, ratings in zip(catalogue.properties, o.stated, o.labels, o.ratings, strict=True):
+            if stated not in (None, label):
+                measured = f"{prop.levels[label]} (mean rating {fmean(ratings):.2f})"
                 where = f"{o.object_id}: {prop.name}"
                 yield finding("stated label", where, measured, prop.levels[stated], Severity.WARNING)
 
 
-def _descriptions(catalogue: Catalogue) -> Iterator[Finding]:
+def _described(catalogue: Catalogue) -> Iterator[Finding]:
     for o in catalogue.objects.values():
         for prop, label, ratings in zip(catalogue.properties, o.labels, o.ratings, strict=True):
-            named = contradiction(o.description, prop, label)
-            if named:
+            if named := contradiction(o.description, prop, label):
                 words = " or ".join(prop.levels[level] for level in sorted(named))
                 measured = f"rated {prop.levels[label]} ({' '.join(map(str, ratings))})"
                 where = f"{o.object_id}: {prop.name}"
@@ -109,20 +103,18 @@ def _descriptions(catalogue: Catalogue) -> Iterator[Finding]:
 
 def _splits(catalogue: Catalogue) -> Iterator[Finding]:
     """Where the catalogue's splits disagree, and parts that lack a class."""
-    names = list(dict.fromkeys(name for o in catalogue.objects.values() for name in o.splits))
+    objects = catalogue.objects.values()
+    names = list(dict.fromkeys(name for o in objects for name in o.splits))
     for name in names[1:]:
-        for o in catalogue.objects.values():
+        for o in objects:
             one, other = o.splits[names[0]], o.splits[name]
             if one != other:
                 yield finding("splits differ", o.object_id, f"{one} in {names[0]}", f"{other} in {name}")
-    for name in names:
-        for part in (Part.TRAIN, Part.VALIDATION, Part.TEST):
-            members = [o for o in catalogue.objects.values() if o.splits[name] == part]
-            for place, prop in enumerate(catalogue.properties):
-                there = {o.labels[place] for o in members}
-                lacking = [word for level, word in enumerate(prop.levels) if level not in there]
-                if members and lacking:
-                    measured = f"no {' or '.join(lacking)}"
-                    yield finding(
-                        "classes of a part", f"{name}, {part}: {prop.name}", measured, "all", Severity.WARNING
-                    )
+    for name, part in product(names, (Part.TRAIN, Part.VALIDATION, Part.TEST)):
+        members = [o for o in objects if o.splits[name] == part]
+        for place, prop in enumerate(catalogue.properties):
+            there = {o.labels[place] for o in members}
+            lacking = " or ".join(word for level, word in enumerate(prop.levels) if level not in there)
+            if members and lacking:
+                where = f"{name}, {part}: {prop.name}"
+                yield finding("classes of a part", where, f"no {lacking}", "all", Severity.WARNING)

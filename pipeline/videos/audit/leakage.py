@@ -42,22 +42,20 @@ Parts = Mapping[str, Part]
 """By video id; empty where no split was asked for."""
 
 
-def check_leakage(probes: Sequence[Probe], split: Sequence[Assignment], catalogue: Catalogue) -> Iterator[Finding]:
-    """All checks of this module."""
-    yield from check_split(probes, split, catalogue)
-    if probes:
-        yield from _untouched_predictions(probes, sessions(probes), catalogue)
-
-
-def check_split(probes: Sequence[Probe], assignments: Sequence[Assignment], catalogue: Catalogue) -> Iterator[Finding]:
-    """The checks that depend on the split."""
-    parts = {a.video_id: a.part for a in assignments}
+def check_leakage(
+    probes: Sequence[Probe], splits: Sequence[Sequence[Assignment]], catalogue: Catalogue
+) -> Iterator[Finding]:
+    """All checks of this module. Those of the split are made for each of `splits`, or as if none were used."""
     if not probes:
         return
-    yield from _objects(probes, parts)
-    yield from _copies(probes, parts)
-    yield from _near_copies(probes, parts)
-    yield from _sessions(probes, parts, sessions(probes), catalogue)
+    recorded = sessions(probes)
+    for assignments in splits or [()]:
+        parts = {a.video_id: a.part for a in assignments}
+        yield from _objects(probes, parts)
+        yield from _copies(probes, parts)
+        yield from _near_copies(probes, parts)
+        yield from _sessions(probes, parts, recorded, catalogue)
+    yield from _untouched_predictions(probes, recorded, catalogue)
 
 
 def sessions(probes: Sequence[Probe]) -> list[str]:
@@ -71,17 +69,17 @@ def sessions(probes: Sequence[Probe]) -> list[str]:
     for place, p in enumerate(probes):
         if not p.session:
             groups[rates[p.video_id], p.width, p.height].append(place)
-    for (rate, width, height), places in sorted(groups.items()):
-        label = f"{rate:.4g} frames/s, {width}x{height}"
+    for (rate, width, height), places in groups.items():
         pictures = np.array([probes[i].thumbnail for i in places]).reshape(len(places), -1, 3)
-        pictures = (pictures - pictures.mean(1, keepdims=True)).reshape(len(places), -1)
-        clusters = _clusters(pictures)
-        # The largest cluster is A, so that names do not depend on the order of the videos.
-        sizes = Counter(clusters.tolist())
-        first = {c: min(probes[i].video_id for i, own in zip(places, clusters, strict=True) if own == c) for c in sizes}
-        order = sorted(sizes, key=lambda c: (-sizes[c], first[c]))
-        for i, cluster in zip(places, clusters, strict=True):
-            names[i] = f"{label}, look {order.index(cluster) + 1}"
+        clusters = _clusters((pictures - pictures.mean(1, keepdims=True)).reshape(len(places), -1))
+        members: dict[int, list[int]] = defaultdict(list)
+        for i, cluster in zip(places, clusters.tolist(), strict=True):
+            members[cluster].append(i)
+        # The largest cluster is the first, so that names do not depend on the order of the videos.
+        ordered = sorted(members.values(), key=lambda own: (-len(own), min(probes[i].video_id for i in own)))
+        for look, own in enumerate(ordered, 1):
+            for i in own:
+                names[i] = f"{rate:.4g} frames/s, {width}x{height}, look {look}"
     return names
 
 
@@ -92,17 +90,15 @@ def _clusters(pictures: np.ndarray) -> np.ndarray:
     """
     from scipy.cluster.hierarchy import fcluster, linkage
     from scipy.spatial import cKDTree
-    from scipy.spatial.distance import pdist, squareform
 
     if len(pictures) <= 2:
         return np.ones(len(pictures), dtype=int)
     some = pictures[_sampled(len(pictures))]
-    distances = pdist(some) / np.sqrt(some.shape[1])
-    square = squareform(distances)
-    np.fill_diagonal(square, np.inf)
-    usual = float(np.median(square.min(1)))
-    clusters: np.ndarray = fcluster(linkage(distances, "average"), max(SPREAD * usual, 1e-9), "distance")
-    return clusters if len(some) == len(pictures) else clusters[cKDTree(some).query(pictures)[1]]
+    tree = cKDTree(some)
+    usual = float(np.median(tree.query(some, 2)[0][:, 1]))
+    clusters = fcluster(linkage(some, "average"), max(SPREAD * usual, 1e-9), "distance")
+    nearest: np.ndarray = clusters[tree.query(pictures)[1]]
+    return nearest
 
 
 def _sampled(count: int) -> np.ndarray:
@@ -158,26 +154,21 @@ def _objects(probes: Sequence[Probe], parts: Parts) -> Iterator[Finding]:
     for p in probes:
         if parts.get(p.video_id, Part.UNUSED) != Part.UNUSED:
             stands[p.object_id].add(parts[p.video_id])
-    for name, where in sorted(stands.items()):
-        if len(where) > 1:
-            yield finding("object in two parts", name, ", ".join(sorted(where)), "one part", Severity.ERROR)
+    crossing = [name for name in sorted(stands) if len(stands[name]) > 1]
+    for name in crossing:
+        yield finding("object in two parts", name, ", ".join(sorted(stands[name])), "one part", Severity.ERROR)
     if parts:
-        crossing = sum(len(where) > 1 for where in stands.values())
-        yield finding("object in two parts", "all", f"{crossing} of {len(stands)} objects", "0")
+        yield finding("object in two parts", "all", f"{len(crossing)} of {len(stands)} objects", "0")
 
 
 def _copies(probes: Sequence[Probe], parts: Parts) -> Iterator[Finding]:
     earlier: dict[str, list[Probe]] = defaultdict(list)
-    copies = 0
     for video in probes:
-        twins = earlier[video.sha256]
-        if twins:
-            copies += 1
-            crossing = [t for t in twins if _crosses(parts, video.video_id, t.video_id)]
-            twin = (crossing or twins)[0]
-            yield _pair("same content", video.path, twin.path, "equal bytes", bool(crossing))
+        if twins := earlier[video.sha256]:
+            twin = next((t for t in twins if _crosses(parts, video, t)), twins[0])
+            yield _pair("same content", video, twin, "equal bytes", _crosses(parts, video, twin))
         twins.append(video)
-    yield finding("same content", "all", f"{copies} of {len(probes)} files", "0")
+    yield finding("same content", "all", f"{len(probes) - len(earlier)} of {len(probes)} files", "0")
 
 
 def _near_copies(probes: Sequence[Probe], parts: Parts) -> Iterator[Finding]:
@@ -201,8 +192,16 @@ def _near_copies(probes: Sequence[Probe], parts: Parts) -> Iterator[Finding]:
         largest = np.sort(np.concatenate([largest, chance]))[-math.isqrt(pairs) - 1 :]
     bound = likeness_bound(largest[::-1], pairs)
     for i, j, likeness in close:
-        if likeness > bound:
-            yield from _near_copy(parts, shown[i], shown[j], likeness)
+        one, other = shown[i], shown[j]
+        # What has equal bytes `_copies` names.
+        if likeness > bound and one.sha256 != other.sha256:
+            measured, crosses = f"contact is alike by {likeness:.3f}", _crosses(parts, one, other)
+            if one.object_id == other.object_id and not crosses:
+                # One object pressed twice in the same way looks alike, and leaks nothing.
+                twice = f"{measured} with {one.path}, the same object"
+                yield finding("near-duplicate", other.path, twice, "different videos")
+            else:
+                yield _pair("near-duplicate", other, one, measured, crosses)
     measured = f"closest pair of {len(shown)} videos in contact is alike by {closest:.3f}"
     yield finding("near-duplicate", "all", measured, f"at most {bound:.3f}")
 
@@ -240,54 +239,43 @@ def likeness_bound(largest: np.ndarray, pairs: int) -> float:
     return max(DUPLICATE, math.tanh(lower + (upper - lower) / math.log(4) * math.log(m / CHANCE)))
 
 
-def _near_copy(parts: Parts, one: Probe, other: Probe, alike: float) -> Iterator[Finding]:
-    if one.sha256 == other.sha256:
-        return  # `_copies` names them.
-    crosses = _crosses(parts, one.video_id, other.video_id)
-    measured = f"contact is alike by {alike:.3f}"
-    if one.object_id == other.object_id and not crosses:
-        # One object pressed twice in the same way looks alike, and leaks nothing.
-        twice = f"{measured} with {one.path}, the same object"
-        yield finding("near-duplicate", other.path, twice, "different videos")
-    else:
-        yield _pair("near-duplicate", other.path, one.path, measured, crosses)
-
-
-def _crosses(parts: Parts, one: str, other: str) -> bool:
+def _crosses(parts: Parts, one: Probe, other: Probe) -> bool:
     """Whether two videos stand in different parts of the split that are both used."""
-    both = {parts.get(one, Part.UNUSED), parts.get(other, Part.UNUSED)}
+    both = {parts.get(one.video_id, Part.UNUSED), parts.get(other.video_id, Part.UNUSED)}
     return len(both) == 2 and Part.UNUSED not in both
 
 
-def _pair(check: str, item: str, twin: str, measured: str, crosses: bool) -> Finding:
-    severity = Severity.ERROR if crosses else Severity.WARNING
+def _pair(check: str, video: Probe, twin: Probe, measured: str, crosses: bool) -> Finding:
     where = "in another part of the split: remove one of them" if crosses else "remove one of them"
-    return finding(check, item, f"{measured} with {twin}, {where}", "different videos", severity)
+    severity = Severity.ERROR if crosses else Severity.WARNING
+    return finding(check, video.path, f"{measured} with {twin.path}, {where}", "different videos", severity)
 
 
 def _sessions(probes: Sequence[Probe], parts: Parts, names: Sequence[str], catalogue: Catalogue) -> Iterator[Finding]:
     """What each session holds beside the whole, and whether training and test share it."""
+
+    def shares(objects: set[str]) -> str:
+        """How the objects' classes are spread, in percent of each property's levels."""
+        told = []
+        for place, prop in enumerate(catalogue.properties):
+            counts = Counter(catalogue.labels(o)[place] for o in objects)
+            percent = "/".join(f"{100 * counts[i] / len(objects):.0f}" for i in range(len(prop.levels)))
+            told.append(f"{prop.name} {percent} %")
+        return "; ".join(told)
+
     members: dict[str, list[Probe]] = defaultdict(list)
     for name, probe in zip(names, probes, strict=True):
         members[name].append(probe)
-    whole = {p.object_id for p in probes}
+    whole = shares({p.object_id for p in probes})
     for name, own in sorted(members.items()):
         objects = {p.object_id for p in own}
         light = fmean(p.brightness for p in own)
-        shares = "; ".join(_shares(prop.name, i, objects, catalogue) for i, prop in enumerate(catalogue.properties))
-        expected = "; ".join(_shares(prop.name, i, whole, catalogue) for i, prop in enumerate(catalogue.properties))
-        measured = f"{len(own)} videos of {len(objects)} objects, brightness {light:.1f}; {shares}"
-        yield finding("session", name, measured, expected)
+        measured = f"{len(own)} videos of {len(objects)} objects, brightness {light:.1f}; {shares(objects)}"
+        yield finding("session", name, measured, whole)
         counts = Counter(parts.get(p.video_id, Part.UNUSED) for p in own)
         if counts[Part.TEST] and any(counts[part] for part in LEARNT_FROM):
             counted = ", ".join(f"{counts[part]} {part}" for part in (*LEARNT_FROM, Part.TEST) if counts[part])
             yield finding("session in two parts", name, counted, "one part", Severity.WARNING)
-
-
-def _shares(name: str, place: int, objects: set[str], catalogue: Catalogue) -> str:
-    counts = Counter(catalogue.labels(o)[place] for o in objects)
-    percent = "/".join(f"{100 * counts[i] / len(objects):.0f}" for i in range(len(catalogue.properties[place].levels)))
-    return f"{name} {percent} %"
 
 
 def _untouched_predictions(probes: Sequence[Probe], names: Sequence[str], catalogue: Catalogue) -> Iterator[Finding]:

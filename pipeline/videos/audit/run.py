@@ -13,7 +13,7 @@ from pipeline.core.parallel import run_parallel
 from pipeline.core.records import Assignment, Finding, Probe, Severity, finding
 from pipeline.videos.audit.files import check_files
 from pipeline.videos.audit.labels import check_labels, similar_names
-from pipeline.videos.audit.leakage import check_leakage, check_split
+from pipeline.videos.audit.leakage import check_leakage
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import Listing, VideoFile, list_videos
 from pipeline.videos.frames.scan import Scan, scan
@@ -31,7 +31,7 @@ def audit_folder(folder: Path, catalogue: Catalogue, split: SplitConfig | None =
     """
     listing = list_videos(folder, catalogue)
     probes, wrong = _scan_all(listing.files)
-    splits: list[Sequence[Assignment]] = []
+    splits = []
     if split is not None and probes:
         try:
             folds = range(split.folds if split.fold_of(0) is not None else 1)
@@ -62,10 +62,8 @@ def by_severity(findings: Iterable[Finding]) -> list[Finding]:
 
 def stop_on_errors(findings: Sequence[Finding], path: Path) -> None:
     """Raise UserError with the first error, and how many there are."""
-    errors = [f for f in findings if f.severity is Severity.ERROR]
-    if errors:
-        first = errors[0]
-        more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
+    if errors := [f for f in findings if f.severity is Severity.ERROR]:
+        first, more = errors[0], f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
         raise UserError(f"{first.check}: {first.item}: {first.measured}{more}; all findings stand in {path}")
 
 
@@ -82,10 +80,8 @@ def _audit(
     splits: Sequence[Sequence[Assignment]],
     catalogue: Catalogue,
 ) -> list[Finding]:
-    first, *others = splits or [()]
     found = [*listing.findings, *similar_names(listing.unknown_objects, catalogue), *wrong, *check_labels(catalogue)]
-    found += [*check_files(probes, catalogue), *check_leakage(probes, first, catalogue)]
-    found += [each for other in others for each in check_split(probes, other, catalogue)]
+    found += [*check_files(probes, catalogue), *check_leakage(probes, splits, catalogue)]
     # Most findings are the same under every split.
     return by_severity(dict.fromkeys(found))
 
