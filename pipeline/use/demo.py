@@ -25,7 +25,6 @@ from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from pipeline.config import ScenesConfig
 from pipeline.core.errors import UserError
-from pipeline.scenes.film import write_film
 from pipeline.scenes.light import make_sensor
 from pipeline.scenes.recipe import Recipe, load_recipes
 from pipeline.scenes.render import make_scene, render
@@ -34,6 +33,7 @@ from pipeline.use.results import Exchange, Pictures, Touch
 from pipeline.use.server import listen, make_server
 from pipeline.use.worker import Failed, Job, Metrics, Worker
 from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.videos.film import write_film
 
 if TYPE_CHECKING:
     from pipeline.use.model import Octopi
