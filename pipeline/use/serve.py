@@ -35,16 +35,17 @@ if TYPE_CHECKING:
 
 UPLOAD_SECONDS, DRAIN_SECONDS = 30.0, 5.0
 """How long a client may take for a body, and for the rest of one that is not wanted."""
+MOST_TOKENS = 1024
+"""The longest answer that a client may ask for."""
 HOME = ("127.0.0.1", "localhost", "::1", "[::1]")
 
 
 class Service:
     """What the routes share."""
 
-    def __init__(self, model: Octopi, name: str, *, token: str, limits: Limits, places: int, most_tokens: int) -> None:
+    def __init__(self, model: Octopi, name: str, *, token: str, limits: Limits, places: int) -> None:
         self.model, self.name, self.token, self.limits = model, name, token, limits
-        self.places, self.most_tokens = places, most_tokens
-        self.created = int(time.time())
+        self.places, self.created = places, int(time.time())
         self.gate, self.worker = Gate(limits), Worker()
         self.requests: Counter[int] = Counter()
         self.videos = 0
@@ -105,7 +106,7 @@ class Service:
     def _ask(self, wanted: ChatRequest, exchanges: list[Exchange], reply: Reply) -> Iterator[str]:
         *history, last = exchanges
         most = wanted.max_completion_tokens or wanted.max_tokens
-        most = min(most, self.most_tokens) if most else None
+        most = min(most, MOST_TOKENS) if most else None
         pieces = self.model.stream(last.question, last.videos, history=history, max_new_tokens=most)
         notes = self.model.notes([video for exchange in exchanges for video in exchange.videos], last.question)
         reply.notes = [PLACE.sub(r"video \1", note) for note in notes]
@@ -208,15 +209,7 @@ def _said(error: Exception) -> tuple[str, int]:
     return PLACE.sub(r"video \1", " ".join(str(error).split())), status
 
 
-def make_app(
-    model: Octopi,
-    name: str,
-    *,
-    token: str = "",
-    limits: Limits | None = None,
-    places: int = 32,
-    most_tokens: int = 1024,
-) -> FastAPI:
+def make_app(model: Octopi, name: str, *, token: str = "", limits: Limits | None = None, places: int = 32) -> FastAPI:
     """The web application.
 
     Args:
@@ -225,9 +218,8 @@ def make_app(
         token: What they must send; empty for none, and then only names of this machine are answered to.
         limits: Of one request.
         places: Requests at once, from the first byte to the answer; the next gets 429.
-        most_tokens: The longest answer; a client may ask for a shorter one.
     """
-    service = Service(model, name, token=token, limits=limits or Limits(), places=places, most_tokens=most_tokens)
+    service = Service(model, name, token=token, limits=limits or Limits(), places=places)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:

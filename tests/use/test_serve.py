@@ -34,7 +34,7 @@ def fake() -> FakeOctopi:
 
 @pytest.fixture(scope="module")
 def client(fake: FakeOctopi) -> Iterator[TestClient]:
-    app = make_app(fake, "octopi", token=TOKEN, limits=LIMITS, places=2, most_tokens=100)
+    app = make_app(fake, "octopi", token=TOKEN, limits=LIMITS, places=2)
     headers = {"Authorization": f"Bearer {TOKEN}"}
     with TestClient(app, headers=headers, raise_server_exceptions=False) as client:
         yield client
@@ -138,7 +138,7 @@ def test_a_conversation_and_what_is_let_through(client: TestClient, fake: FakeOc
     assert fake.tokens[-1] == 7
     client.post(CHAT, json=body(user("a"), max_completion_tokens=5000))
     client.post(CHAT, json=body(user("a")))
-    assert fake.tokens[-2:] == [100, None]
+    assert fake.tokens[-2:] == [1024, None]
 
 
 # ---- refused ----

@@ -258,18 +258,15 @@ def test_addresses() -> None:
                 listen(host, port, token)
 
 
-@pytest.mark.parametrize("token", ["short", "x" * 15, "ü" * 20, "a b\nc" * 5])
-def test_weak_tokens(token: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("OCTOPI_TOKEN", token)
-    with refused("openssl"):
-        read_token(None)
-
-
 def test_tokens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OCTOPI_TOKEN", " \n")
     assert read_token(None) == ""
-    (tmp_path / "token").write_text(f" {'x' * 16}\n")
-    assert read_token(tmp_path / "token") == "x" * 16
+    (file := tmp_path / "token").write_text(f" {'x' * 16}\n")
+    assert read_token(file) == "x" * 16
+    for weak in ("short", "x" * 15, "ü" * 20, "a b\nc" * 5):
+        file.write_text(weak, encoding="utf-8")
+        with refused("openssl"):
+            read_token(file)
 
 
 def test_the_command_says_what_is_wrong_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
