@@ -192,8 +192,8 @@ def bag(
     times: Annotated[float, typer.Option(help="A press begins at this many times the quiet level.")] = 2.0,
 ) -> None:
     """Cut a robot's recording into presses: videos for the chain and `octopi ask`, each with its times in a CSV."""
-    from pipeline.use.bags import shots
-    from pipeline.use.presses import cut
+    from pipeline.videos.importing.bags import shots
+    from pipeline.videos.importing.presses import cut
 
     written = cut(lambda: shots(file, topic), f"{file}, {topic}", out, object_id or file.stem, times)
     typer.echo(f"{len(written)} presses in {out}: {', '.join(path.name for path in written)}")
@@ -214,7 +214,7 @@ def video(
 
     A table (file, object_id, begin and end in seconds, session) says itself where to cut: one video a line.
     """
-    from pipeline.use.presses import cut, cut_listed, film
+    from pipeline.videos.importing.presses import cut, cut_listed, film
 
     if file.suffix.lower() == ".csv":
         written = cut_listed(file, out, fps)

@@ -17,12 +17,12 @@ from pipeline.core.errors import UserError
 from pipeline.core.parallel import run_parallel
 from pipeline.core.records import Record
 from pipeline.core.runtime import derive_seed
-from pipeline.scenes.film import write_film
 from pipeline.scenes.light import make_sensor
 from pipeline.scenes.motion import draw_length
 from pipeline.scenes.recipe import Recipe
 from pipeline.scenes.render import make_scene, measure_scene, render
 from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.film import write_film
 
 cv2.setNumThreads(1)  # Videos are what runs in parallel.
 

@@ -9,8 +9,8 @@ import base64
 import re
 import shutil
 import tempfile
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
-from contextlib import asynccontextmanager, suppress
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Sequence
+from contextlib import aclosing, asynccontextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
@@ -25,15 +25,15 @@ from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from pipeline.config import ScenesConfig
 from pipeline.core.errors import UserError
-from pipeline.scenes.film import write_film
 from pipeline.scenes.light import make_sensor
 from pipeline.scenes.recipe import Recipe, load_recipes
 from pipeline.scenes.render import make_scene, render
 from pipeline.tasks.opd import TEMPLATES
 from pipeline.use.results import Exchange, Pictures, Touch
 from pipeline.use.server import listen, make_server
-from pipeline.use.worker import Failed, Job, Metrics, Worker
+from pipeline.use.worker import Failed, Worker
 from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.videos.film import write_film
 
 if TYPE_CHECKING:
     from pipeline.use.model import Octopi
@@ -76,22 +76,16 @@ class Session:
         self.names = {o: catalogue.objects[o].name for o in self.scenes} if catalogue else {}
         self.folder = Path(tempfile.mkdtemp(prefix="octopi-demo-"))
         self.videos: dict[str, Path] = {}
-        self.worker = Worker(Metrics())
+        self.worker = Worker()
 
     def close(self) -> None:
         """Forget everything that was shown."""
         self.worker.stop()
         shutil.rmtree(self.folder, ignore_errors=True)
 
-    def run(self, ask: Callable[[], Iterator[Any]]) -> Job:
-        """Have the model's thread do something; its pieces come from the job."""
-        job = Job(ask, lambda: None)
-        self.worker.add(job)
-        return job
-
     async def work(self, task: Callable[[], Any]) -> Any:
         """Wait for the model's thread to do something."""
-        return await anext(self.run(lambda: iter([task()])).pieces())
+        return await anext(self.worker.answer(lambda: [task()]))
 
     def scene(self, object_id: str) -> Path:
         """A synthetic press of an object, rendered once."""
@@ -135,19 +129,17 @@ class Session:
         """
         turns = [Exchange(t.question, self._find(t.touches), t.answer) for t in asked.history]
         videos = self._find(asked.touches)
-        job = self.run(lambda: self.model.stream(asked.question, videos, history=turns))
-        pieces = job.pieces()
-        return self._rest(await anext(pieces, ""), pieces, job)
+        pieces = self.worker.answer(lambda: self.model.stream(asked.question, videos, history=turns))
+        return self._rest(await anext(pieces, ""), pieces)
 
-    async def _rest(self, first: str, pieces: AsyncIterator[str], job: Job) -> AsyncIterator[str]:
-        try:
-            yield first
-            async for piece in pieces:
-                yield piece
-        except (UserError, Failed) as error:
-            yield f"\n[{error}]"
-        finally:
-            job.left.set()
+    async def _rest(self, first: str, pieces: AsyncGenerator[str]) -> AsyncIterator[str]:
+        async with aclosing(pieces):
+            try:
+                yield first
+                async for piece in pieces:
+                    yield piece
+            except (UserError, Failed) as error:
+                yield f"\n[{error}]"
 
     def _find(self, keys: Sequence[str]) -> tuple[Path, ...]:
         if unknown := [key for key in keys if key not in self.videos]:

@@ -14,9 +14,9 @@ import numpy as np
 
 from pipeline.core.errors import UserError
 from pipeline.use.model import with_marks
-from pipeline.use.presses import RELEASED, ROUNDING, SHORTEST, Shot, film, mean
 from pipeline.videos.audit.files import FOUND
 from pipeline.videos.frames.reference import LONGEST, contact_strength, starts_touching, thumbnail
+from pipeline.videos.importing.presses import RELEASED, ROUNDING, SHORTEST, Shot, film, mean
 
 if TYPE_CHECKING:
     from pipeline.use.model import Octopi

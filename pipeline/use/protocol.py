@@ -15,14 +15,10 @@ MARK = "{tactile}"
 MESSAGES, CHARACTERS = 64, 20_000
 """The longest conversation, and the longest text of one part of it."""
 Json = dict[str, Any]
-
-
 Said = tuple[str, tuple[bytes, ...], str]
 """A question, its videos, and the answer."""
 
-
 # ---- requests ----
-
 
 Text = Annotated[str, Field(max_length=CHARACTERS)]
 
@@ -31,28 +27,22 @@ class _Url(BaseModel):
     url: str
 
 
-class TextPart(BaseModel):
-    """A piece of text."""
-
+class _Text(BaseModel):
     type: Literal["text"]
     text: Text
 
 
-class VideoPart(BaseModel):
-    """A touch."""
-
+class _Video(BaseModel):
     type: Literal["video_url"]
     video_url: _Url
 
 
-class ImagePart(BaseModel):
-    """A touch, sent by a client that knows pictures only."""
-
+class _Image(BaseModel):  # A touch as well, from a client that knows pictures only.
     type: Literal["image_url"]
     image_url: _Url
 
 
-Part = Annotated[TextPart | VideoPart | ImagePart, Field(discriminator="type")]
+Part = Annotated[_Text | _Video | _Image, Field(discriminator="type")]
 
 
 def _parts(content: object) -> object:
@@ -100,7 +90,7 @@ def read_request(body: bytes) -> ChatRequest:
         raise Refused(f"{place}: {first['msg'][:300]}") from None
 
 
-def read_conversation(messages: Sequence[Message], most: int) -> list[Said]:
+def read_conversation(messages: Sequence[Message]) -> list[Said]:
     """Turn messages into exchanges; the last is the question, whose answer is "".
 
     A video stands where its part stands between two texts. Where a text of the message says `{tactile}`, videos stand
@@ -108,19 +98,12 @@ def read_conversation(messages: Sequence[Message], most: int) -> list[Said]:
 
     System messages are left out: the model was trained under its own and knows no other.
 
-    Args:
-        messages: User and assistant in turn, the user last.
-        most: Videos, at most.
-
     Raises:
-        Refused: where turns are out of order, the assistant sends a video, or there are too many.
+        Refused: where user and assistant do not take turns, the assistant sends a video, or one is no base64.
     """
     turns = [(i, m) for i, m in enumerate(messages) if m.role in ("user", "assistant")]
     if len(turns) % 2 == 0 or any(m.role != ("user", "assistant")[place % 2] for place, (_, m) in enumerate(turns)):
         raise Refused("messages: user and assistant must take turns, the user first and last")
-    count = sum(not isinstance(part, TextPart) for message in messages for part in message.content)
-    if count > most:
-        raise Refused(f"messages: {count} videos; a request may bring at most {most}, earlier turns included", 413)
     said = [_read(message, f"messages.{i}") for i, message in turns]
     if any(videos for _, videos in said[1::2]):
         raise Refused("messages: an assistant's message brings a video; only the user's may")
@@ -129,14 +112,14 @@ def read_conversation(messages: Sequence[Message], most: int) -> list[Said]:
 
 
 def _read(message: Message, place: str) -> tuple[str, tuple[bytes, ...]]:
-    texts = [part.text for part in message.content if isinstance(part, TextPart)]
+    texts = [part.text for part in message.content if isinstance(part, _Text)]
     placed = sum(bool(text.strip()) for text in texts) == 1 or any(MARK in text for text in texts)
     text, videos = "", []
     for i, part in enumerate(message.content):
-        if isinstance(part, TextPart):
+        if isinstance(part, _Text):
             piece = part.text
         else:
-            url = part.video_url if isinstance(part, VideoPart) else part.image_url
+            url = part.video_url if isinstance(part, _Video) else part.image_url
             videos.append(from_base64(url.url, f"{place}.content.{i}"))
             piece = "" if placed else MARK
         apart = text and piece and not text[-1].isspace() and not piece[0].isspace()
@@ -154,21 +137,21 @@ class Reply:
     OpenAI's has not, is what should make one doubt the answer: of a stream its last chunk has it.
     """
 
-    def __init__(self, model: str, notes: Sequence[str] = ()) -> None:
-        self.notes = notes
+    def __init__(self, model: str) -> None:
+        self.notes: list[str] = []
         self.head: Json = {"id": f"chatcmpl-{uuid.uuid4().hex}", "created": int(time.time()), "model": model}
 
     def whole(self, text: str) -> Json:
         """A `chat.completion`."""
-        message = {"role": "assistant", "content": text, "refusal": None}
-        choice = {"index": 0, "message": message, "logprobs": None, "finish_reason": "stop"}
-        return {**self.head, "object": "chat.completion", "choices": [choice], "notes": [*self.notes]}
+        return self._made("chat.completion", "stop", message={"role": "assistant", "content": text, "refusal": None})
 
     def chunk(self, delta: Mapping[str, str], finish: str | None = None) -> Json:
         """A `chat.completion.chunk`."""
-        choice = {"index": 0, "delta": dict(delta), "logprobs": None, "finish_reason": finish}
-        notes = {"notes": [*self.notes]} if finish else {}
-        return {**self.head, "object": "chat.completion.chunk", "choices": [choice], **notes}
+        return self._made("chat.completion.chunk", finish, delta=delta)
+
+    def _made(self, kind: str, finish: str | None, **said: Mapping[str, str | None]) -> Json:
+        choice = {"index": 0, **said, "logprobs": None, "finish_reason": finish}
+        return {**self.head, "object": kind, "choices": [choice], **({"notes": self.notes} if finish else {})}
 
 
 def model_entry(name: str, created: int) -> Json:

@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import asyncio
 import hmac
+import json
 import math
 import threading
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import ExitStack, asynccontextmanager, suppress
+from collections.abc import AsyncGenerator, AsyncIterator, Iterator
+from contextlib import ExitStack, aclosing, asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
-from fastapi import FastAPI, Request
+from fastapi import APIRouter, Depends, FastAPI, Request
 from fastapi.exceptions import HTTPException
 from fastapi.responses import JSONResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.exceptions import HTTPException as AnyHTTPException
@@ -25,28 +26,29 @@ from starlette.types import Message, Receive, Scope, Send
 
 from pipeline.core.errors import UserError
 from pipeline.use.media import PLACE, Gate, Limits, Refused
-from pipeline.use.protocol import Reply, error_body, model_entry, read_conversation, read_request
+from pipeline.use.protocol import ChatRequest, Json, Reply, error_body, model_entry, read_conversation, read_request
 from pipeline.use.results import Exchange
-from pipeline.use.worker import Failed, Job, Metrics, Worker
+from pipeline.use.worker import Failed, Worker
 
 if TYPE_CHECKING:
     from pipeline.use.model import Octopi
 
 UPLOAD_SECONDS, DRAIN_SECONDS = 30.0, 5.0
 """How long a client may take for a body, and for the rest of one that is not wanted."""
+MOST_TOKENS = 1024
+"""The longest answer that a client may ask for."""
 HOME = ("127.0.0.1", "localhost", "::1", "[::1]")
 
 
 class Service:
     """What the routes share."""
 
-    def __init__(self, model: Octopi, name: str, *, token: str, limits: Limits, places: int, most_tokens: int) -> None:
+    def __init__(self, model: Octopi, name: str, *, token: str, limits: Limits, places: int) -> None:
         self.model, self.name, self.token, self.limits = model, name, token, limits
-        self.places, self.most_tokens = places, most_tokens
-        self.created = int(time.time())
-        self.gate = Gate(limits)
-        self.metrics = Metrics()
-        self.worker = Worker(self.metrics)
+        self.places, self.created = places, int(time.time())
+        self.gate, self.worker = Gate(limits), Worker()
+        self.requests: Counter[int] = Counter()
+        self.videos = 0
         self._free = threading.Semaphore(places)
 
     @property
@@ -54,7 +56,7 @@ class Service:
         """Requests that are read, checked, waiting or answered."""
         return self.places - self._free._value
 
-    def check_token(self, request: Request) -> None:
+    async def check_token(self, request: Request) -> None:
         """Raise 401 without the right token; without any, raise 403 where a browser was lured here by another name."""
         if not self.token:
             if (request.url.hostname or "") not in HOME:
@@ -66,55 +68,66 @@ class Service:
                 401, "wrong or no token; send Authorization: Bearer TOKEN", {"WWW-Authenticate": "Bearer"}
             )
 
+    def check_name(self, name: str) -> None:
+        """Raise 404 for another model's name."""
+        if name != self.name:
+            raise HTTPException(404, f"model {name[:80]!r} is not served here; ask for {self.name!r}")
+
     async def chat(self, request: Request) -> Response:
         """Answer `/v1/chat/completions`."""
         if not self._free.acquire(blocking=False):
-            wait = str(min(600, max(1, math.ceil(self.metrics.mean * self.taken))))
+            mean = self.worker.seconds / self.worker.answers if self.worker.answers else 1.0
+            wait = str(min(600, max(1, math.ceil(mean * self.taken))))
             raise HTTPException(
                 429, f"all {self.places} places are taken; come again in {wait} s", {"Retry-After": wait}
             )
+        reply = Reply(self.name)
         with ExitStack() as stack:
             stack.callback(self._free.release)
             body = await _read(request, self.limits.body_bytes)
-            wanted, asked, files, notes = await asyncio.to_thread(self._prepare, body, stack)
+            wanted, exchanges = await asyncio.to_thread(self._prepare, body, stack)
             del body
             # From here on the worker gives the place back, when it needs the files no more.
-            job = Job(asked, stack.pop_all().close)
-            self.worker.add(job)
-        self.metrics.videos += files
-        reply = Reply(self.name, notes)
-        pieces = job.pieces()
-        try:
-            if wanted.stream:
-                first = await _unless_left(request, anext(pieces, ""))
-                return StreamingResponse(_events(reply, first, pieces, job), media_type="text/event-stream")
-            return JSONResponse(reply.whole(await _unless_left(request, _join(pieces))))
-        except BaseException:
-            job.left.set()
-            raise
+            pieces = self.worker.answer(lambda: self._ask(wanted, exchanges, reply), stack.pop_all().close)
+        self.videos += sum(len(exchange.videos) for exchange in exchanges)
+        if wanted.stream:
+            first = await _unless_left(request, anext(pieces, ""))
+            return StreamingResponse(_events(reply, first, pieces), media_type="text/event-stream")
+        return JSONResponse(reply.whole(await _unless_left(request, _join(pieces))))
 
-    def _prepare(self, body: bytes, stack: ExitStack) -> tuple[Any, Callable[[], Iterator[str]], int, list[str]]:
-        """The request, how to answer it, its number of videos, and a list that takes the notes when it is answered."""
+    def _prepare(self, body: bytes, stack: ExitStack) -> tuple[ChatRequest, list[Exchange]]:
+        """The request and its conversation, whose videos are files until the stack is closed."""
         wanted = read_request(body)
-        if wanted.model != self.name:
-            raise HTTPException(404, f"model {wanted.model[:80]!r} is not served here; ask for {self.name!r}")
-        said = read_conversation(wanted.messages, self.limits.videos)
-        every = [video for _, videos, _ in said for video in videos]
-        files = iter(stack.enter_context(self.gate.files(every)))
-        *history, last = [Exchange(q, tuple(next(files) for _ in videos), a) for q, videos, a in said]
+        self.check_name(wanted.model)
+        said = read_conversation(wanted.messages)
+        files = iter(stack.enter_context(self.gate.files([video for _, videos, _ in said for video in videos])))
+        return wanted, [Exchange(q, tuple(next(files) for _ in videos), a) for q, videos, a in said]
+
+    def _ask(self, wanted: ChatRequest, exchanges: list[Exchange], reply: Reply) -> Iterator[str]:
+        *history, last = exchanges
         most = wanted.max_completion_tokens or wanted.max_tokens
-        most = min(most, self.most_tokens) if most else None
-        notes: list[str] = []
+        most = min(most, MOST_TOKENS) if most else None
+        pieces = self.model.stream(last.question, last.videos, history=history, max_new_tokens=most)
+        notes = self.model.notes([video for exchange in exchanges for video in exchange.videos], last.question)
+        reply.notes = [PLACE.sub(r"video \1", note) for note in notes]
+        return pieces
 
-        def ask() -> Iterator[str]:
-            pieces = self.model.stream(last.question, last.videos, history=history, max_new_tokens=most)
-            notes.extend(
-                PLACE.sub(r"video \1", note)
-                for note in self.model.notes([v for e in (*history, last) for v in e.videos], last.question)
-            )
-            return pieces
-
-        return wanted, ask, len(every), notes
+    def metrics(self) -> str:
+        """What happened since the start, in Prometheus' text format."""
+        lines = [
+            "# TYPE octopi_requests_total counter",
+            *(f'octopi_requests_total{{status="{s}"}} {n}' for s, n in sorted(self.requests.items())),
+            "# TYPE octopi_videos_total counter",
+            f"octopi_videos_total {self.videos}",
+            "# TYPE octopi_requests_waiting gauge",
+            f"octopi_requests_waiting {self.taken}",
+            "# TYPE octopi_requests_places gauge",
+            f"octopi_requests_places {self.places}",
+            "# TYPE octopi_answer_seconds summary",
+            f"octopi_answer_seconds_sum {self.worker.seconds:.6f}",
+            f"octopi_answer_seconds_count {self.worker.answers}",
+        ]
+        return "\n".join(lines) + "\n"
 
 
 async def _read(request: Request, most: int) -> bytes:
@@ -122,40 +135,24 @@ async def _read(request: Request, most: int) -> bytes:
     if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
         # A page of another site may send other types without asking the browser's leave.
         raise HTTPException(415, "send Content-Type: application/json")
-    promised = request.headers.get("content-length", "0")
-    too_much = HTTPException(413, f"the request is larger than {most} bytes; send fewer or shorter videos")
-    if not promised.isdecimal() or int(promised) > most:
-        raise too_much
     data = bytearray()
     try:
         async with asyncio.timeout(UPLOAD_SECONDS):
-            async for chunk in _chunks(request):
+            async for chunk in request.stream():
                 data += chunk
                 if len(data) > most:
-                    raise too_much
+                    raise HTTPException(413, f"the request is larger than {most} bytes; send fewer or shorter videos")
     except TimeoutError:
-        request.state.read = True
-        raise HTTPException(
-            408, f"the request took longer than {UPLOAD_SECONDS:g} s to arrive", {"Connection": "close"}
-        ) from None
+        message = f"the request took longer than {UPLOAD_SECONDS:g} s to arrive"
+        raise HTTPException(408, message, {"Connection": "close"}) from None
     return bytes(data)
 
 
-async def _chunks(request: Request) -> AsyncIterator[bytes]:
-    """The body as it comes, from where it was last read; an error where the client hangs up."""
-    while not getattr(request.state, "read", False):
-        message = await request.receive()
-        if message["type"] == "http.disconnect":
-            raise ClientDisconnect
-        request.state.read = not message.get("more_body", False)
-        yield message.get("body", b"")
-
-
 async def _drain(request: Request, most: int) -> None:
-    """Read what is not wanted: a client that is still sending would not see the answer."""
+    """Read the rest of a body that is not wanted: a client that is still sending would not see the answer."""
     with suppress(Exception):
         async with asyncio.timeout(DRAIN_SECONDS):
-            async for chunk in _chunks(request):
+            async for chunk in request.stream():
                 most -= len(chunk)
                 if most < 0:
                     return
@@ -183,26 +180,26 @@ async def _join(pieces: AsyncIterator[str]) -> str:
     return "".join([piece async for piece in pieces])
 
 
-async def _events(reply: Reply, first: str, pieces: AsyncIterator[str], job: Job) -> AsyncIterator[str]:
+async def _events(reply: Reply, first: str, pieces: AsyncGenerator[str]) -> AsyncIterator[str]:
     """Server-sent events as OpenAI sends them; an error that comes late is the last event."""
-    try:
-        yield _event(reply.chunk({"role": "assistant", "content": ""}))
-        yield _event(reply.chunk({"content": first}))
-        async for piece in pieces:
-            yield _event(reply.chunk({"content": piece}))
-        yield _event(reply.chunk({}, "stop"))
-        yield "data: [DONE]\n\n"
-    except (UserError, Failed) as error:
-        yield _event(error_body(*_said(error)))
-    finally:
-        job.left.set()
 
+    def event(value: Json) -> str:
+        return f"data: {json.dumps(value, ensure_ascii=False, separators=(',', ':'))}\n\n"
 
-def _event(value: object) -> str:
-    return f"data: {JSONResponse(value).body.decode()}\n\n"  # type: ignore[union-attr]
+    async with aclosing(pieces):
+        try:
+            yield event(reply.chunk({"role": "assistant", "content": ""}))
+            yield event(reply.chunk({"content": first}))
+            async for piece in pieces:
+                yield event(reply.chunk({"content": piece}))
+            yield event(reply.chunk({}, "stop"))
+            yield "data: [DONE]\n\n"
+        except (UserError, Failed) as error:
+            yield event(error_body(*_said(error)))
 
 
 def _said(error: Exception) -> tuple[str, int]:
+    """What a client is told of an error, and the status."""
     if isinstance(error, AnyHTTPException):
         return str(error.detail), error.status_code
     if isinstance(error, ClientDisconnect):
@@ -212,15 +209,7 @@ def _said(error: Exception) -> tuple[str, int]:
     return PLACE.sub(r"video \1", " ".join(str(error).split())), status
 
 
-def make_app(
-    model: Octopi,
-    name: str,
-    *,
-    token: str = "",
-    limits: Limits | None = None,
-    places: int = 32,
-    most_tokens: int = 1024,
-) -> FastAPI:
+def make_app(model: Octopi, name: str, *, token: str = "", limits: Limits | None = None, places: int = 32) -> FastAPI:
     """The web application.
 
     Args:
@@ -229,9 +218,8 @@ def make_app(
         token: What they must send; empty for none, and then only names of this machine are answered to.
         limits: Of one request.
         places: Requests at once, from the first byte to the answer; the next gets 429.
-        most_tokens: The longest answer; a client may ask for a shorter one.
     """
-    service = Service(model, name, token=token, limits=limits or Limits(), places=places, most_tokens=most_tokens)
+    service = Service(model, name, token=token, limits=limits or Limits(), places=places)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -240,47 +228,41 @@ def make_app(
         service.gate.close()
 
     app = FastAPI(title="octopi serve", lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url=None)
-    app.state.service, counts = service, service.metrics.requests
+    guarded = APIRouter(dependencies=[Depends(service.check_token)])
+    guarded.post("/v1/chat/completions")(service.chat)
 
-    @app.post("/v1/chat/completions")
-    async def chat(request: Request) -> Response:
-        service.check_token(request)
-        return await service.chat(request)
-
-    @app.get("/v1/models")
-    async def models(request: Request) -> dict[str, Any]:
-        service.check_token(request)
+    @guarded.get("/v1/models")
+    async def models() -> dict[str, Any]:
         return {"object": "list", "data": [model_entry(name, service.created)]}
 
-    @app.get("/v1/models/{wanted:path}")
-    async def one_model(request: Request, wanted: str) -> dict[str, Any]:
-        service.check_token(request)
-        if wanted != name:
-            raise HTTPException(404, f"model {wanted[:80]!r} is not served here; ask for {name!r}")
+    @guarded.get("/v1/models/{wanted:path}")
+    async def one_model(wanted: str) -> dict[str, Any]:
+        service.check_name(wanted)
         return model_entry(name, service.created)
+
+    @guarded.get("/metrics")
+    async def metrics() -> Response:
+        return PlainTextResponse(service.metrics(), media_type="text/plain; version=0.0.4")
 
     @app.get("/health")
     async def health() -> dict[str, Any]:
         return {"status": "ok", "model": name, "waiting": service.taken, "places": places}
 
-    @app.get("/metrics")
-    async def metrics(request: Request) -> Response:
-        service.check_token(request)
-        return PlainTextResponse(service.metrics.text(service.taken, places), media_type="text/plain; version=0.0.4")
-
     async def refuse(request: Request, error: Exception) -> Response:
         message, status = _said(error)
-        await _drain(request, 4 * service.limits.body_bytes)
+        if status != 408:
+            await _drain(request, 4 * service.limits.body_bytes)
         return JSONResponse(error_body(message, status), status, getattr(error, "headers", None))
 
     async def fail(_: Request, __: Exception) -> Response:
-        counts[500] += 1  # It answers outside of `_Count`.
+        service.requests[500] += 1  # It answers outside of `_Count`.
         return JSONResponse(error_body(str(Failed()), 500), 500)
 
+    app.include_router(guarded)
     for kind in (AnyHTTPException, UserError, Failed, ClientDisconnect):
         app.add_exception_handler(kind, refuse)
     app.add_exception_handler(Exception, fail)
-    app.add_middleware(_Count, counts=counts)
+    app.add_middleware(_Count, counts=service.requests)
     return app
 
 

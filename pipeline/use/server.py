@@ -62,10 +62,11 @@ def make_server(app: FastAPI) -> uvicorn.Server:
 
 def listen(host: str, port: int, token: str) -> socket.socket:
     """A socket for the server; UserError where others could reach it without a token, or it cannot have the address."""
-    with suppress(ValueError):
-        if token or host == "localhost" or ipaddress.ip_address(host).is_loopback:
-            token = token or "none needed"
-    if not token:
+    try:
+        own = host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        own = False  # A name.
+    if not own and not token:
         raise UserError(f"--host {host}: others can reach it; set OCTOPI_TOKEN or --token-file, or leave --host out")
     try:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -73,14 +74,6 @@ def listen(host: str, port: int, token: str) -> socket.socket:
     except (OSError, OverflowError) as error:
         words = getattr(error, "strerror", None) or error
         raise UserError(f"--host {host} --port {port}: cannot be had ({words}); choose another") from None
-
-
-def checked(token: str) -> str:
-    """The token without space around it; too short a one is a UserError."""
-    token = token.strip()
-    if token and (len(token) < SHORTEST_TOKEN or not token.isascii() or not token.isprintable()):
-        raise UserError(f"the token needs {SHORTEST_TOKEN} or more ASCII characters; `openssl rand -hex 32` makes one")
-    return token
 
 
 def serve(load: Callable[[], Octopi], name: str, host: str, port: int, token_file: Path | None, places: int) -> None:
@@ -91,7 +84,7 @@ def serve(load: Callable[[], Octopi], name: str, host: str, port: int, token_fil
     """
     from pipeline.use.serve import make_app
 
-    token = checked(read_token(token_file))
+    token = read_token(token_file)
     # First the address, which is known at once; loading takes its time.
     with listen(host, port, token) as listening:
         app = make_app(load(), name, token=token, places=places)
@@ -103,12 +96,16 @@ def serve(load: Callable[[], Octopi], name: str, host: str, port: int, token_fil
 
 
 def read_token(file: Path | None) -> str:
-    """What the file says, or else the environment."""
+    """The token that the file holds, or else the environment; UserError for an empty file or a short token."""
     if file is None:
-        return os.environ.get("OCTOPI_TOKEN", "")
-    try:
-        if found := file.read_text(encoding="utf-8").strip():
-            return found
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"--token-file {file}: cannot be read ({error}); name a text file") from None
-    raise UserError(f"--token-file {file}: empty; write the token into it")
+        token = os.environ.get("OCTOPI_TOKEN", "").strip()
+    else:
+        try:
+            token = file.read_text(encoding="utf-8").strip()
+        except (OSError, UnicodeDecodeError) as error:
+            raise UserError(f"--token-file {file}: cannot be read ({error}); name a text file") from None
+        if not token:
+            raise UserError(f"--token-file {file}: empty; write the token into it")
+    if token and (len(token) < SHORTEST_TOKEN or not token.isascii() or not token.isprintable()):
+        raise UserError(f"the token needs {SHORTEST_TOKEN} or more ASCII characters; `openssl rand -hex 32` makes one")
+    return token

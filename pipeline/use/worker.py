@@ -1,4 +1,4 @@
-"""The thread that holds a model, the questions on their way through it, and what it counts."""
+"""The thread that holds a model, and the questions on their way through it."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ import logging
 import queue
 import threading
 import time
-from collections import Counter
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncGenerator, Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass, field
+from typing import Any
 
 from pipeline.core.errors import UserError
 
@@ -24,93 +23,45 @@ class Failed(Exception):
         super().__init__("the model failed at this request; the server's log says why")
 
 
-@dataclass
-class Metrics:
-    """What happened since the start, in Prometheus' text format."""
-
-    requests: Counter[int] = field(default_factory=Counter)
-    """By status."""
-    answers: int = 0
-    seconds: float = 0.0
-    """That the model took for them all."""
-    videos: int = 0
-
-    @property
-    def mean(self) -> float:
-        """Seconds an answer; 1 before the first."""
-        return self.seconds / self.answers if self.answers else 1.0
-
-    def text(self, taken: int, places: int) -> str:
-        """All of it; `taken` of `places` are in use."""
-        lines = [
-            "# TYPE octopi_requests_total counter",
-            *(f'octopi_requests_total{{status="{s}"}} {n}' for s, n in sorted(self.requests.items())),
-            "# TYPE octopi_videos_total counter",
-            f"octopi_videos_total {self.videos}",
-            "# TYPE octopi_requests_waiting gauge",
-            f"octopi_requests_waiting {taken}",
-            "# TYPE octopi_requests_places gauge",
-            f"octopi_requests_places {places}",
-            "# TYPE octopi_answer_seconds summary",
-            f"octopi_answer_seconds_sum {self.seconds:.6f}",
-            f"octopi_answer_seconds_count {self.answers}",
-        ]
-        return "\n".join(lines) + "\n"
-
-
-class Job:
-    """A question on its way through the worker; its pieces arrive in the loop that made it."""
-
-    def __init__(self, ask: Callable[[], Iterator[str]], done: Callable[[], None]) -> None:
-        self.ask, self.done = ask, done
-        self.left = threading.Event()
-        """Set when nobody waits for the answer any more."""
-        self._loop = asyncio.get_running_loop()
-        self._pieces: asyncio.Queue[str | Exception | None] = asyncio.Queue()
-
-    def put(self, piece: str | Exception | None) -> None:
-        """From the worker: a piece, what went wrong, or None behind the last one."""
-        with suppress(RuntimeError):  # The loop is closed: nobody waits.
-            self._loop.call_soon_threadsafe(self._pieces.put_nowait, piece)
-
-    async def pieces(self) -> AsyncIterator[str]:
-        """The answer, as it is made."""
-        while (piece := await self._pieces.get()) is not None:
-            if isinstance(piece, Exception):
-                raise piece
-            yield piece
-
-
 class Worker:
-    """The thread that holds the model."""
+    """The thread that holds the model: it answers one question after another, in the order in which they came.
 
-    def __init__(self, metrics: Metrics) -> None:
-        self.metrics = metrics
-        self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
+    Attributes:
+        answers: How many were given in full.
+        seconds: That the model took for them all.
+    """
+
+    def __init__(self) -> None:
+        self.answers, self.seconds = 0, 0.0
+        self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        # A daemon, so that a second Ctrl-C does not wait for the answer.
         self._thread = threading.Thread(target=self._work, name="octopi-model", daemon=True)
         self._thread.start()
 
-    def add(self, job: Job) -> None:
-        """Queue a job; who calls this keeps count."""
-        self._jobs.put(job)
+    def answer(
+        self, ask: Callable[[], Iterable[Any]], done: Callable[[], object] = lambda: None
+    ) -> AsyncGenerator[Any]:
+        """Queue a question, and yield the pieces of its answer as they are made; who closes this gives it up.
 
-    def stop(self) -> None:
-        """Wait until all that is queued is answered."""
-        self._jobs.put(None)
-        self._thread.join()
+        Args:
+            ask: Called in the thread, where its pieces are made, too.
+            done: Called in the thread behind the last piece, also where the answer failed or was given up.
 
-    def _work(self) -> None:
-        while (job := self._jobs.get()) is not None:
-            started = time.monotonic()
+        Raises:
+            UserError: as `ask` raises it.
+            Failed: where it raises anything else.
+        """
+        loop, left = asyncio.get_running_loop(), threading.Event()
+        pieces: asyncio.Queue[Any] = asyncio.Queue()
+
+        def put(piece: Any) -> None:
+            with suppress(RuntimeError):  # The loop is closed: nobody waits.
+                loop.call_soon_threadsafe(pieces.put_nowait, piece)
+
+        def job() -> None:
             end: Exception | None = None
             try:
-                for piece in () if job.left.is_set() else job.ask():
-                    job.put(piece)
-                    if job.left.is_set():
-                        break
-                else:
-                    self.metrics.answers += 1
-                    self.metrics.seconds += time.monotonic() - started
+                self._ask(ask, put, left)
             except UserError as error:
                 end = error
             except Exception:
@@ -118,5 +69,38 @@ class Worker:
                 end = Failed()
             # First the place and the files, so that who has the answer finds the place free.
             with suppress(Exception):
-                job.done()
-            job.put(end)
+                done()
+            put(end)
+
+        self._jobs.put(job)
+        return _pieces(pieces, left)
+
+    def stop(self) -> None:
+        """Wait until all that is queued is answered."""
+        self._jobs.put(None)
+        self._thread.join()
+
+    def _ask(self, ask: Callable[[], Iterable[Any]], put: Callable[[Any], None], left: threading.Event) -> None:
+        if left.is_set():
+            return
+        started = time.monotonic()
+        for piece in ask():
+            put(piece)
+            if left.is_set():
+                return
+        self.answers += 1
+        self.seconds += time.monotonic() - started
+
+    def _work(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            job()
+
+
+async def _pieces(pieces: asyncio.Queue[Any], left: threading.Event) -> AsyncGenerator[Any]:
+    try:
+        while (piece := await pieces.get()) is not None:
+            if isinstance(piece, Exception):
+                raise piece
+            yield piece
+    finally:
+        left.set()

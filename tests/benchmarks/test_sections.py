@@ -17,10 +17,10 @@ from pipeline.core.io import write_csv, write_table
 from pipeline.core.records import Encoder, Graded, Lora, Opd, ScoreRow, Variant
 from pipeline.encoder import frame_classifier
 from pipeline.encoder.scene_encoder import SceneEncoder
-from pipeline.scenes.film import write_film
 from pipeline.scenes.light import make_sensor, shade
 from pipeline.training.trainable import save_trainable
 from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.film import write_film
 from tests.checkpoints import write_clip, write_llama
 from tests.conftest import ROOT, refused
 from tests.use.shared import make

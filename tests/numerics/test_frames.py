@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from pipeline.config import FramesConfig
-from pipeline.scenes.film import write_film
+from pipeline.videos.film import write_film
 from pipeline.videos.frames.reference import contact_strength
 from pipeline.videos.frames.selection import difference
 from pipeline.videos.frames.subtraction import GAIN, MIDDLE, RING, subtract

@@ -17,11 +17,11 @@ import pytest
 from pipeline.scenes.contact import Method, press
 from pipeline.scenes.elastic.kernels import Gel, Kernel, half_space_table, layer_table, make_kernel
 from pipeline.scenes.elastic.solver import NotConverged, Solution, solve
-from pipeline.scenes.film import write_film
 from pipeline.scenes.grid import Grid, thread
 from pipeline.scenes.light import make_sensor, shade
 from pipeline.scenes.relief import Rough
 from pipeline.videos.decoding import decode
+from pipeline.videos.film import write_film
 from tests.numerics.bounds import summing
 from tests.numerics.harness import FLOAT32, FLOAT64, SOLVED, UINT8, Check, Floats, Format, formats
 

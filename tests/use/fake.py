@@ -1,9 +1,10 @@
-"""A model of the contract's shape that needs no weights, and a server in a thread."""
+"""A model of the contract's shape that needs no weights, a server in a thread, and requests in OpenAI's form."""
 
 from __future__ import annotations
 
 import hashlib
 import itertools
+import json
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -11,38 +12,71 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from pipeline.config import FramesConfig
 from pipeline.core.errors import UserError
 from pipeline.use.model import with_marks
+from pipeline.use.results import Description, Touch, Video
 from pipeline.use.server import listen, make_server
+from pipeline.videos.files import VideoFile
+from pipeline.videos.frames.scan import Scan, scan
 from tests.conftest import HUNG
+from tests.use.videos import uri
+
+CHAT = "/v1/chat/completions"
+KEPT = 5
+LEVELS = {"hardness": ("soft", "hard"), "roughness": ("smooth", "slightly rough", "rough")}
 
 
-def digest(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()[:8]
+def digest(data: bytes | Path) -> str:
+    return hashlib.sha256(data.read_bytes() if isinstance(data, Path) else data).hexdigest()[:8]
 
 
 class FakeOctopi:
-    """Answers `question | history | digest of each video`, word by word; `{tactile}` must fit as in the real one."""
+    """Answers `question | history | digest of each video`, word by word; `{tactile}` must fit as in the real one.
+
+    `threads` are those that its work was done in; with a `gate`, it waits for that behind each word.
+    """
+
+    name = "finetuned-with-all-0"
 
     def __init__(self, seconds: float = 0.0) -> None:
         self.seconds = seconds
-        self.name = "fake"
         self.threads: set[int] = set()
         self.tokens: list[int | None] = []
-        self.asked = 0
+        self.asked = self.made = 0
         self.gate: threading.Event | None = None
+
+    def look(self, video: Path) -> Touch:
+        self.threads.add(threading.get_ident())
+        settings = FramesConfig(pixels=96, fraction=0.15, selection="contact")
+        found = scan(VideoFile(video, str(video), "x", "x_0"), settings)
+        if not isinstance(found, Scan):
+            raise UserError(f"{video}: {found.measured}")
+        frames = np.stack([kept.image for kept in found.kept])
+        difference = 128 + (frames.astype(int) - found.reference) // 2
+        return Touch(
+            frames=frames,
+            numbers=tuple(kept.index for kept in found.kept),
+            reference=found.reference,
+            difference=np.clip(difference, 0, 255).astype(np.uint8),
+            contact=0.25,
+            strength=found.probe.contact,
+            notes=(),
+        )
+
+    def describe(self, video: Video, *, sentence: bool = True) -> Description:
+        share = {p: {level: 1 / 2 ** (i + 1) for i, level in enumerate(names)} for p, names in LEVELS.items()}
+        levels = {p: names[0] for p, names in LEVELS.items()}
+        return Description(levels=levels, probabilities=share, sentence="It is soft.", frames=(1, 2), notes=())
 
     def notes(self, videos: Sequence[Any], question: str = "") -> tuple[str, ...]:
         """As the real one's: behind the name of a file."""
         return tuple(f"{video}: little touches the sensor" for video in videos)
 
     def stream(
-        self,
-        question: str,
-        videos: Sequence[Any] = (),
-        *,
-        history: Sequence[Any] = (),
-        max_new_tokens: int | None = None,
+        self, question: str, videos: Sequence[Path] = (), *, history: Sequence[Any] = (), max_new_tokens: Any = None
     ) -> Iterator[str]:
         self.asked += 1
         self.threads.add(threading.get_ident())
@@ -52,21 +86,18 @@ class FakeOctopi:
             raise UserError(f"{videos[0]}: 12 frames show no touch; record it again")
         if question == "break":
             raise RuntimeError("a secret of /home/somebody")
-        words = self.words(question, [Path(v).read_bytes() for v in videos], history).split(" ")
+        before = [f"{h.question}>{h.answer}:{','.join(map(digest, h.videos))}" for h in history]
+        words = " | ".join([question, *before, *map(digest, videos)]).split(" ")
         for word in itertools.repeat("on") if question == "endless" else words:
+            time.sleep(self.seconds)
+            self.made += 1
+            yield f"{word} "
             if self.gate is not None:
                 self.gate.wait(HUNG)
-            time.sleep(self.seconds)
-            yield f"{word} "
             if word == "late":
                 raise UserError("the touch ended; send another")
             if word == "crash":
                 raise RuntimeError("a secret of /home/somebody")
-
-    def words(self, question: str, videos: Sequence[bytes], history: Sequence[Any] = ()) -> str:
-        shown = [",".join(digest(Path(v).read_bytes()) for v in h.videos) for h in history]
-        before = [f"{h.question}>{h.answer}:{seen}" for h, seen in zip(history, shown, strict=True)]
-        return " | ".join([question, *before, *map(digest, videos)])
 
 
 @contextmanager
@@ -82,3 +113,34 @@ def running(app: Any) -> Iterator[int]:
             there.should_exit = True
             thread.join(HUNG)
             assert not thread.is_alive()
+
+
+def part(data: bytes, kind: str = "video_url") -> dict[str, Any]:
+    return {"type": kind, kind: {"url": uri(data)}}
+
+
+def text(words: str) -> dict[str, Any]:
+    return {"type": "text", "text": words}
+
+
+def user(*content: Any) -> dict[str, Any]:
+    return {"role": "user", "content": content[0] if isinstance(content[0], str) else list(content)}
+
+
+def body(*messages: dict[str, Any], **more: Any) -> dict[str, Any]:
+    return {"model": "octopi", "messages": list(messages), **more}
+
+
+def events(content: str) -> list[Any]:
+    """Server-sent events by the WHATWG's grammar: `data:` lines, a blank line behind each event."""
+    assert content.endswith("\n\n")
+    found = [line.removeprefix("data: ") for line in content.split("\n\n")[:-1]]
+    assert all("\n" not in event for event in found)
+    return [event if event == "[DONE]" else json.loads(event) for event in found]
+
+
+def said(response: Any) -> str:
+    """The answer in a whole response, or in the text of a streamed one."""
+    if not isinstance(response, str):
+        return str(response["choices"][0]["message"]["content"])
+    return "".join(e["choices"][0]["delta"].get("content", "") for e in events(response) if e != "[DONE]")

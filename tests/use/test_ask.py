@@ -217,23 +217,21 @@ def test_a_killed_description_goes_on(
         assert len(looked) == 3 - sum(".avi" in line and "broken" not in line for line in text[:end].split("\n")[:-1])
 
 
-def test_another_trainings_table_is_left_alone(
-    octopi: Octopi, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    describe_folder(octopi, [folder], out := tmp_path / "out.csv")
-    text = out.read_text()
-    monkeypatch.setattr(octopi, "config", octopi.config.model_copy(update={"files": {}}))
-    with refused("is no description by finetuned-with-all-0"):
-        describe_folder(octopi, [folder], out)
-    assert out.read_text() == text
-
-
 @pytest.mark.parametrize(
-    "content", [b"my only notes", b"file,object\n", b"a,b\n1,2\n", "file;größe\n".encode("utf-16")]
+    "content",
+    [b"", b"my only notes", b"file,object\n", b"a,b\n1,2\n", "file;größe\n".encode("utf-16")],
+    ids=["another training's", "notes", "begun alike", "a table", "utf-16"],
 )
-def test_what_somebody_else_wrote_stays(content: bytes, octopi: Octopi, folder: Path, tmp_path: Path) -> None:
+def test_what_another_model_or_somebody_else_wrote_stays(
+    content: bytes, octopi: Octopi, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out = tmp_path / "notes.txt"
-    out.write_bytes(content)
-    with refused("is no description by .*name another file with --csv"):
+    if content:
+        out.write_bytes(content)
+    else:
+        describe_folder(octopi, [folder], out)
+        content = out.read_bytes()
+        monkeypatch.setattr(octopi, "config", octopi.config.model_copy(update={"files": {}}))
+    with refused("is no description by finetuned-with-all-0.*name another file with --csv"):
         describe_folder(octopi, [folder], out)
     assert out.read_bytes() == content

@@ -29,25 +29,13 @@ from pipeline.use.model import Octopi
 from pipeline.use.results import Exchange
 from pipeline.use.worker import Failed
 from pipeline.videos.catalogue import Catalogue
-from tests.conftest import HUNG, ROOT, encode
+from tests.conftest import HUNG, ROOT
 from tests.use.browser import tab
-from tests.use.fake import running
+from tests.use.fake import KEPT, FakeOctopi, digest, running
 from tests.use.shared import Made
-from tests.use.stand_in import KEPT, FakeOctopi
+from tests.use.videos import press
 
 OBJECTS = ROOT / "pipeline" / "physiclear" / "objects.csv"
-
-
-def press(file: Path, turned: bool = False) -> Path:
-    """A video of a disc that presses into a sensor's uneven light."""
-    y, x = np.mgrid[:96, :128]
-    ground = np.stack([90 + x / 3, 110 + y / 3, 100 + (x + y) / 5], axis=2)
-    frames = []
-    for index in range(30):
-        depth = max(0.0, min(index - 8, 28 - index, 6)) * 8
-        side = np.sign((y - 48) if turned else (x - 64)) * (np.hypot(x - 64, y - 48) < 22)
-        frames.append(np.clip(ground + depth * side[:, :, None], 0, 255).astype(np.uint8))
-    return encode(file, frames, codec="mpeg4", pixels="yuv420p", bits=2_000_000)
 
 
 @pytest.fixture(scope="module")
@@ -106,23 +94,22 @@ def test_it_glows_where_it_touches_and_nowhere_else(session: Session, tmp_path: 
 
 
 def test_an_answer_streams_with_its_history(site: str, session: Session, tmp_path: Path) -> None:
-    video = press(tmp_path / "rug.mp4").read_bytes()
-    ids = [json.loads(call(f"{site}/api/touches/{n}.mp4", "PUT", video)[1])["id"] for n in "ab"]
+    videos = [press(tmp_path / "a.mp4"), press(tmp_path / "b.mp4", turned=True)]
+    ids = [json.loads(call(f"{site}/api/touches/{v.name}", "PUT", v.read_bytes())[1])["id"] for v in videos]
     turn = {"question": "{tactile}?", "touches": ids[:1], "answer": "Soft."}
-    asked = {"question": "And {tactile} wait", "touches": ids[1:], "history": [turn]}
+    asked = {"question": "And {tactile}", "touches": ids[1:], "history": [turn]}
     model: Any = session.model
-    model.paused.clear()
+    model.gate = threading.Event()
     request = urllib.request.Request(
         f"{site}/api/ask", json.dumps(asked).encode(), {"Content-Type": "application/json"}, method="POST"
     )
     with urllib.request.urlopen(request, timeout=HUNG) as response:
         assert response.read(4) == b"And ", "the first piece comes while the model goes on"
-        model.paused.set()
-        assert response.read() == b"it wait <b>1</b> "
-    question, videos, history = model.heard[-1]
-    assert (question, videos) == ("And {tactile} wait", ["b.mp4"])
-    assert [(h.question, [v.name for v in h.videos], h.answer) for h in history] == [("{tactile}?", ["a.mp4"], "Soft.")]
+        model.gate.set()
+        rest = f"{{tactile}} | {{tactile}}?>Soft.:{digest(videos[0])} | {digest(videos[1])} "
+        assert response.read().decode() == rest
     assert len(model.threads - {threading.get_ident()}) == 1, "one thread does all that the model does"
+    model.gate = None
 
 
 def said(session: Session, **asked: Any) -> str:
@@ -138,19 +125,20 @@ def test_an_answer_that_nobody_hears_ends(session: Session) -> None:
     model: Any = session.model
 
     async def leave() -> None:
-        model.paused.clear()
-        pieces: Any = await session.stream(Asked(question="wait " + "on " * 50))
+        model.gate = threading.Event()
+        pieces: Any = await session.stream(Asked(question="endless"))
         await anext(pieces)
         await pieces.aclose()
         before = model.made
-        model.paused.set()
+        model.gate.set()
         assert await session.work(lambda: model.made) <= before + 1
+        model.gate = None
 
     asyncio.run(leave())
 
 
 def test_an_answer_that_breaks_off_says_so(session: Session) -> None:
-    assert said(session, question="break") == f"break <b>0</b> \n[{Failed()}]"
+    assert said(session, question="crash") == f"crash \n[{Failed()}]"
 
 
 def test_what_is_wrong_comes_back_as_one_line(site: str, tmp_path: Path) -> None:
@@ -269,13 +257,16 @@ def test_in_a_browser(site: str, tmp_path: Path) -> None:
             ".map(b => b.firstChild.offsetWidth / b.offsetWidth)"
         )
         np.testing.assert_allclose(widths, [0.5, 0.25, 0.5, 0.25, 0.125], atol=0.02)
-        page.type("#question", "Which is softer?")
+        page.type("#question", "Which is <b>softer</b>?")
         page.until("!document.querySelector('#send').disabled && document.querySelector('.model')")
         said = page.run("[...document.querySelectorAll('.said')].map(e => e.textContent)")
-        assert said == ["{tactile} {tactile} Which is softer?", "it it Which is softer? <b>0</b> "]
+        asked = "{tactile} {tactile} Which is <b>softer</b>?"
+        answer = f"{asked} | {digest(files[0])} | {digest(files[1])} "
+        assert said == [asked, answer], "an answer is text, too"
         page.type("#question", "Why?")
         page.until("document.querySelectorAll('.model').length === 2 && !document.querySelector('#send').disabled")
-        assert page.run("[...document.querySelectorAll('.model')].at(-1).textContent") == "Why? <b>1</b> "
+        shown = page.run("[...document.querySelectorAll('.model')].at(-1).textContent")
+        assert shown == f"Why? | {asked}>{answer}:{digest(files[0])},{digest(files[1])} ", "with what was said before"
         page.type("#question", "{tactile} {tactile} {tactile}?")
         page.until("document.querySelector('#message').textContent.includes('3 {tactile} for 2 videos')")
         assert page.run("document.querySelectorAll('.said').length") == 4, "what was refused is no part of the talk"

@@ -15,7 +15,7 @@ import yaml
 
 from pipeline.core.embeddings import TENSOR, TENSOR_FILE
 from pipeline.core.io import load_tensors, read_table, save_tensors, write_table
-from pipeline.core.records import Classification, Part, Probe
+from pipeline.core.records import Classification, Probe
 from pipeline.use.folder import FORMAT, read_folder
 from pipeline.use.model import Octopi
 from pipeline.use.package import describe_base, export, package
@@ -25,7 +25,7 @@ from tests.closure import ROOT
 from tests.conftest import refused
 from tests.fake_run import fake_params
 from tests.report.shared import files_of
-from tests.use.shared import PARTS, Made
+from tests.use.shared import Made
 
 
 @pytest.fixture
@@ -82,11 +82,6 @@ def test_inputs_that_are_equal_give_equal_bytes(
     assert files_of(place / "models" / "new") == files_of(made.folder)
 
 
-def test_rounding_makes_no_training_video_unlike_training(made: Made, octopi: Octopi) -> None:
-    trained = [video for video in made.videos.iterdir() if PARTS[video.stem[:-2]] is not Part.TEST]
-    assert not [note for video in trained for note in octopi.look(video).notes if "unlike" in note]
-
-
 @pytest.mark.parametrize(("overrides", "made_too"), [([], []), (["packaged=all"], ["finetuned-with-none-0"])])
 def test_the_stage_packages_the_full_system_and_the_others_on_demand(
     overrides: list[str], made_too: list[str], made: Made, tmp_path: Path
@@ -115,17 +110,13 @@ def test_export_with_its_base_needs_nothing_else(made: Made, copy: Path, files: 
         export(made.folder, tmp_path / "whole")
 
 
-def test_a_base_by_name(copy: Path, llama: Path, tmp_path: Path) -> None:
+def test_a_base_by_name_and_one_in_a_known_place(copy: Path, llama: Path, tmp_path: Path) -> None:
     assert Octopi.from_pretrained(copy, base=llama).card["base"]["folder"] == "llama"
-    other = write_llama(tmp_path / "other", seed=5)
-    with refused(r"other: is another language model .*model.safetensors differs"):
+    other = write_llama(copy / "base", seed=5)
+    with refused(r"base: is another language model .*model.safetensors differs"):
         Octopi.from_pretrained(copy, base=other)
-
-
-def test_a_known_place_with_another_model_is_passed_over(copy: Path, llama: Path) -> None:
-    write_llama(copy / "base", seed=5)
-    shutil.copytree(llama, copy.parent / "llama")
-    assert Octopi.from_pretrained(copy).card["variant"] == "finetuned-with-all-0"
+    shutil.copytree(llama, tmp_path / "llama")
+    assert Octopi.from_pretrained(copy).card["variant"] == "finetuned-with-all-0", "another's is passed over"
 
 
 def test_another_chat_format_is_refused(copy: Path, llama: Path, tmp_path: Path) -> None:

@@ -13,34 +13,16 @@ from typer.testing import CliRunner
 
 from pipeline.cli import app
 from pipeline.core.errors import UserError
-from pipeline.scenes.film import write_film
 from pipeline.use import live
-from pipeline.use.presses import Shot
+from pipeline.videos.film import write_film
 from pipeline.videos.frames.reference import LONGEST
+from pipeline.videos.importing.presses import Shot
 from tests.use.shared import Made
+from tests.use.videos import recording
 
 STEP_NS = 40_000_000
 TOUCHED = (range(30, 50), range(80, 92))
 LENGTH = 120
-
-
-def recording(drift: float = 0.0) -> list[np.ndarray]:
-    """Pictures (BGR) with noise; a bump brightens one side and darkens the other while touched; the light may drift."""
-    rng = np.random.default_rng(0)
-    y, x = np.mgrid[:48, :64]
-    ground = np.stack([90 + x / 3, 110 + y / 3, 100 + (x + y) / 5], axis=2)
-    bump = 40 * np.sign(x - 32) * (np.hypot(x - 32, y - 24) < 12)
-    return [
-        np.clip(
-            ground
-            + drift * index * np.cos(x / 20)[:, :, None]
-            + bump[:, :, None] * any(index in touched for touched in TOUCHED)
-            + rng.normal(0, 1, ground.shape),
-            0,
-            255,
-        ).astype(np.uint8)
-        for index in range(LENGTH)
-    ]
 
 
 def shots(pictures: Sequence[np.ndarray], kept: Sequence[int]) -> list[Shot]:
@@ -52,7 +34,7 @@ def shots(pictures: Sequence[np.ndarray], kept: Sequence[int]) -> list[Shot]:
 def test_each_press_is_found_once_with_untouched_pictures_in_front(drift: float, dropped: float) -> None:
     rng = np.random.default_rng(1)
     kept = [i for i in range(LENGTH) if rng.random() >= dropped]
-    found = list(live.presses(shots(recording(drift), kept)))
+    found = list(live.presses(shots(recording(TOUCHED, LENGTH, drift=drift), kept)))
     assert len(found) == len(TOUCHED)
     for press, touched in zip(found, TOUCHED, strict=True):
         places = [shot.recorded // STEP_NS for shot in press]
@@ -62,9 +44,9 @@ def test_each_press_is_found_once_with_untouched_pictures_in_front(drift: float,
 
 
 def test_a_light_that_changes_for_good_is_no_endless_press() -> None:
-    plain = recording()[:25]
+    plain = recording(TOUCHED, LENGTH)[:25]
     other = [np.clip(p * np.linspace(0.8, 1.2, 64)[None, :, None], 0, 255).astype(np.uint8) for p in plain]
-    pressed = recording()[TOUCHED[0].start : TOUCHED[0].stop]
+    pressed = recording(TOUCHED, LENGTH)[TOUCHED[0].start : TOUCHED[0].stop]
     pressed = [np.clip(p * np.linspace(0.8, 1.2, 64)[None, :, None], 0, 255).astype(np.uint8) for p in pressed]
     film = [*plain, *other * 31, *pressed, *other]
     found = list(live.presses(shots(film, range(len(film)))))
@@ -75,7 +57,7 @@ def test_a_light_that_changes_for_good_is_no_endless_press() -> None:
 def test_a_press_that_deepens_slowly_is_never_told_by_its_release(steps: float) -> None:
     y, x = np.mgrid[:48, :64]
     bump = np.sign(x - 32) * (np.hypot(x - 32, y - 24) < 12)
-    plain = recording()[:25]
+    plain = recording(TOUCHED, LENGTH)[:25]
     depth = [0.0] * 80 + [min(40.0, steps * i) for i in range(200)] + [0.0] * 60
     film = [np.clip(plain[i % 25] + d * bump[:, :, None], 0, 255).astype(np.uint8) for i, d in enumerate(depth)]
     for press in live.presses(shots(film, range(len(film)))):
@@ -104,7 +86,7 @@ class Camera:
 def test_by_command_on_a_file_and_on_a_camera_that_drops_frames(
     made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pictures = recording()
+    pictures = recording(TOUCHED, LENGTH)
     write_film(tmp_path / "long.mp4", pictures, 25.0)
     command, model = ["live", "--times", "4"], ["--model", str(made.folder), "--device", "cpu"]
     said = CliRunner().invoke(app, [*command, str(tmp_path / "long.mp4"), *model])

@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
@@ -84,6 +85,7 @@ def test_a_video_is_one_for_the_server_for_ask_and_in_a_folder(gate: Gate, suffi
         (lambda: blank(2, 1024, 1024), 413, "pixels"),
         (lambda: avi_of_giant_jpegs(15_000, 15_000), 422, "no frame"),
         (lambda: claims_frames(10**6), 413, "longer than 200 frames"),
+        (lambda: claims_frames(10**8), 413, "longer than 200 frames|too much memory"),
         (lambda: blank(201), 413, "longer than 200 frames"),
         (lambda: b"hello", 422, "no video"),
         (lambda: video()[:300], 422, "no video"),
@@ -91,41 +93,28 @@ def test_a_video_is_one_for_the_server_for_ask_and_in_a_folder(gate: Gate, suffi
         (lambda: bytes(1000), 422, "no video"),
     ],
 )
-def test_bombs_and_what_is_no_video(gate: Gate, data: object, status: int, words: str) -> None:
-    with pytest.raises(Refused, match=words) as refused, gate.files([data()]):  # type: ignore[operator]
+def test_bombs_and_what_is_no_video(gate: Gate, data: Callable[[], bytes], status: int, words: str) -> None:
+    with pytest.raises(Refused, match=words) as refused, gate.files([data()]):
         pass
     assert refused.value.status == status
     assert str(refused.value).startswith("video 1: ")
     assert "/tmp" not in str(refused.value)
+    with gate.files([video()]):
+        pass
 
 
-def test_what_makes_ffmpeg_read_other_files_is_no_video_anywhere(gate: Gate, tmp_path: Path) -> None:
+def test_a_playlist_cannot_read_another_file(gate: Gate, tmp_path: Path) -> None:
     (tmp_path / "secret.mp4").write_bytes(video())
     (playlist := tmp_path / "list.mov").write_text("ffconcat version 1.0\nfile secret.mp4\n")
     with av.open(str(playlist)) as container:
         assert next(container.decode(video=0)), "FFmpeg alone reads it"
     with Decoder(playlist) as decoder:
         assert list(decoder.frames()) == []
-    with pytest.raises(Refused, match="no video"), gate.files([playlist.read_bytes()]):
-        pass
-
-
-def test_the_last_allowed_frame_and_one_more() -> None:
-    with closing(Gate(Limits(frames=12))) as gate, gate.files([blank(12)]):
-        pass
-    with closing(Gate(Limits(frames=11))) as gate, pytest.raises(Refused, match="11 frames"), gate.files([blank(12)]):
-        pass
-
-
-def test_a_playlist_cannot_read_another_file(gate: Gate, tmp_path: Path) -> None:
-    # FFmpeg alone would play the other file.
     other = tmp_path / "secret.mp4"
-    other.write_bytes(video())
-    playlist = "#EXTM3U\n#EXT-X-TARGETDURATION:10\n#EXTINF:10,\n{}\n#EXT-X-ENDLIST\n"
-    for text in (playlist, "ffconcat version 1.0\nfile {}\n"):
-        for place in (other, "/etc/passwd"):
-            with pytest.raises(Refused, match="no video"), gate.files([text.format(place).encode()]):
-                pass
+    hls = f"#EXTM3U\n#EXT-X-TARGETDURATION:10\n#EXTINF:10,\n{other}\n#EXT-X-ENDLIST\n"
+    for text in (hls, f"ffconcat version 1.0\nfile {other}\n"):
+        with pytest.raises(Refused, match="no video"), gate.files([text.encode()]):
+            pass
 
 
 def test_too_many_videos_cost_no_check() -> None:
@@ -183,11 +172,3 @@ def test_bombs_take_no_memory(tmp_path: Path) -> None:
     assert (good, again, limited) == ("", "", "limited")
     assert "more than 10000000 pixels" in pixels
     assert "longer than 3000 frames" in frames
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="Linux limits the memory of a process")
-def test_a_table_beyond_memory_ends_in_one_line(gate: Gate) -> None:
-    with pytest.raises(Refused), gate.files([claims_frames(10**8)]):
-        pass
-    with gate.files([video()]):
-        pass

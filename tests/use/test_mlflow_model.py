@@ -16,15 +16,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import mlflow
-import pandas as pd
 import pytest
 from mlflow import MlflowClient
-from mlflow.exceptions import MlflowException
+from mlflow.pyfunc.scoring_server import init
+from starlette.testclient import TestClient
 
 from pipeline.tracking.registry import NEEDED, log_model, packaged, register
 from pipeline.use.model import Octopi
 from tests.use.shared import Made
-from tests.use.videos import claims_pixels
 
 
 class Logged(NamedTuple):
@@ -59,19 +58,7 @@ def encoded(file: Path) -> str:
     return base64.b64encode(file.read_bytes()).decode()
 
 
-def table(*rows: tuple[str, list[str]]) -> pd.DataFrame:
-    return pd.DataFrame(rows, columns=["question", "videos"])
-
-
 QUESTIONS = ("How hard is it? {tactile}", "Which is softer, {tactile} or {tactile}?", "What can you feel in {tactile}?")
-
-
-def test_answers_are_those_of_the_library(loaded: Any, octopi: Octopi, files: list[Path]) -> None:
-    used = [files[:1], files[1:], files[:1]]
-    asked = table(*((q, [encoded(f) for f in of]) for q, of in zip(QUESTIONS, used, strict=True)))
-    said = loaded.predict(asked)
-    assert list(said.columns) == ["answer"]
-    assert list(said["answer"]) == [octopi.ask(q, of) for q, of in zip(QUESTIONS, used, strict=True)]
 
 
 def test_what_is_logged_says_what_it_is(logged: Logged, loaded: Any, made: Made) -> None:
@@ -148,51 +135,57 @@ def _imported() -> set[str]:
     return {name.split(".")[0] for name in names} - {"pipeline"}
 
 
-@pytest.mark.parametrize(
-    ("rows", "words"),
-    [
-        (table(("{tactile}", ["/etc/passwd"])), "row 1: video 1: "),
-        (table(("{tactile}", ["file:///etc/passwd"])), "data URI"),
-        (table(("{tactile}", ["AAA"])), "row 1: video 1: broken base64"),
-        (table(("{tactile}", [base64.b64encode(b"no video").decode()])), "video 1: no video"),
-        (table(("{tactile}", [base64.b64encode(claims_pixels(40_000, 40_000)).decode()])), "pixels"),
-        (table(("{tactile} and no video", [])), "tactile"),
-        (table(*[("a", [])] * 65), "at most 64"),
-        (pd.DataFrame({"question": ["a"]}), "videos"),
-    ],
-)
-def test_bad_rows_are_400(loaded: Any, rows: pd.DataFrame, words: str) -> None:
-    with pytest.raises(MlflowException, match=words) as refused:
-        loaded.predict(rows)
-    assert refused.value.get_http_status_code() == 400
-    assert "octopi-" not in str(refused.value)
+@pytest.fixture(scope="module")
+def client(loaded: Any) -> TestClient:
+    """As `mlflow models serve` answers."""
+    return TestClient(init(loaded), raise_server_exceptions=False)
 
 
-def test_over_http_as_mlflow_serves_it(loaded: Any, octopi: Octopi, files: list[Path]) -> None:
-    from mlflow.pyfunc.scoring_server import init
-    from starlette.testclient import TestClient
+def ask(client: TestClient, *rows: dict[str, Any]) -> Any:
+    return client.post("/invocations", json={"dataframe_records": rows})
 
-    client = TestClient(init(loaded), raise_server_exceptions=False)
-    question = {"question": QUESTIONS[0], "videos": [encoded(files[0])]}
-    answer = client.post("/invocations", json={"dataframe_records": [question]})
-    assert answer.json() == {"predictions": [{"answer": octopi.ask(QUESTIONS[0], files[:1])}]}
-    bad = client.post("/invocations", json={"dataframe_records": [question, {**question, "videos": ["/etc/passwd"]}]})
-    assert bad.status_code == 400
-    assert "row 2: video 1: " in bad.text
-    assert "Traceback" not in bad.text
-    for wrong in (None, "a" * 20_001):
-        bad = client.post("/invocations", json={"dataframe_records": [{"question": wrong, "videos": []}]})
-        assert bad.status_code == 400
-        assert "no text of at most 20000 characters" in bad.text
-    with pytest.MonkeyPatch.context() as patch:
-        model = loaded.unwrap_python_model().model
-        patch.setattr(model, "ask", lambda *_: 1 / 0)
-        broken = client.post("/invocations", json={"dataframe_records": [question]})
+
+def test_over_http_answers_are_those_of_the_library(
+    client: TestClient, loaded: Any, octopi: Octopi, files: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    used = list(zip(QUESTIONS, (files[:1], files[1:], files[:1]), strict=True))
+    asked = [{"question": q, "videos": [encoded(f) for f in of]} for q, of in used]
+    answers = ask(client, *asked)
+    assert answers.json() == {"predictions": [{"answer": octopi.ask(q, of)} for q, of in used]}
+    with monkeypatch.context() as patch:
+        patch.setattr(loaded.unwrap_python_model().model, "ask", lambda *_: 1 / 0)
+        broken = ask(client, asked[0])
     assert broken.status_code == 500
     assert "row 1: the model broke" in broken.text
     assert "Traceback" not in broken.text
     assert "ZeroDivision" not in broken.text
-    assert client.post("/invocations", json={"dataframe_records": [question]}).status_code == 200
+    assert ask(client, asked[0]).status_code == 200
+
+
+@pytest.mark.parametrize(
+    ("question", "videos", "words"),
+    [
+        ("{tactile}", ["/etc/passwd"], "row 2: video 1: broken base64"),
+        ("{tactile}", [base64.b64encode(b"no video").decode()], "row 2: video 1: no video"),
+        ("{tactile} and no video", [], "row 2: the question has 1 {tactile} for 0 videos"),
+        (None, [], "row 2: its question is no text of at most 20000 characters"),
+        ("a" * 20_001, [], "row 2: its question is no text of at most 20000 characters"),
+    ],
+)
+def test_bad_rows_are_400(client: TestClient, files: list[Path], question: Any, videos: list[str], words: str) -> None:
+    good = {"question": QUESTIONS[0], "videos": [encoded(files[0])]}
+    bad = ask(client, good, {"question": question, "videos": videos})
+    assert bad.status_code == 400
+    assert words in bad.text
+    assert "Traceback" not in bad.text
+    assert "octopi-" not in bad.text, "the folder of the videos"
+
+
+def test_bad_tables_are_400(client: TestClient) -> None:
+    for rows, words in (([{"question": "a", "videos": []}] * 65, "at most 64"), ([{"question": "a"}], "videos")):
+        bad = ask(client, *rows)
+        assert bad.status_code == 400
+        assert words in bad.text
 
 
 def test_a_folder_counts_when_it_is_whole(made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

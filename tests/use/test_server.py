@@ -27,11 +27,10 @@ from pipeline.core.errors import UserError
 from pipeline.use import serve, server
 from pipeline.use.media import Limits
 from pipeline.use.serve import make_app
-from pipeline.use.server import checked, listen
+from pipeline.use.server import listen, read_token
 from tests.closure import ROOT
 from tests.conftest import HUNG, refused, wait_until_ended
-from tests.use.fake import FakeOctopi, digest, running
-from tests.use.test_serve import CHAT, body, events, part, text, user
+from tests.use.fake import CHAT, FakeOctopi, body, digest, events, part, running, said, text, user
 from tests.use.videos import video
 
 
@@ -78,11 +77,7 @@ def test_twenty_clients_ten_requests_none_lost_none_mixed_up() -> None:
             while (answer := ask(port, content))[0] == 429:
                 time.sleep(0.05)
             assert answer[0] == 200, answer
-            if i % 2:
-                said = [e["choices"][0]["delta"].get("content", "") for e in events(answer[1]) if e != "[DONE]"]
-                found.append("".join(said))
-            else:
-                found.append(answer[1]["choices"][0]["message"]["content"])
+            found.append(said(answer[1]))
         return found
 
     fake = FakeOctopi()
@@ -208,8 +203,7 @@ def test_stopping_finishes_what_was_asked_and_leaves_no_process() -> None:
         answer_now(process)
         assert [a.result()[0] for a in answers] == [200] * 4
         for i, answer in enumerate(answers[:3]):
-            said = answer.result()[1]["choices"][0]["message"]["content"]
-            assert said.split() == ["{tactile}", str(i), *"x" * 15, "|", digest(video(i))]
+            assert said(answer.result()[1]).split() == ["{tactile}", str(i), *"x" * 15, "|", digest(video(i))]
         assert events(answers[3].result()[1])[-1] == "[DONE]"
         process.wait(HUNG)
         assert len(children) == 1
@@ -248,30 +242,31 @@ def test_answers_take_no_memory() -> None:
 # ---- the command ----
 
 
-def test_other_addresses_need_a_token() -> None:
+def test_addresses() -> None:
+    """Others than this machine's need a token."""
     for host, token in (("127.0.0.1", ""), ("localhost", ""), ("0.0.0.0", "x" * 16)):
         listen(host, 0, token).close()
-    with refused("OCTOPI_TOKEN"):
-        listen("0.0.0.0", 0, "")
+    with listen("127.0.0.1", 0, "") as taken:
+        for host, port, token, words in (
+            ("0.0.0.0", 0, "", "OCTOPI_TOKEN"),
+            ("127.0.0.1", taken.getsockname()[1], "", "choose another"),
+            ("localhost", 70_000, "", "cannot be had"),
+            ("300.1.1.1", 0, "x" * 16, "cannot be had"),
+            ("no such name.invalid", 0, "x" * 16, "cannot be had"),
+        ):
+            with refused(words):
+                listen(host, port, token)
 
 
-def test_addresses_that_cannot_be_had() -> None:
-    with listen("127.0.0.1", 0, "") as taken, refused("choose another"):
-        listen("127.0.0.1", taken.getsockname()[1], "")
-    for host, port in (("localhost", 70_000), ("300.1.1.1", 0), ("no such name.invalid", 0)):
-        with refused("cannot be had"):
-            listen(host, port, "x" * 16)
-
-
-@pytest.mark.parametrize("token", ["short", "x" * 15, "ü" * 20, "a b\nc" * 5])
-def test_weak_tokens(token: str) -> None:
-    with refused("openssl"):
-        checked(token)
-
-
-def test_tokens() -> None:
-    assert checked("") == checked(" \n") == ""
-    assert checked(f" {'x' * 16}\n") == "x" * 16
+def test_tokens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OCTOPI_TOKEN", " \n")
+    assert read_token(None) == ""
+    (file := tmp_path / "token").write_text(f" {'x' * 16}\n")
+    assert read_token(file) == "x" * 16
+    for weak in ("short", "x" * 15, "ü" * 20, "a b\nc" * 5):
+        file.write_text(weak, encoding="utf-8")
+        with refused("openssl"):
+            read_token(file)
 
 
 def test_the_command_says_what_is_wrong_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import struct
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -28,6 +29,34 @@ def blank(count: int, width: int = 16, height: int = 16) -> bytes:
     with TemporaryDirectory() as folder:
         frame = np.zeros((height, width, 3), np.uint8)
         return encode(Path(folder, "v.mp4"), (frame for _ in range(count)), "mpeg4", "yuv420p").read_bytes()
+
+
+def press(file: Path, turned: bool = False) -> Path:
+    """A video of a disc that presses into a sensor's uneven light."""
+    y, x = np.mgrid[:96, :128]
+    ground = np.stack([90 + x / 3, 110 + y / 3, 100 + (x + y) / 5], axis=2)
+    frames = []
+    for index in range(30):
+        depth = max(0.0, min(index - 8, 28 - index, 6)) * 8
+        side = np.sign((y - 48) if turned else (x - 64)) * (np.hypot(x - 64, y - 48) < 22)
+        frames.append(np.clip(ground + depth * side[:, :, None], 0, 255).astype(np.uint8))
+    return encode(file, frames, codec="mpeg4", pixels="yuv420p", bits=2_000_000)
+
+
+def recording(
+    touched: Sequence[range], length: int, height: int = 48, width: int = 64, drift: float = 0.0
+) -> list[np.ndarray]:
+    """Pictures (BGR) with noise; a bump brightens one side and darkens the other while touched; the light may drift."""
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[:height, :width]
+    ground = np.stack([90 + x / 3, 110 + y / 3, 100 + (x + y) / 5], axis=2)
+    bump = 40 * np.sign(x - width / 2) * (np.hypot(x - width / 2, y - height / 2) < height / 4)
+    pictures = []
+    for index in range(length):
+        pressed = bump[:, :, None] * any(index in pressed for pressed in touched)
+        light = drift * index * np.cos(x / 20)[:, :, None]
+        pictures.append(np.clip(ground + light + pressed + rng.normal(0, 1, ground.shape), 0, 255).astype(np.uint8))
+    return pictures
 
 
 def uri(data: bytes, kind: str = "video/mp4") -> str:

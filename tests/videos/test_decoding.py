@@ -15,10 +15,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.config import FramesConfig
-from pipeline.scenes.film import write_film
 from pipeline.videos.audit.run import check_folder
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.decoding import Decoder, Header, brightness, decode, picture, planes, to_rgb, turns
+from pipeline.videos.film import write_film
 from pipeline.videos.frames.fit import fit
 from tests.conftest import HUNG, encode, moving_square, write_video
 from tests.frame_rules import frames_of, pillow

@@ -23,11 +23,11 @@ from scipy import ndimage
 from pipeline.core.errors import UserError
 from pipeline.core.io import atomic, remove_rests, write_csv
 from pipeline.core.records import Record
-from pipeline.scenes.film import write_film
 from pipeline.videos.audit.files import FOUND
 from pipeline.videos.catalogue.csv_reader import read_rows
 from pipeline.videos.decoding import Decoder, Image, decode
 from pipeline.videos.files import LIST_FILE, SECTION, is_video
+from pipeline.videos.film import write_film
 from pipeline.videos.frames.reference import (
     LONGEST,
     contact_strength,

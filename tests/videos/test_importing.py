@@ -1,4 +1,4 @@
-"""A robot's recording: bags of both ROS versions become the videos that the chain takes."""
+"""Recordings cut into presses: bags of both ROS versions, long videos, folders of pictures."""
 
 from __future__ import annotations
 
@@ -18,15 +18,16 @@ from pipeline.config import FramesConfig
 from pipeline.core.errors import UserError
 from pipeline.core.io import read_csv
 from pipeline.core.records import Severity
-from pipeline.scenes.film import write_film
-from pipeline.use.bags import shots
-from pipeline.use.presses import QUIET, RELEASED, ROUNDING, SHORTEST, FrameTime, cut, presses
 from pipeline.videos.audit.files import FOUND
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.decoding import Decoder, decode
 from pipeline.videos.files import list_videos
+from pipeline.videos.film import write_film
 from pipeline.videos.frames.reference import LONGEST
 from pipeline.videos.frames.scan import Scan, scan
+from pipeline.videos.importing.bags import shots
+from pipeline.videos.importing.presses import QUIET, RELEASED, ROUNDING, SHORTEST, FrameTime, cut, presses
+from tests.use.videos import recording
 
 pytest.importorskip("rosbags", reason="needs rosbags: pip install -e '.[robot]'")
 from rosbags.rosbag1 import Writer as Writer1
@@ -37,19 +38,6 @@ from rosbags.typesys import Stores, get_typestore
 TOPIC, STEP_NS, START_NS = "/gelsight/image", 40_000_000, 1_700_000_000_000_000_000
 TOUCHED = (range(20, 40), range(70, 82))
 LENGTH = 110
-
-
-def recording(height: int = 48, width: int = 64) -> list[np.ndarray]:
-    """Pictures (BGR) of an uneven grey with noise; a bump brightens one side and darkens the other while touched."""
-    rng = np.random.default_rng(0)
-    y, x = np.mgrid[:height, :width]
-    ground = np.stack([90 + x / 3, 110 + y / 3, 100 + (x + y) / 5], axis=2)
-    bump = 40 * np.sign(x - width / 2) * (np.hypot(x - width / 2, y - height / 2) < height / 4)
-    pictures = []
-    for index in range(LENGTH):
-        pressed = bump[:, :, None] * any(index in touched for touched in TOUCHED)
-        pictures.append(np.clip(ground + pressed + rng.normal(0, 1, ground.shape), 0, 255).astype(np.uint8))
-    return pictures
 
 
 def import_bag(bag: Path, topic: str, out: Path, object_id: str) -> list[Path]:
@@ -109,7 +97,7 @@ def write_bag(
 
 @pytest.fixture(scope="module")
 def pictures() -> list[np.ndarray]:
-    return recording()
+    return recording(TOUCHED, LENGTH)
 
 
 @pytest.mark.parametrize("kind", ["ros1", "sqlite3", "mcap"])
@@ -213,7 +201,7 @@ def test_the_rate_is_that_of_the_camera(
 
 
 def test_odd_sizes_are_written(tmp_path: Path) -> None:
-    bag = write_bag(tmp_path, "ros1", recording(47, 65))
+    bag = write_bag(tmp_path, "ros1", recording(TOUCHED, LENGTH, 47, 65))
     assert {frame.shape for frame in decode(import_bag(bag, TOPIC, tmp_path / "out", "rug")[0])} == {(47, 65, 3)}
 
 

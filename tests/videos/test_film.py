@@ -8,8 +8,8 @@ import av
 import numpy as np
 import pytest
 
-from pipeline.scenes.film import KEY_EVERY, write_film
 from pipeline.videos.decoding import Decoder, decode
+from pipeline.videos.film import KEY_EVERY, write_film
 from tests.conftest import refused
 
 

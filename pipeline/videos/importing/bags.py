@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 
 from pipeline.core.errors import UserError
-from pipeline.use.presses import Shot
 from pipeline.videos.decoding import Image
+from pipeline.videos.importing.presses import Shot
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 ENCODINGS: dict[str, tuple[int, int | None]] = {

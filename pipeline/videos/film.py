@@ -1,4 +1,4 @@
-"""Writing scenes as the real videos were written: MPEG-4 part 2, a whole picture every twelve, 200 kbit/s.
+"""Writing videos as the real ones were written: MPEG-4 part 2, a whole picture every twelve, 200 kbit/s.
 
 Coding is most of what is fine in a frame without contact: blocks of 8 x 8 pixels whose brightness is right to a step
 or two, copied from frame to frame until the next whole picture. PyAV's own libavcodec has this encoder in every build.
@@ -11,9 +11,10 @@ from fractions import Fraction
 from pathlib import Path
 
 import av
+import numpy as np
+import numpy.typing as npt
 
 from pipeline.core.errors import UserError
-from pipeline.scenes.light import Image
 
 KEY_EVERY = 12
 """Frames from one whole picture to the next: in each of the public videos looked at, and libavcodec's own default."""
@@ -21,7 +22,7 @@ BITS_A_SECOND = 200_000
 """libavcodec's default. The public videos need 40 to 120 thousand, so that quality is at its best and not the limit."""
 
 
-def write_film(path: Path, frames: Iterable[Image], fps: float) -> None:
+def write_film(path: Path, frames: Iterable[npt.NDArray[np.uint8]], fps: float) -> None:
     """Write frames of one size (height x width x BGR, uint8); equal frames give equal files on one machine.
 
     Raises:
