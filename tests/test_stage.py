@@ -152,7 +152,7 @@ def test_ctrl_c_in_a_chain_is_one_line_and_what_is_finished_stays(here: Path, bo
     (here / "dvc.yaml").write_text(CHAIN)
     (here / "stages").mkdir()
     (here / "stages/slow.py").write_text(f"import time\n{body}\n")
-    subprocess.run("git init -q && python -m dvc init -q", shell=True, check=True)
+    subprocess.run(f"git init -q && '{sys.executable}' -m dvc init -q", shell=True, check=True)
     assert interrupted(here, "octopi", "repro") == (130, [STOPPED])
     assert (here / "first.txt").exists()
     assert list(yaml.safe_load((here / "dvc.lock").read_text())["stages"]) == ["first"]
