@@ -51,7 +51,7 @@ lint: install  ## ruff and mypy
 
 dashboard: install  ## MLflow at http://127.0.0.1:5000 (PORT=...; OPEN=1 opens its table of variants)
 	@mkdir -p mlruns
-	@table=$$(python -m pipeline.tracking.link $(PORT)); \
+	@table=$$(python -c "from pipeline.tracking.publish import table_address; print(table_address($(PORT)))"); \
 	(sleep 10; echo "All variants with their accuracies: $$table"; $(if $(OPEN),python -m webbrowser "$$table")) & \
 	MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false \
 	mlflow ui --backend-store-uri sqlite:///mlruns/mlflow.db --default-artifact-root mlruns/artifacts \

@@ -41,29 +41,19 @@ def test_scale_writes_what_it_says(project: Path) -> None:
 def test_scale_names_the_objects_that_nothing_can_be_asked_about(project: Path) -> None:
     learnt = "baseball,pillow,rug,potato,rice"
     checked = "bubble_wrap,denim,feather_duster_handle,millet,nylon_shirt,steel_wool,tsa_lock_numbers"
-    asked = (
-        "bath_towel,clothes_peg,hairbrush_bristles,hairbrush_handle,ice_block,microfiber_cloth,toilet_brush_bristles"
+    asked = "bath_towel,clothes_peg,hairbrush_bristles,hairbrush_handle,ice_block,microfiber_cloth"
+    lacking = (
+        "split.name=paper: 1 of 7 test objects have no videos (toilet_brush_bristles); 6 of 7 validation objects have "
+        "no videos (bubble_wrap, feather_duster_handle, millet, nylon_shirt, steel_wool, tsa_lock_numbers)"
     )
     for objects, override, words in (
-        (
-            f"{learnt},denim,{asked[:-22]}",
-            "seed=0",
-            "1 of 7 test objects have no videos (toilet_brush_bristles); "
-            "6 of 7 validation objects have no videos (bubble_wrap, feather_duster_handle, millet, nylon_shirt, "
-            "steel_wool, tsa_lock_numbers)",
-        ),
-        (
-            f"{learnt},{checked}",
-            "ablation.seeds=[0,1]",
-            f"7 of 7 test objects have no videos ({asked.replace(',', ', ')})",
-        ),
-        (f"{learnt},{checked},{asked}", "seed=0", ""),
-        (f"{learnt},{checked}", "split.name=kfold", ""),
+        (f"{learnt},denim,{asked}", "seed=0", [lacking]),
+        (f"{learnt},{checked},{asked},toilet_brush_bristles", "seed=0", []),
+        (f"{learnt},{checked}", "split.name=kfold", []),
     ):
         result = RUNNER.invoke(app, ["scale", "smoke", f"scenes.objects=[{objects}]", "ablation.touch=[]", override])
         assert result.exit_code == 0, result.output
-        said = [line for line in result.output.splitlines() if "have no videos" in line]
-        assert said == ([f"split.name=paper: {words}"] if words else [])
+        assert [line for line in result.output.splitlines() if "have no videos" in line] == words
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -35,10 +36,6 @@ def test_a_new_scale_is_a_file(tmp_path: Path) -> None:
     assert load_params(tmp_path / "params.yaml") == params
 
 
-def test_committed_params_are_the_default_scale() -> None:
-    assert load_params(ROOT / "params.yaml") == compose("smoke", conf=CONF)
-
-
 def test_committed_params_are_written_as_they_are(tmp_path: Path) -> None:
     """Else `octopi scale smoke` would run stages anew whose sections have gained a key."""
     write_params(compose("smoke", conf=CONF), tmp_path / "params.yaml")
@@ -52,19 +49,15 @@ def test_committed_params_are_written_as_they_are(tmp_path: Path) -> None:
         (["nothing=1"], ["nothing", "allowed here"]),
         (["frames.size=64"], ["frames.size is called frames.pixels now"]),
         (["frames.per_video=0"], ["frames.per_video", "greater than or equal to 1"]),
-        (["frames.fraction=1.5"], ["frames.fraction", "less than or equal to 1"]),
         (["split.name='Side ways'"], ["split.name", "Side ways", "pattern"]),
         (["split.fold=1"], ["split.fold is not a parameter", "folds"]),
         (["split.name=kfold", "split.folds=3", "ablation.seeds=[0,1,3]"], ["ablation.seeds [0, 1, 3]", "3 folds"]),
         (["ablation.seeds=[1,1]"], ["ablation.seeds", "repeats"]),
         (["ablation.opd=[none]"], ["ablation.opd", "lacks the full system's value all"]),
         (["ablation.lora=[perhaps]"], ["ablation.lora", "'with' or 'without'"]),
-        (["ablation.touch=[swapped,swapped]"], ["ablation.touch", "repeats"]),
         (["align.batch_size=10"], ["align", "does not divide"]),
         (["data.dir=elsewhere"], ["data.dir", "data/scenes/videos"]),
-        (["lora.target_modules=[]"], ["lora.target_modules"]),
         (["lora.target_modules=all"], ["lora.target_modules", "'all-linear'"]),
-        (["encoder.learning_rate=nan"], ["encoder.learning_rate"]),
         (["runtime.device=tpu"], ["runtime.device", "'cuda'"]),
         (["lora.alpha=1e309"], ["lora.alpha", "finite"]),
         (["encoder.epochs=true"], ["encoder", "epochs is true"]),
@@ -168,10 +161,10 @@ def test_any_folder_may_hold_the_videos(name: str, tmp_path: Path) -> None:
         ("smoke frames.selection=uniform", "frames.selection is 'uniform': Input should be 'salient', 'release' or"),
     ],
 )
-def test_missing_inputs_are_named(arguments: str, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_inputs_are_named(arguments: str, words: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     name, *overrides = arguments.split()
-    with pytest.raises(UserError, match=words):
+    with refused(words) if words else nullcontext():
         check_inputs(compose(name, overrides))
 
 
@@ -195,11 +188,8 @@ def test_too_few_objects_are_found_before_any_training(
 ) -> None:
     monkeypatch.chdir(ROOT)
     params = compose("smoke", [f"scenes.objects=[{objects}]", override])
-    if words is None:
+    with refused(words) if words else nullcontext():
         check_inputs(params)
-    else:
-        with pytest.raises(UserError, match=words):
-            check_inputs(params)
 
 
 def test_variants_are_the_product_of_the_lists() -> None:

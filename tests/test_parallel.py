@@ -178,12 +178,6 @@ def test_a_missing_package_is_one_line_before_anything_runs(monkeypatch: pytest.
         use_backend("ray")
 
 
-@pytest.mark.parametrize("old", ["loky", "dask"])
-def test_a_name_of_before_is_told_the_new_one(old: str) -> None:
-    with pytest.raises(UserError, match=rf"\Ascale smoke: runtime\.parallel is '{old}': .*'processes' or 'ray'\Z"):
-        compose("smoke", [f"runtime.parallel={old}"])
-
-
 def test_a_stage_works_where_its_parameters_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(parallel, "_chosen", "processes")

@@ -145,14 +145,16 @@ def publish() -> None:
     typer.echo(to_mlflow(load_params()))
 
 
-CATALOGUE = typer.Option(help="Folder with objects.csv and properties.yaml.")
+Catalogue = Annotated[Path, typer.Option(help="Folder with objects.csv and properties.yaml.")]
+Times = Annotated[float, typer.Option(help="A press begins at this many times the quiet level.")]
+Out = Annotated[Path, typer.Option(help="Folder of the videos.")]
 PHYSICLEAR = Path(__file__).parents[1] / "physiclear"
 
 
 @data_app.command()
 def check(
     folder: Annotated[Path, typer.Argument(help="Folder with the videos.")],
-    catalogue: Annotated[Path, CATALOGUE] = PHYSICLEAR,
+    catalogue: Catalogue = PHYSICLEAR,
 ) -> None:
     """List every file of a folder that is wrong or odd; status 1 where something must be mended."""
     from pipeline.videos.audit.run import check_folder
@@ -164,7 +166,7 @@ def check(
 @data_app.command()
 def audit(
     folder: Annotated[Path, typer.Argument(help="Folder with the videos.")],
-    catalogue: Annotated[Path, CATALOGUE] = PHYSICLEAR,
+    catalogue: Catalogue = PHYSICLEAR,
     split: Annotated[str, typer.Option(help="Also look for leaks between the parts of this split.")] = "",
     out: Annotated[Path, typer.Option(help="Where all findings go.")] = Path("audit.csv"),
 ) -> None:
@@ -187,9 +189,9 @@ def audit(
 def bag(
     file: Annotated[Path, typer.Argument(help="ROS 1 .bag, ROS 2 folder, .mcap or .db3.")],
     topic: Annotated[str, typer.Option(help="Of sensor_msgs/Image or CompressedImage.")],
-    out: Annotated[Path, typer.Option(help="Folder of the videos.")],
+    out: Out,
     object_id: Annotated[str, typer.Option("--object", help="What is touched; the recording's name by default.")] = "",
-    times: Annotated[float, typer.Option(help="A press begins at this many times the quiet level.")] = 2.0,
+    times: Times = 2.0,
 ) -> None:
     """Cut a robot's recording into presses: videos for the chain and `octopi ask`, each with its times in a CSV."""
     from pipeline.videos.importing.bags import shots
@@ -204,9 +206,9 @@ def video(
     file: Annotated[
         Path, typer.Argument(help="A video with several presses, a folder of PNG or JPEG pictures, or a table.")
     ],
-    out: Annotated[Path, typer.Option(help="Folder of the videos.")],
+    out: Out,
     object_id: Annotated[str, typer.Option("--object", help="What is touched; the file's name by default.")] = "",
-    times: Annotated[float, typer.Option(help="A press begins at this many times the quiet level.")] = 2.0,
+    times: Times = 2.0,
     fps: Annotated[float, typer.Option(min=0, help="Pictures a second, where the file does not say.")] = 0.0,
     whole: Annotated[bool, typer.Option("--whole", help="Write one video of all of it.")] = False,
 ) -> None:
@@ -283,9 +285,13 @@ def diff(
     typer.echo(describe(found))
 
 
-MODEL = typer.Option(help="Folder of a trained model; by default the one that is shipped.")
-BASE = typer.Option(help="Folder of its language model, where it lies in none of the known places.")
-MEMORY = typer.Option(help="Folder of remembered touches.")
+Model = Annotated[Path | None, typer.Option(help="Folder of a trained model; by default the one that is shipped.")]
+Base = Annotated[
+    Path | None, typer.Option(help="Folder of its language model, where it lies in none of the known places.")
+]
+Device = Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")]
+Folder = Annotated[Path | None, typer.Argument(help="A trained model; by default the one that is shipped.")]
+Memory = Annotated[Path, typer.Option(help="Folder of remembered touches.")]
 TOUCHES = Path("touches")
 
 
@@ -295,9 +301,9 @@ def ask(
         str, typer.Argument(help="Videos stand in front, or where it says {tactile}; without a question: a chat.")
     ] = "",
     videos: Annotated[list[str] | None, typer.Argument(help="Videos, in the order of the question.")] = None,
-    model: Annotated[Path | None, MODEL] = None,
-    base: Annotated[Path | None, BASE] = None,
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")] = "auto",
+    model: Model = None,
+    base: Base = None,
+    device: Device = "auto",
     json: Annotated[bool, typer.Option("--json", help="Print the answer with what it stands on.")] = False,
     memory: Annotated[
         Path | None, typer.Option(help="Folder of remembered touches: what each video is most like is told with it.")
@@ -337,9 +343,9 @@ def describe(
     csv: Annotated[
         Path | None, typer.Option(help="Write a row each to this file; a second call goes on in it.")
     ] = None,
-    model: Annotated[Path | None, MODEL] = None,
-    base: Annotated[Path | None, BASE] = None,
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")] = "auto",
+    model: Model = None,
+    base: Base = None,
+    device: Device = "auto",
 ) -> None:
     """Describe videos, and every video of folders: classes with probabilities, the model's sentence, notes."""
     from pipeline.use.ask import describe_folder, described
@@ -364,9 +370,9 @@ def compare(
     a: Annotated[str, typer.Argument(help="A video.")],
     b: Annotated[str, typer.Argument(help="Another one.")],
     property: Annotated[str, typer.Argument(help="Such as hardness.")],
-    model: Annotated[Path | None, MODEL] = None,
-    base: Annotated[Path | None, BASE] = None,
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")] = "auto",
+    model: Model = None,
+    base: Base = None,
+    device: Device = "auto",
 ) -> None:
     """Say whether the first video has more of a property than the second."""
     found = _load(model, base, device).compare(a, b, property)
@@ -378,9 +384,9 @@ def compare(
 def rank(
     property: Annotated[str, typer.Argument(help="Such as hardness.")],
     videos: Annotated[list[str], typer.Argument(help="Two videos or more.")],
-    model: Annotated[Path | None, MODEL] = None,
-    base: Annotated[Path | None, BASE] = None,
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")] = "auto",
+    model: Model = None,
+    base: Base = None,
+    device: Device = "auto",
 ) -> None:
     """Order videos by a property, least first, each with its expected class, and ask the model about two or three."""
     found = _load(model, base, device).rank(videos, property)
@@ -403,9 +409,9 @@ def match(
             "or names or ids of the model's catalogue, with commas."
         ),
     ],
-    model: Annotated[Path | None, MODEL] = None,
-    base: Annotated[Path | None, BASE] = None,
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")] = "auto",
+    model: Model = None,
+    base: Base = None,
+    device: Device = "auto",
 ) -> None:
     """Say which video is of which object: by the property heads, and in the model's own words."""
     from pipeline.use.ask import named_objects
@@ -421,10 +427,10 @@ def match(
 def remember(
     name: Annotated[str, typer.Argument(help="What the object is called, such as 'my mug'.")],
     videos: Annotated[list[str], typer.Argument(help="Videos of it being touched; one is enough.")],
-    memory: Annotated[Path, MEMORY] = TOUCHES,
-    model: Annotated[Path | None, MODEL] = None,
-    base: Annotated[Path | None, BASE] = None,
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")] = "auto",
+    memory: Memory = TOUCHES,
+    model: Model = None,
+    base: Base = None,
+    device: Device = "auto",
 ) -> None:
     """Keep touches of an object, by which it is recognised later, without training."""
     loaded = _load(model, base, device)
@@ -437,10 +443,10 @@ def remember(
 @app.command()
 def recognise(
     video: Annotated[str, typer.Argument(help="A video.")],
-    memory: Annotated[Path, MEMORY] = TOUCHES,
-    model: Annotated[Path | None, MODEL] = None,
-    base: Annotated[Path | None, BASE] = None,
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")] = "auto",
+    memory: Memory = TOUCHES,
+    model: Model = None,
+    base: Base = None,
+    device: Device = "auto",
 ) -> None:
     """Say which remembered objects a touch is like, the most similar first."""
     found = _load(model, base, device).recognise(video, memory)
@@ -453,10 +459,10 @@ def recognise(
 def live(
     camera: Annotated[str, typer.Argument(help="A camera's index (0 is the first) or address, or a video.")],
     question: Annotated[str, typer.Option("--ask", help="Asked of each press, in place of a description.")] = "",
-    times: Annotated[float, typer.Option(help="A press begins at this many times the quiet level.")] = 2.0,
-    model: Annotated[Path | None, MODEL] = None,
-    base: Annotated[Path | None, BASE] = None,
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")] = "auto",
+    times: Times = 2.0,
+    model: Model = None,
+    base: Base = None,
+    device: Device = "auto",
 ) -> None:
     """Watch a camera, and say of each press what is felt when it ends, with the true frame rate; Ctrl-C ends it."""
     from pipeline.use.live import run
@@ -472,7 +478,7 @@ def export(
     folder: Annotated[Path, typer.Argument(help="Folder of a trained model, such as models/finetuned-with-all-0.")],
     to: Annotated[Path, typer.Argument(help="Folder to make.")],
     with_base: Annotated[bool, typer.Option("--with-base", help="Put the language model in.")] = False,
-    base: Annotated[Path | None, BASE] = None,
+    base: Base = None,
 ) -> None:
     """Copy a trained model to where it is to be used."""
     from pipeline.use.package import export as copy
@@ -483,12 +489,12 @@ def export(
 
 @app.command()
 def serve(
-    folder: Annotated[Path | None, typer.Argument(help="A trained model; by default the one that is shipped.")] = None,
+    folder: Folder = None,
     host: Annotated[str, typer.Option(help="Address; another than 127.0.0.1 needs a token.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="0 for any that is free.")] = 8000,
     token_file: Annotated[Path | None, typer.Option(help="File with the token; else OCTOPI_TOKEN is taken.")] = None,
-    base: Annotated[Path | None, BASE] = None,
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")] = "auto",
+    base: Base = None,
+    device: Device = "auto",
     places: Annotated[int, typer.Option(min=1, help="Requests at once; the next is told to come later.")] = 32,
 ) -> None:
     """Answer questions about touches over HTTP, in the form of OpenAI's chat completions."""
@@ -500,10 +506,10 @@ def serve(
 
 @app.command()
 def demo(
-    folder: Annotated[Path | None, typer.Argument(help="A trained model; by default the one that is shipped.")] = None,
-    base: Annotated[Path | None, BASE] = None,
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")] = "auto",
-    catalogue: Annotated[Path, CATALOGUE] = PHYSICLEAR,
+    folder: Folder = None,
+    base: Base = None,
+    device: Device = "auto",
+    catalogue: Catalogue = PHYSICLEAR,
     port: Annotated[int, typer.Option(help="Of 127.0.0.1.")] = 7860,
 ) -> None:
     """Show a page to drop videos on: what the model sees, what it takes them for, and a chat. Nothing leaves."""

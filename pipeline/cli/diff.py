@@ -7,13 +7,18 @@ from __future__ import annotations
 
 import io
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 import pyarrow.parquet as pq
+import yaml
+from dvc.api import DVCFileSystem
+from dvc.exceptions import DvcException
+from dvc.repo import Repo
+from dvc.scm import RevError
 
-from pipeline.cli.revisions import State, find_state
 from pipeline.core.errors import UserError, without_secrets
 from pipeline.core.records import EffectRow, Graded
 from pipeline.evaluation.scores import difference, grouped, with_holm
@@ -23,6 +28,88 @@ GRADED, QUESTIONS = "data/graded.parquet", "data/questions"
 KEY = ("task", "measure", "encoder", "lora", "opd", "touch", "seed")
 SHOWN = 40
 Rows = list[dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class State:
+    """The project at one point of its history: its files as Git, the disk and DVC's cache have them."""
+
+    name: str
+    """The revision as the person wrote it, with its hash."""
+    files: DVCFileSystem
+
+    @classmethod
+    def of(cls, root: Path, revision: str) -> State:
+        """What a revision (a hash, a tag, a branch, `HEAD~1`, a DVC experiment) names; the working tree for none."""
+        try:
+            repo = Repo(str(root), rev=revision or None)
+            name = f"{revision} ({repo.get_rev()[:8]})" if revision else "working tree"
+            return cls(name, DVCFileSystem(repo=repo))
+        except (RevError, AttributeError):  # The latter for a file of a commit.
+            there = f"no commit of a Git repository in {root.resolve()}"
+            raise UserError(f"{revision}: {there}; `git log` and `dvc exp list` list them") from None
+        except DvcException as error:
+            raise UserError(f"{root.resolve()}: {error}; go to a clone of the project") from None
+
+    def read(self, path: str) -> bytes | None:
+        """A file; None where it is not at hand."""
+        try:
+            return bytes(self.files.read_bytes(path))
+        except (OSError, DvcException):
+            return None
+
+    def mapping(self, path: str) -> dict[str, Any]:
+        """A file in YAML or JSON; empty where it is absent, a UserError where it is something else."""
+        try:
+            found = yaml.load(self.read(path) or b"{}", Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        except yaml.YAMLError:
+            found = None
+        if not isinstance(found, dict):
+            raise UserError(f"{path} of {self.name}: not a mapping; restore it from Git")
+        return found
+
+    def rows(self, path: str) -> Rows:
+        """A CSV file; none where it is absent."""
+        table = pd.read_csv(io.BytesIO(self.read(path) or b"nothing"), dtype=str)
+        rows: Rows = table.fillna("").to_dict("records")
+        return rows
+
+    def stages(self) -> dict[str, Any]:
+        """Entries of dvc.lock."""
+        stages = self.mapping("dvc.lock").get("stages") or {}
+        if not isinstance(stages, dict) or not all(isinstance(entry, dict) for entry in stages.values()):
+            raise UserError(f"dvc.lock of {self.name}: its stages are no mapping; restore it from Git")
+        return stages
+
+    def figures(self) -> dict[str, dict[str, str]]:
+        """Parameters and what the reports say, by name: metrics, the last loss of each training, scores."""
+        parameters = _flat(self.mapping("params.yaml"))
+        metrics: dict[str, Any] = {}
+        losses: dict[str, str] = {}
+        scores: dict[str, str] = {}
+        folders = sorted(self.files.ls("reports", detail=False)) if self.files.isdir("reports") else []
+        for folder in folders:
+            report = Path(folder).name
+            metrics[report] = self.mapping(f"{folder}/metrics.json")
+            curves = [row for row in self.rows(f"{folder}/curves.csv") if row["name"] == "loss"]
+            losses |= {f"{report} {row['stage']}": row["value"] for row in curves}  # By rising step.
+            for row in self.rows(f"{folder}/scores.csv"):
+                name = " ".join([report, *filter(None, map(row.get, KEY))])
+                scores[name] = f"{row.get('accuracy')} [{row.get('low')}, {row.get('high')}]"
+        return {"parameters": parameters, "metrics": _flat(metrics), "losses": losses, "scores": scores}
+
+    def answers(self) -> list[Graded] | None:
+        """Graded answers; None where they are not at hand."""
+        content = self.read(GRADED)
+        rows = None if content is None else pq.read_table(io.BytesIO(content)).to_pylist()
+        return None if rows is None else [Graded.model_validate(row) for row in rows]
+
+    def questions(self) -> dict[str, object]:
+        """By id, over all seeds, what makes a question this one: its videos and its right answer."""
+        seeds = (self.mapping("params.yaml").get("ablation") or {}).get("seeds", [0])
+        files = [self.read(f"{QUESTIONS}/{seed}/evaluation.jsonl") or b"" for seed in seeds]
+        rows = (json.loads(line) for file in files for line in file.splitlines())
+        return {row["question_id"]: (row["videos"], row["gold"]) for row in rows}
 
 
 def compare(root: Path, old: str, new: str = "") -> dict[str, Any]:
@@ -35,18 +122,14 @@ def compare(root: Path, old: str, new: str = "") -> dict[str, Any]:
     Raises:
         UserError: for an unknown revision, a folder outside Git and DVC, or a broken file.
     """
-    one, two = find_state(root, old), find_state(root, new or None)
+    one, two = State.of(root, old or "HEAD"), State.of(root, new)
+    stages = _stages(one, two)  # First, since DVC lists nothing of a state whose dvc.lock is broken.
+    before, after = one.figures(), two.figures()
     tested, notes = _tested(one, two)
-    found: dict[str, Rows] = {
-        "parameters": _changes(_flat(one.mapping("params.yaml")), _flat(two.mapping("params.yaml"))),
-        "stages": _stages(_locked(one), _locked(two)),
-        "metrics": _changes(_metrics(one), _metrics(two)),
-        "losses": _changes(_losses(one), _losses(two)),
-        "scores": _changes(_scores(one), _scores(two)),
-        "tested": tested,
-    }
-    same = bool(found["stages"]) and bool(_scores(one)) and not (found["scores"] or notes or tested)
-    notes += ["No accuracy changed."] if same else []
+    found: dict[str, Rows] = {name: _changes(before[name], after[name]) for name in after}
+    found = {"parameters": found.pop("parameters"), "stages": stages, **found, "tested": tested}
+    if found["stages"] and before["scores"] and not (found["scores"] or notes or tested):
+        notes.append("No accuracy changed.")
     return {"old": one.name, "new": two.name, "differs": any(found.values()), **found, "notes": notes}
 
 
@@ -61,46 +144,39 @@ def describe(found: dict[str, Any]) -> str:
     return "\n\n".join([*parts, *found["notes"]])
 
 
-def _locked(state: State) -> dict[str, Any]:
-    stages = state.mapping("dvc.lock").get("stages") or {}
-    if not isinstance(stages, dict) or not all(isinstance(entry, dict) for entry in stages.values()):
-        raise UserError(f"dvc.lock of {state.name}: its stages are no mapping; restore it from Git")
-    return stages
-
-
-def _stages(old: dict[str, Any], new: dict[str, Any]) -> Rows:
+def _stages(one: State, two: State) -> Rows:
     rows: Rows = []
-    for name in [name for name in dict.fromkeys([*new, *old]) if old.get(name) != new.get(name)]:
-        one, two = old.get(name, {}), new.get(name, {})
+    for change in _changes(one.stages(), two.stages()):
+        old, new = change["old"] or {}, change["new"] or {}
         deps, outs = (
-            [c["name"] for c in _changes(*({d["path"]: d.get("md5") for d in e.get(kind, ())} for e in (one, two)))]
+            [c["name"] for c in _changes(*({d["path"]: d.get("md5") for d in e.get(kind, ())} for e in (old, new)))]
             for kind in ("deps", "outs")
         )
-        why = [*deps, *(kind for kind in ("params", "cmd") if one.get(kind) != two.get(kind))]
-        because = ", ".join(why) if one and two else f"only in the {'new' if two else 'old'}"
-        rows.append({"stage": name, "because of": because, "made": ", ".join(outs)})
+        why = [*deps, *(kind for kind in ("params", "cmd") if old.get(kind) != new.get(kind))]
+        because = ", ".join(why) if old and new else f"only in the {'new' if new else 'old'}"
+        rows.append({"stage": change["name"], "because of": because, "made": ", ".join(outs)})
     return rows
 
 
 def _tested(one: State, two: State) -> tuple[Rows, list[str]]:
-    """Each system against itself on the questions that both asked, pooled over the seeds that both have."""
+    """Each system against itself on the questions that both asked, pooled over the seeds that both have; notes."""
     try:
-        answers = [_answers(state) for state in (one, two)]
+        answers = {state.name: state.answers() for state in (one, two)}
     except ValueError as error:
-        return [], [
-            f"No paired test: {GRADED} is not as grading writes it today ({' '.join(str(error).split())[:200]})."
-        ]
-    if lacking := " and ".join(state.name for state, found in zip((one, two), answers, strict=True) if found is None):
+        why = " ".join(str(error).split())[:200]
+        return [], [f"No paired test: {GRADED} is not as grading writes it today ({why})."]
+    if lacking := " and ".join(name for name, found in answers.items() if found is None):
         return [], [f"No paired test: {GRADED} of {lacking} is not at hand; `dvc pull` or `dvc repro` there brings it."]
-    asked = [_questions(state) for state in (one, two)]
+    asked = [one.questions(), two.questions()]
     if not all(asked):  # Then objects alone must tell whether a question is the same.
         asked = [{}, {}]
+    graded = [answers[state.name] or [] for state in (one, two)]
     meant = [
-        {g.question_id: (videos.get(g.question_id), g.objects) for g in found or ()}
-        for found, videos in zip(answers, asked, strict=True)
+        {g.question_id: (videos.get(g.question_id), g.objects) for g in found}
+        for found, videos in zip(graded, asked, strict=True)
     ]
     same = {question for question, meaning in meant[0].items() if meaning == meant[1].get(question)}
-    before, after = (grouped(g for g in found or () if g.question_id in same) for found in answers)
+    before, after = (grouped(g for g in found if g.question_id in same) for found in graded)
     rows = []
     for (task, measure), settings in after.items():
         for setting, runs in settings.items() if task in TASKS and measure == TASKS[task].measure else ():
@@ -111,53 +187,6 @@ def _tested(one: State, two: State) -> tuple[Rows, list[str]]:
     other = len(meant[0].keys() | meant[1].keys()) - len(same)
     notes = [f"{len(same)} questions are compared; {other} were asked by one side only, or differ."] if other else []
     return [row.model_dump(mode="json") for row in with_holm(rows)], notes
-
-
-def _metrics(state: State) -> dict[str, str]:
-    return _flat({Path(folder).name: state.mapping(f"{folder}/metrics.json") for folder in state.folders("reports")})
-
-
-def _losses(state: State) -> dict[str, str]:
-    """By report and training: its last loss."""
-    found = {}
-    for folder in state.folders("reports"):
-        for row in _rows(state, f"{folder}/curves.csv"):
-            if row["name"] == "loss":  # Of each training by rising step.
-                found[f"{Path(folder).name} {row['stage']}"] = row["value"]
-    return found
-
-
-def _rows(state: State, file: str) -> Rows:
-    """Of a CSV file; none where there is no such file."""
-    rows: Rows = pd.read_csv(io.BytesIO(state.read(file) or b"nothing"), dtype=str).fillna("").to_dict("records")
-    return rows
-
-
-def _scores(state: State) -> dict[str, str]:
-    """By key: the accuracy and its interval."""
-    found = {}
-    for folder in state.folders("reports"):
-        for row in _rows(state, f"{folder}/scores.csv"):
-            name = " ".join([Path(folder).name, *filter(None, map(row.get, KEY))])
-            found[name] = f"{row.get('accuracy')} [{row.get('low')}, {row.get('high')}]"
-    return found
-
-
-def _answers(state: State) -> list[Graded] | None:
-    content = state.read(GRADED)
-    return (
-        None
-        if content is None
-        else [Graded.model_validate(row) for row in pq.read_table(io.BytesIO(content)).to_pylist()]
-    )
-
-
-def _questions(state: State) -> dict[str, object]:
-    """By id, over all seeds, what makes a question this one: its videos and its right answer."""
-    seeds = (state.mapping("params.yaml").get("ablation") or {}).get("seeds", [0])
-    files = [state.read(f"{QUESTIONS}/{seed}/evaluation.jsonl") or b"" for seed in seeds]
-    rows = (json.loads(line) for file in files for line in file.splitlines())
-    return {row["question_id"]: (row["videos"], row["gold"]) for row in rows}
 
 
 def _changes(old: dict[str, Any], new: dict[str, Any]) -> Rows:

@@ -1,20 +1,14 @@
-"""What lies on disk of a reproduction: stages as DVC knows them, their runs, scores, models and data."""
+"""What lies on disk of a reproduction: stages as DVC and runs/ know them, accuracies, models."""
 
 from __future__ import annotations
 
 import csv
 import hashlib
-import itertools
 import json
-import subprocess
-import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
-from dataclasses import dataclass
 from datetime import datetime
-from functools import reduce
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 
@@ -22,70 +16,70 @@ from pipeline.config import Params
 from pipeline.config.params import CHAIN, PARAMS_FILE
 from pipeline.core.errors import UserError
 from pipeline.core.io import read_json, read_table
-from pipeline.core.records import Encoder, Graded, Lora, Part, Touch, Variant, Video
+from pipeline.core.records import Encoder, Graded, Lora, Touch, Variant
 from pipeline.core.stage import DATA, RUNS
 from pipeline.tasks import TASKS
 
 REPORTS, CHAIN_LOCK = Path("reports"), Path("dvc.lock")
 
 
-@dataclass(frozen=True)
-class ChainStage:
-    """A stage of dvc.yaml with one value a matrix axis, and the last time that it really ran here."""
+class ChainStage(NamedTuple):
+    """A stage as dvc.lock has it for these parameters, and the last time that it really ran here."""
 
-    title: str
-    """As DVC names it, e.g. `align@finetuned-all-0`."""
-    axes: Mapping[str, str]
     lock: str
-    """Hash of its entry in dvc.lock; empty where it did not run yet with these parameters."""
-    outs: Mapping[str, str]
+    """Hash of its entry in dvc.lock."""
+    outs: dict[str, str]
     """Path to hash of what it made."""
     ran: tuple[int, int] | None
     """Start and end in milliseconds since 1970, as all times here; None where DVC only ever restored it."""
-    metrics: Mapping[str, float]
+    metrics: dict[str, float]
     """The stage's own, and what it cost: `system/seconds`, `system/startup_seconds`, `system/peak_memory_mb`."""
 
 
-def read_stages(params: Params) -> list[ChainStage]:
-    """The stages of dvc.yaml, in its order and without `publish`, as dvc.lock and runs/ know them.
+def read_stages(params: Params) -> dict[str, ChainStage]:
+    """Stages of dvc.yaml, without `publish`, that ran with these parameters, by titles such as `align@finetuned-all-0`.
 
-    Either file is a UserError where it is missing, or no YAML of DVC's.
+    dvc.yaml or dvc.lock is a UserError where it is missing, or no YAML of DVC's.
     """
-    chain, entries = map(_stages_in, (CHAIN, CHAIN_LOCK))
-    chain.pop("publish", None)
-    today, values = settings(params), params.model_dump(mode="json")
-
-    def choices(axis: Any) -> list[Any]:
-        """A list, or the parameter that is named like `${ablation.seeds}`."""
-        return list(reduce(lambda v, key: v[key], axis[2:-1].split("."), values) if isinstance(axis, str) else axis)
-
-    found = []
-    for name, stage in chain.items():
-        matrix = {axis: choices(value) for axis, value in stage.get("matrix", {}).items()}
-        for choice in itertools.product(*matrix.values()):
-            title = f"{name}@{'-'.join(map(str, choice))}" if matrix else name
-            entry = entries.get(title) or {}
-            if not dict(flatten((entry.get("params") or {}).get(str(PARAMS_FILE)) or {})).items() <= today.items():
-                entry = {}
+    chain, today, found = _stages_in(CHAIN).keys() - {"publish"}, settings(params), {}
+    for title, entry in _stages_in(CHAIN_LOCK).items():
+        used = dict(flatten((entry.get("params") or {}).get(str(PARAMS_FILE)) or {}))
+        if title.partition("@")[0] in chain and used.items() <= today.items():
             outs = {out["path"]: str(out.get("md5")) for out in entry.get("outs") or ()}
-            axes = dict(zip(matrix, map(str, choice), strict=True))
-            found.append(ChainStage(title, axes, digest(entry) if entry else "", outs, *_last_run(title)))
+            ran, metrics, path = None, {}, RUNS / f"{title}.json"
+            if path.is_file():
+                run = read_json(path)
+                began, ended = (datetime.fromisoformat(run[end]).timestamp() for end in ("started", "ended"))
+                ran = milliseconds(began), milliseconds(ended)
+                costs = {f"system/{name}": run[name] for name in ("seconds", "startup_seconds", "peak_memory_mb")}
+                metrics = {**run["metrics"], **costs}
+            found[title] = ChainStage(digest(entry), outs, ran, metrics)
     return found
 
 
-def _last_run(title: str) -> tuple[tuple[int, int] | None, dict[str, float]]:
-    path = RUNS / f"{title}.json"
-    if not path.is_file():
-        return None, {}
-    run = read_json(path)
-    started, ended = (milliseconds(datetime.fromisoformat(run[end]).timestamp()) for end in ("started", "ended"))
-    costs = {f"system/{name}": run[name] for name in ("seconds", "startup_seconds", "peak_memory_mb")}
-    return (started, ended), {**run["metrics"], **costs}
+def axes(title: str) -> dict[str, str]:
+    """Which of its matrix a stage is: `align@finetuned-all-0` has encoder, opd and seed."""
+    name, _, key = title.partition("@")
+    names = _stages_in(CHAIN).get(name, {}).get("matrix", {})
+    return dict(zip(names, key.split("-", len(names) - 1), strict=False))
 
 
-def settings(params: Params, axes: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Resolved parameters by dotted key, lists as JSON; `axes` come first and in place of those of their name."""
-    return {**(axes or {}), **dict(flatten(params.model_dump(mode="json"))), **(axes or {})}
+def _stages_in(path: Path) -> dict[str, dict[str, Any]]:
+    try:
+        found = yaml.load(path.read_text(encoding="utf-8"), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file; `dvc repro` makes it") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: not YAML ({' '.join(str(error).split())}); restore it from Git") from None
+    stages = (found.get("stages") or {}) if isinstance(found, dict) else {}
+    if not isinstance(stages, dict) or not all(isinstance(stage, dict) for stage in stages.values()):
+        raise UserError(f"{path}: not as DVC writes it; restore it from Git")
+    return stages
+
+
+def settings(params: Params, own: Mapping[str, str] | None = None) -> dict[str, str]:
+    """Resolved parameters by dotted key, lists as JSON; a run's `own` come first, in place of those of their name."""
+    return {**(own or {}), **dict(flatten(params.model_dump(mode="json"))), **(own or {})}
 
 
 def accuracies(params: Params) -> dict[str, dict[str, float]]:
@@ -133,42 +127,6 @@ def artifacts(variant: Variant) -> Iterator[tuple[Path, str]]:
         yield DATA / "encoder" / str(variant.seed), "encoder"
 
 
-def datasets(params: Params) -> Iterator[tuple[str, Any]]:
-    """Training, validation and test videos of each split as MLflow's datasets; digests are over ids and contents."""
-    import pandas as pd
-    from mlflow.data import from_pandas
-
-    from pipeline.videos.split import read_splits
-
-    videos = DATA / "videos.parquet"
-    if not videos.is_file() or not (DATA / "splits").is_dir():
-        return
-    contents = {video.video_id: video.sha256 for video in read_table(videos, Video)}
-    for seed, assignments in read_splits(DATA, params.split, params.ablation.seeds).items():
-        fold = params.split.fold_of(seed)
-        for part in (Part.TRAIN, Part.VALIDATION, Part.TEST):
-            rows = sorted((a.video_id, a.object_id, contents[a.video_id]) for a in assignments if a.part == part)
-            frame = pd.DataFrame(rows, columns=["video_id", "object_id", "sha256"])
-            name = part.value if fold is None else f"{part}-fold{fold}"
-            with warnings.catch_warnings():
-                # MLflow has two readers of local folders, both the same, and says so.
-                warnings.simplefilter("ignore")
-                yield part.value, from_pandas(frame, source=params.data.dir, name=name)
-
-
-def _stages_in(path: Path) -> dict[str, dict[str, Any]]:
-    try:
-        found = yaml.load(path.read_text(encoding="utf-8"), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such file; `dvc repro` makes it") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: not YAML ({' '.join(str(error).split())}); restore it from Git") from None
-    stages = (found.get("stages") or {}) if isinstance(found, dict) else {}
-    if not isinstance(stages, dict) or not all(isinstance(stage, dict) for stage in stages.values()):
-        raise UserError(f"{path}: not as DVC writes it; restore it from Git")
-    return stages
-
-
 def flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
     """Nested values by dotted key, all but texts as JSON."""
     for key, value in values.items():
@@ -186,11 +144,3 @@ def digest(value: object) -> str:
 def milliseconds(seconds: float) -> int:
     """As MLflow counts time."""
     return int(seconds * 1000)
-
-
-def git(*arguments: str) -> str:
-    """What Git prints; "unknown" where it fails."""
-    with suppress(OSError, subprocess.SubprocessError):
-        command = ["git", *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
-    return "unknown"

@@ -9,39 +9,28 @@ import logging
 import os
 import re
 import socket
-import sqlite3
+import subprocess
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
+from contextlib import suppress
 from pathlib import Path
 from threading import Event
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, TypeVar
 
 from pipeline.config import Params, TrackingConfig
 from pipeline.config.params import main_folder
 from pipeline.core.errors import UserError, without_secrets
-from pipeline.tracking.chain import ChainStage, git
+from pipeline.tracking.chain import ChainStage
 
 logger = logging.getLogger(__name__)
-P = ParamSpec("P")
 T = TypeVar("T")
 
 MLRUNS = Path("mlruns")
 KIND, STAGE, FOLDER, PARENT = "octopi.kind", "octopi.stage", "octopi.folder", "mlflow.parentRunId"
-A_CALL, LONGEST_PARAM, LONGEST_TAG = 100, 6000, 8000
-"""MLflow's limits: items a call, and the length of values."""
-LOCK_SECONDS = 120
-"""Longer than anybody publishes; a crash frees the lock."""
+LOCK = "octopi.lock"
+"""Tag of a finished stage's run: the hash of its entry in dvc.lock; written last."""
 
 out_of_reach = Event()
 """Set by the first call that fails: this process makes no other, so that a dead server costs its time once."""
-
-
-MEANT = re.compile(
-    "MLFLOW_(TRACKING|S3|BOTO|GCS|KERBEROS|MYSQL|SQLALCHEMYSTORE|HTTP|WORKSPACE$|ARTIFACT|MULTIPART|"
-    "ENABLE_(PROXY_)?MULTIPART|SYSTEM_METRICS_SAMPL)"
-)
-"""MLflow's variables that say how a server is reached, who asks and how often: a person's to set. Others would have a
-curve logged to another run or experiment, or add to what is recorded."""
 
 
 class TrackingError(UserError):
@@ -55,32 +44,37 @@ def cause(error: Exception, tracking: TrackingConfig) -> str:
     while below := chain[-1].__cause__ or (None if chain[-1].__suppress_context__ else chain[-1].__context__):
         chain.append(below)
     first = chain[-1] if any(isinstance(each, OSError) for each in chain) else error
-    words = without_secrets(" ".join(str(first).split()))
-    mend = ""
+    words, mend = without_secrets(" ".join(str(first).split())), ""
     if re.search(r"\b40[13]\b|PERMISSION_DENIED|UNAUTHENTICATED", words):
         mend = "; set MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD to those of the server"
     place = tracking.uri or MLRUNS / "mlflow.db"
     return without_secrets(f"tracking at {place}: {type(first).__name__}: {words[:300]}{mend}")
 
 
-def attempt(tracking: TrackingConfig, call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T | None:
+def attempt(tracking: TrackingConfig, call: Callable[..., T], *args: object) -> T | None:
     """Call, unless tracking is out of reach already. A failure is one warning: the training is worth more."""
     if not out_of_reach.is_set():
         try:
-            return call(*args, **kwargs)
+            return call(*args)
         except Exception as error:
             out_of_reach.set()
             logger.warning("tracking is off, `octopi publish` completes the run: %s", cause(error, tracking))
     return None
 
 
+def git(*arguments: str) -> str:
+    """What Git prints; "unknown" where it fails."""
+    with suppress(OSError, subprocess.SubprocessError):
+        command = ["git", *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+    return "unknown"
+
+
 class Store:
-    """One experiment of a server, or of the local database."""
+    """The experiment, by MLflow's client: the fluent calls take a run, a server and tags from the shell's variables."""
 
     def __init__(self, tracking: TrackingConfig) -> None:
         """Connect, and make the experiment where it is new."""
-        for name in [name for name in os.environ if "MLFLOW_" in name and not MEANT.match(name)]:
-            del os.environ[name]
         # When a server dies, one call of a training, one of the system monitor and one that ends the run may wait.
         seconds = str(max(1, tracking.timeout_seconds // 3))
         os.environ.update(
@@ -88,65 +82,60 @@ class Store:
             MLFLOW_HTTP_REQUEST_TIMEOUT=seconds,
             PGCONNECT_TIMEOUT=seconds,
             MLFLOW_DISABLE_TELEMETRY="true",
-            MLFLOW_LOGGING_LEVEL="ERROR",
             MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR="false",
             MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT="true",
-            # The Trainer's hundred arguments would hide the parameters that a person sets.
-            MLFLOW_MAX_LOG_PARAMS="0",
         )
-        logging.getLogger("alembic").setLevel(logging.ERROR)
         import mlflow.store.db.utils
         from filelock import FileLock
-        from sqlalchemy import event
-        from sqlalchemy.engine import Engine
 
+        for name in ("alembic", "mlflow"):
+            logging.getLogger(name).setLevel(logging.ERROR)
         # Ten attempts to open a broken database take 107 s.
         mlflow.store.db.utils.MAX_RETRY_COUNT = 1
-        if not event.contains(Engine, "connect", _do_not_wait_for_the_disk):
-            event.listen(Engine, "connect", _do_not_wait_for_the_disk)
         here, home = Path.cwd(), main_folder()
         (home / MLRUNS).mkdir(exist_ok=True)
         if home != here and not MLRUNS.is_symlink():
             MLRUNS.symlink_to(home / MLRUNS)
-        database = MLRUNS.resolve() / "mlflow.db"
-        self.uri = tracking.uri or f"sqlite:///{database}"
+        self.uri = tracking.uri or f"sqlite:///{MLRUNS.resolve() / 'mlflow.db'}"
         # Several folders may share a server. The local database, which moves with its folder, has experiments' copies.
         folder = f"{socket.gethostname()}:{here}" if tracking.uri else here.relative_to(home).as_posix()
         self.mine = {FOLDER: folder.replace("'", "_")}
-        self.lock = FileLock(MLRUNS / ".lock", timeout=LOCK_SECONDS)
+        # Longer than anybody publishes; a crash frees the lock.
+        self.lock = FileLock(MLRUNS / ".lock", timeout=120)
         # Several first starts at once on a new database break it.
         with self.lock:
             self.client = mlflow.MlflowClient(self.uri, self.uri)
-            found = self.client.get_experiment_by_name(tracking.experiment)
-            if found:
+            if found := self.client.get_experiment_by_name(tracking.experiment):
                 self.experiment = str(found.experiment_id)
                 return
+            if not tracking.uri:
+                # Or artifacts would stay behind where the folder is moved: MLflow makes absolute what a call names.
+                self.client._tracking_client.store.artifact_root_uri = (MLRUNS / "artifacts").as_posix()
             # Without the kind, the dashboard takes the experiment for a chat application's.
             kind = {"mlflow.experimentKind": "custom_model_development"}
             self.experiment = str(self.client.create_experiment(tracking.experiment, tags=kind))
-            if not tracking.uri:
-                # MLflow's own call would make the path absolute.
-                with closing(sqlite3.connect(database)) as connection, connection:
-                    change = "UPDATE experiments SET artifact_location = ? WHERE experiment_id = ?"
-                    connection.execute(change, ((MLRUNS / "artifacts").as_posix(), int(self.experiment)))
 
     def find(self, tags: Mapping[str, str], *conditions: str) -> list[Any]:
         """Runs with all these tags, the youngest first."""
         query = " and ".join([*(f"tags.`{name}` = '{value}'" for name, value in tags.items()), *conditions])
         return list(self.client.search_runs([self.experiment], query, order_by=["attributes.start_time DESC"]))
 
-    def run_of(self, stage: ChainStage) -> Any | None:
-        """The run that was made, live or by publishing, when the stage last really ran."""
-        if stage.ran is None:
-            return None
-        times = (f"attributes.start_time {sign} {time}" for sign, time in zip((">=", "<="), stage.ran, strict=True))
-        return next(iter(self.find({STAGE: stage.title}, *times)), None)
+    def fresh(self, stages: Mapping[str, ChainStage]) -> dict[str, Any | None]:
+        """Stages whose last run here has no finished run there, with the one that was logged live, if any."""
+        found = {}
+        for title, stage in stages.items():
+            if stage.ran:
+                times = "attributes.start_time >= {} and attributes.start_time <= {}".format(*stage.ran)
+                run = next(iter(self.find({STAGE: title}, times)), None)
+                if run is None or LOCK not in run.data.tags:
+                    found[title] = run
+        return found
 
-    def open_parent(self, params: Params) -> str | None:
+    def open_reproduction(self, params: Params) -> str | None:
         """The reproduction of this folder that a training began and nobody published yet; those of other scales end."""
         name = f"attributes.run_name = '{params.report_name}'"
-        running = {KIND: "reproduction", **self.mine}, "attributes.status = 'RUNNING'"
-        mine = next((str(run.info.run_id) for run in self.find(*running, name)), None)
+        running = self.find({KIND: "reproduction", **self.mine}, "attributes.status = 'RUNNING'", name)
+        mine = str(running[0].info.run_id) if running else None
         self.kill({KIND: "reproduction"}, but=mine)
         return mine
 
@@ -173,14 +162,13 @@ class Store:
         from mlflow.entities import Metric, Param, RunTag
 
         points = [Metric(*metric) for metric in metrics]
-        own = [Param(name, value[:LONGEST_PARAM]) for name, value in (params or {}).items()]
-        marks = [RunTag(name, value[:LONGEST_TAG]) for name, value in (tags or {}).items()]
-        for i in range(0, max(map(len, (points, own, marks))), A_CALL):
-            self.client.log_batch(run, *(items[i : i + A_CALL] for items in (points, own, marks)))
+        own = [Param(name, value) for name, value in (params or {}).items()]
+        marks = [RunTag(name, value) for name, value in (tags or {}).items()]
+        # MLflow takes 100 parameters or tags a call. At once and not behind a queue, so that a failure shows.
+        for i in range(0, max(map(len, (points, own, marks))), 100):
+            self.client.log_batch(run, *(items[i : i + 100] for items in (points, own, marks)), synchronous=True)
 
-
-def _do_not_wait_for_the_disk(connection: Any, _: object) -> None:
-    """Waiting for each of a thousand small commits makes most of publishing; a power failure may cost the database, and
-    `octopi publish` makes it again."""
-    if isinstance(connection, sqlite3.Connection):
-        connection.execute("PRAGMA synchronous=OFF")
+    def finish(self, run: str, end: int, tags: Mapping[str, str]) -> None:
+        """Say what a run stands for, last of all, and end it."""
+        self.log(run, tags=tags)
+        self.client.set_terminated(run, "FINISHED", end)

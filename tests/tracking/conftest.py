@@ -15,7 +15,7 @@ import yaml
 
 from pipeline.config import Params, TrackingConfig
 from pipeline.core.io import write_json, write_table
-from pipeline.core.records import Assignment, Measurement, Part, Video
+from pipeline.core.records import Measurement
 from pipeline.scales import compose, write_params
 from pipeline.tracking.publish import publish
 from pipeline.tracking.store import Store, out_of_reach
@@ -73,12 +73,6 @@ class FakeChain:
         """Write it whole to the working directory."""
         write_params(self.params)
         Path("dvc.yaml").write_text(CHAIN)
-        parts = {"a_0": Part.TRAIN, "a_1": Part.TRAIN, "b_0": Part.VALIDATION, "c_0": Part.TEST}
-        assigned = [Assignment(video_id=v, object_id=v[0], part=p) for v, p in parts.items()]
-        write_table(Path("data/splits/0.parquet"), Assignment, assigned)
-        form = {"frames": 20, "fps": 25.0, "width": 160, "height": 120}
-        videos = [Video(video_id=v, object_id=v[0], path=f"{v}.avi", sha256=v, **form) for v in parts]
-        write_table(Path("data/videos.parquet"), Video, videos)
         for title in TITLES:
             if title.startswith(("align", "lora")):
                 curve = [Measurement(step=s, name="loss", value=1 / s) for s in range(1, 121)]
@@ -123,24 +117,15 @@ def out(title: str) -> str:
 
 
 @pytest.fixture(scope="session")
-def fresh_database(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """mlruns/ with an empty experiment: making its tables takes seconds."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(tmp_path_factory.mktemp("database"))
-        Store(TrackingConfig())
-        return Path("mlruns").resolve()
-
-
-@pytest.fixture(scope="session")
-def finished(tmp_path_factory: pytest.TempPathFactory, fresh_database: Path) -> FakeChain:
-    """The folder of a chain of which each stage ran once; it is copied, not used."""
-    folder = tmp_path_factory.mktemp("finished") / "a clone"
-    shutil.copytree(fresh_database, folder / "mlruns")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> FakeChain:
+    """The folder of a chain of which each stage ran once, and an empty database; it is copied, not used."""
+    folder = tmp_path_factory.mktemp("finished")
     overrides = ("ablation.lora=[with]", "ablation.opd=[all]", "tracking.timeout_seconds=3")
     fake = FakeChain(compose("smoke", overrides, conf=ROOT / "conf"), folder)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         fake.write()
+        Store(TrackingConfig())
     return fake
 
 

@@ -33,6 +33,7 @@ from pipeline.config import Params
 from pipeline.core.io import read_table, write_table
 from pipeline.core.records import Measurement
 from pipeline.core.stage import Stage
+from pipeline.scales import write_params
 from pipeline.tracking import live as live_module
 from pipeline.tracking.chain import settings
 from pipeline.tracking.live import live
@@ -107,27 +108,15 @@ def minutes_of(stage: Stage) -> float:
     return (stage.started - 1 - FIRST.timestamp()) / 60
 
 
-STRAY = {"MLFLOW_RUN_ID": "0" * 32, "MLFLOW_TAGS": '{"stray": "1"}'}
-READ = set(re.findall(r'os\.getenv\("(\w+)"', inspect.getsource(MLflowCallback)))
-READ |= {found.name for found in vars(fluent).values() if isinstance(found, _EnvironmentVariable)}
-"""Every variable that the callback and MLflow's fluent calls read, by their source."""
-READ |= {"DISABLE_MLFLOW_INTEGRATION", "MLFLOW_SYSTEM_METRICS_NODE_ID", "MLFLOW_REGISTRY_URI"}
-
-
-@pytest.mark.parametrize("name", sorted(READ))
-def test_a_curve_stands_in_its_run_whatever_the_shell_says(
-    chain: FakeChain, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
-    monkeypatch.setenv(name, STRAY.get(name, "1" if "URI" not in name else "sqlite:///stray.db"))
-    kept = {f"MLFLOW_TRACKING_{end}": end for end in ("USERNAME", "PASSWORD", "TOKEN", "SERVER_CERT_PATH")}
-    kept |= {"MLFLOW_S3_ENDPOINT_URL": "http://store", "AWS_ACCESS_KEY_ID": "key"}
-    for variable, value in kept.items():
-        monkeypatch.setenv(variable, value)
-    saving = chain.params.model_copy(update={"runtime": chain.params.runtime.model_copy(update={"save_steps": 2})})
-    with live(Stage(ALIGN, watched(saving))) as callbacks:
-        fit(saving, callbacks)
-        assert not [m for m in by_name("stage")[ALIGN].data.metrics if m.startswith("system/1/")]
-    assert sorted(run.info.run_name for run in runs()) == sorted([ALIGN, saving.report_name])
+def test_a_curve_stands_in_its_run_whatever_the_shell_says(chain: FakeChain, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every variable that MLflow's fluent calls or transformers' callback for MLflow read, by their source."""
+    names = set(re.findall(r'os\.getenv\("(\w+)"', inspect.getsource(MLflowCallback)))
+    names |= {found.name for found in vars(fluent).values() if isinstance(found, _EnvironmentVariable)}
+    for name in sorted({*names, "MLFLOW_REGISTRY_URI", "MLFLOW_ENABLE_ASYNC_LOGGING"}):
+        monkeypatch.setenv(name, STRAY.get(name, "1" if "URI" not in name else "sqlite:///stray.db"))
+    with live(Stage(ALIGN, watched(chain.params))) as callbacks:
+        fit(chain.params, callbacks)
+    assert sorted(run.info.run_name for run in runs()) == sorted([ALIGN, chain.params.report_name])
     run = by_name("stage")[ALIGN]
     assert len(losses(run)) == STEPS
     assert run.data.params.keys() == {*settings(chain.params), "encoder", "opd", "seed"}
@@ -135,7 +124,9 @@ def test_a_curve_stands_in_its_run_whatever_the_shell_says(
     assert client().list_artifacts(run.info.run_id) == []
     assert {e.name for e in client().search_experiments()} == {"Default", "octopi"}
     assert not Path("stray.db").exists()
-    assert kept.items() <= os.environ.items()
+
+
+STRAY = {"MLFLOW_RUN_ID": "0" * 32, "MLFLOW_TAGS": '{"stray": "1"}'}
 
 
 @pytest.mark.parametrize(("error", "status"), [(RuntimeError, "FAILED"), (KeyboardInterrupt, "KILLED")])
@@ -143,7 +134,6 @@ def test_how_a_training_ended(chain: FakeChain, error: type[BaseException], stat
     with pytest.raises(error), live(Stage(ALIGN, watched(chain.params))):
         raise error
     assert by_name("stage")[ALIGN].info.status == status
-    assert mlflow.active_run() is None
 
 
 def test_four_killed_cold_starts_and_the_next_attempt(chain: FakeChain) -> None:
@@ -182,25 +172,20 @@ def test_an_unfinished_reproduction_of_another_scale_ends(chain: FakeChain) -> N
     }
 
 
-def test_without_live_logging_mlflow_is_not_imported(chain: FakeChain) -> None:
+@pytest.mark.parametrize(("on", "rank"), [(False, "0"), (True, "1")])
+def test_without_live_logging_and_beside_the_first_process_mlflow_is_not_imported(
+    chain: FakeChain, on: bool, rank: str
+) -> None:
     shutil.rmtree("mlruns")
+    write_params(watched(chain.params, live=on))
     code = (
         "import sys; from pipeline.config.params import load_params; from pipeline.core.stage import Stage\n"
         f"from pipeline.tracking.live import live\nwith live(Stage('{ALIGN}', load_params())) as callbacks: pass\n"
         "assert callbacks == [] and 'mlflow' not in sys.modules"
     )
-    assert chain.params.tracking.live is False
-    subprocess.run([sys.executable, "-c", code], check=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "RANK": rank}
+    subprocess.run([sys.executable, "-c", code], check=True, env=environment)
     assert not Path("mlruns").exists()
-
-
-def test_only_the_first_process_of_a_distributed_training_logs(
-    chain: FakeChain, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("RANK", "1")
-    with live(Stage(ALIGN, watched(chain.params))) as callbacks:
-        assert callbacks == []
-    assert runs() == []
 
 
 @contextmanager
@@ -311,7 +296,6 @@ def test_a_server_that_dies_while_a_training_goes_on(
             server.wait()
     assert trained.history == fit(params, []).history
     assert [r.levelname for r in caplog.records].count("WARNING") == 1
-    assert mlflow.active_run() is None
 
 
 def address(log: Path) -> str:
@@ -324,20 +308,22 @@ def address(log: Path) -> str:
 
 
 def test_a_curve_that_broke_off_is_completed(chain: FakeChain, monkeypatch: pytest.MonkeyPatch) -> None:
-    calls = iter(range(100))
+    real = mlflow.MlflowClient.log_batch
 
-    def log_metrics(*args: Any, real: Any = mlflow.log_metrics, **kwargs: Any) -> None:
-        if next(calls) >= 3:
+    def log_batch(self: Any, run: str, metrics: Sequence[Any], *rest: Any, **more: Any) -> None:
+        if any(m.key == "loss" and m.step > 3 for m in metrics):
             raise OSError("gone")
-        real(*args, **kwargs)
+        real(self, run, metrics, *rest, **more)
 
-    monkeypatch.setattr(mlflow, "log_metrics", log_metrics)
+    monkeypatch.setattr(mlflow.MlflowClient, "log_batch", log_batch)
     stage = Stage(ALIGN, watched(chain.params))
     with live(stage) as callbacks:
         trained = fit(chain.params, callbacks)
     chain.ran([ALIGN], minutes=minutes_of(stage))
     path = Path("data/models/without/finetuned-all-0/history.parquet")
     write_table(path, Measurement, trained.history)
+    monkeypatch.undo()
+    monkeypatch.chdir(chain.folder)
     out_of_reach.clear()
     publish(chain.params)
     run = by_name("stage")[ALIGN]
