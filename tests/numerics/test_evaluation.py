@@ -64,7 +64,6 @@ def test_one_question_an_object_has_wilsons_interval_whose_ends_are_roots(check:
     """
     values = np.arange(n) < k
     found = accuracy_interval(values.astype(np.float64), by_turns(n, n))
-    assert found is not None
     assert 0 <= found.low <= k / n <= found.high <= 1
     square, size = float(stats.t.ppf(0.975, n - 1)) ** 2, n - (0 < k < n)
     ends = np.roots([size + square, -(2 * size * k / n + square), size * (k / n) ** 2])
@@ -107,7 +106,6 @@ def test_the_smallest_effect_is_proportional_to_its_error(check: Check, freedom:
 def test_a_shift_of_all_ratings_changes_no_icc(check: Check) -> None:
     """roundings: means of numbers near `SHIFT`, off by u times their size, as often as there are ratings."""
     classic, bound = icc3k(CLASSIC), 2 * SHIFT * FLOAT64.roundoff * CLASSIC.size
-    assert classic is not None
     assert round(classic[0], 2) == 0.91
     name = f"ICC, {SHIFT:g} added to all ratings"
     check(name, FLOAT64, lambda _: numbers(*(icc3k(CLASSIC + SHIFT) or [None])), bound, classic)

@@ -11,12 +11,10 @@ import itertools
 import math
 from collections.abc import Sequence
 from fractions import Fraction
-from typing import cast
 
 import numpy as np
 import pytest
 import torch
-from torch import nn
 from torch.nn import functional as F
 
 from pipeline.core.runtime import seed_everything
@@ -52,7 +50,7 @@ def test_features_of_length_0_are_classified(check: Check, fmt: Format) -> None:
     hidden = F.relu(heads.shared.bias)
     with torch.no_grad():
         exact = torch.cat(heads.properties(hidden[None]), dim=1)
-        layers = [cast(nn.Linear, layer) for layer in heads.properties]
+        layers = list(heads.properties)
         sizes = torch.cat([layer.weight.abs() @ hidden + layer.bias.abs() for layer in layers])
 
     def classified(f: Format) -> torch.Tensor:
@@ -62,7 +60,6 @@ def test_features_of_length_0_are_classified(check: Check, fmt: Format) -> None:
         F.cross_entropy(logits.float(), torch.tensor([2], device=f.device)).backward()
         assert all(p.grad is not None and p.grad.isfinite().all() for p in model.heads.parameters())
         # Of the features it is up to 1 / SHORTEST_FEATURE times as large, which float16 does not hold.
-        assert features.grad is not None
         assert f is FLOAT16 or features.grad.isfinite().all()
         return logits
 
@@ -84,7 +81,7 @@ def test_short_features_are_shown_by_the_least_length(
         heads, given = published_heads(f.torch).to(f.device), []
         heads.shared.register_forward_pre_hook(lambda _, inputs: given.append(inputs[0].detach().double()))
         heads(torch.tensor([[length] + [0.0] * 15], dtype=f.torch, device=f.device))
-        return cast(torch.Tensor, given[0].norm(dim=1))
+        return given[0].norm(dim=1)
 
     below = fmt.smallest * (1 / length + 1 / SHORTEST_FEATURE)
     check(f"heads of release: length {length:g} is shown as", fmt, shown, 6 * fmt.roundoff + below, shown_as)
@@ -130,7 +127,7 @@ def test_huge_logits_are_finite_and_decided_on(
     terms = (
         double.standardise(wild).abs().flatten(0, 1) if isinstance(double, JointFrameClassifier) else wild.abs().mean(1)
     )
-    heads = [cast(nn.Linear, head) for head in double.heads.children()]
+    heads = list(double.heads.children())
     sizes = max((terms @ head.weight.abs().T + head.bias.abs()).max().item() for head in heads)
     bound = (2 if kind is JointFrameClassifier else 1) * summing(256 + 4, fmt) * sizes / float(exact.abs().max())
     check(f"{name}: features of {size:g}, weights times {weight:g}", fmt, said, bound)
@@ -140,7 +137,6 @@ def test_huge_logits_are_finite_and_decided_on(
     loss = torch.stack([F.cross_entropy(z, torch.tensor([0, 1, 2, 0])) for z in found]).sum()
     loss.backward()
     assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())
-    assert given.grad is not None
     assert given.grad.isfinite().all()
     decided = model.decide(torch.cat(found, dim=1).detach())
     assert torch.equal(decided, torch.stack([z.argmax(1) for z in exact.split(CLASSES, dim=1)], dim=1))

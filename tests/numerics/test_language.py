@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from functools import cache
-from typing import cast
 
 import numpy as np
 import pytest
@@ -67,7 +66,7 @@ def conversation(model: OctopiForCausalLM) -> tuple[torch.Tensor, torch.Tensor]:
 def answered(model: OctopiForCausalLM, size: float = 1.0) -> torch.Tensor:
     """Logits of the `conversation`, its embeddings multiplied by `size`: rows x length x vocabulary."""
     ids, features = conversation(model)
-    return cast(torch.Tensor, model(ids, size * features).logits)
+    return model(ids, size * features).logits
 
 
 @cache
@@ -102,7 +101,7 @@ def test_embeddings_of_any_size_are_projected_and_answered(check: Check, fmt: Fo
         ids, features = conversation(made(f))
         return made(f).embed(ids, size * features)[:, 4 : 4 + FRAMES]
 
-    first, _, last = (cast(nn.Linear, layer) for layer in made(FLOAT64).connector.projection)
+    first, _, last = made(FLOAT64).connector.projection
     features = (size * conversation(made(FLOAT64))[1]).flatten(0, 1)
     with torch.no_grad():
         hidden = F.gelu(first(features)).abs()
@@ -173,9 +172,9 @@ def test_what_is_trained_is_float32_and_moves_as_adam_says(check: Check, fmt: Fo
     ids, features = conversation(model)
     model(ids, features, labels=ids.masked_fill(ids > 199, IGNORE_INDEX)).loss.backward()
     for parameter in trained:
-        cast(torch.Tensor, parameter.grad).mul_(1e-6)
+        parameter.grad.mul_(1e-6)
     before = torch.cat([p.detach().flatten().double() for p in trained])
-    slope = torch.cat([cast(torch.Tensor, p.grad).flatten().double() for p in trained])
+    slope = torch.cat([p.grad.flatten().double() for p in trained])
     torch.optim.AdamW(trained, lr=rate, weight_decay=0).step()
     after = torch.cat([p.detach().flatten().double() for p in trained])
     exact = -rate * slope / (slope.abs() + 1e-8)
@@ -247,6 +246,6 @@ def test_losses_of_answers_are_cross_entropies(
     labels[:, 0] = IGNORE_INDEX
 
     def loss(_: Format) -> torch.Tensor:
-        return cast(torch.Tensor, model(ids, torch.zeros(len(ids), 0, DIM, device=fmt.device), labels=labels).loss)
+        return model(ids, torch.zeros(len(ids), 0, DIM, device=fmt.device), labels=labels).loss
 
     check(f"loss of answers, logits of 2^{power}", fmt, loss, rounded_loss(power, fmt), mean_loss(power))

@@ -45,7 +45,6 @@ def test_a_registered_task_is_counted_built_stored_and_graded(monkeypatch: pytes
     for question in questions:
         classes = [[(level, float(level)) for level in CATALOGUE.labels(question.objects[0])]]
         concluded = TASKS["HARD"].conclude(question, classes, CATALOGUE)
-        assert concluded is not None
         assert grade([question], [predicted(question, concluded)], CATALOGUE)[0].correct
 
 
@@ -74,7 +73,6 @@ def reworded(counts: dict[str, int], **how: Any) -> list[tuple[Question, Questio
 
 def turns_of(question: Question, opd: Opd = Opd.ALL) -> tuple[Turn, ...]:
     dialogue = question.dialogue(opd)
-    assert dialogue is not None
     return dialogue.turns
 
 

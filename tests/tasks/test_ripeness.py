@@ -52,7 +52,6 @@ def test_the_papers_question_stands_before_the_pair() -> None:
     for question in asked(CATALOGUE, TESTED, 10):
         for mode, turns in ((Opd.NONE, 2), (Opd.NEEDED, 3), (Opd.ALL, 3)):
             dialogue = question.dialogue(mode)
-            assert dialogue is not None
             assert len(dialogue.turns) == turns
             assert dialogue.turns[0].user == TALK
             assert [turn.user.count("{tactile}") for turn in dialogue.turns] == [0, 2, 0][:turns]

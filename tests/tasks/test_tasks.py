@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Iterator
-from itertools import islice
 
 import pytest
 from hypothesis import given, settings
@@ -17,7 +16,7 @@ from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool, find_level
 from pipeline.tasks.questions import build_questions
 from pipeline.videos.catalogue import Catalogue
-from tests.tasks.shared import CATALOGUE, grade
+from tests.tasks.shared import CATALOGUE, drafted, grade
 
 POOL = Pool(Part.TRAIN, CATALOGUE, {o: [f"{o}_{i}" for i in range(3)] for o in CATALOGUE.objects})
 HARDNESS = CATALOGUE.properties[0]
@@ -25,18 +24,7 @@ EACH = 2
 every_task = pytest.mark.parametrize("task", list(TASKS))
 
 
-def drafted(task: str) -> list[Question]:
-    """Some questions of every stratum."""
-    definition, rng, questions = TASKS[task], random.Random(0), []
-    for stratum in range(definition.strata(CATALOGUE)):
-        drafts = (definition.draft(POOL, stratum, rng) for _ in range(2000))
-        for draft in islice(filter(None, drafts), EACH):
-            fields = {name: getattr(draft, name) for name in ("videos", "objects", "dialogues", "gold")}
-            questions.append(Question(question_id=f"{task}-{len(questions)}", task=task, part=POOL.part, **fields))
-    return questions
-
-
-QUESTIONS = {task: drafted(task) for task in TASKS}
+QUESTIONS = {task: drafted(task, POOL, EACH) for task in TASKS}
 
 
 def answers(question: Question) -> Iterator[tuple[Opd, tuple[str, ...]]]:
