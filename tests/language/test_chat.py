@@ -57,7 +57,7 @@ def sentence_piece() -> PreTrainedTokenizerFast:
     )
 
 
-@pytest.fixture(scope="module", params=["smollm2", "bytes", "sentence pieces"])
+@pytest.fixture(scope="module", params=[pytest.param("smollm2", marks=pytest.mark.slow), "bytes", "sentence pieces"])
 def spoken(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[object, str]:
     """A tokenizer, and its format with `generation` blocks."""
     if request.param == "smollm2":
