@@ -16,10 +16,10 @@ export PYTHONUNBUFFERED := 1
 export PYTHONUTF8 := 1
 export HF_HUB_OFFLINE := 1
 
-.PHONY: help install repro test stability drill lint dashboard bench clean
+.PHONY: help install repro test test-fast stability drill lint dashboard bench clean
 
 help:  ## this list
-	@grep -hE '^[a-z]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 12
+	@grep -hE '^[a-z-]+:.*##' Makefile | sed -E 's/:.*## /\t/' | expand -t 12
 
 install: $(DONE)  ## everything into .venv, from the locks
 
@@ -38,10 +38,13 @@ repro: install  ## run the whole chain of params.yaml, and write reports/
 test: install  ## run all tests
 	python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
+test-fast: install  ## a minute or two: no chain, nothing that starts processes
+	python -m pytest --numprocesses 2 --dist loadfile -m "not slow"
+
 stability: install  ## hard cases in every number format, into reports/stability.csv
 	python -m pytest tests/numerics --stability-csv reports/stability.csv; status=$$?; octopi page && exit $$status
 
-drill: install  ## bad inputs, kills, full disks: what is lost, into reports/drill.csv
+drill: install  ## bad inputs, kills: what is lost, into reports/drill.csv
 	python -m tests.drill --kills $(KILLS) --minutes $(MINUTES) --seed $(SEED)
 
 lint: install  ## ruff and mypy

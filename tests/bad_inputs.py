@@ -1,6 +1,6 @@
 """Bad inputs as a table, each through the command that a person types: one line that names it, and no file touched.
 
-Most rows are those of the tests next to the code that refuses them; here they take the whole way.
+Of what the tests next to the code refuse, a few rows of each kind take the whole way here.
 """
 
 from __future__ import annotations
@@ -16,38 +16,25 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from unittest import mock
 
 from pipeline.cli import main
 from pipeline.config.params import PARAMS_FILE, load_params, validate
 from pipeline.scales import write_params
-from tests import test_config
 from tests.checkpoints import write_clip, write_llama
 from tests.closure import ROOT
 from tests.conftest import moving_square, write_video
-from tests.scenes import test_recipes
-from tests.videos import test_catalogue, test_hard_videos, test_videos
 
 
 class BadInput(NamedTuple):
-    """A row: `prepare` makes the input in the working directory, `words` are regular expressions for its line."""
+    """A row: `prepare` makes the input in the working directory, `words` is a regular expression for its line."""
 
     command: str
-    words: Sequence[str]
+    words: str
     prepare: Callable[[], object] = bool
     arguments: Sequence[str] = ()
     """Further ones, which may hold blanks."""
-    status: int = 1
-
-
-def of_test(test: Any) -> list[Any]:
-    """The rows that a parametrised test has."""
-    return list(test.pytestmark[0].args[1])
-
-
-def literal(words: Sequence[str]) -> list[str]:
-    return [re.escape(word) for word in words]
 
 
 def put(name: str, content: str | bytes | None) -> None:
@@ -68,37 +55,21 @@ def with_params(file: Path, **changes: object) -> None:
     write_params(validate(values, str(file)), file)
 
 
-def catalogued(*lines: str, described: Sequence[str] = (), **files: str | bytes) -> None:
-    """params.yaml names catalogue/, which has these objects (PhysiCLeAR's without) and files."""
+def catalogued(name: str, content: str | bytes) -> None:
+    """params.yaml names catalogue/, which is PhysiCLeAR's but for one file."""
     Path("catalogue").mkdir()
     with_params(PARAMS_FILE, data__catalogue="catalogue")
-    shutil.copy(ROOT / "pipeline/physiclear/objects.csv", "catalogue")
-    shutil.copy(ROOT / "pipeline/physiclear/properties.yaml", "catalogue")
-    if lines:
-        test_catalogue.write(Path("catalogue"), *lines, described=described)
-    for name, content in files.items():
-        put(f"catalogue/{name}.yaml", content)
+    for file in ("objects.csv", "properties.yaml"):
+        shutil.copy(ROOT / "pipeline/physiclear" / file, "catalogue")
+    put(f"catalogue/{name}", content)
 
 
-def videos(make: Callable[..., object], *arguments: Any) -> None:
-    """A folder videos/ that `make` fills."""
-    Path("videos").mkdir()
+def videos(**files: str | bytes) -> None:
+    """A folder videos/ with a good video and these files, in whose names two underscores stand for the dot."""
     with_params(PARAMS_FILE, data__source="videos", data__dir="videos")
-    make(Path("videos"), *arguments)
-
-
-def listed(folder: Path, text: str) -> None:
-    test_videos.listed(folder, "")
-    (folder / test_videos.LIST_FILE).write_bytes(text.encode("latin-1"))
-
-
-def good(folder: Path) -> None:
-    for seed, name in enumerate(("baseball_0", "potato_0")):
-        write_video(folder / f"{name}.avi", moving_square(8, seed))
-
-
-def hard_video(name: str, make: Callable[[Path, Path], object], folder: Path) -> None:
-    make(folder / name, write_video(folder.parent / "good.avi", moving_square(31)))
+    write_video(Path("videos/baseball_0.avi"), moving_square(8, 0))
+    for name, content in files.items():
+        put(f"videos/{name.replace('__', '.')}", content)
 
 
 def spoilt(write: Callable[[Path], Path], file: str, change: Callable[[bytes], bytes | None]) -> None:
@@ -108,106 +79,129 @@ def spoilt(write: Callable[[Path], Path], file: str, change: Callable[[bytes], b
 
 
 NOT_THERE = "(no such file|does not exist).*dvc repro"
-CLIP, LLAMA = "scale smoke encoder.weights=weights frames.pixels=32", "scale smoke language.weights=weights"
+LLAMA = "scale smoke language.weights=weights"
+TABLE = "object_id,name,hardness,roughness,bumpiness\n"
+SCALES = {
+    "huge": "paper-7b, small, smoke",
+    "smoke frames.per_vido=1": "frames.per_vido.*did you mean per_video",
+    "smoke frames.size=64": "frames.size is called frames.pixels now",
+    "smoke frames.fraction=1.5": "frames.fraction.*less than or equal to 1",
+    "smoke split.name=kfold split.folds=3 ablation.seeds=[0,1,3]": r"ablation.seeds \[0, 1, 3\].*3 folds",
+    "smoke ablation.opd=[none]": "ablation.opd.*lacks the full system's value all",
+    "smoke align.batch_size=10": "align.*does not divide",
+    "smoke data.dir=elsewhere": "data.dir.*data/scenes/videos",
+    "smoke encoder.learning_rate=nan": "encoder.learning_rate",
+    "smoke runtime.device=tpu": "runtime.device.*'cuda'",
+    "smoke encoder.epochs=true": "encoder.*epochs is true",
+    "smoke justaword": "key=value",
+    "smoke encoder.weights=nowhere": "hf download timm",
+    "smoke language.weights=nowhere": "hf download lmsys",
+    "smoke language.start=models/nothing": "language.start: models/nothing holds no trained model",
+    "smoke scenes.objects=[unicorn]": "scenes.objects: unicorn",
+    "smoke scenes.objects=[bath_towel,ice_block]": "no video of a training object",
+    "smoke cross_validation.models=[papers]": "papers is no model; did you mean paper",
+}
+PARAMS: dict[str | bytes | None, str] = {
+    "": "octopi scale smoke",
+    "scale: [": "not YAML",
+    "scale: smoke\n": "missing",
+    "seed: 1\nseed: 2\n": "seed stands twice",
+    b"\xff\xfes": "not UTF-8",
+    None: "no such file",
+}
+CATALOGUES: tuple[tuple[str, str | bytes, str], ...] = (
+    ("objects.csv", TABLE, "no object"),
+    ("objects.csv", "ball;a ball\n", "missing"),
+    ("objects.csv", f"{TABLE}ball,a ball,1,1,1\nball,a bowl,1,1,1\n", "line 3.*ball.*twice"),
+    ("objects.csv", f"{TABLE}ball,a ball,3,1,1\n", "line 2.*hardness.*0 to 2"),
+    ("objects.csv", f"{TABLE}ball,a ball, red,1,1,1\n", "line 2.*quotation marks"),
+    ("objects.csv", f"{TABLE}../../evil,a ball,1,1,1\n", "line 2.*'../../evil'.*letters, digits"),
+    ("properties.yaml", "properties: [", ""),
+    ("properties.yaml", "properties: []\nunstructured: x\nstructured: y\n", ""),
+    ("properties.yaml", b"\xff\xfe", ""),
+    ("scenes.yaml", "yoyo: {modulus: 1}", "yoyo is not in objects.csv; correct or remove the entry"),
+    ("scenes.yaml", "rug: {modulus: .nan}", "rug: modulus is nan"),
+    ("scenes.yaml", "rug: {modulus: 1, colour: red}", "rug: colour is not a key of a recipe; remove it"),
+    ("scenes.yaml", b"rug: \xff\xfe", "correct it, or remove it"),
+)
+VIDEOS: tuple[tuple[dict[str, str | bytes], str], ...] = (
+    ({"rug__avi": b"x"}, "rug.avi.*<object>_<number>.*rename.*videos.csv"),
+    ({"rug_0__avi": b"", "rug_00__mp4": b""}, "rug_0.*rug_0.*keep one"),
+    ({"rug_0__avi": b"not a video"}, "videos/rug_0.avi"),
+    ({"videos__csv": "name,object_id\na.mov,rug\n"}, "column file is missing"),
+    ({"videos__csv": "file,object_id\ngone.mov,rug\n"}, "line 2: no video 'gone.mov' in the folder; correct the line"),
+    ({"videos__csv": b"file,object_id\n\xe9.avi,rug\n"}, "no CSV in UTF-8"),
+)
+STAGES = {
+    "align.py nonsense all 0": "encoder is 'nonsense'; allowed: finetuned, base.*python stages/",
+    "align.py finetuned all ²": "seed is '²'.*python stages/",
+    "align.py finetuned all": "2 values instead of 3.*python stages/",
+    "lora.py finetuned al 0": "opd is 'al'; allowed: none, needed, all.*python stages/",
+    "answer.py finetuned with all 0 1": "5 values instead of 4.*python stages/",
+    "finetune_encoder.py -1": "seed is '-1'.*python stages/",
+    "cross_validate.py paperr": "model is 'paperr'; allowed: constant, .*python stages/",
+    **dict.fromkeys(("split.py", "audit.py", "questions.py", "cross_validate.py constant", "grade.py"), NOT_THERE),
+    **dict.fromkeys(("finetune_encoder.py 0", "embed.py", "align.py finetuned all 0", "report.py"), NOT_THERE),
+    **dict.fromkeys(("lora.py finetuned all 0", "answer.py finetuned with all 0", "package.py"), NOT_THERE),
+}
+COMMANDS = {
+    "weights gpt": "smollm2",
+    "publish": "dvc.lock: no such file",
+    "ask --model nothing": "nothing: .*|holds no",
+    "describe videos --csv t.csv --model nothing": "nothing: .*|holds no",
+    "export nothing there": "nothing: .*|holds no",
+    "serve nothing": "nothing: .*|holds no",
+    "demo nothing": "nothing: .*|holds no",
+    "ask --model stages": "stages: holds no .*so it is no trained model",
+    "ask --model nothing --device gpu": "allowed: auto, cpu, cuda, mps",
+    "ask params.yaml": "is a file; write the question",
+    "ask --json": "--json takes a question",
+    "serve nothing --host 0.0.0.0": "token",
+    "import bag none.bag --topic /a --out out": "none.bag",
+    "diff nowhere": "nowhere: no commit",
+    "page": "report",
+}
 
 
 def bad_inputs() -> Iterator[BadInput]:
     """Every row."""
-    # Scales and params.yaml.
-    for overrides, words in of_test(test_config.test_wrong_override_is_one_line_with_key_and_mend):
-        yield BadInput("scale smoke", literal(words), arguments=overrides)
-    for text, word in of_test(test_config.test_broken_params_file):
+    yield from (BadInput(f"scale {arguments}", words) for arguments, words in SCALES.items())
+    yield BadInput("scale smoke", "split.name.*Side ways.*pattern", arguments=["split.name='Side ways'"])
+    for text, words in PARAMS.items():
         for command in ("publish", "repro", "stages/split.py"):
-            yield BadInput(command, ["params.yaml", re.escape(word)], partial(put, "params.yaml", text))
-    for arguments, words in of_test(test_config.test_missing_inputs_are_named):
-        yield BadInput(f"scale {arguments}", [words])
-    for objects, override, words in of_test(test_config.test_too_few_objects_are_found_before_any_training):
-        if words:
-            yield BadInput(f"scale smoke scenes.objects=[{objects}] {override}", [words])
-    yield BadInput("scale huge", ["paper-7b, small, smoke"])
-    # Catalogues, scenes, videos.
-    check = "data check videos --catalogue catalogue"
-    for lines, words in of_test(test_catalogue.test_a_bad_table_is_one_clear_line):
-        yield BadInput(check, literal(words), partial(catalogued, *lines))
-    for described, words in of_test(test_catalogue.test_a_bad_description_is_one_clear_line):
-        objects = (test_catalogue.SHORT, test_catalogue.BALL)
-        yield BadInput(
-            "stages/split.py", ["descriptions", *literal(words)], partial(catalogued, *objects, described=described)
-        )
-    for text in ("properties: [", "properties: []\nunstructured: x\nstructured: y\n", "", b"\xff\xfe"):
-        yield BadInput(
-            "scale smoke data.catalogue=catalogue", ["properties.yaml"], partial(catalogued, properties=text)
-        )
-    for text, words in of_test(test_recipes.test_bad_entries_are_refused_in_one_line):
-        yield BadInput("stages/synthesize.py", ["scenes.yaml", words], partial(catalogued, scenes=text))
-    for make, words in of_test(test_videos.test_bad_names_are_one_line_with_their_mend):
-        yield BadInput("stages/extract_frames.py", literal(words), partial(videos, make))
-    for text, words in of_test(test_videos.test_bad_lists_are_one_line_with_their_mend):
-        yield BadInput("stages/extract_frames.py", literal([words]), partial(videos, listed, text))
-    for name, make, words in of_test(test_hard_videos.test_files_that_are_no_good_are_named):
-        bad = partial(videos, partial(hard_video, name, make))
-        yield BadInput("data check videos", [name, re.escape(words)], bad)
-        yield BadInput("stages/extract_frames.py", [f"videos/{name}", re.escape(words)], bad)
-    for split in ("nonsense", "Not a name!"):
-        yield BadInput("data audit videos --split", ["allowed: paper, release"], partial(videos, good), [split])
+            yield BadInput(command, f"params.yaml.*{words}|{words}.*params.yaml", partial(put, "params.yaml", text))
+    for name, content, words in CATALOGUES:
+        command = "stages/synthesize.py" if name == "scenes.yaml" else "scale smoke data.catalogue=catalogue"
+        yield BadInput(command, f"{name}.*{words}", partial(catalogued, name, content))
+    for files, words in VIDEOS:
+        yield BadInput("stages/extract_frames.py", words, partial(videos, **files))
+    yield BadInput("data check videos", "rug_0.avi", partial(videos, rug_0__avi=b"not a video"))
+    yield BadInput("data audit videos --split", "allowed: paper, release", videos, ["Not a name!"])
     # Folders of weights.
-    for command, write, stem in ((CLIP, write_clip, "open_clip_model"), (LLAMA, write_llama, "model")):
-        file = f"{stem}.safetensors"
-        for change in (lambda data: data[:-9], lambda data: b"garbage", lambda data: b"", lambda data: None):
-            yield BadInput(command, [f"{file}|has no weights"], partial(spoilt, write, file, change))
+    for change in (lambda data: data[:-9], lambda data: b"garbage", lambda data: None):
+        yield BadInput(
+            LLAMA, "model.safetensors|has no weights", partial(spoilt, write_llama, "model.safetensors", change)
+        )
     for file in ("config.json", "tokenizer.json"):
-        for change in (lambda data: b"{", lambda data: b"[]", lambda data: None, lambda data: b"\xff"):
-            yield BadInput(LLAMA, [file], partial(spoilt, write_llama, file, change))
-    for change in (lambda data: b"{", lambda data: b"[]", lambda data: None):
-        yield BadInput(CLIP, ["config.json"], partial(spoilt, write_clip, "open_clip_config.json", change))
-    yield BadInput("weights gpt", ["smollm2"])
+        for change in (lambda data: b"{", lambda data: b"[]", lambda data: None):
+            yield BadInput(LLAMA, file, partial(spoilt, write_llama, file, change))
+    clip = "scale smoke encoder.weights=weights frames.pixels=32"
+    for file, words in (("open_clip_model.safetensors", "open_clip_model"), ("open_clip_config.json", "config.json")):
+        yield BadInput(clip, words, partial(spoilt, write_clip, file, lambda data: data[:-9]))
     # Stages: their command line, and what the stages before them left.
-    for arguments, words in (
-        ("align.py nonsense all 0", "encoder is 'nonsense'; allowed: finetuned, base"),
-        ("align.py finetuned All 0", "opd is 'All'"),
-        ("align.py finetuned all ²", "seed is '²'"),
-        ("align.py finetuned all 00", "seed is '00'"),
-        ("align.py finetuned all", "2 values instead of 3"),
-        ("lora.py finetuned al 0", "opd is 'al'; allowed: none, needed, all"),
-        ("lora.py", "0 values instead of 3"),
-        ("answer.py finetuned with all x", "seed is 'x'; allowed: 0, 1"),
-        ("answer.py finetuned with all 0 1", "5 values instead of 4"),
-        ("finetune_encoder.py -1", "seed is '-1'"),
-        ("cross_validate.py paperr", "model is 'paperr'; allowed: constant, "),
-    ):
-        yield BadInput(f"stages/{arguments}", [words, "python stages/"])
-    for stage in (
-        *("split.py", "audit.py", "questions.py", "cross_validate.py constant", "grade.py"),
-        *("finetune_encoder.py 0", "embed.py", "align.py finetuned all 0", "lora.py finetuned all 0", "report.py"),
-        *("answer.py finetuned with all 0", "package.py"),
-    ):
-        yield BadInput(f"stages/{stage}", [NOT_THERE])
-    for content in (b"garbage", b""):
-        for stage, file in (("split.py", "data/videos.parquet"), ("questions.py", "data/splits/0.parquet")):
-            broken = partial(put, file, content)
-            yield BadInput(f"stages/{stage}", [f"{file}: not a readable table.*dvc repro"], broken)
+    yield from (BadInput(f"stages/{arguments}", words) for arguments, words in STAGES.items())
+    for stage, file in (("split.py", "data/videos.parquet"), ("questions.py", "data/splits/0.parquet")):
+        broken = partial(put, file, b"garbage")
+        yield BadInput(f"stages/{stage}", f"{file}: not a readable table.*dvc repro", broken)
     for stage, file in (("align.py finetuned all 0", "train"), ("grade.py", "evaluation")):
         broken = partial(put, f"data/questions/0/{file}.jsonl", "garbage\n")
-        yield BadInput(f"stages/{stage}", [f"{file}.jsonl, line 1: not a Question.*dvc repro"], broken)
+        yield BadInput(f"stages/{stage}", f"{file}.jsonl, line 1: not a Question.*dvc repro", broken)
     # What DVC writes.
-    for text in ("{", "stages: 3\n", "- a\n", "<<<<<<< HEAD\na: 1\n", b"\xff\xfe", "a: 1\na: 1\n"):
-        locked = partial(put, "dvc.lock", text)
-        yield BadInput("repro", ["dvc.lock", "git checkout dvc.lock"], locked)
-    yield BadInput("publish", ["dvc.lock: no such file"])
-    for text in ("{", "stages: 3\n", "stages: {split: 3}\n", "<<<<<<< HEAD\na: 1\n", b"\xff\xfe"):
-        yield BadInput("publish", ["dvc.lock: .*restore it from Git"], partial(put, "dvc.lock", text))
-    # A trained model, and what is done with it.
-    for command in ("ask", "describe videos --csv t.csv", "export nothing there", "serve nothing", "demo nothing"):
-        where = " --model nothing" if command.startswith(("ask", "describe")) else ""
-        yield BadInput(f"{command}{where}", ["nothing: .*|holds no"])
-    yield BadInput("ask --model stages", ["stages: holds no .*so it is no trained model"])
-    yield BadInput("ask --model nothing --device gpu", ["allowed: auto, cpu, cuda, mps"])
-    yield BadInput("ask params.yaml", ["is a file; write the question"])
-    yield BadInput("ask --json", ["--json takes a question"])
-    yield BadInput("serve nothing --host 0.0.0.0", ["token"])
-    yield BadInput("import bag none.bag --topic /a --out out", ["none.bag"])
-    yield BadInput("diff nowhere", ["nowhere: no commit"])
-    yield BadInput("page", ["report"])
+    for text in ("{", "stages: 3\n", "<<<<<<< HEAD\na: 1\n", b"\xff\xfe", "a: 1\na: 1\n"):
+        yield BadInput("repro", "dvc.lock.*git checkout dvc.lock", partial(put, "dvc.lock", text))
+    for text in ("{", "stages: {split: 3}\n", b"\xff\xfe"):
+        yield BadInput("publish", "dvc.lock: .*restore it from Git", partial(put, "dvc.lock", text))
+    yield from (BadInput(command, words) for command, words in COMMANDS.items())
 
 
 def prepare_folder(folder: Path) -> None:
@@ -266,9 +260,9 @@ def refuse(row: BadInput) -> dict[str, str]:
     after = contents(Path())
     # An audit writes its findings, errors among them.
     touched = [p for p in sorted({*before, *after} - {"audit.csv"}) if before.get(p) != after.get(p)]
-    fits = len(said) == 1 and all(re.search(word, said[0]) for word in row.words)
+    fits = len(said) == 1 and re.search(row.words, said[0])
     return {
-        "lost": "" if status == row.status else f"status {status}",
-        "wrong_line": "" if fits else f"expected {list(row.words)}, got {said}",
+        "lost": "" if status == 1 else f"status {status}",
+        "wrong_line": "" if fits else f"expected {row.words}, got {said}",
         "different": ", ".join(touched),
     }

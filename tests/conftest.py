@@ -81,6 +81,14 @@ def refused(words: str) -> Any:
     return pytest.raises(UserError, match=words, check=lambda error: "\n" not in str(error))
 
 
+def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
+    """Mark what `make test-fast` leaves out: the chain, benchmarks, files that start processes, the large model."""
+    for item in items:
+        starts = {"subprocess", "multiprocessing", "copy_project"} & vars(item.module).keys()
+        if starts or item.path.parent.name in ("chain", "benchmarks") or "smollm2_folder" in item.fixturenames:
+            item.add_marker("slow")
+
+
 def pytest_runtest_setup(item: pytest.Item) -> None:
     # What a test draws without a seed of its own must not hang on the tests before it in this process.
     random.seed(0)

@@ -161,10 +161,10 @@ def test_any_folder_may_hold_the_videos(name: str, tmp_path: Path) -> None:
         ("smoke frames.selection=uniform", "frames.selection is 'uniform': Input should be 'salient', 'release' or"),
     ],
 )
-def test_missing_inputs_are_named(arguments: str, words: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_inputs_are_named(arguments: str, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     name, *overrides = arguments.split()
-    with refused(words) if words else nullcontext():
+    with refused(words):
         check_inputs(compose(name, overrides))
 
 

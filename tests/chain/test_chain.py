@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from pathlib import Path
 
 import pytest
 import torch
@@ -12,10 +13,12 @@ from safetensors.torch import load_file
 from pipeline.core.io import read_json, read_jsonl
 from pipeline.core.records import Opd, Prediction, Question
 from pipeline.use.model import Octopi
+from tests.drill import Chain, Ledger, drill_kills
 from tests.project import REDUCED, Project, copy_project
 from tests.use.shared import replay
 
 METRICS = "reports/smoke-scenes/metrics.json"
+KILLS = 4
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +64,15 @@ def test_the_packaged_model_answers_as_the_evaluation_did(project: Project) -> N
 
 def test_second_time_does_nothing(project: Project) -> None:
     assert "stages are up to date" in project.run("octopi", "repro")
+
+
+def test_a_killed_chain_goes_on_and_loses_nothing(project: Project, tmp_path: Path) -> None:
+    """On a copy of what has run; a few of `make drill`'s kills."""
+    shutil.copytree(project.folder, tmp_path / "a project", symlinks=True)
+    ledger = Ledger()
+    drill_kills(Chain(Project(tmp_path / "a project")), ledger, KILLS, minutes=10, seed=0)
+    assert ledger.faults() == 0, "what is wrong is printed"
+    assert sum(count["tries"] for count in ledger.values()) == KILLS
 
 
 def test_changed_grader_regenerates_no_answer(project: Project) -> None:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import csv
-import random
 import re
 from collections import Counter
-from itertools import islice
 from pathlib import Path
 from textwrap import dedent
 
@@ -29,6 +27,7 @@ from pipeline.videos.split import check_split
 from tests.closure import ROOT
 from tests.fake_run import fake_params, write_run
 from tests.project import OBJECTS, REDUCED, Project, copy_project
+from tests.tasks.shared import drafted
 
 PHYSICLEAR = ROOT / "pipeline" / "physiclear"
 LEVELS = ["not sticky", "slightly sticky", "sticky", "very sticky"]
@@ -108,21 +107,13 @@ def tacky(tmp_path_factory: pytest.TempPathFactory) -> Catalogue:
     return load_catalogue(write_catalogue(tmp_path_factory.mktemp("other") / "catalogue", name="surface_tack"))
 
 
-def drafted(catalogue: Catalogue, task: str) -> list[Question]:
-    """A question of every stratum that the nine objects have one of."""
-    pool = Pool(Part.TEST, catalogue, {o: [f"{o}_0"] for o in catalogue.objects})
-    definition, rng, questions = TASKS[task], random.Random(0), []
-    for stratum in range(definition.strata(catalogue)):
-        drafts = (definition.draft(pool, stratum, rng) for _ in range(500))
-        for draft in islice(filter(None, drafts), 1):
-            fields = {key: getattr(draft, key) for key in ("videos", "objects", "dialogues", "gold")}
-            questions.append(Question(question_id=f"{task}-{stratum}", task=task, part=pool.part, **fields))
-    return questions
+def pool_of_nine(catalogue: Catalogue) -> Pool:
+    return Pool(Part.TEST, catalogue, {o: [f"{o}_0"] for o in catalogue.objects})
 
 
 @pytest.mark.parametrize("task", list(TASKS))
 def test_every_task_asks_about_it_and_reads_its_own_answers(tacky: Catalogue, task: str) -> None:
-    questions = drafted(tacky, task)
+    questions = drafted(task, pool_of_nine(tacky), 1)
     assert any("surface_tack" in q.gold.properties for q in questions)
     for question in questions:
         assert all(len(labels) == 4 for labels in question.gold.labels)
@@ -135,9 +126,8 @@ def test_every_task_asks_about_it_and_reads_its_own_answers(tacky: Catalogue, ta
 
 
 def test_a_described_fourth_property_is_graded(tacky: Catalogue) -> None:
-    question = next(q for q in drafted(tacky, "OPD") if q.gold.labels[0][3] == 2)
+    question = next(q for q in drafted("OPD", pool_of_nine(tacky), 1) if q.gold.labels[0][3] == 2)
     dialogue = question.dialogue(Opd.ALL)
-    assert dialogue is not None
     (turn,) = dialogue.turns
     for said, right in (("slightly sticky", False), ("sticky", True), ("", False)):
         text = turn.assistant.replace("is sticky.", f"is {said}.")

@@ -36,7 +36,7 @@ DIES = 5
 
 
 def run(kind: str, held: Material, folder: Path) -> Trained:
-    language = LanguageConfig(weights=held.language.weights, dtype=KINDS[kind])  # type: ignore[arg-type]
+    language = LanguageConfig(weights=held.language.weights, dtype=KINDS[kind])
     return train(Job(kind, "x", 0), replace(held, language=language), CONFIG, folder)
 
 
@@ -77,7 +77,7 @@ def watch(said: dict[str, Any]) -> None:
             return loss
         return step(self, model, *args, **kwargs)
 
-    TrainableTrainer.training_step = watched  # type: ignore[method-assign]
+    TrainableTrainer.training_step = watched
 
 
 def main() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -82,7 +83,6 @@ def mistral(vocab_size: int, window: int | None) -> MistralForCausalLM:
 def prompt(question: Question, opd: Opd, model: OctopiForCausalLM) -> list[int]:
     """Token ids of a question's first turn."""
     dialogue = question.dialogue(opd)
-    assert dialogue is not None
     text = render(dialogue.turns, model.tokenizer, system_prompt="", frames=FRAMES, complete=False)
     return list(encode(text, model.tokenizer).input_ids)
 
@@ -95,10 +95,16 @@ def call(model: OctopiForCausalLM) -> dict[str, torch.Tensor]:
 
 def assert_comes_back(model: OctopiForCausalLM, folder: Path, **how: str) -> OctopiForCausalLM:
     """The model that was saved in the folder, which says the same to the bit."""
-    again = OctopiForCausalLM.from_pretrained(folder, **how)  # type: ignore[arg-type]
+    again = OctopiForCausalLM.from_pretrained(folder, **how)
     assert not again.training
     assert torch.equal(again(**call(again)).logits, model.eval()(**call(model)).logits)
     return again
+
+
+def digests(folder: Path) -> dict[str, str]:
+    """Hash of each file of a folder."""
+    files = sorted(f for f in folder.rglob("*") if f.is_file())
+    return {str(f.relative_to(folder)): hashlib.sha256(f.read_bytes()).hexdigest() for f in files}
 
 
 def by_transformers(

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from tokenizers import Tokenizer, decoders, models, pre_tokenizers, processors, trainers
 from transformers import AutoTokenizer, PreTrainedTokenizerBase, PreTrainedTokenizerFast
@@ -31,8 +31,7 @@ VICUNA = (
 )
 LLAMA3 = (
     "{{ bos_token }}{% for m in messages %}<|head|>{{ m.role }}<|/head|>\n\n"
-    "{% if m.role == 'assistant' %}{% generation %}{{ m.content | trim }}<|eot|>{% endgeneration %}"
-    "{% else %}{{ m.content | trim }}<|eot|>{% endif %}{% endfor %}"
+    "{{ m.content | trim }}<|eot|>{% endfor %}"
     "{% if add_generation_prompt %}<|head|>assistant<|/head|>\n\n{% endif %}"
 )
 """As Llama-3 writes it, with shorter names."""
@@ -41,10 +40,6 @@ PSR = (
     Turn(user="Which is better for a wound?", assistant="The first, since 1 < 2."),
 )
 WORDS = st.text(st.characters(codec="utf-8", exclude_categories=("Cs",), exclude_characters="<>{}"), max_size=40)
-
-
-def plain(template: str) -> str:
-    return template.replace("{% generation %}", "").replace("{% endgeneration %}", "")
 
 
 def sentence_piece() -> PreTrainedTokenizerFast:
@@ -62,7 +57,7 @@ def sentence_piece() -> PreTrainedTokenizerFast:
     )
 
 
-@pytest.fixture(scope="module", params=["smollm2", "bytes", "sentence pieces", "sentence pieces, own template"])
+@pytest.fixture(scope="module", params=[pytest.param("smollm2", marks=pytest.mark.slow), "bytes", "sentence pieces"])
 def spoken(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[object, str]:
     """A tokenizer, and its format with `generation` blocks."""
     if request.param == "smollm2":
@@ -79,10 +74,6 @@ def spoken(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
         template = VICUNA
     else:
         tokenizer, template = sentence_piece(), VICUNA
-        if request.param.endswith("template"):
-            template = LLAMA3
-            tokenizer.chat_template = plain(template)
-            tokenizer.add_special_tokens({"additional_special_tokens": ["<|head|>", "<|/head|>", "<|eot|>"]})
     add_tactile_tokens(tokenizer)
     return tokenizer, template
 
@@ -109,47 +100,27 @@ def reference(
     return ids, labels
 
 
-@pytest.mark.parametrize("system", ["", "Be kind."])
-@pytest.mark.parametrize("turns", [PSR, PSR[:1]])
-def test_tokens_and_labels_are_those_that_transformers_marks(
-    spoken: tuple[PreTrainedTokenizerBase, str], turns: tuple[Turn, ...], system: str
-) -> None:
-    tokenizer, template = spoken
-    encoded = encode(render(turns, tokenizer, system_prompt=system, frames=5, complete=True), tokenizer)
-    ids, labels = reference(turns, tokenizer, template, system, frames=5)
-    assert list(encoded.input_ids) == ids
-    assert list(encoded.labels) == labels
-    runs = "".join("x" if label != IGNORE_INDEX else " " for label in encoded.labels).split()
-    assert len(runs) == len(turns), "each answer is one piece"
-    last = [y for y, after in zip(labels, [*labels[1:], IGNORE_INDEX], strict=True) if y >= 0 > after]
-    assert set(last) <= set(end_ids(tokenizer)), "the model must learn to stop"
+TALKS = st.lists(st.tuples(WORDS, WORDS), min_size=1, max_size=3).map(
+    lambda talk: tuple(Turn(user=u, assistant=f"It is {a}") for u, a in talk)
+)
 
 
-@given(talk=st.lists(st.tuples(WORDS, WORDS), min_size=1, max_size=3))
+@settings(max_examples=30)
+@given(turns=TALKS | st.sampled_from([PSR, PSR[:1]]), system=st.sampled_from(["", "Be kind."]))
 def test_any_text_is_asked_as_it_was_trained(
-    spoken: tuple[PreTrainedTokenizerBase, str], talk: list[tuple[str, str]]
+    spoken: tuple[PreTrainedTokenizerBase, str], turns: tuple[Turn, ...], system: str
 ) -> None:
     """Labels are those of transformers, one end token an answer, and prompts begin the conversation."""
     tokenizer, template = spoken
-    turns = tuple(Turn(user=u, assistant=f"It is {a}") for u, a in talk)
-    encoded = encode(render(turns, tokenizer, system_prompt="", frames=1, complete=True), tokenizer)
-    assert (list(encoded.input_ids), list(encoded.labels)) == reference(turns, tokenizer, template, "", frames=1)
+    how = {"system_prompt": system, "frames": 5}
+    encoded = encode(render(turns, tokenizer, complete=True, **how), tokenizer)
+    assert (list(encoded.input_ids), list(encoded.labels)) == reference(turns, tokenizer, template, system, frames=5)
     for number in range(1, len(turns) + 1):
-        asked = encode(render(turns[:number], tokenizer, system_prompt="", frames=1, complete=False), tokenizer)
+        asked = encode(render(turns[:number], tokenizer, complete=False, **how), tokenizer)
         assert encoded.input_ids[: len(asked.input_ids)] == asked.input_ids
         assert encoded.labels[len(asked.input_ids)] != IGNORE_INDEX
         assert sum(label in end_ids(tokenizer) for label in asked.labels) == number - 1
     assert sum(label in end_ids(tokenizer) for label in encoded.labels) == len(turns)
-
-
-def test_smollm2_is_asked_in_chatml_with_its_own_system_message_or_ours(smollm2_folder: Path) -> None:
-    tokenizer = load_tokenizer(smollm2_folder)
-    assert end_ids(tokenizer) == (tokenizer.convert_tokens_to_ids("<|im_end|>"),)
-    own = render(PSR[:1], tokenizer, system_prompt="", frames=1, complete=False).text
-    assert own.startswith("<|im_start|>system\nYou are a helpful AI assistant named SmolLM")
-    assert own.endswith("Describe both.<|im_end|>\n<|im_start|>assistant\n")
-    ours = render(PSR[:1], tokenizer, system_prompt="Feel.", frames=1, complete=False).text
-    assert ours.startswith("<|im_start|>system\nFeel.<|im_end|>\n<|im_start|>user\nFeel <tact_start><tact_frame>")
 
 
 IM = "<|im_start|>{role}\n{text}<|im_end|>\n"
@@ -175,7 +146,7 @@ FAMILIES = {
     "chatml": (CHATML, "", IM),
     "qwen3": (QWEN3, "<think>\n\n</think>\n\n", IM),
     "always": (ALWAYS, "[FINAL]", IM),
-    "llama3": (plain(LLAMA3), "", "<|head|>{role}<|/head|>\n\n{text}<|eot|>"),
+    "llama3": (LLAMA3, "", "<|head|>{role}<|/head|>\n\n{text}<|eot|>"),
 }
 """Templates by family, with what each writes before an answer of its own, and how it writes a message."""
 OWN = ("<|im_start|>", "<|im_end|>", "<|head|>", "<|/head|>", "<|eot|>")
@@ -192,6 +163,7 @@ def knows_all(request: pytest.FixtureRequest) -> PreTrainedTokenizerFast:
 
 
 @pytest.mark.parametrize("family", FAMILIES)
+@settings(max_examples=20)
 @given(talk=st.lists(st.tuples(WORDS, WORDS), min_size=1, max_size=3))
 def test_what_a_template_writes_before_an_answer_is_asked_and_not_learnt(
     family: str, knows_all: PreTrainedTokenizerFast, talk: list[tuple[str, str]]
@@ -220,15 +192,6 @@ def test_what_a_template_writes_before_an_answer_is_asked_and_not_learnt(
     assert render(turns, knows_all, system_prompt="", frames=1, complete=True).text == text
     assert sum(label != IGNORE_INDEX and a == IGNORE_INDEX for a, label in pairwise(trained.labels)) == len(turns)
     assert end_ids(knows_all) == (2, knows_all.convert_tokens_to_ids(closing.strip()))
-
-
-def test_both_end_tokens_end_an_answer() -> None:
-    """As in Llama-3, whose text ends with another token than its turns."""
-    tokenizer = sentence_piece()
-    assert end_ids(tokenizer) == (2,)
-    tokenizer.add_special_tokens({"additional_special_tokens": ["<|head|>", "<|/head|>", "<|eot|>"]})
-    tokenizer.chat_template = plain(LLAMA3)
-    assert end_ids(tokenizer) == (2, tokenizer.convert_tokens_to_ids("<|eot|>"))
 
 
 REFUSED = {

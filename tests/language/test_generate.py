@@ -1,4 +1,4 @@
-"""Answers against transformers' own generation and by hand, at the limits of tokens, positions and the cache."""
+"""Answers by hand, at the limits of tokens, positions and the cache."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from pipeline.language.generate import answer
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import assemble
 from tests.checkpoints import write_llama
-from tests.language.shared import DIM, FRAMES, by_transformers, generation, material, mistral, prompt, taking
+from tests.language.shared import DIM, FRAMES, generation, material, mistral, prompt, taking
 
 
 def by_hand(model: OctopiForCausalLM, question: Question, store: EmbeddingStore, opd: Opd, count: int) -> list[int]:
@@ -30,21 +30,6 @@ def by_hand(model: OctopiForCausalLM, question: Question, store: EmbeddingStore,
     for _ in range(count):
         said.append(int(model(torch.tensor([said]), features).logits[0, -1].argmax()))
     return said[start:]
-
-
-def test_one_row_answers_as_transformers_own_generation_does(
-    model: OctopiForCausalLM, questions: list[Question], store: EmbeddingStore
-) -> None:
-    """By its own cache, without padding, over more tokens than room is made for at a time."""
-    limit, end = 2 * AHEAD + 20, model.tokenizer.eos_token_id
-    for question in [q for q in questions if q.task in ("PC", "PSS")][:2]:
-        features = evaluation_features(question, store, FRAMES)
-        new = by_transformers(model, prompt(question, Opd.NEEDED, model), features, [end], limit)
-        (prediction,) = answer(model, store, [question], Opd.NEEDED, generation(1, limit), FRAMES)
-        assert prediction.outputs == (model.tokenizer.decode(new, skip_special_tokens=True).strip(),)
-        assert prediction.tokens == len(new)
-        first = by_hand(model, question, store, Opd.NEEDED, 12)
-        assert new[:12] == first[: first.index(end) + 1 if end in first else None]
 
 
 @pytest.mark.parametrize("window", [None, 8])

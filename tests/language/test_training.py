@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
+import itertools
+import multiprocessing
 import os
-import random
 import signal
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,17 +16,16 @@ from safetensors.torch import load_file
 from torch.optim.optimizer import register_optimizer_step_pre_hook
 from transformers import TrainerCallback, TrainerState
 
-from pipeline.config import LoraTrainConfig, RuntimeConfig
+from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig
+from pipeline.core.embeddings import EmbeddingStore
 from pipeline.core.errors import UserError
-from pipeline.core.io import write_jsonl
-from pipeline.core.runtime import derive_seed
+from pipeline.core.io import read_jsonl, write_jsonl
+from pipeline.core.records import Question
 from pipeline.language.chat import IGNORE_INDEX
-from pipeline.language.conversations import collate
 from pipeline.language.training import Job, Material, add_lora, assemble, fit, write_model_card
 from pipeline.training.trainer import Trained, training_arguments
-from tests.closure import ROOT
 from tests.conftest import Begun, refused
-from tests.language.shared import DIM, SMALL, adapted, assert_comes_back, embedded, taking, train, write_store
+from tests.language.shared import DIM, SMALL, adapted, assert_comes_back, embedded, material, taking, train, write_store
 
 CPU = RuntimeConfig(device="cpu")
 RUNTIME = RuntimeConfig(device="cpu", save_steps=2)
@@ -36,37 +33,6 @@ CONFIG = LoraTrainConfig(
     **{**SMALL.model_dump(), "epochs": 2, "samples": 10}, rank=4, alpha=8, learning_rate=1e-3, dropout=0.1
 )
 """Three updates an epoch, the last of them smaller; six in all."""
-CHILD = """
-import os, signal, sys
-from pathlib import Path
-import torch
-from torch.optim.optimizer import register_optimizer_step_pre_hook
-from pipeline.core.io import read_jsonl
-from pipeline.core.embeddings import EmbeddingStore
-from pipeline.core.records import Question
-from pipeline.config import LanguageConfig
-from tests.language.shared import material
-from tests.language.test_training import run
-folder, weights, embeddings, kind, when = sys.argv[1:]
-def die(*_):
-    os.kill(os.getpid(), signal.SIGKILL)
-if when.startswith("writing"):
-    save, saved = torch.save, []
-    def half(value, file, *rest, **others):
-        if str(file).endswith(when.split()[1]):
-            saved.append(file)
-            if len(saved) == 2:
-                Path(file).write_bytes(b"half a file")
-                die()
-        return save(value, file, *rest, **others)
-    torch.save = half
-else:
-    count = iter(range(1000))
-    register_optimizer_step_pre_hook(lambda *_: die() if next(count) == int(when) else None)
-questions = read_jsonl(Path(folder) / "questions.jsonl", Question)
-held = material(LanguageConfig(weights=weights), questions, EmbeddingStore(Path(embeddings)))
-run(kind, held, Path(folder) / "killed")
-"""
 
 
 class AtStep(TrainerCallback):
@@ -77,7 +43,7 @@ class AtStep(TrainerCallback):
 
     def on_log(self, args: object, state: TrainerState, *_: object, **__: object) -> None:
         if state.global_step == self.step:
-            self.act()  # type: ignore[operator]
+            self.act()
 
 
 def run(kind: str, held: Material, folder: Path, *callbacks: TrainerCallback) -> Trained:
@@ -90,27 +56,36 @@ def run(kind: str, held: Material, folder: Path, *callbacks: TrainerCallback) ->
         torch.set_num_threads(threads)
 
 
-@pytest.mark.parametrize(
-    ("kind", "when", "left"), [("align", "logged 5", 4), ("lora", "5", 4), ("lora", "writing optimizer.pt", 2)]
-)
-def test_killed_and_resumed_ends_the_same(kind: str, when: str, left: int, held: Material, checkpoints: Path) -> None:
-    """Interrupted; by SIGKILL in a process of its own between two checkpoints, and while one is being written."""
-    if when == "logged 5":
+def killed(kind: str, when: str, questions: Path, weights: str, embeddings: Path, folder: Path) -> None:
+    """A training that is killed before an update, or while it writes a file of its second checkpoint."""
+    save, count = torch.save, itertools.count(1)
 
-        def die() -> None:
-            raise KeyboardInterrupt
+    def die(*_: object) -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
 
-        with pytest.raises(KeyboardInterrupt):
-            run(kind, held, checkpoints / "killed", AtStep(5, die))
+    def half(value: object, file: str | Path, *rest: object, **others: object) -> None:
+        if str(file).endswith(when) and next(count) == 2:
+            Path(file).write_bytes(b"half a file")
+            die()
+        save(value, file, *rest, **others)
+
+    if when.isdigit():
+        register_optimizer_step_pre_hook(lambda *_: die() if next(count) == int(when) else None)
     else:
-        write_jsonl(checkpoints / "questions.jsonl", held.questions)
-        done = subprocess.run(
-            [sys.executable, "-c", CHILD, str(checkpoints), held.language.weights, str(held.store.folder), kind, when],
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-            capture_output=True,
-            text=True,
-        )
-        assert done.returncode == -signal.SIGKILL, done.stderr[-2000:]
+        torch.save = half
+    held = material(LanguageConfig(weights=weights), read_jsonl(questions, Question), EmbeddingStore(embeddings))
+    run(kind, held, folder)
+
+
+@pytest.mark.parametrize(("kind", "when", "left"), [("align", "6", 4), ("lora", "optimizer.pt", 2)])
+def test_killed_and_resumed_ends_the_same(kind: str, when: str, left: int, held: Material, checkpoints: Path) -> None:
+    """By SIGKILL between two checkpoints, and while one is being written."""
+    write_jsonl(checkpoints / "questions.jsonl", held.questions)
+    given = (checkpoints / "questions.jsonl", held.language.weights, held.store.folder, checkpoints / "killed")
+    process = multiprocessing.get_context("spawn").Process(target=killed, args=(kind, when, *given))
+    process.start()
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
     kept = {int(f.parent.name.split("-")[1]) for f in checkpoints.glob(f"killed/{kind}/*/*/trainer_state.json")}
     assert kept == {left}
     whole = run(kind, held, checkpoints / "whole")
@@ -118,9 +93,8 @@ def test_killed_and_resumed_ends_the_same(kind: str, when: str, left: int, held:
     assert again.history == whole.history
     assert again.state.keys() == whole.state.keys()
     assert all(torch.equal(again.state[name], value) for name, value in whole.state.items())
-    if kind == "align":
-        ended = run(kind, held, checkpoints / "killed", AtStep(1, die))
-        assert ended.history == whole.history, "what is trained waits for the stage to write it"
+    ended = run(kind, held, checkpoints / "killed", AtStep(1, pytest.fail))
+    assert ended.history == whole.history, "what is trained waits for the stage to write it"
 
 
 def test_another_language_model_under_the_same_name_begins_anew(held: Material, tmp_path: Path) -> None:
@@ -133,19 +107,13 @@ def test_another_language_model_under_the_same_name_begins_anew(held: Material, 
     assert marks[0] == marks[1] != marks[2]
 
 
-@pytest.mark.parametrize("factor", [100, 1e30])
-def test_a_rate_too_high_ends_finite_or_in_one_line(factor: float, held: Material, checkpoints: Path) -> None:
+def test_a_rate_too_high_ends_in_one_line(held: Material, checkpoints: Path) -> None:
     """Params allow no rate from 10 on; a model may be as badly scaled all the same."""
     model, data = assemble(held, taking(10), "test")
-    rates = {"learning_rate": factor * 2e-4, "projection_learning_rate": factor * 2e-5}
-    config = CONFIG.model_copy(update=rates)
+    config = CONFIG.model_copy(update={"learning_rate": 1e26, "projection_learning_rate": 1e25})
     add_lora(model, config)
-    if factor == 100:
-        trained = fit(model, data, config, RUNTIME, Job("lora", "x", 0))
-        assert all(v.isfinite().all() for v in trained.state.values())
-    else:
-        with pytest.raises(UserError, match=r"^[a-z_]+ is .* at step \d: .*lower the learning rate.*kept\)$"):
-            fit(model, data, config, RUNTIME, Job("lora", "x", 0))
+    with pytest.raises(UserError, match=r"^[a-z_]+ is .* at step \d: .*lower the learning rate.*kept\)$"):
+        fit(model, data, config, RUNTIME, Job("lora", "x", 0))
 
 
 def test_running_away_late_leaves_the_last_good_checkpoint(held: Material, checkpoints: Path) -> None:
@@ -214,19 +182,21 @@ def test_training_goes_on_from_a_trained_model(held: Material, checkpoints: Path
         assemble(other, CONFIG, "align")
 
 
-@pytest.mark.parametrize("weighting", ["question", "token"])
-@pytest.mark.parametrize("micro", [4, 2, 1])
+@pytest.mark.parametrize(("micro", "weighting"), [(4, "question"), (2, "token"), (1, "question")])
 def test_an_updates_gradient_is_that_of_its_questions_one_at_a_time(
     micro: int, weighting: str, held: Material, checkpoints: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Updates of four, four and one, by a plain loop in float64 over tokens, without batches, padding or a cache."""
+    """Updates of four, four and one, by a plain loop in float64 over tokens, without batches, padding or a cache.
+
+    Frames are drawn anew in the second epoch.
+    """
     order = [7, 0, 1, 2, 8, 3, 4, 5, 6]
     monkeypatch.setattr("pipeline.language.training.UpdateSampler", lambda *_, **__: order)
-    own = {"epochs": 1, "samples": 9, "max_grad_norm": 0.0, "weighting": weighting}
+    own = {"epochs": 2, "samples": 9, "max_grad_norm": 0.0, "weighting": weighting}
     config = LoraTrainConfig(**{**SMALL.model_dump(), **own, "given": 1.0})  # Descriptions weigh nothing.
     model, data = assemble(held, config, "test")
     assert {bool(weights.eq(0).any()) for weights in data.weights} == {False, True}
-    parameters, gaps, counts = list(model.double().connector.parameters()), [], []
+    parameters, gaps, counts, drawn = list(model.double().connector.parameters()), [], [], []
 
     def loss(update: list[int]) -> torch.Tensor:
         own, total, whole = dict(model.connector.named_parameters()), torch.zeros(()).double(), 0.0
@@ -249,9 +219,11 @@ def test_an_updates_gradient_is_that_of_its_questions_one_at_a_time(
 
     @torch.enable_grad()
     def compare(*_: object) -> None:
-        update = order[4 * len(gaps) : 4 * len(gaps) + 4]
+        start = 4 * (len(gaps) % 3)
+        update = order[start : start + 4]
+        drawn.append(data[order[0]]["features"])
         wanted = torch.cat([g.flatten() for g in torch.autograd.grad(loss(update), parameters)])
-        found = torch.cat([p.grad.flatten() for p in parameters])  # type: ignore[union-attr]
+        found = torch.cat([p.grad.flatten() for p in parameters])
         gaps.append(float((found - wanted).abs().max() / wanted.abs().max()))
 
     kept = register_optimizer_step_pre_hook(compare)
@@ -260,43 +232,9 @@ def test_an_updates_gradient_is_that_of_its_questions_one_at_a_time(
     assert len(data) == 9
     assert max(counts) > 3 * min(counts), "or either weighting would do"
     # transformers' normalisation computes in float32 whatever it is given.
-    assert len(gaps) == 3
+    assert len(gaps) == 6
+    assert not torch.equal(drawn[0], drawn[3])
     assert max(gaps) < 2e-6, gaps
-
-
-@pytest.mark.parametrize("micro", [1, 2, 4])
-def test_how_many_are_computed_at_once_changes_nothing_but_rounding(
-    micro: int, held: Material, checkpoints: Path
-) -> None:
-    """Against a plain loop over whole updates of questions in random order; the last of an epoch has two."""
-    config = SMALL.model_copy(update={"micro_batch_size": micro})
-    model, data = assemble(held, taking(10), "test")
-    begin = {name: p.detach().double().clone() for name, p in model.connector.named_parameters()}
-    trained = {n: v.clone() for n, v in fit(model.double(), data, config, CPU, Job("align", "x", 0)).state.items()}
-    with torch.no_grad():
-        for name, parameter in model.connector.named_parameters():
-            parameter.copy_(begin[name])
-    parameters = [p for p in model.parameters() if p.requires_grad]
-    optimizer = torch.optim.AdamW(parameters, weight_decay=0.0)
-    counts: list[int] = []
-    for epoch in range(2):
-        data.follow(lambda: epoch)  # noqa: B023 - asked in this round alone
-        order = list(range(10))
-        random.Random(derive_seed(0, epoch, "order")).shuffle(order)
-        for start in range(0, 10, 4):
-            optimizer.param_groups[0]["lr"] = 1e-3 * (1 + math.cos(math.pi * len(counts) / 6)) / 2
-            chosen = [data[i] for i in order[start : start + 4]]
-            counts.append(len({len(item["input_ids"]) for item in chosen}))
-            model(**collate(chosen)).loss.backward()
-            torch.nn.utils.clip_grad_norm_(parameters, config.max_grad_norm)
-            optimizer.step()
-            optimizer.zero_grad()
-    assert max(counts) > 2, "of unlike length, or any order would do"
-    moved = max(float((p.detach() - begin[name]).abs().max()) for name, p in model.connector.named_parameters())
-    assert moved > 2e-3
-    for name, parameter in model.connector.named_parameters():
-        # transformers' normalisation computes in float32 whatever it is given.
-        torch.testing.assert_close(trained[f"connector.{name}"], parameter.detach(), atol=1e-5, rtol=0)
 
 
 def test_gradients_are_shortened_to_what_the_parameters_say(held: Material, checkpoints: Path) -> None:
@@ -314,30 +252,26 @@ def test_gradients_are_shortened_to_what_the_parameters_say(held: Material, chec
     assert norms[1] == pytest.approx(1e-3, rel=1e-2)
 
 
-@pytest.mark.parametrize("kind", ["align", "lora"])
 def test_a_training_is_not_gone_on_with_by_another_version_of_the_code(
-    kind: str, held: Material, checkpoints: Path, versions: Callable[[str], None], begun_in: Begun
+    held: Material, checkpoints: Path, versions: Callable[[str], None], begun_in: Begun
 ) -> None:
     def begin() -> None:
-        run(kind, held, checkpoints)
+        run("lora", held, checkpoints)
 
     places = [begun_in(begin)]
-    for file in ("report/build.py", "training/trainer.py", "language/base.py", "language/words.py"):
+    for file in ("report/build.py", "training/trainer.py", "language/base.py"):
         versions(f"pipeline/{file}")
         places.append(begun_in(begin))
     assert places[0] == places[1], "it does not depend on reports"
-    assert len(set(places)) == 4
+    assert len(set(places)) == 3
 
 
 @pytest.mark.parametrize(
     ("variables", "words"),
     [
         ({"ACCELERATE_MIXED_PRECISION": "bf16"}, "ACCELERATE_MIXED_PRECISION is bf16"),
-        ({"ACCELERATE_MIXED_PRECISION": "fp8"}, "ACCELERATE_MIXED_PRECISION is fp8"),
         ({"ACCELERATE_DYNAMO_BACKEND": "INDUCTOR"}, "ACCELERATE_DYNAMO_BACKEND is INDUCTOR"),
         ({"ACCELERATE_USE_DEEPSPEED": "true"}, "ACCELERATE_USE_DEEPSPEED is true"),
-        ({"ACCELERATE_USE_MEGATRON_LM": "true"}, "ACCELERATE_USE_MEGATRON_LM is true"),
-        ({"ACCELERATE_USE_PARALLELISM_CONFIG": "true"}, "ACCELERATE_USE_PARALLELISM_CONFIG is true"),
         ({"ACCELERATE_USE_FSDP": "true"}, "FSDP_VERSION is 1"),
         ({"WORLD_SIZE": "3"}, "micro_batch_size 2 on 3 devices does not divide batch_size 4"),
     ],

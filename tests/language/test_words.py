@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -20,8 +19,7 @@ from pipeline.language.decoding import greedy
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import Job, Material, add_lora, assemble, fit, write_model_card
 from tests.checkpoints import write_llama
-from tests.language.shared import DIM, SMALL, assert_comes_back, embedded, taking
-from tests.language.test_octopi import digests
+from tests.language.shared import DIM, SMALL, assert_comes_back, digests, embedded, taking
 
 CPU = RuntimeConfig(device="cpu")
 STEP = SMALL.model_copy(update={"epochs": 1, "max_grad_norm": 0.0})
@@ -83,22 +81,6 @@ def test_a_step_is_that_of_plain_torch(tied: bool, held: Material, tmp_path: Pat
     assert all(torch.equal(p, base[n]) for n, p in model.llm.named_parameters())
     assert torch.equal(model.llm.get_output_embeddings().weight, head)
     assert digests(folder) == before
-
-
-def test_without_it_no_old_row_moves_and_none_is_saved(held: Material, checkpoints: Path) -> None:
-    model, data = assemble(held, taking(4), "test")
-    base = {n: p.detach().clone() for n, p in model.llm.named_parameters()}
-    start = model.connector.delimiters.detach().clone()
-    trained = fit(model, data, STEP, CPU, Job("align", "x", 0))
-    assert all(torch.equal(p, base[n]) for n, p in model.llm.named_parameters())
-    assert (model.connector.delimiters != start).any(1).all()
-    model.save_pretrained(checkpoints / "saved", trained.state)
-    assert digests(checkpoints / "saved").keys() == {"config.json", "connector.safetensors"}
-    assert OctopiForCausalLM.from_pretrained(checkpoints / "saved").words is None
-    older = json.loads((checkpoints / "saved" / "config.json").read_text())
-    assert older.pop("trained_embeddings") == "new"
-    (checkpoints / "saved" / "config.json").write_text(json.dumps(older))
-    OctopiForCausalLM.from_pretrained(checkpoints / "saved")
 
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])

@@ -1,4 +1,4 @@
-"""Pictures and videos at their edges: black, white, even, flashing, a single frame, sums beyond 32 bits.
+"""Pictures at their edges: black, white, saturated, a single pixel, sums beyond 32 bits.
 
 All of it is arithmetic on bytes. Sums and differences are whole numbers below 2^53 and thus exact in a double, so that
 nearly every bound is 0; what they are held against is written down here in float64.
@@ -6,18 +6,12 @@ nearly every bound is 0; what they are held against is written down here in floa
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from pipeline.config import FramesConfig
-from pipeline.videos.film import write_film
 from pipeline.videos.frames.reference import contact_strength
 from pipeline.videos.frames.selection import difference
 from pipeline.videos.frames.subtraction import GAIN, MIDDLE, RING, subtract
-from pipeline.videos.frames.video_pass import run_pass
-from tests.frame_rules import luma, salience
 from tests.numerics.bounds import summing
 from tests.numerics.harness import FLOAT64, UINT8, Check, Floats
 
@@ -46,16 +40,6 @@ PAIRS = {
     "one pixel": (even(255, 1, 1, 3), even(0, 1, 1, 3)),
 }
 """Two pictures each that are hard to compare: bytes that wrap around, saturate, or do not differ at all."""
-VIDEOS = {
-    "black": [even(0)] * 12,
-    "even": [even(77)] * 12,
-    "white": [even(255)] * 12,
-    "a single frame": [even(77)],
-    "two frames": [even(77), even(90)],
-    "black and white by turns": [even(255 * (i % 2)) for i in range(12)],
-    "noise": [noise(i) for i in range(12)],
-}
-"""Without contact, too short, or as restless as can be."""
 
 
 @pytest.mark.parametrize("name", PAIRS)
@@ -93,13 +77,3 @@ def test_a_difference_beyond_32_bits_is_exact(check: Check) -> None:
         "salience: a sum beyond 32 bits", UINT8, lambda _: difference(even(255, *shape), even(0, *shape)), 0,
         255.0 * shape[0] * shape[1],
     )  # fmt: skip
-
-
-@pytest.mark.parametrize("name", VIDEOS)
-def test_kept_frames_are_those_with_the_largest_differences(check: Check, tmp_path: Path, name: str) -> None:
-    """30 % of them, of equal ones the earlier; index and score of each."""
-    path = tmp_path / "video.mp4"
-    write_film(path, VIDEOS[name], 25.0)
-    kept = run_pass(path, FramesConfig(pixels=16, fraction=0.3)).kept
-    found = [(k.index, k.score) for k in kept]
-    check(f"salient frames of a video: {name}", UINT8, lambda _: found, 0, salience(luma(path), "0.3"))

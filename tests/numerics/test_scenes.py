@@ -59,35 +59,33 @@ def pixels_summed(fmt: Format) -> float:
     return summing(SIDE * SIDE, fmt)
 
 
-@formats(*SOLVED)
-@pytest.mark.parametrize("force", [0.0, 1e-12, 1e-6, 1.0, 1e6, 1e12])
-def test_a_ball_carries_any_force(check: Check, fmt: Format, force: float) -> None:
-    name = f"ball under {force:g} N: force carried"
-    check(name, fmt, lambda f: carried(pressed(ball(), force, f)), pixels_summed, [force])
+CONTACTS: dict[str, tuple[Floats, list[float]]] = {
+    "ball": (ball(), [0.0, 1e-12, 1e-6, 1.0, 1e6, 1e12]),
+    "flat on flat": (np.zeros((SIDE, SIDE)), [2.0]),
+    "contact everywhere": (ball(radius=500.0), [1e3]),
+}
 
 
 @formats(*SOLVED)
-@pytest.mark.parametrize(
-    ("name", "gap", "force"),
-    [("flat on flat", np.zeros((SIDE, SIDE)), 2.0), ("contact everywhere", ball(radius=500.0), 1e3)],
-)
-def test_contact_of_the_whole_field_carries_its_force(
-    check: Check, fmt: Format, name: str, gap: Floats, force: float
-) -> None:
-    check(f"{name}: force carried", fmt, lambda f: carried(pressed(gap, force, f)), pixels_summed, [force])
+@pytest.mark.parametrize("name", CONTACTS)
+def test_any_force_is_carried(check: Check, fmt: Format, name: str) -> None:
+    gap, forces = CONTACTS[name]
+    for force in forces:
+        case = f"{name} under {force:g} N: force carried"
+        check(case, fmt, lambda f, force=force: carried(pressed(gap, force, f)), pixels_summed, [force])
 
 
 @formats(*SOLVED)
-@pytest.mark.parametrize("ratio", [1e-4, 1e-2, 1.0, 1e2, 1e4])
-def test_an_object_of_any_modulus_carries_its_force(check: Check, fmt: Format, ratio: float) -> None:
-    """`ratio`: its modulus over the gel's."""
+def test_an_object_of_any_modulus_carries_its_force(check: Check, fmt: Format) -> None:
+    """From a ten thousandth of the gel's modulus to ten thousand times as much."""
+    for ratio in (1e-4, 1e-2, 1.0, 1e2, 1e4):
 
-    def forces(f: Format) -> Floats:
-        gap, gel = ball(0.3).astype(f), Gel()
-        layers = layer_table(gap.shape, 0.3, gel) + half_space_table(gap.shape, 0.3, gel.modulus * ratio)
-        return carried(solve(gap, [0.1, 10.0], make_kernel(layers, gap), 0.3, tolerance=TOLERANCE), 0.3)
+        def forces(f: Format, ratio: float = ratio) -> Floats:
+            gap, gel = ball(0.3).astype(f), Gel()
+            layers = layer_table(gap.shape, 0.3, gel) + half_space_table(gap.shape, 0.3, gel.modulus * ratio)
+            return carried(solve(gap, [0.1, 10.0], make_kernel(layers, gap), 0.3, tolerance=TOLERANCE), 0.3)
 
-    check(f"modulus {ratio:g} of the gel's: force carried", fmt, forces, pixels_summed, [0.1, 10.0])
+        check(f"modulus {ratio:g} of the gel's: force carried", fmt, forces, pixels_summed, [0.1, 10.0])
 
 
 def needle(fmt: Format) -> Solution:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import random
+from itertools import islice
+
 from pipeline.core.records import Part, Prediction, Question, Score
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool
@@ -20,3 +23,14 @@ def predicted(question: Question, *outputs: str, truncated: bool = False) -> Pre
 
 def grade(question: Question, *outputs: str, truncated: bool = False, catalogue: Catalogue = CATALOGUE) -> list[Score]:
     return TASKS[question.task].grade(question, predicted(question, *outputs, truncated=truncated), catalogue)
+
+
+def drafted(task: str, pool: Pool, each: int) -> list[Question]:
+    """So many questions of every stratum that the pool has any of."""
+    definition, rng, questions = TASKS[task], random.Random(0), list[Question]()
+    for stratum in range(definition.strata(pool.catalogue)):
+        drafts = (definition.draft(pool, stratum, rng) for _ in range(2000))
+        for draft in islice(filter(None, drafts), each):
+            fields = {name: getattr(draft, name) for name in ("videos", "objects", "dialogues", "gold")}
+            questions.append(Question(question_id=f"{task}-{len(questions)}", task=task, part=pool.part, **fields))
+    return questions

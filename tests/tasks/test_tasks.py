@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Iterator
-from itertools import islice
 
 import pytest
 from hypothesis import given, settings
@@ -14,10 +13,10 @@ from hypothesis import strategies as st
 from pipeline.core.records import Opd, Part, Question, Score
 from pipeline.language.chat import TACTILE
 from pipeline.tasks import TASKS
-from pipeline.tasks.base import Pool, conclusion, find_level
+from pipeline.tasks.base import Pool, find_level
 from pipeline.tasks.questions import build_questions
 from pipeline.videos.catalogue import Catalogue
-from tests.tasks.shared import CATALOGUE, grade
+from tests.tasks.shared import CATALOGUE, drafted, grade
 
 POOL = Pool(Part.TRAIN, CATALOGUE, {o: [f"{o}_{i}" for i in range(3)] for o in CATALOGUE.objects})
 HARDNESS = CATALOGUE.properties[0]
@@ -25,18 +24,7 @@ EACH = 2
 every_task = pytest.mark.parametrize("task", list(TASKS))
 
 
-def drafted(task: str) -> list[Question]:
-    """Some questions of every stratum."""
-    definition, rng, questions = TASKS[task], random.Random(0), []
-    for stratum in range(definition.strata(CATALOGUE)):
-        drafts = (definition.draft(POOL, stratum, rng) for _ in range(2000))
-        for draft in islice(filter(None, drafts), EACH):
-            fields = {name: getattr(draft, name) for name in ("videos", "objects", "dialogues", "gold")}
-            questions.append(Question(question_id=f"{task}-{len(questions)}", task=task, part=POOL.part, **fields))
-    return questions
-
-
-QUESTIONS = {task: drafted(task) for task in TASKS}
+QUESTIONS = {task: drafted(task, POOL, EACH) for task in TASKS}
 
 
 def answers(question: Question) -> Iterator[tuple[Opd, tuple[str, ...]]]:
@@ -75,23 +63,6 @@ def test_prompts_show_each_video_once_in_every_mode(task: str) -> None:
             assert not any(TACTILE in turn.assistant for turn in dialogue.turns)
 
 
-@pytest.mark.parametrize("task", ["PC", "PSS"])
-def test_comparisons_and_superlatives_are_true_and_the_extreme_is_unique(task: str) -> None:
-    for question in QUESTIONS[task]:
-        (name,) = question.gold.properties
-        prop = CATALOGUE.properties[CATALOGUE.property_index(name)]
-        levels = [labels[CATALOGUE.property_index(name)] for labels in question.gold.labels]
-        asked = question.dialogues[0].turns[0].user
-        if task == "PC":
-            rising = f" {prop.more} than" in asked
-            truth = "same" if levels[0] == levels[1] else "yes" if (levels[0] > levels[1]) == rising else "no"
-        else:
-            extreme = max(levels) if f"the {prop.most}" in asked else min(levels)
-            assert levels.count(extreme) == 1
-            truth = "abc"[levels.index(extreme)]
-        assert question.gold.choice == truth
-
-
 LABELS = st.lists(st.tuples(*(st.integers(0, len(p.levels) - 1) for p in CATALOGUE.properties)), max_size=9)
 
 
@@ -127,17 +98,6 @@ def test_options_are_alphabetical_and_told_apart() -> None:
         names = [options[int(number) - 1] for number in question.gold.choice]
         assert names == [CATALOGUE.objects[o].name for o in question.objects]
         assert len(set(question.gold.labels)) == 3
-
-
-def test_scenarios_prefer_what_their_classes_say() -> None:
-    for question in QUESTIONS["PSR"]:
-        asked = question.dialogues[0].turns[0].user
-        scenario = next(s for s in CATALOGUE.language.scenarios if s.question in asked)
-        right = "ab".index(question.gold.choice)
-        for position, classes in ((right, scenario.target), (1 - right, scenario.other)):
-            for name, allowed in classes.items():
-                assert question.gold.labels[position][CATALOGUE.property_index(name)] in allowed
-    assert {q.gold.choice for q in QUESTIONS["PSR"]} == {"a", "b"}
 
 
 def test_a_description_is_graded_property_by_property() -> None:
@@ -183,87 +143,7 @@ def test_the_answer_to_another_question_is_wrong(task: str) -> None:
         assert not any(choice(question, *outputs).correct for other in others for _, outputs in answers(other))
 
 
-UNREADABLE = {
-    "OPD": ["", " ", "yes", "Overall", "a)", "Conclusion:", "\x00", "🙂" * 50, "a" * 10_000],
-    "PC": [
-        *("", "Maybe.", "Not sure.", "None", "Nobody knows", "The first object is harder.", "Yesterday", "Bothersome"),
-        *("Conclusion:", "Conclusion: maybe", "Yes. Conclusion: I cannot say.", "First object: Overall, yes."),
-        *("Yes and no.", "yes or no", "Yes/No", "Conclusion: No / yes", "Both or no", "**Yes** / **No**"),
-        *("No idea.", "**No** answer can be given.", "Conclusion: Yes. Answer: No.", "Conclusion: ~~Yes~~"),
-        *("<think>Conclusion: Yes.</think> I cannot tell.", "<think>Conclusion: Yes."),
-    ],
-    "PSS": [
-        *(
-            "",
-            "a hard one",
-            "The hardest.",
-            "a), b) or c)",
-            "d) is the hardest.",
-            "a) is the hardest. b) is the hardest.",
-        ),
-        *("ba) is the", "a) is the same as b).", "The hardest is **a)** or **b)**.", "Answer: A human cannot tell."),
-        *(f"Conclusion: {x}" for x in ("a), b) or c)", "a) is soft, b) is hard, c) is hard.", "d)", "unclear", "a b)")),
-        *("a) The surface feels hard", "a. The surface feels hard.", "Conclusion: **a)**. Answer: **b)**."),
-        *("Answer: b) Conclusion: I cannot tell.", "Option A or option B", "None of **b)**"),
-    ],
-    "RIPE": [
-        "",
-        "a) It is soft",
-        "The riper avocado is a) or b).",
-        "The riper avocado is c).",
-        "The riper kiwi is a).",
-    ],
-    "PSR": [
-        *(
-            f"The most suitable object is {x}"
-            for x in ("a) or b).", "a) and b).", "c).", "x), because xxx", "a hammer")
-        ),
-        *("The most suitable object is a). The most suitable object is b).", "a) and b)", "", "The object is a)."),
-        *(
-            "Neither a) nor b) is the most suitable.",
-            "I do not think that b) is the most suitable.",
-            "Answer: c",
-            "The most suitable object is a",
-        ),
-        *("The most suitable object for this is a) or b).", "The most suitable object for a pan. What is b)?"),
-    ],
-}
-
-
-@pytest.mark.parametrize("task", UNREADABLE)
-def test_nothing_is_read_from(task: str) -> None:
-    for output in UNREADABLE[task]:
-        scores = grade(QUESTIONS[task][0], *(["descriptions"] if task in ("PSR", "RIPE") else []), output)
-        assert not any(s.parsed or s.correct or s.predicted for s in scores), output
-
-
-@pytest.mark.parametrize(
-    ("output", "predicted"),
-    [
-        ("The most suitable object is a), because of its hardness.", "a"),
-        ("The most suitable object is (b), because a) is soft.", "b"),
-        ("the most suitable object is B)", "b"),
-        ("The most suitable object for cleaning a pan without scratching it is a).", "a"),
-    ],
-)
-def test_what_is_read_of_a_scenario(output: str, predicted: str) -> None:
-    assert choice(QUESTIONS["PSR"][0], "descriptions", output).predicted == predicted
-
-
-MARKS = (
-    "**{}**",
-    "*{}*",
-    "_{}_",
-    "__{}__",
-    "***{}***",
-    "`{}`",
-    "<b>{}</b>",
-    "\\textbf{{{}}}",
-    "“{}”",
-    "'{}'",
-    "${}$",
-    "({})",
-)
+MARKS = ["**{}**", "*{}*", "_{}_", "__{}__", "***{}***", "`{}`", "<b>{}</b>", "“{}”", "'{}'", "${}$"]
 OPENINGS = ("", "### ", "- ", "* ", "> ", "2. ", "**Answer:** ", "<think>\nConclusion: no. a) is the</think>\n\n")
 
 
@@ -275,7 +155,7 @@ def test_markdown_and_the_like_leave_what_is_read(task: str, data: st.DataObject
     question = data.draw(st.sampled_from(QUESTIONS[task]))
     *before, last = data.draw(st.sampled_from([outputs for _, outputs in answers(question)]))
     words, separator = last.split(" "), data.draw(st.sampled_from([" ", "\N{NO-BREAK SPACE}", "  "]))
-    for mark in data.draw(st.lists(st.sampled_from(MARKS[:-1]), max_size=3)):
+    for mark in data.draw(st.lists(st.sampled_from(MARKS), max_size=3)):
         start = data.draw(st.integers(0, len(words) - 1))
         stop = data.draw(st.integers(start + 1, min(len(words), start + 4)))
         words[start:stop] = mark.format(" ".join(words[start:stop])).split(" ")
@@ -289,148 +169,164 @@ def test_markdown_and_the_like_leave_what_is_read(task: str, data: st.DataObject
     ]
 
 
+UNREAD = {
+    "OPD": "yes\nOverall\na)\nConclusion:\n\x00\n" + "🙂" * 50 + "\n" + "a" * 10_000,
+    "PC": """
+        Maybe.
+        Nobody knows
+        The first object is harder.
+        Yesterday
+        Conclusion: maybe
+        Yes. Conclusion: I cannot say.
+        First object: Overall, yes.
+        Yes and no.
+        Conclusion: No / yes
+        **Yes** / **No**
+        No idea.
+        **No** answer can be given.
+        Conclusion: Yes. Answer: No.
+        Conclusion: ~~Yes~~
+        <think>Conclusion: Yes.</think> I cannot tell.
+        <think>Conclusion: Yes.
+        """,
+    "PSS": """
+        a hard one
+        The hardest.
+        d) is the hardest.
+        a) is the hardest. b) is the hardest.
+        ba) is the
+        a) is the same as b).
+        The hardest is **a)** or **b)**.
+        Answer: A human cannot tell.
+        Conclusion: a), b) or c)
+        Conclusion: a) is soft, b) is hard, c) is hard.
+        Conclusion: a b)
+        a. The surface feels hard.
+        Conclusion: **a)**. Answer: **b)**.
+        Answer: b) Conclusion: I cannot tell.
+        None of **b)**
+        """,
+    "RIPE": """
+        a) It is soft
+        The riper avocado is a) or b).
+        The riper avocado is c).
+        The riper kiwi is a).
+        """,
+    "PSR": """
+        The most suitable object is a) or b).
+        The most suitable object is x), because xxx
+        The most suitable object is a hammer
+        The most suitable object is a). The most suitable object is b).
+        a) and b)
+        The object is a).
+        Neither a) nor b) is the most suitable.
+        I do not think that b) is the most suitable.
+        Answer: c
+        The most suitable object is a
+        The most suitable object for a pan. What is b)?
+        """,
+}
+READ = {
+    ("PC", "yes"): """
+        **Conclusion:** Yes, the first.
+        **Conclusion**: yes
+        \\boxed{Yes}
+        The answer is **yes**.
+        In conclusion, yes.
+        _Yes_ — the first
+        “Yes”, it is.
+        1. Yes.
+        $\\boxed{\\text{Yes, the first}}$
+        Conclusion: No. Conclusion: Yes, the first object is harder.
+        """,
+    ("PC", "same"): "Conclusion: **Both** objects are similar.\nAnswer: both are.",
+    ("PSS", "b"): """
+        Conclusion: **b)** is the hardest.
+        **b)** is the hardest. So B) is the hardest.
+        Option B is the hardest.
+        Answer: b
+        The hardest object is b).
+        (b)
+        B.
+        \\boxed{b}
+        **Conclusion:** b), because a) is soft
+        b is clearly the hardest
+        Final answer - B
+        The most bumpy one is **b**.
+        Conclusion: \\(b\\)
+        \N{FULLWIDTH LATIN SMALL LETTER B}) is the hardest
+        """,
+    ("PSR", "b"): """
+        Conclusion: **b)**
+        The most suitable object is **b**, because it is soft.
+        The most suitable object is (b), because a) is soft.
+        The most suitable object for cleaning a pan without scratching it is b).
+        the most suitable object is B)
+        b) is the best choice.
+        \\boxed{\\text{b)}}
+        Option B
+        The most suitable object is: b)
+        So, b) is the most suitable object.
+        the most suitable object is Object b
+        """,
+    ("RIPE", "b"): "The riper avocado is **b)**.\n**Answer:** b\nThus b) is riper.\n\\boxed{B}",
+}
+"""What nobody reads an answer from, and what a person reads as which, a line each."""
+
+
 @pytest.mark.parametrize(
     ("task", "read", "outputs"),
     [
-        (
-            "PC",
-            "yes",
-            [
-                *("**Conclusion:** Yes, the first.", "**Conclusion**: yes", "### Conclusion\n\nYes.", "\\boxed{Yes}"),
-                *("Answer: Yes", "The answer is **yes**.", "In conclusion, yes.", "_Yes_ — the first", "“Yes”, it is."),
-                *(
-                    "1. Yes.",
-                    "$\\boxed{\\text{Yes, the first}}$",
-                    "# Answer\nYES",
-                    "It is hard.\n\n**Final Answer:** yes",
-                ),
-            ],
-        ),
-        ("PC", "same", ["Conclusion: **Both** objects are similar.", "Answer: both are."]),
-        (
-            "PSS",
-            "b",
-            [
-                *(
-                    "Conclusion: **b)** is the hardest.",
-                    "**b)** is the hardest. So B) is the hardest.",
-                    "**Conclusion: b)**",
-                ),
-                *(
-                    "Option B is the hardest.",
-                    "Answer: b",
-                    "Answer: Option B.",
-                    "The hardest object is b).",
-                    "(b)",
-                    "B.",
-                ),
-                *(
-                    "\\boxed{b}",
-                    "**Conclusion:** b), because a) is soft",
-                    "b is clearly the hardest",
-                    "Final answer - B",
-                ),
-                *(
-                    "The most bumpy one is **b**.",
-                    "`b)` is the hardest",
-                    "Conclusion: \\(b\\)",
-                    "\N{FULLWIDTH LATIN SMALL LETTER B}) is the hardest",
-                ),
-            ],
-        ),
-        (
-            "PSR",
-            "b",
-            [
-                *(
-                    "Conclusion: **b)**",
-                    "The most suitable object is **b**, because it is soft.",
-                    "b) is the best choice.",
-                ),
-                *(
-                    "The **most suitable object** is *b)*, since a) is hard.",
-                    "Answer: B",
-                    "\\boxed{\\text{b)}}",
-                    "Option B",
-                ),
-                *(
-                    "The most suitable object is: b)",
-                    "So, b) is the most suitable object.",
-                    "the most suitable object is Object b",
-                ),
-            ],
-        ),
-        ("RIPE", "b", ["The riper avocado is **b)**.", "**Answer:** b", "Thus b) is riper.", "\\boxed{B}"]),
+        *((task, "", ["", *outputs.split("\n")]) for task, outputs in UNREAD.items()),
+        *((*key, outputs.strip().split("\n")) for key, outputs in READ.items()),
+        ("PC", "yes", ["### Conclusion\n\nYes.", "# Answer\nYES", "It is hard.\n\n**Final Answer:** yes"]),
     ],
 )
-def test_what_a_person_reads_is_read(task: str, read: str, outputs: list[str]) -> None:
+def test_what_a_person_reads_is_read_and_nothing_else(task: str, read: str, outputs: list[str]) -> None:
     for output in outputs:
-        found = grade(QUESTIONS[task][0], *(["descriptions"] if task in ("PSR", "RIPE") else []), output)
-        assert [s.predicted for s in found] == [read], output
+        found = grade(QUESTIONS[task][0], *(["descriptions"] if task in ("PSR", "RIPE") else []), output.strip(" "))
+        assert {(s.predicted, s.parsed) for s in found} == {(read, bool(read))}, output
 
 
-def test_the_last_conclusion_counts() -> None:
-    question = next(q for q in QUESTIONS["PC"] if q.gold.choice == "yes")
-    assert choice(question, "Conclusion: No. Conclusion: Yes, the first object is harder.").correct
-    assert not choice(question, "Conclusion: Yes. CONCLUSION : No, the second.").correct
-    assert conclusion("no marker") == ["no marker"]
+PLAIN = ("a lanyard's card holder", "a baseball", "a lemon")
 
 
-def matching(*names: str) -> Question:
-    """A matching question whose options bear these names, the videos in that order."""
+@pytest.mark.parametrize(
+    ("names", "output", "verdict"),
+    [
+        (PLAIN, "a) is {a}, b) is {b} and c) is {c}.", True),
+        (PLAIN, "c) is {c}; b) is A BASEBALL; a) is {a}", True),
+        (PLAIN, "**Conclusion:** **a)** is **{a}**, **b)** is *{b}* and c) is `{c}`.", True),
+        (PLAIN, "- a) {a}\n- b) {b}\n- c) {c}", True),
+        (PLAIN, "A: {a}; B: {b}; C: {c}", True),
+        (PLAIN, "(a) is “{a}”, (b) is '{b}', (c) is \"{c}\".", True),
+        (PLAIN, "Option A is a lanyard\N{RIGHT SINGLE QUOTATION MARK}s card holder, B is {b} and C is {c}", True),
+        (PLAIN, "\\boxed{{a) = {a}, b) = {b}, c) = {c}}}", True),
+        (PLAIN, "1. a) → {a}\n2. b) → {b}\n3. c) → {c}", True),
+        (PLAIN, "a) is {b}, b) is {a} and c) is {c}.", False),
+        (PLAIN, "a) is {a}, b) is {b}.", None),
+        (PLAIN, "a) is {a}, b) is {b} and c) is {b}.", None),
+        (PLAIN, "a) is {a}, a) is {a}, b) is {b} and c) is {c}.", None),
+        (PLAIN, "a) is {a}, b) is {b} and c) is {c}s.", None),
+        (PLAIN, "{a}, {b}, {c}", None),
+        (PLAIN, "1) is {a}, 2) is {b} and 3) is {c}.", None),
+        (PLAIN, "a) is not {a}, b) is {b} and c) is {c}.", None),
+        (PLAIN, "a) {a} or {b}, b) {b}, c) {c}", None),
+        (PLAIN, "a) is {a}, b) or c) is {c}", None),
+        (("a lanyard", "a tomato", "a potato"), "a) is {a}, b) is {b} and c) is {c}.", True),
+        (("a lanyard", "a tomato", "a potato"), "a) is a lanyard's card holder, b) is {b} and c) is {c}.", None),
+        (("a lanyard's card holder", "a lanyard", "a potato"), "a) is {a}, b) is {b} and c) is {c}.", True),
+    ],
+)
+def test_a_matching_must_be_whole_however_it_is_set(names: tuple[str, ...], output: str, verdict: bool | None) -> None:
+    """None: it cannot be read. A longer name is not the shorter one."""
     by_name = {o.name: o.object_id for o in CATALOGUE.objects.values()}
-    question = QUESTIONS["POM"][0]
     order = "".join(str(sorted(names, key=str.lower).index(n) + 1) for n in names)
+    question = QUESTIONS["POM"][0]
     gold = question.gold.model_copy(update={"choice": order})
-    return question.model_copy(update={"objects": tuple(by_name[n] for n in names), "gold": gold})
-
-
-def test_a_matching_must_be_whole() -> None:
-    a, b, c = names = ("a tomato", "a baseball", "a lemon")
-    question = matching(*names)
-    assert choice(question, f"a) is {a}, b) is {b} and c) is {c}.").correct
-    assert choice(question, f"c) is {c}; b) is {b}; a) is {a.upper()}").correct
-    swapped = choice(question, f"a) is {b}, b) is {a} and c) is {c}.")
-    assert (swapped.parsed, swapped.correct) == (True, False)
-    for output in (
-        f"a) is {a}, b) is {b}.",
-        f"a) is {a}, b) is {b} and c) is {b}.",
-        f"a) is {a}, a) is {a}, b) is {b} and c) is {c}.",
-        f"a) is {a}, b) is {b} and c) is {c}s.",
-        f"a) is {a}, b) is {b} and c) is a spaceship.",
-        f"{a}, {b}, {c}",
-        f"1) is {a}, 2) is {b} and 3) is {c}.",
-    ):
-        assert not choice(question, output).parsed, output
-
-
-def test_a_matching_is_read_however_it_is_set() -> None:
-    names = a, b, c = ("a lanyard's card holder", "a baseball", "a lemon")
-    question = matching(*names)
-    for output in (
-        f"**Conclusion:** **a)** is **{a}**, **b)** is *{b}* and c) is `{c}`.",
-        f"- a) {a}\n- b) {b}\n- c) {c}",
-        f"A: {a}; B: {b}; C: {c}",
-        f"(a) is “{a}”, (b) is '{b}', (c) is \"{c}\".",
-        f"Option A is {a.replace(chr(39), chr(8217))}, option B is {b} and option C is {c}",
-        f"\\boxed{{a) = {a}, b) = {b}, c) = {c}}}",
-        f"1. a) → {a}\n2. b) → {b}\n3. c) → {c}",
-    ):
-        assert choice(question, output).correct, output
-    for output in (
-        f"a) is not {a}, b) is {b} and c) is {c}.",
-        f"a) {a} or {b}, b) {b}, c) {c}",
-        f"a) is {a}, b) or c) is {c}",
-    ):
-        assert not choice(question, output).parsed, output
-
-
-def test_a_longer_name_is_not_the_shorter_one() -> None:
-    question = matching("a lanyard", "a tomato", "a potato")
-    assert choice(question, "a) is a lanyard, b) is a tomato and c) is a potato.").correct
-    assert not choice(question, "a) is a lanyard's card holder, b) is a tomato and c) is a potato.").parsed
-    both = matching("a lanyard's card holder", "a lanyard", "a potato")
-    assert choice(both, "a) is a lanyard's card holder, b) is a lanyard and c) is a potato.").correct
+    question = question.model_copy(update={"objects": tuple(by_name[n] for n in names), "gold": gold})
+    score = choice(question, output.format(**dict(zip("abc", names, strict=True))))
+    assert (score.parsed, score.correct) == (verdict is not None, bool(verdict))
 
 
 WORDS = ["Overall", "hard", "a)", "b)", " is ", "is the", "Conclusion:", "yes", "no", "(", "[", "\\", "*", "\n"]
