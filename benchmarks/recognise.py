@@ -16,7 +16,7 @@ from pipeline.core.records import Probe, Video
 from pipeline.core.runtime import derive_seed, track
 
 Values = npt.NDArray[np.float64]
-KEPT, UNTOUCHED, SHUFFLED = "embedding, as `octopi remember` keeps it", "untouched sensor alone", "names shuffled"
+KEPT, UNTOUCHED, SHUFFLED = "embedding", "untouched sensor", "names shuffled"
 COUNTS = (2, 5)
 """Objects to choose from; and all."""
 
@@ -44,22 +44,25 @@ def measure(root: Path) -> list[Row]:
         UNTOUCHED: np.array([p.thumbnail for p in probes], dtype=np.float64),
     }
     rows: list[Row] = []
-    for place, where in (("", None), (" of one session", names)):
+    for place, where in (("", None), (", candidates of one session", names)):
+        errors: dict[str, Error] = {}
         for k in (*COUNTS, 0):
-            errors = {kind: wrong(cosines(values), objects, k, where) for kind, values in kinds.items()}
-            errors[SHUFFLED] = wrong(cosines(kinds[KEPT]), shuffled, k, where)
-            found = {kind: error for kind, error in errors.items() if error}
-            if KEPT in found:
-                size = f"{k or 'all'} objects"
-                rows += make_rows(
-                    f"recognise, {params.data.source}, {size}{place}",
-                    {kind: [kinds.get(kind, kinds[KEPT]).shape[1]] for kind in found},
-                    unit="numbers a touch",
-                    baseline=KEPT,
-                    errors=found,
-                    error_of=f"share of touches taken for another of {size}, each remembered by one touch",
-                    machine=platform.processor() or platform.machine(),
-                )
+            size = f", {k or 'all'} objects"
+            for kind, values in kinds.items():
+                errors |= {kind + size: error} if (error := wrong(cosines(values), objects, k, where)) else {}
+            chance = wrong(cosines(kinds[KEPT]), shuffled, k, where)
+            errors |= {f"{SHUFFLED}{size}": chance} if chance else {}
+        if f"{KEPT}, all objects" in errors:
+            numbers = {SHUFFLED: kinds[KEPT].shape[1], **{kind: values.shape[1] for kind, values in kinds.items()}}
+            rows += make_rows(
+                f"recognise, {params.data.source}{place}",
+                {name: [numbers[next(k for k in numbers if name.startswith(k))]] for name in errors},
+                unit="numbers kept of a touch",
+                baseline=f"{KEPT}, all objects",
+                errors=errors,
+                error_of="share of touches taken for another object, each remembered by one touch",
+                machine=platform.processor() or platform.machine(),
+            )
     return rows
 
 
