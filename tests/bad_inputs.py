@@ -99,7 +99,7 @@ SCALES = {
     "smoke language.start=models/nothing": "language.start: models/nothing holds no trained model",
     "smoke scenes.objects=[unicorn]": "scenes.objects: unicorn",
     "smoke scenes.objects=[bath_towel,ice_block]": "no video of a training object",
-    "smoke cross_validation.models=[papers]": "papers is no model; did you mean paper",
+    "smoke cross_validation.models=[papers]": "models.0 is 'papers': Input should be",
 }
 PARAMS: dict[str | bytes | None, str] = {
     "": "octopi scale smoke",

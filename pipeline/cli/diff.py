@@ -18,6 +18,7 @@ from dvc.api import DVCFileSystem
 from dvc.exceptions import DvcException
 from dvc.repo import Repo
 from dvc.scm import RevError
+from scmrepo.exceptions import SCMError
 
 from pipeline.core.errors import UserError, without_secrets
 from pipeline.core.records import EffectRow, Graded
@@ -45,7 +46,7 @@ class State:
             repo = Repo(str(root), rev=revision or None)
             name = f"{revision} ({repo.get_rev()[:8]})" if revision else "working tree"
             return cls(name, DVCFileSystem(repo=repo))
-        except (RevError, AttributeError):  # The latter for a file of a commit.
+        except (RevError, SCMError, AttributeError):  # SCMError without any commit; the last for a file of a commit.
             there = f"no commit of a Git repository in {root.resolve()}"
             raise UserError(f"{revision}: {there}; `git log` and `dvc exp list` list them") from None
         except DvcException as error:

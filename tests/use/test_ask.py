@@ -95,8 +95,11 @@ def test_a_stopped_answer_is_forgotten(octopi: Octopi, monkeypatch: pytest.Monke
 
 
 def test_a_folder_without_videos_is_refused(octopi: Octopi, tmp_path: Path) -> None:
-    with refused("holds no video"):
+    with refused("no such file or folder"):
         describe_folder(octopi, [tmp_path / "nothing"], tmp_path / "out.csv")
+    (tmp_path / "empty").mkdir()
+    with refused("holds no video"):
+        describe_folder(octopi, [tmp_path / "empty"], tmp_path / "out.csv")
 
 
 @pytest.fixture
