@@ -376,7 +376,7 @@ class Embedding(Record):
 
 ALL_SEEDS = "all"
 """In place of a seed: the mean over seeds, or over the repeats of a cross-validation."""
-HEADS, VALIDATION_HEADS, CROSS_VALIDATION = "heads", "heads_validation", "cross_validation"
+HEADS, VALIDATION_HEADS, RECALL, CROSS_VALIDATION = "heads", "heads_validation", "heads_recall", "cross_validation"
 """What stands as the task where no language model with touch answered: the fine-tuned encoder's property heads on test
 videos and on validation videos, encoders on objects that they were not trained on, and base models about objects that
 are described to them in words."""

@@ -18,6 +18,7 @@ from pipeline.core.records import (
     ALL_SEEDS,
     CROSS_VALIDATION,
     HEADS,
+    RECALL,
     VALIDATION_HEADS,
     Classification,
     EffectRow,
@@ -115,6 +116,20 @@ def score_rows(
             rows += _rows(
                 by_seed, task=task_name, measure=measure, chance=chance, encoder=Encoder.FINETUNED, touch=Touch.REAL
             )
+    for p in catalogue.properties:
+        for level, word in enumerate(p.levels):
+            wanted = (Part.TEST, p.name, level)
+            by_seed = {
+                seed: {
+                    c.video_id: Answer(c.predicted == level, (c.object_id,))
+                    for c in sorted(records, key=lambda c: c.video_id)
+                    if (c.part, c.property, c.expected) == wanted
+                }
+                for seed, records in (classifications or {}).items()
+            }
+            named = {"task": RECALL, "measure": f"{p.name}: {word}", "chance": chances[p.name]}
+            known = {seed: videos for seed, videos in by_seed.items() if videos}
+            rows += _rows(known, **named, encoder=Encoder.FINETUNED, touch=Touch.REAL)
     for name, records in (out_of_fold or {}).items():
         for place, measure in enumerate(chances):
             runs = repeats(records, place if place < len(catalogue.properties) else None)

@@ -12,7 +12,7 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.core.records import ALL_SEEDS, CROSS_VALIDATION, HEADS, VALIDATION_HEADS, Shown
+from pipeline.core.records import ALL_SEEDS, CROSS_VALIDATION, HEADS, RECALL, VALIDATION_HEADS, Shown
 from pipeline.report.load import DATASET, KEYS, Report, cells, published, published_datasets
 from pipeline.tasks import TASKS
 
@@ -20,7 +20,7 @@ Select = Callable[[pd.DataFrame], "pd.Series[bool]"]
 Cell = Callable[[dict[str, Any]], str]
 FULL = {"encoder": "finetuned", "lora": "with", "opd": "all"}
 CHOICE, COMBINED = "choice", "combined"
-NOT_ANSWERED = (HEADS, VALIDATION_HEADS, CROSS_VALIDATION)
+NOT_ANSWERED = (HEADS, VALIDATION_HEADS, RECALL, CROSS_VALIDATION)
 """Tasks of scores.csv that no language model with touch answered."""
 PUBLISHED_MODELS = ("7b", "13b", "CLIP", "PG-InstructBLIP")
 SYSTEM_WORDS = {"base": "base encoder", "without": "without LoRA", "none": "without OPD", "needed": "OPD as needed"}
@@ -131,6 +131,7 @@ def task_title(task: str) -> str:
     titles = {
         HEADS: "Property heads",
         VALIDATION_HEADS: "Property heads, validation videos",
+        RECALL: "Property heads, class by class",
         CROSS_VALIDATION: "Cross-validation",
         **{name: task.title for name, task in TASKS.items()},
     }
@@ -150,7 +151,7 @@ def system(row: dict[str, Any]) -> str:
     }
     if touch in others:
         return others[touch]
-    if task in (HEADS, VALIDATION_HEADS):
+    if task in (HEADS, VALIDATION_HEADS, RECALL):
         return "property heads, no language model"
     if task == CROSS_VALIDATION:
         return str(encoder)
@@ -364,6 +365,13 @@ TABLES: tuple[Table, ...] = (
         "What the encoder's heads say of test and validation videos, without a language model.",
         lambda f: f["task"].isin((HEADS, VALIDATION_HEADS)),
         ("task", "measure", "encoder", "measured", "n", "chance", "published"),
+    ),
+    Table(
+        "recall",
+        "Recall of the property heads",
+        "Of the test videos of each class, the share that the heads take for it; figures/confusion.png has the others.",
+        lambda f: f["task"].eq(RECALL),
+        ("measure", "measured", "n", "chance"),
     ),
     Table(
         "cross_validation",

@@ -7,6 +7,7 @@ from statistics import fmean
 
 import numpy as np
 import pytest
+from sklearn.metrics import recall_score
 
 from pipeline.core.io import read_csv, write_csv
 from pipeline.core.records import Classification, EffectRow, OutOfFold, Part, ScoreRow
@@ -150,6 +151,26 @@ def test_property_heads_on_test_and_on_validation_videos() -> None:
     interval = accuracy_interval(np.array([1.0, 0, 0, 1]), ABOUT)
     assert (found["combined"].low, found["combined"].high) == pytest.approx(interval, abs=1e-6)
     assert row(rows, task="heads_validation", measure="combined", seed="all").n == 1
+
+
+def test_recall_of_each_class_is_scikit_learns() -> None:
+    rng = np.random.default_rng(0)
+    said = []
+    for number in range(60):
+        labels, taken = ((int(a), int(b), 2) for a, b in rng.integers(0, 3, (2, 2)))
+        said += heads(Part.TEST, {f"{number % 20:02}_{number // 20}": taken}, labels)
+    rows = score_rows([], CATALOGUE, {0: said})
+    for p in CATALOGUE.properties:
+        own = [c for c in said if c.property == p.name]
+        true, taken = [c.expected for c in own], [c.predicted for c in own]
+        known = recall_score(true, taken, labels=sorted(set(true)), average=None)
+        found = [
+            row(rows, task="heads_recall", seed="all", measure=f"{p.name}: {p.levels[level]}")
+            for level in sorted(set(true))
+        ]
+        assert [r.accuracy for r in found] == pytest.approx(known.tolist(), abs=1e-6)
+        assert [r.n for r in found] == [true.count(level) for level in sorted(set(true))]
+    assert {r.measure for r in rows if r.task == "heads_recall" and "bump" in r.measure} == {"bumpiness: big bumps"}
 
 
 def out_of_fold(predicted: list[tuple[tuple[int, ...], ...]]) -> list[OutOfFold]:
