@@ -172,8 +172,8 @@ class QuestionsConfig(Section):
     is asked for, and which object has more or less of it, before they conclude: for a language model too small to find
     and compare at once. Reports say so."""
     two_turns: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """Share of the training questions about several videos whose OPD mode `all` takes two turns, as scenarios (PSR) do:
-    describe everything, then answer every question of the task about these videos."""
+    """Share of the training questions about several videos that become a dialogue in OPD mode `all`: the first turn
+    describes all videos, as in scenarios (PSR), and each later one asks a question about them."""
     plainly: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Share of the other training comparisons that are asked as people do: "Which is softer?"."""
 

@@ -30,8 +30,7 @@ from pipeline.core.runtime import CHECKPOINTS, limit_threads, quiet_libraries
 DATA = Path("data")
 RUNS = Path("runs")
 NUMBERS = ("NVIDIA_TF32_OVERRIDE", "TORCH_ALLOW_TF32_CUBLAS_OVERRIDE")
-"""Variables by which a GPU multiplies float32 with the digits of float16, or does not where it would; some containers
-set them."""
+"""Variables that turn TF32, which has float16's precision, on or off. They change results; some containers set them."""
 
 
 @dataclass

@@ -1,7 +1,7 @@
 """Everything measured, as the rows of two tidy tables: accuracies (scores.csv) and differences (effects.csv).
 
-This is the one place where an accuracy is computed. A task appears here by itself once it is registered: its chance,
-and with it its measures, come from its own module.
+Every accuracy that a report shows is computed here; training computes its own on validation objects. A task appears
+here by itself once it is registered: its chance, and with it its measures, come from its own module.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def score_rows(
     for (task, measure, model, shown), runs in by_model.items():
         chance = TASKS[task].chance(catalogue)[measure]
         rows += _rows(runs, task=task, measure=measure, chance=chance, encoder=model, opd=Opd.ALL, touch=shown)
-    chances = TASKS["OPD"].chance(catalogue)  # What describes a video answers the same as its heads.
+    chances = TASKS["OPD"].chance(catalogue)  # Heads are asked what a description is.
     for task_name, part in ((HEADS, Part.TEST), (VALIDATION_HEADS, Part.VALIDATION)):
         found = {seed: _videos(records, part) for seed, records in (classifications or {}).items()}
         for measure, chance in chances.items():

@@ -1,4 +1,4 @@
-"""Answers: batched, greedy, in one or two turns."""
+"""Answers: batched, greedy, turn by turn."""
 
 from __future__ import annotations
 

@@ -188,7 +188,7 @@ def assemble(
 
 
 def with_given(questions: Sequence[Question], opd: Opd, share: float, seed: int) -> tuple[list[Question], set[str]]:
-    """The questions, of which a share of those that describe several videos have touches of others like them.
+    """Exchange the touches of a share of the questions that describe several videos, among those with as many.
 
     Returns:
         All questions in their order, and the ids of those whose touches were exchanged.
@@ -216,7 +216,10 @@ class Job:
 def fit(
     model: OctopiForCausalLM, data: ConversationDataset, config: TrainConfig, runtime: RuntimeConfig, job: Job
 ) -> Trained:
-    """Train the projection, the two new tokens and the word embeddings, if they are, and adapters at their own rate."""
+    """Train the projection, the two new tokens' vectors, all word embeddings where `model.words` is set, and adapters.
+
+    Adapters have a learning rate of their own.
+    """
     # The new tokens' vectors are word embeddings, wherever they are kept.
     trained = ("connector.projection", "connector.delimiters", *(("words",) if model.words is not None else ()))
     adapters = {"llm": config.learning_rate} if isinstance(config, LoraTrainConfig) else {}

@@ -324,7 +324,7 @@ TABLES: tuple[Table, ...] = (
         "effects",
         "What each part brings",
         "The full system minus the system that lacks one part, on the same questions. p is of a test by sign flips "
-        "over objects; Holm's counts all comparisons of the report.",
+        "over objects; p, Holm is corrected for all comparisons of the report.",
         lambda f: f["part"] != "touch",
         ("part", "change", "task", "measure", "difference", "p", "p_holm", "smallest", "n", "objects", "seeds"),
         source="effects",

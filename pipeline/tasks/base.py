@@ -14,7 +14,7 @@ from pipeline.videos.catalogue.wording import mentioned, plain, unmarked
 
 LETTERS = "abc"
 LISTED = ("a)", "b)", "c)")
-"""The letters as a list of videos, and what describes them, has them."""
+"""Labels of the videos, in the question's list and in descriptions."""
 Classes = Sequence[Sequence[tuple[int, float]]]
 """What an encoder takes each video for, property by property: its class, and the mean class by its probabilities.
 

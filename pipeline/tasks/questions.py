@@ -18,9 +18,9 @@ from pipeline.tasks.base import Draft, Pool, TaskDefinition, in_turns
 from pipeline.videos.catalogue import Catalogue
 
 CHOICES = 2
-"""Of the questions about the videos of a description, at most, that are asked again in the form of scenarios."""
+"""At most so many questions of a dialogue in several turns are also asked in the form of a scenario."""
 ATTEMPTS = 60
-"""Draws a question before its stratum is given up for this round (a rare class may need many)."""
+"""Draws without a new question after which a stratum is left out; a rare class may need many."""
 
 
 def pool_of(part: Part, assignments: Sequence[Assignment], catalogue: Catalogue) -> Pool:

@@ -7,7 +7,7 @@
     base/                  the language model itself, where it was put in
     README.md              the model card
 
-All weights are safetensors, all else JSON: reading it runs no code. Apart from `base/` it needs nothing but the base
+All weights are safetensors, all else is text: reading it runs no code. Apart from `base/` it needs nothing but the base
 language model, which is named by hash.
 """
 

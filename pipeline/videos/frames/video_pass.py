@@ -58,7 +58,7 @@ class VideoPass:
     """Degrees against the clock."""
     reference: Reference | None = None
     steady: bool = True
-    """Whether the light is in the frames that make a reference."""
+    """Whether the light stays the same in the frames whose mean is the reference."""
     first: Image = field(default_factory=lambda: NOTHING)
     last: Image = field(default_factory=lambda: NOTHING)
     """Thumbnails: the mean of the first frames, and the last frame."""
