@@ -261,7 +261,7 @@ def answer_with(
 
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
 def repro(context: typer.Context) -> None:
-    """Run `dvc repro`: say how many stages will run, and write the page of all reports behind it."""
+    """Run `dvc repro`, and say before it how many stages will run."""
     from pipeline.cli.reproduce import reproduce
 
     raise typer.Exit(reproduce(Path(), context.args))
@@ -269,7 +269,7 @@ def repro(context: typer.Context) -> None:
 
 @app.command()
 def diff(
-    old: Annotated[str, typer.Argument(help="A Git revision: a hash, a tag, a branch, HEAD~1.")],
+    old: Annotated[str, typer.Argument(help="A Git revision (a hash, a tag, HEAD~1) or an experiment's name.")],
     new: Annotated[str, typer.Argument(help="Another one; without it, what lies on disk now.")] = "",
     json: Annotated[Path | None, typer.Option(help="Also write everything to this file, for machines.")] = None,
 ) -> None:

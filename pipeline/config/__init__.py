@@ -70,7 +70,7 @@ class DataConfig(Section):
     dir: str = Field(min_length=1)
     """Folder of the videos; for scenes, where the chain puts them."""
     catalogue: str = "pipeline/physiclear"
-    """Folder with objects.csv and properties.yaml (and, optionally, descriptions.csv)."""
+    """Folder with objects.csv and properties.yaml (and, optionally, descriptions.csv and scenes.yaml)."""
 
 
 class InventConfig(Section):
