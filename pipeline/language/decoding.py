@@ -49,7 +49,7 @@ def greedy_tokens(
         prompts: Token ids, of like length where little is to be spent on padding.
         features: Of each prompt's frames: frames x tactile_dim.
         ends: Ids of tokens that end an answer.
-        limits: Most new tokens of each, at least 1.
+        limits: Most new tokens of each, at least 1. One that is lowered meanwhile ends that row.
 
     Yields:
         The place of a prompt and its next token, as soon as it is known. In float32 a row's tokens do not depend on
@@ -64,7 +64,7 @@ def greedy_tokens(
             if ended[row]:
                 continue
             said[row] += 1
-            ended[row] = token in ends or said[row] == limits[row]
+            ended[row] = token in ends or said[row] >= limits[row]
             if not ended[row]:
                 going.append(place)
             yield row, token

@@ -154,21 +154,49 @@ def _reply_batch(model: OctopiForCausalLM, batch: Batch) -> list[Generated]:
     return [_said(row, ends, model.tokenizer) for row in rows]
 
 
-def stream(
-    model: OctopiForCausalLM, prompt: Sequence[int], features: torch.Tensor, language: LanguageConfig
-) -> Iterator[str]:
+@dataclass(frozen=True)
+class Stream:
     """What `reply` says to one prompt, in pieces as they come; together they are the same text."""
-    ends, tokens, given = end_ids(model.tokenizer), [], ""
-    for _, token in greedy_tokens(model, [prompt], [features], ends, _room(model, [prompt], language)):
-        tokens.append(token)
-        text = _said(tokens, ends, model.tokenizer).text
-        # A character may be spread over tokens; until it is whole it is shown as the replacement character.
-        if text.startswith(given) and len(text) > len(given) and not text.endswith("\N{REPLACEMENT CHARACTER}"):
-            yield text[len(given) :]
-            given = text
-    rest = _said(tokens, ends, model.tokenizer).text.removeprefix(given)
-    if rest:
-        yield rest
+
+    model: OctopiForCausalLM
+    prompt: Sequence[int]
+    features: torch.Tensor
+    language: LanguageConfig
+
+    def __iter__(self) -> Iterator[str]:
+        return (piece for _, piece in self.together([self], set()) if piece is not None)
+
+    @staticmethod
+    def together(streams: Sequence[Stream], left: Collection[int]) -> Iterator[tuple[int, str | None]]:
+        """The place of a stream and its next piece, None behind its last; all are computed in one batch.
+
+        Args:
+            streams: Of one model.
+            left: Places of those that nobody listens to any more; they may be added meanwhile.
+        """
+        model = streams[0].model
+        ends, tokenizer = end_ids(model.tokenizer), model.tokenizer
+        limits = [_room(model, [s.prompt], s.language)[0] for s in streams]
+        # Neighbours of like length pad little.
+        order = sorted(range(len(streams)), key=lambda place: len(streams[place].prompt))
+        tokens: list[list[int]] = [[] for _ in streams]
+        given = [""] * len(streams)
+        rows = [streams[place] for place in order]
+        prompts, features, room = [s.prompt for s in rows], [s.features for s in rows], [limits[p] for p in order]
+        for row, token in greedy_tokens(model, prompts, features, ends, room):
+            place = order[row]
+            if place in left:
+                room[row] = 0
+                continue
+            tokens[place].append(token)
+            text, over = _said(tokens[place], ends, tokenizer).text, token in ends or len(tokens[place]) == room[row]
+            # A character may be spread over tokens; until it is whole it is shown as the replacement character.
+            whole = over or not text.endswith("\N{REPLACEMENT CHARACTER}")
+            if text.startswith(given[place]) and len(text) > len(given[place]) and whole:
+                yield place, text[len(given[place]) :]
+                given[place] = text
+            if over:
+                yield place, None
 
 
 def _room(model: OctopiForCausalLM, prompts: Sequence[Sequence[int]], language: LanguageConfig) -> list[int]:

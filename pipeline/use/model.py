@@ -6,7 +6,7 @@ import logging
 import os
 import random
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -27,7 +27,7 @@ from pipeline.core.runtime import (
     resolve_device,
 )
 from pipeline.language.chat import TACTILE, TACTILE_TOKENS
-from pipeline.language.generate import reply, stream, write_prompt
+from pipeline.language.generate import Stream, reply, write_prompt
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.tasks import opd, pc, pom, psr, pss
 from pipeline.tasks.base import LETTERS
@@ -167,10 +167,10 @@ class Octopi:
         *,
         history: Sequence[Exchange] = (),
         max_new_tokens: int | None = None,
-    ) -> Iterator[str]:
+    ) -> Stream:
         """As `ask`, in pieces of text as they come. Bad input is refused here, before the first piece is asked for."""
         prompt, features = self._prompt((*history, Exchange(question, _listed(videos), "")))
-        return stream(self.llm, prompt, features, self._language(max_new_tokens))
+        return Stream(self.llm, prompt, features, self._language(max_new_tokens))
 
     def ask_all(
         self, asked: Sequence[tuple[str, Video | Sequence[Video]]], *, max_new_tokens: int | None = None
@@ -288,8 +288,8 @@ class Octopi:
         catalogue = Catalogue(language=self.catalogue.language, objects=found)
         question = pom.asked(pom.OPENINGS[len(listed) == 2], listed)[self.config.opd]
         if self.config.facts or isinstance(names, Mapping):
-            facts = pom.facts(catalogue, list(found), random.Random(derive_seed("facts", *listed)))
-            question = f"{facts} {question}"
+            rng, labels = random.Random(derive_seed("facts", *listed)), [o.labels for o in found.values()]
+            question = f"{pom.told_first(catalogue, list(found), labels, rng)} {question}"
         answer = self.ask(question, videos)
         read = pom.read(answer, listed)
         said = None if read is None else tuple(listed[read[letter]] for letter in LETTERS[: len(listed)])

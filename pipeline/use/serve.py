@@ -13,7 +13,7 @@ import math
 import threading
 import time
 from collections import Counter
-from collections.abc import AsyncGenerator, AsyncIterator, Iterator
+from collections.abc import AsyncGenerator, AsyncIterator, Iterable
 from contextlib import ExitStack, aclosing, asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
@@ -103,7 +103,7 @@ class Service:
         files = iter(stack.enter_context(self.gate.files([video for _, videos, _ in said for video in videos])))
         return wanted, [Exchange(q, tuple(next(files) for _ in videos), a) for q, videos, a in said]
 
-    def _ask(self, wanted: ChatRequest, exchanges: list[Exchange], reply: Reply) -> Iterator[str]:
+    def _ask(self, wanted: ChatRequest, exchanges: list[Exchange], reply: Reply) -> Iterable[str]:
         *history, last = exchanges
         most = wanted.max_completion_tokens or wanted.max_tokens
         most = min(most, MOST_TOKENS) if most else None

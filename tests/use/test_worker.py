@@ -1,0 +1,97 @@
+"""Questions that wait are answered in one batch, each as it would be alone."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import AsyncGenerator, Collection, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.core.errors import UserError
+from pipeline.language.generate import Stream
+from pipeline.use.model import Octopi
+from pipeline.use.worker import Failed, Worker
+from tests.conftest import HUNG
+
+QUESTIONS = (("Describe this. {tactile}", 1, None), ("Is it soft?", 1, 3), ("Which is softer?", 2, 20), ("Why?", 3, 1))
+
+
+async def everything(pieces: AsyncGenerator[Any]) -> str:
+    return "".join([piece async for piece in pieces])
+
+
+@pytest.fixture
+def batches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many were answered at once, batch by batch."""
+    sizes: list[int] = []
+    together = Stream.together
+
+    def counted(streams: Sequence[Stream], left: Collection[int]) -> Iterator[tuple[int, str | None]]:
+        sizes.append(len(streams))
+        return together(streams, left)
+
+    monkeypatch.setattr(Stream, "together", staticmethod(counted))
+    return sizes
+
+
+def test_what_waits_is_one_batch_and_each_answer_is_the_one_given_alone(
+    octopi: Octopi, files: list[Path], batches: list[int]
+) -> None:
+    """Beside one that is refused, one that breaks, one that is given up before its turn, and one in the middle."""
+    alone = [octopi.ask(q, files[:n], max_new_tokens=most) for q, n, most in QUESTIONS]
+    ended: list[object] = []
+
+    async def ask() -> list[Any]:
+        worker, gate = Worker(), threading.Event()
+        first = asyncio.ensure_future(everything(worker.answer(lambda: [str(gate.wait(HUNG))])))
+
+        def queue(question: str, count: int, most: int | None = None) -> AsyncGenerator[Any]:
+            asked = partial(octopi.stream, question, files[:count], max_new_tokens=most)
+            return worker.answer(asked, partial(ended.append, question))
+
+        asked = [queue(*each) for each in QUESTIONS]
+        refused, never, halfway = queue("{tactile}", 0), queue("Never?", 1), queue("Halfway?", 1)
+        broken = worker.answer(lambda: iter([1 / 0]), partial(ended.append, "broken"))
+        begun = asyncio.ensure_future(anext(never))
+        await asyncio.sleep(0)
+        begun.cancel()
+        await asyncio.gather(begun, return_exceptions=True)
+        gate.set()
+        whole = [asyncio.ensure_future(everything(pieces)) for pieces in asked]
+        await anext(halfway)
+        await halfway.aclose()
+        failed = await asyncio.gather(everything(refused), everything(broken), return_exceptions=True)
+        found = [await first, failed, [text.strip() for text in await asyncio.gather(*whole)]]
+        await asyncio.to_thread(worker.stop)
+        return [*found, worker.answers]
+
+    first, (refused, broken), answered, count = asyncio.run(ask())
+    assert first == "True"
+    assert isinstance(refused, UserError)
+    assert isinstance(broken, Failed)
+    assert answered == [text.strip() for text in alone]
+    assert batches[-1] == len(QUESTIONS) + 1
+    assert count == 1 + len(QUESTIONS)
+    assert sorted(map(str, ended)) == sorted([*(q for q, *_ in QUESTIONS), "{tactile}", "broken", "Never?", "Halfway?"])
+
+
+def test_a_batch_that_breaks_fails_each_of_its_questions(
+    octopi: Octopi, files: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def ask() -> list[Any]:
+        worker = Worker()
+        asked = [worker.answer(lambda: octopi.stream("Why?", files[:1])) for _ in range(3)]
+        found = await asyncio.gather(*map(everything, asked), return_exceptions=True)
+        monkeypatch.undo()
+        after = await everything(worker.answer(lambda: octopi.stream("Why?", files[:1])))
+        await asyncio.to_thread(worker.stop)
+        return [*found, after.strip()]
+
+    monkeypatch.setattr("pipeline.language.generate.greedy_tokens", lambda *_: iter([1 / 0]))
+    *failed, after = asyncio.run(ask())
+    assert [type(error) for error in failed] == [Failed] * 3
+    assert after == octopi.ask("Why?", files[:1])
