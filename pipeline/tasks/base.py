@@ -57,6 +57,8 @@ class Draft:
     gold: Gold
     finding: str = ""
     """What the classes of the property asked for lead to, before it is put as an answer: "Harder: second object."."""
+    facts: tuple[tuple[int, ...], ...] = ()
+    """The classes that the question tells of each object, where it tells any."""
 
 
 class TaskDefinition(ABC):
@@ -112,6 +114,10 @@ class TaskDefinition(ABC):
             inexact: Chance that a class told is a neighbour of the right one.
         """
         return draft
+
+    def tied(self, draft: Draft, pool: Pool, rng: random.Random) -> Draft | None:
+        """The question as a training gives it where an encoder's classes leave it open, if the task has such."""
+        return None
 
     def plainly(self, draft: Draft, catalogue: Catalogue, rng: random.Random) -> Draft:
         """The question as people ask it, where they ask it otherwise."""

@@ -65,11 +65,15 @@ def build_questions(
     """Build up to `counts[task]` questions of each task, in random order.
 
     Fewer come back where the pool has no more to ask (too few objects, a class without objects): strata that yield
-    nothing after `ATTEMPTS` draws are left out, and with `distinct` no question is asked twice. With `facts` the same
-    questions come as each task's `with_facts` makes them, with that chance of `inexact` classes, and with `restate` as
-    its `restated` does. A share of `two_turns` is asked as `in_turns` does, with all further questions about the same
-    videos, and of the others a share of `plainly` as the task's method of that name does. The questions of a `fold`
-    carry it in their ids, which are so unique over all folds.
+    nothing after `ATTEMPTS` draws are left out, and with `distinct` no question is asked twice.
+
+    Args:
+        facts: The same questions as each task's `with_facts` makes them.
+        inexact: Chance that a fact's class is off by one, and that a question becomes what its task's `tied` makes.
+        restate: Answers as each task's `restated` has them.
+        two_turns: Share of the questions that are asked as `in_turns` does, with all others about the same videos.
+        plainly: Share of the others that become what their task's `plainly` makes.
+        fold: Stands in the questions' ids, which are so unique over all folds.
     """
     place = str(pool.part) if fold is None else f"{pool.part}-fold{fold}"
     questions: list[Question] = []
@@ -80,10 +84,14 @@ def build_questions(
             random.Random(derive_seed(seed, pool.part, task, *purpose)) for purpose in ((), ("facts",), ("turns",))
         )
         for number, draft in enumerate(islice(_drafts(definition, pool, rng, distinct), count)):
-            asked_on = turns.random() < two_turns and len(draft.videos) > 1
+            tied = definition.tied(draft, pool, turns) if inexact and turns.random() < inexact else None
+            draft = tied or draft
+            asked_on = tied is None and turns.random() < two_turns and len(draft.videos) > 1
             more = further(definition, pool, draft, turns) if asked_on else []
             if not asked_on and turns.random() < plainly:
                 draft = definition.plainly(draft, pool.catalogue, turns)
+            if facts:
+                draft = definition.with_facts(draft, pool.catalogue, order, inexact)
             if restate:
                 draft, *more = (definition.restated(d, pool.catalogue) for d in (draft, *more))
             if asked_on:
@@ -91,8 +99,6 @@ def build_questions(
                 # A choice may stand anywhere, also first, where a scenario's stands.
                 more += islice(filter(None, choices), CHOICES)
                 draft = in_turns(draft, turns.sample(more, len(more)))
-            if facts:
-                draft = definition.with_facts(draft, pool.catalogue, order, inexact)
             questions.append(
                 Question(
                     question_id=f"{task}-{place}-{number:05d}",
