@@ -26,9 +26,9 @@ from benchmarks.table import Row, make_rows
 from benchmarks.timing import counted, interleaved, machine
 from pipeline.config import EncoderConfig, LanguageConfig
 from pipeline.config.params import load_params
-from pipeline.core.embeddings import FLIPS, INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
+from pipeline.core.embeddings import FLIPS, EmbeddingStore
 from pipeline.core.io import save_tensors, write_table
-from pipeline.core.records import Assignment, Embedding, Opd, Part, Question
+from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Assignment, Embedding, Opd, Part, Question
 from pipeline.core.runtime import DtypeName, seed_everything
 from pipeline.encoder.model import FrameEncoder, base_encoder
 from pipeline.language.chat import IGNORE_INDEX

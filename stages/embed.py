@@ -6,10 +6,10 @@ from pathlib import Path
 
 import torch
 
-from pipeline.core.embeddings import INDEX_FILE, STATISTICS_FILE, TENSOR, TENSOR_FILE
+from pipeline.core.embeddings import STATISTICS_FILE
 from pipeline.core.io import fingerprint, read_table, save_tensors, write_table
 from pipeline.core.parallel import device_here
-from pipeline.core.records import Assignment, Embedding, Encoder, Part
+from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Assignment, Embedding, Encoder, Part
 from pipeline.core.stage import DATA, Stage, stage
 from pipeline.encoder.embed import EncoderSource, embed_videos, logits_of, standardize, statistics, union
 from pipeline.videos.catalogue import load_catalogue

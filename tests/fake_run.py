@@ -6,13 +6,19 @@ import random
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import yaml
+from safetensors.numpy import save_file
 
 from pipeline.config import Params
 from pipeline.core.io import write_csv, write_jsonl, write_table
 from pipeline.core.records import (
+    INDEX_FILE,
+    TENSOR,
+    TENSOR_FILE,
     Assignment,
     Classification,
+    Embedding,
     Finding,
     Graded,
     Measurement,
@@ -75,6 +81,12 @@ def write_run(root: Path, params: Params, *, objects: Sequence[str] = (), skill:
         asked[seed] = build_questions(pool, counts, seed=0, distinct=True, fold=fold)
         write_jsonl(data / "questions" / str(seed) / "evaluation.jsonl", asked[seed])
         write_jsonl(data / "questions" / str(seed) / "examples.jsonl", build_examples(split, catalogue, seed=0))
+        for encoder in params.ablation.encoders:
+            folder = data / "embeddings" / f"{encoder}-{seed}"
+            frames = [Embedding(video_id=a.video_id, frame_index=0, flip="none", row=i) for i, a in enumerate(split)]
+            write_table(folder / INDEX_FILE, Embedding, frames)
+            features = np.random.default_rng(seed).normal(size=(len(split), 4)).astype(np.float32)
+            save_file({TENSOR: features}, folder / TENSOR_FILE)
         said = [c for a in split for c in _classify(a, catalogue, skill, rng)]
         write_table(data / "encoder" / str(seed) / "classifications.parquet", Classification, said)
         write_table(data / "encoder" / str(seed) / "history.parquet", Measurement, _history("loss", "validation_loss"))

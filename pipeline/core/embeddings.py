@@ -12,12 +12,9 @@ import torch
 
 from pipeline.core.errors import UserError
 from pipeline.core.io import load_tensors, read_table, save_tensors
-from pipeline.core.records import Embedding, Flip
+from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Embedding, Flip
 
 FLIPS: tuple[Flip, ...] = ("none", "horizontal", "vertical", "both")
-TENSOR = "embeddings"
-TENSOR_FILE = "embeddings.safetensors"
-INDEX_FILE = "index.parquet"
 STATISTICS_FILE = "statistics.safetensors"
 
 

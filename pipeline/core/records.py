@@ -376,12 +376,18 @@ class Embedding(Record):
     row: int = Field(ge=0)
 
 
+TENSOR = "embeddings"
+"""The embedding tensor's name in its file: float32, rows x dim."""
+TENSOR_FILE, INDEX_FILE = "embeddings.safetensors", "index.parquet"
+
+
 ALL_SEEDS = "all"
 """In place of a seed: the mean over seeds, or over the repeats of a cross-validation."""
 HEADS, VALIDATION_HEADS, RECALL, CROSS_VALIDATION = "heads", "heads_validation", "heads_recall", "cross_validation"
+NEIGHBOURS = "nearest_neighbour"
 """What stands as the task where no language model with touch answered: the fine-tuned encoder's property heads on test
-videos and on validation videos, encoders on objects that they were not trained on, and base models about objects that
-are described to them in words."""
+videos and on validation videos, class by class, encoders on objects that they were not trained on, and the class of
+each test video's nearest neighbour."""
 
 
 class ScoreRow(Record):

@@ -18,6 +18,7 @@ from pipeline.core.records import (
     ALL_SEEDS,
     CROSS_VALIDATION,
     HEADS,
+    NEIGHBOURS,
     RECALL,
     VALIDATION_HEADS,
     Classification,
@@ -85,6 +86,7 @@ def score_rows(
     out_of_fold: Mapping[str, Sequence[OutOfFold]] | None = None,
     seen: Iterable[GradedVision] = (),
     concluded: Mapping[int, Sequence[Score]] | None = None,
+    neighbours: Mapping[str, Sequence[OutOfFold]] | None = None,
 ) -> list[ScoreRow]:
     """The rows of scores.csv: one a seed and one over all of them, for each measure and setting that has answers.
 
@@ -94,6 +96,7 @@ def score_rows(
         out_of_fold: By candidate.
         seen: Graded answers of vision-only models.
         concluded: By seed, what `pipeline.evaluation.grading.conclude` graded.
+        neighbours: By encoder, the classes of each test video's nearest neighbour.
     """
     rows: list[ScoreRow] = []
     for (task, measure), settings in _table(graded, catalogue, concluded or {}).items():
@@ -130,10 +133,17 @@ def score_rows(
             named = {"task": RECALL, "measure": f"{p.name}: {word}", "chance": chances[p.name]}
             known = {seed: videos for seed, videos in by_seed.items() if videos}
             rows += _rows(known, **named, encoder=Encoder.FINETUNED, touch=Touch.REAL)
-    for name, records in (out_of_fold or {}).items():
-        for place, measure in enumerate(chances):
-            runs = repeats(records, place if place < len(catalogue.properties) else None)
-            rows += _rows(runs, task=CROSS_VALIDATION, measure=measure, chance=chances[measure], encoder=name)[-1:]
+    for task_name, by_name in ((CROSS_VALIDATION, out_of_fold), (NEIGHBOURS, neighbours)):
+        for name, records in (by_name or {}).items():
+            for place, measure in enumerate(chances):
+                runs = repeats(records, place if place < len(catalogue.properties) else None)
+                rows += _rows(runs, task=task_name, measure=measure, chance=chances[measure], encoder=name)[-1:]
+    for name, records in (neighbours or {}).items():
+        for place, p in enumerate(catalogue.properties):
+            for level, word in enumerate(p.levels):
+                runs = repeats([r for r in records if r.expected[place] == level], place)
+                named = {"measure": f"{p.name}: {word}", "chance": chances[p.name], "encoder": name}
+                rows += _rows(runs, task=NEIGHBOURS, **named)[-1:]
     return rows
 
 
@@ -157,23 +167,23 @@ def effect_rows(
     return with_holm(rows)
 
 
-def candidate_rows(out_of_fold: Mapping[str, Iterable[OutOfFold]], reference: str) -> list[EffectRow]:
-    """Each other encoder less the reference in a cross-validation, every property of a video right at once.
+def candidate_rows(
+    out_of_fold: Mapping[str, Sequence[OutOfFold]],
+    reference: str,
+    task: str = CROSS_VALIDATION,
+    properties: Sequence[str] = (),
+) -> list[EffectRow]:
+    """Each other encoder less the reference, every property of a video right at once, then each of these properties.
 
     As effects, with the repeats in place of seeds; a family of its own. Empty where the reference was not run.
     """
-    runs = {name: repeats(records) for name, records in out_of_fold.items()}
-    rows = [
-        EffectRow(
-            part="encoder",
-            change=f"{name} - {reference}",
-            task=CROSS_VALIDATION,
-            measure="combined",
-            **vars(gap),
-        )
-        for name, videos in runs.items()
-        if name != reference and (gap := difference(videos, runs.get(reference, {})))
-    ]
+    rows = []
+    for place, measure in [(None, "combined"), *enumerate(properties)]:
+        runs = {name: repeats(records, place) for name, records in out_of_fold.items()}
+        for name, videos in runs.items():
+            if name != reference and (gap := difference(videos, runs.get(reference, {}))):
+                change = f"{name} - {reference}"
+                rows.append(EffectRow(part="encoder", change=change, task=task, measure=measure, **vars(gap)))
     return with_holm(rows)
 
 

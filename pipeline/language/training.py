@@ -21,10 +21,10 @@ from pipeline.config import (
     TrainConfig,
 )
 from pipeline.core.card import write_card
-from pipeline.core.embeddings import TENSOR_FILE, EmbeddingStore
+from pipeline.core.embeddings import EmbeddingStore
 from pipeline.core.errors import UserError
 from pipeline.core.io import fingerprint, read_jsonl
-from pipeline.core.records import Encoder, Opd, Question
+from pipeline.core.records import TENSOR_FILE, Encoder, Opd, Question
 from pipeline.core.runtime import derive_seed, name_dtype, seed_everything
 from pipeline.language.base import ADAPTER_WEIGHTS
 from pipeline.language.connector import CONFIG_FILE, read_config

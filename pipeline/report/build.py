@@ -13,8 +13,12 @@ from pipeline.config.params import PARAMS_FILE
 from pipeline.core.io import R, read_csv, read_jsonl, read_table, write_csv, write_json, write_text
 from pipeline.core.records import (
     HEADS,
+    NEIGHBOURS,
+    TENSOR_FILE,
+    Assignment,
     Classification,
     EffectRow,
+    Encoder,
     Finding,
     Graded,
     GradedVision,
@@ -31,6 +35,7 @@ from pipeline.core.records import (
 )
 from pipeline.evaluation.calibration import CalibrationRow, calibrated, calibration_rows
 from pipeline.evaluation.grading import EXTERNAL, conclude, vision_models
+from pipeline.evaluation.neighbours import map_frame, means, nearest_neighbours
 from pipeline.evaluation.ordinal import ErrorRow, error_rows
 from pipeline.evaluation.scores import candidate_rows, effect_rows, score_rows
 from pipeline.report.dataset import dataset_frame
@@ -93,10 +98,13 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     rated = {(g.model, g.shown) for g in seen}
     sources = vision_models(root / EXTERNAL / params.report_name).values()
     origin["vision"] = [s.model_dump(mode="json") for s in sources if (s.model, s.shown) in rated]
-    scores = score_rows(graded, catalogue, said, out_of_fold, seen, concluded)
+    neighbours, maps = embedded(params, data, catalogue)
+    scores = score_rows(graded, catalogue, said, out_of_fold, seen, concluded, neighbours)
     write_csv(folder / "scores.csv", ScoreRow, scores)
     write_csv(folder / "effects.csv", EffectRow, effect_rows(graded, catalogue, concluded))
-    write_csv(folder / "encoder_effects.csv", EffectRow, candidate_rows(out_of_fold, BASELINE))
+    candidates = candidate_rows(out_of_fold, BASELINE)
+    candidates += candidate_rows(neighbours, Encoder.BASE, NEIGHBOURS, catalogue.property_names)
+    write_csv(folder / "encoder_effects.csv", EffectRow, candidates)
     write_csv(folder / "encoder_errors.csv", ErrorRow, error_rows(out_of_fold, catalogue))
     write_csv(folder / "calibration.csv", CalibrationRow, calibration_rows(list(by_encoder.values())))
     audit = data / "audit" / "audit.csv"
@@ -106,6 +114,7 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
         "confusion.csv": confusion_frame(said, catalogue),
         "described.csv": described_frame(by_encoder, params, data, catalogue),
         "curves.csv": curves_frame(data, params.ablation),
+        "map.csv": maps,
     }
     for name, frame in frames.items():
         write_text(folder / name, frame.to_csv(index=False, lineterminator="\n"))
@@ -128,7 +137,8 @@ def finish_report(folder: Path) -> dict[str, float]:
     # Classes are words, even where they read like numbers or like nothing.
     confusion = pd.read_csv(folder / "confusion.csv", dtype=str, keep_default_na=False)
     curves = pd.read_csv(folder / "curves.csv")
-    figures = draw_figures(folder / "figures", report.effects, confusion, curves, report.provenance["properties"])
+    maps = pd.read_csv(folder / "map.csv", dtype=dict.fromkeys(report.provenance["properties"], str))
+    figures = draw_figures(folder / "figures", report.effects, confusion, curves, maps, report.provenance["properties"])
     write_json(folder / "metrics.json", metrics)
     write_text(folder / "README.md", render_readme(report, figures))
     return metrics
@@ -154,6 +164,25 @@ def confusion_frame(said: dict[int, list[Classification]], catalogue: Catalogue)
         if c.part is Part.TEST and c.property == name
     ]
     return pd.DataFrame(rows, columns=list(CONFUSION))
+
+
+def embedded(params: Params, data: Path, catalogue: Catalogue) -> tuple[dict[str, list[OutOfFold]], pd.DataFrame]:
+    """By encoder, the nearest neighbours of test videos among those of their fold, and the maps of the first seed."""
+    neighbours: dict[str, list[OutOfFold]] = {}
+    maps = [pd.DataFrame(columns=["encoder", "method", "video_id", "x", "y", *catalogue.property_names])]
+    for seed in sorted(params.ablation.seeds):
+        split = read_table(data / "splits" / f"{seed}.parquet", Assignment)
+        tested = sorted((a for a in split if a.part is Part.TEST), key=lambda a: a.video_id)
+        for encoder in sorted(params.ablation.encoders):
+            folder = data / "embeddings" / f"{encoder}-{seed}"
+            if len(tested) < 2 or not (folder / TENSOR_FILE).is_file():
+                continue
+            features = means(folder, tested)
+            found = nearest_neighbours(features, tested, catalogue, params.split.replicate_of(seed))
+            neighbours.setdefault(encoder, []).extend(found)
+            if seed == min(params.ablation.seeds):
+                maps.append(map_frame(features, tested, catalogue).assign(encoder=str(encoder)))
+    return neighbours, pd.concat(maps, ignore_index=True)
 
 
 def described_frame(

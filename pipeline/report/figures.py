@@ -29,6 +29,7 @@ def draw_figures(
     effects: pd.DataFrame,
     confusion: pd.DataFrame,
     curves: pd.DataFrame,
+    maps: pd.DataFrame,
     properties: Mapping[str, Sequence[str]],
 ) -> list[str]:
     """Draw what there is figures for and remove figures of an earlier run.
@@ -36,6 +37,7 @@ def draw_figures(
     Args:
         confusion: property, rated, predicted; one row a video.
         curves: stage, name, step, value.
+        maps: encoder, method, x, y, and a column a property with classes.
         properties: the classes of each, in rising order.
 
     Returns:
@@ -46,6 +48,8 @@ def draw_figures(
         drawn["effects.png"] = draw_effects(effects)
     if len(confusion):
         drawn["confusion.png"] = draw_confusion(confusion, properties)
+    if len(maps):
+        drawn["map.png"] = draw_maps(maps, properties)
     if (curves["name"] == "loss").any():
         drawn["curves.png"] = draw_curves(curves)
     for old in folder.glob("*.png"):
@@ -109,6 +113,27 @@ def draw_confusion(confusion: pd.DataFrame, properties: Mapping[str, Sequence[st
     return figure
 
 
+def draw_maps(maps: pd.DataFrame, properties: Mapping[str, Sequence[str]]) -> Figure:
+    """Test videos by their mean embedding, coloured by class: a row a property, a column a method and encoder."""
+    columns = list(dict.fromkeys(zip(maps["method"], maps["encoder"], strict=True)))
+    figure, places = _panels(len(properties) * len(columns), 2.6, 2.6, across=len(columns))
+    for number, axes in enumerate(places):
+        name, (method, encoder) = list(properties)[number // len(columns)], columns[number % len(columns)]
+        rows = maps[(maps["method"] == method) & (maps["encoder"] == encoder)]
+        for level, color in zip(properties[name], SERIES, strict=False):
+            own = rows[rows[name] == level]
+            axes.plot(own["x"], own["y"], "o", color=color, markersize=3, alpha=0.8, label=level)
+        axes.set_xticks([])
+        axes.set_yticks([])
+        if number < len(columns):
+            axes.set_title(f"{method}, {encoder}", fontsize=10)
+        if number % len(columns) == 0:
+            axes.set_ylabel(name, fontsize=10)
+            axes.legend(frameon=False, fontsize=7, loc="best", handletextpad=0.1)
+        _quiet(axes)
+    return figure
+
+
 def draw_curves(curves: pd.DataFrame) -> Figure:
     """The loss of each training over its optimiser steps: a panel a stage, a colour a variant, a line a seed."""
     from matplotlib.lines import Line2D
@@ -137,12 +162,12 @@ def draw_curves(curves: pd.DataFrame) -> Figure:
     return figure
 
 
-def _panels(count: int, width: float, height: float, left: float = 0.0) -> tuple[Figure, list[Axes]]:
-    """A figure of so many panels, four in a row, each of this width and height in inches, with room at the left."""
+def _panels(count: int, width: float, height: float, left: float = 0.0, across: int = 4) -> tuple[Figure, list[Axes]]:
+    """A figure of so many panels, `across` in a row, each of this width and height in inches, with room at the left."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    across, down = min(count, 4), -(-count // 4)
+    across, down = min(count, across), -(-count // across)
     figure = Figure(figsize=(width * across + left, height * down), layout="constrained")
     FigureCanvasAgg(figure)
     grid = list(figure.subplots(down, across, squeeze=False).flat)

@@ -12,7 +12,7 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.core.records import ALL_SEEDS, CROSS_VALIDATION, HEADS, RECALL, VALIDATION_HEADS, Shown
+from pipeline.core.records import ALL_SEEDS, CROSS_VALIDATION, HEADS, NEIGHBOURS, RECALL, VALIDATION_HEADS, Shown
 from pipeline.report.load import DATASET, KEYS, Report, cells, published, published_datasets
 from pipeline.tasks import TASKS
 
@@ -20,7 +20,7 @@ Select = Callable[[pd.DataFrame], "pd.Series[bool]"]
 Cell = Callable[[dict[str, Any]], str]
 FULL = {"encoder": "finetuned", "lora": "with", "opd": "all"}
 CHOICE, COMBINED = "choice", "combined"
-NOT_ANSWERED = (HEADS, VALIDATION_HEADS, RECALL, CROSS_VALIDATION)
+NOT_ANSWERED = (HEADS, VALIDATION_HEADS, RECALL, CROSS_VALIDATION, NEIGHBOURS)
 """Tasks of scores.csv that no language model with touch answered."""
 PUBLISHED_MODELS = ("7b", "13b", "CLIP", "PG-InstructBLIP")
 SYSTEM_WORDS = {"base": "base encoder", "without": "without LoRA", "none": "without OPD", "needed": "OPD as needed"}
@@ -133,6 +133,7 @@ def task_title(task: str) -> str:
         VALIDATION_HEADS: "Property heads, validation videos",
         RECALL: "Property heads, class by class",
         CROSS_VALIDATION: "Cross-validation",
+        NEIGHBOURS: "Nearest neighbour",
         **{name: task.title for name, task in TASKS.items()},
     }
     return f"{titles[task]} ({task})" if task in TASKS else titles.get(task, task)
@@ -153,7 +154,7 @@ def system(row: dict[str, Any]) -> str:
         return others[touch]
     if task in (HEADS, VALIDATION_HEADS, RECALL):
         return "property heads, no language model"
-    if task == CROSS_VALIDATION:
+    if task in (CROSS_VALIDATION, NEIGHBOURS):
         return str(encoder)
     if not row["lora"]:
         return f"heads and rules, no language model{told}"
@@ -380,5 +381,15 @@ TABLES: tuple[Table, ...] = (
         "is the main evidence about encoders.",
         lambda f: f["task"].eq(CROSS_VALIDATION),
         ("measure", "system", "measured", "n", "chance"),
+    ),
+    Table(
+        "neighbours",
+        "What embeddings tell by themselves",
+        "Of the test videos, the share whose nearest neighbour among other objects' videos has their class, by the "
+        "embeddings of the fine-tuned encoder and of the base one (mean over frames); then those of each class alone, "
+        "which say what the map shows: classes that overlap have few of their own about them. Paired differences are "
+        "in encoder_effects.csv.",
+        lambda f: f["task"].eq(NEIGHBOURS),
+        ("measure", "encoder", "measured", "n", "chance"),
     ),
 )

@@ -19,10 +19,10 @@ from sklearn.preprocessing import StandardScaler
 from transformers import TrainerCallback
 
 from pipeline.config import PRETRAINED
-from pipeline.core.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore, Statistics
+from pipeline.core.embeddings import EmbeddingStore, Statistics
 from pipeline.core.errors import UserError
 from pipeline.core.io import save_tensors, write_table
-from pipeline.core.records import Assignment, Embedding, Part
+from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Assignment, Embedding, Part
 from pipeline.core.runtime import derive_seed, seed_everything
 from pipeline.encoder import finetune as training
 from pipeline.encoder.clip import load_visual_tower

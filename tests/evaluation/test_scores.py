@@ -216,6 +216,11 @@ def test_encoders_are_compared_video_by_video() -> None:
     assert (found.difference, found.low, found.high, found.p) == pytest.approx(expected, abs=1e-6)
     assert found.p_holm == found.p
     assert candidate_rows({"constant": CONSTANT}, "backbone") == []
+    rows = candidate_rows({"backbone": FROZEN, "constant": CONSTANT}, "backbone", "other", CATALOGUE.property_names)
+    assert [r.measure for r in rows] == ["combined", *CATALOGUE.property_names]
+    assert rows[0].difference == found.difference
+    hardness = np.mean([r.expected[0] == r.predicted[0] for r in CONSTANT]) - 7 / 8
+    assert rows[1].difference == pytest.approx(hardness, abs=1e-6)
 
 
 def test_errors_know_the_order_of_classes() -> None:

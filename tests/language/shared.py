@@ -11,9 +11,9 @@ from torch.nn import functional as F
 from transformers import MistralConfig, MistralForCausalLM
 
 from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig, TrainConfig
-from pipeline.core.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
+from pipeline.core.embeddings import EmbeddingStore
 from pipeline.core.io import save_tensors, write_table
-from pipeline.core.records import Embedding, Opd, Question
+from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Embedding, Opd, Question
 from pipeline.language.chat import encode, render
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import Job, Material, add_lora, assemble, fit

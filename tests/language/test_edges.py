@@ -13,10 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.config import LanguageConfig
-from pipeline.core.embeddings import INDEX_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
+from pipeline.core.embeddings import EmbeddingStore
 from pipeline.core.errors import UserError
 from pipeline.core.io import read_table, save_tensors
-from pipeline.core.records import Embedding, Opd, Question
+from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Embedding, Opd, Question
 from pipeline.language.chat import IGNORE_INDEX, Encoded, encode_turns
 from pipeline.language.generate import answer
 from pipeline.language.octopi import OctopiForCausalLM

@@ -25,7 +25,7 @@ from pipeline.report.dataset import dataset_tables
 from pipeline.report.load import DATASET, load_report
 from pipeline.report.page import write_page
 from pipeline.report.provenance import base_model, digest, encoder_words
-from pipeline.report.tables import TABLES
+from pipeline.report.tables import NOT_ANSWERED, TABLES
 from pipeline.videos.catalogue import Catalogue
 from tests.closure import ROOT
 from tests.fake_run import fake_params, write_run
@@ -34,9 +34,9 @@ from tests.report.shared import edit, files_of
 
 FILES = {
     *("README.md", "params.yaml", "provenance.json", "metrics.json", "samples.json", "scores.csv", "effects.csv"),
-    *("encoder_effects.csv", "encoder_errors.csv", "calibration.csv", "curves.csv", "confusion.csv"),
+    *("encoder_effects.csv", "encoder_errors.csv", "calibration.csv", "curves.csv", "confusion.csv", "map.csv"),
     *("described.csv", "dataset.csv", "audit.csv"),
-    *(f"figures/{name}.png" for name in ("effects", "confusion", "curves")),
+    *(f"figures/{name}.png" for name in ("effects", "confusion", "curves", "map")),
 }
 ONE = ("ablation.encoders=[finetuned]", "ablation.lora=[with]", "ablation.opd=[all]", "ablation.touch=[]")
 
@@ -73,7 +73,7 @@ def test_classes_may_read_like_nothing_or_like_numbers(written: Path, tmp_path: 
 def test_accuracies_are_those_of_the_graded_answers(written: Path) -> None:
     graded = read_table(written.parents[1] / "data" / "graded.parquet", Graded)
     rows = load_report(written).scores
-    answered = rows[~rows["task"].isin(["heads", "heads_validation", "heads_recall", "cross_validation", "described"])]
+    answered = rows[~rows["task"].isin(NOT_ANSWERED)]
     by_rule = answered["lora"] == ""
     assert set(answered.loc[by_rule, "task"]) == {"OPD", "PC", "PSS", "POM", "PSR"}
     answered = answered[~by_rule]
@@ -224,7 +224,7 @@ def test_a_run_that_measured_nothing_says_so_and_shows_no_picture_of_its_videos(
     assert "Whether answers depend on touch was not tested." in text
     assert "0, 0 videos" in text
     assert json.loads((report.folder / "metrics.json").read_text()) == {}
-    assert set(files_of(report.folder)) == FILES - {"figures/effects.png", "figures/confusion.png"}
+    assert set(files_of(report.folder)) == FILES - {f"figures/{name}.png" for name in ("effects", "confusion", "map")}
 
 
 def test_the_stage_does_not_load_a_network() -> None:

@@ -11,9 +11,12 @@ import pandas as pd
 import torch
 
 from pipeline.config import Params
-from pipeline.core.embeddings import INDEX_FILE, STATISTICS_FILE, TENSOR, TENSOR_FILE, EmbeddingStore
+from pipeline.core.embeddings import STATISTICS_FILE, EmbeddingStore
 from pipeline.core.io import fingerprint, save_tensors, write_json, write_jsonl, write_table
 from pipeline.core.records import (
+    INDEX_FILE,
+    TENSOR,
+    TENSOR_FILE,
     Assignment,
     Classification,
     Embedding,

@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.core.embeddings import TENSOR, TENSOR_FILE
 from pipeline.core.io import load_tensors, read_table, save_tensors, write_table
-from pipeline.core.records import Classification, Probe
+from pipeline.core.records import TENSOR, TENSOR_FILE, Classification, Probe
 from pipeline.use.folder import FORMAT, read_folder
 from pipeline.use.model import Octopi
 from pipeline.use.package import describe_base, export, package

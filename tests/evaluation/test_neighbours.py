@@ -1,0 +1,69 @@
+"""Nearest neighbours of other objects, against scikit-learn's; maps keep what is near, and are the same each time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from sklearn.model_selection import LeaveOneGroupOut, cross_val_predict
+from sklearn.neighbors import KNeighborsClassifier
+
+from pipeline.core.records import Assignment, Part
+from pipeline.evaluation.neighbours import MAPPED, map_frame, nearest_neighbours
+from pipeline.evaluation.scores import score_rows
+from tests.tasks.shared import CATALOGUE
+
+
+def videos(objects: int, each: int) -> list[Assignment]:
+    names = list(CATALOGUE.objects)[:objects]
+    return [Assignment(video_id=f"{o}_{i}", object_id=o, part=Part.TEST) for o in names for i in range(each)]
+
+
+@pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
+def test_neighbours_are_those_of_a_library(scale: float) -> None:
+    tested = videos(30, 4)
+    features = scale * np.random.default_rng(1).normal(size=(len(tested), 5)) + scale
+    found = nearest_neighbours(features, tested, CATALOGUE, repeat=2)
+    assert [r.video_id for r in found] == [v.video_id for v in tested]
+    assert {r.repeat for r in found} == {2}
+    groups = [v.object_id for v in tested]
+    for place in range(len(CATALOGUE.properties)):
+        labels = np.array([CATALOGUE.labels(o)[place] for o in groups])
+        model = KNeighborsClassifier(1, algorithm="brute")
+        expected = cross_val_predict(model, features, labels, groups=groups, cv=LeaveOneGroupOut())
+        assert [r.predicted[place] for r in found] == expected.tolist()
+    rows = {(r.measure, r.encoder): r for r in score_rows([], CATALOGUE, neighbours={"base": found})}
+    for place, p in enumerate(CATALOGUE.properties):
+        right = [r.expected[place] == r.predicted[place] for r in found]
+        assert rows[p.name, "base"].accuracy == pytest.approx(np.mean(right), abs=1e-6)
+        for level, word in enumerate(p.levels):
+            own = [ok for r, ok in zip(found, right, strict=True) if r.expected[place] == level]
+            if own:
+                assert rows[f"{p.name}: {word}", "base"].accuracy == pytest.approx(np.mean(own), abs=1e-6)
+
+
+def test_one_object_has_no_neighbours() -> None:
+    assert nearest_neighbours(np.zeros((3, 2)), videos(1, 3), CATALOGUE, 0) == []
+
+
+@pytest.mark.parametrize("count", [2, 3, 40, 130])
+def test_a_map_has_each_video_once_a_method_and_keeps_clusters_apart(count: int) -> None:
+    tested = videos(min(count, 65), max(1, count // 65))
+    far = 20.0 * (np.arange(len(tested)) % 2)
+    features = np.random.default_rng(0).normal(size=(len(tested), 8)) + far[:, None]
+    found = map_frame(features, tested, CATALOGUE)
+    assert found.equals(map_frame(features, tested, CATALOGUE)), "the same each time"
+    for _, rows in found.groupby("method"):
+        assert sorted(rows["video_id"]) == sorted(v.video_id for v in tested)
+        assert np.isfinite(rows[["x", "y"]].to_numpy()).all()
+        if count >= 40:
+            places = rows[["x", "y"]].to_numpy()
+            apart = np.linalg.norm(places[:, None] - places[None], axis=2) + np.where(np.eye(len(rows)), np.inf, 0)
+            assert (far[apart.argmin(1)] == far).all()
+
+
+def test_of_many_videos_a_map_has_some_evenly() -> None:
+    tested = videos(60, 10)
+    found = map_frame(np.random.default_rng(0).normal(size=(600, 3)), tested, CATALOGUE)
+    shown = found[found["method"] == "PCA"]
+    assert len(shown) == MAPPED
+    assert shown["video_id"].str.rpartition("_")[0].nunique() == 60
