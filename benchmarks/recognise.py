@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import platform
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ from benchmarks.table import Row, make_rows
 from pipeline.config.params import load_params
 from pipeline.core.io import read_table
 from pipeline.core.records import Probe, Video
-from pipeline.core.runtime import derive_seed, track
+from pipeline.core.runtime import derive_seed, processor, track
 
 Values = npt.NDArray[np.float64]
 KEPT, UNTOUCHED, SHUFFLED = "embedding", "untouched sensor", "names shuffled"
@@ -61,7 +60,7 @@ def measure(root: Path) -> list[Row]:
                 baseline=f"{KEPT}, all objects",
                 errors=errors,
                 error_of="share of touches taken for another object, each remembered by one touch",
-                machine=platform.processor() or platform.machine(),
+                machine=processor(),
             )
     return rows
 

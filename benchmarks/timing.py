@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from pathlib import Path
 from statistics import median
 from time import perf_counter
 from typing import TYPE_CHECKING, TypeVar
 
-from pipeline.core.runtime import cores
+from pipeline.core.runtime import cores, processor
 
 if TYPE_CHECKING:
     from torch import nn
@@ -51,10 +49,7 @@ def interleaved(
 
 def machine(threads: str) -> str:
     """The processor, how many cores there are and how many were used."""
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.is_file() else []
-    name = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
-    return f"{name}, {cores()} cores, {threads}"
+    return f"{processor()}, {cores()} cores, {threads}"
 
 
 def counted(run: Callable[[], R]) -> tuple[R, float]:

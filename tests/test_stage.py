@@ -59,6 +59,7 @@ def test_a_stage_says_when_it_starts_and_ends_and_what_it_cost(here: Path, capsy
     assert written["metrics"] == {"loss": 1.5, "steps": 5}
     assert written["started"] <= written["ended"]
     assert min(written[k] for k in ("seconds", "startup_seconds", "peak_memory_mb")) >= 0
+    assert f"{len(os.sched_getaffinity(0))} cores" in written["device"]
     first, last = capsys.readouterr().out.splitlines()
     assert first == "align@x: starts (smoke-scenes)"
     assert last.startswith("align@x: done in ")

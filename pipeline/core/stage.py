@@ -25,7 +25,7 @@ from pipeline.core.errors import UserError
 from pipeline.core.io import remove_rests, write_json
 from pipeline.core.parallel import end_with_parent, use_backend
 from pipeline.core.records import Measurement
-from pipeline.core.runtime import CHECKPOINTS, limit_threads, quiet_libraries
+from pipeline.core.runtime import CHECKPOINTS, cores, limit_threads, processor, quiet_libraries
 
 DATA = Path("data")
 RUNS = Path("runs")
@@ -216,6 +216,9 @@ def _write_run(running: Stage, started: float) -> None:
 
         unit = 1 if sys.platform == "darwin" else 1024
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
+    device, torch = f"{processor()}, {cores()} cores", sys.modules.get("torch")
+    if torch is not None and torch.cuda.is_available():
+        device, peak = torch.cuda.get_device_name(), torch.cuda.max_memory_allocated() / 2**20
     write_json(
         RUNS / f"{running.name}.json",
         {
@@ -223,6 +226,7 @@ def _write_run(running: Stage, started: float) -> None:
             "ended": datetime.now(UTC).isoformat(timespec="milliseconds"),
             "startup_seconds": round(started - process.create_time(), 3),
             "seconds": round(time.time() - started, 3),
+            "device": device,
             "peak_memory_mb": round(peak, 1),
             "metrics": running.metrics,
         },

@@ -11,9 +11,9 @@ import pytest
 import torch
 import yaml
 
-from benchmarks import contact, describing, encoder, frames, language, serving
+from benchmarks import contact, describing, encoder, frames, language, serving, training
 from benchmarks.table import Row, merge, read_rows
-from pipeline.core.io import write_csv, write_table
+from pipeline.core.io import write_csv, write_json, write_table
 from pipeline.core.records import Encoder, Graded, Lora, Opd, ScoreRow, Variant
 from pipeline.encoder import frame_classifier
 from pipeline.encoder.scene_encoder import SceneEncoder
@@ -181,3 +181,15 @@ def test_serving_asks_a_fresh_process_and_a_server(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(serving, "COMMAND", ["sh", "-c", "echo octopi: no such model >&2; exit 1"])
     with refused("octopi: no such model"):
         serving.measure(tmp_path)
+
+
+def test_trainings_are_read_from_what_the_stages_left(tmp_path: Path) -> None:
+    with refused("no training ran here; run `make repro` first"):
+        training.measure(tmp_path)
+    for name, seconds, peak in (("align@x-0", 60, 100), ("lora@x-0", 120, 300), ("embed", 9, 9), ("pretrain", 30, 50)):
+        write_json(tmp_path / "runs" / f"{name}.json", {"seconds": seconds, "peak_memory_mb": peak, "device": "a card"})
+    *paper, model, pretrained = training.measure(tmp_path)
+    assert [row.setting[:10] for row in paper] == ["the paper:"] * 3
+    assert (model.setting, model.cost, model.machine) == ("alignment and end to end: x-0", 3, "a card")
+    assert model.megabytes == pytest.approx(300 * 1.048576, rel=1e-3)
+    assert (pretrained.setting, pretrained.cost) == ("pretraining on scenes", 0.5)
