@@ -1,0 +1,106 @@
+"""A trained model's answers about a run's videos, whose objects it has never met: how the shipped model is tried."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+from pipeline.config import Params
+from pipeline.core.embeddings import EmbeddingStore
+from pipeline.core.errors import UserError
+from pipeline.core.records import Classification, GradedVision, Part, Shown, Video
+from pipeline.core.runtime import track
+from pipeline.evaluation.grading import conclude, grade
+from pipeline.language.generate import answer
+from pipeline.tasks.base import Pool
+from pipeline.tasks.questions import build_questions, counts_by_task
+from pipeline.use.model import Octopi
+from pipeline.videos.catalogue import Catalogue, load_catalogue
+
+BATCH = 64
+"""Answers at once: a gigabyte of keys and values. A processor reads all weights for each token of a batch, however many
+answers are in it."""
+
+
+class Touches(NamedTuple):
+    """Videos as the model's encoder has them."""
+
+    features: torch.Tensor
+    """Of all frames, one video after another: frames x dim."""
+    rows: dict[str, range]
+    """Where each video's frames are."""
+    classified: list[Classification]
+    """What its heads say."""
+
+
+def answers_about(octopi: Octopi, params: Params, videos: Sequence[Video]) -> list[GradedVision]:
+    """Ask `params.shipped` questions about the videos, and grade the answers and what follows by rule from the heads.
+
+    Real videos are asked about twice: as they are, and standardised by their own mean and deviation, which takes no
+    label. Another sensor shifts and scales embeddings.
+
+    Raises:
+        UserError: for an object that the model was trained on, or a video that it cannot use.
+    """
+    catalogue = load_catalogue(Path(params.data.catalogue)).asking(params.questions.scenarios)
+    catalogue = catalogue.called("number" if octopi.numbered else "catalogue")
+    of_object: dict[str, list[str]] = {}
+    for video in videos:
+        of_object.setdefault(video.object_id, []).append(video.video_id)
+    if met := sorted(octopi.catalogue.objects.keys() & of_object.keys()):
+        raise UserError(f"{octopi.name} knows {met[0]}, so it is not asked; set shipped to 0 in params.yaml")
+    # Half of them describe: those answers are short, and the others follow from what they say.
+    asked = {task: count for task, count in counts_by_task(params.questions, "evaluation").items() if count}
+    parts = {task: max(1, len(asked) - 1) if task == "OPD" else 1 for task in asked}
+    questions = build_questions(
+        Pool(Part.TEST, catalogue, of_object),
+        {task: params.shipped * part // sum(parts.values()) for task, part in parts.items()},
+        seed=params.questions.seed,
+        distinct=True,
+        facts=octopi.config.facts,
+    )
+    touches = touched(octopi, catalogue, Path(params.data.dir), videos)
+    ways = {Shown.TOUCH: touches.features}
+    if params.data.source == "videos":
+        std, mean = torch.std_mean(touches.features, dim=0)
+        ways[Shown.STANDARDISED] = (touches.features - mean) / std.clamp_min(1e-6)
+    config = octopi.config
+    language = config.language.model_copy(update={"generation_batch_size": BATCH})
+    scored = {}
+    for shown, features in ways.items():
+        store = EmbeddingStore().with_rows(touches.rows, features)
+        said = answer(octopi.llm, store, questions, config.opd, language, config.frames.per_video)
+        scored[shown] = grade(questions, said, catalogue)
+    scored[Shown.CLASSES] = conclude(questions, touches.classified, catalogue)
+    return [
+        GradedVision(**score.model_dump(), model=octopi.name, shown=shown, seed=params.ablation.seeds[0])
+        for shown, scores in scored.items()
+        for score in scores
+    ]
+
+
+def touched(octopi: Octopi, catalogue: Catalogue, folder: Path, videos: Sequence[Video]) -> Touches:
+    """Encode and classify videos."""
+    features, rows, classified = [torch.zeros(0, octopi.llm.octopi_config.tactile_dim)], dict[str, range](), []
+    for video in track(videos, "touches", "video"):
+        before = sum(map(len, features))
+        features.append(octopi.encoder.encode(folder / video.path).features)
+        rows[video.video_id] = range(before, before + len(features[-1]))
+        said = octopi.encoder.classify(folder / video.path)
+        found = zip(catalogue.properties, catalogue.labels(video.object_id), *said, strict=True)
+        classified += [
+            Classification(
+                video_id=video.video_id,
+                object_id=video.object_id,
+                part=Part.TEST,
+                property=prop.name,
+                expected=label,
+                predicted=level,
+                probabilities=probabilities,
+            )
+            for prop, label, probabilities, level in found
+        ]
+    return Touches(torch.cat(features), rows, classified)
