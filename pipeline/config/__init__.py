@@ -308,9 +308,6 @@ class LanguageConfig(Section):
     """Scale each projected tactile embedding to the root mean square of the word embeddings. Without, alignment at a
     high rate makes them a hundred times as long as words, and what attention adds to them, as which video they are of,
     is lost in them."""
-    touch_noise: Annotated[float, Field(ge=0, le=10)] = 0.0
-    """Deviation of the normal noise on the standardised embeddings in training, one draw a video: few objects are apart
-    in many dimensions, and without it a language model learns them by heart."""
     max_new_tokens: Annotated[int, Field(ge=1, le=4096)] = 256
     """Of an answer; fewer where the language model has no more positions. Longer answers are cut and marked."""
     generation_batch_size: Positive = 32
@@ -486,12 +483,6 @@ class Params(Section):
     def _scenes_have_their_place(self) -> Self:
         if self.data.source == "scenes" and Path(self.data.dir) != SCENES_DIR:
             raise ValueError(f"data.dir must be {SCENES_DIR} where data.source is scenes (set data.source=videos?)")
-        return self
-
-    @model_validator(mode="after")
-    def _noise_has_its_scale(self) -> Self:
-        if self.language.touch_noise and not self.encoder.standardize:
-            raise ValueError("language.touch_noise is in deviations of the embeddings; set encoder.standardize=true")
         return self
 
     @model_validator(mode="after")

@@ -33,7 +33,6 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
         positions: Tokens that the language model can read at once; None where that is unknown.
         given: Ids of questions whose descriptions are given: nothing of them is learnt.
         by_question: Divide the weights of a conversation by their sum, so that all conversations weigh alike.
-        touch_noise: Deviation of the normal noise on embeddings, one draw a video of a question and epoch.
 
     Raises:
         UserError: naming the question that is too long, or has nothing to learn from.
@@ -54,14 +53,12 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
         bos: bool = True,
         given: Collection[str] = (),
         by_question: bool = True,
-        touch_noise: float = 0.0,
     ) -> None:
         super().__init__()
         self.questions = [q for q in questions if q.dialogue(opd)]
         self.store = store
         self.per_video = per_video
         self.flip_probability = flip_probability
-        self.touch_noise = touch_noise
         self.seed = seed
         self.by_question = by_question
         self.encoded: list[Encoded] = []
@@ -97,16 +94,10 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
         question = self.questions[index]
         rng = random.Random(derive_seed(self.seed, self.epoch, question.question_id))
         parts = [torch.zeros(0, self.store.dim)]
-        for place, video_id in enumerate(question.videos):
+        for video_id in question.videos:
             positions = sample_training(self.store.count(video_id), self.per_video, rng)
             horizontal, vertical = (rng.random() < self.flip_probability for _ in range(2))
-            features = self.store.features(video_id, positions, FLIPS[horizontal + 2 * vertical])
-            if self.touch_noise:
-                # Of a stream of its own, so that the same frames are drawn with noise and without.
-                seed = derive_seed(self.seed, self.epoch, question.question_id, "noise", place)
-                drawn = torch.randn(self.store.dim, generator=torch.Generator().manual_seed(seed))
-                features = features + self.touch_noise * drawn
-            parts.append(features)
+            parts.append(self.store.features(video_id, positions, FLIPS[horizontal + 2 * vertical]))
         return self._tensors(self.encoded[index], torch.cat(parts), self.weights[index])
 
     def _tensors(self, encoded: Encoded, features: torch.Tensor, weights: torch.Tensor) -> dict[str, torch.Tensor]:

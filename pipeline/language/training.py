@@ -181,7 +181,6 @@ def assemble(
         positions=model.positions,
         bos=language.bos,
         by_question=config.weighting == "question",
-        touch_noise=language.touch_noise,
         given=given,
     )
     return model, data

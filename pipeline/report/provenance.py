@@ -93,7 +93,7 @@ def provenance(
 
 BEYOND = {
     "questions": ("wording", "names", "inexact", "restate", "two_turns", "plainly"),
-    "language": ("start", "normalize_touch", "touch_noise"),
+    "language": ("start", "normalize_touch"),
     "align": ("weighting", "begin_with_words"),
     "lora": ("weighting", "target_modules", "dropout", "given"),
 }

@@ -21,7 +21,7 @@ from pipeline.language.chat import IGNORE_INDEX, encode, render
 from pipeline.language.conversations import FILLER, UpdateSampler, collate
 from pipeline.language.generate import write_prompt
 from pipeline.language.training import Material, assemble
-from tests.language.shared import DIM, FRAMES, generation, taking
+from tests.language.shared import FRAMES, generation, taking
 
 
 def test_without_a_begin_token_all_else_is_the_same(held: Material) -> None:
@@ -48,27 +48,6 @@ def test_same_draws_for_same_epoch_and_others_for_another(held: Material) -> Non
     assert all(torch.equal(a, data[i]["features"]) for i, a in enumerate(first))
     data.follow(lambda: 1)
     assert not all(torch.equal(a, data[i]["features"]) for i, a in enumerate(first))
-
-
-def test_noise_is_drawn_once_a_video_and_anew_for_each_question_and_epoch(held: Material) -> None:
-    """Held against what is given without: all frames of a video move alike, by a normal draw of that deviation."""
-    noisy = replace(held, language=held.language.model_copy(update={"touch_noise": 1.5}))
-    (_, plain), (_, moved) = (assemble(material, taking(11), "test") for material in (held, noisy))
-    draws = []
-    for epoch in range(20):
-        for data in (plain, moved):
-            data.follow(lambda: epoch)  # noqa: B023 - asked in this round alone
-        for index in range(len(plain)):
-            noise = (moved[index]["features"] - plain[index]["features"]).view(-1, FRAMES, DIM)
-            assert torch.allclose(noise, noise[:, :1].expand_as(noise), atol=1e-5)
-            draws.append(noise[:, 0])
-    drawn = torch.cat(draws)
-    assert len({tuple(row.tolist()) for row in drawn}) == len(drawn) > 300
-    assert drawn.std() == pytest.approx(1.5, rel=0.05)
-    assert drawn.mean() == pytest.approx(0, abs=0.1)
-    assert drawn.T.corrcoef().fill_diagonal_(0).abs().max() < 0.25
-    again = moved[3]["features"]
-    assert torch.equal(moved[3]["features"], again), "a resumed training sees the same"
 
 
 @settings(max_examples=30)
