@@ -7,7 +7,7 @@ from pipeline.core.io import read_table, write_table
 from pipeline.core.records import Assignment, Part, Video
 from pipeline.core.stage import DATA, stage
 from pipeline.videos.catalogue import load_catalogue
-from pipeline.videos.split import assign, assign_objects, without_videos
+from pipeline.videos.split import assign, assign_objects, untested
 
 
 def main() -> None:
@@ -22,8 +22,8 @@ def main() -> None:
                 run.metrics[f"{seed}.{part}_objects"] = len({a.object_id for a in split if a.part == part})
         if not any(run.metrics[f"{seed}.{Part.TEST}_objects"] for seed in run.params.ablation.seeds):
             present = {video.object_id for video in videos}
-            lacking = without_videos(assign_objects(catalogue, present, config), present)
-            logging.getLogger(__name__).warning("nothing can be asked, as %s", lacking)
+            lacking = untested(assign_objects(catalogue, present, config), present)
+            logging.getLogger(__name__).warning("%s", lacking)
 
 
 if __name__ == "__main__":

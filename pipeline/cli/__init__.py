@@ -383,12 +383,15 @@ def compare(
 @app.command()
 def rank(
     property: Annotated[str, typer.Argument(help="Such as hardness.")],
-    videos: Annotated[list[str], typer.Argument(help="Two videos or more.")],
+    paths: Annotated[list[Path], typer.Argument(metavar="VIDEOS...", help="Two videos or more, or folders of them.")],
     model: Model = None,
     base: Base = None,
     device: Device = "auto",
 ) -> None:
     """Order videos by a property, least first, each with its expected class, and ask the model about two or three."""
+    from pipeline.use.ask import videos_of
+
+    videos = [file for file, _ in videos_of(paths)]
     found = _load(model, base, device).rank(videos, property)
     classes = ", ".join(f"{number} {level}" for number, level in enumerate(found.levels))
     typer.echo(f"{found.property} by the property heads: {classes}")

@@ -45,6 +45,9 @@ def reproduce(root: Path, arguments: list[str]) -> int:
     """Run `dvc repro` with these arguments where anything changed; return its exit status."""
     from dvc.cli import main as dvc
 
+    from pipeline.tracking.publish import publish
+    from pipeline.tracking.store import MLRUNS, attempt
+
     stopped: list[BaseException] = []
 
     def heard(record: logging.LogRecord) -> bool:
@@ -54,7 +57,8 @@ def reproduce(root: Path, arguments: list[str]) -> int:
             stopped.append(error)
         return not stopped
 
-    name = load_params(root / "params.yaml").report_name
+    params = load_params(root / "params.yaml")
+    name = params.report_name
     waiting, total = outdated(root)
     if waiting:
         print(f"{name}: up to {waiting} of {total} stages will run", flush=True)
@@ -68,6 +72,9 @@ def reproduce(root: Path, arguments: list[str]) -> int:
             return 130 if stopped else status
     else:
         print(f"{name}: all {total} stages are up to date")
+    if not (params.tracking.uri or (MLRUNS / "mlflow.db").is_file()):
+        # A clone has the lock of a chain that ran elsewhere, so that DVC does not publish it; MLflow has nothing yet.
+        attempt(params.tracking, publish, params)
     print(f"Report: reports/{name}/README.md; all reports on one page: reports/index.html")
     print("Dashboard: make dashboard, then open http://127.0.0.1:5000")
     return 0

@@ -24,7 +24,7 @@ from pipeline.scenes.invented import catalogue_of
 from pipeline.tasks.questions import counts_by_task
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.files import list_videos, raise_errors
-from pipeline.videos.split import FEWEST_TRAINING_OBJECTS, assign_objects, without_videos
+from pipeline.videos.split import FEWEST_TRAINING_OBJECTS, assign_objects, untested
 from pipeline.weights.check import check_encoder_files, check_language_files
 
 CONF = Path("conf")
@@ -134,12 +134,12 @@ def check_objects(params: Params, catalogue: Catalogue) -> str:
         training, tested = (sorted(o for o in present if parts.get(o) == part) for part in (Part.TRAIN, Part.TEST))
         fold = params.split.fold_of(seed)
         where = f"split.name={params.split.name}" + (f", fold {fold}" if fold is not None else "")
-        if absent := without_videos(parts, present):
+        if absent := untested(parts, present):
             lacking = f"{where}: {absent}"
         if len(training) < FEWEST_TRAINING_OBJECTS:
             raise UserError(
                 f"{where}: {len(training)} training objects have videos, but questions about three objects need three; "
-                "add objects, or choose another split.name"
+                f"add objects, or {'raise split.folds' if fold is not None else 'choose another split.name'}"
             )
         if len(tested) == 1 and Touch.SWAPPED in params.ablation.touch:
             raise UserError(

@@ -149,11 +149,11 @@ def describe_folder(model: Octopi, paths: Sequence[Path], out: Path) -> tuple[in
     Raises:
         UserError: for a folder without videos, or a file that another model or something else wrote.
     """
-    files = _files(paths)
+    files = videos_of(paths)
     levels = {p.name: p.levels for p in model.catalogue.properties}
     probabilities = [f"{name}: {level}" for name, known in levels.items() for level in known]
     columns = ["file", *levels, *probabilities, "sentence", "frames", "notes", "error", "model"]
-    done = _done(out, columns, model.config.name)
+    done = _done(out, columns, _whose(model))
     rest = [(file, name) for file, name in files if name not in done]
     failed = sum(bool(error) for error in done.values())
     if not out.is_file() or not done:
@@ -178,7 +178,7 @@ def described(model: Octopi, paths: Sequence[Path]) -> tuple[Table, list[str]]:
     Raises:
         UserError: the first video's error, where none could be described.
     """
-    files = _files(paths)
+    files = videos_of(paths)
     table = Table("video", *model.properties, "in words")
     notes, errors = [*model.doubts], list[str]()
     for start in range(0, len(files), BATCH):
@@ -193,7 +193,7 @@ def described(model: Octopi, paths: Sequence[Path]) -> tuple[Table, list[str]]:
     return table, [*errors, *notes]
 
 
-def _files(paths: Sequence[Path]) -> list[tuple[Path, str]]:
+def videos_of(paths: Sequence[Path]) -> list[tuple[Path, str]]:
     """The videos that paths name, each as a row calls it: from the one folder that is named, else by its whole path."""
     found: list[tuple[Path, str]] = []
     for path in paths:
@@ -208,6 +208,11 @@ def _files(paths: Sequence[Path]) -> list[tuple[Path, str]]:
         named = files if paths[1:] else [file.relative_to(start) for file in files]
         found += zip(files, [readable(name.as_posix()) for name in named], strict=True)
     return found
+
+
+def _whose(model: Octopi) -> str:
+    """What a CSV calls a model, by which rows of another one are told apart."""
+    return f"{model.name} {model.config.digest}"
 
 
 def _done(out: Path, columns: Sequence[str], name: str) -> dict[str, str]:
@@ -229,7 +234,7 @@ def _describe(model: Octopi, files: Sequence[tuple[Path, str]]) -> list[dict[str
     rows: list[dict[str, object]] = []
     good = []
     for file, name in files:
-        row: dict[str, object] = {"file": name, "model": model.config.name}
+        row: dict[str, object] = {"file": name, "model": _whose(model)}
         rows.append(row)
         try:
             model.look(file)

@@ -94,9 +94,9 @@ class ModelConfig(Record):
     """Of the libraries that it was made with."""
 
     @property
-    def name(self) -> str:
-        """The variant and a hash of all that answers depend on: two trainings of one variant have two names."""
-        return f"{self.variant} {fingerprint(self.model_copy(update={'scores': {}, 'versions': {}}))}"
+    def digest(self) -> str:
+        """A hash of all that answers depend on, by which two trainings of one variant are told apart."""
+        return fingerprint(self.model_copy(update={"scores": {}, "versions": {}}))
 
 
 def identify(folder: Path) -> dict[str, str]:

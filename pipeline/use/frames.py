@@ -67,8 +67,8 @@ def prepare_video(video: Video, frames: FramesConfig, *, subtracts: bool, quiet:
     touched = probe.contact > quiet
     if not touched:
         notes.append(f"nothing touches the sensor: strength {probe.contact:.2f}, where noise alone has {quiet:.2f}")
-    elif probe.contact <= FOUND * quiet:
-        notes.append(f"little touches the sensor: strength {probe.contact:.2f}, where noise alone has {quiet:.2f}")
+    elif probe.contact <= FOUND * (noise := max(quiet, probe.quiet)):
+        notes.append(f"little touches the sensor: strength {probe.contact:.2f}, where noise alone has {noise:.2f}")
     if probe.unsteady:
         notes.append(f"the light is {unsteady(probe)}")
     if probe.hdr:

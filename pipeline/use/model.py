@@ -272,8 +272,8 @@ class Octopi:
         """
         called: dict[str, str] = {}
         if len(videos) != len(names) or len(videos) not in (2, 3):
-            given = f"{counted(len(videos), 'video')} and {counted(len(names), 'name')}"
-            raise UserError(f"{given}: two or three of each can be matched")
+            given = f"{counted(len(videos), 'video')} and {counted(len(names), 'name')} ({'; '.join(names)})"
+            raise UserError(f"{given}: two or three of each can be matched; write {self._example()}; ...")
         if isinstance(names, Mapping):
             objects = [self._told(name, classes) for name, classes in names.items()]
         else:

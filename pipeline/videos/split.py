@@ -72,6 +72,16 @@ def assign_objects(
     return parts
 
 
+def untested(parts: Mapping[str, Part], present: Collection[str]) -> str:
+    """In words, which objects have videos but no part, and whether any is for test; empty where all is well."""
+    said = [without_videos(parts, present)]
+    if spare := sorted(o for o in present if parts.get(o, Part.UNUSED) is Part.UNUSED):
+        said.append(f"{len(spare)} with videos are in no part ({', '.join(spare)}): objects.csv gives parts")
+    if not any(parts.get(o) is Part.TEST for o in present):
+        said.append("so nothing can be asked; split.name=kfold tests every object that has videos")
+    return "; ".join(filter(None, said))
+
+
 def without_videos(parts: Mapping[str, Part], present: Collection[str]) -> str:
     """In words, how many test and validation objects have no videos, and which; empty where all have some."""
     said = []

@@ -182,7 +182,8 @@ def _to_be_made(folder: Path, kind: str, key: str) -> bool:
         return False
     fitting = [n for n, other in MADE.items() if other.kind == kind]
     if name not in fitting:
-        raise UserError(f"{key}: {folder} is none that is made here; allowed below {MADE_DIR}: {', '.join(fitting)}")
+        allowed = f"allowed below {MADE_DIR}: {', '.join(fitting)}" if fitting else f"name a folder of a {kind}"
+        raise UserError(f"{key}: {folder} is none that is made here; {allowed}")
     package = MADE[name].package
     if not folder.exists() and package is not None:
         installed(package)
@@ -198,7 +199,7 @@ def installed(package: str) -> metadata.Distribution:
 
 
 def _mend(folder: Path, text: str) -> str:
-    return again(folder) if made(folder) else text.format(folder=folder)
+    return again(folder) if made(folder) else (text or "name the folder that has it").format(folder=folder)
 
 
 class Backbone(NamedTuple):

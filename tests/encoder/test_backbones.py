@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -395,3 +395,33 @@ def test_a_stage_that_cannot_be_read_is_one_line(timm_folder: Path, tmp_path: Pa
         loaded(timm_folder, 9)
     with refused("neither a CNN nor a plain vision transformer"):
         loaded(write_timm(tmp_path / "windows", "swin_s3_tiny_224"), 2)
+
+
+def test_the_backbone_of_the_documentation_works(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As it stands in docs/encoders.md: module and entry."""
+    from transformers import Dinov2Config, Dinov2Model
+
+    module, entry = (ROOT / "docs" / "encoders.md").read_text().split("```python\n")[1:3]
+    written = ModuleType("pipeline.encoder.dino")
+    exec(module.split("```")[0], written.__dict__)
+    monkeypatch.setitem(sys.modules, written.__name__, written)
+    for name, backbone in eval("{" + entry.split("```")[0] + "}", {"Backbone": Backbone}).items():
+        monkeypatch.setitem(BACKBONES, name, backbone)
+    sizes = Dinov2Config(hidden_size=12, num_hidden_layers=2, num_attention_heads=2, image_size=28, patch_size=14)
+    network = Dinov2Model(sizes).eval()
+    network.save_pretrained(tmp_path)
+    own = config(recipe="tuned", backbone=("dino",), weights=str(tmp_path))
+    check_encoder(tmp_path, 28, ("dino",))
+    check_encoder_files(tmp_path, ("dino",))
+    frames = torch.randint(256, (3, 28, 28, 3), dtype=torch.uint8)
+    embedded = base_encoder(own)(frames, torch.zeros(3, dtype=torch.int64))
+    with torch.no_grad():
+        patches = network(pixel_values=(frames.permute(0, 3, 1, 2) / 255 - 0.5) / 0.5).last_hidden_state[:, 1:]
+    torch.testing.assert_close(embedded, patches.mean(1), rtol=1e-4, atol=1e-5)
+    learnt = [name for name, p in property_classifier(own, CLASSES).named_parameters() if p.requires_grad]
+    assert any(".layer.1." in name for name in learnt)
+    assert not any(".layer.0." in name for name in learnt)
+    with refused(r"nothing.config.json does not exist; name the folder that has it"):
+        check_encoder(tmp_path / "nothing", 28, ("dino",))
+    with refused("tiny-clip is none that is made here; name a folder of a dino"):
+        check_encoder(Path("data/weights/tiny-clip"), 28, ("dino",))
