@@ -459,6 +459,23 @@ def recognise(
 
 
 @app.command()
+def adapt(
+    videos: Annotated[list[Path], typer.Argument(help="Videos of another sensor, or folders of them; no labels.")],
+    out: Annotated[Path, typer.Option(help="Folder of the copy, which --model names.")],
+    model: Model = None,
+    base: Base = None,
+    device: Device = "auto",
+) -> None:
+    """Copy a model for another sensor, whose videos say by how much it shifts and scales what the model reads."""
+    from pipeline.use.ask import videos_of
+    from pipeline.use.package import adapt as fit
+
+    found = videos_of(videos)
+    fit(_load(model, base, device), [file for file, _ in found], out)
+    typer.echo(f"{out}: fitted to {counted(len(found), 'video')}; name it with --model {out}")
+
+
+@app.command()
 def live(
     camera: Annotated[str, typer.Argument(help="A camera's index (0 is the first) or address, or a video.")],
     question: Annotated[str, typer.Option("--ask", help="Asked of each press, in place of a description.")] = "",

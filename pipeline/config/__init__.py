@@ -169,9 +169,9 @@ class QuestionsConfig(Section):
     matching staying the nearest; exact facts teach to look for equal classes alone. PSS: chance that descriptions are
     given and take another object for the extreme one, too; then touch decides."""
     restate: bool = False
-    """Where everything is described (OPD `all`), have answers take steps before they conclude, for a language model
-    too small to find and compare at once. PC and PSS: the classes of the one property that is asked for, and which
-    object has more or less of it. POM: by how many classes each object differs from each fact. Reports say so."""
+    """Where everything is described (OPD `all`), have answers to PC and PSS name the classes of the one property that
+    is asked for, and which object has more or less of it, before they conclude: for a language model too small to find
+    and compare at once. Reports say so."""
     two_turns: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """Share of the training questions about several videos that become a dialogue in OPD mode `all`: the first turn
     describes all videos, as in scenarios (PSR), and each later one asks a question about them."""

@@ -57,8 +57,6 @@ class Draft:
     gold: Gold
     finding: str = ""
     """What the classes of the property asked for lead to, before it is put as an answer: "Harder: second object."."""
-    facts: tuple[tuple[int, ...], ...] = ()
-    """The classes that the question tells of each object, where it tells any."""
 
 
 class TaskDefinition(ABC):

@@ -34,29 +34,29 @@ TRIES = 60
 """Draws of inexact facts before they are told as they are."""
 
 
-def words(catalogue: Catalogue, labels: Sequence[int]) -> list[str]:
-    """The words for the class of each property."""
-    return [p.levels[level] for p, level in zip(catalogue.properties, labels, strict=True)]
+def fact(catalogue: Catalogue, object_id: str, labels: Sequence[int] | None = None) -> str:
+    """What an object is like: "hard, smooth, no bumps is a ruler."; by these classes in place of its own, if given."""
+    labels = labels or catalogue.labels(object_id)
+    classes = [p.levels[level] for p, level in zip(catalogue.properties, labels, strict=True)]
+    return sentence(classes, catalogue.objects[object_id].name)
 
 
 def sentence(classes: Iterable[str], name: str) -> str:
-    """What an object is like: "hard, smooth, no bumps is a ruler."."""
+    """A fact of any object."""
     return f"{', '.join(classes)} is {name}."
 
 
-def facts(
-    catalogue: Catalogue, objects: Sequence[str], rng: random.Random, inexact: float = 0.0
-) -> tuple[tuple[int, ...], ...]:
-    """The classes that are told of each object.
+def facts(catalogue: Catalogue, objects: Sequence[str], rng: random.Random, inexact: float = 0.0) -> str:
+    """What each object is like, in random order.
 
     Args:
         inexact: Chance that the class of a property is a neighbour of the right one. The right matching stays nearer
             than any other.
     """
-    right = tuple(map(catalogue.labels, objects))
+    right = [catalogue.labels(o) for o in objects]
     told = right
     for _ in range(TRIES if inexact else 0):
-        told = tuple(
+        told = [
             tuple(
                 rng.choice([n for n in (level - 1, level + 1) if 0 <= n < len(p.levels)] or [level])
                 if rng.random() < inexact
@@ -64,20 +64,12 @@ def facts(
                 for p, level in zip(catalogue.properties, labels, strict=True)
             )
             for labels in right
-        )
-        others = (steps(told, order) for order in itertools.permutations(right) if order != right)
+        ]
+        others = (steps(told, order) for order in itertools.permutations(right) if list(order) != right)
         if steps(told, right) < min(others):
             break
         told = right
-    return told
-
-
-def told_first(
-    catalogue: Catalogue, objects: Sequence[str], labels: Sequence[Sequence[int]], rng: random.Random
-) -> str:
-    """What a question begins with: what each object is like, by these classes, in random order."""
-    names = [catalogue.objects[o].name for o in objects]
-    sentences = [sentence(words(catalogue, own), name) for own, name in zip(labels, names, strict=True)]
+    sentences = [fact(catalogue, o, labels) for o, labels in zip(objects, told, strict=True)]
     return " ".join(rng.sample(sentences, len(sentences)))
 
 
@@ -157,29 +149,18 @@ class PropertyObjectMatching(TaskDefinition):
     def with_facts(self, draft: Draft, catalogue: Catalogue, rng: random.Random, inexact: float = 0.0) -> Draft:
         """The same question after the facts about its objects; touch and reasoning remain to be asked for."""
         told = facts(catalogue, draft.objects, rng, inexact)
-        beginning = told_first(catalogue, draft.objects, told, rng)
 
         def begin(dialogue: Dialogue) -> Dialogue:
             first, *rest = dialogue.turns
-            first = first.model_copy(update={"user": f"{beginning} {first.user}"})
+            first = first.model_copy(update={"user": f"{told} {first.user}"})
             return dialogue.model_copy(update={"turns": (first, *rest)})
 
-        return replace(draft, dialogues=tuple(map(begin, draft.dialogues)), facts=told)
+        return replace(draft, dialogues=tuple(map(begin, draft.dialogues)))
 
     def restated(self, draft: Draft, catalogue: Catalogue) -> Draft:
-        """The question whose answer counts, behind descriptions of everything, by how many classes each pair differs.
-
-        One such line a video: "a) soft, rough, no bumps: object 7 0+1+0=1, object 12 2+0+1=3, object 9 1+1+1=3." The
-        right matching has the smallest sum. A small model finds one class and compares it, but not nine in a token.
-        """
-        told = zip(draft.objects, draft.facts or draft.gold.labels, strict=True)
-        named = sorted(((catalogue.objects[o].name, fact) for o, fact in told), key=lambda one: one[0].lower())
-        lines = []
-        for letter, labels in zip(LETTERS, draft.gold.labels, strict=True):
-            off = [(name, [abs(a - b) for a, b in zip(labels, fact, strict=True)]) for name, fact in named]
-            counted = (f"{name} {'+'.join(map(str, apart))}={sum(apart)}" for name, apart in off)
-            lines.append(f"{letter}) {', '.join(words(catalogue, labels))}: {', '.join(counted)}.")
-        return before_concluding(draft, " ".join(lines))
+        """The question whose answer, behind descriptions of everything, says of each video what a fact would."""
+        told = zip(LETTERS, draft.objects, strict=True)
+        return before_concluding(draft, " ".join(f"{x}) {fact(catalogue, o)}" for x, o in told))
 
     def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str:
         """The matching that `nearest` finds."""

@@ -90,8 +90,6 @@ def build_questions(
             more = further(definition, pool, draft, turns) if asked_on else []
             if not asked_on and turns.random() < plainly:
                 draft = definition.plainly(draft, pool.catalogue, turns)
-            if facts:
-                draft = definition.with_facts(draft, pool.catalogue, order, inexact)
             if restate:
                 draft, *more = (definition.restated(d, pool.catalogue) for d in (draft, *more))
             if asked_on:
@@ -99,6 +97,8 @@ def build_questions(
                 # A choice may stand anywhere, also first, where a scenario's stands.
                 more += islice(filter(None, choices), CHOICES)
                 draft = in_turns(draft, turns.sample(more, len(more)))
+            if facts:
+                draft = definition.with_facts(draft, pool.catalogue, order, inexact)
             questions.append(
                 Question(
                     question_id=f"{task}-{place}-{number:05d}",

@@ -62,6 +62,7 @@ class Octopi:
     It remembers no conversation: the caller hands the earlier exchanges in. One call at a time.
 
     Attributes:
+        folder: That it was loaded from.
         name: Of the folder that is shipped, else the variant's.
         card: What the folder's config.json says.
         properties: The catalogue's properties.
@@ -73,7 +74,7 @@ class Octopi:
     def __init__(
         self, folder: Path, config: ModelConfig, catalogue: Catalogue, llm: OctopiForCausalLM, device: torch.device
     ) -> None:
-        self.config, self.catalogue = config, catalogue
+        self.folder, self.config, self.catalogue = folder, config, catalogue
         self.name = SHIPPED.name if folder == SHIPPED else config.variant
         self.llm = llm.to(device)
         self.card: Mapping[str, Any] = config.model_dump(mode="json")
@@ -288,8 +289,8 @@ class Octopi:
         catalogue = Catalogue(language=self.catalogue.language, objects=found)
         question = pom.asked(pom.OPENINGS[len(listed) == 2], listed)[self.config.opd]
         if self.config.facts or isinstance(names, Mapping):
-            rng, labels = random.Random(derive_seed("facts", *listed)), [o.labels for o in found.values()]
-            question = f"{pom.told_first(catalogue, list(found), labels, rng)} {question}"
+            facts = pom.facts(catalogue, list(found), random.Random(derive_seed("facts", *listed)))
+            question = f"{facts} {question}"
         answer = self.ask(question, videos)
         read = pom.read(answer, listed)
         said = None if read is None else tuple(listed[read[letter]] for letter in LETTERS[: len(listed)])

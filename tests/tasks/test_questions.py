@@ -7,7 +7,6 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from scipy.optimize import linear_sum_assignment
 
 from pipeline.config import SplitConfig
 from pipeline.core.records import Opd, Part, Question
@@ -157,31 +156,6 @@ def test_inexact_facts_leave_the_right_matching_the_nearest() -> None:
         off[sum(int(np.abs(said[o] - own).sum()) for o, own in zip(question.objects, right, strict=True))] += 1
     # Of nine classes a question, where .35 of each are drawn off and some drawings are refused.
     assert 1.5 < sum(n * count for n, count in off.items()) / 200 < 9 * 0.35
-
-
-@pytest.mark.parametrize("chance", [0.0, 0.35])
-def test_a_matching_counts_by_how_many_classes_each_pair_differs(chance: float) -> None:
-    """As a second implementation reads them back; the assignment of the smallest sum is the one that is concluded."""
-    told = build_questions(
-        POOLS[Part.TRAIN], {"POM": 60}, seed=1, distinct=True, facts=True, inexact=chance, restate=True
-    )
-    place = {word: level for p in CATALOGUE.properties for level, word in enumerate(p.levels)}
-    for question in told:
-        (turn,) = next(d.turns for d in question.dialogues if d.opd is Opd.ALL)
-        names = [CATALOGUE.objects[o].name for o in question.objects]
-        facts = {n: [place[w] for w in turn.user.split(f" is {n}.")[0].split(". ")[-1].split(", ")] for n in names}
-        counted = np.zeros((3, 3))
-        for row, own in enumerate(question.gold.labels):
-            line = turn.assistant[turn.described :].split(f"{'abc'[row]}) ", 1)[1]
-            assert [place[w] for w in line.split(": ")[0].split(", ")] == list(own)
-            for column, name in enumerate(names):
-                terms, total = line.split(f"{name} ", 1)[1].split("=")[:2]
-                apart = np.abs(np.subtract(own, facts[name]))
-                assert [int(term) for term in terms.split("+")] == apart.tolist()
-                assert int(total[0]) == apart.sum()
-                counted[row, column] = apart.sum()
-        rows, columns = linear_sum_assignment(counted)
-        assert columns.tolist() == rows.tolist(), "names stand in the order of their videos here"
 
 
 def test_ties_are_given_and_not_learnt_and_their_conclusion_is_the_right_one() -> None:

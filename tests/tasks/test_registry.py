@@ -14,6 +14,7 @@ from pipeline.core.records import Dialogue, Opd, Question, Turn
 from pipeline.evaluation.grading import grade
 from pipeline.tasks import TASKS, psr
 from pipeline.tasks.base import TaskDefinition
+from pipeline.tasks.pom import fact
 from pipeline.tasks.questions import CHOICES, build_questions, counts_by_task
 from tests.conftest import ROOT, refused
 from tests.tasks.shared import CATALOGUE, POOL, predicted
@@ -114,12 +115,17 @@ def test_a_share_of_the_questions_takes_several_turns() -> None:
 
 
 def test_classes_are_restated_before_a_conclusion() -> None:
-    """Where everything was described: of the property that is asked for, with what has most of it."""
-    changed = reworded({"OPD": 4, "PC": 36, "PSS": 36, "PSR": 6}, restate=True)
-    assert Counter(q.task for q, _ in changed) == {"PC": 36, "PSS": 36}
+    """Where everything was described: of the property that is asked for, with what has most of it; of a matching the
+    facts of each object."""
+    changed = reworded({"OPD": 4, "PC": 36, "PSS": 36, "POM": 6, "PSR": 6}, restate=True)
+    assert Counter(q.task for q, _ in changed) == {"PC": 36, "PSS": 36, "POM": 6}
     for question, restated in changed:
         (*_, old), (*_, new) = turns_of(question), turns_of(restated)
         assert old.user == new.user
+        if question.task == "POM":
+            facts = [f"{x}) {fact(CATALOGUE, o)}" for x, o in zip("abc", question.objects, strict=True)]
+            assert new.assistant.replace(" ".join((*facts, "")), "", 1) == old.assistant
+            continue
         assert [d for d in restated.dialogues if d.opd is not Opd.ALL] == [
             d for d in question.dialogues if d.opd is not Opd.ALL
         ]

@@ -27,8 +27,9 @@ from pipeline.tasks.base import find_level
 from pipeline.use import folder
 from pipeline.use.folder import SHIPPED, Base, find_base, read_folder
 from pipeline.use.model import Octopi
+from pipeline.use.package import adapt
 from tests.closure import ROOT
-from tests.conftest import fake_videos
+from tests.conftest import fake_videos, refused
 from tests.models import model_folder
 
 EXAMPLES = ROOT / "examples"
@@ -184,3 +185,18 @@ def test_a_runs_videos_are_asked_about_as_they_are_and_standardised(
             assert f" {row.predicted} " in said[row.objects[0]].sentence
     with pytest.raises(SystemExit, match=r"octopi-small knows object_\S+, so it is not asked; set shipped to 0"):
         run({next(iter(octopi.catalogue.objects)): "soft"})
+
+
+def test_a_copy_for_another_sensor_standardises_by_its_videos(octopi: Octopi, tmp_path: Path) -> None:
+    """Against float64 of what its heads' logits are; the property heads stay, and the copy is whole."""
+    videos = [EXAMPLES / f"{name}.mp4" for name in ("soft", "hard", "rough")]
+    adapt(octopi, videos, tmp_path / "mine")
+    mine = Octopi.from_pretrained(tmp_path / "mine", base=model_folder("smollm2"), dtype="float32")
+    before, after = (torch.cat([m.encoder.encode(v).features for v in videos]).double() for m in (octopi, mine))
+    expected = (before - before.mean(0)) / before.std(0)
+    torch.testing.assert_close(after, expected, rtol=1e-4, atol=1e-4)
+    assert [mine.encoder.classify(v) for v in videos] == [octopi.encoder.classify(v) for v in videos]
+    assert not mine.config.scores, "they were another's"
+    assert mine.ask("Is it soft?", videos[0])
+    with refused("is there already"):
+        adapt(octopi, videos, tmp_path / "mine")
