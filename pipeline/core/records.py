@@ -384,10 +384,10 @@ TENSOR_FILE, INDEX_FILE = "embeddings.safetensors", "index.parquet"
 ALL_SEEDS = "all"
 """In place of a seed: the mean over seeds, or over the repeats of a cross-validation."""
 HEADS, VALIDATION_HEADS, RECALL, CROSS_VALIDATION = "heads", "heads_validation", "heads_recall", "cross_validation"
-NEIGHBOURS = "nearest_neighbour"
+NEIGHBOURS, ADJECTIVES = "nearest_neighbour", "adjective"
 """What stands as the task where no language model with touch answered: the fine-tuned encoder's property heads on test
 videos and on validation videos, class by class, encoders on objects that they were not trained on, and the class of
-each test video's nearest neighbour."""
+each test video's nearest neighbour. Or where answers are counted a second time, adjective by adjective."""
 
 
 class ScoreRow(Record):

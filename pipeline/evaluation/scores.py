@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.core.records import (
+    ADJECTIVES,
     ALL_SEEDS,
     CROSS_VALIDATION,
     HEADS,
@@ -87,6 +88,7 @@ def score_rows(
     seen: Iterable[GradedVision] = (),
     concluded: Mapping[int, Sequence[Score]] | None = None,
     neighbours: Mapping[str, Sequence[OutOfFold]] | None = None,
+    adjectives: Mapping[str, str] | None = None,
 ) -> list[ScoreRow]:
     """The rows of scores.csv: one a seed and one over all of them, for each measure and setting that has answers.
 
@@ -97,6 +99,7 @@ def score_rows(
         seen: Graded answers of vision-only models.
         concluded: By seed, what `pipeline.evaluation.grading.conclude` graded.
         neighbours: By encoder, the classes of each test video's nearest neighbour.
+        adjectives: By question, the adjective that it asks by.
     """
     rows: list[ScoreRow] = []
     for (task, measure), settings in _table(graded, catalogue, concluded or {}).items():
@@ -104,6 +107,11 @@ def score_rows(
         for setting, runs in settings.items():
             named = {axis: value for axis, value in setting._asdict().items() if value is not None}
             rows += _rows(runs, task=task, measure=measure, chance=chance, **named)
+            for word in dict.fromkeys((adjectives or {}).values()) if setting in (FULL, RULES) else ():
+                asked = {q for q, adjective in (adjectives or {}).items() if adjective == word}
+                own = {seed: {q: a for q, a in found.items() if q in asked} for seed, found in runs.items()}
+                if all(own.values()):
+                    rows += _rows(own, task=ADJECTIVES, measure=f"{task}: {word}", chance=chance, **named)[-1:]
     by_model: dict[tuple[str, ...], dict[int, dict[str, Answer]]] = defaultdict(lambda: defaultdict(dict))
     for g in seen:
         answer = Answer(g.correct, g.objects, g.parsed, g.strict)

@@ -45,6 +45,7 @@ from pipeline.report.provenance import provenance
 from pipeline.report.readme import render_readme
 from pipeline.report.samples import choose_examples, choose_samples
 from pipeline.report.tables import headline, over_seeds
+from pipeline.tasks import TASKS
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.split import read_splits
 
@@ -85,6 +86,7 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     by_encoder: dict[int, list[Classification]] = {}
     said: dict[int, list[Classification]] = {}
     concluded: dict[int, list[Score]] = {}
+    adjectives: dict[str, str] = {}
     for seed in sorted(params.ablation.seeds):
         if classified := _read(data / "encoder" / str(seed) / "classifications.parquet", Classification):
             asked = read_jsonl(data / "questions" / str(seed) / "evaluation.jsonl", Question)
@@ -93,13 +95,15 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
             by_encoder[seed] = classified
             said.setdefault(replicate, []).extend(classified)
             concluded.setdefault(replicate, []).extend(conclude(asked, classified, taken))
+            named = {q.question_id: TASKS[q.task].adjective(q, catalogue) for q in asked}
+            adjectives |= {question: word for question, word in named.items() if word}
     origin = provenance(params, catalogue, videos, splits, [g.objects for g in graded], root)
     # Not those whose answers are to other questions, which were not graded.
     rated = {(g.model, g.shown) for g in seen}
     sources = vision_models(root / EXTERNAL / params.report_name).values()
     origin["vision"] = [s.model_dump(mode="json") for s in sources if (s.model, s.shown) in rated]
     neighbours, maps = embedded(params, data, catalogue)
-    scores = score_rows(graded, catalogue, said, out_of_fold, seen, concluded, neighbours)
+    scores = score_rows(graded, catalogue, said, out_of_fold, seen, concluded, neighbours, adjectives)
     write_csv(folder / "scores.csv", ScoreRow, scores)
     write_csv(folder / "effects.csv", EffectRow, effect_rows(graded, catalogue, concluded))
     candidates = candidate_rows(out_of_fold, BASELINE)

@@ -12,7 +12,16 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.core.records import ALL_SEEDS, CROSS_VALIDATION, HEADS, NEIGHBOURS, RECALL, VALIDATION_HEADS, Shown
+from pipeline.core.records import (
+    ADJECTIVES,
+    ALL_SEEDS,
+    CROSS_VALIDATION,
+    HEADS,
+    NEIGHBOURS,
+    RECALL,
+    VALIDATION_HEADS,
+    Shown,
+)
 from pipeline.report.load import DATASET, KEYS, Report, cells, published, published_datasets
 from pipeline.tasks import TASKS
 
@@ -20,7 +29,7 @@ Select = Callable[[pd.DataFrame], "pd.Series[bool]"]
 Cell = Callable[[dict[str, Any]], str]
 FULL = {"encoder": "finetuned", "lora": "with", "opd": "all"}
 CHOICE, COMBINED = "choice", "combined"
-NOT_ANSWERED = (HEADS, VALIDATION_HEADS, RECALL, CROSS_VALIDATION, NEIGHBOURS)
+NOT_ANSWERED = (HEADS, VALIDATION_HEADS, RECALL, CROSS_VALIDATION, NEIGHBOURS, ADJECTIVES)
 """Tasks of scores.csv that no language model with touch answered."""
 PUBLISHED_MODELS = ("7b", "13b", "CLIP", "PG-InstructBLIP")
 SYSTEM_WORDS = {"base": "base encoder", "without": "without LoRA", "none": "without OPD", "needed": "OPD as needed"}
@@ -134,6 +143,7 @@ def task_title(task: str) -> str:
         RECALL: "Property heads, class by class",
         CROSS_VALIDATION: "Cross-validation",
         NEIGHBOURS: "Nearest neighbour",
+        ADJECTIVES: "By adjective",
         **{name: task.title for name, task in TASKS.items()},
     }
     return f"{titles[task]} ({task})" if task in TASKS else titles.get(task, task)
@@ -380,6 +390,14 @@ TABLES: tuple[Table, ...] = (
         "Grouped cross-validation: a model judges only videos of objects that it never saw. With few test objects this "
         "is the main evidence about encoders.",
         lambda f: f["task"].eq(CROSS_VALIDATION),
+        ("measure", "system", "measured", "n", "chance"),
+    ),
+    Table(
+        "adjectives",
+        "Adjective by adjective",
+        "The full system's comparisons and superlatives, and what follows by rule, counted by the word that is asked by: "
+        "whether a property, or a direction of it, is the harder one.",
+        lambda f: f["task"].eq(ADJECTIVES),
         ("measure", "system", "measured", "n", "chance"),
     ),
     Table(

@@ -101,6 +101,10 @@ class TaskDefinition(ABC):
         """
         return None
 
+    def adjective(self, question: Question, catalogue: Catalogue) -> str:
+        """The adjective that the question asks by, such as "softer"; empty where it asks by none."""
+        return ""
+
     def chance(self, catalogue: Catalogue) -> dict[str, float]:
         """Accuracy of a uniform guess, 0 to 1, by measure."""
         return {"choice": 1 / self.choices}

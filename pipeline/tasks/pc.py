@@ -129,11 +129,15 @@ class PropertyComparison(TaskDefinition):
         return replace(draft, dialogues=tuple(Dialogue(opd=d.opd, turns=(turn,)) for d in draft.dialogues))
 
     def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str:
-        place = catalogue.property_index(question.gold.properties[0])
+        place, word = catalogue.property_index(question.gold.properties[0]), self.adjective(question, catalogue)
         prop = catalogue.properties[place]
-        rising = mentioned(question.dialogues[0].turns[-1].user, (prop.more, prop.less)) == [plain(prop.more)]
         (first, _), (second, _) = (video[place] for video in classes)
-        return verdict(compare(first, second, rising), prop.more if rising else prop.less, prop)
+        return verdict(compare(first, second, word == prop.more), word, prop)
+
+    def adjective(self, question: Question, catalogue: Catalogue) -> str:
+        prop = catalogue.properties[catalogue.property_index(question.gold.properties[0])]
+        named = mentioned(question.dialogues[0].turns[-1].user, (prop.more, prop.less))
+        return prop.more if named == [plain(prop.more)] else prop.less
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         predicted = read(prediction.outputs[0])

@@ -112,11 +112,15 @@ class PropertySuperlativeSelection(TaskDefinition):
         )
 
     def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str:
-        place = catalogue.property_index(question.gold.properties[0])
-        prop = catalogue.properties[place]
-        most = mentioned(question.dialogues[0].turns[-1].user, (prop.most, prop.least)) == [plain(prop.most)]
-        extreme = (max if most else min)(range(len(classes)), key=lambda i: classes[i][place])
-        return f"{LETTERS[extreme]}) is the {prop.most if most else prop.least}."
+        place, word = catalogue.property_index(question.gold.properties[0]), self.adjective(question, catalogue)
+        furthest = max if word == catalogue.properties[place].most else min
+        extreme = furthest(range(len(classes)), key=lambda i: classes[i][place])
+        return f"{LETTERS[extreme]}) is the {word}."
+
+    def adjective(self, question: Question, catalogue: Catalogue) -> str:
+        prop = catalogue.properties[catalogue.property_index(question.gold.properties[0])]
+        named = mentioned(question.dialogues[0].turns[-1].user, (prop.most, prop.least))
+        return prop.most if named == [plain(prop.most)] else prop.least
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         predicted = read(prediction.outputs[0])

@@ -77,6 +77,20 @@ def test_tasks_and_measures_come_from_the_registry(monkeypatch: pytest.MonkeyPat
     assert [(r.part, r.task, r.measure) for r in effect_rows(answers + less, CATALOGUE)] == [("lora", "LATER", "shape")]
 
 
+def test_answers_are_counted_adjective_by_adjective() -> None:
+    """Of the full system and the rules alone; a word that a setting was never asked by has no row."""
+    right = drawn()
+    full, less = graded("PC", right), graded("PC", drawn(), lora="without")
+    words = {g.question_id: "softer" if number % 3 else "harder" for number, g in enumerate(full)}
+    rows = score_rows(full + less, CATALOGUE, adjectives={**words, "another": "hardest"})
+    found = {r.measure: r for r in rows if r.task == "adjective"}
+    assert found.keys() == {"PC: softer", "PC: harder"}
+    assert {(r.lora, r.seed) for r in found.values()} == {("with", "all")}
+    own = [ok for number, ok in enumerate(right) if number % 3 == 0]
+    assert (found["PC: harder"].n, found["PC: harder"].right) == (5, sum(own))
+    assert [r for r in rows if r.task != "adjective"] == score_rows(full + less, CATALOGUE)
+
+
 def test_one_object_has_an_accuracy_but_no_interval(tmp_path: Path) -> None:
     alone = [("object0",)] * 4
     answers = graded("OPD", [True, False, True, True], measure="combined", objects=alone)
