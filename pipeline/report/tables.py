@@ -395,7 +395,7 @@ TABLES: tuple[Table, ...] = (
     Table(
         "adjectives",
         "Adjective by adjective",
-        "The full system's comparisons and superlatives, and what follows by rule, counted by the word that is asked by: "
+        "The full system's comparisons and superlatives, and what follows by rule, counted by the word asked by: "
         "whether a property, or a direction of it, is the harder one.",
         lambda f: f["task"].eq(ADJECTIVES),
         ("measure", "system", "measured", "n", "chance"),
