@@ -1,7 +1,7 @@
 """Ask the model that is shipped about this run's videos, all of which are new to it."""
 
 from pipeline.core.io import read_table, write_table
-from pipeline.core.records import GradedVision, Video
+from pipeline.core.records import GradedVision, Shown, Video
 from pipeline.core.runtime import limit_threads
 from pipeline.core.stage import DATA, stage
 from pipeline.use.folder import SHIPPED
@@ -18,7 +18,7 @@ def main() -> None:
             # Half precision on one processor and not on another would make the report depend on the machine.
             octopi = Octopi.from_pretrained(SHIPPED, device=run.params.runtime.device, dtype="float32")
             graded = answers_about(octopi, run.params, read_table(DATA / "videos.parquet", Video))
-            run.metrics["graded"] = len(graded)
+            run.metrics["answers"] = len({(g.shown, g.question_id) for g in graded if g.shown is not Shown.CLASSES})
         write_table(DATA / "shipped.parquet", GradedVision, graded)
 
 

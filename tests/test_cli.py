@@ -79,6 +79,22 @@ def test_ctrl_c_is_one_line(project: Path, monkeypatch: pytest.MonkeyPatch, comm
     assert result.stderr == "octopi: stopped; what is finished stays, call it again to go on\n"
 
 
+@pytest.mark.parametrize(("arguments", "there", "published"), [([], False, 1), (["--dry"], False, 0), ([], True, 0)])
+def test_a_clone_whose_chain_is_up_to_date_is_published_once(
+    project: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], there: bool, published: int
+) -> None:
+    write_params(compose("smoke"))
+    calls: list[object] = []
+    monkeypatch.setattr("pipeline.cli.reproduce.outdated", lambda _: (0, 16))
+    monkeypatch.setattr("dvc.cli.main", lambda _: 0)
+    monkeypatch.setattr("pipeline.tracking.publish.publish", calls.append)
+    if there:
+        (project / "mlruns").mkdir()
+        (project / "mlruns" / "mlflow.db").touch()
+    assert RUNNER.invoke(app, ["repro", *arguments]).exit_code == 0
+    assert len(calls) == published
+
+
 def lines(output: str, severity: str) -> list[str]:
     return [line for line in output.splitlines() if line.startswith(f"{severity} ")]
 

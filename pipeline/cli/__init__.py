@@ -467,8 +467,8 @@ def adapt(
     device: Device = "auto",
 ) -> None:
     """Copy a model for another sensor, whose videos say by how much it shifts and scales what the model reads."""
+    from pipeline.use.adapt import adapt as fit
     from pipeline.use.ask import videos_of
-    from pipeline.use.package import adapt as fit
 
     found = videos_of(videos)
     fit(_load(model, base, device), [file for file, _ in found], out)

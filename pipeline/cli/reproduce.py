@@ -72,7 +72,7 @@ def reproduce(root: Path, arguments: list[str]) -> int:
             return 130 if stopped else status
     else:
         print(f"{name}: all {total} stages are up to date")
-    if not (params.tracking.uri or (MLRUNS / "mlflow.db").is_file()):
+    if not (arguments or params.tracking.uri or (MLRUNS / "mlflow.db").is_file()):
         # A clone has the lock of a chain that ran elsewhere, so that DVC does not publish it; MLflow has nothing yet.
         attempt(params.tracking, publish, params)
     print(f"Report: reports/{name}/README.md; all reports on one page: reports/index.html")

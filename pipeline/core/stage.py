@@ -217,8 +217,8 @@ def _write_run(running: Stage, started: float) -> None:
         unit = 1 if sys.platform == "darwin" else 1024
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
     device, torch = f"{processor()}, {cores()} cores", sys.modules.get("torch")
-    if torch is not None and torch.cuda.is_available():
-        device, peak = torch.cuda.get_device_name(), torch.cuda.max_memory_allocated() / 2**20
+    if torch is not None and torch.cuda.is_initialized() and (most := torch.cuda.max_memory_allocated()):
+        device, peak = torch.cuda.get_device_name(), most / 2**20
     write_json(
         RUNS / f"{running.name}.json",
         {

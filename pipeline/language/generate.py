@@ -168,35 +168,39 @@ class Stream:
 
     @staticmethod
     def together(streams: Sequence[Stream], left: Collection[int]) -> Iterator[tuple[int, str | None]]:
-        """The place of a stream and its next piece, None behind its last; all are computed in one batch.
+        """The place of a stream and its next piece, None behind its last; computed in batches.
 
         Args:
-            streams: Of one model.
+            streams: Of one model, whose first says how many a batch has (`language.generation_batch_size`).
             left: Places of those that nobody listens to any more; they may be added meanwhile.
         """
-        model = streams[0].model
+        model, size = streams[0].model, streams[0].language.generation_batch_size
         ends, tokenizer = end_ids(model.tokenizer), model.tokenizer
-        limits = [_room(model, [s.prompt], s.language)[0] for s in streams]
         # Neighbours of like length pad little.
-        order = sorted(range(len(streams)), key=lambda place: len(streams[place].prompt))
-        tokens: list[list[int]] = [[] for _ in streams]
-        given = [""] * len(streams)
-        rows = [streams[place] for place in order]
-        prompts, features, room = [s.prompt for s in rows], [s.features for s in rows], [limits[p] for p in order]
-        for row, token in greedy_tokens(model, prompts, features, ends, room):
-            place = order[row]
-            if place in left:
-                room[row] = 0
+        places = sorted(range(len(streams)), key=lambda place: len(streams[place].prompt))
+        for start in range(0, len(places), size):
+            order = [place for place in places[start : start + size] if place not in left]
+            if not order:
                 continue
-            tokens[place].append(token)
-            text, over = _said(tokens[place], ends, tokenizer).text, token in ends or len(tokens[place]) == room[row]
-            # A character may be spread over tokens; until it is whole it is shown as the replacement character.
-            whole = over or not text.endswith("\N{REPLACEMENT CHARACTER}")
-            if text.startswith(given[place]) and len(text) > len(given[place]) and whole:
-                yield place, text[len(given[place]) :]
-                given[place] = text
-            if over:
-                yield place, None
+            rows = [streams[place] for place in order]
+            room = [_room(model, [s.prompt], s.language)[0] for s in rows]
+            tokens: list[list[int]] = [[] for _ in rows]
+            given = [""] * len(rows)
+            prompts, features = [s.prompt for s in rows], [s.features for s in rows]
+            for row, token in greedy_tokens(model, prompts, features, ends, room):
+                place, own = order[row], tokens[row]
+                if place in left:
+                    room[row] = 0
+                    continue
+                own.append(token)
+                text, over = _said(own, ends, tokenizer).text, token in ends or len(own) == room[row]
+                # A character may be spread over tokens; until it is whole it is shown as the replacement character.
+                whole = over or not text.endswith("\N{REPLACEMENT CHARACTER}")
+                if text.startswith(given[row]) and len(text) > len(given[row]) and whole:
+                    yield place, text[len(given[row]) :]
+                    given[row] = text
+                if over:
+                    yield place, None
 
 
 def _room(model: OctopiForCausalLM, prompts: Sequence[Sequence[int]], language: LanguageConfig) -> list[int]:

@@ -141,7 +141,8 @@ def finish_report(folder: Path) -> dict[str, float]:
     # Classes are words, even where they read like numbers or like nothing.
     confusion = pd.read_csv(folder / "confusion.csv", dtype=str, keep_default_na=False)
     curves = pd.read_csv(folder / "curves.csv")
-    maps = pd.read_csv(folder / "map.csv", dtype=dict.fromkeys(report.provenance["properties"], str))
+    words = dict.fromkeys(report.provenance["properties"], str)
+    maps = pd.read_csv(folder / "map.csv", dtype={**words, "x": float, "y": float}, keep_default_na=False)
     figures = draw_figures(folder / "figures", report.effects, confusion, curves, maps, report.provenance["properties"])
     write_json(folder / "metrics.json", metrics)
     write_text(folder / "README.md", render_readme(report, figures))

@@ -139,7 +139,7 @@ def check_objects(params: Params, catalogue: Catalogue) -> str:
         if len(training) < FEWEST_TRAINING_OBJECTS:
             raise UserError(
                 f"{where}: {len(training)} training objects have videos, but questions about three objects need three; "
-                f"add objects, or {'raise split.folds' if fold is not None else 'choose another split.name'}"
+                "add objects, or choose another split.name"
             )
         if len(tested) == 1 and Touch.SWAPPED in params.ablation.touch:
             raise UserError(

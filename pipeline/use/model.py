@@ -237,7 +237,7 @@ class Octopi:
         expected: list[float] = []
         notes: list[str] = []
         for video in videos:  # All of a video at once, as not all may be remembered.
-            self._touched(video)
+            self.touched(video)
             expected.append(self._classes(video)[place][1])
             notes += self.notes(video)[len(self.doubts) :]
         answer, most = "", None
@@ -310,7 +310,7 @@ class Octopi:
         Raises:
             UserError: for a video in which nothing is touched, or a memory that is broken or another encoder's.
         """
-        encoded = self._touched(video)
+        encoded = self.touched(video)
         levels = self._described(video).levels
         return remember(
             Path(memory),
@@ -325,7 +325,7 @@ class Octopi:
     def recognise(self, video: Video, memory: Path | str) -> Recognition:
         """Which remembered objects a touch is like, the most similar first. An object that was never remembered is like
         one, too: similarities tell apart, and are no probabilities."""
-        encoded = self._touched(video)
+        encoded = self.touched(video)
         touches = recall(Path(memory), self._encoder_name)
         objects = most_similar(encoded.embedding.double().numpy(), touches)
         return Recognition(objects=objects, touches=len(touches), notes=self.notes(video))
@@ -376,11 +376,12 @@ class Octopi:
             raise UserError("the question comes without a video, so any touch would be made up; give one or more")
         features = [torch.zeros(0, self.llm.octopi_config.tactile_dim)]
         for video in (v for exchange in conversation for v in exchange.videos):
-            encoded = self.encoder.encode(video) if untouched else self._touched(video)
+            encoded = self.encoder.encode(video) if untouched else self.touched(video)
             features.append(encoded.features)
         return prompt, torch.cat(features)
 
-    def _touched(self, video: Video) -> EncodedVideo:
+    def touched(self, video: Video) -> EncodedVideo:
+        """A video as the model reads it; UserError where nothing touches the sensor."""
         encoded = self.encoder.encode(video)
         if not encoded.prepared.touched:
             raise UserError(f"{encoded.prepared.name}: {encoded.notes[0]}; record the sensor being pressed")

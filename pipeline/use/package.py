@@ -8,9 +8,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
-
-import torch
+from typing import NamedTuple
 
 from pipeline.config import LANGUAGE_DIR, PRETRAINED, Params
 from pipeline.core.card import CARD_FILE, write_card
@@ -46,11 +44,6 @@ from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.frames.store import PROBES_FILE
 from pipeline.weights import TIMM_WEIGHTS, backbone_files
 
-if TYPE_CHECKING:
-    from pipeline.use.model import Octopi
-
-LEAST_DEVIATION = 1e-6
-"""An embedding's number that never changes says nothing, whatever it is divided by."""
 LIBRARIES = ("octopi-pipeline", "torch", "transformers", "peft", "open_clip_torch", "timm", "av")
 LIMITS = (
     "It knows objects and sensors only as its training videos show them; for another sensor it must be trained anew.",
@@ -145,29 +138,6 @@ def export(folder: Path, to: Path, *, with_base: bool = False, base: Path | None
         shutil.copytree(folder, made, dirs_exist_ok=True, ignore=shutil.ignore_patterns(BASE_DIR))
         if with_base:
             shutil.copytree(find_base(folder, config.base, base), made / BASE_DIR)
-
-
-def adapt(model: Octopi, videos: Sequence[Path], to: Path) -> None:
-    """Copy a model's folder for the sensor of these videos: their frames' mean and deviation standardise embeddings.
-
-    No label is needed: another sensor shifts and scales embeddings, and these say by how much. The property heads look
-    at the pictures themselves, and stay as they are.
-
-    Raises:
-        UserError: for a model that does not standardise, videos that cannot be used, or as `export`.
-    """
-    if not model.config.encoder.standardize:
-        raise UserError("encoder.standardize was off in training, so there is nothing to adapt; train the model anew")
-    features = torch.cat([model.encoder.encode(video).features for video in videos]).double()
-    if len(features) < 2:
-        raise UserError("one frame has no deviation; name more videos")
-    std, mean = torch.std_mean(features, dim=0)
-    known = model.encoder.statistics
-    fitted = known._replace(mean=known.mean + mean * known.scale, scale=known.scale * std.clamp_min(LEAST_DEVIATION))
-    export(model.folder, to)
-    fitted.save(to / ENCODER_DIR / STATISTICS_FILE)
-    files = {**model.config.files, f"{ENCODER_DIR}/{STATISTICS_FILE}": sha256(to / ENCODER_DIR / STATISTICS_FILE)}
-    write_json(to / CONFIG, model.config.model_copy(update={"files": files, "scores": {}}).model_dump(mode="json"))
 
 
 class Score(NamedTuple):

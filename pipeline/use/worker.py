@@ -17,7 +17,7 @@ from pipeline.core.errors import UserError
 logger = logging.getLogger(__name__)
 
 TOGETHER = 32
-"""Most questions of a batch."""
+"""Most questions that are begun at once; the model divides them by its own batch size."""
 
 
 class Failed(Exception):
@@ -128,9 +128,9 @@ class Worker:
         open_ = dict(enumerate(job for job, _ in batch))
         try:
             for place, piece in batch[0][1].together([pieces for _, pieces in batch], left):
-                if piece is not None:
+                if piece is not None and place in open_:
                     open_[place].put(piece)
-                else:
+                elif piece is None and place in open_:
                     self.answers += 1
                     open_.pop(place).end()
                 for gone in [p for p, job in open_.items() if job.left.is_set()]:

@@ -61,11 +61,20 @@ def test_a_report_names_no_place_of_the_machine(path: str) -> None:
     assert shown == base_model(Path("/home/me"), "my videos")["folder"] == "my videos"
 
 
-def test_classes_may_read_like_nothing_or_like_numbers(written: Path, tmp_path: Path) -> None:
+def test_classes_may_read_like_nothing_or_like_numbers(
+    written: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     report = Path(shutil.copytree(written, tmp_path / "report"))
     lines = ("seed,video_id,property,rated,predicted", "0,v0,roughness,None,1", "0,v1,roughness,1,None")
     (report / "confusion.csv").write_text("\n".join(lines) + "\n")
+    places = ("encoder,method,video_id,x,y,roughness", "base,PCA,v0,1,2,None", "base,PCA,v1,1e-3,4,1")
+    (report / "map.csv").write_text("\n".join(places) + "\n")
     edit(report / "provenance.json", properties={"roughness": ["None", "1"]})
+    shown: list[pd.DataFrame] = []
+    monkeypatch.setattr("pipeline.report.build.draw_figures", lambda *given: shown.append(given[4]) or [])
+    finish_report(report)
+    assert shown[0]["roughness"].tolist() == ["None", "1"]
+    monkeypatch.undo()
     finish_report(report)
     assert (report / "figures" / "confusion.png").is_file()
 

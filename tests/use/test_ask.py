@@ -188,6 +188,8 @@ def test_videos_described_compared_ranked_and_matched_by_command(
     assert [line.split("  ")[1] for line in lines] == [[three, one, two][i] for i in ranked.order]
     assert answer == ranked.answer
     assert scale.endswith("0 smooth, 1 slightly rough, 2 rough")
+    folder = said("rank", "roughness", str(files[0].parent)).splitlines()[1:]
+    assert {Path(line.split("  ")[1]) for line in folder} == set(files[0].parent.iterdir())
     names = "rug, a fuzzy rug" if "rug" not in octopi.catalogue.objects else "rug, millet"
     ids = [name.strip() for name in names.split(",")]
     own = {"mug": ["hard", "smooth", "no bumps"], "rug": ["soft", "rough", "no bumps"]}

@@ -25,9 +25,9 @@ from pipeline.report.tables import measured
 from pipeline.scales import compose, write_params
 from pipeline.tasks.base import find_level
 from pipeline.use import folder
+from pipeline.use.adapt import adapt
 from pipeline.use.folder import SHIPPED, Base, find_base, read_folder
 from pipeline.use.model import Octopi
-from pipeline.use.package import adapt
 from tests.closure import ROOT
 from tests.conftest import fake_videos, refused
 from tests.models import model_folder

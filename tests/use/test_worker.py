@@ -14,7 +14,7 @@ import pytest
 from pipeline.core.errors import UserError
 from pipeline.language.generate import Stream
 from pipeline.use.model import Octopi
-from pipeline.use.worker import Failed, Worker
+from pipeline.use.worker import Failed, Job, Worker
 from tests.conftest import HUNG
 
 QUESTIONS = (("Describe this. {tactile}", 1, None), ("Is it soft?", 1, 3), ("Which is softer?", 2, 20), ("Why?", 3, 1))
@@ -75,7 +75,7 @@ def test_what_waits_is_one_batch_and_each_answer_is_the_one_given_alone(
     assert isinstance(broken, Failed)
     assert answered == [text.strip() for text in alone]
     assert batches[-1] == len(QUESTIONS) + 1
-    assert count == 1 + len(QUESTIONS)
+    assert count - 1 - len(QUESTIONS) in (0, 1), "the one that is given up may have been at its end"
     assert sorted(map(str, ended)) == sorted([*(q for q, *_ in QUESTIONS), "{tactile}", "broken", "Never?", "Halfway?"])
 
 
@@ -95,3 +95,21 @@ def test_a_batch_that_breaks_fails_each_of_its_questions(
     *failed, after = asyncio.run(ask())
     assert [type(error) for error in failed] == [Failed] * 3
     assert after == octopi.ask("Why?", files[:1])
+
+
+def test_who_leaves_at_the_last_piece_leaves_the_others_their_answers() -> None:
+    said: dict[int, list[Any]] = {0: [], 1: []}
+    leaves = threading.Event()
+
+    class Pieces:
+        @staticmethod
+        def together(streams: Sequence[Pieces], left: Collection[int]) -> Iterator[tuple[int, str | None]]:
+            leaves.set()
+            yield from [(0, "last"), (0, None), (1, "one"), (1, None)]
+
+    jobs = [Job(Pieces, lambda: None, said[n].append, event) for n, event in enumerate((leaves, threading.Event()))]
+    worker = Worker()
+    worker._answer(jobs)
+    worker.stop()
+    assert said[1] == ["one", None]
+    assert worker.answers == 1

@@ -14,7 +14,7 @@ from pipeline.config import SplitConfig
 from pipeline.core.errors import UserError
 from pipeline.core.records import Assignment, Part
 from pipeline.videos.catalogue import Catalogue, load_catalogue
-from pipeline.videos.split import VALIDATION, assign, check_split, without_videos
+from pipeline.videos.split import VALIDATION, assign, check_split, untested, without_videos
 from tests.conftest import ROOT, fake_videos, refused
 
 CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")
@@ -124,6 +124,11 @@ def test_missing_objects_are_reported_or_refused() -> None:
 
 def test_a_split_that_tests_nothing_says_so() -> None:
     assert without_videos({"rug": Part.TRAIN, "denim": Part.VALIDATION}, {"rug", "denim"}) == "no object is for test"
+    said = untested({"rug": Part.TRAIN, "denim": Part.TEST, "mug": Part.UNUSED}, {"rug", "mug", "new"})
+    assert "1 of 1 test objects have no videos (denim)" in said
+    assert "2 with videos are in no part (mug, new)" in said
+    assert "split.name=kfold" in said
+    assert untested({"rug": Part.TRAIN, "denim": Part.TEST}, {"rug", "denim"}) == ""
 
 
 def renamed(**columns: str) -> Catalogue:
