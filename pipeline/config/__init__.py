@@ -165,9 +165,8 @@ class QuestionsConfig(Section):
     """What objects are called. `number`: "object 7", as the objects are that the shipped model has learnt from; it
     copies no other name. With `facts`, a name says nothing about its object."""
     inexact: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Training as an encoder errs. With `facts`: chance that a class told is a neighbour of the right one, the right
-    matching staying the nearest; exact facts teach to look for equal classes alone. PSS: chance that descriptions are
-    given and take another object for the extreme one, too; then touch decides."""
+    """`facts` in training: chance that a class told is a neighbour of the right one, the right matching staying the
+    nearest. An encoder's errors are of this kind, and exact facts teach to look for equal classes alone."""
     restate: bool = False
     """Where everything is described (OPD `all`), have answers to PC and PSS name the classes of the one property that
     is asked for, and which object has more or less of it, before they conclude: for a language model too small to find

@@ -211,8 +211,6 @@ class Turn(Record):
     assistant: str
     described: int = 0
     """Characters at the beginning of `assistant` that describe; what stands behind them is concluded from them."""
-    given: bool = False
-    """Whether training gives the description, which then need not be right, and nothing of it is learnt."""
 
 
 class Dialogue(Record):

@@ -75,8 +75,7 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
                 raise UserError(f"{question.question_id}: has no answer to learn from; run `dvc repro questions -f`")
             self.encoded.append(encoded)
             weights = torch.ones(len(encoded.labels))
-            told = question.question_id in given and any(turn.described for turn in dialogue.turns)
-            if told or any(turn.given for turn in dialogue.turns):
+            if question.question_id in given and any(turn.described for turn in dialogue.turns):
                 weights[torch.tensor(write(descriptions=False).labels) == IGNORE_INDEX] = 0
             self.weights.append(weights)
 

@@ -196,7 +196,6 @@ def with_given(questions: Sequence[Question], opd: Opd, share: float, seed: int)
     changed: dict[str, Question] = {}
     for count in (2, 3):
         told = [q for q in questions if len(q.videos) == count and (d := q.dialogue(opd)) and d.turns[0].described]
-        told = [q for q in told if not any(t.given for d in q.dialogues for t in d.turns)]
         chosen = rng.sample(told, round(share * len(told)))
         for own, other in zip(chosen, chosen[1:] + chosen[:1], strict=True):
             changed[own.question_id] = own.model_copy(update={"videos": other.videos})

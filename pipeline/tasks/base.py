@@ -117,10 +117,6 @@ class TaskDefinition(ABC):
         """
         return draft
 
-    def tied(self, draft: Draft, pool: Pool, rng: random.Random) -> Draft | None:
-        """The question as a training gives it where an encoder's classes leave it open, if the task has such."""
-        return None
-
     def plainly(self, draft: Draft, catalogue: Catalogue, rng: random.Random) -> Draft:
         """The question as people ask it, where they ask it otherwise."""
         return draft

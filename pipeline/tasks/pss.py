@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import random
-from dataclasses import replace
 
-from pipeline.core.records import Dialogue, Opd, Prediction, Question, Score
+from pipeline.core.records import Opd, Prediction, Question, Score
 from pipeline.tasks.base import (
     LETTERS,
     LISTED,
@@ -80,35 +79,6 @@ class PropertySuperlativeSelection(TaskDefinition):
             choice=LETTERS[position],
             properties=[prop.name],
             finding=f"{superlative.capitalize()}: {LETTERS[position]}).",
-        )
-
-    def tied(self, draft: Draft, pool: Pool, rng: random.Random) -> Draft:
-        """The question beside descriptions that take a second or every object for the extreme one, as encoders do.
-
-        Of the real videos' questions half are tied by their heads' classes. Where the right classes alone are learnt
-        from, the conclusion of a tie is a guess. Here touch breaks it, and what is wrong is given, not learnt.
-        """
-        catalogue, right = pool.catalogue, LETTERS.index(draft.gold.choice)
-        place = catalogue.property_index(draft.gold.properties[0])
-        extreme = draft.gold.labels[right][place]
-        alike = [o for o in pool.objects if catalogue.labels(o)[place] == extreme]
-        described = list(draft.objects)
-        for wrong in rng.sample([i for i in range(3) if i != right], rng.choice((1, 2))):
-            # Described as the object of that class which is otherwise like it.
-            own = draft.gold.labels[wrong]
-            described[wrong] = min(
-                rng.sample(alike, len(alike)),
-                key=lambda o: sum(abs(a - b) for a, b in zip(catalogue.labels(o), own, strict=True)),
-            )
-        verdict = draft.dialogues[0].turns[0].assistant
-        answers = concluded(catalogue, described, verdict, draft.gold.properties)
-        turns = single_turn({d.opd: d.turns[0].user for d in draft.dialogues}, answers)
-        return replace(
-            draft,
-            dialogues=tuple(
-                Dialogue(opd=mode, turns=(turn.model_copy(update={"given": True}),)) for mode, (turn,) in turns.items()
-            ),
-            gold=draft.gold.model_copy(update={"labels": tuple(map(catalogue.labels, described))}),
         )
 
     def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str:

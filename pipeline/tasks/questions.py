@@ -69,7 +69,7 @@ def build_questions(
 
     Args:
         facts: The same questions as each task's `with_facts` makes them.
-        inexact: Chance that a fact's class is off by one, and that a question becomes what its task's `tied` makes.
+        inexact: Chance that a fact's class is off by one.
         restate: Answers as each task's `restated` has them.
         two_turns: Share of the questions that are asked as `in_turns` does, with all others about the same videos.
         plainly: Share of the others that become what their task's `plainly` makes.
@@ -84,9 +84,7 @@ def build_questions(
             random.Random(derive_seed(seed, pool.part, task, *purpose)) for purpose in ((), ("facts",), ("turns",))
         )
         for number, draft in enumerate(islice(_drafts(definition, pool, rng, distinct), count)):
-            tied = definition.tied(draft, pool, turns) if inexact and turns.random() < inexact else None
-            draft = tied or draft
-            asked_on = tied is None and turns.random() < two_turns and len(draft.videos) > 1
+            asked_on = turns.random() < two_turns and len(draft.videos) > 1
             more = further(definition, pool, draft, turns) if asked_on else []
             if not asked_on and turns.random() < plainly:
                 draft = definition.plainly(draft, pool.catalogue, turns)

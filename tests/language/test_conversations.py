@@ -102,27 +102,6 @@ def test_given_descriptions_are_not_learnt_and_stand_beside_other_touches(share:
     assert changed == pytest.approx(share * several, abs=1)
 
 
-def test_of_a_turn_whose_description_is_given_only_the_rest_is_learnt(held: Material) -> None:
-    """And its touches stay, whatever is given besides."""
-    turned = []
-    for question in held.questions:
-        dialogues = tuple(
-            d.model_copy(update={"turns": tuple(t.model_copy(update={"given": t.described > 0}) for t in d.turns)})
-            for d in question.dialogues
-        )
-        turned.append(question.model_copy(update={"dialogues": dialogues}))
-    _, data = assemble(replace(held, questions=turned), taking(1000, given=1.0), "test")
-    told = 0
-    for index, question in enumerate(data.questions):
-        assert question in turned
-        turns = question.dialogue(held.opd).turns
-        if any(t.given and t.described < len(t.assistant) for t in turns):
-            told += 1
-            text = held_text(data.encoded[index].input_ids, data[index]["weights"] > 0, held)
-            assert text.split() == " ".join(t.assistant[t.described :] for t in turns).split()
-    assert told
-
-
 def held_text(ids: tuple[int, ...], learnt: torch.Tensor, held: Material) -> str:
     """The words that are learnt, without the tokens that end a turn."""
     tokenizer = load_tokenizer(Path(held.language.weights))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.config import SplitConfig
-from pipeline.core.records import Opd, Part, Question
+from pipeline.core.records import Part, Question
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool
 from pipeline.tasks.questions import build_questions, pool_of
@@ -156,33 +156,6 @@ def test_inexact_facts_leave_the_right_matching_the_nearest() -> None:
         off[sum(int(np.abs(said[o] - own).sum()) for o, own in zip(question.objects, right, strict=True))] += 1
     # Of nine classes a question, where .35 of each are drawn off and some drawings are refused.
     assert 1.5 < sum(n * count for n, count in off.items()) / 200 < 9 * 0.35
-
-
-def test_ties_are_given_and_not_learnt_and_their_conclusion_is_the_right_one() -> None:
-    usual, tied = (
-        build_questions(POOLS[Part.TRAIN], {"PSS": 180}, seed=1, distinct=True, inexact=chance, restate=True)
-        for chance in (0.0, 0.35)
-    )
-    wrong = Counter[int]()
-    for own, question in zip(usual, tied, strict=True):
-        assert (question.videos, question.gold.choice) == (own.videos, own.gold.choice)
-        assert [d.turns[0].user for d in question.dialogues] == [d.turns[0].user for d in own.dialogues]
-        if question == own:
-            continue
-        index, right = CATALOGUE.property_index(own.gold.properties[0]), "abc".index(own.gold.choice)
-        said = [labels[index] for labels in question.gold.labels]
-        wrong[said.count(said[right])] += 1
-        for before, dialogue in zip(own.dialogues, question.dialogues, strict=True):
-            (turn,), (bare,) = dialogue.turns, before.turns
-            assert turn.given
-            assert not bare.given
-            assert turn.assistant.rpartition(" Conclusion: ")[2] == bare.assistant.rpartition(" Conclusion: ")[2]
-        prop, whole = CATALOGUE.properties[index], question.dialogue(Opd.ALL)
-        assert whole is not None
-        for letter, level in zip("abc", said, strict=True):
-            assert f"{letter}) {prop.levels[level]}" in whole.turns[0].assistant
-    assert set(wrong) == {2, 3}
-    assert 0.25 < wrong.total() / 180 < 0.45
 
 
 def test_few_objects_give_few_questions_and_none_give_none() -> None:
