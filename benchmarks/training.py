@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.table import Row
+from pipeline.config.params import PARAMS_FILE, load_params
 from pipeline.core.errors import UserError
 from pipeline.core.io import read_json
 from pipeline.core.stage import RUNS
@@ -41,7 +42,7 @@ def measure(root: Path) -> list[Row]:
         raise UserError(f"{root / RUNS}: no training ran here; run `make repro` first")
     shown = [
         (
-            f"{what}{f': {key}' if key else ''}",
+            f"{what}, {load_params(root / PARAMS_FILE).report_name}{f' {key}' if key else ''}",
             sum(run["seconds"] for run in runs) / 60,
             max(run["peak_memory_mb"] for run in runs) * 2**20 / 1e6,
             runs[-1].get("device", "not recorded"),

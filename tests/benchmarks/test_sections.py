@@ -17,6 +17,7 @@ from pipeline.core.io import write_csv, write_json, write_table
 from pipeline.core.records import Encoder, Graded, Lora, Opd, ScoreRow, Variant
 from pipeline.encoder import frame_classifier
 from pipeline.encoder.scene_encoder import SceneEncoder
+from pipeline.scales import compose, write_params
 from pipeline.scenes.light import make_sensor, shade
 from pipeline.training.trainable import save_trainable
 from pipeline.videos.catalogue import Catalogue
@@ -186,10 +187,11 @@ def test_serving_asks_a_fresh_process_and_a_server(tmp_path: Path, monkeypatch: 
 def test_trainings_are_read_from_what_the_stages_left(tmp_path: Path) -> None:
     with refused("no training ran here; run `make repro` first"):
         training.measure(tmp_path)
+    write_params(compose("smoke", conf=ROOT / "conf"), tmp_path / "params.yaml")
     for name, seconds, peak in (("align@x-0", 60, 100), ("lora@x-0", 120, 300), ("embed", 9, 9), ("pretrain", 30, 50)):
         write_json(tmp_path / "runs" / f"{name}.json", {"seconds": seconds, "peak_memory_mb": peak, "device": "a card"})
     *paper, model, pretrained = training.measure(tmp_path)
     assert [row.cost_ratio for row in paper] == [1, 1, 1.3]
-    assert (model.setting, model.cost, model.machine) == ("alignment and end to end: x-0", 3, "a card")
+    assert (model.setting, model.cost, model.machine) == ("alignment and end to end, smoke-scenes x-0", 3, "a card")
     assert model.megabytes == pytest.approx(300 * 1.048576, rel=1e-3)
-    assert (pretrained.setting, pretrained.cost) == ("pretraining on scenes", 0.5)
+    assert (pretrained.setting, pretrained.cost) == ("pretraining on scenes, smoke-scenes", 0.5)
