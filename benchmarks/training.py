@@ -6,24 +6,22 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
-from benchmarks.table import Row
+from benchmarks.table import Row, make_rows
 from pipeline.config.params import PARAMS_FILE, load_params
 from pipeline.core.errors import UserError
 from pipeline.core.io import read_json
 from pipeline.core.stage import RUNS
 
-TRAININGS = {
-    "pretrain": "pretraining on scenes",
-    "finetune_encoder": "encoder",
-    "align": "alignment and end to end",
-    "lora": "alignment and end to end",
+ENCODER, LANGUAGE = "training an encoder", "training a language model"
+TRAININGS = {"pretrain": ENCODER, "finetune_encoder": ENCODER, "align": LANGUAGE, "lora": LANGUAGE}
+PUBLISHED: dict[str, dict[str, tuple[float, float | None, str]]] = {
+    ENCODER: {"the paper's encoder (less than 5 GB)": (360.0, 5000.0, "NVIDIA RTX A6000")},
+    LANGUAGE: {
+        "the paper's 7b": (300.0, None, "NVIDIA RTX A6000"),
+        "the paper's 13b": (390.0, None, "2 x NVIDIA RTX A6000"),
+    },
 }
-PUBLISHED: tuple[tuple[str, float, float | None, str], ...] = (
-    ("encoder, the paper's (less than 5 GB)", 360.0, 5000.0, "NVIDIA RTX A6000"),
-    ("alignment and end to end, the paper's 7b", 300.0, None, "NVIDIA RTX A6000"),
-    ("alignment and end to end, the paper's 13b", 390.0, None, "2 x NVIDIA RTX A6000"),
-)
-"""Minutes, and megabytes where it says them: Yu et al. 2024, appendix on training."""
+"""Minutes, megabytes where it says them, the device: Yu et al. 2024, appendix on training. Ratios are to the first."""
 
 
 def measure(root: Path) -> list[Row]:
@@ -35,30 +33,25 @@ def measure(root: Path) -> list[Row]:
     found: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
     for file in sorted((root / RUNS).glob("*.json")):
         stage, _, key = file.stem.partition("@")
-        # A variant's alignment and its LoRA make one model.
         if stage in TRAININGS:
-            found[TRAININGS[stage], key].append(read_json(file))
+            # A variant's alignment and its LoRA make one model.
+            name = key if TRAININGS[stage] == LANGUAGE else f"{stage} {key}".strip()
+            found[TRAININGS[stage], name].append(read_json(file))
     if not found:
         raise UserError(f"{root / RUNS}: no training ran here; run `make repro` first")
-    shown = [
-        (
-            f"{what}, {load_params(root / PARAMS_FILE).report_name}{f' {key}' if key else ''}",
-            sum(run["seconds"] for run in runs) / 60,
-            max(run["peak_memory_mb"] for run in runs) * 2**20 / 1e6,
-            runs[-1].get("device", "not recorded"),
-        )
-        for (what, key), runs in found.items()
-    ]
-    return [
-        Row(
-            question="training",
-            setting=setting,
-            cost=float(f"{minutes:.4g}"),
+    report, rows = load_params(root / PARAMS_FILE).report_name, list[Row]()
+    for question, published in PUBLISHED.items():
+        known = dict(published)
+        for (kind, name), runs in found.items():
+            if kind == question:
+                minutes, peak = sum(r["seconds"] for r in runs) / 60, max(r["peak_memory_mb"] for r in runs)
+                known[f"{report}, {name}"] = minutes, peak * 2**20 / 1e6, runs[-1].get("device", "not recorded")
+        made = make_rows(
+            question,
+            {name: [minutes] for name, (minutes, _, _) in known.items()},
             unit="minutes",
-            # To the paper's encoder, or to its 7b.
-            cost_ratio=float(f"{minutes / PUBLISHED[setting.startswith('alignment')][1]:.4g}"),
-            megabytes=peak and float(f"{peak:.4g}"),
-            machine=device,
+            baseline=next(iter(published)),
+            counts={name: {"megabytes": peak} for name, (_, peak, _) in known.items() if peak is not None},
         )
-        for setting, minutes, peak, device in [*PUBLISHED, *shown]
-    ]
+        rows += [row.model_copy(update={"machine": known[row.setting][2]}) for row in made]
+    return rows

@@ -119,8 +119,8 @@ def read_folder(folder: Path) -> tuple[ModelConfig, Catalogue]:
             f"{folder / CONFIG}: of format {version}, but this version reads {FORMAT}; run `dvc repro package` again, "
             "or install the version that made it"
         )
-    # A setting that was always off and is gone.
-    values.get("language", {}).pop("touch_noise", None)
+    if isinstance(language := values.get("language"), dict):
+        language.pop("touch_noise", None)  # A setting that was always off and is gone.
     config = _validate(ModelConfig, values, folder / CONFIG)
     for name, expected in config.files.items():
         file = folder / name

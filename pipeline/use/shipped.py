@@ -66,7 +66,7 @@ def answers_about(octopi: Octopi, params: Params, videos: Sequence[Video]) -> li
     ways = {Shown.TOUCH: touches.features}
     if params.data.source == "videos":
         std, mean = torch.std_mean(touches.features, dim=0)
-        ways[Shown.STANDARDISED] = (touches.features - mean) / std.clamp_min(1e-6)
+        ways[Shown.STANDARDISED] = (touches.features - mean) / torch.where(std > 0, std, 1.0)  # As `adapt` does.
     config = octopi.config
     language = config.language.model_copy(update={"generation_batch_size": BATCH})
     scored = {}

@@ -191,8 +191,10 @@ def test_trainings_are_read_from_what_the_stages_left(tmp_path: Path) -> None:
     write_params(compose("smoke", conf=ROOT / "conf"), tmp_path / "params.yaml")
     for name, seconds, peak in (("align@x-0", 60, 100), ("lora@x-0", 120, 300), ("embed", 9, 9), ("pretrain", 30, 50)):
         write_json(tmp_path / "runs" / f"{name}.json", {"seconds": seconds, "peak_memory_mb": peak, "device": "a card"})
-    *paper, model, pretrained = training.measure(tmp_path)
-    assert [row.cost_ratio for row in paper] == [1, 1, 1.3]
-    assert (model.setting, model.cost, model.machine) == ("alignment and end to end, smoke-scenes x-0", 3, "a card")
+    theirs, pretrained, seven, thirteen, model = training.measure(tmp_path)
+    assert theirs.question == pretrained.question != seven.question == thirteen.question == model.question
+    assert [row.cost_ratio for row in (theirs, seven, thirteen)] == [1, 1, 1.3], "each to the paper's own"
+    assert (model.setting, model.cost, model.machine) == ("smoke-scenes, x-0", 3, "a card")
+    assert model.cost_ratio == 0.01
     assert model.megabytes == pytest.approx(300 * 1.048576, rel=1e-3)
-    assert (pretrained.setting, pretrained.cost) == ("pretraining on scenes, smoke-scenes", 0.5)
+    assert (pretrained.setting, pretrained.cost) == ("smoke-scenes, pretrain", 0.5)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import runpy
@@ -200,3 +201,11 @@ def test_a_copy_for_another_sensor_standardises_by_its_videos(octopi: Octopi, tm
     assert mine.ask("Is it soft?", videos[0])
     with refused("is there already"):
         adapt(octopi, videos, tmp_path / "mine")
+    told = read_json(tmp_path / "mine" / "config.json")
+    (tmp_path / "mine" / "config.json").write_text(
+        json.dumps({**told, "language": {**told["language"], "touch_noise": 0.0}})
+    )
+    assert read_folder(tmp_path / "mine")[0] == mine.config, "as models of before say it"
+    (tmp_path / "mine" / "config.json").write_text(json.dumps({**told, "language": "none"}))
+    with refused("config.json: language"):
+        read_folder(tmp_path / "mine")
