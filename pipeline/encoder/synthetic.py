@@ -21,8 +21,9 @@ from pipeline.config import FramesConfig, PretrainConfig
 from pipeline.core.io import atomic
 from pipeline.core.parallel import run_parallel
 from pipeline.core.runtime import derive_seed
-from pipeline.scenes.contact import Body, Method
-from pipeline.scenes.geometry import IMAGE_MM, Heights, heights
+from pipeline.scenes.contact import Method, press_by
+from pipeline.scenes.geometry import IMAGE_MM, heights
+from pipeline.scenes.grid import Heights
 from pipeline.scenes.invent import LAYERS, invent
 from pipeline.scenes.light import Image, Sensor, make_sensor, shade
 from pipeline.scenes.measure import CUTOFF, bump_share, texture
@@ -111,7 +112,7 @@ def draw_object(number: int, config: PretrainConfig, frames: FramesConfig) -> Sy
     recipe = invent(rng)
     surface = heights(recipe.body, recipe.relief, SIDE, PITCH, rng)
     forces = np.sort(np.exp(rng.uniform(math.log(FORCES[0]), math.log(FORCES[1]), config.presses)))
-    pressed = Body(surface, recipe.modulus, PITCH).press(METHOD, forces)
+    pressed = press_by(METHOD, surface, forces, recipe.modulus, PITCH)
     rough = texture(surface, PITCH)
     pictures, quantities = [], []
     for force, whole, area in zip(forces.tolist(), pressed.skins, pressed.areas.tolist(), strict=True):

@@ -112,14 +112,13 @@ def press(
         method: None takes the cheapest whose estimated error is below the tolerance.
         tolerance: Relative error of the skin's slopes, which are what the light shows.
     """
-    body = Body(heights, modulus, pitch)
     forces = force * (np.arange(1, FORCES + 1) / FORCES) ** 1.5
     error = None
     if method is None:
-        method, error, last = choose(body, force, tolerance)
-        pressed = [body.press(method, forces[:-1]), last]
+        method, error, last = choose(heights, force, modulus, pitch, tolerance)
+        pressed = [press_by(method, heights, forces[:-1], modulus, pitch), last]
     else:
-        pressed = [body.press(method, forces)]
+        pressed = [press_by(method, heights, forces, modulus, pitch)]
     flat = np.zeros((1, *heights.shape), np.float32)
     return Imprint(
         skins=np.concatenate([flat, *(p.skins for p in pressed)]),
@@ -131,7 +130,9 @@ def press(
     )
 
 
-def choose(body: Body, force: float, tolerance: float) -> tuple[Method, float, Pressed]:
+def choose(
+    heights: Heights, force: float, modulus: float, pitch: float, tolerance: float
+) -> tuple[Method, float, Pressed]:
     """The cheapest method whose slopes under the largest force are near enough to those of the next finer one.
 
     A grid's error is estimated as its distance to the next finer grid, which exceeds the true error as long as
@@ -141,18 +142,18 @@ def choose(body: Body, force: float, tolerance: float) -> tuple[Method, float, P
     Returns:
         The method, its error as estimated, and the body by it under the largest force.
     """
+    side, top, winkler = heights.shape[0], np.array([force]), Method("winkler")
     # A layer's influence is smooth on cells of half its thickness only.
-    ladder = [m for m in LADDER if body.side * body.pitch <= m.cells * GEL.thickness / 2]
-    rungs = [m for m in ladder if m.cells < body.side]
+    ladder = [m for m in LADDER if side * pitch <= m.cells * GEL.thickness / 2]
+    rungs = [m for m in ladder if m.cells < side]
     if len(rungs) < max(2, len(ladder)):  # One alone would be held against nothing.
         rungs.append(Method("layer"))
-    top = np.array([force])
-    springs, coarse = body.press(Method("winkler"), top), body.press(rungs[0], top)
+    springs, coarse = (press_by(method, heights, top, modulus, pitch) for method in (winkler, rungs[0]))
     error = 0.0
     for method, finer in itertools.pairwise(rungs):
-        fine = body.press(finer, top)
-        for candidate, pressed in ((Method("winkler"), springs), (method, coarse)):
-            error = slope_error(pressed.skins[0], fine.skins[0], body.pitch)
+        fine = press_by(finer, heights, top, modulus, pitch)
+        for candidate, pressed in ((winkler, springs), (method, coarse)):
+            error = slope_error(pressed.skins[0], fine.skins[0], pitch)
             if error <= tolerance:
                 return candidate, error, pressed
         coarse = fine
@@ -170,59 +171,50 @@ class Pressed:
     """A body under some forces."""
 
     skins: npt.NDArray[np.float32]
+    """As in `Imprint`."""
     areas: npt.NDArray[np.float64]
+    """Of the contacts, in mm^2."""
     residual: float
 
 
-class Body:
-    """An object over the gel, with what its coarser grids share."""
-
-    def __init__(self, heights: Heights, modulus: float, pitch: float) -> None:
-        self.heights, self.modulus, self.pitch = heights, modulus, pitch
-        self.side = heights.shape[0]
-        self.together = series(GEL.modulus, modulus)
-
-    def press(self, method: Method, forces: npt.NDArray[np.float64]) -> Pressed:
-        """Under each force, in N."""
-        return self._springs(forces) if method.tier == "winkler" else self._elastic(method, forces)
-
-    def _springs(self, forces: npt.NDArray[np.float64]) -> Pressed:
-        gap = self.heights.max() - self.heights
-        found = [press_springs(gap, force, self.modulus, self.pitch, GEL) for force in forces.tolist()]
-        skins = [hang_skin(springs, self.modulus, self.pitch, GEL) for springs in found]
-        areas = [np.count_nonzero(springs.overlap) * self.pitch**2 for springs in found]
-        return Pressed(np.stack(skins), np.array(areas), 0.0)
-
-    def _elastic(self, method: Method, forces: npt.NDArray[np.float64]) -> Pressed:
-        cells = min(method.cells or self.side, self.side)
-        coarse = cv2.resize(self.heights, (cells, cells), interpolation=cv2.INTER_AREA)
-        pitch = self.side * self.pitch / cells
-        gel, unit = _bodies(cells, pitch, method.tier)
-        # Compliances of gel and object add.
-        both = gel.plus(unit, 1 / self.modulus)
-        solution = solve(coarse.max() - coarse, forces, both, pitch, tolerance=RESIDUAL / cells)
-        sinks, pressures = gel.sink(solution.pressure), solution.pressure
-        areas = np.count_nonzero(pressures > 0, axis=(1, 2)) * pitch**2
-        if cells == self.side:
-            return Pressed(sinks, areas, float(solution.residual.max()))
-        fine = self.heights - _enlarge(coarse, self.side)
-        # The share of the fine part that the pressure flattens, of that what the gel and not the object gives way.
-        flattened = math.sqrt(2) / (self.together * max(_rms_slope(fine, self.pitch), 1e-9))
-        share = np.float32(self.together / GEL.modulus) * fine
-        skins = [
-            _enlarge(sink, self.side) + share * erf(np.float32(flattened) * _enlarge(pressure, self.side))
-            for sink, pressure in zip(sinks, pressures, strict=True)
-        ]
-        return Pressed(np.stack(skins), areas, float(solution.residual.max()))
+def press_by(
+    method: Method, heights: Heights, forces: npt.NDArray[np.float64], modulus: float, pitch: float
+) -> Pressed:
+    """Press a body with each of the forces (N) by one method; further arguments as for `press`."""
+    side = heights.shape[0]
+    if method.tier == "winkler":
+        gap = heights.max() - heights
+        overlaps = [press_springs(gap, force, modulus, pitch, GEL) for force in forces.tolist()]
+        skins = [hang_skin(overlap, modulus, pitch, GEL) for overlap in overlaps]
+        return Pressed(np.stack(skins), np.array([np.count_nonzero(o) * pitch**2 for o in overlaps]), 0.0)
+    cells = min(method.cells or side, side)
+    coarse = cv2.resize(heights, (cells, cells), interpolation=cv2.INTER_AREA)
+    cell = side * pitch / cells
+    gel, unit = _compliances(cells, cell, method.tier)
+    # Compliances of gel and object add.
+    solution = solve(coarse.max() - coarse, forces, gel.plus(unit, 1 / modulus), cell, tolerance=RESIDUAL / cells)
+    sinks = gel.sink(solution.pressure)
+    areas, residual = np.count_nonzero(solution.pressure > 0, axis=(1, 2)) * cell**2, float(solution.residual.max())
+    if cells == side:
+        return Pressed(sinks, areas, residual)
+    fine = heights - _enlarge(coarse, side)
+    together = series(GEL.modulus, modulus)
+    # The share of the fine part that the pressure flattens, of that what the gel and not the object gives way.
+    flattened = math.sqrt(2) / (together * max(_rms_slope(fine, pitch), 1e-9))
+    share = np.float32(together / GEL.modulus) * fine
+    skins = [
+        _enlarge(sink, side) + share * erf(np.float32(flattened) * _enlarge(pressure, side))
+        for sink, pressure in zip(sinks, solution.pressure, strict=True)
+    ]
+    return Pressed(np.stack(skins), areas, residual)
 
 
 @lru_cache(maxsize=16)
-def _bodies(cells: int, pitch: float, tier: Tier) -> tuple[Kernel, Kernel]:
+def _compliances(cells: int, pitch: float, tier: Tier) -> tuple[Kernel, Kernel]:
     """Of the gel, and of a half-space of modulus 1."""
     shape = (cells, cells)
-    field = np.zeros(shape, np.float32)
-    own = layer_table(shape, pitch, GEL) if tier == "layer" else half_space_table(shape, pitch, GEL.modulus)
-    return make_kernel(own, field), make_kernel(half_space_table(shape, pitch, 1.0), field)
+    gel = layer_table(shape, pitch, GEL) if tier == "layer" else half_space_table(shape, pitch, GEL.modulus)
+    return make_kernel(gel, np.float32), make_kernel(half_space_table(shape, pitch, 1.0), np.float32)
 
 
 def _enlarge(field: Heights, side: int) -> Heights:

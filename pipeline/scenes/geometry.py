@@ -11,12 +11,11 @@ from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from pipeline.core.records import Record
 from pipeline.scenes.grid import Grid, Heights, Length
 from pipeline.scenes.relief import AnyLayer
-
-__all__ = ["IMAGE_MM", "Bar", "Body", "Flat", "Heights", "Round", "Wedge", "heights"]
 
 IMAGE_MM = (18.6, 14.3)
 """Width and height of what the camera sees (data sheet of the GelSight Mini)."""
@@ -24,11 +23,7 @@ Radius = Annotated[float, Field(gt=0, le=1e4, allow_inf_nan=False)]
 """In mm."""
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class Flat(_Part):
+class Flat(Record):
     """A plane."""
 
     kind: Literal["flat"]
@@ -38,7 +33,7 @@ class Flat(_Part):
         return np.zeros((grid.side, grid.side), np.float32)
 
 
-class Round(_Part):
+class Round(Record):
     """The paraboloid -x^2 / 2 Rx - y^2 / 2 Ry that touches a body of these radii (Johnson, Contact Mechanics, 4.1)."""
 
     kind: Literal["round"]
@@ -51,7 +46,7 @@ class Round(_Part):
         return -x * x / np.float32(2 * self.radii[0]) - y * y / np.float32(2 * self.radii[1])
 
 
-class Bar(_Part):
+class Bar(Record):
     """A long bar, flat on top, whose edges fall off as -(|x| - width / 2 + edge)^2 / 2 edge: tape, strap, ruler."""
 
     kind: Literal["bar"]
@@ -73,7 +68,7 @@ class Bar(_Part):
         return below
 
 
-class Wedge(_Part):
+class Wedge(Record):
     """A rounded edge, the hyperbola -s (sqrt(x^2 + s^2 R^2) - s R): radius R on top, slope s far from it."""
 
     kind: Literal["wedge"]

@@ -10,7 +10,9 @@ from typing import Annotated
 import numpy as np
 import numpy.typing as npt
 import scipy.fft
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from pipeline.core.records import Record
 
 Heights = npt.NDArray[np.float32]
 Length = Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)]
@@ -45,10 +47,8 @@ class Grid:
         return x * cosine + y * sine, y * cosine - x * sine
 
 
-class Layer(BaseModel, ABC):
+class Layer(Record, ABC):
     """One layer of relief."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     @abstractmethod
     def sample(self, grid: Grid, rng: np.random.Generator) -> Heights:

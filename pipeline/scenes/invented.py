@@ -19,12 +19,11 @@ from pipeline.config import INVENTED, InventConfig, Params
 from pipeline.core.io import atomic_folder, code_of, fingerprint, write_text
 from pipeline.core.parallel import run_parallel
 from pipeline.core.runtime import CHECKPOINTS, derive_seed
-from pipeline.scenes.contact import Body, Method
+from pipeline.scenes.contact import Method, press_by
 from pipeline.scenes.geometry import IMAGE_MM, heights
 from pipeline.scenes.invent import invent
 from pipeline.scenes.measure import BIG_SHARE, ROUGH_MM, bump_share, texture
 from pipeline.scenes.recipe import MODULUS_MPA, SCENES, Range, Recipe
-from pipeline.scenes.relief import AnyLayer
 from pipeline.videos.catalogue import OBJECTS, PROPERTIES, Catalogue, Object, load_catalogue
 
 WORDS = Path(__file__).parents[1] / "physiclear"
@@ -43,7 +42,7 @@ BUMPS: tuple[Range, ...] = ((0.0, 0.0), (0.02, BIG_SHARE / 1.25), (BIG_SHARE * 1
 WIDTHS_MM: tuple[Range, ...] = ((0.0, math.inf), (0.7, 4.5), (3.0, math.inf))
 """Of the widest layer of relief, by bumpiness: outside nothing measures as such, so it need not be pressed."""
 ACROSS = {"plates": "size", "weave": "spacing", "creases": "spacing", "digits": "stroke"}
-"""By kind of layer, what says how wide it is where that is not called `width`."""
+"""By kind of layer, what says how wide a feature is where that is not called `width`; roughness has no width."""
 FORCES_N = (1.0, 3.0)
 """A patch is pressed with each; both must show the bumps of the class."""
 WIDTH, HEIGHT = 160, 120
@@ -111,7 +110,9 @@ def draw(classes: tuple[int, int, int], rng: np.random.Generator) -> Recipe:
     hardness, roughness, bumpiness = classes
     while True:
         recipe = invent(rng)
-        if not _within(max(map(_width, recipe.relief), default=0.0), WIDTHS_MM[bumpiness]):
+        sizes = [getattr(layer, ACROSS.get(layer.kind, "width"), 0.0) for layer in recipe.relief]
+        widest = max((size[0] if isinstance(size, tuple) else size for size in sizes), default=0.0)
+        if not WIDTHS_MM[bumpiness][0] <= widest <= WIDTHS_MM[bumpiness][1]:
             continue
         modulus = math.exp(rng.uniform(*np.log(MODULUS_MPA[hardness])))
         recipe = recipe.model_copy(update={"modulus": modulus})
@@ -123,20 +124,10 @@ def _measures(recipe: Recipe, roughness: int, bumpiness: int, force: float, rng:
     """Whether a fresh patch has the texture and, pressed, shows the bumps of these classes."""
     surface = heights(recipe.body, recipe.relief, SIDE, PITCH, rng)
     view = tuple(slice((SIDE - size) // 2, (SIDE - size) // 2 + size) for size in (HEIGHT, WIDTH))
-    if not _within(texture(surface[view], PITCH), TEXTURE[roughness]):
+    if not TEXTURE[roughness][0] <= texture(surface[view], PITCH) <= TEXTURE[roughness][1]:
         return False
-    (skin,) = Body(surface, recipe.modulus, PITCH).press(METHOD, np.array([force])).skins
-    return _within(bump_share(skin[view], PITCH), BUMPS[bumpiness])
-
-
-def _width(layer: AnyLayer) -> float:
-    """Of one of its features, in mm; 0 for roughness, which has none."""
-    size = getattr(layer, ACROSS.get(layer.kind, "width"), 0.0)
-    return float(size[0] if isinstance(size, tuple) else size)
-
-
-def _within(value: float, bounds: Range) -> bool:
-    return bounds[0] <= value <= bounds[1]
+    (skin,) = press_by(METHOD, surface, np.array([force]), recipe.modulus, PITCH).skins
+    return BUMPS[bumpiness][0] <= bump_share(skin[view], PITCH) <= BUMPS[bumpiness][1]
 
 
 @dataclass(frozen=True)

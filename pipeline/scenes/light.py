@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.scenes.geometry import Heights
+from pipeline.scenes.grid import Heights
 
 Image = npt.NDArray[np.uint8]
 Plane = npt.NDArray[np.float32]
@@ -107,7 +107,11 @@ def make_sensor(width: int, height: int, seed: int) -> Sensor:
         [np.exp(surface(c, *moved)) * t for c, t in zip(NARROW if narrow else WIDE, tints, strict=True)], -1
     )
     if not narrow:
-        glow *= _rim(x * width / height, y, width / height)[..., None]
+        # How far a pixel lies beyond the rounded rectangle of the gel, in half picture heights; 1 on it, RIM beyond.
+        aspect, radius = width / height, 2 * RIM_RADIUS
+        over_x, over_y = np.abs(x * width / height) - aspect + radius, np.abs(y) - 1 + radius
+        beyond = np.hypot(np.maximum(over_x, 0), np.maximum(over_y, 0)) - radius
+        glow *= (1 - (1 - RIM) / (1 + np.exp(-np.clip((beyond - 0.023) / 0.015, -50, 50))))[..., None]
     glow = glow.astype(np.float32)
     gains = tuple(
         ((surface(across, x, y) * s).astype(np.float32), (surface(along, x, y) * s).astype(np.float32))
@@ -144,7 +148,14 @@ def shade(skin: Heights, sensor: Sensor, pitch: float, seed: int, drift: Drift |
         changes.append(light)
     picture = cv2.merge(changes)
     picture += sensor.glow
-    picture *= sensor.dust if drift is None else _moved(sensor.dust, drift, pitch)
+    dust = sensor.dust
+    if drift is not None:
+        # Where the paint has carried it; drift is smooth, so where a grain came from has moved about as far.
+        x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+        from_x, from_y = x - drift[0] / np.float32(pitch), y - drift[1] / np.float32(pitch)
+        # Beyond the picture there is no dust: all light passes.
+        dust = cv2.remap(dust, from_x, from_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(1, 1, 1))
+    picture *= dust
     top, left = seed % (height // 2 + 1), (seed >> 20) % (width // 2 + 1)
     picture += sensor.noise[top : top + height, left : left + width]
     image: Image = cv2.convertScaleAbs(np.maximum(picture, 0, out=picture))
@@ -156,13 +167,6 @@ def surface(curve: Curve, x: npt.NDArray[np.float64], y: npt.NDArray[np.float64]
     powers = [(total - down, down) for total in range(len(curve)) for down in range(total + 1)][: len(curve)]
     terms = (factor * x**across * y**down for factor, (across, down) in zip(curve, powers, strict=True))
     return sum(terms, np.zeros_like(x))
-
-
-def _rim(x: npt.NDArray[np.float64], y: npt.NDArray[np.float64], aspect: float) -> npt.NDArray[np.float64]:
-    """1 on the gel, `RIM` beyond its rounded corners; x from -aspect to aspect, y from -1 to 1."""
-    radius = 2 * RIM_RADIUS
-    beyond = np.hypot(np.maximum(np.abs(x) - aspect + radius, 0), np.maximum(np.abs(y) - 1 + radius, 0)) - radius
-    return 1 - (1 - RIM) / (1 + np.exp(-np.clip((beyond - 0.023) / 0.015, -50, 50)))
 
 
 def _dust(
@@ -178,14 +182,3 @@ def _dust(
         size = max(size, 0.5 * 2 * half / width)  # No smaller than what the grid can carry.
         dust *= 1 - rng.uniform(0.1, 0.35) * np.exp(-((along / longer) ** 2 + across**2) / (2 * size**2))
     return np.repeat(dust[..., None].astype(np.float32), 3, axis=-1)
-
-
-def _moved(dust: npt.NDArray[np.float32], drift: Drift, pitch: float) -> npt.NDArray[np.float32]:
-    """The dust where the paint has carried them; drift is smooth, so where it came from has moved about as far."""
-    height, width = dust.shape[:2]
-    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    from_x, from_y = x - drift[0] / np.float32(pitch), y - drift[1] / np.float32(pitch)
-    moved: npt.NDArray[np.float32] = cv2.remap(
-        dust, from_x, from_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(1, 1, 1)
-    )
-    return moved

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from pipeline.scenes.grid import Heights
 
@@ -74,18 +73,6 @@ class Measured:
         return (self.bump > 0) + (self.bump > BIG_SHARE)
 
 
-def measure(modulus: float, surface: Heights, skin: Heights, pitch: float) -> Measured:
-    """All that the classes need.
-
-    Args:
-        modulus: The object's reduced modulus in MPa.
-        surface: Its undeformed heights over the image, height x width, in mm.
-        skin: Indentation of the gel in the same place, height x width, in mm.
-        pitch: Of both, in mm a pixel.
-    """
-    return Measured(modulus, texture(surface, pitch), bump_share(skin, pitch))
-
-
 def texture(surface: Heights, pitch: float) -> float:
     """Root mean square height in mm of wavelengths below `TEXTURE_MM` where the surface stands out.
 
@@ -117,8 +104,10 @@ def bump_share(skin: Heights, pitch: float) -> float:
     if not touched.any():
         return 0.0
     smooth = _smooth(coarse, TEXTURE_MM, pitch * rows / height)
-    body = _paraboloid(smooth, touched)
-    # Around the contact the paraboloid means nothing.
+    # The least-squares paraboloid through the skin where it is touched; around the contact it means nothing.
+    x, y = np.meshgrid(np.linspace(-1, 1, smooth.shape[1]), np.linspace(-1, 1, height))
+    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+    body = (terms @ np.linalg.lstsq(terms[touched], smooth[touched], rcond=None)[0]).astype(np.float32)
     rest = np.where(touched, smooth - body, np.minimum(smooth - body, 0))
     proud = np.minimum(_top_hat(smooth), _top_hat(rest))
     widths, areas = _widths(proud)
@@ -128,16 +117,6 @@ def bump_share(skin: Heights, pitch: float) -> float:
     half = np.searchsorted(np.cumsum(np.asarray(areas)[order]), sum(areas) / 2)
     typical = float(np.asarray(widths)[order][half])
     return typical / float(height)
-
-
-def _paraboloid(skin: Heights, where: npt.NDArray[np.bool_]) -> Heights:
-    """The least-squares paraboloid through the skin within a mask."""
-    height, width = skin.shape
-    x, y = np.meshgrid(np.linspace(-1, 1, width), np.linspace(-1, 1, height))
-    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
-    fit = np.linalg.lstsq(terms[where], skin[where], rcond=None)[0]
-    fitted: Heights = (terms @ fit).astype(np.float32)
-    return fitted
 
 
 def _top_hat(image: Heights) -> Heights:

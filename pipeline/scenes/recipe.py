@@ -12,15 +12,16 @@ from pathlib import Path
 from typing import Annotated
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from pipeline.config.params import OneKeyLoader
-from pipeline.core.errors import UserError
+from pipeline.core.errors import UserError, first_problem
+from pipeline.core.records import Record
 from pipeline.core.runtime import derive_seed
 from pipeline.scenes.bumps import Domes, Ridges
 from pipeline.scenes.geometry import IMAGE_MM, Body, Flat, Round
 from pipeline.scenes.relief import AnyLayer, Rough
-from pipeline.videos.catalogue import Catalogue, Object
+from pipeline.videos.catalogue import Catalogue
 
 SCENES = "scenes.yaml"
 Range = tuple[float, float]
@@ -47,10 +48,8 @@ HELD = ("handle", "barrel", "grip")
 """Parts that are thicker in no direction but one."""
 
 
-class Recipe(BaseModel):
+class Recipe(Record):
     """An object as physics sees it."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     modulus: Annotated[float, Field(ge=0.001, le=1e6)]
     """Reduced modulus E / (1 - nu^2) in MPa."""
@@ -87,7 +86,12 @@ def recipe_of(object_id: str, catalogue: Catalogue, seed: int) -> Recipe:
             "data.source=videos for a catalogue with others"
         )
     rng = random.Random(derive_seed(seed, "object", object_id))
-    across, along = RADII_MM[_body(catalogue.objects[object_id], rng)]
+    described = catalogue.objects[object_id]
+    if described.material in LIMP:
+        shape = "flat"
+    else:
+        shape = "barrel" if described.part in HELD else rng.choice(("flat", "round"))
+    across, along = RADII_MM[shape]
     width = max(rng.uniform(*BUMP_SHARE[levels["bumpiness"]]) * IMAGE_MM[1], 0.01)
     height, spacing = width * rng.uniform(*BUMP_STEEPNESS), width * rng.uniform(1.15, 1.7)
     size = {"height": height, "width": width, "spacing": spacing}
@@ -115,25 +119,9 @@ def _read(file: Path, catalogue: Catalogue) -> dict[str, Recipe]:
         try:
             recipes[object_id] = Recipe.model_validate(entry)
         except ValidationError as error:
-            raise UserError(f"{file}: {object_id}: {_explain(error)}") from None
+            what = first_problem(error)
+            raise UserError(f"{file}: {object_id}: {what}; docs/scenes.md says which keys a recipe has") from None
     return recipes
-
-
-def _explain(error: ValidationError) -> str:
-    """The first problem in one line: key, what it is, what it should be."""
-    detail = error.errors(include_url=False)[0]
-    key = ".".join(str(part) for part in detail["loc"]) or "recipe"
-    if detail["type"] == "extra_forbidden":
-        return f"{key} is not a key of a recipe; remove it or see docs/scenes.md for the right name"
-    if detail["type"] == "missing":
-        return f"{key} is missing; add it"
-    return f"{key} is {detail['input']!r}: {detail['msg']}; correct it"
-
-
-def _body(described: Object, rng: random.Random) -> str:
-    if described.material in LIMP:
-        return "flat"
-    return "barrel" if described.part in HELD else rng.choice(("flat", "round"))
 
 
 def _log_uniform(rng: random.Random, bounds: Range) -> float:

@@ -14,9 +14,10 @@ from pipeline.core.errors import UserError
 from pipeline.core.runtime import derive_seed
 from pipeline.scenes.contact import GEL, LADDER, Imprint, Method, press
 from pipeline.scenes.elastic.torsion import slip_turn, twist
-from pipeline.scenes.geometry import IMAGE_MM, Heights, heights
+from pipeline.scenes.geometry import IMAGE_MM, heights
+from pipeline.scenes.grid import Heights
 from pipeline.scenes.light import Image, Sensor, shade
-from pipeline.scenes.measure import Measured, measure
+from pipeline.scenes.measure import Measured, bump_share, texture
 from pipeline.scenes.motion import REACH_MM, Motion, make_motion
 from pipeline.scenes.recipe import Recipe
 
@@ -59,7 +60,8 @@ def measure_scene(scene: Scene, recipe: Recipe, config: ScenesConfig) -> Measure
     """What the object's classes can be told from, in the middle of the patch under the largest force."""
     top, left = (scene.surface.shape[0] - config.height) // 2, (scene.surface.shape[1] - config.width) // 2
     view = (slice(top, top + config.height), slice(left, left + config.width))
-    return measure(recipe.modulus, scene.surface[view], scene.imprint.skins[-1][view], scene.pitch)
+    rough, bump = texture(scene.surface[view], scene.pitch), bump_share(scene.imprint.skins[-1][view], scene.pitch)
+    return Measured(recipe.modulus, rough, bump)
 
 
 def render(scene: Scene, config: ScenesConfig, sensor: Sensor, seed: int) -> Iterator[Image]:

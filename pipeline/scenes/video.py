@@ -7,7 +7,6 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import fmean
 
 import cv2
 import numpy as np
@@ -82,18 +81,15 @@ def synthesize(recipes: Mapping[str, Recipe], config: ScenesConfig, folder: Path
     return sorted(rows, key=lambda row: row.video)
 
 
-MEASURED = ("hardness", "roughness", "bumpiness")
-"""Properties that a scene shows; a catalogue's others may have the name of another column."""
-
-
 def share_as_labelled(rows: Sequence[SceneRow], catalogue: Catalogue) -> float:
     """The share of the videos whose scene measures in all classes as the catalogue labels its object."""
-
-    def fits(row: SceneRow) -> bool:
-        labels = zip(catalogue.property_names, catalogue.labels(row.object_id), strict=True)
-        return all(getattr(row, name) == label for name, label in labels if name in MEASURED)
-
-    return round(fmean(map(fits, rows)), 4)
+    fitting = 0
+    for row in rows:
+        # Further properties of a catalogue leave no trace in a scene.
+        labels = dict(zip(catalogue.property_names, catalogue.labels(row.object_id), strict=True))
+        measured = {"hardness": row.hardness, "roughness": row.roughness, "bumpiness": row.bumpiness}
+        fitting += all(labels.get(name, found) == found for name, found in measured.items())
+    return round(fitting / len(rows), 4)
 
 
 @dataclass(frozen=True)

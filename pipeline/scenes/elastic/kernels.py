@@ -41,10 +41,6 @@ class Gel:
         """G = E / 2 (1 + nu), in MPa."""
         return self.modulus * (1 - self.poisson) / 2
 
-    def __post_init__(self) -> None:
-        if not (self.modulus > 0 and 0 <= self.poisson <= 0.5 and self.thickness > 0):
-            raise ValueError(f"{self}: modulus and thickness must be positive, Poisson's ratio from 0 to .5")
-
 
 def layer_response(wave: npt.ArrayLike, poisson: float) -> npt.NDArray[np.float64]:
     """How much softer than a half-space a bonded layer is to a wave of pressure: S, from 0 to about 1.
@@ -72,24 +68,24 @@ def layer_response(wave: npt.ArrayLike, poisson: float) -> npt.NDArray[np.float6
     return over / under
 
 
-def love(shape: tuple[int, int]) -> Table:
-    """A half-space's influence table for pixels of side 1 and a reduced modulus of 1, at offsets of 0 to
-    rows - 1 and 0 to columns - 1.
+def half_space_table(shape: tuple[int, int], pitch: float, modulus: float) -> Table:
+    """The influence table of a half-space of this reduced modulus, at offsets of 0 to rows - 1 and 0 to columns - 1.
 
     Love 1929, Phil. Trans. A 228; Johnson, Contact Mechanics, 3.25: with f(x, y) = x asinh(y/|x|) + y asinh(x/|y|)
-    the sink is [f(x+1/2, y+1/2) - f(x+1/2, y-1/2) - f(x-1/2, y+1/2) + f(x-1/2, y-1/2)] / pi.
+    and pixels of side 1, the sink is [f(x+1/2, y+1/2) - f(x+1/2, y-1/2) - f(x-1/2, y+1/2) + f(x-1/2, y-1/2)] / pi.
     """
     y = np.arange(shape[0] + 1)[:, None] - 0.5
     x = np.arange(shape[1] + 1)[None, :] - 0.5
     corner = x * np.arcsinh(y / np.abs(x)) + y * np.arcsinh(x / np.abs(y))
-    return np.asarray(np.diff(np.diff(corner, axis=0), axis=1) / np.pi)
+    return np.asarray(np.diff(np.diff(corner, axis=0), axis=1) / np.pi * pitch / modulus)
 
 
-def layer_correction(shape: tuple[int, int], pitch: float, gel: Gel) -> Table:
-    """What a bonded layer's influence table has in addition to the half-space's, in mm per MPa.
+def layer_table(shape: tuple[int, int], pitch: float, gel: Gel) -> Table:
+    """The influence table of a bonded layer, at the same offsets: the half-space's and a correction.
 
-    The inverse Hankel transform of 2 (S - 1) / (E* q), smooth on the scale of the thickness, so that it is computed
-    along a radius by Gauss's rule and interpolated; a pixel's pressure is spread over the pixel by exp(-q^2 h^2 / 24).
+    The correction is the inverse Hankel transform of 2 (S - 1) / (E* q). It is smooth on the scale of the thickness, so
+    that it is computed along a radius by Gauss's rule and interpolated; a pixel's pressure is spread over the pixel by
+    exp(-q^2 h^2 / 24).
 
     Raises:
         ValueError: if the gel is thinner than two pixels, where the correction is not smooth.
@@ -103,7 +99,8 @@ def layer_correction(shape: tuple[int, int], pitch: float, gel: Gel) -> Table:
     radii = np.linspace(0, farthest, int(32 + 24 * farthest))
     along = j0(radii[:, None] * k[None, :]) @ (weights * change)
     place = np.hypot(np.arange(shape[0])[:, None], np.arange(shape[1])[None, :]) * pitch / gel.thickness
-    return np.asarray(CubicSpline(radii, along)(place) * pitch**2 / (np.pi * gel.modulus * gel.thickness))
+    correction = CubicSpline(radii, along)(place) * pitch**2 / (np.pi * gel.modulus * gel.thickness)
+    return np.asarray(half_space_table(shape, pitch, gel.modulus) + correction)
 
 
 @dataclass(frozen=True)
@@ -114,8 +111,6 @@ class Kernel:
     """Transform of the table in the doubled domain."""
     waves: Array
     """Transform of the table as if the field were repeated without end."""
-    own: float
-    """How far a pixel sinks under a unit pressure on itself, in mm per MPa."""
     shape: tuple[int, int]
     """Of the fields."""
 
@@ -137,36 +132,24 @@ class Kernel:
 
     def plus(self, other: Kernel, share: float) -> Kernel:
         """With `share` times the other's compliance added."""
-        spectrum, waves = self.spectrum + other.spectrum * share, self.waves + other.waves * share
-        return Kernel(spectrum, waves, self.own + other.own * share, self.shape)
+        return Kernel(self.spectrum + other.spectrum * share, self.waves + other.waves * share, self.shape)
 
 
-def make_kernel(table: Table, field: Array) -> Kernel:
-    """Prepare a table of offsets for fields of the number format of `field`, rows x columns last."""
-    rows, columns = field.shape[-2:]
-    spectrum, waves = (_transform(table, _quick(domain)) for domain in ((2 * rows, 2 * columns), (rows, columns)))
-    return Kernel(spectrum.astype(field.dtype), waves.astype(field.dtype), float(table[0, 0]), (rows, columns))
-
-
-def _transform(table: Table, domain: tuple[int, int]) -> Table:
-    """Of the table, continued evenly to the left and upwards; even in both directions, it has no imaginary part."""
-    row, column = (np.minimum(np.arange(n), n - np.arange(n)) for n in domain)
-    known = (row < table.shape[0])[:, None] & (column < table.shape[1])[None, :]
-    whole = table[np.minimum(row, table.shape[0] - 1)[:, None], np.minimum(column, table.shape[1] - 1)[None, :]]
-    return np.asarray(np.fft.rfft2(np.where(known, whole, 0.0)).real)
+def make_kernel(table: Table, dtype: npt.DTypeLike = np.float64) -> Kernel:
+    """Prepare a table of offsets for fields of its size, in this number format."""
+    rows, columns = table.shape
+    transforms: list[Array] = []
+    for domain in (_quick((2 * rows, 2 * columns)), _quick((rows, columns))):
+        # The table, continued evenly to the left and upwards, and 0 where it ends: its transform is real.
+        row, column = (np.minimum(np.arange(n), n - np.arange(n)) for n in domain)
+        known = (row < rows)[:, None] & (column < columns)[None, :]
+        whole = table[np.minimum(row, rows - 1)[:, None], np.minimum(column, columns - 1)[None, :]]
+        transforms.append(np.fft.rfft2(np.where(known, whole, 0.0)).real.astype(dtype))
+    spectrum, waves = transforms
+    return Kernel(spectrum, waves, (rows, columns))
 
 
 def _quick(shape: tuple[int, int]) -> tuple[int, int]:
     """The next size that is quick to transform."""
     rows, columns = (scipy.fft.next_fast_len(n, real=True) for n in shape)
     return rows, columns
-
-
-def half_space_table(shape: tuple[int, int], pitch: float, modulus: float) -> Table:
-    """The influence table of a half-space of this reduced modulus, rows x columns."""
-    return love(shape) * pitch / modulus
-
-
-def layer_table(shape: tuple[int, int], pitch: float, gel: Gel) -> Table:
-    """The influence table of a bonded layer, rows x columns; ValueError as `layer_correction`."""
-    return half_space_table(shape, pitch, gel.modulus) + layer_correction(shape, pitch, gel)

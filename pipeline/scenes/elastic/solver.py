@@ -19,7 +19,6 @@ import numpy.typing as npt
 from pipeline.scenes.elastic.kernels import Array, Kernel
 
 Values = npt.NDArray[np.float64]
-ITERATIONS = 500
 
 
 class NotConverged(UserWarning):
@@ -36,7 +35,6 @@ class Solution:
     """How far the bodies come together after first touch, in mm."""
     residual: Values
     """Share of the work that is not done yet."""
-    iterations: npt.NDArray[np.int64]
     converged: npt.NDArray[np.bool_]
 
 
@@ -47,7 +45,7 @@ def solve(
     pitch: float,
     *,
     tolerance: float = 1e-5,
-    iterations: int = ITERATIONS,
+    iterations: int = 500,
 ) -> Solution:
     """Press bodies with forces; warns (`NotConverged`) where the residual stays above the tolerance.
 
@@ -73,87 +71,70 @@ def solve(
     scale = mean[:, None, None].astype(gap.dtype)
     pressure = np.zeros_like(np.broadcast_to(gap, shape))
     approach, residual = np.zeros(len(loads)), np.zeros(len(loads))
-    steps = np.zeros(len(loads), dtype=np.int64)
 
+    # Letters as in Polonsky & Keer: pressure p, sink u, gap g, direction of descent t; `before` is gap times descent of
+    # the step before.
     active = np.flatnonzero(loads > 0)
-    work = _Contacts(np.ones_like(pressure[active]), np.broadcast_to(gap, shape)[active] / scale[active])
+    apart = np.broadcast_to(gap, shape)[active] / scale[active]
+    p, t = np.ones_like(apart), np.zeros_like(apart)
+    before = np.ones_like(apart[:, :1, :1])
     for step in range(1, iterations + 1):
+        u = kernel.sink(p)
+        pressed = p > 0
+        g = apart + u
+        # The approach is the mean over the contact; the residual is measured from the lowest gap, as g >= 0 must hold.
+        near = _mean(g, pressed)
+        undone = _sum(p * (g - np.min(g, axis=(-2, -1), keepdims=True)))
+        total = _sum(p * u)
+        undone = undone / np.where(total > 0, total, 1)
+        g = g - near
+
+        done = ~(undone[:, 0, 0] > tolerance) | (step == iterations)
+        out, rest = active[done], ~done
+        pressure[out] = p[done] * scale[out]
+        approach[out] = near[done, 0, 0] * mean[out]
+        residual[out] = undone[done, 0, 0]
+        active = active[rest]
         if not len(active):
             break
-        work.measure(kernel)
-        undone = work.residual[:, 0, 0]
-        done = ~(undone > tolerance) | (step == iterations)
-        if done.any():
-            out = active[done]
-            pressure[out] = work.p[done] * scale[out]
-            approach[out] = work.approach[done, 0, 0] * mean[out]
-            residual[out], steps[out] = undone[done], step
-            active = active[~done]
-            work.keep(np.flatnonzero(~done))
-        if len(active):
-            work.descend(kernel)
+        apart, p, t, g, before, pressed = (field[rest] for field in (apart, p, t, g, before, pressed))
+
+        # Where bodies overlap without pressure, there is contact from now on, and the direction starts afresh.
+        touching = pressed | (g < 0)
+        grown = np.any(touching & ~pressed, axis=(-2, -1), keepdims=True)
+        inside = np.where(touching, g, 0)
+        z = np.where(touching, kernel.press(inside), 0)
+        z = np.where(touching, z - _mean(z, touching), 0)
+        descent = _sum(inside * z)
+        t = np.where(touching, z + np.where(grown, 0, descent / before) * t, 0)
+        under = _sum(kernel.sink(t) * t)
+        length = _sum(inside * t) / np.where(under > 0, under, 1)
+        p = np.clip(p - length * t, 0, None)
+        average = np.mean(p, axis=(-2, -1), keepdims=True)
+        # Scaled to a mean of 1; even where nothing is left of it.
+        p = np.where(average > 0, p / np.where(average > 0, average, 1), 1)
+        before = np.where(descent == 0, np.inf, descent)
+
     converged = residual <= tolerance
     if not converged.all():
         worst = int(np.argmax(np.nan_to_num(residual, nan=np.inf)))
         warnings.warn(
-            f"the contact under {loads[worst]:g} N has not converged after {steps[worst]} iterations: residual "
+            f"the contact under {loads[worst]:g} N has not converged within {iterations} iterations: residual "
             f"{residual[worst]:.2g}, asked for {tolerance:.2g}",
             NotConverged,
             stacklevel=2,
         )
-    return Solution(pressure, approach, residual, steps, converged)
+    return Solution(pressure, approach, residual, converged)
 
 
-class _Contacts:
-    """Contacts on their way to equilibrium; letters as in Polonsky & Keer."""
+def _sum(field: Array) -> Array:
+    """Over the field, for each contact."""
+    total: Array = np.sum(field, axis=(-2, -1), keepdims=True)
+    return total
 
-    def __init__(self, p: Array, gap: Array) -> None:
-        self.p, self.gap = p, gap
-        self.t = np.zeros_like(p)
-        """Direction of descent."""
-        self.g_old = np.ones_like(p[:, :1, :1])
-        """Gap times direction before; infinite after the contact has grown, so that the direction starts afresh."""
 
-    def measure(self, kernel: Kernel) -> None:
-        """Gaps, approach and residual of the pressures as they are."""
-        u = kernel.sink(self.p)
-        pressed = self.p > 0
-        g = self.gap + u
-        # The approach is the mean over the contact; the residual is measured from the lowest gap, as g >= 0 must hold.
-        self.approach = self._mean(g, pressed)
-        worst = np.min(g, axis=(-2, -1), keepdims=True)
-        undone = np.sum(self.p * (g - worst), axis=(-2, -1), keepdims=True)
-        total = np.sum(self.p * u, axis=(-2, -1), keepdims=True)
-        self.residual = undone / np.where(total > 0, total, 1)
-        self.g = g - self.approach
-        # Where bodies overlap without pressure, there is contact from now on.
-        self.touching = pressed | (self.g < 0)
-        self.grown = np.any(self.touching & ~pressed, axis=(-2, -1), keepdims=True)
-
-    def keep(self, which: npt.NDArray[np.int64]) -> None:
-        """Go on with these only."""
-        for name in ("p", "gap", "t", "g_old", "touching", "grown", "g"):
-            setattr(self, name, getattr(self, name)[which])
-
-    def descend(self, kernel: Kernel) -> None:
-        """One step along the conjugate direction, cut off at 0."""
-        inside = np.where(self.touching, self.g, 0)
-        z = np.where(self.touching, kernel.press(inside), 0)
-        z = np.where(self.touching, z - self._mean(z, self.touching), 0)
-        squares = np.sum(inside * z, axis=(-2, -1), keepdims=True)
-        share = np.where(self.grown, 0, squares / self.g_old)
-        self.t = np.where(self.touching, z + share * self.t, 0)
-        r = kernel.sink(self.t)
-        under = np.sum(r * self.t, axis=(-2, -1), keepdims=True)
-        length = np.sum(inside * self.t, axis=(-2, -1), keepdims=True) / np.where(under > 0, under, 1)
-        p = np.clip(self.p - length * self.t, 0, None)
-        mean = np.mean(p, axis=(-2, -1), keepdims=True)
-        # Scaled to a mean of 1; even where nothing is left of it.
-        self.p = np.where(mean > 0, p / np.where(mean > 0, mean, 1), 1)
-        self.g_old = np.where(squares == 0, np.inf, squares)
-
-    def _mean(self, field: Array, where: npt.NDArray[np.bool_]) -> Array:
-        """Over the contact."""
-        count = np.sum(where, axis=(-2, -1), keepdims=True, dtype=field.dtype)
-        mean: Array = np.sum(np.where(where, field, 0), axis=(-2, -1), keepdims=True) / count
-        return mean
+def _mean(field: Array, where: npt.NDArray[np.bool_]) -> Array:
+    """Over a part of the field, for each contact."""
+    count = np.sum(where, axis=(-2, -1), keepdims=True, dtype=field.dtype)
+    mean: Array = _sum(np.where(where, field, 0)) / count
+    return mean

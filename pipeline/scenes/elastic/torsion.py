@@ -26,17 +26,13 @@ def share_of_turn(distance: npt.ArrayLike, radius: float) -> npt.NDArray[np.floa
     return np.where(ratio > 1e-2, near, 2 * ratio**3 / 3 + ratio**5 / 5) * (2 / np.pi)
 
 
-def torque(turn: float, radius: float, shear_modulus: float) -> float:
-    """T = 16/3 G a^3 theta, in N mm for radians, mm and MPa (Johnson, 3.112)."""
-    return 16 / 3 * shear_modulus * radius**3 * turn
-
-
-def slip_turn(force: float, radius: float, shear_modulus: float, friction: float = FRICTION) -> float:
+def slip_turn(force: float, radius: float, shear_modulus: float) -> float:
     """The turn in radians at which a ball's contact slips as a whole: the torque of friction over the stiffness.
 
-    Friction under Hertz's pressure carries 3 pi / 16 mu F a (Lubkin 1951; Johnson, 7.4).
+    Friction under Hertz's pressure carries 3 pi / 16 mu F a (Lubkin 1951; Johnson, 7.4); a radian takes 16/3 G a^3
+    (Johnson, 3.112). In N, mm and MPa.
     """
-    return 3 * math.pi / 16 * friction * force * radius / torque(1.0, radius, shear_modulus) if radius > 0 else 0.0
+    return 3 * math.pi / 16 * FRICTION * force * radius / (16 / 3 * shear_modulus * radius**3) if radius > 0 else 0.0
 
 
 def twist(

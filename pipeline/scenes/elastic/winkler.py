@@ -7,8 +7,6 @@ in series, and the camera sees the gel's share of the overlap, (E* / E_gel) c.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -26,23 +24,15 @@ TOLERANCE = 1e-4
 STEPS = 100
 
 
-@dataclass(frozen=True)
-class Springs:
-    """A contact in equilibrium."""
-
-    approach: float
-    """How far the bodies come together after first touch, in mm."""
-    overlap: Heights
-    """Shared out between gel and object, in mm; 0 outside the contact."""
-
-
 def series(first: float, second: float) -> float:
     """The modulus of two springs in series, in the unit of both."""
     return first * (second / (first + second))
 
 
-def press_springs(gap: Heights, force: float, modulus: float, pitch: float, gel: Gel) -> Springs:
+def press_springs(gap: Heights, force: float, modulus: float, pitch: float, gel: Gel) -> Heights:
     """Press an object into the gel until the pressure adds up to `force`, by bisection of the approach.
+
+    Returns how far both overlap, shared out between them, in mm: 0 outside the contact, at most the approach.
 
     Args:
         gap: Distance of the undeformed surfaces at first touch, in mm; not negative, and 0 somewhere.
@@ -52,25 +42,23 @@ def press_springs(gap: Heights, force: float, modulus: float, pitch: float, gel:
         gel: The sensor's.
     """
     if force <= 0:
-        return Springs(0.0, np.zeros_like(gap))
+        return np.zeros_like(gap)
     # Force a millimetre of overlap and pixel: (E* / t) dA.
     stiffness = series(gel.modulus, modulus) / gel.thickness * pitch * pitch
     low, high = 0.0, float(gap.max()) + force / (stiffness * gap.size)
     for _ in range(STEPS):
         approach = (low + high) / 2
-        overlap = np.maximum(np.float32(approach) - gap, 0)
+        overlap: Heights = np.maximum(np.float32(approach) - gap, 0)
         reached = stiffness * cv2.sumElems(overlap)[0]
         if abs(reached - force) <= TOLERANCE * force:
             break
         low, high = (approach, high) if reached < force else (low, approach)
-    return Springs(approach, overlap)
+    return overlap
 
 
-def hang_skin(springs: Springs, modulus: float, pitch: float, gel: Gel) -> Heights:
-    """How far the gel's skin is pushed in, in mm: the gel's share, and around it a Gaussian average."""
-    held = springs.overlap * np.float32(series(gel.modulus, modulus) / gel.modulus)
-    if springs.approach == 0:
-        return held
+def hang_skin(overlap: Heights, modulus: float, pitch: float, gel: Gel) -> Heights:
+    """How far the gel's skin is pushed in, in mm: the gel's share of the overlap, and around it a Gaussian average."""
+    held = overlap * np.float32(series(gel.modulus, modulus) / gel.modulus)
     # The Gaussian is taken on a coarser grid where it is much wider than a pixel.
     sigma = MEMBRANE * gel.thickness / pitch
     step, (height, width) = max(1, int(sigma / 2)), held.shape
