@@ -40,7 +40,6 @@ from pipeline.encoder.synthetic import (
 from pipeline.scenes.geometry import heights
 from pipeline.scenes.invent import MODULUS_MPA, invent
 from pipeline.scenes.light import Sensor
-from pipeline.scenes.measure import measure
 from pipeline.scenes.recipe import Recipe
 from pipeline.videos.frames.subtraction import subtract
 from tests.frame_rules import pillow
@@ -180,9 +179,8 @@ def test_quantities_are_measured_where_they_are_shown(number: int, monkeypatch: 
     assert surface.shape == (SIDE, SIDE)
     assert {skin.shape for skin in skins} == {(HEIGHT, WIDTH)}
     for press, skin in zip(told, skins, strict=True):
-        found = measure(float(10 ** press[0]), surface, skin, PITCH)
-        assert 10 ** press[3] - 5e-4 == pytest.approx(found.texture, rel=1e-4, abs=1e-8)
-        assert press[4] == pytest.approx(found.bump, abs=1e-6)
+        assert 10 ** press[3] - 5e-4 == pytest.approx(texture(surface, PITCH), rel=1e-4, abs=1e-8)
+        assert press[4] == pytest.approx(share(skin, PITCH), abs=1e-6)
         assert press[5] == pytest.approx(math.log10(skin.max() + 1e-3), abs=1e-5)
 
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterator
-from dataclasses import fields
+from dataclasses import astuple, fields
 from pathlib import Path
 
 import pytest
 import torch
 
 from pipeline.core.io import atomic
-from tests.numerics.harness import Check, Row, table
+from tests.numerics.harness import Check, Format, Row
 
 ROWS = pytest.StashKey[list[Row]]()
 
@@ -27,9 +27,11 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_sessionfinish(session: pytest.Session) -> None:
     if path := session.config.getoption("--stability-csv", default=None):
         with atomic(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as stream:
-            writer = csv.DictWriter(stream, [f.name for f in fields(Row)], lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(table(session.config.stash[ROWS]))
+            writer = csv.writer(stream, lineterminator="\n")
+            writer.writerow([f.name for f in fields(Row)])
+            # In an order that does not depend on which test ran first.
+            ordered = sorted(session.config.stash[ROWS], key=lambda r: (r.part, r.case, list(Format).index(r.format)))
+            writer.writerows(map(astuple, ordered))
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
@@ -32,11 +32,6 @@ class Format(StrEnum):
     def roundoff(self) -> float:
         """The unit roundoff u: half the distance from 1 to the next number."""
         return torch.finfo(self.torch).eps / 2
-
-    @property
-    def smallest(self) -> float:
-        """The smallest positive number, a subnormal one; what lies below is off by half of it at most."""
-        return torch.finfo(self.torch).smallest_normal * torch.finfo(self.torch).eps
 
     @property
     def short(self) -> bool:
@@ -101,17 +96,20 @@ class Check:
             bound: How far the result may be off; see `Row`.
             exact: The result from another computation, in float64 or better, of the same shape or a single number.
         """
-        assert not any((r.part, r.case, r.format) == (self.part, case, fmt.value) for r in self.rows), f"{case}: twice"
-        found, limit, error = self._floats(compute, fmt), None, None
-        if exact is None and fmt is FLOAT64:
+        found, wanted = _floats(compute, fmt), None
+        if exact is not None:
+            wanted = np.asarray(exact, np.float64)
+            wanted = wanted if wanted.ndim else np.full(found.shape, wanted)
+        elif fmt is FLOAT64:
             self.float64[case] = found
         elif bound is not None:
-            limit = bound(fmt) if callable(bound) else bound
-            if exact is None and case not in self.float64:
-                self.float64[case] = self._floats(compute, FLOAT64)
-            wanted = self.float64[case] if exact is None else np.asarray(exact, np.float64)
-            wanted = wanted if wanted.ndim else np.full(found.shape, wanted)
+            if case not in self.float64:
+                self.float64[case] = _floats(compute, FLOAT64)
+            wanted = self.float64[case]
+        limit = error = None
+        if wanted is not None:
             assert found.shape == wanted.shape, case
+            limit = bound(fmt) if callable(bound) else bound
             if np.isfinite(found).all():
                 error = float(np.abs(found - wanted).max(initial=0)) / (float(np.abs(wanted).max(initial=0)) or 1)
         finite = bool(np.isfinite(found).all())
@@ -120,14 +118,10 @@ class Check:
         self.rows.append(Row(self.part, case, fmt.value, finite, *digits, "pass" if right else "fail"))
         assert right, f"{case} in {fmt}: error {error}, at most {limit}" if finite else f"{case} in {fmt}: not finite"
 
-    def _floats(self, compute: Callable[[Format], npt.ArrayLike], fmt: Format) -> Floats:
-        # A case goes over the edge on purpose: what comes out says so, no warning is needed beside it.
-        with np.errstate(all="ignore"):
-            found = compute(fmt)
-        plain = found.detach().double().cpu().numpy() if isinstance(found, torch.Tensor) else found
-        return np.atleast_1d(np.asarray(plain, np.float64))
 
-
-def table(rows: list[Row]) -> list[dict[str, object]]:
-    """Rows in an order that does not depend on which test ran first."""
-    return [asdict(row) for row in sorted(rows, key=lambda r: (r.part, r.case, list(Format).index(Format(r.format))))]
+def _floats(compute: Callable[[Format], npt.ArrayLike], fmt: Format) -> Floats:
+    # A case goes over the edge on purpose: what comes out says so, no warning is needed beside it.
+    with np.errstate(all="ignore"):
+        found = compute(fmt)
+    plain = found.detach().double().cpu().numpy() if isinstance(found, torch.Tensor) else found
+    return np.atleast_1d(np.asarray(plain, np.float64))

@@ -15,16 +15,13 @@ import torch
 from torch.nn import functional as F
 
 from pipeline.config import EncoderConfig
-from pipeline.core.records import Part
 from pipeline.core.runtime import seed_everything
-from pipeline.encoder.clips import classify
 from pipeline.encoder.frame_classifier import JointFrameClassifier
 from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier, SideBySide, mean_and_deviation
 from pipeline.encoder.recipes import RECIPES, base_encoder, property_classifier
 from pipeline.encoder.release import sinusoid
 from pipeline.encoder.scene_encoder import CHANNELS, SceneEncoder
-from pipeline.videos.catalogue import Catalogue
-from tests.encoders import PARTS, config, encoder_data, write_timm, write_tower
+from tests.encoders import config, write_timm, write_tower
 from tests.numerics.bounds import longest_sum, magnification, rounded, summing
 from tests.numerics.harness import FLOAT32, FLOAT64, NETWORKS, Check, Format, formats
 
@@ -63,15 +60,10 @@ def draw_statistics(network: FrameEncoder) -> None:
 
 
 @cache
-def folder(kind: str) -> Path:
-    made = Path(mkdtemp())
-    return write_timm(made) if kind == "timm" else write_tower(made)
-
-
 def settings(kind: str) -> EncoderConfig:
     if kind == "timm":
-        return config(folder(kind), "tuned", backbone=("timm",), feature_stage=2)
-    return config(folder("clip"), kind)
+        return config(write_timm(Path(mkdtemp())), "tuned", backbone=("timm",), feature_stage=2)
+    return config(write_tower(Path(mkdtemp())), kind)
 
 
 @cache
@@ -88,17 +80,12 @@ def both(model: FrameEncoder, frames: torch.Tensor, times: torch.Tensor = TIMES)
     return given if same else torch.cat([given, model.describe(frames, times)], dim=1)
 
 
-def hard_frames() -> dict[str, torch.Tensor]:
-    """uint8, 4 x side x side x RGB."""
-    noise = torch.from_numpy(np.random.default_rng(0).integers(0, 256, (4, SIDE, SIDE, 3), dtype=np.uint8))
-    shown = {"noise": noise}
-    for name, value in (("black", 0), ("grey", 128), ("white", 255)):
-        shown[f"{name}, one half the opposite"] = torch.full_like(noise, value)
-        shown[f"{name}, one half the opposite"][1, : SIDE // 2] = 255 - value
-    return shown
-
-
-FRAMES = hard_frames()
+NOISE = torch.from_numpy(np.random.default_rng(0).integers(0, 256, (4, SIDE, SIDE, 3), dtype=np.uint8))
+FRAMES = {"noise": NOISE}
+"""uint8, 4 x side x side x RGB."""
+for name, value in (("black", 0), ("grey", 128), ("white", 255)):
+    FRAMES[f"{name}, one half the opposite"] = torch.full_like(NOISE, value)
+    FRAMES[f"{name}, one half the opposite"][1, : SIDE // 2] = 255 - value
 
 
 @cache
@@ -206,24 +193,3 @@ def test_the_network_is_seven_convolutions_of_what_differs_from_128(check: Check
         return encoder("tuned", f)(shown, TIMES)
 
     check("scenes: against folded convolutions", FLOAT32, found, 2 * network("tuned", "noise", FLOAT32), exact.numpy())
-
-
-@pytest.mark.parametrize("kind", CLASSIFIERS)
-def test_classifications_do_not_depend_on_the_batch(
-    check: Check, kind: str, catalogue: Catalogue, tmp_path: Path
-) -> None:
-    """use: probabilities are written and compared to six digits."""
-    data, model = encoder_data(tmp_path, catalogue, PARTS), classifier(kind)
-    alone, together = (
-        classify(model, data, [Part.TRAIN, Part.VALIDATION], size, torch.device("cpu")) for size in (1, 64)
-    )
-    assert [(r.video_id, r.predicted) for r in alone] == [(r.video_id, r.predicted) for r in together]
-    exact = np.array([r.probabilities for r in together])
-    np.testing.assert_allclose(exact.sum(1), 1)
-    check(
-        f"{kind}: probabilities one by one, against a batch",
-        FLOAT32,
-        lambda _: [r.probabilities for r in alone],
-        1e-6,
-        exact,
-    )

@@ -20,10 +20,10 @@ from torch.nn import functional as F
 from pipeline.core.runtime import seed_everything
 from pipeline.encoder.frame_classifier import JointFrameClassifier, decode_jointly
 from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
-from pipeline.encoder.release import SHORTEST_FEATURE, PublishedHeads
+from pipeline.encoder.release import PublishedHeads
 from pipeline.encoder.scene_encoder import SceneEncoder
 from tests.numerics.bounds import summing
-from tests.numerics.harness import FLOAT16, FLOAT64, NETWORKS, SOLVED, Check, Floats, Format, formats
+from tests.numerics.harness import FLOAT16, FLOAT64, NETWORKS, SOLVED, Check, Format, formats
 
 PART = "heads"
 CLASSES = (3, 3, 3)
@@ -35,12 +35,6 @@ CLASSES = (3, 3, 3)
 def published_heads(dtype: torch.dtype) -> PublishedHeads:
     seed_everything(0)
     return PublishedHeads(16, [3, 2]).to(dtype).eval()
-
-
-def cancelling(dtype: torch.dtype) -> torch.Tensor:
-    """Two frames whose mean is exactly 0: 1 x 2 x 16."""
-    frame = torch.randn(1, 1, 16, generator=torch.Generator().manual_seed(0)).to(dtype)
-    return torch.cat([frame, -frame], dim=1)
 
 
 @formats(*NETWORKS)
@@ -55,11 +49,12 @@ def test_features_of_length_0_are_classified(check: Check, fmt: Format) -> None:
 
     def classified(f: Format) -> torch.Tensor:
         model = PropertyClassifier(FrameEncoder(16), published_heads(f.torch), [3, 2]).to(f.device)
-        features = cancelling(f.torch).to(f.device).requires_grad_()
+        frame = torch.randn(1, 1, 16, generator=torch.Generator().manual_seed(0)).to(f.device, f.torch)
+        features = torch.cat([frame, -frame], dim=1).requires_grad_()  # Their mean is exactly 0.
         logits = torch.cat(model.classify(features), dim=1)
         F.cross_entropy(logits.float(), torch.tensor([2], device=f.device)).backward()
         assert all(p.grad is not None and p.grad.isfinite().all() for p in model.heads.parameters())
-        # Of the features it is up to 1 / SHORTEST_FEATURE times as large, which float16 does not hold.
+        # Of the features it is up to 1 / release.SHORTEST_FEATURE times as large, which float16 does not hold.
         assert f is FLOAT16 or features.grad.isfinite().all()
         return logits
 
@@ -67,75 +62,51 @@ def test_features_of_length_0_are_classified(check: Check, fmt: Format) -> None:
     check("heads of release: mean of length 0", fmt, classified, bound, exact.numpy())
 
 
-@formats(*NETWORKS)
-@pytest.mark.parametrize(("factor", "shown_as"), [(0.1, 0.1), (10.0, 1.0)])
-def test_short_features_are_shown_by_the_least_length(
-    check: Check, fmt: Format, factor: float, shown_as: float
-) -> None:
-    """roundings: the feature, the least length, their quotient; and what lies below the smallest number, since short
-    formats have few digits left there."""
-    length = factor * SHORTEST_FEATURE
-
-    def shown(f: Format) -> torch.Tensor:
-        """The length of what the hidden layer is given."""
-        heads, given = published_heads(f.torch).to(f.device), []
-        heads.shared.register_forward_pre_hook(lambda _, inputs: given.append(inputs[0].detach().double()))
-        heads(torch.tensor([[length] + [0.0] * 15], dtype=f.torch, device=f.device))
-        return given[0].norm(dim=1)
-
-    below = fmt.smallest * (1 / length + 1 / SHORTEST_FEATURE)
-    check(f"heads of release: length {length:g} is shown as", fmt, shown, 6 * fmt.roundoff + below, shown_as)
-
-
 # Huge logits
-
-
-def huge_classifier(kind: type[PropertyClassifier], weight: float) -> PropertyClassifier:
-    """Heads whose weights are `weight` times as large as fresh ones."""
-    seed_everything(0)
-    network = SceneEncoder()
-    model = (
-        JointFrameClassifier(network, CLASSES)
-        if kind is JointFrameClassifier
-        else kind(network, Heads(256, CLASSES), CLASSES)
-    )
-    with torch.no_grad():
-        for parameter in model.heads.parameters():
-            parameter.mul_(weight)
-    return model
 
 
 @formats(*SOLVED)
 @pytest.mark.parametrize("weight", [1.0, 1e4])
 @pytest.mark.parametrize("size", [1e4, 1e30])
-@pytest.mark.parametrize(("name", "kind"), [("heads", PropertyClassifier), ("frame heads", JointFrameClassifier)])
+@pytest.mark.parametrize("name", ["heads", "frame heads"])
 def test_huge_logits_are_finite_and_decided_on(
-    check: Check, name: str, kind: type[PropertyClassifier], size: float, weight: float, fmt: Format
+    check: Check, name: str, size: float, weight: float, fmt: Format
 ) -> None:
     """roundings: the mean over frames and the sum over features, by the sizes of its terms.
 
     Heads of single frames clip features, so that there it is the weights that count; they take a softmax's logarithm
     besides, which is off by no more than twice its logits.
     """
-    features = size * torch.randn(4, 3, 256, generator=torch.Generator().manual_seed(0))
+
+    def classifier(f: Format) -> PropertyClassifier:
+        """With heads whose weights are `weight` times as large as fresh ones."""
+        seed_everything(0)
+        network = SceneEncoder()
+        model = (
+            JointFrameClassifier(network, CLASSES)
+            if name == "frame heads"
+            else PropertyClassifier(network, Heads(256, CLASSES), CLASSES)
+        )
+        with torch.no_grad():
+            for parameter in model.heads.parameters():
+                parameter.mul_(weight)
+        return model.to(f.torch)
+
+    features = size * torch.randn(4, 3, 256, generator=torch.Generator().manual_seed(0), dtype=torch.float32)
 
     def said(f: Format) -> torch.Tensor:
-        return torch.cat(huge_classifier(kind, weight).to(f.torch).classify(features.to(f.torch)), dim=1).detach()
+        return torch.cat(classifier(f).classify(features.to(f.torch)), dim=1).detach()
 
-    exact, double = said(FLOAT64), huge_classifier(kind, weight).double()
-    wild = features.double()
-    terms = (
-        double.standardise(wild).abs().flatten(0, 1) if isinstance(double, JointFrameClassifier) else wild.abs().mean(1)
-    )
-    heads = list(double.heads.children())
-    sizes = max((terms @ head.weight.abs().T + head.bias.abs()).max().item() for head in heads)
-    bound = (2 if kind is JointFrameClassifier else 1) * summing(256 + 4, fmt) * sizes / float(exact.abs().max())
+    exact, double, wild = said(FLOAT64), classifier(FLOAT64), features.double()
+    joint = isinstance(double, JointFrameClassifier)
+    terms = double.standardise(wild).abs().flatten(0, 1) if joint else wild.abs().mean(1)
+    sizes = max((terms @ head.weight.abs().T + head.bias.abs()).max().item() for head in double.heads.children())
+    bound = (2 if joint else 1) * summing(256 + 4, fmt) * sizes / float(exact.abs().max())
     check(f"{name}: features of {size:g}, weights times {weight:g}", fmt, said, bound)
 
-    model, given = huge_classifier(kind, weight).to(fmt.torch), features.to(fmt.torch).requires_grad_()
+    model, given = classifier(fmt), features.to(fmt.torch).requires_grad_()
     found = model.classify(given)
-    loss = torch.stack([F.cross_entropy(z, torch.tensor([0, 1, 2, 0])) for z in found]).sum()
-    loss.backward()
+    torch.stack([F.cross_entropy(z, torch.tensor([0, 1, 2, 0])) for z in found]).sum().backward()
     assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())
     assert given.grad.isfinite().all()
     decided = model.decide(torch.cat(found, dim=1).detach())
@@ -146,9 +117,8 @@ def test_huge_logits_are_finite_and_decided_on(
 
 Table = Sequence[Sequence[float]]
 """One video's probabilities of each class, by property."""
-HALF = ((0.5, 0.5), (0.5, 0.5))
 TABLES: dict[str, Table] = {
-    "all classes alike": HALF,
+    "all classes alike": ((0.5, 0.5), (0.5, 0.5)),
     "certain": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
     "tie of two combinations": ((0.25, 0.5, 0.25), (0.5, 0.5, 0.0)),
     "too small for float32": ((1e-300, 1e-200), (1e-100, 1.0)),
@@ -163,12 +133,14 @@ TABLES: dict[str, Table] = {
 def test_decisions_are_those_of_exact_fractions(check: Check, name: str) -> None:
     table = TABLES[name]
     shape = tuple(map(len, table))
-
-    def worth(combination: tuple[int, ...]) -> Fraction:
-        return math.prod((Fraction(table[i][k]) for i, k in enumerate(combination)), start=Fraction(1))
-
-    def decided(_: Format) -> Floats:
-        return decode_jointly([np.log([row]) for row in table], np.zeros(shape))[0]
-
-    best = max(itertools.product(*map(range, shape)), key=worth)
-    check(f"joint decision: {name}", FLOAT64, decided, 0, best)
+    best = max(
+        itertools.product(*map(range, shape)),
+        key=lambda combination: math.prod(Fraction(row[k]) for row, k in zip(table, combination, strict=True)),
+    )
+    check(
+        f"joint decision: {name}",
+        FLOAT64,
+        lambda _: decode_jointly([np.log([row]) for row in table], np.zeros(shape))[0],
+        0,
+        best,
+    )

@@ -14,6 +14,7 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
+from scipy.special import logsumexp
 from torch import nn
 from torch.nn import functional as F
 from transformers.modeling_outputs import CausalLMOutput
@@ -25,7 +26,7 @@ from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import add_lora
 from tests.models import model_folder
 from tests.numerics.bounds import longest_sum, magnification, rounded, summing
-from tests.numerics.harness import BFLOAT16, FLOAT16, FLOAT32, FLOAT64, NETWORKS, Check, Floats, Format, formats
+from tests.numerics.harness import BFLOAT16, FLOAT16, FLOAT32, FLOAT64, NETWORKS, Check, Format, formats
 
 PART = "language"
 DIM, FRAMES, LENGTH = 64, 4, 40
@@ -82,11 +83,6 @@ def network(fmt: Format, size: float = 1.0) -> float:
     return rounded(magnified(size), longest_sum(made(FLOAT64)), FLOAT32 if fmt is FLOAT64 else fmt)
 
 
-def over(difference: torch.Tensor, whole: torch.Tensor) -> torch.Tensor:
-    """Relative to the largest; NaN where any of the whole is not finite."""
-    return torch.where(whole.isfinite().all(), difference / whole.abs().max(), torch.nan)
-
-
 # Embeddings
 
 
@@ -131,7 +127,8 @@ def test_a_row_of_nothing_but_padding_spoils_no_other(check: Check, fmt: Format,
     @torch.no_grad()
     def lost(_: Format) -> torch.Tensor:
         beside, alone = model(ids, none, mask).logits, model(ids[:1], none[:1]).logits
-        return over(beside[:1] - alone, beside)
+        # NaN where any logit is not finite.
+        return torch.where(beside.isfinite().all(), (beside[:1] - alone) / beside.abs().max(), torch.nan)
 
     name = f"a row of nothing but padding, padded on the {side}, beside others"
     check(name, fmt, lost, 2 * network(fmt), 0.0)
@@ -190,27 +187,6 @@ format holds, so that what is off is the loss alone."""
 TARGETS = (3, 1, 0, 4)
 
 
-def logits(power: int) -> Floats:
-    """`STEPS` times 2^power: 4 x 5."""
-    return STEPS * 2.0**power
-
-
-def mean_loss(power: int) -> float:
-    """The mean of log sum exp z - z of the target over the rows, with exact sums."""
-    losses = []
-    for row, target in zip(logits(power).tolist(), TARGETS, strict=True):
-        losses.append(math.log(math.fsum(math.exp(z - max(row)) for z in row)) + max(row) - row[target])
-    return math.fsum(losses) / len(losses)
-
-
-def rounded_loss(power: int, fmt: Format) -> float:
-    """roundings: exp, log, sums over classes and rows, in float32 at least, by the spread of logits over the loss."""
-    largest = max(mean_loss(power), 2.0**-53)
-    terms = sum(STEPS.shape) + 6
-    exact = fmt if fmt is FLOAT64 else FLOAT32
-    return summing(terms, exact) * (float(np.ptp(logits(power))) + largest) / largest
-
-
 @formats(*NETWORKS)
 def test_labels_that_are_all_ignored_weigh_nothing(check: Check, fmt: Format) -> None:
     """use: exactly nothing is learnt, however many tokens the update counts."""
@@ -226,17 +202,22 @@ def test_labels_that_are_all_ignored_weigh_nothing(check: Check, fmt: Format) ->
 
 
 @formats(*NETWORKS)
-@pytest.mark.parametrize("power", [0, 5, 12, 60, 120])
+@pytest.mark.parametrize("power", [0, 12, 120])
 def test_losses_of_answers_are_cross_entropies(
     check: Check, monkeypatch: pytest.MonkeyPatch, fmt: Format, power: int
 ) -> None:
     """Of a language model that says the same whatever it reads, its first column foretelling the second.
 
     2^120 is a three hundredth of the largest number of float32; 7 x 2^12 is near that of float16.
+    roundings: exp, log, sums over classes and rows, in float32 at least, by the spread of logits over the loss.
     """
     if fmt is Format.FLOAT16 and power > 12:
         pytest.skip("beyond float16")
-    said = torch.from_numpy(logits(power))[:, None].expand(-1, 2, -1).to(fmt.device, fmt.torch)
+    logits = STEPS * 2.0**power
+    losses = logsumexp(logits, axis=1) - logits[np.arange(len(STEPS)), TARGETS]
+    exact = math.fsum(losses) / len(losses)
+    bound = summing(sum(STEPS.shape) + 6, fmt if fmt is FLOAT64 else FLOAT32) * (float(np.ptp(logits)) / exact + 1)
+    said = torch.from_numpy(logits)[:, None].expand(-1, 2, -1).to(fmt.device, fmt.torch)
     model = made(fmt)
     monkeypatch.setattr(
         model.llm, "forward", lambda logits_to_keep, **_: CausalLMOutput(logits=said[:, logits_to_keep])
@@ -248,4 +229,4 @@ def test_losses_of_answers_are_cross_entropies(
     def loss(_: Format) -> torch.Tensor:
         return model(ids, torch.zeros(len(ids), 0, DIM, device=fmt.device), labels=labels).loss
 
-    check(f"loss of answers, logits of 2^{power}", fmt, loss, rounded_loss(power, fmt), mean_loss(power))
+    check(f"loss of answers, logits of 2^{power}", fmt, loss, bound, exact)

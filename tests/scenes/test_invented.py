@@ -29,6 +29,7 @@ def test_each_combination_comes_as_often() -> None:
     assert [catalogue.labels(o) for o in catalogue.objects] == [classes_of(n) for n in range(270)]
 
 
+@pytest.mark.slow
 def test_an_object_measures_as_its_classes_in_videos_of_it() -> None:
     """By the scene that a video is made of: a patch, a force and a resolution that the drawing has not seen."""
     numbers, right = (0, 5, 13, 21, 26), 0

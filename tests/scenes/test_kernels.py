@@ -13,22 +13,16 @@ from scipy.special import j0
 
 from pipeline.scenes.elastic.kernels import (
     Gel,
-    Kernel,
     half_space_table,
     layer_response,
     layer_table,
-    love,
     make_kernel,
 )
 
 
-def kernel(table: np.ndarray, side: int) -> Kernel:
-    return make_kernel(table, np.zeros((side, side)))
-
-
 def test_a_pixel_sinks_by_the_integral_of_boussinesq() -> None:
     """u = 1 / (pi E*) times the integral of dA / r (Johnson, 3.2)."""
-    table = love((6, 6))
+    table = half_space_table((6, 6), pitch=1.0, modulus=1.0)
     assert table[0, 0] == pytest.approx(4 * math.log(1 + math.sqrt(2)) / math.pi, rel=1e-12)
     for row, column in ((0, 1), (2, 0), (3, 4)):
         direct, _ = dblquad(
@@ -87,12 +81,12 @@ def test_a_thick_layer_is_a_half_space() -> None:
 
 def test_a_wave_of_pressure_sinks_as_the_transform_says() -> None:
     """In the middle of a wide field, away from its ends: u = 2 S(qt) / (E* q) p."""
-    side, pitch = 256, 0.15
-    gel = Gel(modulus=0.5, poisson=0.45, thickness=1.2)
+    side, pitch = 192, 0.2
+    gel = Gel(modulus=0.5, poisson=0.45, thickness=2.0)
     x = (np.arange(side) - side // 2) * pitch
     for length in (3.0, 6.0):
         wave = np.cos(2 * np.pi * x / length)[None, :] * np.ones((side, 1))
-        sink = kernel(layer_table((side, side), pitch, gel), side).sink(wave)[side // 2]
+        sink = make_kernel(layer_table((side, side), pitch, gel)).sink(wave)[side // 2]
         q = 2 * np.pi / length
         expected = 2 * float(layer_response(q * gel.thickness, gel.poisson)) / (gel.modulus * q)
         inside = np.abs(x) < 6
@@ -119,17 +113,11 @@ def test_convolution_is_the_direct_sum() -> None:
     rows, columns = (np.abs(np.subtract.outer(np.arange(n), np.arange(n))) for n in table.shape)
     # Of pixels (i, j) and (k, m) the offsets are |i - k| and |j - m|.
     direct = np.einsum("ikjm,nkm->nij", table[rows[:, :, None, None], columns], pressure)
-    np.testing.assert_allclose(make_kernel(table, pressure).sink(pressure), direct, rtol=1e-12)
+    np.testing.assert_allclose(make_kernel(table).sink(pressure), direct, rtol=1e-12)
     single = pressure.astype(np.float32)
-    found = make_kernel(table, single).sink(single)
+    found = make_kernel(table, np.float32).sink(single)
     assert found.dtype == np.float32
     np.testing.assert_allclose(found, direct, rtol=2e-6)
-
-
-@pytest.mark.parametrize("bad", [{"modulus": 0.0}, {"poisson": 0.6}, {"poisson": -0.1}, {"thickness": -1.0}])
-def test_impossible_gels_are_refused(bad: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match="Poisson"):
-        Gel(**bad)
 
 
 def test_a_gel_thinner_than_its_pixels_is_refused() -> None:

@@ -100,13 +100,6 @@ def test_drift_carries_the_marks_and_nothing_else() -> None:
     np.testing.assert_array_equal(shade(skin, quiet(sensor), PITCH, 0, drift(1, 1)), bare)
 
 
-def test_sensors_differ_and_some_have_no_rim() -> None:
-    corners = [make_sensor(WIDTH, HEIGHT, seed).glow[-1, -1].mean() for seed in range(40)]
-    dark = np.array(corners) < 55
-    assert 0.6 < dark.mean() < 1
-    assert len(set(corners)) == 40
-
-
 def test_a_curve_is_its_polynomial() -> None:
     x, y = np.array([0.3]), np.array([-0.7])
     assert surface((1, 2, 3, 4, 5, 6), x, y)[0] == pytest.approx(1 + 2 * 0.3 - 3 * 0.7 + 4 * 0.09 - 5 * 0.21 + 6 * 0.49)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from statistics import fmean
+
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.scenes.contact import Body, Method
-from pipeline.scenes.geometry import IMAGE_MM, Heights, heights
-from pipeline.scenes.measure import BIG_SHARE, VISIBLE_MM, Measured, bump_share, measure, texture
+from pipeline.scenes.contact import Method, press_by
+from pipeline.scenes.geometry import IMAGE_MM, heights
+from pipeline.scenes.grid import Heights
+from pipeline.scenes.measure import BIG_SHARE, VISIBLE_MM, Measured, bump_share, texture
 from pipeline.scenes.recipe import Recipe, load_recipes, recipe_of
 from pipeline.videos.catalogue import Catalogue
 from tests.conftest import ROOT
@@ -26,25 +30,27 @@ def look(recipe: Recipe, seed: int) -> Measured:
     """The measures of one press onto the middle of a patch."""
     cv2.setNumThreads(1)
     patch = heights(recipe.body, recipe.relief, SIDE, PITCH, np.random.default_rng(seed))
-    skin = Body(patch, recipe.modulus, PITCH).press(Method("layer", 128), np.array([FORCE_N])).skins[0]
+    skin = press_by(Method("layer", 128), patch, np.array([FORCE_N]), recipe.modulus, PITCH).skins[0]
     top, left = (SIDE - HEIGHT) // 2, (SIDE - WIDTH) // 2
     view = (slice(top, top + HEIGHT), slice(left, left + WIDTH))
-    return measure(recipe.modulus, patch[view], skin[view], PITCH)
+    return Measured(recipe.modulus, texture(patch[view], PITCH), bump_share(skin[view], PITCH))
 
 
+def agreeing(recipes: Mapping[str, Recipe], catalogue: Catalogue) -> float:
+    """The share of objects that measure as their labels say, by three seeds in turn; no measure sees a label."""
+    found = {o: look(recipe, number % 3) for number, (o, recipe) in enumerate(recipes.items())}
+    return fmean((m.hardness, m.roughness, m.bumpiness) == catalogue.labels(o) for o, m in found.items())
+
+
+@pytest.mark.slow
 def test_scenes_show_what_the_labels_say(catalogue: Catalogue) -> None:
-    """All 74 objects, all three properties, three seeds in turn; nothing is measured from the labels."""
-    for number, (object_id, recipe) in enumerate(load_recipes(ROOT / RECIPES, catalogue, 0).items()):
-        found = look(recipe, number % 3)
-        assert (found.hardness, found.roughness, found.bumpiness) == catalogue.labels(object_id), object_id
+    assert agreeing(load_recipes(ROOT / RECIPES, catalogue, 0), catalogue) == 1
+    assert agreeing({o: recipe_of(o, catalogue, 0) for o in sorted(catalogue.objects)[::2]}, catalogue) >= 0.94
 
 
-def test_drawn_scenes_show_what_the_labels_say(catalogue: Catalogue) -> None:
-    shown, objects = 0, sorted(catalogue.objects)[::2]
-    for object_id in objects:
-        found = look(recipe_of(object_id, catalogue, 0), 0)
-        shown += (found.hardness, found.roughness, found.bumpiness) == catalogue.labels(object_id)
-    assert shown >= 0.94 * len(objects)
+def test_a_few_scenes_show_what_the_labels_say(catalogue: Catalogue) -> None:
+    recipes = load_recipes(ROOT / RECIPES, catalogue, 0)
+    assert agreeing({o: recipes[o] for o in ("egg", "rug", "basket")}, catalogue) == 1
 
 
 def waves(length: float, amplitude: float) -> Heights:

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from pipeline.config import FramesConfig, ScenesConfig
-from pipeline.core.errors import UserError
+from pipeline.scenes import video
 from pipeline.scenes.contact import GEL
 from pipeline.scenes.geometry import IMAGE_MM, Round
 from pipeline.scenes.light import make_sensor
+from pipeline.scenes.motion import RECORDED
 from pipeline.scenes.recipe import Recipe, load_recipes
-from pipeline.scenes.render import Scene, make_scene, measure_scene, render
+from pipeline.scenes.render import Scene, make_scene, render
 from pipeline.scenes.video import share_as_labelled, synthesize
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.decoding import decode
@@ -37,32 +38,30 @@ def film(recipe: Recipe, config: ScenesConfig, seed: int) -> tuple[Scene, np.nda
     return scene, np.stack(list(render(scene, config, sensor, seed)))
 
 
-@pytest.mark.parametrize("tier", ["auto", "winkler", "layer", "half_space"])
-def test_every_tier_shows_a_contact(recipes: dict[str, Recipe], tier: str) -> None:
-    config = SMALL.model_copy(update={"tier": tier, "cells": 48, "frames": 20, "width": 96, "height": 72})
-    scene, frames = film(recipes["egg"], config, 3)
+@pytest.mark.parametrize(
+    ("tier", "width", "height"),
+    [("auto", 64, 48), ("auto", 48, 64), ("winkler", 64, 48), ("layer", 48, 64), ("half_space", 64, 48)],
+)
+def test_every_tier_shows_a_contact_on_pictures_of_either_shape(tier: str, width: int, height: int) -> None:
+    config = SMALL.model_copy(update={"tier": tier, "cells": 64, "frames": 20, "width": width, "height": height})
+    scene, frames = film(PLAIN, config, 3)
+    assert frames.shape == (20, height, width, 3)
     assert tier == "auto" or scene.imprint.method.tier == tier
     assert (scene.imprint.error is not None) == (tier == "auto")
     strongest = int(scene.motion.force.argmax())
     change = np.abs(frames.astype(int) - frames[0]).mean((1, 2, 3))
-    assert change[strongest] > 2 * np.median(change[scene.motion.force == 0])
+    assert change[strongest] > 1.5 * np.median(change[scene.motion.force == 0])
 
 
 def test_a_scene_is_the_same_at_other_resolutions(recipes: dict[str, Recipe]) -> None:
     """Lengths are in mm: the depth of a plain body's imprint does not depend on the pixels."""
     depths = []
     for width in (64, 128):
-        config = ScenesConfig(frames=10, width=width, height=width * 3 // 4, tolerance=0.02)
+        config = ScenesConfig(frames=10, width=width, height=width * 3 // 4, tier="layer", cells=64)
         scene = make_scene(PLAIN, config, 10, 5)
         assert scene.pitch == pytest.approx(IMAGE_MM[0] / width)
         depths.append(float(scene.imprint.skins[-1].max()))
     np.testing.assert_allclose(depths, depths[-1], rtol=0.02)
-
-
-@pytest.mark.parametrize("tier", ["auto", "layer"])
-def test_pictures_may_be_upright(tier: str) -> None:
-    config = SMALL.model_copy(update={"width": 48, "height": 64, "tier": tier, "cells": 64})
-    assert film(PLAIN, config, 1)[1][0].shape == (64, 48, 3)
 
 
 @pytest.mark.parametrize(("tier", "width", "height"), [("auto", 32, 960), ("layer", 32, 960), ("layer", 120, 160)])
@@ -74,53 +73,51 @@ def test_pictures_that_no_grid_is_fine_enough_for(tier: str, width: int, height:
     assert 2 * np.hypot(width, height) * IMAGE_MM[0] / width / GEL.thickness < needed <= 1024
 
 
-def test_files_are_equal_for_equal_seeds(recipes: dict[str, Recipe], catalogue: Catalogue, tmp_path: Path) -> None:
+@pytest.fixture
+def in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Videos are made one after the other, in this process."""
+    monkeypatch.setattr(video, "run_parallel", lambda work, jobs, *_: map(work, jobs))
+
+
+@pytest.mark.usefixtures("in_turn")
+@pytest.mark.parametrize("frames", [8, "recorded"])
+def test_files_are_equal_for_equal_seeds_and_as_their_rows_say(
+    recipes: dict[str, Recipe], catalogue: Catalogue, tmp_path: Path, frames: int | str
+) -> None:
     folders = [tmp_path / "a b", tmp_path / "c"]
-    first, second = (synthesize(recipes, SMALL, folder) for folder in folders)
+    config = SMALL.model_copy(update={"frames": frames})
+    rows, again = (synthesize(recipes, config, folder) for folder in folders)
+    assert rows == again
+    names = [row.video for row in rows]
+    assert names == sorted(f.name for f in folders[0].iterdir()) == ["rug_0.mp4", "rug_1.mp4"]
+    first, second = ([(folder / name).read_bytes() for name in names] for folder in folders)
     assert first == second
-    names = [row.video for row in first]
-    assert names == sorted(p.name for p in folders[0].iterdir()), "nothing else is left there"
-    assert [(folders[0] / n).read_bytes() for n in names] == [(folders[1] / n).read_bytes() for n in names]
-    assert (folders[0] / names[0]).read_bytes() != (folders[0] / names[1]).read_bytes()
-    for file in list_videos(folders[0], catalogue).files:
+    assert first[0] != first[1], "each video has its own patch, motion and noise"
+    for row, file in zip(rows, list_videos(folders[0], catalogue).files, strict=True):
         found = scan(file, FramesConfig(pixels=16))
         assert isinstance(found, Scan)
-        video = found.probe
-        assert (video.frames, video.width, video.height, video.fps) == (8, 64, 48, 25.0)
+        probe = found.probe
+        assert (probe.frames, probe.width, probe.height, probe.fps) == (row.frames, 64, 48, row.fps)
+        assert (row.frames, row.fps) in ([(8, 25.0)] if frames == 8 else RECORDED)
 
 
-def test_recorded_lengths_are_those_of_the_public_videos(recipes: dict[str, Recipe], tmp_path: Path) -> None:
-    config = SMALL.model_copy(update={"frames": "recorded", "videos_per_object": 9, "width": 32, "height": 24})
-    rows = synthesize(recipes, config, tmp_path)
-    assert {(row.frames, row.fps) for row in rows} <= {(126, 25.0), (50, 10.0)}
-    assert len({row.frames for row in rows}) == 2
-
-
+@pytest.mark.usefixtures("in_turn")
 def test_rows_say_what_scenes_measure_as(recipes: dict[str, Recipe], catalogue: Catalogue, tmp_path: Path) -> None:
-    config = ScenesConfig(objects=("egg", "potato", "basket"), videos_per_object=1, frames=2, width=96, height=72)
+    config = SMALL.model_copy(update={"objects": ("egg", "basket"), "videos_per_object": 1, "frames": 2})
     rows = synthesize(recipes, config, tmp_path)
     for row in rows:
         first, last = (frame.astype(int) for frame in decode(tmp_path / row.video))  # Two frames are enough.
-        assert first.shape == (72, 96, 3)
         assert np.abs(last - first).mean() > 1, "the press is seen"
-        assert (row.frames, row.error is None) == (2, False)
         assert row.force > 0
         assert row.hardness == catalogue.labels(row.object_id)[catalogue.property_index("hardness")]
-    share = share_as_labelled(rows, catalogue)
     agreeing = [(r.hardness, r.roughness, r.bumpiness) == catalogue.labels(r.object_id) for r in rows]
-    assert share == pytest.approx(np.mean(agreeing), abs=1e-4)
-    scene = make_scene(recipes["egg"], config, 2, 1)
-    assert measure_scene(scene, recipes["egg"], config).modulus == recipes["egg"].modulus
+    assert share_as_labelled(rows, catalogue) == pytest.approx(np.mean(agreeing), abs=1e-4)
 
 
-def test_an_unknown_object_is_named(recipes: dict[str, Recipe], tmp_path: Path) -> None:
-    config = ScenesConfig(objects=("rug", "yoyo"))
-    with pytest.raises(UserError, match=r"scenes\.objects: yoyo"):
-        synthesize(recipes, config, tmp_path / "out")
+def test_unknown_objects_and_unwritable_folders_are_named(recipes: dict[str, Recipe], tmp_path: Path) -> None:
+    with refused(r"scenes\.objects: yoyo"):
+        synthesize(recipes, ScenesConfig(objects=("rug", "yoyo")), tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-def test_a_folder_that_cannot_be_written_is_named(recipes: dict[str, Recipe], tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises((UserError, OSError), match="file"):
+    with pytest.raises(FileExistsError, match="file"):
         synthesize(recipes, SMALL, tmp_path / "file")
