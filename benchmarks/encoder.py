@@ -1,6 +1,6 @@
-"""Size and number of frames, on one core: what they cost the encoder pretrained on scenes, and what they bring.
+"""Size of frames, on one core: what it costs the encoder pretrained on scenes, and what it brings.
 
-It is frozen and has seen no label; each setting is judged by a grouped cross-validation of heads on its features.
+The encoder is frozen and has seen no label; each size is judged by a grouped cross-validation of heads on its features.
 """
 
 from __future__ import annotations
@@ -19,26 +19,17 @@ from benchmarks.classifier import heads_error
 from benchmarks.errors import WRONG
 from benchmarks.frames import bench_videos
 from benchmarks.table import Row, make_rows
-from benchmarks.timing import counted, interleaved, machine, megabytes
+from benchmarks.timing import interleaved, machine
 from pipeline.config import PRETRAINED, FramesConfig
 from pipeline.core.errors import UserError
 from pipeline.encoder.clips import ClipDataset, LabelledVideo
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.training.trainable import load_trainable
-from pipeline.videos.files import list_videos
 from pipeline.videos.frames.extract import extract_frames
 from pipeline.videos.frames.store import FrameStore
 
-SIDE, FRAMES = 120, 5
-"""Pixels and frames a video, where these are not what differs."""
-SETTINGS = {
-    "frame size": {f"{side} pixels": (side, FRAMES) for side in (SIDE, 90, 60, 30)},
-    "frames a video": {f"{number} frame{'s' * (number > 1)}": (SIDE, number) for number in (FRAMES, 1, 2, 10)},
-}
-"""Pixels and frames, by question and name; the first of each is its baseline."""
-CONFIG = FramesConfig(selection="salient", pixels=SIDE)
-Clip = tuple[torch.Tensor, torch.Tensor]
-"""Difference pictures and the frames' places in the video."""
+SIDES, FRAMES = (120, 90, 60, 30), 5
+"""Pixels, of which the first are the baseline, and frames a video."""
 
 
 @dataclass(frozen=True)
@@ -53,62 +44,52 @@ class Size:
 
 
 def measure(root: Path, size: Size | None = None) -> list[Row]:
-    """Both questions, over the videos that `frames.bench_videos` finds.
+    """Over the videos that `frames.bench_videos` finds.
 
     Raises:
-        UserError: without pretrained weights, or where there are too few objects for folds.
+        UserError: without pretrained weights, or as `frames.bench_videos`.
     """
     size = size or Size()
-    folder, catalogue = bench_videos(root)
+    folder, catalogue = bench_videos(root, size.folds)
     pretrained = root / PRETRAINED
     if not pretrained.is_file():
         raise UserError(f"{pretrained}: no such file; `octopi scale small`, `dvc repro pretrain` make it")
-    if len({f.object_id for f in list_videos(folder, catalogue).files}) < 2 * size.folds:
-        raise UserError(f"{folder}: bench encoder needs videos of {2 * size.folds} objects or more")
     torch.set_num_threads(1)
     encoder = SceneEncoder()
     load_trainable(encoder, pretrained)
     encoder.eval()
 
     @torch.inference_mode()
-    def describe(clips: Sequence[Clip], video: int) -> np.ndarray:
-        found: np.ndarray = encoder.describe(*clips[video]).numpy()
+    def describe(pictures: Sequence[torch.Tensor], video: int) -> np.ndarray:
+        found: np.ndarray = encoder.describe(pictures[video], items[video]["frame_indices"]).numpy()
         return found
 
+    config = FramesConfig(selection="salient", pixels=SIDES[0])
     with TemporaryDirectory() as made:
-        videos = extract_frames(folder, catalogue, CONFIG, Path(made) / "frames", Path(made) / "partial").videos
+        videos = extract_frames(folder, catalogue, config, Path(made) / "frames", Path(made) / "partial").videos
         store = FrameStore(Path(made) / "frames", "subtract")
-        named = [LabelledVideo(video.video_id, ()) for video in videos]
-        items = {
-            number: list(map(ClipDataset(store, named, per_video=number).__getitem__, range(len(named))))
-            for _, number in {setting for own in SETTINGS.values() for setting in own.values()}
-        }
+        clips = ClipDataset(store, [LabelledVideo(v.video_id, ()) for v in videos], per_video=FRAMES)
+        items = [clips[video] for video in range(len(videos))]
     objects = [video.object_id for video in videos]
     labels, classes = np.array([catalogue.labels(o) for o in objects]), [len(p.levels) for p in catalogue.properties]
+    runs, errors = {}, {}
+    for side in SIDES:
+        pictures = [_resized(item["frames"], side) for item in items]
+        runs[f"{side} pixels"] = partial(describe, pictures)
+        seen = np.stack([describe(pictures, video) for video in range(len(videos))])
+        errors[f"{side} pixels"] = heads_error(seen, seen, labels, objects, classes, size.folds, size.deals)
     # At equal distances in the order of the videos, which is by object.
     count = min(size.videos, len(videos))
-    timed = [i * len(videos) // count for i in range(count)]
-    rows: list[Row] = []
-    for question, settings in SETTINGS.items():
-        runs, errors, counts = {}, {}, {}
-        for name, (side, number) in settings.items():
-            clips = [(_resized(item["frames"], side), item["frame_indices"]) for item in items[number]]
-            runs[name] = partial(describe, clips)
-            seen = np.stack([runs[name](video) for video in range(len(videos))])
-            errors[name] = heads_error(seen, seen, labels, objects, classes, size.folds, size.deals)
-            flops = counted(partial(runs[name], 0))[1]
-            counts[name] = {"frames": float(number), "megabytes": megabytes(encoder), "flops": flops}
-        rows += make_rows(
-            question,
-            interleaved(runs, timed, size.repeats),
-            unit="ms a video, encoder alone",
-            baseline=next(iter(settings)),
-            errors=errors,
-            error_of=WRONG,
-            counts=counts,
-            machine=machine("1 thread"),
-        )
-    return rows
+    return make_rows(
+        "frame size",
+        interleaved(runs, [i * len(videos) // count for i in range(count)], size.repeats),
+        unit="ms a video, encoder alone",
+        baseline=f"{SIDES[0]} pixels",
+        errors=errors,
+        error_of=WRONG,
+        counts={name: {"frames": float(FRAMES)} for name in runs},
+        machine=machine("1 thread"),
+    )
 
 
 def _resized(pictures: torch.Tensor, side: int) -> torch.Tensor:

@@ -28,13 +28,11 @@ class Row(Record):
     cost_ratio: float = Field(ge=0)
     """Median over the repeats of the cost over that of the question's baseline, whose ratio is 1."""
     frames: float | None = None
-    """A video. This and the next three count what the unit is about, and are the same on every machine."""
+    """A video."""
     tokens: float | None = None
     """Generated for an answer."""
-    flops: float | None = None
-    """Floating-point operations of matrix products, convolutions and attention."""
     megabytes: float | None = None
-    """Weights and buffers, in 10^6 bytes."""
+    """Peak of memory, in 10^6 bytes."""
     error: float | None = None
     """What `error_of` says; None where all settings compute the same."""
     error_of: str = ""

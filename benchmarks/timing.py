@@ -1,4 +1,4 @@
-"""Times of settings that take turns, and counts that no machine changes."""
+"""Times of settings that take turns."""
 
 from __future__ import annotations
 
@@ -6,12 +6,9 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from statistics import median
 from time import perf_counter
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 from pipeline.core.runtime import cores, processor
-
-if TYPE_CHECKING:
-    from torch import nn
 
 R = TypeVar("R")
 T = TypeVar("T")
@@ -50,27 +47,3 @@ def interleaved(
 def machine(threads: str) -> str:
     """The processor, how many cores there are and how many were used."""
     return f"{processor()}, {cores()} cores, {threads}"
-
-
-def counted(run: Callable[[], R]) -> tuple[R, float]:
-    """What a call gives, and its operations: two for a multiplication and an addition.
-
-    torch counts those of matrix products, convolutions and attention. Fused kernels of attention, which its counter
-    does not see into, are off meanwhile.
-    """
-    import torch
-    from torch.utils.flop_counter import FlopCounterMode
-
-    fused = torch.backends.mha.get_fastpath_enabled()
-    torch.backends.mha.set_fastpath_enabled(False)
-    try:
-        with FlopCounterMode(display=False) as counter:
-            found = run()
-    finally:
-        torch.backends.mha.set_fastpath_enabled(fused)
-    return found, float(counter.get_total_flops())
-
-
-def megabytes(module: nn.Module) -> float:
-    """Parameters and buffers as they lie in memory, in 10^6 bytes."""
-    return float(sum(value.numel() * value.element_size() for value in module.state_dict().values())) / 1e6

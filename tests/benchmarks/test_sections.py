@@ -81,19 +81,13 @@ def score(**columns: object) -> ScoreRow:
 
 
 def test_frames(project: Path, tmp_path: Path) -> None:
-    found = by_question(frames.measure(project, repeats=1, folds=2, deals=1), tmp_path)
-    assert {"published way", "bare decoding", "salient, 64 pixels"} <= set(found["frame extraction"])
-    assert all(row.error is None for row in found["frame extraction"].values())
-    rules = found["frames"]
-    assert list(rules) == [str(s) for s in frames.SETTINGS]
+    rules = by_question(frames.measure(project, folds=2, deals=1), tmp_path)["frames"]
+    assert list(rules) == list(frames.SETTINGS)
     # 30 % of the frames are fewer than ten.
     assert [rules[f"salient, {n} frame{'s' * (n > 1)}"].frames for n in (1, 3, 5, 10)] == [1, 3, 5, 6]
     assert all(row.n == 12 and row.low is not None for row in rules.values())
-
-
-def test_frames_need_objects(project: Path) -> None:
     with refused("videos of 40 objects"):
-        frames.measure(project, repeats=1, folds=20)
+        frames.measure(project, folds=20)
 
 
 def test_encoder(project: Path, tmp_path: Path) -> None:
@@ -103,18 +97,14 @@ def test_encoder(project: Path, tmp_path: Path) -> None:
     torch.manual_seed(0)
     save_trainable(SceneEncoder(), project / encoder.PRETRAINED)
     found = by_question(encoder.measure(project, size), tmp_path)
-    assert list(found) == ["frame size", "frames a video"]
-    sides, numbers = found.values()
-    assert sides["60 pixels"].flops == pytest.approx(sides["120 pixels"].flops / 4, rel=0.05)
-    assert numbers["10 frames"].flops == pytest.approx(10 * numbers["1 frame"].flops, rel=0.01)
+    assert list(found["frame size"]) == ["120 pixels", "90 pixels", "60 pixels", "30 pixels"]
+    assert all((row.n, row.frames) == (12, 5) for row in found["frame size"].values())
 
 
 def test_language(project: Path, tmp_path: Path) -> None:
     found = by_question(language.measure(project, TINY), tmp_path)
     assert list(found) == ["answering", "number format, language model"], "nothing was described yet"
-    ways = found["answering"]
-    assert all(row.error == 0 for row in ways.values()), "all ways say the same"
-    assert ways["the pipeline's way, 1 at a time"].flops < ways["published way"].flops
+    assert [row.error for row in found["answering"].values()] == [0, 0], "one at a time and three say the same"
     assert found["number format, language model"]["float32"].error == 0
 
 
@@ -126,14 +116,8 @@ def test_describing_takes_tokens_from_answers_and_errors_from_the_report(project
     scores, graded = [], []
     for opd, tokens, accuracy in ((Opd.ALL, 100, 0.5), (Opd.NONE, 10, 0.25)):
         for task in describing.DESCRIBED:
-            kind = {
-                "task": task,
-                "measure": "choice",
-                "encoder": "finetuned",
-                "lora": "with",
-                "opd": opd,
-                "touch": "real",
-            }
+            kind = {"task": task, "measure": "choice", "encoder": "finetuned", "lora": "with", "touch": "real"}
+            kind["opd"] = opd
             scores.append(score(**kind, accuracy=accuracy, low=accuracy - 0.1, high=accuracy + 0.2, n=8))
             said = {"question_id": task, "correct": True, "parsed": True, "truncated": False, "expected": "A"}
             said |= {"predicted": "A", "objects": ("rug",), "tokens": tokens, "seed": 0, "trained": 0}
@@ -177,9 +161,7 @@ def test_serving_asks_a_fresh_process_and_a_server(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(serving, "COMMAND", ["true"])
     said = itertools.count()
     monkeypatch.setattr(serving, "post", lambda *_: str(next(said)))
-    assert {"6 unlike the one alone"} == {
-        row.machine.rpartition(", ")[2] for row in serving.measure(tmp_path, clients=3, each=2)
-    }
+    assert serving.measure(tmp_path, clients=3, each=2)[0].machine.endswith("6 unlike the one alone")
     monkeypatch.setattr(serving, "COMMAND", ["sh", "-c", "echo octopi: no such model >&2; exit 1"])
     with refused("octopi: no such model"):
         serving.measure(tmp_path)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
@@ -14,7 +13,7 @@ from benchmarks import __main__ as command
 from benchmarks.errors import Error, error_of, mean_of, share_of
 from benchmarks.figures import FOLDER, draw
 from benchmarks.table import CSV, Row, front, make_rows, merge, read_rows
-from benchmarks.timing import counted, interleaved, megabytes
+from benchmarks.timing import interleaved
 from pipeline.core.records import ScoreRow
 from tests.conftest import ROOT, refused
 
@@ -111,18 +110,6 @@ def test_settings_take_turns_at_each_item() -> None:
     costs = interleaved(settings, [1, 2], 2, warm=False)
     assert seen == 2 * [("a", 1), ("b", 1), ("a", 2), ("b", 2)]
     assert {name: len(own) for name, own in costs.items()} == {"a": 2, "b": 2}
-
-
-def test_operations_and_bytes_are_those_of_the_shapes() -> None:
-    attention = torch.nn.MultiheadAttention(8, 2, batch_first=True).eval()
-    x = torch.zeros(1, 5, 8)
-    # Four projections of 8 x 8, and scores and sums over 5 x 5, two operations each.
-    with torch.no_grad():
-        found, flops = counted(lambda: attention(x, x, x, need_weights=False))
-    assert (found[0].shape, flops) == (x.shape, 2 * 4 * 5 * 8 * 8 + 2 * 2 * 5 * 5 * 8)
-    model = torch.nn.Sequential(torch.nn.Conv2d(3, 4, 3), torch.nn.Flatten(), torch.nn.Linear(4 * 36, 2))
-    assert counted(lambda: model(torch.zeros(2, 3, 8, 8)))[1] == 2 * 2 * (4 * 36 * 27 + 144 * 2)
-    assert megabytes(model) == 4 * (4 * 27 + 4 + 144 * 2 + 2) / 1e6
 
 
 def test_errors_have_intervals_over_objects() -> None:
