@@ -57,6 +57,7 @@ MOMENTS = (
     ("while a checkpoint is removed", "os.remove", "trainer_state|scheduler", "finetune_encoder|align|lora"),
 )
 """When, as an audit event and what its arguments match, and the stages in which it comes."""
+REPRO = ("dvc", "repro")
 COLUMNS = ("tries", "lost", "different", "orphaned", "wrong line")
 GRACE, LONGEST = 5.0, 600.0
 """Seconds after which nothing may be left of what was killed, and in which every command is through."""
@@ -97,8 +98,6 @@ def drill_bad_inputs(ledger: Ledger, folder: Path) -> None:
 class Chain:
     """A project whose chain has run once without interruption."""
 
-    command = ("dvc", "repro")
-
     def __init__(self, project: Project) -> None:
         self.project, self.folder = project, project.folder
         (self.folder / "sitecustomize.py").write_text(HOOK)
@@ -122,58 +121,25 @@ class Chain:
             out = self.folder / entry["path"]
             shutil.rmtree(out) if out.is_dir() else out.unlink(missing_ok=True)
 
-    def start(self, log: str = "run.txt", **environment: str) -> subprocess.Popen[str]:
-        """Start the chain in a session of its own."""
-        with self.folder.with_name(log).open("w") as stream:
+    def start(self, log: Path, **environment: str) -> subprocess.Popen[str]:
+        """Start the chain in a session of its own, with its output in a file."""
+        with log.open("w") as stream:
+            environment = {**self.project.environment, **environment}
             return subprocess.Popen(
-                self.command,
-                cwd=self.folder,
-                env={**self.project.environment, **environment},
-                stdout=stream,
-                stderr=stream,
-                start_new_session=True,
+                REPRO, cwd=self.folder, env=environment, stdout=stream, stderr=stream, start_new_session=True
             )
 
-    def end(self, process: subprocess.Popen[str], log: str = "run.txt") -> tuple[int, str]:
-        """Wait for the chain; return status and output."""
-        try:
-            process.wait(LONGEST)
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
-        return process.wait(), self.folder.with_name(log).read_text()
-
-    def settle(self, ledger: Ledger, case: str, said: str, **wrong: str) -> None:
-        """Run the chain again, as a person does; compare, and count what was wrong."""
-        status, output = self.end(self.start())
-        made = self.made()
-        other = [path for path in sorted({*made, *self.expected}) if made.get(path) != self.expected.get(path)]
-        wrong["lost"] = output[-600:] if status else ""
-        wrong["wrong_line"] = wrong["wrong_line"] or (output[-600:] if "Traceback" in output else "")
-        wrong["different"] = ", ".join(other)
-        ledger.add(case, **{column: text and f"{said}: {text}" for column, text in wrong.items()})
-        if status or other:
-            shutil.rmtree(self.folder)
-            shutil.copytree(self.folder.with_name("pristine"), self.folder, symlinks=True)
+    def run(self) -> tuple[int, str]:
+        """Run the chain as a person does; return status and output."""
+        log = self.folder.with_name("run.txt")
+        return ended(self.start(log)), log.read_text()
 
 
-def alive(session: int, script: str = "") -> list[psutil.Process]:
-    """Processes of a session that are not dead, the oldest first; those that run `script`."""
-    found = []
-    for process in psutil.process_iter():
-        try:
-            if os.getsid(process.pid) == session and not dead(process):
-                found += [process] if not script or script in process.cmdline() else []
-        except (psutil.Error, OSError):
-            continue
-    return sorted(found, key=lambda process: process.pid)
-
-
-def dead(process: psutil.Process) -> bool:
-    """Whether a process has ended, whoever has to take note of that."""
-    try:
-        return process.status() == psutil.STATUS_ZOMBIE
-    except psutil.NoSuchProcess:
-        return True
+def ended(process: subprocess.Popen[str]) -> int:
+    """The status of a process and, where it takes too long, the end of its session."""
+    if not wait_until(lambda: process.poll() is not None):
+        os.killpg(process.pid, signal.SIGKILL)
+    return process.wait()
 
 
 def wait_until(true: Callable[[], object], seconds: float = LONGEST) -> bool:
@@ -186,52 +152,77 @@ def wait_until(true: Callable[[], object], seconds: float = LONGEST) -> bool:
     return True
 
 
-def left_behind(session: int, but: int) -> str:
-    """What is still there of a session after the time that it has, but for one process; it is ended."""
-    if wait_until(lambda: all(process.pid == but for process in alive(session)), GRACE):
-        return ""
-    rest = [process for process in alive(session) if process.pid != but]
-    for process in rest:
-        with suppress(psutil.NoSuchProcess):
-            process.kill()
-    return f"{len(rest)} processes"
+def alive(session: int, script: str = "") -> list[psutil.Process]:
+    """Processes of a session that have not ended, the oldest first; those that run `script`."""
+    found = []
+    for process in psutil.process_iter():
+        with suppress(psutil.Error, OSError):
+            # A zombie has ended, whoever has to take note of that.
+            if os.getsid(process.pid) == session and process.status() != psutil.STATUS_ZOMBIE:
+                found += [process] if not script or script in process.cmdline() else []
+    return sorted(found, key=lambda process: process.pid)
 
 
 def kill(chain: Chain, ledger: Ledger, stage: str, rng: random.Random, moment: Sequence[str] | None) -> bool:
     """Let a stage run again, end it on the way, and look; False where it was through before."""
     chain.forget(stage)
-    script, struck = f"stages/{stage.partition('@')[0]}.py", chain.folder / "struck"
-    leader = chain.start("killed.txt", **({"DRILL_STRIKE": json.dumps(moment[1:3])} if moment else {}))
+    log = chain.folder.with_name("killed.txt")
+    leader = chain.start(log, **({"DRILL_STRIKE": json.dumps(moment[1:3])} if moment else {}))
+
+    def running() -> list[psutil.Process]:
+        """The stage's process, once there is one."""
+        return alive(leader.pid, f"stages/{stage.partition('@')[0]}.py")[:1]
+
     met = ""
     if moment:
         case, said = f"kill {moment[0]}", f"{stage} at {moment[1]} {moment[2]}"
+        struck = chain.folder / "struck"
         wait_until(lambda: struck.exists() or leader.poll() is not None)
-        hit, victims = struck.exists(), alive(leader.pid, script)[:1]
+        hit, victims = struck.exists(), running()
     else:
         whom = rng.choice(("stage", "stage", "dvc", "group"))
         # DVC does not hear Ctrl-C while a stage runs.
         number = rng.choice((signal.SIGKILL, signal.SIGTERM, *([signal.SIGINT] if whom != "dvc" else [])))
         delay = rng.uniform(0, chain.seconds[stage])
         case, said = f"kill {whom}", f"{stage}, {number.name} to {whom} after {delay:.2f} s"
-        wait_until(lambda: alive(leader.pid, script) or leader.poll() is not None)
-        victims = alive(leader.pid, script)[:1]
-        hit = bool(victims) and not wait_until(lambda: dead(victims[0]), delay)
+        wait_until(lambda: running() or leader.poll() is not None)
+        victims = running()
+        hit = bool(victims) and not wait_until(lambda: running() != victims, delay)
         if hit and whom == "group":
             os.killpg(leader.pid, number)
         elif hit:
             os.kill(leader.pid if whom == "dvc" else victims[0].pid, number)
         if hit and whom == "dvc":
             # A stage whose DVC was killed runs on, and the next `dvc repro` meets it.
-            met = chain.end(chain.start())[1]
+            met = chain.run()[1]
     if not hit:
-        leader.wait()
+        ended(leader)
         return False
-    wait_until(lambda: all(map(dead, victims)))
-    orphaned = left_behind(leader.pid, but=leader.pid)
-    output = chain.end(leader, "killed.txt")[1] + met
+    wait_until(lambda: not victims or running() != victims)
+    wait_until(lambda: all(process.pid == leader.pid for process in alive(leader.pid)), GRACE)
+    orphans = [process for process in alive(leader.pid) if process.pid != leader.pid]
+    for process in orphans:
+        with suppress(psutil.NoSuchProcess):
+            process.kill()
+    ended(leader)
+    output = log.read_text() + met
+
+    # Run the chain again, as a person does, and compare.
+    status, again = chain.run()
+    made = chain.made()
+    other = [path for path in sorted({*made, *chain.expected}) if made.get(path) != chain.expected.get(path)]
     # Ctrl-C says where it interrupted.
-    wrong = output[-600:] if "Traceback" in output and "KeyboardInterrupt" not in output else ""
-    chain.settle(ledger, case, said, orphaned=orphaned, wrong_line=wrong)
+    traced = "Traceback" in again or ("Traceback" in output and "KeyboardInterrupt" not in output)
+    wrong = {
+        "lost": again[-600:] if status else "",
+        "different": ", ".join(other),
+        "orphaned": f"{len(orphans)} processes" if orphans else "",
+        "wrong_line": (output + again)[-600:] if traced else "",
+    }
+    ledger.add(case, **{column: text and f"{said}: {text}" for column, text in wrong.items()})
+    if status or other:
+        shutil.rmtree(chain.folder)
+        shutil.copytree(chain.folder.with_name("pristine"), chain.folder, symlinks=True)
     return True
 
 
@@ -255,7 +246,7 @@ def drill(kills: int, minutes: float, seed: int) -> int:
             drill_bad_inputs(ledger, Path(name) / "inputs")
             project = copy_project(Path(name) / "a project")
             project.run("octopi", "scale", *REDUCED, "runtime.save_steps=2")
-            project.run(*Chain.command)
+            project.run(*REPRO)
             drill_kills(Chain(project), ledger, kills, minutes, seed)
         finally:
             ledger.write(ROOT / "reports" / "drill.csv")
