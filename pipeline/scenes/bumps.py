@@ -21,7 +21,7 @@ class Domes(Layer):
     Where none meet they cover occupied pi w^2 / (2 sqrt 3 s^2) of the surface (density of a hexagonal packing).
     """
 
-    kind: Literal["domes"]
+    kind: Literal["domes"] = "domes"
     height: Relief
     width: Length
     spacing: Length
@@ -59,7 +59,7 @@ class Domes(Layer):
 class Ridges(Layer):
     """Parallel ridges with the profile of `Domes`: ribs, grooves, corrugation, seams."""
 
-    kind: Literal["ridges"]
+    kind: Literal["ridges"] = "ridges"
     height: Relief
     width: Length
     spacing: Length
@@ -78,7 +78,7 @@ class Ridges(Layer):
 class Plates(Layer):
     """Raised rectangles with round corners (superellipses of power 4) on a lattice: keys, tiles, basketwork."""
 
-    kind: Literal["plates"]
+    kind: Literal["plates"] = "plates"
     height: Relief
     size: tuple[Length, Length]
     """Across and along the body."""
@@ -102,7 +102,7 @@ class Plates(Layer):
 class Digits(Layer):
     """Random digits in rows, embossed or (height below 0) engraved: number wheels, stamped codes."""
 
-    kind: Literal["digits"]
+    kind: Literal["digits"] = "digits"
     height: Relief
     size: Length
     """Height of a digit."""

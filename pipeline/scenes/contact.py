@@ -26,7 +26,8 @@ from scipy.special import erf
 
 from pipeline.scenes.elastic.kernels import Gel, Kernel, half_space_table, layer_table, make_kernel
 from pipeline.scenes.elastic.solver import solve
-from pipeline.scenes.elastic.winkler import Heights, hang_skin, press_springs, series
+from pipeline.scenes.elastic.winkler import hang_skin, press_springs, series
+from pipeline.scenes.grid import Heights
 
 Tier = Literal["winkler", "layer", "half_space"]
 GEL = Gel()

@@ -26,7 +26,7 @@ Radius = Annotated[float, Field(gt=0, le=1e4, allow_inf_nan=False)]
 class Flat(Record):
     """A plane."""
 
-    kind: Literal["flat"]
+    kind: Literal["flat"] = "flat"
 
     def sample(self, grid: Grid) -> Heights:
         """0 everywhere."""
@@ -36,7 +36,7 @@ class Flat(Record):
 class Round(Record):
     """The paraboloid -x^2 / 2 Rx - y^2 / 2 Ry that touches a body of these radii (Johnson, Contact Mechanics, 4.1)."""
 
-    kind: Literal["round"]
+    kind: Literal["round"] = "round"
     radii: tuple[Radius, Radius]
     """Across and along: equal for a ball, a long second one for a barrel."""
 
@@ -49,7 +49,7 @@ class Round(Record):
 class Bar(Record):
     """A long bar, flat on top, whose edges fall off as -(|x| - width / 2 + edge)^2 / 2 edge: tape, strap, ruler."""
 
-    kind: Literal["bar"]
+    kind: Literal["bar"] = "bar"
     width: Length
     edge: Length
     """Radius of the edges."""
@@ -71,7 +71,7 @@ class Bar(Record):
 class Wedge(Record):
     """A rounded edge, the hyperbola -s (sqrt(x^2 + s^2 R^2) - s R): radius R on top, slope s far from it."""
 
-    kind: Literal["wedge"]
+    kind: Literal["wedge"] = "wedge"
     slope: Annotated[float, Field(gt=0, le=2)]
     tip: Length
     """Radius of the edge, in mm."""

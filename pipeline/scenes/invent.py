@@ -27,20 +27,19 @@ def invent(rng: np.random.Generator) -> Recipe:
 def _body(rng: np.random.Generator) -> Body:
     choice = rng.random()
     if choice < 0.25:
-        return Flat(kind="flat")
+        return Flat()
     if choice < 0.75:
         first = _log(rng, 5, 300)
         second = first * _log(rng, 0.7, 1.4) if rng.random() < 0.5 else _log(rng, 5, 1000)
-        return Round(kind="round", radii=(first, second))
+        return Round(radii=(first, second))
     if choice < 0.88:
-        return Bar(kind="bar", width=_log(rng, 3, 25), edge=_log(rng, 0.3, 1.5))
-    return Wedge(kind="wedge", slope=_log(rng, 0.05, 0.8), tip=_log(rng, 0.3, 5))
+        return Bar(width=_log(rng, 3, 25), edge=_log(rng, 0.3, 1.5))
+    return Wedge(slope=_log(rng, 0.05, 0.8), tip=_log(rng, 0.3, 5))
 
 
 def _rough(rng: np.random.Generator) -> AnyLayer:
     stretch = _log(rng, 2, 12) if rng.random() < 0.25 else 1.0
     return Rough(
-        kind="rough",
         rms=_log(rng, 0.0004, 0.12),
         longest=_log(rng, 0.3, 6),
         hurst=rng.uniform(0.3, 1),
@@ -52,7 +51,6 @@ def _rough(rng: np.random.Generator) -> AnyLayer:
 def _domes(rng: np.random.Generator) -> AnyLayer:
     width = _log(rng, 0.4, 7)
     return Domes(
-        kind="domes",
         height=_height(rng, width),
         width=width,
         spacing=width * _log(rng, 1.0, 3),
@@ -66,7 +64,6 @@ def _domes(rng: np.random.Generator) -> AnyLayer:
 def _ridges(rng: np.random.Generator) -> AnyLayer:
     width = _log(rng, 0.4, 8)
     return Ridges(
-        kind="ridges",
         height=_height(rng, width),
         width=width,
         spacing=width * _log(rng, 1.0, 4),
@@ -78,7 +75,6 @@ def _ridges(rng: np.random.Generator) -> AnyLayer:
 def _plates(rng: np.random.Generator) -> AnyLayer:
     size = _log(rng, 1, 8)
     return Plates(
-        kind="plates",
         height=_height(rng, size),
         size=(size, size * _log(rng, 0.6, 2)),
         gap=size * rng.uniform(0.1, 0.8),
@@ -90,7 +86,6 @@ def _plates(rng: np.random.Generator) -> AnyLayer:
 def _weave(rng: np.random.Generator) -> AnyLayer:
     spacing = _log(rng, 0.35, 3)
     return Weave(
-        kind="weave",
         spacing=spacing,
         thread=spacing * rng.uniform(0.6, 1.2),
         crimp=spacing * rng.uniform(0.05, 0.4),
@@ -101,7 +96,6 @@ def _weave(rng: np.random.Generator) -> AnyLayer:
 def _strands(rng: np.random.Generator) -> AnyLayer:
     width = _log(rng, 0.2, 4)
     return Strands(
-        kind="strands",
         width=width,
         spacing=width * rng.uniform(1, 2),
         uneven=rng.uniform(0, 0.7),
@@ -113,7 +107,6 @@ def _strands(rng: np.random.Generator) -> AnyLayer:
 def _grains(rng: np.random.Generator) -> AnyLayer:
     width = _log(rng, 0.8, 4)
     return Grains(
-        kind="grains",
         length=width * _log(rng, 1, 3),
         width=width,
         thickness=width * rng.uniform(0.4, 0.9),
@@ -125,14 +118,13 @@ def _grains(rng: np.random.Generator) -> AnyLayer:
 def _creases(rng: np.random.Generator) -> AnyLayer:
     spacing = _log(rng, 0.8, 8)
     height = _height(rng, spacing) * 0.6
-    return Creases(kind="creases", height=height if rng.random() < 0.5 else -height, spacing=spacing, fold=rng.random())
+    return Creases(height=height if rng.random() < 0.5 else -height, spacing=spacing, fold=rng.random())
 
 
 def _digits(rng: np.random.Generator) -> AnyLayer:
     size = _log(rng, 1.5, 6)
     sign = 1 if rng.random() < 0.7 else -1
     return Digits(
-        kind="digits",
         height=sign * _log(rng, 0.05, 0.5),
         size=size,
         stroke=size * rng.uniform(0.1, 0.25),

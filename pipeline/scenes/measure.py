@@ -92,10 +92,10 @@ def texture(surface: Heights, pitch: float) -> float:
 def bump_share(skin: Heights, pitch: float) -> float:
     """Typical width of the protrusions over the image's height; 0 where none is visible.
 
-    What rises over its own opening by a wide disc (white top hat) stands out, unless it is the body: so it must do so
-    in the skin and in what a fitted paraboloid leaves of it. A protrusion counts where it rises over `VISIBLE_MM`; its
-    width follows from the largest circle at half its height, its weight is its area, and the typical width is the
-    weighted median.
+    A protrusion rises over what a wide disc can reach from below (white top hat). The body itself may do so too, so a
+    protrusion must also rise in what is left of the skin after a fitted paraboloid is taken off. It counts where it
+    rises over `VISIBLE_MM`. Its width follows from the largest circle at half its height. The typical width is the
+    median over protrusions, weighted by their areas.
     """
     rows, columns = skin.shape
     height = min(rows, ROWS)

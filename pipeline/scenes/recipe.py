@@ -53,7 +53,7 @@ class Recipe(Record):
 
     modulus: Annotated[float, Field(ge=0.001, le=1e6)]
     """Reduced modulus E / (1 - nu^2) in MPa."""
-    body: Body = Flat(kind="flat")
+    body: Body = Flat()
     relief: tuple[AnyLayer, ...] = ()
     twist: bool = True
     """Whether the hand turns it under pressure, as in the public videos, or only presses."""
@@ -94,13 +94,13 @@ def recipe_of(object_id: str, catalogue: Catalogue, seed: int) -> Recipe:
     across, along = RADII_MM[shape]
     width = max(rng.uniform(*BUMP_SHARE[levels["bumpiness"]]) * IMAGE_MM[1], 0.01)
     height, spacing = width * rng.uniform(*BUMP_STEEPNESS), width * rng.uniform(1.15, 1.7)
-    size = {"height": height, "width": width, "spacing": spacing}
-    bumps: AnyLayer = Domes(kind="domes", **size) if rng.random() < 0.5 else Ridges(kind="ridges", **size)
+    shaped = Domes if rng.random() < 0.5 else Ridges
+    bumps: AnyLayer = shaped(height=height, width=width, spacing=spacing)
     rms = _log_uniform(rng, ROUGH_RMS_MM[levels["roughness"]])
-    rough = Rough(kind="rough", rms=rms, longest=rng.uniform(*ROUGH_LONGEST_MM))
+    rough = Rough(rms=rms, longest=rng.uniform(*ROUGH_LONGEST_MM))
     return Recipe(
         modulus=_log_uniform(rng, MODULUS_MPA[levels["hardness"]]),
-        body=Round(kind="round", radii=(_log_uniform(rng, across), _log_uniform(rng, along))),
+        body=Round(radii=(_log_uniform(rng, across), _log_uniform(rng, along))),
         relief=(bumps, rough) if levels["bumpiness"] > 0 else (rough,),
     )
 

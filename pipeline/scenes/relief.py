@@ -38,7 +38,7 @@ class Rough(Layer):
     added to the longer ones: the root mean square is rms sqrt(1 - (2 pitch / longest)^2H), exactly.
     """
 
-    kind: Literal["rough"]
+    kind: Literal["rough"] = "rough"
     rms: Length
     """Root mean square height of all waves."""
     longest: Length
@@ -70,7 +70,7 @@ class Creases(Layer):
     line is the wavelength / sqrt 2 (Rice, Bell Syst. Tech. J. 24 (1945) 46, for an isotropic field).
     """
 
-    kind: Literal["creases"]
+    kind: Literal["creases"] = "creases"
     height: Relief
     spacing: Length
     """Mean distance of folds along a line."""
@@ -92,7 +92,7 @@ class Weave(Layer):
     that of the crossing family opposite; the surface is the upper envelope of the threads.
     """
 
-    kind: Literal["weave"]
+    kind: Literal["weave"] = "weave"
     spacing: Length
     """Between neighbouring threads."""
     thread: Length
@@ -124,7 +124,7 @@ class Strands(Layer):
     make a tangle; the surface is the upper envelope.
     """
 
-    kind: Literal["strands"]
+    kind: Literal["strands"] = "strands"
     width: Length
     """Diameter of a strand."""
     spacing: Length
@@ -154,7 +154,7 @@ class Grains(Layer):
     Their outlines add up to `packing` of the surface; the envelope of the upper halves is what can be touched.
     """
 
-    kind: Literal["grains"]
+    kind: Literal["grains"] = "grains"
     length: Length
     width: Length
     thickness: Length

@@ -17,7 +17,7 @@ from torch.nn import functional as F
 from pipeline.config import EncoderConfig
 from pipeline.core.runtime import seed_everything
 from pipeline.encoder.frame_classifier import JointFrameClassifier
-from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier, SideBySide, mean_and_deviation
+from pipeline.encoder.model import FrameEncoder, PropertyClassifier, SideBySide, mean_and_deviation
 from pipeline.encoder.recipes import RECIPES, base_encoder, property_classifier
 from pipeline.encoder.release import sinusoid
 from pipeline.encoder.scene_encoder import CHANNELS, SceneEncoder
@@ -32,31 +32,21 @@ TIMES = torch.tensor([0, 1, 40_000, 10**6])
 """Numbers of the frames in their videos: float32 no longer holds the sinusoid of the last."""
 BASES = {"base": "paper", "base of release": "release"}
 """Encoders without prompts, and the recipe that they are read by."""
-CLASSIFIERS = (*RECIPES, "timm", "scratch")
+CLASSIFIERS = (*RECIPES, "timm")
 """Recipes; `tuned` stands on the backbone `scenes`, `timm` is that recipe on a network of timm's."""
-NETWORK_KINDS = [kind for kind in CLASSIFIERS if kind != "scratch"]
 
 
 def classifier(kind: str) -> PropertyClassifier:
-    """Of a recipe, equal at every call; `scratch` is the network of difference pictures with the paper's heads."""
+    """Of a recipe, equal at every call."""
     seed_everything(0)
-    if kind == "scratch":
-        model = PropertyClassifier(SceneEncoder(), Heads(256, CLASSES), CLASSES)
-        draw_statistics(model.encoder)
-    elif kind == "tuned":
-        network = SceneEncoder()
-        draw_statistics(network)
-        model = JointFrameClassifier(SideBySide([network]), CLASSES)
-    else:
-        model = property_classifier(settings(kind), CLASSES)
-    return model
-
-
-def draw_statistics(network: FrameEncoder) -> None:
-    """Running statistics of some pictures: a fresh network's are 0 and 1."""
+    if kind != "tuned":
+        return property_classifier(settings(kind), CLASSES)
+    network = SceneEncoder()
+    # Running statistics of some pictures: a fresh network's are 0 and 1.
     draw = torch.Generator().manual_seed(7)
     for _ in range(20):
         network.train()(torch.randint(0, 256, (8, 32, 32, 3), dtype=torch.uint8, generator=draw), torch.zeros(8))
+    return JointFrameClassifier(SideBySide([network]), CLASSES)
 
 
 @cache
@@ -101,7 +91,7 @@ def network(kind: str, name: str, fmt: Format) -> float:
 
 @formats(*NETWORKS)
 @pytest.mark.parametrize("name", FRAMES)
-@pytest.mark.parametrize("kind", [*BASES, *NETWORK_KINDS])
+@pytest.mark.parametrize("kind", [*BASES, *CLASSIFIERS])
 def test_hard_frames_are_embedded(check: Check, kind: str, name: str, fmt: Format) -> None:
     @torch.no_grad()
     def embedded(f: Format) -> torch.Tensor:
@@ -137,7 +127,7 @@ def test_positions_of_late_frames_are_told_apart(check: Check) -> None:
     assert not torch.equal(*sinusoid(torch.tensor([late, late + 1]), 64))
 
 
-@pytest.mark.parametrize("kind", [*BASES, *NETWORK_KINDS])
+@pytest.mark.parametrize("kind", [*BASES, *CLASSIFIERS])
 def test_a_batch_of_one_equals_a_batch_of_many(check: Check, kind: str) -> None:
     """condition: twice that of the network, as two ways are compared."""
 

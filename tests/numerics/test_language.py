@@ -89,24 +89,16 @@ def network(fmt: Format, size: float = 1.0) -> float:
 @formats(*NETWORKS)
 @pytest.mark.parametrize("size", SIZES)
 def test_embeddings_of_any_size_are_projected_and_answered(check: Check, fmt: Format, size: float) -> None:
-    """The connector: roundings of two layers in float32, by the sizes of their terms (GELU's slope is at most 1.13),
-    and the cast to the model's format."""
+    """condition: the connector's own magnification, in float32, and the cast to the model's format."""
 
     @torch.no_grad()
     def projected(f: Format) -> torch.Tensor:
         ids, features = conversation(made(f))
         return made(f).embed(ids, size * features)[:, 4 : 4 + FRAMES]
 
-    first, _, last = made(FLOAT64).connector.projection
-    features = (size * conversation(made(FLOAT64))[1]).flatten(0, 1)
-    with torch.no_grad():
-        hidden = F.gelu(first(features)).abs()
-        off = summing(DIM + 1, FLOAT32) * (features.abs() @ first.weight.abs().T + first.bias.abs())
-        off = 1.13 * off + 4 * FLOAT32.roundoff * hidden
-        sizes = (hidden + off) @ last.weight.abs().T + last.bias.abs()
-        off = off @ last.weight.abs().T + summing(len(last.weight) + 1, FLOAT32) * sizes
-        largest = made(FLOAT64).connector.projection(features).abs().max()
-    check(f"connector: embeddings of {size:g}", fmt, projected, float(off.max() / largest) + fmt.roundoff)
+    connector = made(FLOAT64).connector
+    off = rounded(magnification(connector, lambda: projected(FLOAT64)), longest_sum(connector), FLOAT32)
+    check(f"connector: embeddings of {size:g}", fmt, projected, off + fmt.roundoff)
     name = f"logits after embeddings of {size:g}"
     check(name, fmt, lambda f: answered(made(f), size), lambda f: network(f, size))
 

@@ -173,7 +173,7 @@ def test_a_thread_is_round_up_to_its_rim(check: Check) -> None:
 @pytest.mark.parametrize("rms", [1e-6, 100.0])
 def test_roughness_deviates_as_much_as_the_grid_carries(check: Check, rms: float, pitch: float) -> None:
     """Of a self-affine surface that is rms sqrt(1 - (2 pitch / longest)^2H); roundings: sums over all pixels."""
-    layer, grid = Rough(kind="rough", rms=rms, longest=25.0), Grid(SIDE, pitch)
+    layer, grid = Rough(rms=rms, longest=25.0), Grid(SIDE, pitch)
     check(
         f"roughness of {rms:g} mm, pixels of {pitch:g} mm: deviation",
         FLOAT32,

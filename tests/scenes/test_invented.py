@@ -51,7 +51,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def drawn(classes: tuple[int, int, int], rng: np.random.Generator) -> Recipe:
-    return Recipe(modulus=1 + classes[0] + rng.random(), body=Flat(kind="flat"))
+    return Recipe(modulus=1 + classes[0] + rng.random(), body=Flat())
 
 
 def test_it_is_written_as_a_catalogue_whose_objects_depend_on_seed_and_number(

@@ -70,16 +70,6 @@ def test_red_comes_from_above_green_from_the_right_blue_from_below() -> None:
     assert right[1] > 10 > -10 > left[1]
 
 
-def test_everything_follows_from_seeds() -> None:
-    skin = bump(0.5, 2.0)
-    make_sensor.cache_clear()
-    first = shade(skin, make_sensor(WIDTH, HEIGHT, 3), PITCH, 5)
-    make_sensor.cache_clear()
-    np.testing.assert_array_equal(first, shade(skin, make_sensor(WIDTH, HEIGHT, 3), PITCH, 5))
-    assert (first != shade(skin, make_sensor(WIDTH, HEIGHT, 3), PITCH, 6)).any()
-    assert (first != shade(skin, make_sensor(WIDTH, HEIGHT, 4), PITCH, 5)).any()
-
-
 def drift(x: float, y: float) -> Drift:
     return np.full_like(FLAT, x), np.full_like(FLAT, y)
 

@@ -9,58 +9,47 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pydantic import TypeAdapter
 
 from pipeline.scenes.bumps import Digits, Domes, Plates, Ridges
 from pipeline.scenes.grid import Grid, Layer
-from pipeline.scenes.relief import AnyLayer, Creases, Grains, Rough, Strands, Weave
+from pipeline.scenes.relief import Creases, Grains, Rough, Strands, Weave
 
 GRID = Grid(320, 0.1)
 LAYERS: tuple[Layer, ...] = (
-    Rough(kind="rough", rms=0.03, longest=2.0),
-    Rough(kind="rough", rms=0.03, longest=2.0, stretch=4, angle=30),
-    Creases(kind="creases", height=0.3, spacing=2.0),
-    Domes(kind="domes", height=0.4, width=1.6, spacing=2.2),
-    Domes(kind="domes", height=-0.4, width=2.4, spacing=2.2, jitter=1, occupied=0.7),
-    Ridges(kind="ridges", height=0.4, width=1.6, spacing=2.2, angle=25),
-    Plates(kind="plates", height=0.5, size=(3, 2), gap=1, uneven=0.3),
-    Weave(kind="weave", spacing=1.0, thread=0.8, crimp=0.3),
-    Weave(kind="weave", spacing=0.8, thread=0.8, crimp=0.2, repeat=4),
-    Strands(kind="strands", width=1.0, spacing=1.2, waver=0.4, bundles=3),
-    Grains(kind="grains", length=4, width=2, thickness=1.5),
-    Digits(kind="digits", height=-0.3, size=4, stroke=0.8, spacing=(4, 6)),
+    Rough(rms=0.03, longest=2.0),
+    Rough(rms=0.03, longest=2.0, stretch=4, angle=30),
+    Creases(height=0.3, spacing=2.0),
+    Domes(height=0.4, width=1.6, spacing=2.2),
+    Domes(height=-0.4, width=2.4, spacing=2.2, jitter=1, occupied=0.7),
+    Ridges(height=0.4, width=1.6, spacing=2.2, angle=25),
+    Plates(height=0.5, size=(3, 2), gap=1, uneven=0.3),
+    Weave(spacing=1.0, thread=0.8, crimp=0.3),
+    Weave(spacing=0.8, thread=0.8, crimp=0.2, repeat=4),
+    Strands(width=1.0, spacing=1.2, waver=0.4, bundles=3),
+    Grains(length=4, width=2, thickness=1.5),
+    Digits(height=-0.3, size=4, stroke=0.8, spacing=(4, 6)),
 )
-every_layer = pytest.mark.parametrize("layer", LAYERS, ids=lambda layer: layer.kind)
 
 
 def patch(layer: Layer, seed: int = 0, grid: Grid = GRID) -> np.ndarray:
     return layer.sample(grid, np.random.default_rng(seed))
 
 
-@every_layer
-def test_a_patch_is_finite_and_follows_from_its_generator(layer: Layer) -> None:
-    first, again, other = patch(layer, 1), patch(layer, 1), patch(layer, 2)
-    assert (first.shape, first.dtype) == ((320, 320), np.float32)
-    assert np.isfinite(first).all()
-    assert np.ptp(first) > 0.01
-    np.testing.assert_array_equal(first, again)
-    assert (first != other).any()
-    assert TypeAdapter(AnyLayer).validate_python(layer.model_dump()) == layer
-
-
-@every_layer
+@pytest.mark.parametrize("layer", LAYERS, ids=lambda layer: layer.kind)
 def test_statistics_do_not_depend_on_the_pitch(layer: Layer) -> None:
     spreads = [
         np.mean([patch(layer, seed, Grid(round(32 / pitch), pitch)).std() for seed in range(6)])
         for pitch in (0.06, 0.12)
     ]
     assert spreads[0] == pytest.approx(spreads[1], rel=0.12)
+    assert spreads[0] > 0.005
 
 
 @given(st.sampled_from(LAYERS), st.integers(1, 60), st.floats(0.02, 5), st.integers(0, 9))
 def test_any_grid_will_do(layer: Layer, side: int, pitch: float, seed: int) -> None:
-    found = patch(layer, seed, Grid(side, pitch))
-    assert found.shape == (side, side)
+    found, again = (patch(layer, seed, Grid(side, pitch)) for _ in range(2))
+    np.testing.assert_array_equal(found, again)
+    assert (found.shape, found.dtype) == ((side, side), np.float32)
     assert np.isfinite(found).all()
     assert np.abs(found).max() < 10
 
@@ -69,7 +58,7 @@ def test_any_grid_will_do(layer: Layer, side: int, pitch: float, seed: int) -> N
 def test_roughness_falls_off_with_its_hurst_exponent(hurst: float) -> None:
     """Power ~ q^-2(1 + H) in two dimensions, fitted over a decade of wavelengths; nothing beyond the longest."""
     side, pitch, longest = 512, 0.05, 4.0
-    layer = Rough(kind="rough", rms=0.05, longest=longest, hurst=hurst)
+    layer = Rough(rms=0.05, longest=longest, hurst=hurst)
     q = np.hypot(np.fft.fftfreq(side, pitch)[:, None], np.fft.fftfreq(side, pitch)[None])
     power = np.mean([np.abs(np.fft.fft2(patch(layer, s, Grid(side, pitch)))) ** 2 for s in range(4)], axis=0)
     edges = np.geomspace(0.5, 5, 12)
@@ -80,21 +69,21 @@ def test_roughness_falls_off_with_its_hurst_exponent(hurst: float) -> None:
 
 
 def test_stretched_roughness_is_longer_along_its_direction() -> None:
-    field = patch(Rough(kind="rough", rms=0.05, longest=2, stretch=4, angle=0)).astype(float)
+    field = patch(Rough(rms=0.05, longest=2, stretch=4, angle=0)).astype(float)
     along, across = (np.abs(np.diff(field, axis=a)).mean() for a in (0, 1))
     assert across > 2 * along
 
 
 @pytest.mark.parametrize(("width", "spacing", "occupied"), [(1.0, 2.0, 1.0), (2.0, 2.5, 1.0), (1.5, 2.0, 0.6)])
 def test_domes_cover_what_a_hexagonal_packing_covers(width: float, spacing: float, occupied: float) -> None:
-    layer = Domes(kind="domes", height=0.3, width=width, spacing=spacing, occupied=occupied, jitter=0, uneven=0)
+    layer = Domes(height=0.3, width=width, spacing=spacing, occupied=occupied, jitter=0, uneven=0)
     covered = np.mean([(patch(layer, seed, Grid(700, 0.05)) > 1e-6).mean() for seed in range(4)])
     assert covered == pytest.approx(occupied * math.pi * width**2 / (2 * math.sqrt(3) * spacing**2), rel=0.05)
     assert patch(layer).max() == pytest.approx(0.3, rel=0.02)
 
 
 def test_ridges_have_their_width_height_and_spacing() -> None:
-    field = patch(Ridges(kind="ridges", height=0.5, width=1.5, spacing=2.5), grid=Grid(1000, 0.02))
+    field = patch(Ridges(height=0.5, width=1.5, spacing=2.5), grid=Grid(1000, 0.02))
     assert (field > 1e-6).mean() == pytest.approx(1.5 / 2.5, rel=0.02)
     assert field.max() == pytest.approx(0.5, rel=1e-3)
     assert np.ptp(field, axis=0).max() < 1e-4, "they run along the body"
@@ -102,7 +91,7 @@ def test_ridges_have_their_width_height_and_spacing() -> None:
 
 
 def test_plates_repeat_and_are_flat_on_top() -> None:
-    field = patch(Plates(kind="plates", height=0.5, size=(3, 2), gap=1, edge=0.1), grid=Grid(800, 0.02))
+    field = patch(Plates(height=0.5, size=(3, 2), gap=1, edge=0.1), grid=Grid(800, 0.02))
     np.testing.assert_allclose(field[:-150, :-200], field[150:, 200:], atol=2e-3)
     superellipse = math.gamma(1.25) ** 2 / math.gamma(1.5)  # Area of x^4 + y^4 < 1 over its square.
     assert (field > 1e-6).mean() == pytest.approx(3 * 2 / (4 * 3) * superellipse, rel=0.02)
@@ -111,7 +100,7 @@ def test_plates_repeat_and_are_flat_on_top() -> None:
 
 @pytest.mark.parametrize("repeat", [2, 4])
 def test_cloth_repeats_both_ways_and_no_sooner(repeat: int) -> None:
-    layer = Weave(kind="weave", spacing=1.0, thread=0.9, crimp=0.3, repeat=repeat)
+    layer = Weave(spacing=1.0, thread=0.9, crimp=0.3, repeat=repeat)
     field = patch(layer, grid=Grid(600, 0.02))
     shift = 50 * repeat
     np.testing.assert_allclose(field[shift:], field[:-shift], atol=2e-3)
@@ -122,7 +111,7 @@ def test_cloth_repeats_both_ways_and_no_sooner(repeat: int) -> None:
 
 
 def test_strands_are_cylinders() -> None:
-    field = patch(Strands(kind="strands", width=2, spacing=3, uneven=0), grid=Grid(600, 0.01))
+    field = patch(Strands(width=2, spacing=3, uneven=0), grid=Grid(600, 0.01))
     assert field.max() == pytest.approx(0, abs=1e-4)
     assert (field > -1).mean() == pytest.approx(2 / 3, rel=0.02)
     assert (field[field > -1] + 1).mean() == pytest.approx(math.pi / 4, rel=0.02), "mean height of a half circle"
@@ -130,7 +119,7 @@ def test_strands_are_cylinders() -> None:
 
 def test_folds_are_as_far_apart_as_rice_says() -> None:
     """Rice's formula: zeros of a Gaussian process along a line."""
-    layer = Creases(kind="creases", height=1.0, spacing=2.0, fold=0)
+    layer = Creases(height=1.0, spacing=2.0, fold=0)
     crossings = []
     for seed in range(6):
         found = patch(layer, seed, Grid(1024, 0.05))
@@ -142,7 +131,7 @@ def test_folds_are_as_far_apart_as_rice_says() -> None:
 def test_grains_hide_the_ground_as_their_number_says() -> None:
     """Less than the exp(-packing) of places drawn at will (Boolean model), for they are stratified."""
     for packing in (0.5, 1.5):
-        layer = Grains(kind="grains", length=2, width=1.5, thickness=1.5, packing=packing, depth=0.3)
+        layer = Grains(length=2, width=1.5, thickness=1.5, packing=packing, depth=0.3)
         fields = [patch(layer, seed) for seed in range(4)]
         bare = np.mean([(f == f.min()).mean() for f in fields])
         assert max(0, 1 - packing) < bare < math.exp(-packing)
@@ -150,7 +139,7 @@ def test_grains_hide_the_ground_as_their_number_says() -> None:
 
 
 def test_digits_are_as_tall_as_asked_for() -> None:
-    layer = Digits(kind="digits", height=0.4, size=5, stroke=0.6, spacing=(9, 60))
+    layer = Digits(height=0.4, size=5, stroke=0.6, spacing=(9, 60))
     fields = [patch(layer, seed, Grid(800, 0.05)) for seed in range(8)]
     tall = max(np.count_nonzero((f > 0.2).any(axis=1)) for f in fields) * 0.05
     assert tall == pytest.approx(5, abs=0.4)

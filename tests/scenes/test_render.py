@@ -23,7 +23,7 @@ from pipeline.videos.frames.scan import Scan, scan
 from tests.conftest import ROOT, refused
 
 SMALL = ScenesConfig(objects=("rug",), videos_per_object=2, frames=8, width=64, height=48)
-PLAIN = Recipe(modulus=100.0, body=Round(kind="round", radii=(30.0, 30.0)))
+PLAIN = Recipe(modulus=100.0, body=Round(radii=(30.0, 30.0)))
 PHYSICLEAR = ROOT / "pipeline" / "physiclear"
 
 

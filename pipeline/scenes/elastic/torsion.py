@@ -11,7 +11,8 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-Field = npt.NDArray[np.float32]
+from pipeline.scenes.grid import Heights
+
 FRICTION = 1.0
 """Of a gel; soft rubber on dry solids has about that."""
 
@@ -37,7 +38,7 @@ def slip_turn(force: float, radius: float, shear_modulus: float) -> float:
 
 def twist(
     shape: tuple[int, int], centre: tuple[float, float], radius: float, radians: float, pitch: float
-) -> tuple[Field, Field]:
+) -> tuple[Heights, Heights]:
     """How far the gel's surface has moved, in mm: across and down, each rows x columns.
 
     The turn may be large: every point stays at its distance from the axis.

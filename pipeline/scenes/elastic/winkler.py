@@ -9,11 +9,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from pipeline.scenes.elastic.kernels import Gel
-
-Heights = npt.NDArray[np.float32]
+from pipeline.scenes.grid import Heights
 
 MEMBRANE_SHARE = 0.75
 """How much of the averaged indentation the skin takes up where nothing touches it."""
