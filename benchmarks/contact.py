@@ -112,17 +112,16 @@ class _Scene:
 def _look(weights: Path, job: _Job) -> _Scene:
     seed = derive_seed("bench", job.object_id, job.number)
     sensor = make_sensor(WIDTH, HEIGHT, job.number % 3)
-    films: list[list[Image]] = []
-    costs, hardest = [], 0
+    # Springs first, uncounted: what all models share is in the caches for all of them.
+    springs = ScenesConfig(frames=FRAMES, width=WIDTH, height=HEIGHT, tier="winkler")
+    hardest = int(np.argmax(make_scene(job.recipe, springs, FRAMES, seed).motion.force))
+
+    def film(config: ScenesConfig) -> list[Image]:
+        return list(render(make_scene(job.recipe, config, FRAMES, seed), config, sensor, seed))
+
+    films, costs = [], []
     for config in models().values():
-        # What all models share is in the caches for all of them.
-        shared = make_scene(job.recipe, config.model_copy(update={"tier": "winkler"}), FRAMES, seed)
-        hardest = int(np.argmax(shared.motion.force))
-
-        def film(config: ScenesConfig = config) -> list[Image]:
-            return list(render(make_scene(job.recipe, config, FRAMES, seed), config, sensor, seed))
-
-        frames, spent = timed(film)
+        frames, spent = timed(partial(film, config))
         films.append(frames)
         costs.append(spent / FRAMES)
     # Noise is drawn from the seed alone, so that pictures of two models share it.

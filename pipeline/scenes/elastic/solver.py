@@ -90,14 +90,15 @@ def solve(
         g = g - near
 
         done = ~(undone[:, 0, 0] > tolerance) | (step == iterations)
-        out, rest = active[done], ~done
-        pressure[out] = p[done] * scale[out]
-        approach[out] = near[done, 0, 0] * mean[out]
-        residual[out] = undone[done, 0, 0]
-        active = active[rest]
-        if not len(active):
-            break
-        apart, p, t, g, before, pressed = (field[rest] for field in (apart, p, t, g, before, pressed))
+        if done.any() or not len(active):
+            out, rest = active[done], ~done
+            pressure[out] = p[done] * scale[out]
+            approach[out] = near[done, 0, 0] * mean[out]
+            residual[out] = undone[done, 0, 0]
+            active = active[rest]
+            if not len(active):
+                break
+            apart, p, t, g, before, pressed = (field[rest] for field in (apart, p, t, g, before, pressed))
 
         # Where bodies overlap without pressure, there is contact from now on, and the direction starts afresh.
         touching = pressed | (g < 0)
