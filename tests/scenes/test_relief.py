@@ -45,7 +45,7 @@ def test_statistics_do_not_depend_on_the_pitch(layer: Layer) -> None:
     assert spreads[0] > 0.005
 
 
-@given(st.sampled_from(LAYERS), st.integers(1, 60), st.floats(0.02, 5), st.integers(0, 9))
+@given(st.sampled_from(LAYERS), st.integers(1, 40), st.floats(0.02, 5), st.integers(0, 9))
 def test_any_grid_will_do(layer: Layer, side: int, pitch: float, seed: int) -> None:
     found, again = (patch(layer, seed, Grid(side, pitch)) for _ in range(2))
     np.testing.assert_array_equal(found, again)

@@ -75,7 +75,7 @@ def test_energies_agree() -> None:
 
 @pytest.mark.parametrize("thickness", [0.5, 3.0, None])
 def test_pressure_and_gap_exclude_each_other(thickness: float | None) -> None:
-    side, pitch = 64, 0.15
+    side, pitch = 48, 0.2
     rng = np.random.default_rng(2)
     gap = ball(side, pitch) + 0.02 * rng.random((side, side))
     table = layer_table((side, side), pitch, Gel(modulus=1.0, thickness=thickness)) if thickness else None
