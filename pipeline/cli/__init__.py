@@ -66,16 +66,17 @@ def scale(
     from pipeline.core.stage import running_stages
     from pipeline.scales import check_inputs, compose, prune, write_params
     from pipeline.scales.cost import costs
-    from pipeline.scales.memory import count, table
+    from pipeline.scales.memory import count, read_shapes, table
 
     in_project()
     if not plan and (running := running_stages()):
         raise UserError(f"{running[0]} is running, and would be recorded with other parameters; wait for it or stop it")
     params = compose(name, overrides or ())
-    uses, notes = count(params)
+    shapes = read_shapes(params)
+    uses = count(params, shapes)
     # First, since what a scale takes is asked before its weights are fetched.
     counted = ["Memory in GiB on each device, counted from shapes:", table(uses)] if uses else []
-    typer.echo("\n".join([*counted, *notes, *costs(params, uses, card)]))
+    typer.echo("\n".join([*counted, *shapes.notes, *costs(params, shapes, uses, card)]))
     if plan:
         typer.echo(f"{len(params.ablation.variants())} variants; nothing is written.")
         return

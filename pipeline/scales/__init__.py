@@ -28,9 +28,6 @@ from pipeline.videos.split import FEWEST_TRAINING_OBJECTS, assign_objects, untes
 from pipeline.weights.check import check_encoder_files, check_language_files
 
 CONF = Path("conf")
-RECIPE = "encoder.recipe"
-SHORT = 2
-"""Keys of a section that stands in one line of params.yaml."""
 HEADER = "# Written by `octopi scale`; change it with that command, or edit conf/ and run it again.\n"
 
 
@@ -60,7 +57,7 @@ def compose(name: str, overrides: Sequence[str] = (), conf: Path = CONF) -> Para
     # Every key may be set here; whether it exists is the validation's matter, since that knows what is allowed.
     forced = [o if o.startswith(("+", "~")) else f"++{_literal(o)}" for o in overrides]
     # A recipe brings its own values; they give way to what is set beside it.
-    asked = dict(o.lstrip("+").split("=", 1) for o in overrides).get(RECIPE)
+    asked = dict(o.lstrip("+").split("=", 1) for o in overrides).get("encoder.recipe")
     if asked is not None and (conf / "recipe" / f"{asked}.yaml").is_file():
         forced.insert(0, f"recipe={asked}")
     try:
@@ -156,15 +153,12 @@ def check_objects(params: Params, catalogue: Catalogue) -> str:
 
 def write_params(params: Params, path: Path = PARAMS_FILE) -> bool:
     """Write params.yaml if that changes it; return whether it did."""
-    values = params.model_dump(mode="json")
-    lines = {
-        name: section
-        if not isinstance(section, dict)
-        else _Line(section)
-        if len(section) <= SHORT
-        else {key: _Line(v) if isinstance(v, dict) else v for key, v in section.items()}
-        for name, section in values.items()
-    }
+    lines = params.model_dump(mode="json")
+    for name, section in lines.items():
+        if isinstance(section, dict):
+            # A section of one or two keys stands in one line, and so does a mapping within a longer one.
+            inner = {key: _Line(v) if isinstance(v, dict) else v for key, v in section.items()}
+            lines[name] = _Line(section) if len(section) <= 2 else inner
     text = HEADER + yaml.dump(lines, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)
     if path.is_file() and path.read_bytes() == text.encode():
         return False

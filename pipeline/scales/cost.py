@@ -9,31 +9,15 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from pipeline.config import Params
 from pipeline.core.errors import UserError, counted, did_you_mean
-from pipeline.scales.memory import (
-    BYTES,
-    FULL,
-    GIB,
-    Lengths,
-    Use,
-    adapters,
-    connector_parameters,
-    embedding_length,
-    launched,
-    longest,
-)
-from pipeline.scenes.invented import catalogue_of
+from pipeline.scales.memory import BYTES, FULL, GIB, Shapes, Use, launched, trained_parameters
 from pipeline.tasks.questions import counts_by_task
 from pipeline.videos.files import list_videos
 from pipeline.weights import DOWNLOADED
-from pipeline.weights.shapes import layers, parameters, read_language, read_tower
-
-if TYPE_CHECKING:
-    from open_clip.transformer import VisionTransformer
-    from transformers import PreTrainedModel
+from pipeline.weights.shapes import layers, parameters, read_language
 
 GB = 1e9
 
@@ -59,37 +43,6 @@ CARDS = {
 REACHED = 0.35
 """Share of a card's peak that training reaches: an assumption. Large trainings report .21 to .46 (Chowdhery et al.
 2022, table 3); small batches reach less."""
-
-
-def costs(params: Params, uses: list[Use], card: str = "") -> list[str]:
-    """Sentences about downloads, disk, hours, and what does not fit the card.
-
-    Args:
-        uses: Memory by stage, from `memory.count`.
-        card: One of `CARDS`; empty for this machine's processor.
-    """
-    known = find_card(card) if card else None
-    catalogue, place = catalogue_of(params), Path(params.data.dir)
-    tower, llm = read_tower(Path(params.encoder.weights)), read_language(Path(params.language.weights))
-    lengths = longest(params, catalogue, Path(params.language.weights)) if llm is not None else None
-    if params.data.source == "scenes":
-        videos = len(params.scenes.objects or catalogue.objects) * params.scenes.videos_per_object
-    else:
-        videos = len(list_videos(place, catalogue).files) if place.is_dir() else 0
-    embedding = 0 if llm is None else llm.config.hidden_size
-    if tower is not None:
-        embedding = embedding_length(params.encoder, tower)
-    if params.encoder.embedding == "logits":
-        embedding = sum(len(p.levels) for p in catalogue.properties)
-    return [
-        *downloads(params),
-        *disk(params, llm, embedding, videos),
-        *describe(work(params, llm, lengths, tower, videos), params, card),
-        *(fits(uses, known.gib) if known else ()),
-        *host(params, llm),
-    ]
-
-
 REST = ("pretrain", "cross_validate", "finetune_encoder", "embed")
 """Stages that run a model and may not be counted: for want of shapes, videos, or a formula."""
 
@@ -109,12 +62,67 @@ class Hours(NamedTuple):
         return max(self.work / flops, self.read / bandwidth if bandwidth else 0) / 3600
 
 
-def work(
-    params: Params, llm: PreTrainedModel | None, lengths: Lengths | None, tower: VisionTransformer | None, videos: int
-) -> list[Hours]:
+def costs(params: Params, shapes: Shapes, uses: list[Use], card: str = "") -> Iterator[str]:
+    """Sentences about downloads, disk, hours, and what does not fit the card.
+
+    Args:
+        uses: Memory by stage, from `memory.count`.
+        card: One of `CARDS`; empty for this machine's processor.
+    """
+    if card and card not in CARDS:
+        raise UserError(f"--card {card}: not known; {did_you_mean(card, CARDS)}it is one of {', '.join(CARDS)}")
+    place = Path(params.data.dir)
+    if params.data.source == "scenes":
+        videos = len(params.scenes.objects or shapes.catalogue.objects) * params.scenes.videos_per_object
+    else:
+        videos = len(list_videos(place, shapes.catalogue).files) if place.is_dir() else 0
+    for folder in (Path(params.encoder.weights), Path(params.language.weights)):
+        found = next((d for d in DOWNLOADED.values() if d.folder == folder.name), None)
+        if found and not folder.is_dir():
+            llm = read_language(folder)
+            size = f", {parameters(llm) * 2 / GB:.0f} GB" if llm is not None else ", 1.7 GB, its text tower included"
+            yield f"Download: {found.repository}{size}, to {folder} (README, section Real weights)."
+    if params.data.source == "videos" and not place.is_dir():
+        yield f"Videos: {params.data.dir} is not there (README, section Real videos)."
+    yield disk(params, shapes, videos)
+    yield from describe(work(params, shapes, videos), params, card)
+    if card:
+        yield from fits(uses, CARDS[card].gib)
+    devices, sharded = launched(params.runtime.launcher)
+    if shapes.llm is not None and sharded:
+        each = parameters(shapes.llm) * BYTES[params.language.dtype] / GB
+        yield (
+            f"Host memory: each of {devices} processes loads the whole language model ({each:.3g} GB) before it keeps "
+            f"its share, {devices * each:.3g} GB together."
+        )
+
+
+def disk(params: Params, shapes: Shapes, videos: int) -> str:
+    """What the chain writes of its own: embeddings, trained models, and the checkpoints of the one that trains."""
+    shown = videos * params.frames.per_video * FULL * shapes.embedding * (4 if params.encoder.flip_probability else 1)
+    total = shown * len(params.ablation.encoders) * len(params.ablation.seeds)
+    parts = [f"embeddings {_round(total / GB)}" if videos else "embeddings not known without the videos"]
+    if shapes.llm is not None:
+        connector, words, adapters = trained_parameters(params, shapes.llm, shapes.embedding)
+        variants = params.ablation.variants()
+        aligned = len({(v.encoder, v.opd, v.seed) for v in variants})
+        lora = sum(v.lora == "with" for v in variants)
+        models = FULL * ((connector + words) * (aligned + lora) + adapters * lora)
+        # Weights and Adam's two means.
+        checkpoints = 3 * FULL * (connector + words + adapters)
+        parts += [f"data/models {_round(models / GB)}", f"checkpoints {_round(checkpoints / GB)} while one trains"]
+        total += models + checkpoints
+    return (
+        f"Disk in GB: {_round(total / GB)} besides videos and downloads ({', '.join(parts)}); DVC's cache links to the "
+        "same files where the disk allows."
+    )
+
+
+def work(params: Params, shapes: Shapes, videos: int) -> list[Hours]:
     """Count the stages' operations; `videos` is how many there are, 0 where that is not known."""
     found = []
     encoder, seeds, variants = params.encoder, len(params.ablation.seeds), params.ablation.variants()
+    tower, llm, lengths = shapes.tower, shapes.llm, shapes.lengths
     if tower is not None and videos:
         picture = 2 * parameters(tower) * (len(tower.positional_embedding) + encoder.prompts)
         shown = videos * params.frames.per_video
@@ -122,9 +130,10 @@ def work(
             found.append(Hours("finetune_encoder", seeds, 2 * seeds * encoder.epochs * shown * picture))
         flips = 4 if encoder.flip_probability else 1
         found.append(Hours("embed", seeds, seeds * len(params.ablation.encoders) * flips * shown * picture))
-    if llm is not None and lengths:
+    if llm is not None:
         inside = parameters(layers(llm))
         forward, outside = 2 * inside, parameters(llm) - inside
+        # Checkpointing computes each layer's forward once more.
         back = forward * (2 if params.runtime.gradient_checkpointing else 1)
         aligned = len({(v.encoder, v.opd, v.seed) for v in variants})
         adapted = sum(v.lora == "with" for v in variants)
@@ -132,8 +141,8 @@ def work(
             tokens = runs * config.samples * config.epochs * lengths.mean_training
             learnt = runs * config.samples * config.epochs * lengths.mean_answer
             found.append(Hours(stage, runs, tokens * (forward + back) + learnt * 6 * outside))
-        asked = len(variants) * sum(counts_by_task(params.questions, "evaluation").values())
-        asked += len(params.ablation.touch) * seeds * sum(counts_by_task(params.questions, "evaluation").values())
+        systems = len(variants) + len(params.ablation.touch) * seeds
+        asked = systems * sum(counts_by_task(params.questions, "evaluation").values())
         said = asked * lengths.mean_answer
         weights = parameters(llm) * BYTES[params.language.dtype]
         batch = params.language.generation_batch_size
@@ -149,7 +158,7 @@ def describe(hours: list[Hours], params: Params, card: str) -> Iterator[str]:
         return
     devices, _ = launched(params.runtime.launcher)
     if card:
-        known = find_card(card)
+        known = CARDS[card]
         flops, bandwidth = REACHED * known.flops, known.bandwidth
         how = f"on {card}, if training reaches {REACHED:.0%} of its {known.flops / 1e12:.0f} TFLOP/s"
     else:
@@ -157,28 +166,17 @@ def describe(hours: list[Hours], params: Params, card: str) -> Iterator[str]:
         how = f"on this processor, at the {flops / 1e9:.0f} GFLOP/s that it reaches now (name a GPU with --card)"
     each = [(h, h.on(flops * (devices if h.stage in ("align", "lora") else 1), bandwidth)) for h in hours]
     yield f"Hours {how}: " + ", ".join(f"{h.stage} {_round(t)} ({counted(h.runs, 'run')})" for h, t in each) + "."
-    rest = [*(s for s in REST if s not in {h.stage for h in hours})]
     least = sum(t for _, t in each)
-    # The paper: 5 h of a 7b model on an A6000, where .24 h are counted.
     together = f"{_round(least)} together"
     if card:
+        # The paper: 5 h of a 7b model on an A6000, where .24 h are counted.
         together = f"{_round(least)} to {_round(20 * least)} together: the paper's took 20 times what is counted so"
+    rest = [s for s in REST if s not in {h.stage for h in hours}]
     yield f"{together}. Not counted: {', '.join(rest)}, and the work on videos."
 
 
 def _round(number: float) -> str:
     return f"{number:.0f}" if number >= 10 else f"{number:.2g}"
-
-
-def host(params: Params, llm: PreTrainedModel | None) -> Iterator[str]:
-    """What sharded training needs of the machine itself: every process reads all weights before it keeps its share."""
-    devices, sharded = launched(params.runtime.launcher)
-    if llm is not None and sharded:
-        each = parameters(llm) * BYTES[params.language.dtype] / GB
-        yield (
-            f"Host memory: each of {devices} processes loads the whole language model ({each:.3g} GB) before it keeps "
-            f"its share, {devices * each:.3g} GB together."
-        )
 
 
 def measured_rate(side: int = 1024, seconds: float = 0.5) -> float:
@@ -192,46 +190,6 @@ def measured_rate(side: int = 1024, seconds: float = 0.5) -> float:
         a @ b
         times.append(time.perf_counter() - begin)
     return float(2 * side**3 / sorted(times)[len(times) // 2])
-
-
-def find_card(name: str) -> Card:
-    """A card of `CARDS`; UserError for another."""
-    if name not in CARDS:
-        raise UserError(f"--card {name}: not known; {did_you_mean(name, CARDS)}it is one of {', '.join(CARDS)}")
-    return CARDS[name]
-
-
-def downloads(params: Params) -> Iterator[str]:
-    """What has to be fetched first: weights that are published and not there, with their size by their shapes."""
-    for folder in (Path(params.encoder.weights), Path(params.language.weights)):
-        found = next((d for d in DOWNLOADED.values() if d.folder == folder.name), None)
-        if found and not folder.is_dir():
-            llm = read_language(folder)
-            size = f", {parameters(llm) * 2 / GB:.0f} GB" if llm is not None else ", 1.7 GB, its text tower included"
-            yield f"Download: {found.repository}{size}, to {folder} (README, section Real weights)."
-    if params.data.source == "videos" and not Path(params.data.dir).is_dir():
-        yield f"Videos: {params.data.dir} is not there (README, section Real videos)."
-
-
-def disk(params: Params, llm: PreTrainedModel | None, embedding: int, videos: int) -> Iterator[str]:
-    """What the chain writes of its own: embeddings, trained models, and the checkpoints of the one that trains."""
-    shown = videos * params.frames.per_video * FULL * embedding * (4 if params.encoder.flip_probability else 1)
-    embedded = shown * len(params.ablation.encoders) * len(params.ablation.seeds)
-    parts = [f"embeddings {_round(embedded / GB)}" if videos else "embeddings not known without the videos"]
-    total = embedded
-    if llm is not None:
-        connector = sum(connector_parameters(params, llm, embedding))
-        trained = connector + adapters(llm, params.lora)
-        variants = params.ablation.variants()
-        aligned = len({(v.encoder, v.opd, v.seed) for v in variants})
-        models = FULL * (trained * sum(v.lora == "with" for v in variants) + connector * aligned)
-        checkpoints = 3 * FULL * trained
-        parts += [f"data/models {_round(models / GB)}", f"checkpoints {_round(checkpoints / GB)} while one trains"]
-        total += models + checkpoints
-    yield (
-        f"Disk in GB: {_round(total / GB)} besides videos and downloads ({', '.join(parts)}); DVC's cache links to the "
-        "same files where the disk allows."
-    )
 
 
 def fits(uses: list[Use], gib: float) -> Iterator[str]:

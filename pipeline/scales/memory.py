@@ -10,9 +10,8 @@ from __future__ import annotations
 import argparse
 import shlex
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import yaml
 
@@ -49,8 +48,7 @@ LETTERS = 4
 """Letters a token of English text, where the tokenizer is not there to ask."""
 
 
-@dataclass(frozen=True)
-class Use:
+class Use(NamedTuple):
     """Memory of a stage in bytes, on each of its devices."""
 
     stage: str
@@ -82,12 +80,26 @@ class Lengths(NamedTuple):
     mean_prompt: float = 0.0
 
 
-def count(params: Params) -> tuple[list[Use], list[str]]:
-    """Count all stages that run a base model; the sentences say what was assumed or left out."""
+class Shapes(NamedTuple):
+    """What memory, time and disk are counted from; models lie on torch's meta device, without values."""
+
+    catalogue: Catalogue
+    tower: VisionTransformer | None
+    llm: PreTrainedModel | None
+    lengths: Lengths
+    """All 0 where the language model's shapes are not known."""
+    embedding: int
+    """Values of a frame's embedding as the language model gets it; where the encoder's shapes are not known, as many as
+    a word's embedding has."""
+    notes: list[str]
+    """Sentences on what was assumed or left out."""
+
+
+def read_shapes(params: Params) -> Shapes:
+    """Read the base models' shapes, and look for the longest conversations."""
     catalogue = catalogue_of(params)
     encoder, language = Path(params.encoder.weights), Path(params.language.weights)
     tower, llm = read_tower(encoder), read_language(language)
-    uses: list[Use] = []
     notes = ["language.dtype is auto: counted as float32."] if params.language.dtype == "auto" else []
     for folder, model, kind, stages in (
         (encoder, tower, "open_clip model", "encoder's"),
@@ -97,23 +109,34 @@ def count(params: Params) -> tuple[list[Use], list[str]]:
             notes.append(f"{folder}: no {kind} whose shapes are known; the {stages} stages are not counted.")
         elif not folder.is_dir():
             notes.append(f"{folder} is not there: counted with the shapes that are published for {folder.name}.")
-    if tower is not None:
-        uses += encoder_uses(params, tower, sum(len(p.levels) for p in catalogue.properties))
+    lengths, embedding = Lengths(0, 0, 0), 0
     if llm is not None:
-        lengths = longest(params, catalogue, language)
+        lengths, embedding = longest(params, catalogue, language), llm.config.hidden_size
         if not (language / TOKENIZER).is_file():
             notes.append(f"Without its tokenizer, a token is taken for {LETTERS} letters.")
         notes.append(
             f"Longest conversation {lengths.training} tokens, {lengths.answer} of them learnt; longest question "
             f"{lengths.prompt}, answered in at most {params.language.max_new_tokens}."
         )
-        embedding = llm.config.hidden_size if tower is None else embedding_length(params.encoder, tower)
-        uses += language_uses(params, llm, embedding, lengths)
-    return uses, notes
+    if params.encoder.embedding == "logits":
+        embedding = sum(len(p.levels) for p in catalogue.properties)
+    elif tower is not None:
+        embedding = features(params.encoder, tower)
+    return Shapes(catalogue, tower, llm, lengths, embedding, notes)
 
 
-def embedding_length(config: EncoderConfig, tower: VisionTransformer) -> int:
-    """Values of a frame's embedding as the language model gets it."""
+def count(params: Params, shapes: Shapes) -> list[Use]:
+    """The memory of all stages that run a base model whose shapes are known."""
+    uses: list[Use] = []
+    if shapes.tower is not None:
+        uses += encoder_uses(params, shapes.tower, sum(len(p.levels) for p in shapes.catalogue.properties))
+    if shapes.llm is not None:
+        uses += language_uses(params, shapes.llm, shapes.embedding, shapes.lengths)
+    return uses
+
+
+def features(config: EncoderConfig, tower: VisionTransformer) -> int:
+    """Values of a picture that are read of a tower."""
     whole = config.recipe == "release" or (config.recipe == "paper" and config.embedding == "class_token")
     return int(tower.transformer.width if whole else tower.output_dim)
 
@@ -150,24 +173,19 @@ def tower_kept(tower: VisionTransformer, frames: int, prompts: int, size: int) -
 
 def encoder_uses(params: Params, tower: VisionTransformer, classes: int) -> Iterator[Use]:
     """Fine-tuning by gradients (recipes `paper` and `release`), and embedding; `classes` counts all properties'."""
-    config, frames, width = params.encoder, params.frames.per_video, tower.transformer.width
+    config, width = params.encoder, tower.transformer.width
     if config.recipe in ("paper", "release"):
         trained = min(len(layers(tower)), config.prompt_layers or len(layers(tower))) * config.prompts * width
         if config.recipe == "paper":
-            trained += (width + 1) * width + (embedding_length(config, tower) + 1) * classes
+            trained += (width + 1) * width + (features(config, tower) + 1) * classes
         else:
             trained += (width + 1) * 512 + 513 * classes
-        pictures = frames * min(config.micro_batch_size or config.batch_size, config.batch_size)
-        size = BYTES["bfloat16" if config.autocast == "bfloat16" else "float32"]
-        yield Use(
-            "finetune_encoder",
-            1,
-            parameters=FULL * (parameters(tower) + trained),
-            optimizer=ADAM * trained,
-            activations=sum(tower_kept(tower, pictures, config.prompts, size)),
-        )
+        pictures = params.frames.per_video * min(config.micro_batch_size or config.batch_size, config.batch_size)
+        size = BYTES["float32" if config.autocast == "none" else config.autocast]
+        activations = sum(tower_kept(tower, pictures, config.prompts, size))
+        yield Use("finetune_encoder", 1, FULL * (parameters(tower) + trained), ADAM * trained, activations)
     _, passing = tower_kept(tower, config.embed_batch_size, config.prompts, FULL)
-    yield Use("embed", 1, parameters=FULL * parameters(tower), optimizer=0, activations=passing)
+    yield Use("embed", 1, FULL * parameters(tower), 0, passing)
 
 
 def language_uses(params: Params, llm: PreTrainedModel, embedding: int, lengths: Lengths) -> Iterator[Use]:
@@ -178,16 +196,15 @@ def language_uses(params: Params, llm: PreTrainedModel, embedding: int, lengths:
     # Linear maps alone are held in four bits.
     layer = sum(a * b for a, b in maps.values())
     frozen = blocks * layer * held + (parameters(llm) - blocks * layer) * size
-    connector, words = connector_parameters(params, llm, embedding)
-    adapted = adapters(llm, params.lora)
+    connector, words, adapters = trained_parameters(params, llm, embedding)
     devices, sharded = launched(params.runtime.launcher)
     shards = devices if sharded else 1
-    trainings: tuple[tuple[str, TrainConfig, int], ...] = (
-        ("align", params.align, connector + words),
-        ("lora", params.lora, connector + words + adapted),
-    )
     outside = parameters(llm) - parameters(layers(llm))
     gathered = GATHERED * layer * held + outside * size + FULL * (connector + words) if shards > 1 else 0.0
+    trainings: tuple[tuple[str, TrainConfig, int], ...] = (
+        ("align", params.align, connector + words),
+        ("lora", params.lora, connector + words + adapters),
+    )
     for stage, config, trained in trainings:
         # What comes and goes at the widest place: the logits and their gradient, or three of a layer's middle.
         tokens, logits = config.micro_batch_size * lengths.training, config.micro_batch_size * lengths.answer
@@ -205,7 +222,7 @@ def language_uses(params: Params, llm: PreTrainedModel, embedding: int, lengths:
     yield Use(
         "answer",
         1,
-        parameters=frozen + FULL * (connector + words + adapted),
+        parameters=frozen + FULL * (connector + words + adapters),
         optimizer=0,
         # The prompts are read at once: the widest maps' outcomes, and a mask for each pair of tokens.
         activations=rows * lengths.prompt * (3 * middle + 2 * hidden + lengths.prompt) * size,
@@ -213,24 +230,25 @@ def language_uses(params: Params, llm: PreTrainedModel, embedding: int, lengths:
     )
 
 
-def connector_parameters(params: Params, llm: PreTrainedModel, embedding: int) -> tuple[int, int]:
-    """What alignment trains: the connector with the two tactile tokens, and all words where they are trained.
+def trained_parameters(params: Params, llm: PreTrainedModel, embedding: int) -> tuple[int, int, int]:
+    """What is trained: the connector with the two tactile tokens, all words where they are trained, and the adapters.
 
     Words are a copy beside the frozen ones, which a tied head still needs.
     """
     hidden = llm.config.hidden_size
     words = llm.config.vocab_size * hidden if params.align.train_embeddings == "all" else 0
-    return (embedding + 1) * hidden + (hidden + 1) * hidden + 2 * hidden, words
+    ends = sum(map(sum, adapted(llm, params.lora).values()))
+    return (
+        (embedding + 1) * hidden + (hidden + 1) * hidden + 2 * hidden,
+        words,
+        len(layers(llm)) * params.lora.rank * ends,
+    )
 
 
-def adapted(llm: PreTrainedModel, targets: Sequence[str] | Literal["all-linear"]) -> dict[str, tuple[int, int]]:
-    """The linear maps of a layer that get an adapter."""
+def adapted(llm: PreTrainedModel, config: LoraTrainConfig) -> dict[str, tuple[int, int]]:
+    """Lengths of what goes in and comes out of the linear maps of a layer that get an adapter."""
+    targets = config.target_modules
     return {name: ends for name, ends in linear(llm).items() if targets == "all-linear" or name in targets}
-
-
-def adapters(llm: PreTrainedModel, config: LoraTrainConfig) -> int:
-    """Parameters of the low-rank adapters."""
-    return len(layers(llm)) * config.rank * sum(map(sum, adapted(llm, config.target_modules).values()))
 
 
 def language_kept(params: Params, llm: PreTrainedModel, config: TrainConfig, lengths: Lengths) -> int:
@@ -240,7 +258,7 @@ def language_kept(params: Params, llm: PreTrainedModel, config: TrainConfig, len
     queries, keys, middle = maps["q_proj"][1], maps["k_proj"][1], maps["down_proj"][0]
     layer = layer_kept(hidden, llm.config.num_attention_heads, keys, queries, 3 * middle, 1, size)
     if isinstance(config, LoraTrainConfig):
-        own = adapted(llm, config.target_modules)
+        own = adapted(llm, config)
         # Each map casts or drops what it reads for itself; a GPU remembers in a byte whether a value was dropped.
         read = sum(ends[0] for ends in own.values()) * (FULL + (config.dropout > 0))
         if size == FULL and not config.dropout:
@@ -275,18 +293,19 @@ def launched(launcher: str) -> tuple[int, bool]:
 
 def longest(params: Params, catalogue: Catalogue, language: Path) -> Lengths:
     """Look for the longest conversations among questions on all objects, in tokens of the folder's language model."""
-    known = read_tokenizer(language) if (language / TOKENIZER).is_file() else None
+    tokenizer = read_tokenizer(language) if (language / TOKENIZER).is_file() else None
     config = params.questions
 
     def tokens(text: str) -> int:
-        return len(known.encode(text).ids) if known else -(-len(text) // LETTERS)
+        return len(tokenizer.encode(text).ids) if tokenizer else -(-len(text) // LETTERS)
 
     def length(question: Question, turns: Sequence[Turn]) -> int:
         text = " ".join([params.language.system_prompt, *(f"USER: {t.user} ASSISTANT: {t.assistant}" for t in turns)])
         # A video is its frames and two delimiters.
         return tokens(text.replace("{tactile}", "")) + len(question.videos) * (params.frames.per_video + 2)
 
-    training, prompts = [(0, 0)], [0]
+    training: list[tuple[int, int]] = []
+    prompts: list[int] = []
     for part in (Part.TRAIN, Part.TEST):
         wanted = counts_by_task(config, "train" if part == Part.TRAIN else "evaluation")
         questions = build_questions(
@@ -304,14 +323,12 @@ def longest(params: Params, catalogue: Catalogue, language: Path) -> Lengths:
             else:
                 prompts.append(length(question, [*turns[:-1], Turn(user=turns[-1].user, assistant="")]))
     columns = ([t for t, _ in training], [a for _, a in training], prompts)
-    means = (sum(numbers) / max(1, len(numbers) - 1) for numbers in columns)
-    return Lengths(*max(training), max(prompts), *means)
+    means = (sum(numbers) / max(1, len(numbers)) for numbers in columns)
+    return Lengths(*max(training, default=(0, 0)), max(prompts, default=0), *means)
 
 
 def table(uses: Sequence[Use]) -> str:
     """The stages as lines of text, in GiB on each device."""
     line = "{:<16}  {:>7}  {:>10}  {:>9}  {:>11}  {:>5}  {:>5}".format
-    rows = [(use.parameters, use.optimizer, use.activations, use.cache, use.total) for use in uses]
-    figures = [[f"{size / GIB:.2f}" for size in row] for row in rows]
-    heads = line("stage", "devices", "parameters", "optimizer", "activations", "cache", "total")
-    return "\n".join([heads, *(line(u.stage, u.devices, *row) for u, row in zip(uses, figures, strict=True))])
+    rows = [(u.stage, u.devices, *(f"{size / GIB:.2f}" for size in (*u[2:], u.total))) for u in uses]
+    return "\n".join(line(*row) for row in (("stage", "devices", *Use._fields[2:], "total"), *rows))
