@@ -58,6 +58,18 @@ class Draft:
     finding: str = ""
     """What the classes of the property asked for lead to, before it is put as an answer: "Harder: second object."."""
 
+    def numbered(self, question_id: str, task: str, part: Part) -> Question:
+        """The question as it is written to disk."""
+        return Question(
+            question_id=question_id,
+            task=task,
+            part=part,
+            videos=self.videos,
+            objects=self.objects,
+            dialogues=self.dialogues,
+            gold=self.gold,
+        )
+
 
 class TaskDefinition(ABC):
     """One task: how it asks, what a right answer is, what a guess would score and what tables call it."""
@@ -70,6 +82,8 @@ class TaskDefinition(ABC):
     """Whether its questions may be used for training (PSR's may not)."""
     listed: tuple[str, ...] = ()
     """What an answer calls the objects where it restates their classes; none where it is about several properties."""
+    adjectives: tuple[str, ...] = ()
+    """Fields of a property with the two adjectives that a question may ask by, the one for high classes first."""
     choices = 2
     """How many answers there are to choose from."""
     measure = "choice"
@@ -103,7 +117,12 @@ class TaskDefinition(ABC):
 
     def adjective(self, question: Question, catalogue: Catalogue) -> str:
         """The adjective that the question asks by, such as "softer"; empty where it asks by none."""
-        return ""
+        if not self.adjectives:
+            return ""
+        prop = catalogue.properties[catalogue.property_index(question.gold.properties[0])]
+        high, low = (getattr(prop, field) for field in self.adjectives)
+        asked: str = high if mentioned(question.dialogues[0].turns[-1].user, (high, low)) == [plain(high)] else low
+        return asked
 
     def chance(self, catalogue: Catalogue) -> dict[str, float]:
         """Accuracy of a uniform guess, 0 to 1, by measure."""
@@ -153,11 +172,6 @@ def before_concluding(draft: Draft, told: str) -> Draft:
     return replace(draft, dialogues=tuple(dialogues))
 
 
-def draw_videos(pool: Pool, objects: Sequence[str], rng: random.Random) -> tuple[str, ...]:
-    """One random video of each object."""
-    return tuple(rng.choice(list(pool.videos[o])) for o in objects)
-
-
 def draft_about(
     pool: Pool,
     objects: Sequence[str],
@@ -170,10 +184,10 @@ def draft_about(
 ) -> Draft:
     """A question about one random video of each of these objects, one dialogue for each OPD mode that has turns."""
     return Draft(
-        videos=draw_videos(pool, objects, rng),
+        videos=tuple(rng.choice(list(pool.videos[o])) for o in objects),
         objects=tuple(objects),
         dialogues=tuple(Dialogue(opd=m, turns=tuple(turns[m])) for m in Opd if m in turns),
-        gold=gold(pool, objects, choice, properties),
+        gold=Gold(choice=choice, labels=tuple(map(pool.catalogue.labels, objects)), properties=tuple(properties)),
         finding=finding,
     )
 
@@ -222,11 +236,6 @@ def in_turns(draft: Draft, more: Sequence[Draft] = ()) -> Draft:
 def described_first(count: int) -> str:
     """The first turn of a question in two: everything about two or three videos."""
     return f"Describe these {('two', 'three')[count - 2]} tactile videos: {lettered(count)}."
-
-
-def gold(pool: Pool, objects: Sequence[str], choice: str, properties: Sequence[str]) -> Gold:
-    """The structured answer about these objects."""
-    return Gold(choice=choice, labels=tuple(map(pool.catalogue.labels, objects)), properties=tuple(properties))
 
 
 def descriptions(

@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from pipeline.core.records import Assignment, Dialogue, Opd, Part, Prediction, Question, Score, Turn
+from pipeline.core.records import Assignment, Opd, Part, Prediction, Question, Score, Turn
 from pipeline.core.runtime import derive_seed
 from pipeline.tasks.base import (
     LETTERS,
@@ -16,8 +16,7 @@ from pipeline.tasks.base import (
     chosen_letter,
     described_first,
     descriptions,
-    draw_videos,
-    gold,
+    draft_about,
 )
 from pipeline.tasks.opd import TEMPLATES
 from pipeline.videos.catalogue import Catalogue
@@ -70,21 +69,14 @@ def build_examples(assignments: Sequence[Assignment], catalogue: Catalogue, *, s
                 opening, described = described_first(2), descriptions(catalogue, objects)
             named = " or ".join(f"{x}) {option}" for x, option in zip(LETTERS, options, strict=False))
             request = f"{example.question.format(options=named)} Use the format '{example.answer} x), because xxx'."
-            turns = (
+            turns = [
                 Turn(user=opening, assistant=described),
                 Turn(user=request, assistant=f"{example.answer} {letter})."),
+            ]
+            draft = draft_about(
+                pool, objects, rng, turns={Opd.ALL: turns}, choice=letter, properties=catalogue.property_names
             )
-            questions.append(
-                Question(
-                    question_id=f"{example.name}-{letter}",
-                    task=example.name,
-                    part=part,
-                    videos=draw_videos(pool, objects, rng),
-                    objects=objects,
-                    dialogues=(Dialogue(opd=Opd.ALL, turns=turns),),
-                    gold=gold(pool, objects, letter, catalogue.property_names),
-                )
-            )
+            questions.append(draft.numbered(f"{example.name}-{letter}", example.name, part))
     return questions
 
 

@@ -23,7 +23,6 @@ from pipeline.tasks.base import (
     single_turn,
 )
 from pipeline.videos.catalogue import Catalogue, Property
-from pipeline.videos.catalogue.wording import mentioned, plain
 
 TEMPLATES = (
     "Is the object in the tactile video {tactile} COMPARATIVE than the one in {tactile}?",
@@ -71,6 +70,7 @@ class PropertyComparison(TaskDefinition):
     name = "PC"
     title = "Property Comparison"
     listed = ("first object", "second object")
+    adjectives = ("more", "less")
     choices = 3
 
     def strata(self, catalogue: Catalogue) -> int:
@@ -90,6 +90,7 @@ class PropertyComparison(TaskDefinition):
         user = asked(rng.choice(TEMPLATES), comparative, prop.spoken)
         told, prefixes = verdict(choice, comparative, prop), [f"{o} object:" for o in ORDINALS]
         answer = concluded(pool.catalogue, objects, told, [prop.name], prefixes)
+        found = {"yes": self.listed[0], "no": self.listed[1], "same": "neither"}[choice]
         return draft_about(
             pool,
             objects,
@@ -97,33 +98,31 @@ class PropertyComparison(TaskDefinition):
             turns=single_turn(user, answer),
             choice=choice,
             properties=[prop.name],
-            finding=self._finding(choice, comparative),
+            finding=f"{comparative.capitalize()}: {found}.",
         )
 
-    def _finding(self, choice: Reading, comparative: str) -> str:
-        found = {"yes": self.listed[0], "no": self.listed[1], "same": "neither"}[choice]
-        return f"{comparative.capitalize()}: {found}."
+    def _asked_for(self, draft: Draft, catalogue: Catalogue) -> tuple[Property, str]:
+        """The property that a question compares, and its comparative, which the finding begins with."""
+        prop = catalogue.properties[catalogue.property_index(draft.gold.properties[0])]
+        return prop, prop.more if draft.finding.startswith(f"{prop.more.capitalize()}:") else prop.less
 
     def plainly(self, draft: Draft, catalogue: Catalogue, rng: random.Random) -> Draft:
         """ "Which is softer?", videos in front or behind, which is answered by the name of one, or by "Both"."""
-        prop = catalogue.properties[catalogue.property_index(draft.gold.properties[0])]
-        comparative = prop.more if draft.finding.startswith(f"{prop.more.capitalize()}:") else prop.less
+        _, comparative = self._asked_for(draft, catalogue)
         places = ("{{tactile}} {{tactile}} Which is {}?", "Which is {}? {{tactile}} {{tactile}}")
         user, dialogues = rng.choice(places).format(comparative), []
         for dialogue in draft.dialogues:
             (turn,) = dialogue.turns
             said = re.sub(r"(?:Yes|No), the (?=first|second)", "The ", turn.assistant)
-            dialogues.append(
-                Dialogue(opd=dialogue.opd, turns=(turn.model_copy(update={"user": user, "assistant": said}),))
-            )
+            plain = turn.model_copy(update={"user": user, "assistant": said})
+            dialogues.append(Dialogue(opd=dialogue.opd, turns=(plain,)))
         return replace(draft, dialogues=tuple(dialogues))
 
     def as_choice(self, draft: Draft, catalogue: Catalogue) -> Draft | None:
         """ "Which object is softer?", answered as scenarios want it: "The most suitable object is b), ..."."""
-        prop = catalogue.properties[catalogue.property_index(draft.gold.properties[0])]
         if draft.gold.choice == "same":
             return None
-        comparative = prop.more if draft.finding.startswith(f"{prop.more.capitalize()}:") else prop.less
+        prop, comparative = self._asked_for(draft, catalogue)
         ask = psr.REQUEST.format(question=f"Which object is {comparative}?", based=psr.BASED)
         turn = Turn(user=ask, assistant=psr.verdict("ab"[draft.gold.choice == "no"], prop.spoken))
         return replace(draft, dialogues=tuple(Dialogue(opd=d.opd, turns=(turn,)) for d in draft.dialogues))
@@ -133,11 +132,6 @@ class PropertyComparison(TaskDefinition):
         prop = catalogue.properties[place]
         (first, _), (second, _) = (video[place] for video in classes)
         return verdict(compare(first, second, word == prop.more), word, prop)
-
-    def adjective(self, question: Question, catalogue: Catalogue) -> str:
-        prop = catalogue.properties[catalogue.property_index(question.gold.properties[0])]
-        named = mentioned(question.dialogues[0].turns[-1].user, (prop.more, prop.less))
-        return prop.more if named == [plain(prop.more)] else prop.less
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         predicted = read(prediction.outputs[0])

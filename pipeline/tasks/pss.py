@@ -21,7 +21,6 @@ from pipeline.tasks.base import (
     single_turn,
 )
 from pipeline.videos.catalogue import Catalogue
-from pipeline.videos.catalogue.wording import mentioned, plain
 
 TEMPLATES = (
     ("Given three tactile videos: {videos}.", "select the {superlative}."),
@@ -52,6 +51,7 @@ class PropertySuperlativeSelection(TaskDefinition):
     name = "PSS"
     title = "Property Superlative Selection"
     listed = LISTED
+    adjectives = ("most", "least")
     choices = 3
 
     def strata(self, catalogue: Catalogue) -> int:
@@ -86,11 +86,6 @@ class PropertySuperlativeSelection(TaskDefinition):
         furthest = max if word == catalogue.properties[place].most else min
         extreme = furthest(range(len(classes)), key=lambda i: classes[i][place])
         return f"{LETTERS[extreme]}) is the {word}."
-
-    def adjective(self, question: Question, catalogue: Catalogue) -> str:
-        prop = catalogue.properties[catalogue.property_index(question.gold.properties[0])]
-        named = mentioned(question.dialogues[0].turns[-1].user, (prop.most, prop.least))
-        return prop.most if named == [plain(prop.most)] else prop.least
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         predicted = read(prediction.outputs[0])

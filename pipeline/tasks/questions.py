@@ -97,17 +97,7 @@ def build_questions(
                 draft = in_turns(draft, turns.sample(more, len(more)))
             if facts:
                 draft = definition.with_facts(draft, pool.catalogue, order, inexact)
-            questions.append(
-                Question(
-                    question_id=f"{task}-{place}-{number:05d}",
-                    task=task,
-                    part=pool.part,
-                    videos=draft.videos,
-                    objects=draft.objects,
-                    dialogues=draft.dialogues,
-                    gold=draft.gold,
-                )
-            )
+            questions.append(draft.numbered(f"{task}-{place}-{number:05d}", task, pool.part))
     random.Random(derive_seed(seed, pool.part, "order")).shuffle(questions)
     return questions
 

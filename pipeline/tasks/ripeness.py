@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import random
 import re
-from collections.abc import Sequence
 
 from pipeline.core.records import Opd, Prediction, Question, Score, Turn
 from pipeline.tasks.base import (
@@ -53,10 +52,12 @@ class Ripeness(TaskDefinition):
         if ranks[objects[0]] == ranks[objects[1]]:
             return None
         objects.sort(key=ranks.__getitem__, reverse=position == 0)
-        names = _telling(catalogue, fruit)
-        spoken = _spoken(catalogue, names)
+        # The properties whose classes differ between ripe and unripe ones; all, where none does.
+        ranked = [o.labels for o in catalogue.objects.values() if fruit in o.ripeness]
+        telling = [p for p, *classes in zip(catalogue.properties, *ranked, strict=True) if len(set(classes)) > 1]
+        names, spoken = zip(*((p.name, p.spoken) for p in telling or catalogue.properties), strict=True)
         verdict = f"The riper {fruit} is {LETTERS[position]}), because of its {' and '.join(spoken)}."
-        talk = Turn(user=_question(catalogue, fruit), assistant=f"First to last: {', '.join(spoken)}.")
+        talk = Turn(user=papers_question(catalogue, fruit), assistant=f"First to last: {', '.join(spoken)}.")
         ask = f"Each shows one {fruit}. Which {fruit} is riper? Use the format 'The riper {fruit} is x), because xxx'."
         needed = Turn(
             user=f"Describe the {' and '.join(spoken)} of these two tactile videos: {lettered(2)}.",
@@ -82,19 +83,7 @@ def _fruits(catalogue: Catalogue) -> list[str]:
     return sorted({fruit for o in catalogue.objects.values() for fruit in o.ripeness})
 
 
-def _telling(catalogue: Catalogue, fruit: str) -> list[str]:
-    """The properties whose classes differ between ripe and unripe ones; all, where none does."""
-    ranked = [o.labels for o in catalogue.objects.values() if fruit in o.ripeness]
-    return [p.name for i, p in enumerate(catalogue.properties) if len({labels[i] for labels in ranked}) > 1] or list(
-        catalogue.property_names
-    )
-
-
-def _spoken(catalogue: Catalogue, names: Sequence[str]) -> list[str]:
-    return [p.spoken for p in catalogue.properties if p.name in names]
-
-
-def _question(catalogue: Catalogue, fruit: str) -> str:
+def papers_question(catalogue: Catalogue, fruit: str) -> str:
     """The paper's question (section "Avocado Ripeness Classification"), about this catalogue's properties."""
     count = NUMBERS.get(len(catalogue.properties), str(len(catalogue.properties)))
     told = " ".join(
@@ -103,7 +92,7 @@ def _question(catalogue: Catalogue, fruit: str) -> str:
     )
     return (
         f"You will be given tactile descriptions that consist of {count} physical properties: "
-        f"{', '.join(_spoken(catalogue, catalogue.property_names))}. {told} "
+        f"{', '.join(p.spoken for p in catalogue.properties)}. {told} "
         f"Which of these properties help to determine {fruit} ripeness? Rank them."
     )
 

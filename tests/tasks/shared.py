@@ -31,6 +31,5 @@ def drafted(task: str, pool: Pool, each: int) -> list[Question]:
     for stratum in range(definition.strata(pool.catalogue)):
         drafts = (definition.draft(pool, stratum, rng) for _ in range(2000))
         for draft in islice(filter(None, drafts), each):
-            fields = {name: getattr(draft, name) for name in ("videos", "objects", "dialogues", "gold")}
-            questions.append(Question(question_id=f"{task}-{len(questions)}", task=task, part=pool.part, **fields))
+            questions.append(draft.numbered(f"{task}-{len(questions)}", task, pool.part))
     return questions
