@@ -135,6 +135,16 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working directory, where the scale smoke is chosen and nothing else lies."""
+    from pipeline.scales import compose, write_params
+
+    write_params(compose("smoke", conf=ROOT / "conf"), tmp_path / "params.yaml")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
 def versions(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
     """Changes a byte of a file of the code, as unfinished work knows it; the code that runs stays as it is."""
     copy = tmp_path_factory.mktemp("version")

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import csv
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -163,19 +160,6 @@ def test_data_audit_names_what_is_no_text(folder: Path) -> None:
     rename = "its name is no text in UTF-8; rename it"
     assert told == {r"rug\udcff_0.avi": rename, r"sub\udcff/rug_0.avi": rename}
     assert [line for item in told for line in lines(output, "error") if item in line] == lines(output, "error")
-
-
-def test_any_path_is_printed(folder: Path) -> None:
-    """On a terminal whose locale takes no bytes but UTF-8."""
-    out = not_utf8(folder, "found?.csv")
-    command = [sys.executable, "-c", "from pipeline.cli import main; main()", "data", "audit"]
-    env = {**os.environ, "PYTHONIOENCODING": "utf-8:strict", "PYTHONPATH": str(ROOT)}
-    done = subprocess.run([*command, not_utf8(folder, "none?"), "--out", out], env=env, capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (1, "")
-    first, second = done.stdout.splitlines()[:2]
-    assert first.endswith(rf" findings in {folder}/found\udcff.csv")
-    assert rf"{folder}/none\udcff: no such folder" in second
-    assert rf"{folder}/none\udcff,no such folder" in out.read_text(encoding="utf-8")
 
 
 def test_data_audit_ends_with_status_1_where_parts_share_a_video(folder: Path) -> None:

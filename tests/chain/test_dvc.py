@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import re
 import shutil
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from types import FunctionType
-from typing import Any, get_args, get_origin
+from typing import Any
 
 import pytest
 import yaml
@@ -16,13 +15,8 @@ from dvc.dependency import ParamsDependency
 from dvc.repo import Repo
 from dvc.stage.cache import _get_cache_hash
 from dvc.stage.serialize import to_single_stage_lockfile
-from dvc_data.hashfile.meta import Meta
-from pydantic import BaseModel
 
 from pipeline import config
-from pipeline.config import Params
-from pipeline.scales import compose, shipped_scales
-from pipeline.tasks import TASKS
 from tests.closure import ROOT, closure
 from tests.project import OBJECTS, REDUCED, copy_project
 
@@ -87,52 +81,8 @@ def test_config_computes_nothing_else() -> None:
     assert {name for name in own if not name.startswith("_")} == {*COMPUTED, "report_name"}
 
 
-def test_dvc_yaml_is_read_on_a_few_screens() -> None:
-    assert len((ROOT / "dvc.yaml").read_text().splitlines()) <= 300
-    assert len((ROOT / "params.yaml").read_text().splitlines()) <= 150
-
-
-@pytest.mark.parametrize(("target", "status"), [("bench", 0), ("stability", 0), ("stability", 1)])
-def test_what_measures_draws_the_page_anew(target: str, status: int, tmp_path: Path) -> None:
-    """The page shows its table; a hard case that fails stands on it too, and still fails the command."""
-    shutil.copy(ROOT / "Makefile", tmp_path)
-    for name in ("requirements.lock", "requirements-weights.lock", "pyproject.toml", ".venv/.installed"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).touch()
-    for name, ends in (("python", status), ("octopi", 0)):
-        program = tmp_path / ".venv" / "bin" / name
-        program.parent.mkdir(exist_ok=True)
-        program.write_text(f'#!/bin/sh\necho "{name} $*" >> ran\nexit {ends}\n')
-        program.chmod(0o755)
-    done = subprocess.run(["make", "-C", str(tmp_path), target, "SECTION=frames"], check=False, capture_output=True)
-    measured, *after = (tmp_path / "ran").read_text().splitlines()
-    assert measured.startswith("python -m")
-    assert (after, bool(done.returncode)) == (["octopi page"], bool(status))
-
-
 def test_every_script_is_a_stage() -> None:
     assert {f.stem for f in (ROOT / "stages").glob("*.py")} == set(stages())
-
-
-def names(kind: Any, key: str = "") -> Iterator[str]:
-    """Dotted names of all parameters; of free dictionaries those that their keys may be."""
-    if isinstance(kind, type) and issubclass(kind, BaseModel):
-        for name, field in kind.model_fields.items():
-            yield f"{key}{name}"
-            yield from names(field.annotation, f"{key}{name}.")
-    elif get_origin(kind) is dict:
-        assert key in ("questions.train.", "questions.evaluation."), f"{key}: say here which keys it may have"
-        yield from (f"{key}{task.lower()}" for task in TASKS)
-    else:
-        for part in get_args(kind):
-            yield from names(part, key)
-
-
-def test_no_parameter_has_a_name_that_dvc_leaves_out() -> None:
-    """DVC's run cache does not hash what is called so: other values would bring back the results of earlier ones."""
-    found = list(names(Params))
-    assert {"seed", "frames.per_video", "questions.train.opd", "lora.rank"} <= set(found)
-    assert not [name for name in found if name.rpartition(".")[2] in (Meta.PARAM_SIZE, Meta.PARAM_NFILES)]
 
 
 def leaves(values: Any, key: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
@@ -144,7 +94,10 @@ def leaves(values: Any, key: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
 
 
 def test_every_listed_parameter_changes_the_stage_s_key_in_the_run_cache(tmp_path: Path) -> None:
-    """The key by which DVC brings results back, as it computes it from the real dvc.yaml."""
+    """The key by which DVC brings results back, as it computes it from the real dvc.yaml.
+
+    It leaves out what is called `size` or `nfiles`: no parameter may be.
+    """
     for file in ("dvc.yaml", "params.yaml"):
         shutil.copy(ROOT / file, tmp_path / file)
     with Repo.init(str(tmp_path), no_scm=True) as repo:
@@ -229,16 +182,3 @@ def test_what_changes_answers_is_a_parameter_of_what_answers() -> None:
     batches |= dict.fromkeys(("embed", "cross_validate"), "encoder.embed_batch_size")
     batches |= {"finetune_encoder": "encoder.max_grad_norm"}
     assert {name for name, key in batches.items() if key not in stages()[name]["params"]} == set()
-
-
-def test_language_training_does_not_depend_on_the_encoders_code() -> None:
-    assert not [d for name in ("align", "lora", "answer") for d in code(name) if "encoder" in d]
-
-
-@pytest.mark.parametrize("scale", shipped_scales(ROOT / "conf"))
-def test_every_scale_has_the_matrices_lists(scale: str) -> None:
-    ablation = compose(scale, conf=ROOT / "conf").ablation
-    for name in ("align", "lora", "answer"):
-        for axis, values in stages()[name]["matrix"].items():
-            assert values == f"${{ablation.{axis if axis in ('lora', 'opd') else axis + 's'}}}"
-            assert getattr(ablation, values[len("${ablation.") : -1])

@@ -1,0 +1,411 @@
+"""What starts processes: Ctrl-C, launchers, kills, and work on many files here and on a local cluster of Ray's.
+
+That no worker outlives a parent that is killed is tests/videos/test_extract.py's.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from importlib.util import find_spec
+from pathlib import Path
+
+import psutil
+import pytest
+import yaml
+
+from pipeline.config import FramesConfig
+from pipeline.core.io import atomic_folder
+from pipeline.core.stage import stage
+from pipeline.scales import compose, write_params
+from pipeline.videos.catalogue import load_catalogue
+from pipeline.videos.frames.extract import extract_frames
+from tests.closure import ROOT
+from tests.conftest import not_utf8, wait_until_ended
+
+CHAIN = """\
+stages:
+  first: {cmd: touch first.txt, outs: [first.txt]}
+  slow: {cmd: python stages/slow.py, deps: [first.txt]}
+"""
+
+
+IMPORTING = "import pipeline\nprint('now', flush=True)\ntime.sleep(600)"
+
+
+RUNNING = (
+    "from pipeline.core.stage import stage\nwith stage('slow'):\n    print('now', flush=True)\n    time.sleep(600)"
+)
+
+
+WORKERS = "from pipeline.core.parallel import run_parallel\n"
+
+
+SLEEPING = f"{WORKERS}print('now', flush=True)\nlist(run_parallel(time.sleep, [600] * 64, '', ''))"
+
+
+# So much to hand over that a worker is always in the middle of it.
+TELLING = (
+    f"{WORKERS}for i, _ in enumerate(run_parallel(bytes, [1 << 22] * 9000, '', '')):\n    i or print('now', flush=True)"
+)
+
+
+STOPPED = "slow: stopped; finished stages stay, and `octopi repro` goes on from there"
+
+
+def interrupted(folder: Path, *command: str) -> tuple[int, list[str]]:
+    """Run a command, press Ctrl-C when `now` is printed, and give its status and the lines from there on."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "SHELL": "/bin/sh"}
+    environment["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    process = subprocess.Popen(
+        command, cwd=folder, env=environment, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
+        # What a script starts in the background is born deaf to Ctrl-C, as this process then is.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
+    try:
+        assert process.stdout
+        while (line := process.stdout.readline()) != "now\n":
+            assert line, "it ended"
+        # As a terminal does it: to every process at once.
+        os.killpg(process.pid, signal.SIGINT)
+        lines = process.communicate(timeout=300)[0].splitlines()
+        return process.returncode, lines
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+
+
+@pytest.mark.parametrize("body", [IMPORTING, RUNNING])
+def test_ctrl_c_in_a_chain_is_one_line_and_what_is_finished_stays(here: Path, body: str) -> None:
+    (here / "dvc.yaml").write_text(CHAIN)
+    (here / "stages").mkdir()
+    (here / "stages/slow.py").write_text(f"import time\n{body}\n")
+    subprocess.run(f"git init -q && '{sys.executable}' -m dvc init -q", shell=True, check=True)
+    assert interrupted(here, "octopi", "repro") == (130, [STOPPED])
+    assert (here / "first.txt").exists()
+    assert list(yaml.safe_load((here / "dvc.lock").read_text())["stages"]) == ["first"]
+    _, lines = interrupted(here, "dvc", "repro")
+    assert lines[0] == STOPPED
+    assert [line.split(":")[0] for line in lines[1:]] == ["ERROR"], "DVC's own"
+
+
+@pytest.mark.parametrize("body", [SLEEPING, TELLING])
+def test_ctrl_c_ends_the_processes_of_a_stage(tmp_path: Path, body: str) -> None:
+    (tmp_path / "stages").mkdir()
+    (tmp_path / "stages/slow.py").write_text(f"import time\n{body}\n")
+    assert interrupted(tmp_path, sys.executable, "stages/slow.py") == (130, [STOPPED])
+
+
+@pytest.mark.parametrize("code", ["import torch; limit_threads(1)", "limit_threads(1); import torch"])
+def test_threads_are_limited_before_and_after_torch_is_imported(code: str) -> None:
+    """Some stages import it when they need it."""
+    code = f"from pipeline.core.runtime import limit_threads; {code}; print(torch.get_num_threads())"
+    environment = {**os.environ, "OMP_NUM_THREADS": "2", "PYTHONPATH": str(ROOT)}
+    assert subprocess.check_output([sys.executable, "-c", code], text=True, env=environment) == "1\n"
+
+
+def test_a_stage_runs_the_code_beside_it_or_refuses(tmp_path: Path) -> None:
+    """Whichever environment is active, since dvc.lock records what lies in the project's folder."""
+    clone, linked = tmp_path / "another clone", tmp_path / "linked clone"
+    for part in ("pipeline", "stages", "conf"):
+        shutil.copytree(ROOT / part, clone / part, ignore=shutil.ignore_patterns("__pycache__", "pretrained"))
+    shutil.copy(ROOT / "dvc.yaml", clone)
+    write_params(compose("smoke", conf=ROOT / "conf"), clone / "params.yaml")
+    linked.symlink_to(clone)
+
+    def split(folder: Path, code: Path) -> tuple[str, str]:
+        command = [sys.executable, "stages/split.py"]
+        environment = {**os.environ, "PYTHONPATH": str(code)}
+        done = subprocess.run(command, cwd=folder, env=environment, text=True, capture_output=True, check=False)
+        assert done.returncode == 1
+        return done.stdout, done.stderr
+
+    for folder in (clone, linked):
+        started, stopped = split(folder, ROOT)
+        assert started == ""
+        assert stopped.count("\n") == 1
+        assert f"split: {ROOT / 'pipeline'} would run, but dvc.lock records {clone / 'pipeline'}" in stopped
+        for code in (clone, linked):
+            started, stopped = split(folder, code)
+            assert started == "split: starts (smoke-scenes)\n"
+            assert "data/videos.parquet: no such file" in stopped
+
+
+STARTED = """
+import os, sys, time
+from pathlib import Path
+from pipeline.core.errors import UserError
+from pipeline.core.stage import stage
+with stage("align", "x", launched=True) as run:
+    Path("started").write_text(str(os.getpid()))
+    while sys.argv[1] == "waits":
+        time.sleep(0.1)
+    from accelerate import Accelerator
+    from pipeline.training.trainer import check_accelerate
+    print("computes in", Accelerator().mixed_precision)
+    check_accelerate()
+    if sys.argv[1] == "fails":
+        raise UserError("no such thing")
+"""
+
+
+SHIPPED = compose("paper-7b", conf=ROOT / "conf").runtime.launcher
+
+
+def started(here: Path, launcher: str, what: str) -> subprocess.Popen[str]:
+    """A stage that is started as DVC starts it, where the user's own configuration of accelerate says bfloat16."""
+    (here / "stage.py").write_text(STARTED)
+    (here / "conf").symlink_to(ROOT / "conf")
+    own = {"compute_environment": "LOCAL_MACHINE", "distributed_type": "NO", "mixed_precision": "bf16"}
+    (here / "home" / "accelerate").mkdir(parents=True)
+    (here / "home" / "accelerate" / "default_config.yaml").write_text(yaml.safe_dump(own | {"num_processes": 1}))
+    (here / "two.yaml").write_text(yaml.safe_dump(own | {"distributed_type": "MULTI_CPU", "num_processes": 2}))
+    write_params(compose("smoke", [f"runtime.launcher={launcher}"], conf=ROOT / "conf"), here / "params.yaml")
+    programs = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    return subprocess.Popen(
+        ["python", "stage.py", what],
+        env={**os.environ, "PATH": programs, "PYTHONPATH": str(ROOT), "HF_HOME": str(here / "home")},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        # A background shell has it ignored.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+
+
+@pytest.mark.parametrize(
+    ("launcher", "line"),
+    [
+        (SHIPPED, "no such thing\n"),
+        ("accelerate launch -q --num_processes 1", "runtime.launcher: ACCELERATE_MIXED_PRECISION is bf16, which"),
+        ("nowhere", "runtime.launcher: nowhere: No such file or directory; set it to python\n"),
+    ],
+)
+def test_a_stage_starts_itself_by_the_launcher(here: Path, launcher: str, line: str) -> None:
+    """With its status and one line. The configuration that comes along keeps the user's own out."""
+    process = started(here, launcher, "fails")
+    output, errors = process.communicate(timeout=300)
+    assert process.returncode == 1
+    assert errors.startswith(f"align@x: {line}")
+    assert errors.count("\n") == 1
+    if launcher == SHIPPED:
+        assert "computes in no\n" in output
+        assert int((here / "started").read_text()) != process.pid
+
+
+@pytest.mark.parametrize(
+    ("launcher", "number"),
+    [
+        (SHIPPED, signal.SIGINT),
+        ("accelerate launch --cpu --config_file two.yaml", signal.SIGKILL),
+    ],
+)
+def test_a_stage_that_is_ended_leaves_no_process(here: Path, launcher: str, number: signal.Signals) -> None:
+    process = started(here, launcher, "waits")
+    file = here / "started"
+    while process.poll() is None and not (file.exists() and file.read_text()):
+        time.sleep(0.1)
+    children = psutil.Process(process.pid).children(recursive=True)
+    assert int(file.read_text()) in {child.pid for child in children}
+    process.send_signal(number)
+    process.communicate(timeout=300)
+    assert process.returncode != 0
+    assert psutil.wait_procs(children, timeout=300)[1] == []
+
+
+def test_a_stage_removes_what_killed_ones_were_writing(here: Path) -> None:
+    kill = "import os; from pathlib import Path; from pipeline.core.io import atomic"
+    kill += "; t = atomic(Path('data/graded.parquet')).__enter__(); t.write_text('half'); os.kill(os.getpid(), 9)"
+    assert subprocess.run([sys.executable, "-c", kill], cwd=here, check=False).returncode == -9
+    (rest,) = (here / "data").iterdir()
+    dead = rest.name.split(".")[-2]
+    rests = [rest]
+    for folder in ("data", "data/encoder/0", "reports/smoke-scenes/figures", "models", "runs"):
+        (here / folder).mkdir(parents=True, exist_ok=True)
+        others = [here / folder / name for name in (f".x.{os.getpid()}.part", ".frames.part", f"x.{dead}.csv")]
+        for other in others:
+            other.touch()
+        rests += [here / folder / name for name in (f".b.npy.{dead}.part", f".c.{dead}.part.mp4")]
+        for made in rests[-2:]:
+            made.touch()
+        rests.append(here / folder / f".d.{dead}.part")
+        (rests[-1] / "within").mkdir(parents=True)
+    kept = {f for f in here.rglob("*") if f.is_file()} - set(rests)
+    with stage("grade"):
+        assert not [rest for rest in rests if rest.exists()]
+    assert not kept - set(here.rglob("*")), "a living process's, and what is none"
+
+
+def test_a_folder_that_was_killed_is_made_anew_and_one_in_the_making_left_alone(tmp_path: Path) -> None:
+    kill = "import os; from pathlib import Path; from pipeline.core.io import atomic_folder"
+    kill += "; making = atomic_folder(Path('[a]')); (making.__enter__() / 'half').touch(); os.kill(os.getpid(), 9)"
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    assert subprocess.run([sys.executable, "-c", kill], cwd=tmp_path, env=env, check=False).returncode == -9
+    (rest,) = tmp_path.iterdir()
+    living, other = tmp_path / f".[a].{os.getppid()}.part", rest.with_name(rest.name.replace("[a]", "a"))
+    living.mkdir()
+    other.mkdir()
+    with atomic_folder(tmp_path / "[a]") as made:
+        (made / "whole").touch()
+    assert set(tmp_path.iterdir()) == {tmp_path / "[a]", living, other}
+    assert os.listdir(tmp_path / "[a]") == ["whole"]
+
+
+def test_any_path_is_printed(tmp_path: Path) -> None:
+    """On a terminal whose locale takes no bytes but UTF-8."""
+    out = not_utf8(tmp_path, "found?.csv")
+    command = [sys.executable, "-c", "from pipeline.cli import main; main()", "data", "audit"]
+    env = {**os.environ, "PYTHONIOENCODING": "utf-8:strict", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [*command, not_utf8(tmp_path, "none?"), "--out", out],
+        cwd=tmp_path, env=env, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (1, "")
+    first, second = done.stdout.splitlines()[:2]
+    assert first.endswith(rf" findings in {tmp_path}/found\udcff.csv")
+    assert rf"{tmp_path}/none\udcff: no such folder" in second
+    assert rf"{tmp_path}/none\udcff,no such folder" in out.read_text(encoding="utf-8")
+
+
+SCRIPT = """
+import os, sys, time
+from pathlib import Path
+from pipeline.core import parallel
+from pipeline.config import FramesConfig
+from pipeline.core.errors import UserError
+from pipeline.core.parallel import run_parallel, use_backend
+from pipeline.videos.catalogue import load_catalogue
+from pipeline.videos.frames.extract import extract_frames
+
+def fails(job):
+    Path("last").write_text(str(job))
+    if job == "refused":
+        raise UserError("file 7 is broken; mend it")
+    if job == "dies":
+        os._exit(9)
+    Path(f"{os.getpid()}.pid").touch()
+    while len(list(Path().glob("*.pid"))) < 2:  # Else a quick worker might do all.
+        time.sleep(0.01)
+    return job, os.getpid()
+
+def main():
+    backend, videos, catalogue = sys.argv[1:]
+    parallel.cores = lambda: 2
+    if backend == "ray":
+        import ray
+        ray.init(num_cpus=2, log_to_driver=False)
+    use_backend(backend)
+    extract_frames(Path(videos), load_catalogue(Path(catalogue)), FramesConfig(pixels=16), Path("out"), Path("partial"))
+    jobs = list(range(70))
+    results = list(run_parallel(fails, jobs, "numbers", "number"))
+    assert [job for job, _ in results] == jobs
+    workers = {pid for _, pid in results}
+    assert len(workers) == 2 and os.getpid() not in workers, workers
+    for bad in ("refused", "dies"):
+        try:
+            list(run_parallel(fails, ["good", bad], "numbers", "number"))
+        except UserError as error:
+            with open("said", "a") as stream:
+                print(error, file=stream)
+
+if __name__ == "__main__":
+    main()
+"""
+
+MODELS = """
+import os, sys
+from pathlib import Path
+import torch
+from pipeline.core.embeddings import EmbeddingStore
+from pipeline.encoder.embed import EncoderSource, embed_videos
+from pipeline.core import parallel
+from pipeline.core.io import read_table
+from pipeline.language import generate
+from pipeline.core.parallel import use_backend
+from pipeline.core.records import Assignment, Encoder, Lora, Opd, Variant
+from tests.use.shared import make
+
+def main():
+    parallel.cores = lambda: 2
+    torch.set_num_threads(1)
+    made = make(Path.cwd(), Variant(Encoder.FINETUNED, Lora.WITH, Opd.ALL, 0))
+    params, data = made.params, Path("data")
+    state, catalogue = data / "encoder" / "0" / "encoder.safetensors", Path(params.data.catalogue)
+    encoder = EncoderSource(params.encoder, "cpu", data / "frames", catalogue, state)
+    parts = read_table(data / "splits" / "0.parquet", Assignment)
+    here = embed_videos(encoder(), parts, encoder)
+    source = generate.ModelSource(data / "models" / "with" / "finetuned-all-0", "llama", "float32", "none", "cpu")
+    language = params.language.model_copy(update={"max_new_tokens": 12, "generation_batch_size": 8})
+    store, model = EmbeddingStore(data / "embeddings" / "finetuned-0"), source()
+    said = generate.answer(model, store, made.questions, Opd.ALL, language, params.frames.per_video, source)
+
+    use_backend(sys.argv[1])
+    generate.greedy = None  # Not in this process.
+    there = embed_videos(encoder()._replace(encoder=None), parts, encoder)
+    assert torch.equal(here[0], there[0]) and here[1] == there[1]
+    assert generate.answer(model, store, made.questions, Opd.ALL, language, params.frames.per_video, source) == said
+    assert len(said) > 40 and len({p.outputs for p in said}) > 10
+
+if __name__ == "__main__":
+    main()
+"""
+
+
+def run_script(text: str, folder: Path, *arguments: str) -> None:
+    (folder / "work.py").write_text(text)
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    env = {**os.environ, "PYTHONPATH": path, "PYTHONWARNINGS": "ignore"}
+    command = [sys.executable, "work.py", *arguments]
+    done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+
+
+needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="needs ray: pip install -e '.[ray]'")
+
+
+@pytest.fixture(scope="module")
+def made_alone(tiny_videos: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The sha256 of each file that is made of the videos one after another, in this process."""
+    folder = tmp_path_factory.mktemp("alone")
+    catalogue = load_catalogue(ROOT / "pipeline" / "physiclear")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pipeline.videos.frames.extract.run_parallel", lambda work, jobs, *_: map(work, jobs))
+        extract_frames(tiny_videos, catalogue, FramesConfig(pixels=16), folder / "out", folder / "partial")
+    return hashes(folder / "out")
+
+
+def hashes(folder: Path) -> dict[str, str]:
+    return {f.name: hashlib.sha256(f.read_bytes()).hexdigest() for f in folder.iterdir()}
+
+
+def work_on(backend: str, folder: Path, videos: Path) -> dict[str, str]:
+    """The sha256 of each file that two workers make of the videos; what is said of bad jobs is checked here."""
+    folder.mkdir()
+    run_script(SCRIPT, folder, backend, str(videos), str(ROOT / "pipeline" / "physiclear"))
+    refused, died = (folder / "said").read_text().splitlines()
+    assert refused == "file 7 is broken; mend it"
+    assert died.startswith("numbers: a process died at or soon after "), died
+    assert died.endswith("Run again")
+    # No worker outlives the work.
+    wait_until_ended(p for p in psutil.process_iter(["cwd"]) if p.info["cwd"] == str(folder))
+    return hashes(folder / "out")
+
+
+@pytest.mark.parametrize("backend", ["processes", pytest.param("ray", marks=needs_ray)])
+def test_two_workers_make_the_same_bytes_on_either_backend(
+    backend: str, made_alone: dict[str, str], tiny_videos: Path, tmp_path: Path
+) -> None:
+    assert work_on(backend, tmp_path / "there", tiny_videos) == made_alone
+
+
+@needs_ray
+def test_a_cluster_embeds_and_answers_to_the_same_bytes(tmp_path: Path) -> None:
+    run_script(MODELS, tmp_path, "ray")
