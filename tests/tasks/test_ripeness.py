@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections import Counter
 from pathlib import Path
 
@@ -69,22 +68,6 @@ def test_without_two_ranks_nothing_is_asked(objects: list[str]) -> None:
     assert asked(CATALOGUE, objects) == []
 
 
-@pytest.mark.parametrize(
-    ("said", "letter"),
-    [
-        ("The riper avocado is a), because it is soft.", "a"),
-        ("The Riper Avocado is (B).", "b"),
-        ("b) is hard, so the riper one is a).", "a"),
-        ("The riper avocado is a). No: the riper avocado is b).", None),
-        ("The less ripe avocado is a).", None),
-    ],
-)
-def test_what_is_read(said: str, letter: str | None) -> None:
-    for question in asked(CATALOGUE, TESTED, 4):
-        (score,) = grade(question, "Hardness.", "descriptions", said, catalogue=CATALOGUE)
-        assert (score.parsed, score.correct) == (letter is not None, letter == question.gold.choice)
-
-
 def test_fruits_are_read_by_their_letters() -> None:
     avocados = [o.model_copy(update={"ripeness": {"plum (c++)": 1.0}}) for o in CATALOGUE.objects.values()]
     catalogue = CATALOGUE.model_copy(update={"objects": dict(zip(CATALOGUE.objects, avocados, strict=True))})
@@ -135,10 +118,3 @@ def test_a_hand_that_only_presses_turns_nothing() -> None:
         # No hand lets go in the first half; until then a twisting one presses less and less.
         assert (pressed.force[:26] >= twisted.force[:26] - 1e-12).all()
         assert pressed.force[25] == pressed.force.max() > 0
-
-
-def test_published_figures_are_shares_of_their_questions() -> None:
-    with (ROOT / "pipeline" / "report" / "published.csv").open(newline="") as stream:
-        rows = [r for r in csv.DictReader(stream) if r["dataset"] == CATALOGUE.language.dataset and r["n"]]
-    assert rows
-    assert all((float(r["value"]) * int(r["n"]) / 100) % 1 == 0 for r in rows)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import random
 from collections.abc import Iterator
 
 import pytest
@@ -209,6 +208,8 @@ UNREAD = {
     "RIPE": """
         a) It is soft
         The riper avocado is a) or b).
+        The riper avocado is a). No: the riper avocado is b).
+        The less ripe avocado is a).
         The riper avocado is c).
         The riper kiwi is a).
         """,
@@ -269,7 +270,14 @@ READ = {
         So, b) is the most suitable object.
         the most suitable object is Object b
         """,
-    ("RIPE", "b"): "The riper avocado is **b)**.\n**Answer:** b\nThus b) is riper.\n\\boxed{B}",
+    ("RIPE", "b"): """
+        The riper avocado is **b)**.
+        **Answer:** b
+        Thus b) is riper.
+        \\boxed{B}
+        The Riper Avocado is (B).
+        a) is hard, so the riper one is b).
+        """,
 }
 """What nobody reads an answer from, and what a person reads as which, a line each."""
 
@@ -348,13 +356,3 @@ def test_chance_is_that_of_a_uniform_guess() -> None:
     described = TASKS["OPD"].chance(CATALOGUE)
     assert described["combined"] == pytest.approx(1 / 27)
     assert math.prod(described[p] for p in CATALOGUE.property_names) == pytest.approx(described["combined"])
-
-
-@every_task
-@pytest.mark.parametrize("objects", [("rug",), ("rug", "potato")])
-def test_too_few_objects_are_no_crash(task: str, objects: tuple[str, ...]) -> None:
-    pool = Pool(Part.TEST, CATALOGUE, {o: [f"{o}_0"] for o in objects})
-    for stratum in range(TASKS[task].strata(CATALOGUE)):
-        for _ in range(3):
-            draft = TASKS[task].draft(pool, stratum, random.Random(0))
-            assert draft is None or set(draft.objects) <= set(objects)
