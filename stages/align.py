@@ -5,7 +5,6 @@ from pathlib import Path
 
 from pipeline.core.io import write_table
 from pipeline.core.records import Encoder, Measurement, Opd
-from pipeline.core.runtime import limit_threads
 from pipeline.core.stage import DATA, matrix_key, stage
 from pipeline.tracking.live import live
 from pipeline.videos.catalogue import load_catalogue
@@ -19,7 +18,6 @@ def main() -> None:
         from pipeline.language.training import Job, Material, assemble, fit, write_model_card
         from pipeline.language.words import begin_with_words
 
-        limit_threads(run.params.runtime.threads)
         config = run.params.align
         material = Material.load(DATA, run.params, encoder, opd, seed)
         model, data = assemble(material, config, "align")

@@ -2,7 +2,6 @@
 
 from pipeline.core.io import write_table
 from pipeline.core.records import Encoder, Measurement, Opd
-from pipeline.core.runtime import limit_threads
 from pipeline.core.stage import DATA, matrix_key, stage
 from pipeline.tracking.live import live
 
@@ -13,7 +12,6 @@ def main() -> None:
     with stage("lora", key, launched=True) as run:
         from pipeline.language.training import Job, Material, add_lora, assemble, fit, write_model_card
 
-        limit_threads(run.params.runtime.threads)
         config = run.params.lora
         material = Material.load(DATA, run.params, encoder, opd, seed)
         aligned = DATA / "models" / "without" / key

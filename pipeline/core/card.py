@@ -37,7 +37,9 @@ def write_card(
         front: What else the front matter says.
         tables: Further tables by their heading, a mapping a row.
     """
-    licences = {part: _licence(path) for part, path in bases.items()}
+    # As the card beside the weights states it.
+    beside = {part: front_matter(path if path.is_dir() else path.parent) for part, path in bases.items()}
+    licences = {part: str(card["license"]) if "license" in card else None for part, card in beside.items()}
     stated = set(licences.values())
     front = {
         **front,
@@ -75,11 +77,6 @@ def front_matter(folder: Path) -> dict[str, Any]:
     except yaml.YAMLError:  # Of another's model: it is then as good as none.
         front = None
     return front if isinstance(front, dict) else {}
-
-
-def _licence(path: Path) -> str | None:
-    front = front_matter(path if path.is_dir() else path.parent)
-    return str(front["license"]) if "license" in front else None
 
 
 def _shown(value: object) -> str:

@@ -93,12 +93,17 @@ def write_json(path: Path, value: object) -> None:
     write_text(path, json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n")
 
 
+def check_made(path: Path) -> None:
+    """Raise UserError where a file that the chain makes is not there."""
+    if not path.is_file():
+        raise UserError(f"{path}: no such file; `dvc repro` makes it")
+
+
 def read_json(path: Path) -> Any:
     """Read a JSON file; raise UserError where it is missing or broken."""
+    check_made(path)
     try:
         return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such file; `dvc repro` makes it") from None
     except ValueError as error:  # Or not UTF-8.
         raise UserError(f"{path}: not JSON ({error}); delete it and run `dvc repro`") from None
 
@@ -112,19 +117,17 @@ def write_jsonl(path: Path, records: Iterable[Record]) -> None:
 
 def read_jsonl(path: Path, model: type[R]) -> list[R]:
     """Read records written by `write_jsonl`; a bad line is a UserError that names it."""
+    check_made(path)
     records = []
-    try:
-        with path.open(encoding="utf-8") as stream:
-            for number, line in enumerate(stream, 1):
-                try:
-                    records.append(model.model_validate_json(line))
-                except ValidationError as error:
-                    raise UserError(
-                        f"{path}, line {number}: not a {model.__name__} ({first_problem(error)}); "
-                        "delete the file and run `dvc repro`"
-                    ) from None
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such file; `dvc repro` makes it") from None
+    with path.open(encoding="utf-8") as stream:
+        for number, line in enumerate(stream, 1):
+            try:
+                records.append(model.model_validate_json(line))
+            except ValidationError as error:
+                raise UserError(
+                    f"{path}, line {number}: not a {model.__name__} ({first_problem(error)}); "
+                    "delete the file and run `dvc repro`"
+                ) from None
     return records
 
 
@@ -133,8 +136,9 @@ def write_table(path: Path, model: type[R], records: Iterable[R]) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    rows = [record.model_dump(mode="json") for record in records]
-    table = pa.Table.from_pylist(rows, schema=_schema(model))
+    hints = typing.get_type_hints(model)
+    schema = pa.schema([(name, _arrow(hints[name])) for name in model.model_fields])
+    table = pa.Table.from_pylist([record.model_dump(mode="json") for record in records], schema=schema)
     with atomic(path) as temporary:
         pq.write_table(table, temporary, compression="zstd")
 
@@ -144,10 +148,9 @@ def read_table(path: Path, model: type[R]) -> list[R]:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    check_made(path)
     try:
         table = pq.read_table(path, partitioning=None)
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such file; `dvc repro` makes it") from None
     except (pa.ArrowInvalid, OSError) as error:
         raise UserError(f"{path}: not a readable table ({error}); delete it and run `dvc repro`") from None
     if table.schema.names != list(model.model_fields):
@@ -167,11 +170,10 @@ def write_csv(path: Path, model: type[R], records: Iterable[R]) -> None:
 
 def read_csv(path: Path, model: type[R]) -> list[R]:
     """Read what `write_csv` wrote; a missing file or a row that is no `model` is a UserError."""
+    check_made(path)
     try:
         with path.open(encoding="utf-8", newline="") as stream:
             return [model.model_validate(row) for row in csv.DictReader(stream)]
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such file; `dvc repro` makes it") from None
     except ValidationError as error:
         raise UserError(f"{path}: not a table of {model.__name__} ({first_problem(error)}); run `dvc repro`") from None
 
@@ -189,8 +191,7 @@ def load_tensors(path: Path) -> dict[str, torch.Tensor]:
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
-    if not path.is_file():
-        raise UserError(f"{path}: no such file; `dvc repro` makes it")
+    check_made(path)
     try:
         tensors: dict[str, torch.Tensor] = load_file(path)
     except SafetensorError as error:
@@ -254,14 +255,8 @@ def code_of(stage: str) -> list[Path]:
     return [file for file in files if file.is_file() and file.suffix != ".pyc"]
 
 
-def _schema(model: type[Record]) -> pa.Schema:
-    import pyarrow as pa
-
-    hints = typing.get_type_hints(model)
-    return pa.schema([(name, _arrow(hints[name])) for name in model.model_fields])
-
-
 def _arrow(hint: Any) -> pa.DataType:
+    """The column type of a field's annotation; texts of an enumeration are texts."""
     import pyarrow as pa
 
     origin = typing.get_origin(hint)
