@@ -117,16 +117,16 @@ def stage(name: str, key: str | None = None, *, launched: bool = False) -> Itera
             launch(params.runtime.launcher)
         with alone(full):
             running = Stage(full, params, started)
-            limit_threads(running.params.runtime.threads)
-            use_backend(running.params.runtime.parallel)
+            limit_threads(params.runtime.threads)
+            use_backend(params.runtime.parallel)
             if _main_process():
                 for folder in (DATA, RUNS, Path("reports"), Path("models")):
                     remove_rests(folder)
-                print(f"{full}: starts ({running.params.report_name})", flush=True)
+                print(f"{full}: starts ({params.report_name})", flush=True)
             yield running
-            if load_params() != running.params:
+            if load_params() != params:
                 raise UserError(
-                    f"{PARAMS_FILE} was changed while it ran, and what it made fits the old one; run it again"
+                    f"{PARAMS_FILE} was changed while it ran; what it made fits the old one, so run it again"
                 )
             if _main_process():
                 _write_run(running, started)
@@ -146,18 +146,18 @@ def stage(name: str, key: str | None = None, *, launched: bool = False) -> Itera
 
 NO_MEMORY = ("out of memory", "can't allocate memory", "CUBLAS_STATUS_ALLOC_FAILED")
 """How torch says it, on a GPU and on a processor: by a RuntimeError."""
-OS_ERROR = re.compile(r"\(os error (\d+)\)")
-"""How safetensors ends what the operating system said."""
-TORCH_WRITES = ("iostream error", "PytorchStreamWriter failed")
-"""How torch says that a file could not be written; it does not say why."""
+LITTLE = 64 * 2**20
+"""Free bytes below which a disk counts as full where a library does not say why it could not write."""
 
 
 def disk_error(error: Exception) -> str | None:
     """One line for what the operating system refused, in whichever library's words; None for any other error."""
-    number = error.errno if isinstance(error, OSError) else None
-    if found := OS_ERROR.search(str(error)):
+    number, said = error.errno if isinstance(error, OSError) else None, str(error)
+    # How safetensors ends what the operating system said.
+    if found := re.search(r"\(os error (\d+)\)", said):
         number = int(found[1])
-    elif not isinstance(error, OSError) and any(words in str(error) for words in TORCH_WRITES):
+    # Torch says that it could not write a file, and not why.
+    elif number is None and ("iostream error" in said or "PytorchStreamWriter failed" in said):
         number = errno.ENOSPC if shutil.disk_usage(".").free < LITTLE else errno.EIO
     if number is None:
         return None
@@ -167,10 +167,6 @@ def disk_error(error: Exception) -> str | None:
     if number in (errno.EACCES, errno.EPERM, errno.EROFS):
         return f"{where}: {os.strerror(number)}; make it readable and writable, and run again"
     return f"{where}: {os.strerror(number)}; mend that and run again"
-
-
-LITTLE = 64 * 2**20
-"""Free bytes below which a disk counts as full where a library does not say why it could not write."""
 
 
 def running_stages() -> list[str]:

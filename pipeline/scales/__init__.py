@@ -96,9 +96,9 @@ def check_inputs(params: Params) -> str:
     launched(params.runtime.launcher)
     check_backend(params.runtime.parallel)
     folder = Path(params.data.dir)
-    if params.data.source == "videos" and folder.exists() and not folder.is_dir():
-        raise UserError(f"data.dir: {folder} is a file; name the folder that the videos are in")
     if params.data.source == "videos" and not folder.is_dir():
+        if folder.exists():
+            raise UserError(f"data.dir: {folder} is a file; name the folder that the videos are in")
         raise UserError(
             f"data.dir: {folder} does not exist; import the public data set (README, section Real videos) or name the "
             "folder with data.dir=..."
@@ -107,11 +107,11 @@ def check_inputs(params: Params) -> str:
     if unknown:
         raise UserError(f"scenes.objects: {unknown[0]} is not in {params.data.catalogue}/objects.csv")
     lacking = check_objects(params, catalogue)
-    backbone = params.encoder.backbone
-    weights.check_encoder(Path(params.encoder.weights), params.frames.pixels, backbone)
-    check_encoder_files(Path(params.encoder.weights), backbone)
-    weights.check_language(Path(params.language.weights), "language.weights")
-    check_language_files(Path(params.language.weights), "language.weights")
+    encoder, language = Path(params.encoder.weights), Path(params.language.weights)
+    weights.check_encoder(encoder, params.frames.pixels, params.encoder.backbone)
+    check_encoder_files(encoder, params.encoder.backbone)
+    weights.check_language(language, "language.weights")
+    check_language_files(language, "language.weights")
     if params.language.start and not (Path(params.language.start) / LANGUAGE_DIR).is_dir():
         raise UserError(f"language.start: {params.language.start} holds no trained model; name a folder of models/")
     return lacking
@@ -122,9 +122,11 @@ def check_objects(params: Params, catalogue: Catalogue) -> str:
     if params.data.source == "scenes":
         present = set(params.scenes.objects or catalogue.objects)
     else:
-        present = {file.object_id for file in list_videos(Path(params.data.dir), catalogue).files}
+        folder = Path(params.data.dir)
+        listing = list_videos(folder, catalogue)
+        present = {file.object_id for file in listing.files}
         if not present:
-            raise_errors(Path(params.data.dir), list_videos(Path(params.data.dir), catalogue).findings)
+            raise_errors(folder, listing.findings)
     lacking = ""
     for seed in params.ablation.seeds:
         parts = assign_objects(catalogue, present, params.split, seed)
