@@ -252,16 +252,20 @@ def descriptions(
 def concluded(
     catalogue: Catalogue,
     objects: Sequence[str],
-    verdict: str,
+    conclusion: str,
     only: Sequence[str] = (),
     prefixes: Sequence[str] = LISTED,
 ) -> dict[Opd, str]:
-    """The answer in every OPD mode: descriptions of all objects, then the verdict; `needed` describes `only` these."""
+    """The answer in every OPD mode: descriptions of all objects, then the conclusion.
+
+    Args:
+        only: Properties that `needed` describes.
+    """
     needed, whole = (descriptions(catalogue, objects, some, prefixes) for some in (only, ()))
     return {
-        Opd.NONE: verdict,
-        Opd.NEEDED: f"{needed} Conclusion: {verdict}",
-        Opd.ALL: f"{whole} Conclusion: {verdict}",
+        Opd.NONE: conclusion,
+        Opd.NEEDED: f"{needed} Conclusion: {conclusion}",
+        Opd.ALL: f"{whole} Conclusion: {conclusion}",
     }
 
 
@@ -306,18 +310,6 @@ def chosen_letter(answer: str, letters: str, *sayings: str, concluded: bool = Fa
     return named.pop() if len(named) == 1 and named <= {*letters} else None
 
 
-def begins_as_published(question: Question, prediction: Prediction) -> bool:
-    """Whether a conclusion begins with the right one letter by letter, as the published code compares them.
-
-    What stands behind the last "Conclusion: " is compared, or the whole answer where there is none. All OPD modes
-    conclude alike, so it does not matter which one was asked.
-    """
-    said, right = (
-        text.split("Conclusion: ")[-1] for text in (prediction.outputs[-1], question.dialogues[0].turns[-1].assistant)
-    )
-    return said.startswith(right)
-
-
 def scored(
     question: Question,
     prediction: Prediction,
@@ -343,7 +335,17 @@ def scored(
 
 
 def choice_score(
-    question: Question, prediction: Prediction, predicted: str | None, strict: bool | None = None
+    question: Question, prediction: Prediction, predicted: str | None, *, published: bool = False
 ) -> list[Score]:
-    """The score of a question with one right choice, as `scored` has it."""
+    """The score of a question with one right choice, as `scored` has it.
+
+    Args:
+        published: Also compare as the published code does: letter by letter from the last "Conclusion: " on, or the
+            whole answer where there is none.
+    """
+    strict = None
+    if published:
+        # All OPD modes conclude alike, so it does not matter which one was asked.
+        right = question.dialogues[0].turns[-1].assistant.split("Conclusion: ")[-1]
+        strict = prediction.outputs[-1].split("Conclusion: ")[-1].startswith(right)
     return [scored(question, prediction, "choice", question.gold.choice, predicted, strict)]

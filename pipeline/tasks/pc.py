@@ -15,7 +15,6 @@ from pipeline.tasks.base import (
     Draft,
     Pool,
     TaskDefinition,
-    begins_as_published,
     choice_score,
     concluded,
     conclusion,
@@ -47,7 +46,7 @@ def compare(first: int, second: int, rising: bool) -> Reading:
     return "same" if first == second else "yes" if (first > second) == rising else "no"
 
 
-def verdict(choice: Reading, comparative: str, prop: Property) -> str:
+def in_words(choice: Reading, comparative: str, prop: Property) -> str:
     """The conclusion in words."""
     return {
         "yes": f"Yes, the first object is {comparative}.",
@@ -88,7 +87,7 @@ class PropertyComparison(TaskDefinition):
             return None
         comparative = prop.more if rising else prop.less
         user = asked(rng.choice(TEMPLATES), comparative, prop.spoken)
-        told, prefixes = verdict(choice, comparative, prop), [f"{o} object:" for o in ORDINALS]
+        told, prefixes = in_words(choice, comparative, prop), [f"{o} object:" for o in ORDINALS]
         answer = concluded(pool.catalogue, objects, told, [prop.name], prefixes)
         found = {"yes": self.listed[0], "no": self.listed[1], "same": "neither"}[choice]
         return draft_about(
@@ -124,18 +123,18 @@ class PropertyComparison(TaskDefinition):
             return None
         prop, comparative = self._asked_for(draft, catalogue)
         ask = psr.REQUEST.format(question=f"Which object is {comparative}?", based=psr.BASED)
-        turn = Turn(user=ask, assistant=psr.verdict("ab"[draft.gold.choice == "no"], prop.spoken))
+        turn = Turn(user=ask, assistant=psr.in_words("ab"[draft.gold.choice == "no"], prop.spoken))
         return replace(draft, dialogues=tuple(Dialogue(opd=d.opd, turns=(turn,)) for d in draft.dialogues))
 
     def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str:
         place, word = catalogue.property_index(question.gold.properties[0]), self.adjective(question, catalogue)
         prop = catalogue.properties[place]
         (first, _), (second, _) = (video[place] for video in classes)
-        return verdict(compare(first, second, word == prop.more), word, prop)
+        return in_words(compare(first, second, word == prop.more), word, prop)
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         predicted = read(prediction.outputs[0])
-        return choice_score(question, prediction, predicted, begins_as_published(question, prediction))
+        return choice_score(question, prediction, predicted, published=True)
 
 
 TASK = PropertyComparison()

@@ -16,7 +16,6 @@ from pipeline.tasks.base import (
     Pool,
     TaskDefinition,
     before_concluding,
-    begins_as_published,
     choice_score,
     concluded,
     conclusion,
@@ -115,7 +114,7 @@ def nearest(classes: Classes, catalogue: Catalogue, objects: Iterable[str] | Non
     return min(itertools.permutations(sorted(catalogue.objects if objects is None else objects)), key=distance)
 
 
-def verdict(catalogue: Catalogue, objects: Sequence[str]) -> str:
+def in_words(catalogue: Catalogue, objects: Sequence[str]) -> str:
     """The conclusion in words, for three object ids in the order of their videos."""
     names = [f"{letter}) is {catalogue.objects[o].name}" for letter, o in zip(LETTERS, objects, strict=True)]
     return f"{names[0]}, {names[1]} and {names[2]}."
@@ -143,7 +142,7 @@ class PropertyObjectMatching(TaskDefinition):
         order = ORDERS[stratum % len(ORDERS)]
         objects = [options[int(number) - 1] for number in order]
         user = asked(rng.choice(OPENINGS), [catalogue.objects[o].name for o in options])
-        turns = single_turn(user, concluded(catalogue, objects, verdict(catalogue, objects)))
+        turns = single_turn(user, concluded(catalogue, objects, in_words(catalogue, objects)))
         return draft_about(pool, objects, rng, turns=turns, choice=order, properties=catalogue.property_names)
 
     def with_facts(self, draft: Draft, catalogue: Catalogue, rng: random.Random, inexact: float = 0.0) -> Draft:
@@ -164,14 +163,14 @@ class PropertyObjectMatching(TaskDefinition):
 
     def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str:
         """The matching that `nearest` finds."""
-        return verdict(catalogue, nearest(classes, catalogue, question.objects))
+        return in_words(catalogue, nearest(classes, catalogue, question.objects))
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         """Read from "a) is NAME": each letter must name exactly one option, and no option twice."""
         names = sorted((catalogue.objects[o].name for o in question.objects), key=str.lower)
         found = read(prediction.outputs[0], names)
         predicted = "".join(str(found[x] + 1) for x in LETTERS) if found else None
-        return choice_score(question, prediction, predicted, begins_as_published(question, prediction))
+        return choice_score(question, prediction, predicted, published=True)
 
 
 TASK = PropertyObjectMatching()

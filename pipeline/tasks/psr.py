@@ -39,7 +39,7 @@ def asked(question: str, aspects: str) -> dict[Opd, tuple[str, ...]]:
     }
 
 
-def verdict(letter: str, reasons: str) -> str:
+def in_words(letter: str, reasons: str) -> str:
     """The conclusion in words."""
     return f"The most suitable object is {letter}), because of its {reasons}."
 
@@ -76,7 +76,7 @@ class PropertyScenarioReasoning(TaskDefinition):
         names = [p for p in catalogue.property_names if p in scenario.target or p in scenario.other]
         spoken = {p.name: p.spoken for p in catalogue.properties}
         reasons, aspects = (" and ".join(spoken[p] for p in chosen) for chosen in (scenario.target, names))
-        answer = verdict(LETTERS[position], reasons)
+        answer = in_words(LETTERS[position], reasons)
         said = {
             Opd.NONE: (answer,),
             Opd.NEEDED: (descriptions(catalogue, objects, names), answer),

@@ -12,7 +12,6 @@ from pipeline.tasks.base import (
     Draft,
     Pool,
     TaskDefinition,
-    begins_as_published,
     choice_score,
     chosen_letter,
     concluded,
@@ -70,12 +69,12 @@ class PropertySuperlativeSelection(TaskDefinition):
         objects.insert(position, rng.choice([o for o, level in levels.items() if level == extreme]))
         superlative = prop.most if most else prop.least
         user = asked(rng.choice(TEMPLATES), superlative, prop.spoken)
-        verdict = f"{LETTERS[position]}) is the {superlative}."
+        conclusion = f"{LETTERS[position]}) is the {superlative}."
         return draft_about(
             pool,
             objects,
             rng,
-            turns=single_turn(user, concluded(pool.catalogue, objects, verdict, [prop.name])),
+            turns=single_turn(user, concluded(pool.catalogue, objects, conclusion, [prop.name])),
             choice=LETTERS[position],
             properties=[prop.name],
             finding=f"{superlative.capitalize()}: {LETTERS[position]}).",
@@ -89,7 +88,7 @@ class PropertySuperlativeSelection(TaskDefinition):
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         predicted = read(prediction.outputs[0])
-        return choice_score(question, prediction, predicted, begins_as_published(question, prediction))
+        return choice_score(question, prediction, predicted, published=True)
 
 
 TASK = PropertySuperlativeSelection()

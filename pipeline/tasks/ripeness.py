@@ -56,7 +56,7 @@ class Ripeness(TaskDefinition):
         ranked = [o.labels for o in catalogue.objects.values() if fruit in o.ripeness]
         telling = [p for p, *classes in zip(catalogue.properties, *ranked, strict=True) if len(set(classes)) > 1]
         names, spoken = zip(*((p.name, p.spoken) for p in telling or catalogue.properties), strict=True)
-        verdict = f"The riper {fruit} is {LETTERS[position]}), because of its {' and '.join(spoken)}."
+        answer = f"The riper {fruit} is {LETTERS[position]}), because of its {' and '.join(spoken)}."
         talk = Turn(user=papers_question(catalogue, fruit), assistant=f"First to last: {', '.join(spoken)}.")
         ask = f"Each shows one {fruit}. Which {fruit} is riper? Use the format 'The riper {fruit} is x), because xxx'."
         needed = Turn(
@@ -64,9 +64,9 @@ class Ripeness(TaskDefinition):
             assistant=descriptions(catalogue, objects, names),
         )
         whole = Turn(user=described_first(2), assistant=descriptions(catalogue, objects))
-        last = Turn(user=ask, assistant=verdict)
+        last = Turn(user=ask, assistant=answer)
         turns = {
-            Opd.NONE: [talk, Turn(user=f"Given two tactile videos: {lettered(2)}. {ask}", assistant=verdict)],
+            Opd.NONE: [talk, Turn(user=f"Given two tactile videos: {lettered(2)}. {ask}", assistant=answer)],
             Opd.NEEDED: [talk, needed, last],
             Opd.ALL: [talk, whole, last],
         }
