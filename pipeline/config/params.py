@@ -20,12 +20,6 @@ RENAMED = {"frames.size": "frames.pixels"}
 """What a parameter was called before, and what it is called now."""
 
 
-def project_above() -> str:
-    """The nearest parent folder with a dvc.yaml; empty where none has, or this folder has."""
-    above = (folder for folder in Path.cwd().parents if (folder / CHAIN).is_file())
-    return "" if CHAIN.is_file() else str(next(above, ""))
-
-
 def check_code(folder: Path) -> None:
     """Raise UserError where a folder has a `pipeline` of its own, which dvc.lock records, and another one runs."""
     own = folder / PACKAGE.name
@@ -44,8 +38,8 @@ def in_project() -> None:
     """
     here, script = Path.cwd(), Path(sys.argv[0]).absolute()
     if not any(path.exists() for path in (CHAIN, PARAMS_FILE, Path("conf"))):
-        above = project_above()
-        raise UserError(f"{here} has no {CHAIN}; go to {f'{above}, ' if above else ''}the project's folder")
+        above = next((f"{folder}, " for folder in here.parents if (folder / CHAIN).is_file()), "")
+        raise UserError(f"{here} has no {CHAIN}; go to {above}the project's folder")
     try:
         check_code(here)
         check_code(script.parents[1] if script.parent.name == "stages" else here)
@@ -86,7 +80,7 @@ class OneKeyLoader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: igno
     """Refuses a key that stands twice, of which YAML readers take the last one silently."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """As PyYAML's."""
+        """Construct a mapping as PyYAML does, unless a key repeats."""
         seen = set()
         for key, _ in node.value:
             if key.value in seen:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 R = TypeVar("R", bound=Record)
 REST = re.compile(r"\..+\.(\d{1,9})\.part(\.\w+)?")
-"""What a process, by its number, is writing: the name that it will have, between dots."""
+"""Name of an unfinished file or folder: the name it will have, and the number of the process that is writing it."""
 
 
 @contextmanager
@@ -48,13 +48,14 @@ def atomic(path: Path) -> Iterator[Path]:
 
 
 def remove_rests(folder: Path) -> None:
-    """Remove what killed processes were writing anywhere below a folder; nothing else would ever do it."""
-    for place, folders, files in os.walk(folder):  # It passes over what vanishes meanwhile.
+    """Remove what killed processes left unfinished anywhere below a folder; nothing else would ever remove it."""
+    for place, folders, files in os.walk(folder):  # Which passes over what vanishes meanwhile.
         for name in (*folders, *files):
             _remove_rest(Path(place, name))
 
 
 def _remove_rest(path: Path) -> None:
+    """Remove a file or folder that is unfinished and whose process has ended."""
     import psutil
 
     process = REST.fullmatch(path.name)
@@ -68,7 +69,10 @@ def _remove_rest(path: Path) -> None:
 
 @contextmanager
 def atomic_folder(folder: Path) -> Iterator[Path]:
-    """Give an empty folder beside `folder` that takes its place if the block succeeds; a killed one's rest goes."""
+    """Give an empty folder beside `folder` that takes its place if the block succeeds.
+
+    What a killed process left of the same folder is removed.
+    """
     for rest in folder.parent.glob(f".{glob.escape(folder.name)}.*.part"):
         _remove_rest(rest)
     temporary = folder.with_name(f".{folder.name}.{os.getpid()}.part")
@@ -219,7 +223,7 @@ def tensor_shapes(path: Path, mend: str = "get it again") -> dict[str, tuple[int
 
 
 def sha256(file: Path) -> str:
-    """Of a file's bytes, in hexadecimal digits."""
+    """The SHA-256 of a file's bytes, in hexadecimal digits."""
     with file.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
@@ -245,7 +249,10 @@ def fingerprint(*parts: BaseModel | str | int | Path) -> str:
 
 
 def code_of(stage: str) -> list[Path]:
-    """All files of code that dvc.yaml lists for a stage, or `stage@key`: which version unfinished work is of."""
+    """All files of code that dvc.yaml lists for a stage, or `stage@key`.
+
+    Their bytes are part of a checkpoint's key, so that work begun by another version of the code is not resumed.
+    """
     import yaml
 
     root = Path(__file__).parents[2]

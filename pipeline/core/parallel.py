@@ -32,7 +32,7 @@ R = TypeVar("R")
 
 _chosen: Backend = "processes"
 MOST_SECONDS = 5.0
-"""That a worker may take to hand over a result before it is ended."""
+"""Seconds that a worker may take to hand over a result, after Ctrl-C, before it is ended."""
 
 
 def use_backend(name: Backend) -> None:
@@ -106,12 +106,13 @@ def run_with(
 
 
 def device_here(name: DeviceName) -> DeviceName:
-    """Where this process computes: on a cluster the workers have the devices, and it keeps off theirs."""
+    """The device of this process; on a cluster the CPU, since the workers compute on the others."""
     return name if _chosen == "processes" else "cpu"
 
 
 @lru_cache(maxsize=1)
 def _loaded(source: Callable[[], Any]) -> Any:
+    """A worker's model, which it keeps from job to job."""
     return source()
 
 

@@ -110,11 +110,11 @@ def cores() -> int:
 
 
 QUICK = 5.0
-"""Seconds between two lines of progress in a log file at least: what is quick says nothing."""
+"""Least seconds between two lines of progress in a log file, so that quick work writes none."""
 
 
 class LogLines:
-    """Says in a log file how far something is: a line each tenth, with what is left.
+    """Writes progress to a log file: a line each tenth, with the seconds that are left.
 
     Args:
         label: What it is.

@@ -183,9 +183,10 @@ def running_stages() -> list[str]:
 
 @contextmanager
 def alone(name: str) -> Iterator[None]:
-    """One process a stage: a killed `dvc` leaves its stage running, and the next must not write beside it.
+    """Let one process at a time run a stage: a killed `dvc` leaves its stage running, and both would write.
 
-    The UserError where another process is in it lacks the stage's name, which the caller puts before it.
+    Raises:
+        UserError: where another process runs it; the caller puts the stage's name before the line.
     """
     if not _main_process():
         yield
@@ -203,6 +204,7 @@ def _main_process() -> bool:
 
 
 def _write_run(running: Stage, started: float) -> None:
+    """Write runs/NAME.json: times, seconds, device, most memory in MiB (the GPU's, where one was used) and metrics."""
     import psutil
 
     process = psutil.Process()

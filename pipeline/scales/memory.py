@@ -62,7 +62,7 @@ class Use(NamedTuple):
 
     @property
     def total(self) -> float:
-        """Of all."""
+        """The sum of the four."""
         return self.parameters + self.optimizer + self.activations + self.cache
 
 
