@@ -56,12 +56,9 @@ def test_scale_names_the_objects_that_nothing_can_be_asked_about(project: Path) 
 @pytest.mark.parametrize(
     ("command", "inner"),
     [
-        ("scale smoke", "pipeline.scales.compose"),
         ("repro", "pipeline.cli.reproduce.outdated"),
         ("data audit .", "pipeline.videos.audit.run.audit_folder"),
-        ("answer-with --endpoint http://a/v1 --model b --input frames", "pipeline.evaluation.answer_with.ask_all"),
-        *((f"{use} --model .", "pipeline.use.model.Octopi.from_pretrained") for use in ("ask a", "describe . --csv a")),
-        *((f"{show} .", "pipeline.use.model.Octopi.from_pretrained") for show in ("serve", "demo")),
+        ("describe . --csv a --model .", "pipeline.use.model.Octopi.from_pretrained"),
     ],
 )
 def test_ctrl_c_is_one_line(project: Path, monkeypatch: pytest.MonkeyPatch, command: str, inner: str) -> None:

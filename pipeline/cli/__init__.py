@@ -24,7 +24,7 @@ class Commands(TyperGroup):
     """Ends a command that Ctrl-C stops with one line."""
 
     def invoke(self, ctx: Any) -> Any:
-        """As typer's, which says nothing."""
+        """Run the command; typer alone would say nothing of Ctrl-C."""
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
@@ -161,7 +161,7 @@ def check(
     from pipeline.videos.audit.run import check_folder
     from pipeline.videos.catalogue import load_catalogue
 
-    _show(check_folder(folder, load_catalogue(catalogue)))
+    _print_findings(check_folder(folder, load_catalogue(catalogue)))
 
 
 @data_app.command()
@@ -183,7 +183,7 @@ def audit(
     findings = audit_folder(folder, load_catalogue(catalogue), config)
     write_csv(out, Finding, findings)
     typer.echo(f"{len(findings)} findings in {out}")
-    _show(findings)
+    _print_findings(findings)
 
 
 @import_app.command()
@@ -226,7 +226,8 @@ def video(
     typer.echo(f"{counted(len(written), 'video')} in {out}: {', '.join(path.name for path in written)}")
 
 
-def _show(findings: Sequence[Finding]) -> None:
+def _print_findings(findings: Sequence[Finding]) -> None:
+    """Print an audit's findings; errors among them end the command with status 1."""
     for f in findings:
         expected = f" (expected: {f.expected})" if f.expected else ""
         typer.echo(f"{f.severity:8} {f.check}: {f.item}: {f.measured}{expected}")
@@ -335,7 +336,7 @@ def ask(
         for piece in asked.stream(question, videos or ()):
             say(piece)
         say("\n")
-        _doubt(asked.notes(videos or (), question))
+        _print_notes(asked.notes(videos or (), question))
 
 
 @app.command()
@@ -357,7 +358,7 @@ def describe(
 
         table, notes = described(asked, videos)
         Console().print(table)
-        _doubt(notes)
+        _print_notes(notes)
         return
     rows, failed = describe_folder(asked, videos, csv)
     lacking = f", {failed} of them not described (column error; delete their rows to try them again)" if failed else ""
@@ -378,7 +379,7 @@ def compare(
     """Say whether the first video has more of a property than the second."""
     found = _load(model, base, device).compare(a, b, property)
     typer.echo(found.answer)
-    _doubt(found.notes)
+    _print_notes(found.notes)
 
 
 @app.command()
@@ -400,7 +401,7 @@ def rank(
         typer.echo(f"{found.expected[place]:.2f}  {videos[place]}")
     if found.answer:
         typer.echo(found.answer)
-    _doubt(found.notes)
+    _print_notes(found.notes)
 
 
 @app.command()
@@ -424,7 +425,7 @@ def match(
     for video, name in zip(videos, found.heads, strict=True):
         typer.echo(f"{video}: {name} (by the property heads)")
     typer.echo(found.answer)
-    _doubt(found.notes)
+    _print_notes(found.notes)
 
 
 @app.command()
@@ -440,7 +441,7 @@ def remember(
     loaded = _load(model, base, device)
     for video in videos:
         known = loaded.remember(name, video, memory)
-        _doubt(loaded.notes(video))
+        _print_notes(loaded.notes(video))
     typer.echo(f"{memory}: remembers {counted(known, 'video')}")
 
 
@@ -456,7 +457,7 @@ def recognise(
     found = _load(model, base, device).recognise(video, memory)
     for known in found.objects[:5]:
         typer.echo(f"{known.similarity:.3f}  {known.name} ({', '.join(known.classes)})")
-    _doubt(found.notes)
+    _print_notes(found.notes)
 
 
 @app.command()
@@ -539,7 +540,8 @@ def demo(
     serve_demo(lambda: _load(folder, base, device), catalogue, port)
 
 
-def _doubt(notes: Sequence[str]) -> None:
+def _print_notes(notes: Sequence[str]) -> None:
+    """Print what speaks against an answer on the error stream, each note once."""
     for note in dict.fromkeys(notes):
         typer.echo(f"note: {note}", err=True)
 
