@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.core.io import (
@@ -54,7 +54,8 @@ def test_tables_come_back_as_they_went(tmp_path: Path) -> None:
         assert read_jsonl(tmp_path / "t.jsonl", model) == records
 
 
-@given(st.lists(st.floats(allow_nan=False, width=64), max_size=5))
+@settings(max_examples=15)
+@given(st.lists(st.floats(allow_nan=False, width=64), max_size=40))
 def test_floats_survive_exactly(tmp_path_factory: pytest.TempPathFactory, values: list[float]) -> None:
     path = tmp_path_factory.mktemp("t") / "t.parquet"
     records = [Measurement(step=i, name="x", value=v) for i, v in enumerate(values)]

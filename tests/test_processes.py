@@ -34,28 +34,16 @@ stages:
   first: {cmd: touch first.txt, outs: [first.txt]}
   slow: {cmd: python stages/slow.py, deps: [first.txt]}
 """
-
-
 IMPORTING = "import pipeline\nprint('now', flush=True)\ntime.sleep(600)"
-
-
 RUNNING = (
     "from pipeline.core.stage import stage\nwith stage('slow'):\n    print('now', flush=True)\n    time.sleep(600)"
 )
-
-
 WORKERS = "from pipeline.core.parallel import run_parallel\n"
-
-
 SLEEPING = f"{WORKERS}print('now', flush=True)\nlist(run_parallel(time.sleep, [600] * 64, '', ''))"
-
-
 # So much to hand over that a worker is always in the middle of it.
 TELLING = (
     f"{WORKERS}for i, _ in enumerate(run_parallel(bytes, [1 << 22] * 9000, '', '')):\n    i or print('now', flush=True)"
 )
-
-
 STOPPED = "slow: stopped; finished stages stay, and `octopi repro` goes on from there"
 
 
