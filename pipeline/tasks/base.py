@@ -233,9 +233,10 @@ def in_turns(draft: Draft, more: Sequence[Draft] = ()) -> Draft:
     )
 
 
-def described_first(count: int) -> str:
-    """The first turn of a question in two: everything about two or three videos."""
-    return f"Describe these {('two', 'three')[count - 2]} tactile videos: {lettered(count)}."
+def described_first(count: int, aspects: str = "") -> str:
+    """The first turn of a question in two: `aspects` of two or three videos, or everything about them."""
+    asked = f"the {aspects} of these" if aspects else "these"
+    return f"Describe {asked} {('two', 'three')[count - 2]} tactile videos: {lettered(count)}."
 
 
 def descriptions(

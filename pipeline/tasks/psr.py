@@ -34,7 +34,7 @@ def asked(question: str, aspects: str) -> dict[Opd, tuple[str, ...]]:
     second = REQUEST.format(question=question, based=BASED)
     return {
         Opd.NONE: (f"Given two tactile videos: {lettered(2)}. {REQUEST.format(question=question, based='')}",),
-        Opd.NEEDED: (f"Describe the {aspects} of these two tactile videos: {lettered(2)}.", second),
+        Opd.NEEDED: (described_first(2, aspects), second),
         Opd.ALL: (described_first(2), second),
     }
 

@@ -56,14 +56,12 @@ class Ripeness(TaskDefinition):
         ranked = [o.labels for o in catalogue.objects.values() if fruit in o.ripeness]
         telling = [p for p, *classes in zip(catalogue.properties, *ranked, strict=True) if len(set(classes)) > 1]
         names, spoken = zip(*((p.name, p.spoken) for p in telling or catalogue.properties), strict=True)
-        answer = f"The riper {fruit} is {LETTERS[position]}), because of its {' and '.join(spoken)}."
+        aspects = " and ".join(spoken)
+        answer = f"The riper {fruit} is {LETTERS[position]}), because of its {aspects}."
         talk = Turn(user=papers_question(catalogue, fruit), assistant=f"First to last: {', '.join(spoken)}.")
         ask = f"Each shows one {fruit}. Which {fruit} is riper? Use the format 'The riper {fruit} is x), because xxx'."
-        needed = Turn(
-            user=f"Describe the {' and '.join(spoken)} of these two tactile videos: {lettered(2)}.",
-            assistant=descriptions(catalogue, objects, names),
-        )
         whole = Turn(user=described_first(2), assistant=descriptions(catalogue, objects))
+        needed = Turn(user=described_first(2, aspects), assistant=descriptions(catalogue, objects, names))
         last = Turn(user=ask, assistant=answer)
         turns = {
             Opd.NONE: [talk, Turn(user=f"Given two tactile videos: {lettered(2)}. {ask}", assistant=answer)],
