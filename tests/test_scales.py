@@ -284,13 +284,10 @@ def test_settings_move_what_they_should() -> None:
     usual, two = uses(), uses("encoder.micro_batch_size=2")["finetune_encoder"]
     assert two.total / GIB < 5 < usual["finetune_encoder"].total / GIB, "the paper's encoder took less than 5 GB"
     assert two.activations == pytest.approx(usual["finetune_encoder"].activations / 4)
-    assert uses("encoder.autocast=bfloat16")["finetune_encoder"].activations < usual["finetune_encoder"].activations
     checkpointed = uses("runtime.gradient_checkpointing=true")
     assert checkpointed["lora"].activations < usual["lora"].activations / 4
     assert max(use.total for use in checkpointed.values()) < 24e9 - GIB
     assert uses("language.quantization=nf4")["lora"].parameters < usual["lora"].parameters / 2.5
-    assert uses("language.generation_batch_size=32")["answer"].cache == 2 * usual["answer"].cache
-    assert uses("lora.rank=64")["lora"].optimizer < usual["lora"].optimizer
     shared = uses("runtime.launcher=accelerate launch --config_file conf/accelerate/fsdp.yaml")["lora"]
     assert shared.devices == 2
     assert usual["lora"].parameters / 2 < shared.parameters < usual["lora"].parameters
