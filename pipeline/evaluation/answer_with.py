@@ -23,7 +23,6 @@ from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
 from pipeline.config import Params
@@ -121,8 +120,20 @@ def ask_all(params: Params, endpoint: Endpoint, shown: Shown, folder: Path, limi
                 for seed, predictions in answered.items():
                     write_jsonl(place / f"{seed}.jsonl", predictions)
                 # Last: it says of what stands beside it that it belongs to these questions.
-                hashes = {str(seed): fingerprint(file) for seed, file in files.items()}
-                source = asker.source(shown=shown, per_video=most, questions=hashes)
+                days = sorted(reply.day for reply in asker.used.values())
+                source = VisionModel(
+                    model=endpoint.model,
+                    served_as=tuple(sorted({reply.model for reply in asker.used.values()})),
+                    endpoint=endpoint.url,
+                    temperature=endpoint.temperature,
+                    max_tokens=endpoint.max_tokens,
+                    first=days[0],
+                    last=days[-1],
+                    ended=asker.ended(),
+                    shown=shown,
+                    per_video=most,
+                    questions={str(seed): fingerprint(file) for seed, file in files.items()},
+                )
                 write_json(place / SOURCE_FILE, source.model_dump(mode="json"))
             state = f"{done} of {total} questions are answered"
             if asker.failure:
@@ -218,21 +229,6 @@ class _Asker:
         """How many of the replies that were used ended in each way."""
         return dict(sorted(Counter(reply.ended for reply in self.used.values()).items()))
 
-    def source(self, **asked: Any) -> VisionModel:
-        """Who gave the replies that were used, and how; `asked` is what the other fields hold."""
-        days = sorted(reply.day for reply in self.used.values())
-        return VisionModel(
-            model=self.endpoint.model,
-            served_as=tuple(sorted({reply.model for reply in self.used.values()})),
-            endpoint=self.endpoint.url,
-            temperature=self.endpoint.temperature,
-            max_tokens=self.endpoint.max_tokens,
-            first=days[0],
-            last=days[-1],
-            ended=self.ended(),
-            **asked,
-        )
-
     def ask(self, messages: Sequence[dict[str, Any]]) -> Reply | None:
         """The reply to a conversation; None where it is not known and may not be asked for."""
         body = {
@@ -251,7 +247,8 @@ class _Asker:
             except UserError as error:
                 # In one short line; an endpoint may quote the key.
                 why = " ".join(str(error).split())
-                why = why.replace(self._key, "[key]") if self._key else why
+                if self._key:
+                    why = why.replace(self._key, "[key]")
                 self.failure = f"{self.endpoint.url}: {why}"[:400]
                 return None
             self._cache.parent.mkdir(parents=True, exist_ok=True)
@@ -361,24 +358,21 @@ def _photos(folder: Path, objects: Sequence[str], most: int) -> Show:
 
     @lru_cache(maxsize=64)
     def of_object(object_id: str) -> list[str]:
-        files = found[object_id]
-        return [_url(_read_photo(files[i]), "jpeg") for i in sorted(set(sample_evaluation(len(files), most)))]
+        urls, files = [], found[object_id]
+        for file in (files[i] for i in sorted(set(sample_evaluation(len(files), most)))):
+            data = np.fromfile(file, np.uint8)
+            # OpenCV turns it as its camera noted that it was held.
+            photo = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+            if photo is None:
+                raise UserError(f"{file}: not a picture that can be read; replace it")
+            scale = min(1.0, LONGEST / max(photo.shape[:2]))
+            urls.append(_url(cv2.resize(photo, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), "jpeg"))
+        return urls
 
     return lambda video_id, object_id: of_object(object_id)
 
 
-def _read_photo(file: Path) -> npt.NDArray[np.uint8]:
-    data = np.fromfile(file, np.uint8)
-    # OpenCV turns it as its camera noted that it was held.
-    photo: npt.NDArray[np.uint8] | None = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
-    if photo is None:
-        raise UserError(f"{file}: not a picture that can be read; replace it")
-    scale = min(1.0, LONGEST / max(photo.shape[:2]))
-    shrunk: npt.NDArray[np.uint8] = cv2.resize(photo, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return shrunk
-
-
-def _url(picture: npt.NDArray[np.uint8], kind: str) -> str:
+def _url(picture: cv2.typing.MatLike, kind: str) -> str:
     """A picture of rows x columns x BGR as a data URL."""
     _, data = cv2.imencode(f".{kind}", picture)
     return f"data:image/{kind};base64,{base64.b64encode(data.tobytes()).decode()}"

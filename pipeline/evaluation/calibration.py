@@ -46,9 +46,10 @@ class CalibrationRow(Record):
 
 def rescale(probabilities: npt.ArrayLike, temperature: float) -> Floats:
     """Softmax of log(probabilities) / temperature over the last axis; 1 leaves them as they are."""
+    from scipy.special import softmax
+
     logits = np.log(np.maximum(np.asarray(probabilities, np.float64), SMALLEST)) / temperature
-    powers = np.exp(logits - logits.max(axis=-1, keepdims=True))
-    scaled: Floats = powers / powers.sum(axis=-1, keepdims=True)
+    scaled: Floats = softmax(logits, axis=-1)
     return scaled
 
 
@@ -79,19 +80,25 @@ def fit_temperature(classified: Sequence[Classification]) -> float:
     return float(np.exp(found.x))
 
 
+def _binned(classified: Sequence[Classification]) -> pd.DataFrame:
+    """A row an answer: its object, the probability of the likeliest class, whether that is the rated one, its bin."""
+    probabilities = np.array([c.probabilities for c in classified])
+    right = probabilities.argmax(axis=1) == [c.expected for c in classified]
+    table = pd.DataFrame({"mean_probability": probabilities.max(axis=1), "right": right.astype(float)})
+    # A border belongs to the bin below it.
+    bins = np.clip(np.ceil(table["mean_probability"] * BINS).astype(int) - 1, 0, BINS - 1)
+    return table.assign(bin=bins, object_id=[c.object_id for c in classified])
+
+
 def reliability(classified: Sequence[Classification]) -> pd.DataFrame:
     """Answers of like confidence: `BINS` bins of equal width, by number from 0, of which empty ones are left out.
 
     Returns:
         Columns `n`, `mean_probability` of the likeliest class, and `right`, the share where it is the rated one.
     """
-    probabilities = np.array([c.probabilities for c in classified])
-    right = probabilities.argmax(axis=1) == [c.expected for c in classified]
-    table = pd.DataFrame({"mean_probability": probabilities.max(axis=1), "right": right.astype(float)})
-    # A border belongs to the bin below it.
-    places = np.clip(np.ceil(table["mean_probability"] * BINS).astype(int) - 1, 0, BINS - 1)
-    bins = table.groupby(places).mean()
-    return bins.assign(n=places.value_counts())
+    table = _binned(classified)
+    bins = table.groupby("bin")[["mean_probability", "right"]].mean()
+    return bins.assign(n=table["bin"].value_counts())
 
 
 def calibrated(said: Sequence[Classification]) -> Iterator[tuple[Classification, Classification]]:
@@ -133,21 +140,17 @@ def calibration_rows(encoders: Sequence[Sequence[Classification]]) -> list[Calib
                 without_temperature=calibration_error(given[name]),
             )
         )
-        rows += [
-            CalibrationRow(
-                property=name,
-                probability=f"{place / BINS:.1f} to {(place + 1) / BINS:.1f}",
-                error=abs(b["right"] - b["mean_probability"]),
-                **b,
-            )
-            for place, b in zip(bins.index, bins.to_dict("records"), strict=True)
-        ]
+        for place, b in bins.iterrows():
+            words = f"{place / BINS:.1f} to {(place + 1) / BINS:.1f}"
+            error = abs(b["right"] - b["mean_probability"])
+            rows.append(CalibrationRow(property=name, probability=words, error=error, **b))
     return rows
 
 
 def calibration_error(classified: Sequence[Classification]) -> float:
     """Expected calibration error: the bins' mean |right - mean probability|, each weighing as many as its answers."""
-    return float(np.abs(_gaps(classified)).sum()) / len(classified)
+    bins = reliability(classified)
+    return float((bins["n"] * (bins["right"] - bins["mean_probability"])).abs().sum()) / len(classified)
 
 
 def error_interval(classified: Sequence[Classification]) -> tuple[float, float]:
@@ -155,21 +158,13 @@ def error_interval(classified: Sequence[Classification]) -> tuple[float, float]:
 
     The error of few answers is biased upwards, since chance alone parts accuracy from confidence; so is this interval.
     """
-    by_object: dict[str, list[Classification]] = {}
-    for c in classified:
-        by_object.setdefault(c.object_id, []).append(c)
-    gaps = np.stack([_gaps(group) for group in by_object.values()])
-    sizes = np.array([len(group) for group in by_object.values()])
+    table = _binned(classified)
+    objects = table["object_id"].unique()
+    # By object and bin, how many answers more are right than their probabilities say: a sum over the objects drawn.
+    excess = (table["right"] - table["mean_probability"]).groupby([table["object_id"], table["bin"]]).sum()
+    gaps = excess.unstack(fill_value=0.0).reindex(objects).to_numpy()
+    sizes = table["object_id"].value_counts().reindex(objects).to_numpy()
     drawn = np.random.default_rng(derive_seed("calibration")).integers(len(sizes), size=(DRAWS, len(sizes)))
     errors = np.abs(gaps[drawn].sum(axis=1)).sum(axis=1) / sizes[drawn].sum(axis=1)
     low, high = np.quantile(errors, [0.025, 0.975]).tolist()
     return low, high
-
-
-def _gaps(classified: Sequence[Classification]) -> Floats:
-    """By how many answers each of the `BINS` bins is right more often than its probabilities say."""
-    bins = reliability(classified)
-    gaps: Floats = (
-        (bins["n"] * (bins["right"] - bins["mean_probability"])).reindex(range(BINS), fill_value=0).to_numpy()
-    )
-    return gaps

@@ -3,8 +3,8 @@
 Values are differences, (..., seeds, questions), from -1 to 1: how right the one setting is less how right the other.
 
 Sources: Bonett and Price 2012 (the interval); Fisher 1935, Gail, Mark, Carroll, Green, Pee 1996 and, with few clusters,
-Canay, Romano, Shaikh 2017 (sign flips); Cameron, Gelbach, Miller 2011 (seeds across objects); Holm 1979; Bloom 1995 and
-Murray 1998 (smallest effects).
+Canay, Romano, Shaikh 2017 (sign flips); Cameron, Gelbach, Miller 2011 (seeds across objects); Bloom 1995 and Murray
+1998 (smallest effects).
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from functools import lru_cache
 import numpy as np
 from scipy import optimize, stats
 from scipy.sparse.csgraph import connected_components
-from statsmodels.stats.multitest import multipletests
 
 from pipeline.evaluation.intervals import LEVEL, Design, Objects, Values, design_of, effective, variance
 
@@ -26,6 +25,7 @@ MOST_FLIPPED = 15
 DRAWS = 10_000
 ROUNDING = 1e-9
 POWER, SIZE = 0.8, 0.05
+"""How often a true difference is to be found, and how often one where there is none."""
 
 
 @dataclass(frozen=True)
@@ -89,25 +89,20 @@ def standard_error(values: Values, design: Design) -> tuple[Values, Values, Valu
     """
     means = values.mean(axis=-2)
     mean, square = means.mean(axis=-1), (means**2).mean(axis=-1)
-    total, freedom = _crossed(values, design)
+    total = variance(means, design)
+    freedom, seeds = np.full(total.shape, design.freedom), values.shape[-2]
+    if seeds > 1:
+        of_objects = total
+        both = variance(values - values.mean(axis=-2, keepdims=True), design).mean(axis=-1) * seeds / (seeds - 1)
+        of_seeds = np.maximum(0.0, values.mean(axis=-1).var(axis=-1, ddof=1) - both) / seeds
+        total = of_objects + of_seeds
+        known = np.where(total > 0, total, 1.0)
+        inverse = (of_objects / known) ** 2 / freedom + (of_seeds / known) ** 2 / (seeds - 1)
+        freedom = np.where(total > 0, 1 / np.where(inverse > 0, inverse, 1.0), freedom)
     spread = np.maximum(0.0, square - mean**2) * design.questions / max(1, design.questions - 1)
     n = effective(spread, total, design)
     centre = n * mean / (n + 2)
     return np.sqrt(np.maximum(0.0, (n * square + 2) / (n + 2) - centre**2) / (n + 2)), centre, freedom
-
-
-def _crossed(values: Values, design: Design) -> tuple[Values, Values]:
-    """Variance of the mean over seeds and questions, and its degrees of freedom."""
-    of_objects = variance(values.mean(axis=-2), design)
-    freedom, seeds = np.full(of_objects.shape, design.freedom), values.shape[-2]
-    if seeds < 2:
-        return of_objects, freedom
-    both = variance(values - values.mean(axis=-2, keepdims=True), design).mean(axis=-1) * seeds / (seeds - 1)
-    of_seeds = np.maximum(0.0, values.mean(axis=-1).var(axis=-1, ddof=1) - both) / seeds
-    total = of_objects + of_seeds
-    known = np.where(total > 0, total, 1.0)
-    inverse = (of_objects / known) ** 2 / freedom + (of_seeds / known) ** 2 / (seeds - 1)
-    return total, np.where(total > 0, 1 / np.where(inverse > 0, inverse, 1.0), freedom)
 
 
 def sign_flip(values: Values, design: Design) -> Values:
@@ -127,6 +122,7 @@ def sign_flip(values: Values, design: Design) -> Values:
         extra = 0
     else:
         signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(DRAWS, len(units)))
+        # The measured signs count as a draw too, so that p is never 0.
         extra = 1
     measured = np.abs(parts.sum(axis=-1, keepdims=True)) - ROUNDING * np.abs(values).sum(axis=-1, keepdims=True)
     as_far = (np.abs(parts @ signs.T) >= measured).sum(axis=-1)
@@ -153,20 +149,12 @@ def flip_units(design: Design) -> Values:
 
 
 @lru_cache(maxsize=256)
-def smallest_effect(error: float, freedom: float, power: float = POWER, size: float = SIZE) -> float:
-    """The smallest true difference that a two-sided t test finds with the given power, in the unit of `error`.
+def smallest_effect(error: float, freedom: float) -> float:
+    """The smallest true difference that a two-sided t test finds as often as `POWER`, in the unit of `error`.
 
-    That is the standard error times the noncentrality at which t exceeds its critical value as often as `power`. The
-    sign flips of few objects need more. For a family of tests give `size`, how often a difference is found where there
-    is none, over their number.
+    That is the standard error times the noncentrality at which t exceeds its critical value that often. The sign flips
+    of few objects need more, and so does one test of a family.
     """
     # The square of t is F with one degree of freedom; statsmodels' TTestPower goes astray at fractional freedom.
-    critical = stats.f.isf(size, 1, freedom)
-    return error * float(optimize.brentq(lambda x: stats.ncf.sf(critical, 1, freedom, x * x) - power, 1e-6, 1e3))
-
-
-def holm(ps: Sequence[float | None]) -> list[float | None]:
-    """Holm's step-down adjustment: what each p of a family is worth, as all of them were looked at; None stays None."""
-    tested = [p for p in ps if p is not None]
-    adjusted = iter(multipletests(tested, method="holm")[1].tolist() if tested else [])
-    return [None if p is None else next(adjusted) for p in ps]
+    critical = stats.f.isf(SIZE, 1, freedom)
+    return error * float(optimize.brentq(lambda x: stats.ncf.sf(critical, 1, freedom, x * x) - POWER, 1e-6, 1e3))

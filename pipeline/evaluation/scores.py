@@ -1,4 +1,5 @@
-"""Everything measured, as the rows of two tidy tables: accuracies (scores.csv) and differences (effects.csv).
+"""Everything measured, as the rows of tidy tables: accuracies (scores.csv), differences (effects.csv), and how far off
+encoders are (encoder_errors.csv).
 
 Every accuracy that a report shows is computed here; training computes its own on validation objects. A task appears
 here by itself once it is registered: its chance, and with it its measures, come from its own module.
@@ -13,6 +14,7 @@ from statistics import fmean
 from typing import NamedTuple
 
 import numpy as np
+from statsmodels.stats.multitest import multipletests
 
 from pipeline.core.records import (
     ADJECTIVES,
@@ -29,14 +31,17 @@ from pipeline.core.records import (
     GradedVision,
     Lora,
     Opd,
+    Optional,
     OutOfFold,
     Part,
+    Record,
     Score,
     ScoreRow,
+    Share,
     Touch,
 )
 from pipeline.evaluation.intervals import Objects, accuracy_interval
-from pipeline.evaluation.paired import Difference, holm, paired
+from pipeline.evaluation.paired import Difference, paired
 from pipeline.tasks import TASKS
 from pipeline.videos.catalogue import Catalogue
 
@@ -102,14 +107,14 @@ def score_rows(
         adjectives: By question, the adjective that it asks by.
     """
     rows: list[ScoreRow] = []
+    words = adjectives or {}
     for (task, measure), settings in _table(graded, catalogue, concluded or {}).items():
         chance = TASKS[task].chance(catalogue)[measure]
         for setting, runs in settings.items():
             named = {axis: value for axis, value in setting._asdict().items() if value is not None}
             rows += _rows(runs, task=task, measure=measure, chance=chance, **named)
-            for word in dict.fromkeys((adjectives or {}).values()) if setting in (FULL, RULES) else ():
-                asked = {q for q, adjective in (adjectives or {}).items() if adjective == word}
-                own = {seed: {q: a for q, a in found.items() if q in asked} for seed, found in runs.items()}
+            for word in dict.fromkeys(words.values()) if setting in (FULL, RULES) else ():
+                own = {seed: {q: a for q, a in found.items() if words.get(q) == word} for seed, found in runs.items()}
                 if all(own.values()):
                     rows += _rows(own, task=ADJECTIVES, measure=f"{task}: {word}", chance=chance, **named)[-1:]
     by_model: dict[tuple[str, ...], dict[int, dict[str, Answer]]] = defaultdict(lambda: defaultdict(dict))
@@ -120,38 +125,30 @@ def score_rows(
         chance = TASKS[task].chance(catalogue)[measure]
         rows += _rows(runs, task=task, measure=measure, chance=chance, encoder=model, opd=Opd.ALL, touch=shown)
     chances = TASKS["OPD"].chance(catalogue)  # Heads are asked what a description is.
-    for task_name, part in ((HEADS, Part.TEST), (VALIDATION_HEADS, Part.VALIDATION)):
-        found = {seed: _videos(records, part) for seed, records in (classifications or {}).items()}
+    classes = [(place, p, level) for place, p in enumerate(catalogue.properties) for level in range(len(p.levels))]
+    heads = {"encoder": Encoder.FINETUNED, "touch": Touch.REAL}
+    said = classifications or {}
+    for kind, part in ((HEADS, Part.TEST), (VALIDATION_HEADS, Part.VALIDATION)):
+        videos = {seed: _videos(records, part) for seed, records in said.items()}
         for measure, chance in chances.items():
-            by_seed = {seed: videos[measure] for seed, videos in found.items() if measure in videos}
-            rows += _rows(
-                by_seed, task=task_name, measure=measure, chance=chance, encoder=Encoder.FINETUNED, touch=Touch.REAL
-            )
-    for p in catalogue.properties:
-        for level, word in enumerate(p.levels):
-            wanted = (Part.TEST, p.name, level)
-            by_seed = {
-                seed: {
-                    c.video_id: Answer(c.predicted == level, (c.object_id,))
-                    for c in sorted(records, key=lambda c: c.video_id)
-                    if (c.part, c.property, c.expected) == wanted
-                }
-                for seed, records in (classifications or {}).items()
-            }
-            named = {"task": RECALL, "measure": f"{p.name}: {word}", "chance": chances[p.name]}
-            known = {seed: videos for seed, videos in by_seed.items() if videos}
-            rows += _rows(known, **named, encoder=Encoder.FINETUNED, touch=Touch.REAL)
-    for task_name, by_name in ((CROSS_VALIDATION, out_of_fold), (NEIGHBOURS, neighbours)):
-        for name, records in (by_name or {}).items():
+            runs = {seed: found[measure] for seed, found in videos.items() if measure in found}
+            rows += _rows(runs, task=kind, measure=measure, chance=chance, **heads)
+    for _, p, level in classes:
+        # Recall: the accuracy on the videos whose rated class is this one.
+        rated = {seed: [c for c in records if c.expected == level] for seed, records in said.items()}
+        videos = {seed: _videos(records, Part.TEST) for seed, records in rated.items()}
+        runs = {seed: found[p.name] for seed, found in videos.items() if p.name in found}
+        rows += _rows(runs, task=RECALL, measure=f"{p.name}: {p.levels[level]}", chance=chances[p.name], **heads)
+    for kind, by_name in ((CROSS_VALIDATION, out_of_fold or {}), (NEIGHBOURS, neighbours or {})):
+        for name, records in by_name.items():
             for place, measure in enumerate(chances):
-                runs = repeats(records, place if place < len(catalogue.properties) else None)
-                rows += _rows(runs, task=task_name, measure=measure, chance=chances[measure], encoder=name)[-1:]
+                told = repeats(records, place if place < len(catalogue.properties) else None)
+                rows += _rows(told, task=kind, measure=measure, chance=chances[measure], encoder=name)[-1:]
     for name, records in (neighbours or {}).items():
-        for place, p in enumerate(catalogue.properties):
-            for level, word in enumerate(p.levels):
-                runs = repeats([r for r in records if r.expected[place] == level], place)
-                named = {"measure": f"{p.name}: {word}", "chance": chances[p.name], "encoder": name}
-                rows += _rows(runs, task=NEIGHBOURS, **named)[-1:]
+        for place, p, level in classes:
+            told = repeats([r for r in records if r.expected[place] == level], place)
+            measure = f"{p.name}: {p.levels[level]}"
+            rows += _rows(told, task=NEIGHBOURS, measure=measure, chance=chances[p.name], encoder=name)[-1:]
     return rows
 
 
@@ -196,9 +193,48 @@ def candidate_rows(
 
 
 def with_holm(rows: Sequence[EffectRow]) -> list[EffectRow]:
-    """The rows with p adjusted over all of them."""
-    adjusted = holm([row.p for row in rows])
-    return [row.model_copy(update={"p_holm": p}) for row, p in zip(rows, adjusted, strict=True)]
+    """The rows as one family: what each p is worth, as all of them were looked at (Holm 1979); none has none."""
+    tested = [row.p for row in rows if row.p is not None]
+    adjusted = iter(multipletests(tested, method="holm")[1].tolist() if tested else [])
+    return [row if row.p is None else row.model_copy(update={"p_holm": next(adjusted)}) for row in rows]
+
+
+class ErrorRow(Record):
+    """How far one encoder is off in one property, pooled over the repeats of a cross-validation."""
+
+    encoder: str
+    property: str
+    absolute_error: Share
+    """Mean distance of the predicted from the expected class, in classes."""
+    kappa: Optional = None
+    """Quadratically weighted (Cohen 1968): 1 - (mean squared distance) / (the same if both were paired at random); None
+    where all is expected and predicted as one class."""
+    n: int
+    """Videos."""
+
+
+def error_rows(out_of_fold: Mapping[str, Sequence[OutOfFold]], catalogue: Catalogue) -> list[ErrorRow]:
+    """A row for each candidate and property: classes have an order, and one class off is less wrong than two."""
+    from sklearn.metrics import cohen_kappa_score
+
+    rows = []
+    for name, records in out_of_fold.items():
+        for place, prop in enumerate(catalogue.properties):
+            expected, predicted = ([getattr(r, side)[place] for r in records] for side in ("expected", "predicted"))
+            kappa = None
+            if len({*expected, *predicted}) > 1:
+                levels = range(len(prop.levels))
+                kappa = float(cohen_kappa_score(expected, predicted, weights="quadratic", labels=levels))
+            rows.append(
+                ErrorRow(
+                    encoder=name,
+                    property=prop.name,
+                    absolute_error=float(np.abs(np.subtract(expected, predicted)).mean()),
+                    kappa=kappa,
+                    n=len({r.video_id for r in records}),
+                )
+            )
+    return rows
 
 
 def difference(one: Runs, other: Runs) -> Difference | None:

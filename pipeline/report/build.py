@@ -36,8 +36,7 @@ from pipeline.core.records import (
 from pipeline.evaluation.calibration import CalibrationRow, calibrated, calibration_rows
 from pipeline.evaluation.grading import EXTERNAL, conclude, vision_models
 from pipeline.evaluation.neighbours import map_frame, means, nearest_neighbours
-from pipeline.evaluation.ordinal import ErrorRow, error_rows
-from pipeline.evaluation.scores import candidate_rows, effect_rows, score_rows
+from pipeline.evaluation.scores import ErrorRow, candidate_rows, effect_rows, error_rows, score_rows
 from pipeline.report.dataset import dataset_frame
 from pipeline.report.figures import draw_figures
 from pipeline.report.load import load_report

@@ -8,7 +8,7 @@ import random
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy import stats
 from statsmodels.stats.proportion import proportion_confint
@@ -26,7 +26,7 @@ def ordinary(values: np.ndarray, about: About) -> float:
     return len(groups) / (len(groups) - 1) * math.fsum(s * s for s in sums) / len(values) ** 2
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_single_objects_have_the_ordinary_cluster_robust_variance(seed: int) -> None:
     rng = np.random.default_rng(seed)
     about = single(7, 5)
@@ -64,7 +64,6 @@ def test_by_hand() -> None:
 
 
 @given(about=designs(), right=RIGHT, seed=st.integers(0, 9))
-@settings(deadline=None, max_examples=60)
 def test_it_holds_the_accuracy_and_wilsons_and_depends_on_no_order_or_name(
     about: About, right: list[bool], seed: int
 ) -> None:

@@ -9,13 +9,13 @@ from statistics import fmean
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 from scipy.integrate import quad
 
 from pipeline.evaluation.intervals import design_of
-from pipeline.evaluation.paired import DRAWS, flip_units, holm, paired, sign_flip, smallest_effect
+from pipeline.evaluation.paired import DRAWS, flip_units, paired, sign_flip, smallest_effect, standard_error
 from tests.evaluation.conftest import About, designs, single
 
 GAINS = st.lists(st.integers(-1, 1), min_size=24, max_size=24)
@@ -41,7 +41,6 @@ def signs_of(count: int) -> list[tuple[int, ...]]:
 
 
 @given(better=st.integers(0, 12), worse=st.integers(0, 12), same=st.integers(0, 12))
-@settings(deadline=None, max_examples=40)
 def test_independent_questions_have_bonett_and_prices_interval(better: int, worse: int, same: int) -> None:
     """One question an object: both kinds of discordant questions get one more, and t stands in place of z."""
     n = better + worse + same
@@ -69,7 +68,6 @@ def test_without_difference_with_one_object_and_with_none() -> None:
 
 
 @given(about=designs(), gains=GAINS, more=GAINS, seed=st.integers(0, 9))
-@settings(deadline=None, max_examples=60)
 def test_properties(about: About, gains: list[int], more: list[int], seed: int) -> None:
     values = np.array([gains[: len(about)], more[: len(about)]], dtype=float)
     gap, mirrored = paired(values, about), paired(-values, about)
@@ -97,7 +95,7 @@ def test_sign_flip_of_darwins_maize() -> None:
     assert float(sign_flip(np.ones(40), design_of(single(40, 1)))) == 1 / (DRAWS + 1)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_sign_flip_against_scipy(seed: int) -> None:
     rng = np.random.default_rng(seed)
     values = rng.integers(-1, 2, size=35) + 0.1 * rng.integers(-3, 4, size=35)
@@ -156,18 +154,20 @@ def test_several_seeds_are_one_comparison_of_their_means() -> None:
 
 def test_the_interval_covers_new_seeds() -> None:
     """Two equally good settings whose runs deviate by ten points: what leaves the seeds out covers less."""
-    rng, objects, seeds, covered, without = np.random.default_rng(2), 20, 5, 0, 0
+    rng, objects, seeds, repeats = np.random.default_rng(2), 20, 5, 300
     sets = [rng.choice(objects, 2, replace=False) for _ in range(100)]
-    names = [tuple(f"{o:02}" for o in sorted(s)) for s in sets]
-    for _ in range(150):
-        rates = 0.5 + rng.normal(0, 0.1, (2, seeds, 1)) + rng.normal(0, 0.05, (2, 1, objects))[:, :, sets].mean(axis=-1)
-        one, other = rng.random((2, seeds, 100)) < rates
-        table = one.astype(float) - other
-        gap, alone = paired(table, names), paired(table.mean(axis=0, keepdims=True), names)
-        covered += gap.low <= 0 <= gap.high  # type: ignore[operator]
-        without += alone.low <= 0 <= alone.high  # type: ignore[operator]
-    assert covered / 150 >= 0.93
-    assert without / 150 <= 0.88
+    design = design_of(tuple(tuple(f"{o:02}" for o in sorted(s)) for s in sets))
+    of_seeds = rng.normal(0, 0.1, (repeats, 2, seeds, 1))
+    rates = 0.5 + of_seeds + rng.normal(0, 0.05, (repeats, 2, 1, objects))[..., sets].mean(axis=-1)
+    right = (rng.random((repeats, 2, seeds, 100)) < rates).astype(float)
+    gains = right[:, 0] - right[:, 1]
+
+    def covered(values: np.ndarray) -> float:
+        error, centre, freedom = standard_error(values, design)
+        return float((np.abs(centre) <= stats.t.ppf(0.975, freedom) * error).mean())
+
+    assert covered(gains) >= 0.93
+    assert covered(gains.mean(axis=1, keepdims=True)) <= 0.88
 
 
 def test_smallest_effect_of_known_designs() -> None:
@@ -178,31 +178,13 @@ def test_smallest_effect_of_known_designs() -> None:
         assert enough <= effect < less
 
 
-@pytest.mark.parametrize(
-    ("freedom", "power", "size"), [(1, 0.8, 0.05), (2.5, 0.8, 0.05), (6, 0.95, 0.05), (59, 0.9, 0.01)]
-)
-def test_the_smallest_effect_has_its_power_by_quadrature(freedom: float, power: float, size: float) -> None:
+@pytest.mark.parametrize("freedom", [1, 2.5, 6, 59])
+def test_the_smallest_effect_has_its_power_by_quadrature(freedom: float) -> None:
     """Over the deviation's distribution, the normal mean beyond the critical value on either side."""
-    shift, critical = smallest_effect(1, freedom, power, size), stats.t.ppf(1 - size / 2, freedom)
+    shift, critical = smallest_effect(1, freedom), stats.t.ppf(0.975, freedom)
 
     def found(s: float) -> float:
         beyond = stats.norm.sf(critical * s - shift) + stats.norm.cdf(-critical * s - shift)
         return float(beyond * stats.chi.pdf(s * math.sqrt(freedom), freedom) * math.sqrt(freedom))
 
-    assert quad(found, 0, 10, limit=200, points=[1])[0] == pytest.approx(power, abs=1e-7)
-
-
-def test_holm_of_some_that_have_no_p() -> None:
-    assert holm([0.01, None, 0.04, 0.03, 0.005]) == pytest.approx([0.03, None, 0.06, 0.06, 0.02])
-    assert holm([None]) == [None]
-    assert holm([]) == []
-
-
-@given(st.lists(st.floats(0.001, 1), min_size=1, max_size=5))
-@settings(max_examples=15, deadline=None)
-def test_holm_is_the_closure_of_bonferroni(ps: list[float]) -> None:
-    """Marcus, Peritz, Gabriel 1976: a p is worth the largest that any family with it gives by Bonferroni."""
-    places = range(len(ps))
-    families = [f for size in range(1, len(ps) + 1) for f in itertools.combinations(places, size)]
-    worth = {f: min(1.0, len(f) * min(ps[i] for i in f)) for f in families}
-    assert holm(ps) == pytest.approx([max(w for f, w in worth.items() if i in f) for i in places], abs=1e-12)
+    assert quad(found, 0, 10, limit=200, points=[1])[0] == pytest.approx(0.8, abs=1e-7)

@@ -12,9 +12,8 @@ from sklearn.metrics import recall_score
 from pipeline.core.io import read_csv, write_csv
 from pipeline.core.records import Classification, EffectRow, OutOfFold, Part, ScoreRow
 from pipeline.evaluation.intervals import accuracy_interval
-from pipeline.evaluation.ordinal import error_rows, quadratic_kappa
 from pipeline.evaluation.paired import paired
-from pipeline.evaluation.scores import candidate_rows, effect_rows, score_rows
+from pipeline.evaluation.scores import candidate_rows, effect_rows, error_rows, score_rows, with_holm
 from pipeline.tasks import TASKS
 from tests.evaluation.conftest import CATALOGUE, PAIRS, graded
 
@@ -245,12 +244,19 @@ def test_errors_know_the_order_of_classes() -> None:
 
 
 def test_kappa_of_cohens_example() -> None:
-    """Counts after Cohen 1968 with quadratic weights, by hand."""
+    """Counts after Cohen 1968 with quadratic weights, by hand; where all is one class there is no kappa."""
     table = [[88, 14, 18], [10, 40, 10], [2, 6, 12]]
     pairs = [(r, c) for r, line in enumerate(table) for c, count in enumerate(line) for _ in range(count)]
     apart = fmean((r - c) ** 2 for r, c in pairs)
     by_chance = fmean((r - c) ** 2 for r, _ in pairs for _, c in pairs)
-    expected, predicted = [r for r, _ in pairs], [c for _, c in pairs]
-    assert quadratic_kappa(expected, predicted, 3) == pytest.approx(1 - apart / by_chance, abs=1e-12)
-    assert quadratic_kappa([1, 1], [1, 1], 3) is None
-    assert quadratic_kappa([0, 0], [1, 1], 3) == 0, "constant answers that are wrong agree by chance alone"
+    said = {"video_id": "a_0", "object_id": "a", "repeat": 0}
+    records = [OutOfFold(expected=(r, 1, 0), predicted=(c, 1, 1), **said) for r, c in pairs]
+    kappas = [r.kappa for r in error_rows({"backbone": records}, CATALOGUE)]
+    assert kappas == [pytest.approx(1 - apart / by_chance, abs=1e-6), None, 0]
+
+
+def test_holm_over_effects_some_of_which_have_no_p() -> None:
+    named = {"part": "lora", "change": "x", "task": "PC", "measure": "choice", "n": 9, "objects": 9, "seeds": 1}
+    rows = [EffectRow(difference=0.1, p=p, **named) for p in (0.01, None, 0.04, 0.03, 0.005)]
+    assert [r.p_holm for r in with_holm(rows)] == pytest.approx([0.03, None, 0.06, 0.06, 0.02])
+    assert [r.p_holm for r in with_holm(rows[1:2])] == [None]
