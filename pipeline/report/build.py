@@ -52,8 +52,6 @@ MOST_METRICS = 12
 """Columns of `dvc metrics show` that a person still reads."""
 BASELINE = "backbone"
 """The cross-validated model that all others are compared with in encoder_effects.csv."""
-CONFUSION = ("seed", "video_id", "property", "rated", "predicted")
-CURVES = ("stage", "name", "step", "value")
 LOGGED = ("loss", "validation_loss", "validation_combined")
 """Curves that a report keeps; the others are in data/ and in MLflow."""
 
@@ -121,7 +119,13 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     }
     for name, frame in frames.items():
         write_text(folder / name, frame.to_csv(index=False, lineterminator="\n"))
-    write_json(folder / "samples.json", _samples(params, data, graded, catalogue))
+    full = [variant for variant in params.ablation.variants() if variant.full]
+    examples = [pair for v in full for pair in _answered(data, v, "examples", "examples")]
+    chosen = choose_samples(
+        _answered(data, full[0], "evaluation", Touch.REAL),
+        [g for g in graded if g.variant == full[0] and g.touch is Touch.REAL],
+    )
+    write_json(folder / "samples.json", {**chosen, **choose_examples(examples, catalogue)})
     write_text(folder / "params.yaml", without_places((root / PARAMS_FILE).read_text(encoding="utf-8")))
     write_json(folder / "provenance.json", origin)
     return finish_report(folder)
@@ -136,7 +140,11 @@ def without_places(text: str) -> str:
 def finish_report(folder: Path) -> dict[str, float]:
     """Write metrics.json, figures/ and README.md from the other files of a report; return the metrics."""
     report = load_report(folder)
-    metrics = summary(report.scores)
+    # The full system's tasks, then the encoder's heads on test videos.
+    tasks, heads = headline(report.scores), over_seeds(report.scores[report.scores["task"] == HEADS])
+    heads = heads.sort_values("measure", key=lambda measure: measure != "combined", kind="stable")
+    found = pd.concat([tasks.set_index("task"), heads.set_index("encoder_" + heads["measure"])])["accuracy"]
+    metrics = {str(name): round(float(value), 6) for name, value in found.head(MOST_METRICS).items()}
     # Classes are words, even where they read like numbers or like nothing.
     confusion = pd.read_csv(folder / "confusion.csv", dtype=str, keep_default_na=False)
     curves = pd.read_csv(folder / "curves.csv")
@@ -148,17 +156,8 @@ def finish_report(folder: Path) -> dict[str, float]:
     return metrics
 
 
-def summary(scores: pd.DataFrame) -> dict[str, float]:
-    """At most `MOST_METRICS` accuracies by name: the full system's tasks, then the encoder's heads on test videos."""
-    tasks = headline(scores)
-    heads = over_seeds(scores[scores["task"] == HEADS])
-    heads = heads.sort_values("measure", key=lambda measure: measure != "combined", kind="stable")
-    found = pd.concat([tasks.set_index("task"), heads.set_index("encoder_" + heads["measure"])])["accuracy"]
-    return {str(name): round(float(value), 6) for name, value in found.head(MOST_METRICS).items()}
-
-
 def confusion_frame(said: dict[int, list[Classification]], catalogue: Catalogue) -> pd.DataFrame:
-    """What the heads say of test videos, with `CONFUSION`: one row a seed, video and property."""
+    """What the heads say of test videos: a row a seed, video and property."""
     levels = {p.name: p.levels for p in catalogue.properties}
     rows = [
         (seed, c.video_id, name, words[c.expected], words[c.predicted])
@@ -167,7 +166,7 @@ def confusion_frame(said: dict[int, list[Classification]], catalogue: Catalogue)
         for c in found
         if c.part is Part.TEST and c.property == name
     ]
-    return pd.DataFrame(rows, columns=list(CONFUSION))
+    return pd.DataFrame(rows, columns=["seed", "video_id", "property", "rated", "predicted"])
 
 
 def embedded(params: Params, data: Path, catalogue: Catalogue) -> tuple[dict[str, list[OutOfFold]], pd.DataFrame]:
@@ -215,7 +214,7 @@ def described_frame(
 
 
 def curves_frame(data: Path, ablation: AblationConfig) -> pd.DataFrame:
-    """The histories of this ablation's trainings below data/, with `CURVES`; a stage is named as DVC names it."""
+    """The histories of this ablation's trainings below data/; a stage is named as DVC names it."""
     seeds = sorted(map(str, ablation.seeds))
     trained = sorted({f"{v.encoder}-{v.opd}-{v.seed}" for v in ablation.variants()})
     places = {
@@ -230,15 +229,7 @@ def curves_frame(data: Path, ablation: AblationConfig) -> pd.DataFrame:
         for m in sorted(_read(folder / "history.parquet", Measurement), key=lambda m: (m.name, m.step))
         if m.name in LOGGED
     ]
-    return pd.DataFrame(rows, columns=list(CURVES))
-
-
-def _samples(params: Params, data: Path, graded: list[Graded], catalogue: Catalogue) -> dict[str, object]:
-    full = [variant for variant in params.ablation.variants() if variant.full]
-    scores = [g for g in graded if g.variant == full[0] and g.touch is Touch.REAL]
-    examples = [pair for v in full for pair in _answered(data, v, "examples", "examples")]
-    chosen = choose_samples(_answered(data, full[0], "evaluation", Touch.REAL), scores)
-    return {**chosen, **choose_examples(examples, catalogue)}
+    return pd.DataFrame(rows, columns=["stage", "name", "step", "value"])
 
 
 def _answered(data: Path, variant: Variant, asked: str, said: str) -> list[tuple[Question, Prediction]]:

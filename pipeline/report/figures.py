@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import pandas as pd
 
 from pipeline.core.io import atomic
+from pipeline.report.tables import PARTS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
 MEASURED, QUIET, LINE = "#0a5fb4", "#555b66", "#c9ced6"
 SERIES = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#000000")
 """Okabe and Ito's colours, safe for the colour-blind."""
-FACTORS = {"language": "language model", "lora": "LoRA", "opd": "OPD"}
 DPI = 150
 
 
@@ -79,7 +79,7 @@ def draw_effects(effects: pd.DataFrame) -> Figure:
             face = MEASURED if row["p_holm"] < 0.05 else "white"
             axes.plot(100 * row["difference"], height, "o", color=MEASURED, markerfacecolor=face, markersize=6)
         axes.axvline(0, color=QUIET, linewidth=0.9)
-        axes.set_title(f"{FACTORS.get(part, part)}\n{change}", fontsize=10)
+        axes.set_title(f"{PARTS.get(part, part)}\n{change}", fontsize=10)
         axes.xaxis.set_major_locator(MaxNLocator(4, prune="both"))
         axes.set_xlim(-1.06 * reach, 1.06 * reach)
         axes.set_ylim(-len(labels) + 0.4, 0.6)

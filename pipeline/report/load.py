@@ -18,7 +18,9 @@ KEYS = ("task", "measure", "encoder", "lora", "opd")
 SCORE_COLUMNS, EFFECT_COLUMNS = tuple(ScoreRow.model_fields), tuple(EffectRow.model_fields)
 TEXT = frozenset((*KEYS, "touch", "seed", "part", "change", "model", "dataset"))
 DATASET = "PhysiCLeAR"
-"""The data set of most of the paper's figures, as properties.yaml names it: beside another's they would mislead."""
+"""That of most of the paper's figures."""
+DATASETS = (DATASET, "avocados")
+"""What the paper has figures about, as properties.yaml names it; beside another data set's they would mislead."""
 
 
 @dataclass(frozen=True)
@@ -74,23 +76,15 @@ def read_frame(file: Path, columns: tuple[str, ...]) -> pd.DataFrame:
 
 
 @cache
-def _published() -> pd.DataFrame:
-    return read_frame(Path(__file__).with_name("published.csv"), (*KEYS, "model", "value", "n", "dataset"))
-
-
 def published(dataset: str = DATASET) -> pd.DataFrame:
-    """The paper's figures about a data set: `KEYS`, model, value, n; no row where it has none about that one.
+    """The paper's figures about a data set: `KEYS`, model, value, n; no row where it is none of `DATASETS`.
 
     `value` is as printed: percent, a count, frames or an ICC. `model` is 7b, 13b, CLIP (the heads, without a language
     model), PG-InstructBLIP (which only sees) or `chance`. The paper gives no numbers of questions: n are the ones that
     its percentages fit.
     """
-    return _published()[_published()["dataset"] == dataset].drop(columns="dataset")
-
-
-def published_datasets() -> tuple[str, ...]:
-    """The data sets that the paper has figures about."""
-    return tuple(dict.fromkeys(_published()["dataset"]))
+    every = read_frame(Path(__file__).with_name("published.csv"), (*KEYS, "model", "value", "n", "dataset"))
+    return every[every["dataset"] == dataset].drop(columns="dataset")
 
 
 def cells(published: pd.DataFrame) -> dict[tuple[str, ...], tuple[float, float]]:

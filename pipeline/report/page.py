@@ -23,9 +23,10 @@ from pipeline.core.errors import UserError
 from pipeline.core.io import write_text
 from pipeline.report.dataset import dataset_tables
 from pipeline.report.load import KEYS, Report, cells, load_report, read_frame
-from pipeline.report.readme import OTHER_MODELS, PLUMBING, at_random, finding, looked_at, origin, stands_on
+from pipeline.report.readme import OTHER_MODELS, told
 from pipeline.report.render import draw_table, render
 from pipeline.report.tables import (
+    PARTS,
     SHIPPED_TABLE,
     TABLES,
     difference,
@@ -47,7 +48,6 @@ MODELS = ("7b", "13b")
 AUDIT = ("check", "item", "measured", "expected", "severity")
 EXPECTED = ("effects.csv", "audit.csv", "samples.json", "curves.csv", "confusion.csv")
 OLDER = "the report is older than this file: `dvc repro report` at its scale writes it"
-FACTORS = {"language": "Language model", "encoder": "Encoder", "lora": "LoRA", "opd": "OPD", "touch": "Touch"}
 BESIDE = (
     (
         "encoder_errors.csv",
@@ -149,19 +149,14 @@ def _chapter(report: Report, gaps: list[Gap]) -> dict[str, Any]:
     gaps += [(name, task_title(task), "the full system was not asked") for task in TASKS if task in unasked]
     gaps += [(name, file, OLDER) for file in EXPECTED if not (report.folder / file).is_file()]
     return {
+        **told(report),
         "report": report,
-        "name": name,
         "scale": said["scale"],
         "source": said["source"],
-        "finding": finding(report),
         "shipped": _block(name, SHIPPED_TABLE.title, SHIPPED_TABLE.caption, SHIPPED_TABLE.build(report), "scores.csv"),
-        "plumbing": PLUMBING if at_random(said) else "",
-        "looked_at": said["settings"] if looked_at(said) else "",
         "tasks": tasks,
         "effects": effects,
         "points": points,
-        "stands_on": stands_on(said),
-        "origin": origin(said),
         "blocks": list(_blocks(report, gaps)),
         "files": sorted(p.relative_to(report.folder).as_posix() for p in report.folder.rglob("*.*") if p.is_file()),
     }
@@ -207,7 +202,8 @@ def _effects(report: Report) -> tuple[dict[str, list[dict[str, Any]]], float]:
             n: 50 + 5000 * row[c] / points for n, c in (("value", "difference"), ("low", "low"), ("high", "high"))
         }
         line = _line(row, f"{report.name}/effects.csv", index, difference(row), number(row["p_holm"], 3), **places)
-        groups.setdefault(f"{FACTORS.get(row['part'], row['part'])}: {row['change']}", []).append(line)
+        part = PARTS.get(row["part"], row["part"])
+        groups.setdefault(f"{part[:1].upper()}{part[1:]}: {row['change']}", []).append(line)
     return groups, points
 
 

@@ -58,6 +58,7 @@ def provenance(
     test = {a.video_id: a.object_id for assignments in splits for a in assignments if a.part is Part.TEST}
     seeds, fold_of = params.ablation.seeds, params.split.fold_of
     folds = sorted({fold for seed in seeds if (fold := fold_of(seed)) is not None})
+    notes: dict[str, str] = yaml.safe_load(NOTES.read_text(encoding="utf-8"))
     commit = _git(root, "log", "-1", "--format=%H", "--", *CODE) or UNKNOWN
     return {
         "report": params.report_name,
@@ -72,7 +73,8 @@ def provenance(
         "seeds": list(seeds),
         "folds": {"of": params.split.folds, "tested": folds} if folds else None,
         "replicates": len({params.split.replicate_of(seed) for seed in seeds}),
-        "settings": settings_note(params.report_name, params.split.name),
+        # What people noted about the test objects of this report, or else of its split.
+        "settings": notes.get(f"{params.report_name}/{params.split.name}", notes.get(params.split.name, "")),
         "intervals": coverage_note(asked),
         "facts_told": params.questions.facts,
         "beyond_paper": beyond_paper(params),
@@ -129,9 +131,16 @@ def base_model(root: Path, folder: str) -> dict[str, Any]:
     """
     where = root / folder
     elsewhere = folder.startswith("~") or Path(folder).is_absolute()
+    kind = "model"
+    if (where / "open_clip_config.json").is_file():
+        kind = "CLIP"
+    elif (where / "config.json").is_file():
+        config = json.loads((where / "config.json").read_text(encoding="utf-8"))
+        name = str(config.get("model_type") or config.get("architecture", "model"))
+        kind = ARCHITECTURES.get(name, name)
     return {
         "folder": Path(folder).name if elsewhere else folder,
-        "kind": _kind(where),
+        "kind": kind,
         "parameters": sum(prod(s) for file in where.glob("*.safetensors") for s in tensor_shapes(file).values()),
         "sha256": digest(where),
         "taught": str(front_matter(where).get("taught", "")),
@@ -146,22 +155,6 @@ def digest(folder: Path) -> str:
     for name in files:
         total.update(f"{name.as_posix()} {sha256(found[name])}\n".encode())
     return total.hexdigest() if files else UNKNOWN
-
-
-def settings_note(report: str, split: str) -> str:
-    """What people wrote in notes.yaml about a report's test objects under a split, or else about the split, if any."""
-    notes: dict[str, str] = yaml.safe_load(NOTES.read_text(encoding="utf-8")) or {}
-    return notes.get(f"{report}/{split}", notes.get(split, ""))
-
-
-def _kind(folder: Path) -> str:
-    if (folder / "open_clip_config.json").is_file():
-        return "CLIP"
-    if not (folder / "config.json").is_file():
-        return "model"
-    config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
-    kind = str(config.get("model_type") or config.get("architecture", "model"))
-    return ARCHITECTURES.get(kind, kind)
 
 
 def _git(root: Path, *arguments: str) -> str:

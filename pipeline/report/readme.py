@@ -13,7 +13,7 @@ import pandas as pd
 from pipeline.core.records import Shown
 from pipeline.report.load import Report
 from pipeline.report.render import count, markdown, render, size
-from pipeline.report.tables import FIVE_TASKS, SHIPPED_TABLE, SHOWN_WORDS, TABLES, headline, measured, number
+from pipeline.report.tables import FIVE_TASKS, PARTS, SHIPPED_TABLE, SHOWN_WORDS, TABLES, headline, measured, number
 from pipeline.weights import is_tiny
 
 MOST_LINES = 150
@@ -29,23 +29,29 @@ OTHER_MODELS = (
     "Published figures are the paper's, of Octopi with Vicuna 7b and 13b (and of CLIP ViT-L/14 where no language model "
     "answers): other models on other questions about other objects. They are no target that was met or missed."
 )
-WORDS = {"lora": "LoRA", "opd": "OPD"}
 
 
 def render_readme(report: Report, figures: Sequence[str]) -> str:
     """The text of README.md; `figures` are names of the files in figures/ that were drawn."""
-    said = report.provenance
+    # How the shipped model answers about the run's videos, where it was asked.
+    shipped: dict[str, str] = {}
+    rows = SHIPPED_TABLE.select(report)
+    if len(rows):
+        against = _against_chance(rows[rows["touch"] == Shown.TOUCH], f"`{rows['encoder'].iloc[0]}`'s")
+        shown_rows = markdown(SHIPPED_TABLE.build(report))
+        shipped = {"title": SHIPPED_TABLE.title, "caption": f"{SHIPPED_TABLE.caption} {against}", "rows": shown_rows}
+    # The table of the first screen says whose figures these are in its heads.
+    first = FIVE_TASKS.build(report)
+    parameters = size(report.provenance["base_models"]["language"]["parameters"])
+    first["Measured % [95 %]"] = "**" + first["Measured % [95 %]"] + "**"
+    first.columns = first.columns.str.replace("Measured", f"Measured here ({parameters} model)")
+    first.columns = first.columns.str.replace(r"Published (\d+b)", r"Published (Vicuna \1)", regex=True)
     values = {
-        "name": report.name,
-        "shipped": _shipped(report),
-        "plumbing": PLUMBING if at_random(said) else "",
-        "looked_at": said["settings"] if looked_at(said) else "",
-        "finding": finding(report),
-        "five_tasks": _five_tasks(report),
+        **told(report),
+        "shipped": shipped,
+        "five_tasks": markdown(first) if len(first) else "",
         "other_models": OTHER_MODELS if len(report.published) else "",
         "figures": figures,
-        "stands_on": stands_on(said),
-        "origin": origin(said),
         "files": [p.name for pattern in ("*.csv", "samples.json") for p in sorted(report.folder.glob(pattern))],
     }
     built = {table: table.build(report) for table in TABLES}
@@ -61,14 +67,23 @@ def render_readme(report: Report, figures: Sequence[str]) -> str:
     return text
 
 
-def _shipped(report: Report) -> dict[str, str]:
-    """How the shipped model answers about the run's videos, with its table; empty where it was not asked."""
-    rows = SHIPPED_TABLE.select(report)
-    if not len(rows):
-        return {}
-    said = _against_chance(rows[rows["touch"] == Shown.TOUCH], f"`{rows['encoder'].iloc[0]}`'s")
-    table = SHIPPED_TABLE.build(report)
-    return {"title": SHIPPED_TABLE.title, "caption": f"{SHIPPED_TABLE.caption} {said}", "rows": markdown(table)}
+def told(report: Report) -> dict[str, Any]:
+    """What the README and the page say of a report in words.
+
+    Returns:
+        `name`; `finding`; `plumbing`, a warning where a base model is a random one; `looked_at`, how recipes were
+        chosen by the test objects, if these are the development split's; `stands_on`, what a figure is worth: models
+        with their size, test objects, seeds; `origin`: command, commit, data, base models by hash, packages.
+    """
+    said = report.provenance
+    return {
+        "name": report.name,
+        "finding": finding(report),
+        "plumbing": PLUMBING if at_random(said) else "",
+        "looked_at": said["settings"] if said["split"] == "development" else "",
+        "stands_on": render("stands_on.md", said=said, shown=SHOWN_WORDS).splitlines(),
+        "origin": render("origin.md", said=said).splitlines(),
+    }
 
 
 def finding(report: Report) -> list[str]:
@@ -84,34 +99,9 @@ def finding(report: Report) -> list[str]:
     return [" ".join(filter(None, sentences)) for sentences in ((chance, who), (_against_chance(rows),), rest)]
 
 
-def looked_at(said: dict[str, Any]) -> bool:
-    """Whether the test objects are those of the development split, which recipes were chosen by."""
-    return bool(said["split"] == "development" and said["settings"])
-
-
 def at_random(said: dict[str, Any]) -> bool:
     """Whether a base model is a random one, so that figures are chance."""
     return any(is_tiny(model["folder"]) for model in said["base_models"].values())
-
-
-def _five_tasks(report: Report) -> str:
-    """The table of the first screen: the full system, and the rules, on each task."""
-    shown = FIVE_TASKS.build(report)
-    parameters = size(report.provenance["base_models"]["language"]["parameters"])
-    shown["Measured % [95 %]"] = "**" + shown["Measured % [95 %]"] + "**"
-    shown.columns = shown.columns.str.replace("Measured", f"Measured here ({parameters} model)")
-    shown.columns = shown.columns.str.replace(r"Published (\d+b)", r"Published (Vicuna \1)", regex=True)
-    return markdown(shown) if len(shown) else ""
-
-
-def stands_on(said: dict[str, Any]) -> list[str]:
-    """What a figure is worth: models with their size, test objects, seeds, whether they were looked at before."""
-    return render("stands_on.md", said=said, shown=SHOWN_WORDS).splitlines()
-
-
-def origin(said: dict[str, Any]) -> list[str]:
-    """Command, commit, data, base models by hash, packages."""
-    return render("origin.md", said=said).splitlines()
 
 
 def _against_chance(rows: pd.DataFrame, whose: str = "The full system's") -> str:
@@ -187,7 +177,7 @@ def _parts(effects: pd.DataFrame, solved: Collection[str]) -> str:
     if not len(rows):
         return ""
     form = rows["difference"].gt(0) & ~rows["task"].isin(solved)
-    named = rows.assign(part=rows["part"].replace(WORDS))
+    named = rows.assign(part=rows["part"].replace(PARTS))
     gains = named["part"] + " in " + named["task"] + (100 * named["difference"]).map(" {:+.1f}".format)
     words, only = (", ".join(gains[rows["p_holm"].lt(ALPHA) & kind]) for kind in (~form, form))
     *others, last = dict.fromkeys(named["part"])

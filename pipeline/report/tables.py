@@ -22,7 +22,7 @@ from pipeline.core.records import (
     VALIDATION_HEADS,
     Shown,
 )
-from pipeline.report.load import DATASET, KEYS, Report, cells, published, published_datasets
+from pipeline.report.load import DATASET, DATASETS, KEYS, Report, cells, published
 from pipeline.tasks import TASKS
 
 Select = Callable[[pd.DataFrame], "pd.Series[bool]"]
@@ -36,6 +36,8 @@ SYSTEM_WORDS = {"base": "base encoder", "without": "without LoRA", "none": "with
 SHOWN_WORDS = {"frames": "frames of the videos", "photos": "photos of the objects"}
 """What vision-only models were shown, in the place where others have their touch."""
 ENCODERS = {"finetuned": "fine-tuned", "base": "base"}
+PARTS = {"language": "language model", "lora": "LoRA", "opd": "OPD"}
+"""Parts of the full system that are called otherwise than in effects.csv."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,7 @@ def side_by_side(reports: Mapping[str, Report], *, every: bool) -> pd.DataFrame:
     """
     about = {r.provenance["dataset"]: r.published for r in reports.values()}
     if every and DATASET in about:
-        about |= {dataset: published(dataset) for dataset in published_datasets()}
+        about |= {dataset: published(dataset) for dataset in DATASETS}
     place, blocks = [*KEYS, "touch"], []
     for dataset, printed in sorted(about.items(), key=lambda pair: pair[0] != DATASET):
         rows = ordered(printed[printed["model"].isin(PUBLISHED_MODELS)].assign(touch="real").drop_duplicates(place))
