@@ -11,24 +11,25 @@ import pytest
 
 from pipeline.core.io import read_table
 from pipeline.core.records import Assignment, Graded, Part
-from pipeline.evaluation.scores import effect_rows
 from pipeline.report.build import write_report
 from pipeline.report.load import load_report
-from pipeline.report.provenance import settings_note
-from pipeline.report.readme import render_readme
-from pipeline.videos.catalogue import load_catalogue
-from tests.closure import ROOT
 from tests.fake_run import fake_params, write_run
-from tests.report.conftest import report, score
-
-CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")
 
 
 def run(root: Path, seeds: str) -> Path:
-    """The folder of a report over these seeds of three folds."""
-    params = write_run(root, fake_params("split.name=kfold", "split.folds=3", f"ablation.seeds={seeds}"))
-    write_report(params, root)
+    """The folder of a report over these seeds of three folds, without its figures."""
+    few = ("ablation.lora=[with]", "ablation.opd=[all]", "ablation.touch=[]", "cross_validation.models=[backbone]")
+    params = write_run(root, fake_params("split.name=kfold", "split.folds=3", f"ablation.seeds={seeds}", *few))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pipeline.report.build.draw_figures", lambda *_: [])
+        write_report(params, root)
     return root / "reports" / params.report_name
+
+
+@pytest.fixture(scope="module")
+def twice(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The report of two replicates of three folds."""
+    return run(tmp_path_factory.mktemp("folds"), "[0,1,2,3,4,5]")
 
 
 def rows(report_folder: Path, **named: str) -> list[dict[str, float]]:
@@ -36,10 +37,10 @@ def rows(report_folder: Path, **named: str) -> list[dict[str, float]]:
     return [row for row in every if all(row[column] == value for column, value in named.items())]
 
 
-def test_two_replicates_of_three_folds_test_each_object_twice(tmp_path: Path) -> None:
+def test_two_replicates_of_three_folds_test_each_object_twice(twice: Path) -> None:
     """An accuracy is the mean over all six models' answers; a replicate's that over its three."""
-    folder = run(tmp_path, "[0,1,2,3,4,5]")
-    graded = read_table(tmp_path / "data" / "graded.parquet", Graded)
+    folder, root = twice, twice.parents[1]
+    graded = read_table(root / "data" / "graded.parquet", Graded)
     full = [g for g in graded if g.variant.full and g.touch == "real" and (g.task, g.measure) == ("PC", "choice")]
     assert {(g.trained, g.seed) for g in full} == {(s, s // 3) for s in range(6)}
     for seed, kept in (("0", {0, 1, 2}), ("1", {3, 4, 5}), ("all", set(range(6)))):
@@ -47,7 +48,7 @@ def test_two_replicates_of_three_folds_test_each_object_twice(tmp_path: Path) ->
         (row,) = rows(folder, task="PC", encoder="finetuned", lora="with", opd="all", touch="real", seed=seed)
         assert row["n"] == len({g.question_id for g in mine})
         assert row["accuracy"] == pytest.approx(fmean(g.correct for g in mine), abs=1e-6)
-    splits = [read_table(tmp_path / "data" / "splits" / f"{seed}.parquet", Assignment) for seed in range(3)]
+    splits = [read_table(root / "data" / "splits" / f"{seed}.parquet", Assignment) for seed in range(3)]
     tested = [a.video_id for assignments in splits for a in assignments if a.part is Part.TEST]
     assert len(tested) == len(set(tested)) == len(splits[0])
     (heads,) = rows(folder, task="heads", measure="combined", seed="0")
@@ -62,23 +63,27 @@ def test_two_replicates_of_three_folds_test_each_object_twice(tmp_path: Path) ->
     assert "3 of 3 folds (0, 1, 2) are in, each object of theirs was tested 2 times" in text
 
 
-def test_effects_are_paired_within_a_fold(tmp_path: Path) -> None:
+def test_effects_are_paired_within_a_fold(twice: Path) -> None:
     """The reference: the mean difference of two systems, question by question, whatever fold a question is of."""
-    run(tmp_path, "[0,1,2]")
-    graded = read_table(tmp_path / "data" / "graded.parquet", Graded)
-    right: dict[str, dict[str, bool]] = defaultdict(dict)
+    graded = read_table(twice.parents[1] / "data" / "graded.parquet", Graded)
+    right: dict[str, dict[tuple[int, str], bool]] = defaultdict(dict)
     for g in graded:
         if (g.task, g.measure, g.lora, g.opd, g.touch) == ("PC", "choice", "with", "all", "real"):
-            right[g.encoder][g.question_id] = g.correct
-    (row,) = [e for e in effect_rows(graded, CATALOGUE) if (e.part, e.task) == ("encoder", "PC")]
+            right[g.encoder][g.seed, g.question_id] = g.correct
+    effects = pd.read_csv(twice / "effects.csv").to_dict("records")
+    (row,) = [e for e in effects if (e["part"], e["task"]) == ("encoder", "PC")]
     assert right["finetuned"].keys() == right["base"].keys()
-    assert (row.n, row.seeds) == (len(right["base"]), 1)
+    assert (row["n"], row["seeds"]) == (len({question for _, question in right["base"]}), 2)
     expected = fmean(right["finetuned"].values()) - fmean(right["base"].values())
-    assert row.difference == pytest.approx(expected, abs=1e-6)
+    assert row["difference"] == pytest.approx(expected, abs=1e-6)
 
 
-def test_one_fold_of_three_is_reported_as_one(tmp_path: Path) -> None:
+def test_one_fold_of_three_is_reported_as_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With what was noted of this report, and not what of all reports under such a split."""
+    (tmp_path / "notes.yaml").write_text("kfold: of all\nsmoke-scenes/kfold: of this one\n")
+    monkeypatch.setattr("pipeline.report.provenance.NOTES", tmp_path / "notes.yaml")
     folder = run(tmp_path, "[1]")
+    assert load_report(folder).provenance["settings"] == "of this one"
     text = (folder / "README.md").read_text()
     assert "1 of 3 folds (1) are in" in text
     assert "2 of 3 folds are still to be run" in text
@@ -86,17 +91,3 @@ def test_one_fold_of_three_is_reported_as_one(tmp_path: Path) -> None:
     assert {(g.seed, g.trained) for g in graded} == {(0, 1)}
     counts = pd.read_csv(folder / "dataset.csv").query("table == 'property_counts'")
     assert (counts["train"] + counts["validation"] + counts["test"] == counts["with_videos"]).all()
-
-
-def test_spoilt_test_objects_are_no_headline() -> None:
-    note = settings_note("small-videos", "development")
-    assert "looked at four times while recipes changed" in note
-    spoilt = render_readme(report([score()], split="development", settings=note), ["effects.png"])
-    head, _, rest = spoilt.partition("## On test objects that were looked at")
-    assert "| Task" not in head
-    assert "![What encoder" not in head
-    assert note in rest.split("| Task")[0]
-    fresh = settings_note("paper-7b-videos", "kfold")
-    kfold = render_readme(report([score()], split="kfold", settings=fresh), ["curves.png"])
-    assert "looked at four times" not in kfold
-    assert "| Task" in kfold.split("## What the figures stand on")[0]

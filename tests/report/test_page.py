@@ -113,16 +113,14 @@ def test_published_figures_stand_only_beside_their_data(page: Page, changed: Pat
     assert all("so none stand here" in words(other.named(name)) for name in ("small-videos", "together"))
 
 
-def test_the_current_run_comes_first_then_real_videos_then_smoke(page: Page, tmp_path: Path) -> None:
+def test_the_current_run_comes_first_then_real_videos_then_smoke(page: Page, changed: Path) -> None:
     chapters = [e.get("id") for e in page.all(kind="chapter")]
     assert chapters == ["together", "small-videos", "smoke-scenes", "speed", "stability", "missing"]
-    parts = [e.attrib["id"].removeprefix("small-videos-") for e in page.named("small-videos").iter("h3")]
-    assert parts == ["shipped", "tasks", "parts", "stands-on", "origin", "examples", "tables", "files"]
     random = [words(e).startswith("The base models are tiny and random") for e in page.all(kind="finding")]
     assert random == [False, True]
-    root = write_reports(tmp_path, "smoke-scenes", "small-videos")
-    shutil.copy(ROOT / "params.yaml", root)
-    page = Page(write_page(root))
+    shutil.copytree(ROOT / "reports" / "smoke-scenes", changed / "reports" / "smoke-scenes")
+    shutil.copy(ROOT / "params.yaml", changed)
+    page = Page(write_page(changed))
     assert [e.get("id") for e in page.all(kind="chapter")][1:3] == ["smoke-scenes", "small-videos"]
     assert ["that params.yaml names" in words(e) for e in page.all(kind="kind")] == [True, False]
 
@@ -239,12 +237,11 @@ def test_what_only_users_can_measure_is_missing_until_they_have(page: Page) -> N
 
 
 def test_all_reports_stand_beside_the_paper(page: Page) -> None:
-    few, every = page.named("together").iter("table")
+    few, _ = page.named("together").iter("table")
     heads = [words(e) for e in few.findall("thead/tr/th")]
-    assert heads[1:3] == ["Published 7b % (n)", "Published 13b % (n)"]
     assert heads[3:] == ["Measured small-videos† % [95 %] (n)"], "and no random models"
     assert "† Settings were chosen on these test objects" in words(page.named("together"))
-    assert (len(few.findall("tbody/tr")), len(every.findall(".//td[@class='measured']"))) == (5, 37)
+    assert len(few.findall("tbody/tr")) == 5
 
 
 def test_the_papers_examples_are_shown_right_and_wrong(changed: Path) -> None:
@@ -258,7 +255,6 @@ def test_the_papers_examples_are_shown_right_and_wrong(changed: Path) -> None:
     page = Page(write_page(changed))
     shown = page.all("article")
     assert [words(e[0]) for e in shown] == ["rice (train): right", "rice (train): wrong"]
-    assert [e.get("class") for e in shown] == ["sample good", "sample bad"]
     assert words(shown[0][1]).startswith("Asked Describe. Answered Rough. Asked Cooked? Answered Uncooked. Read as")
     assert "for want of videos: toothbrush (of handle and bristles)." in words(page.named("small-videos"))
 

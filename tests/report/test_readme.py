@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from pipeline.report.provenance import beyond_paper
-from pipeline.report.readme import CHANCE, MOST_LINES, finding, render_readme, stands_on
+from pipeline.report.readme import CHANCE, MOST_LINES, finding, render_readme, told
 from pipeline.scales import compose
 from tests.closure import ROOT
 from tests.report.conftest import effect, report, score
@@ -29,10 +29,9 @@ def test_who_made_the_figures_comes_first_with_size_and_teaching() -> None:
 
 
 def test_a_large_base_is_no_stand_in_and_has_no_teaching_noted() -> None:
-    large = report([score()], language={"parameters": 6_738_415_616, "taught": ""})
-    said = finding(large)[0]
-    assert said.startswith("A 6.7 B-parameter Llama made these figures.")
-    assert "not noted" in stands_on(large.provenance)[0]
+    said = told(report([score()], language={"parameters": 6_738_415_616, "taught": ""}))
+    assert said["finding"][0].startswith("A 6.7 B-parameter Llama made these figures.")
+    assert "not noted" in said["stands_on"][0]
 
 
 def test_above_and_below_chance_are_said_only_where_the_whole_interval_is() -> None:
@@ -134,19 +133,29 @@ def test_random_base_models_are_said_to_be_chance_first(part: str) -> None:
     """By what the models are, whatever the scale is called."""
     said = report([score()])
     said.provenance["base_models"][part]["folder"] = "data/weights/tiny-llama"
-    first = render_readme(said, []).splitlines()[2]
-    assert first.startswith(f"{CHANCE} A 2.2 M-parameter Llama")
+    assert finding(said)[0].startswith(f"{CHANCE} A 2.2 M-parameter Llama")
     for folder in ("data/weights/smollm2", "weights/tiny-llama", "elsewhere/data/weights/tiny-clip", "data/taught"):
         said.provenance["base_models"][part]["folder"] = folder
-        assert "tiny and random" not in render_readme(said, [])
-    assert "tiny and random" not in render_readme(report([score()], scale="smoke"), [])
+        assert "tiny and random" not in finding(said)[0]
+    assert "tiny and random" not in finding(report([score()], scale="smoke"))[0]
+
+
+def test_spoilt_test_objects_are_no_headline() -> None:
+    note = "They were looked at while recipes changed."
+    spoilt = render_readme(report([score()], split="development", settings=note), ["effects.png"])
+    head, _, rest = spoilt.partition("## On test objects that were looked at")
+    assert "| Task" not in head
+    assert "![What encoder" not in head
+    assert note in rest.split("| Task")[0]
+    kfold = render_readme(report([score()], split="kfold", settings=note), ["curves.png"])
+    assert "| Task" in kfold.split("## What the figures stand on")[0]
 
 
 def test_what_the_figures_stand_on_is_said_in_words() -> None:
     went_on = {"language.start": "pipeline/pretrained/octopi-small"}
     said = report([], settings="", facts_told=True, intervals="Known to be narrow.", beyond_paper=went_on)
     assert "its training went on from `octopi-small`, which was trained before" in finding(said)[0]
-    facts = "\n".join(stands_on(said.provenance))
+    facts = "\n".join(told(said)["stands_on"])
     for words in ("2 (a, b), 4 videos, split `paper`", "Nothing is noted", "Known to be narrow.", "ask for touch"):
         assert words in facts
 
@@ -156,6 +165,6 @@ def test_a_report_names_what_the_paper_does_not_train() -> None:
     found = beyond_paper(compose("small", ["lora.given=0.7"], ROOT / "conf"))
     assert found["questions.restate"] is True
     assert (found["lora.given"], found["questions.wording"]) == (0.7, "class")
-    facts = "\n".join(stands_on(report([], beyond_paper=found).provenance))
+    facts = "\n".join(told(report([], beyond_paper=found))["stands_on"])
     assert all(f"`{key}={value}`" in facts for key, value in found.items())
-    assert "the paper has not" not in "\n".join(stands_on(report([], beyond_paper={}).provenance))
+    assert "the paper has not" not in "\n".join(told(report([], beyond_paper={}))["stands_on"])

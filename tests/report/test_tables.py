@@ -11,7 +11,7 @@ import pytest
 from pipeline.report import load
 from pipeline.report.dataset import dataset_frame
 from pipeline.report.load import KEYS, load_report, published, read_frame
-from pipeline.report.tables import TABLES, Table, headline, side_by_side, task_title
+from pipeline.report.tables import TABLES, headline, side_by_side, task_title
 from pipeline.tasks import TASKS
 from pipeline.videos.catalogue import Catalogue
 from tests.conftest import refused
@@ -92,10 +92,8 @@ def test_tasks_stand_where_they_belong_whole_answers_first() -> None:
     assert list(build("description", *rows)["Published CLIP % (n)"]) == ["", "", "57.89 (38)"]
 
 
-@pytest.mark.parametrize("table", TABLES, ids=lambda t: t.key)
-def test_nothing_measured_is_an_empty_table_and_a_key_is_used_once(table: Table) -> None:
-    assert table.build(report()).empty
-    assert table.caption.endswith(".")
+def test_nothing_measured_is_an_empty_table_and_a_key_is_used_once() -> None:
+    assert all(table.build(report()).empty for table in TABLES)
     assert len(BY_KEY) == len(TABLES)
 
 
@@ -161,7 +159,7 @@ def test_reports_about_other_data_stand_beside_what_is_published_of_these() -> N
     assert side_by_side({"own": own}, every=True).empty
 
 
-@pytest.mark.parametrize("dataset", [load.DATASET, "avocados"])
+@pytest.mark.parametrize("dataset", load.DATASETS)
 def test_published_keys_are_unique_percentages_of_their_n_and_of_registered_tasks(
     catalogue: Catalogue, dataset: str
 ) -> None:
@@ -175,6 +173,7 @@ def test_published_keys_are_unique_percentages_of_their_n_and_of_registered_task
     for row in cells[cells["model"] == "chance"].to_dict("records"):
         assert row["value"] == pytest.approx(100 * TASKS[row["task"]].chance(catalogue)[row["measure"]], abs=0.005)
     assert published("Other").empty
+    assert {*pd.read_csv(Path(load.__file__).with_name("published.csv"))["dataset"]} == {*load.DATASETS}
 
 
 def test_a_folder_that_is_no_report_or_lacks_a_column_is_one_line(tmp_path: Path) -> None:
