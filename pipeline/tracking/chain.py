@@ -1,11 +1,11 @@
-"""What lies on disk of a reproduction: stages as DVC and runs/ know them, accuracies, models."""
+"""What lies on disk of a reproduction: stages as DVC and runs/ know them, and accuracies."""
 
 from __future__ import annotations
 
 import csv
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ from pipeline.config import Params
 from pipeline.config.params import CHAIN, PARAMS_FILE
 from pipeline.core.errors import UserError
 from pipeline.core.io import read_json, read_table
-from pipeline.core.records import Encoder, Graded, Lora, Touch, Variant
+from pipeline.core.records import Graded, Touch, Variant
 from pipeline.core.stage import DATA, RUNS
 from pipeline.tasks import TASKS
 
@@ -83,48 +83,33 @@ def settings(params: Params, own: Mapping[str, str] | None = None) -> dict[str, 
 
 
 def accuracies(params: Params) -> dict[str, dict[str, float]]:
-    """Metrics of each variant by its key, from the report's scores.csv (of folds, from each fold's own answers).
+    """Metrics of each variant by its key, from the report's scores.csv; of folds, which the report pools and of which
+    each has a model of its own, from graded answers.
 
     `PC` is the share of right answers (0 to 1), `low/PC` and `high/PC` its interval, `swapped/PC` the share
     with another object's video; parts of an answer are named like `OPD.hardness`.
     """
+    rows: Iterable[Mapping[str, Any]] = ()
+    table, graded = REPORTS / params.report_name / "scores.csv", DATA / "graded.parquet"
+    if params.split.fold_of(0) is None:
+        rows = csv.DictReader(table.read_text(encoding="utf-8").splitlines()) if table.is_file() else ()
+    elif graded.is_file():
+        from pipeline.evaluation.scores import score_rows
+        from pipeline.videos.catalogue import load_catalogue
+
+        own = [g.model_copy(update={"seed": g.trained}) for g in read_table(graded, Graded)]
+        rows = map(dict, score_rows(own, load_catalogue(Path(params.data.catalogue))))
     found: dict[str, dict[str, float]] = {}
-    for row in _score_rows(params):
+    for row in rows:
         if row["lora"] and row["seed"].isdigit():
             whole = TASKS[row["task"]].measure if row["task"] in TASKS else "choice"
             task = row["task"] if row["measure"] == whole else f"{row['task']}.{row['measure']}"
             cells = {task: row["accuracy"], f"low/{task}": row["low"], f"high/{task}": row["high"]}
             if row["touch"] != Touch.REAL:
                 cells = {f"{row['touch']}/{task}": row["accuracy"]}
-            key = "-".join(row[axis] for axis in Variant._fields)
-            found.setdefault(key, {}).update({name: round(float(cell), 4) for name, cell in cells.items() if cell})
+            metrics = found.setdefault("-".join(row[axis] for axis in Variant._fields), {})
+            metrics |= {name: round(float(cell), 4) for name, cell in cells.items() if cell not in ("", None)}
     return found
-
-
-def _score_rows(params: Params) -> Iterator[Mapping[str, str]]:
-    path = REPORTS / params.report_name / "scores.csv"
-    if params.split.fold_of(0) is None:
-        yield from csv.DictReader(path.read_text(encoding="utf-8").splitlines()) if path.is_file() else ()
-    elif (DATA / "graded.parquet").is_file():
-        from pipeline.evaluation.scores import score_rows
-        from pipeline.videos.catalogue import load_catalogue
-
-        # The report pools folds, but a run in the dashboard is one model.
-        graded = read_table(DATA / "graded.parquet", Graded)
-        each = [g.model_copy(update={"seed": g.trained}) for g in graded]
-        for row in score_rows(each, load_catalogue(Path(params.data.catalogue))):
-            yield {name: "" if cell is None else str(cell) for name, cell in row}
-
-
-def artifacts(variant: Variant) -> Iterator[tuple[Path, str]]:
-    """What a variant said and is made of: folders and files, with their place among the artifacts."""
-    key = f"{variant.encoder}-{variant.opd}-{variant.seed}"
-    yield DATA / "answers" / variant.key, "predictions"
-    yield DATA / "models" / variant.lora / key, "model"
-    if variant.lora is Lora.WITH:
-        yield DATA / "models" / Lora.WITHOUT / key, "alignment"
-    if variant.encoder is Encoder.FINETUNED:
-        yield DATA / "encoder" / str(variant.seed), "encoder"
 
 
 def flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:

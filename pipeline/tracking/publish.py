@@ -15,14 +15,14 @@ from pipeline.config import Params
 from pipeline.config.params import load_params
 from pipeline.core.errors import UserError
 from pipeline.core.io import read_json, read_table
-from pipeline.core.records import Measurement, Variant
+from pipeline.core.records import Encoder, Lora, Measurement, Variant
+from pipeline.core.stage import DATA
 from pipeline.tasks import TASKS
 from pipeline.tracking.chain import (
     CHAIN_LOCK,
     REPORTS,
     ChainStage,
     accuracies,
-    artifacts,
     axes,
     digest,
     flatten,
@@ -31,7 +31,7 @@ from pipeline.tracking.chain import (
     settings,
 )
 from pipeline.tracking.registry import log_model, register
-from pipeline.tracking.store import KIND, LOCK, PARENT, STAGE, Store, TrackingError, cause, git, out_of_reach
+from pipeline.tracking.store import KIND, LOCK, PARENT, STAGE, Store, TrackingError, cause, out_of_reach
 
 VARIANT, CONTENT, STATE = "octopi.variant", "octopi.content", "octopi.state"
 """Tags with what a finished variant and reproduction were made from; written last."""
@@ -84,10 +84,16 @@ def _publish(store: Store, params: Params, stages: Mapping[str, ChainStage]) -> 
     done = store.find({KIND: "stage", PARENT: parent})
     ended = [run.info.end_time for run in done if LOCK in run.data.tags]
     new, links = _variants(store, params, parent, stages)
-    _log_report(store, params, parent)
+    report = REPORTS / params.report_name
+    if report.is_dir():
+        store.client.log_artifacts(parent, str(report), "report")
+    summary = read_json(report / "metrics.json") if (report / "metrics.json").is_file() else {}
+    # Where publishing was cut off some are there, and MLflow refuses other values.
+    known = store.client.get_run(parent).data.params
+    own = {name: value for name, value in settings(params).items() if name not in known}
+    store.log(parent, [(name, float(value), now, 0) for name, value in flatten(summary)], own)
     about = {
         "octopi.dvc_lock": digest([CHAIN_LOCK.read_text(encoding="utf-8")]),
-        "octopi.uncommitted": git("status", "--porcelain", "--", "pipeline", "stages", "dvc.yaml", "params.yaml"),
         NOTE: f"{len(ended)} stages ran, the others came from DVC's cache. Tables and figures: Artifacts, "
         "`report/README.md`.",
     }
@@ -148,9 +154,15 @@ def _variants(
             ordered = sorted(metrics.items(), key=lambda metric: ("." in metric[0], metric[0]))
             factors = {axis: str(value) for axis, value in variant._asdict().items()}
             store.log(run, [(name, value, end, 0) for name, value in ordered], settings(params, factors))
-            for path, place in artifacts(variant):
-                if path.is_dir():
-                    store.client.log_artifacts(run, str(path), place)
+            trained = f"{variant.encoder}-{variant.opd}-{variant.seed}"
+            made = {"predictions": Path("answers") / variant.key, "model": Path("models") / variant.lora / trained}
+            if variant.lora is Lora.WITH:
+                made["alignment"] = Path("models") / Lora.WITHOUT / trained
+            if variant.encoder is Encoder.FINETUNED:
+                made["encoder"] = Path("encoder") / str(variant.seed)
+            for place, path in made.items():
+                if (DATA / path).is_dir():
+                    store.client.log_artifacts(run, str(DATA / path), place)
             if made_of:
                 log_model(store.client, run, params, variant, folder)
             store.finish(run, end, {CONTENT: content})
@@ -161,18 +173,6 @@ def _variants(
     for name, value in _front_page(store.experiment, store.find({KIND: "variant"})).items():
         store.client.set_experiment_tag(store.experiment, name, value)
     return new, links
-
-
-def _log_report(store: Store, params: Params, parent: str) -> None:
-    """The report with its metrics, and the parameters."""
-    report, now = REPORTS / params.report_name, milliseconds(time.time())
-    summary = read_json(report / "metrics.json") if (report / "metrics.json").is_file() else {}
-    if report.is_dir():
-        store.client.log_artifacts(parent, str(report), "report")
-    # Where publishing was cut off some are there, and MLflow refuses other values.
-    known = store.client.get_run(parent).data.params
-    own = {name: value for name, value in settings(params).items() if name not in known}
-    store.log(parent, [(name, float(value), now, 0) for name, value in flatten(summary)], own)
 
 
 def _front_page(experiment: str, runs: Sequence[Any]) -> dict[str, str]:

@@ -9,9 +9,7 @@ import logging
 import os
 import re
 import socket
-import subprocess
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from threading import Event
 from typing import Any, TypeVar
@@ -60,14 +58,6 @@ def attempt(tracking: TrackingConfig, call: Callable[..., T], *args: object) -> 
             out_of_reach.set()
             logger.warning("tracking is off, `octopi publish` completes the run: %s", cause(error, tracking))
     return None
-
-
-def git(*arguments: str) -> str:
-    """What Git prints; "unknown" where it fails."""
-    with suppress(OSError, subprocess.SubprocessError):
-        command = ["git", *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
-    return "unknown"
 
 
 class Store:
@@ -147,8 +137,10 @@ class Store:
 
     def create(self, name: str, kind: str, start: int, tags: Mapping[str, str] | None = None) -> str:
         """Begin a run."""
-        own = {KIND: kind, **self.mine, "mlflow.user": "octopi", **(tags or {})}
-        own["mlflow.source.git.commit"] = git("rev-parse", "HEAD")
+        from mlflow.utils.git_utils import get_git_commit
+
+        commit = {"mlflow.source.git.commit": get_git_commit(str(Path.cwd())) or "unknown"}
+        own = {KIND: kind, **self.mine, "mlflow.user": "octopi", **commit, **(tags or {})}
         return str(self.client.create_run(self.experiment, start, own, name).info.run_id)
 
     def log(
@@ -164,7 +156,7 @@ class Store:
         points = [Metric(*metric) for metric in metrics]
         own = [Param(name, value) for name, value in (params or {}).items()]
         marks = [RunTag(name, value) for name, value in (tags or {}).items()]
-        # MLflow takes 100 parameters or tags a call. At once and not behind a queue, so that a failure shows.
+        # MLflow takes 100 parameters or tags a call. Synchronous, so that a failure shows here.
         for i in range(0, max(map(len, (points, own, marks))), 100):
             self.client.log_batch(run, *(items[i : i + 100] for items in (points, own, marks)), synchronous=True)
 

@@ -21,6 +21,7 @@ from pipeline.tracking.chain import accuracies
 from pipeline.tracking.publish import publish
 from pipeline.tracking.store import TrackingError
 from tests.closure import ROOT
+from tests.conftest import refused
 from tests.fake_run import fake_params
 from tests.tracking.conftest import (
     BASE,
@@ -197,15 +198,14 @@ def test_a_moved_folder_keeps_its_artifacts(again: FakeChain, monkeypatch: pytes
     assert "nothing new" in publish(again.params)
 
 
-def test_the_command_says_in_one_line_why_it_could_not(chain: FakeChain, monkeypatch: pytest.MonkeyPatch) -> None:
-    from pipeline import cli
+def test_the_command_says_what_was_added_or_in_one_line_why_it_could_not(chain: FakeChain) -> None:
+    from pipeline.cli import app
 
-    assert "2 variants are new" in CliRunner().invoke(cli.app, ["publish"]).stdout
-    Path("dvc.lock").unlink()
-    monkeypatch.setattr(sys, "argv", ["octopi", "publish"])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    assert ended.value.code == 1
+    assert "2 variants are new" in CliRunner().invoke(app, ["publish"]).stdout
+    for text, words in (("{", "not YAML"), ("stages: [split]", "not as DVC writes it"), (None, "no such file")):
+        Path("dvc.lock").unlink() if text is None else Path("dvc.lock").write_text(text)
+        with refused(f"dvc.lock: {words}"):
+            publish(chain.params)
 
 
 PUBLISH = """\
