@@ -1,7 +1,8 @@
-"""The evaluation questions to a model that sees and does not feel, behind an OpenAI-compatible endpoint.
+"""Ask a vision-language model behind an OpenAI-compatible endpoint the evaluation questions.
 
-The paper compares with such a model, PG-InstructBLIP (Gao et al. 2024, arXiv:2309.02561). What any of them answers is
-written to `external/`, which the stages `grade` and `report` read: no stage asks a network.
+In place of tactile videos it gets pictures. The paper compares with such a model, PG-InstructBLIP (Gao et al. 2024,
+arXiv:2309.02561). Answers are written to `external/`, which the stages `grade` and `report` read: no stage asks a
+network.
 """
 
 from __future__ import annotations
@@ -37,12 +38,12 @@ from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.frames.store import FrameStore
 
 Show = Callable[[str, str], list[str]]
-"""The pictures of a video, or of its object, as data URLs."""
+"""From a video's and its object's name to the pictures that stand for it, as data URLs."""
 
 CACHE_FILE = "cache.jsonl"
 PHOTO_SUFFIXES = (".jpeg", ".jpg", ".png", ".webp")
 EXAMPLES = 3
-"""Most training questions that are told before a question."""
+"""Most training questions that stand before a question as examples (few-shot)."""
 LONGEST = 1024
 """Pixels of a photo's longer side that are sent at most."""
 FILTERS = ("content_filter", "content_policy_violation")
@@ -146,7 +147,7 @@ def ask_all(params: Params, endpoint: Endpoint, shown: Shown, folder: Path, limi
 
 
 def choose_examples(training: Sequence[Question], task: str) -> list[Question]:
-    """Of a task the first training questions whose right choices differ, so that each kind of answer is seen."""
+    """The first `EXAMPLES` training questions of a task whose right choices differ, so that they show each kind."""
     first: dict[str, Question] = {}
     for question in training:
         if question.task == task:
@@ -176,7 +177,7 @@ def instruction(catalogue: Catalogue, shown: Shown, examples: Sequence[Question]
 
 
 def _answer(question: Question, told: str, asker: _Asker, show: Show) -> Prediction | None:
-    """All turns of a question, as the full system is asked; None where the budget does not reach to its end."""
+    """Ask all turns of a question, as the full system is asked; None where a reply is not to be had."""
     dialogue = question.dialogue(Opd.ALL)
     assert dialogue is not None, "every task has this mode"
     messages: list[dict[str, Any]] = []
@@ -208,7 +209,7 @@ def _answer(question: Question, told: str, asker: _Asker, show: Show) -> Predict
 
 
 class _Asker:
-    """Replies by what was asked: from the cache, else from the endpoint until it fails or the budget is spent."""
+    """Replies to requests: from the cache, else from the endpoint until it fails or `limit` requests are sent."""
 
     def __init__(self, endpoint: Endpoint, cache: Path, limit: int | None) -> None:
         import openai
@@ -300,6 +301,7 @@ class _Asker:
 
 
 def _read_cache(file: Path) -> dict[str, Reply]:
+    """Replies by request; half a line at the end is cut off."""
     if not file.is_file():
         return {}
     content = file.read_bytes()
@@ -316,6 +318,7 @@ def _read_cache(file: Path) -> dict[str, Reply]:
 
 
 def _check(endpoint: Endpoint) -> None:
+    """Refuse what is no URL, or holds a secret."""
     try:
         parts = urlsplit(endpoint.url)
         whole = parts.scheme in ("http", "https") and parts.hostname and parts.port != 0
@@ -345,7 +348,7 @@ def _frames(folder: Path, most: int) -> Show:
 
 
 def _photos(folder: Path, objects: Sequence[str], most: int) -> Show:
-    """Photos of an object, upright and without what a camera notes beside them (such as the place)."""
+    """Photos of an object, upright. They are encoded anew, so that no EXIF data (such as the place) leaves."""
     found: dict[str, list[Path]] = {}
     for name in objects:
         # Those named after it, and those in the folder of its name.

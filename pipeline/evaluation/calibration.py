@@ -1,4 +1,4 @@
-"""How far probabilities can be believed: temperature scaling, reliability, expected calibration error.
+"""Calibration of the property heads' probabilities: temperature scaling, reliability, expected calibration error.
 
 Guo et al. 2017, "On Calibration of Modern Neural Networks" (arXiv 1706.04599).
 """
@@ -20,14 +20,17 @@ Floats = npt.NDArray[np.float64]
 
 BINS = 10
 RANGE = (0.05, 20.0)
-"""Temperatures that are looked at: beyond them probabilities are one-hot, or even, to the eye."""
+"""Temperatures to search: beyond them probabilities are all but one-hot, or uniform."""
 PRIOR = 2.0
+"""Standard deviation of the prior on the temperature, as a factor."""
 SMALLEST = 1e-12
+"""Probabilities are lifted to it before a logarithm."""
 DRAWS = 1000
+"""Bootstrap samples."""
 
 
 class CalibrationRow(Record):
-    """How far one property's probabilities can be believed: all answers, or those of like confidence."""
+    """Calibration of one property's probabilities: of all answers, or of those in one bin of confidence."""
 
     property: str
     probability: str
@@ -101,10 +104,11 @@ def reliability(classified: Sequence[Classification]) -> pd.DataFrame:
     return bins.assign(n=table["bin"].value_counts())
 
 
-def calibrated(said: Sequence[Classification]) -> Iterator[tuple[Classification, Classification]]:
-    """What an encoder says of test videos, property by property, as it is and by the temperature of its validation."""
-    for name in dict.fromkeys(c.property for c in said):
-        mine = [c for c in said if c.property == name]
+def calibrated(classified: Sequence[Classification]) -> Iterator[tuple[Classification, Classification]]:
+    """One encoder's classifications of test videos, before and after scaling by a temperature that is fitted to its
+    validation videos, property by property."""
+    for name in dict.fromkeys(c.property for c in classified):
+        mine = [c for c in classified if c.property == name]
         temperature = fit_temperature([c for c in mine if c.part is Part.VALIDATION])
         for c in mine:
             if c.part is Part.TEST:
@@ -115,12 +119,12 @@ def calibration_rows(encoders: Sequence[Sequence[Classification]]) -> list[Calib
     """Test videos of all encoders together, by property; a row for all of them, then one a bin.
 
     Args:
-        encoders: What each says of validation and test videos. Its temperatures are fitted on its validation videos.
+        encoders: The classifications of validation and test videos by each.
     """
     given: dict[str, list[Classification]] = {}
     tempered: dict[str, list[Classification]] = {}
-    for said in encoders:
-        for before, after in calibrated(said):
+    for classified in encoders:
+        for before, after in calibrated(classified):
             given.setdefault(before.property, []).append(before)
             tempered.setdefault(after.property, []).append(after)
     rows = []

@@ -1,4 +1,4 @@
-"""How sure an accuracy is, where questions share objects.
+"""Confidence intervals of accuracies, where questions share objects.
 
 Questions about one object are ordinary clusters. Two questions about pairs or triples of objects depend on each other
 as soon as they share one: their clusters overlap, which no library handles. So the variance of the mean is fitted by
@@ -31,7 +31,7 @@ LEVEL = 0.95
 TINY = 1e-12
 """Variances up to it are rounding."""
 DISTINCT = 1e-3
-"""Two factors are kept apart where no combination of their moments, scaled to 1, is smaller."""
+"""A factor is estimated beside the others where the smallest eigenvalue of all moments, scaled to 1, is larger."""
 
 
 class Interval(NamedTuple):

@@ -1,4 +1,4 @@
-"""What embeddings tell without a head: the class of the most similar other object's video, and a map of them all."""
+"""Embeddings without a trained head: nearest neighbours among videos of other objects, and two-dimensional maps."""
 
 from __future__ import annotations
 

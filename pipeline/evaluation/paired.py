@@ -1,4 +1,4 @@
-"""Two settings on the same questions: how far they differ, whether chance explains it, and what could have been found.
+"""Paired comparison of two settings on the same questions: interval, sign-flip test, minimum detectable effect.
 
 Values are differences, (..., seeds, questions), from -1 to 1: how right the one setting is less how right the other.
 
@@ -46,7 +46,8 @@ class Difference:
     """Two-sided, of sign flips over objects. It takes few values (with seven objects none below 2/128) and is about
     these runs alone, so that it may doubt what the interval excludes, or the other way round."""
     smallest_effect: float | None = None
-    """The smallest true difference that such a comparison finds in four of five repetitions; above 1 there is none."""
+    """Minimum detectable effect: the smallest true difference that such a comparison finds in four of five repetitions;
+    above 1 there is none."""
 
 
 def paired(values: Values, objects: Sequence[Objects]) -> Difference:
@@ -150,7 +151,7 @@ def flip_units(design: Design) -> Values:
 
 @lru_cache(maxsize=256)
 def smallest_effect(error: float, freedom: float) -> float:
-    """The smallest true difference that a two-sided t test finds as often as `POWER`, in the unit of `error`.
+    """Minimum detectable effect of a two-sided t test with the power `POWER`, in the unit of `error`.
 
     That is the standard error times the noncentrality at which t exceeds its critical value that often. The sign flips
     of few objects need more, and so does one test of a family.

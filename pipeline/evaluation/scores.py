@@ -58,7 +58,7 @@ class Setting(NamedTuple):
 
 FULL = Setting(Encoder.FINETUNED, Lora.WITH, Opd.ALL, Touch.REAL)
 RULES = Setting(Encoder.FINETUNED, None, None, Touch.REAL)
-"""The property heads' classes, and what follows from them by rule."""
+"""No language model: answers follow by rule from the classes that the property heads predict."""
 CHANGES: tuple[tuple[str, Setting, Setting], ...] = (
     ("language", FULL, RULES),
     ("encoder", FULL, FULL._replace(encoder=Encoder.BASE)),
@@ -71,7 +71,7 @@ CHANGES: tuple[tuple[str, Setting, Setting], ...] = (
 
 
 class Answer(NamedTuple):
-    """What an accuracy needs to know of an answer to one question, or of what was said of one video."""
+    """A graded answer to one question, or the heads' classification of one video."""
 
     correct: bool
     objects: Objects
@@ -90,7 +90,7 @@ def score_rows(
     catalogue: Catalogue,
     classifications: Mapping[int, Sequence[Classification]] | None = None,
     out_of_fold: Mapping[str, Sequence[OutOfFold]] | None = None,
-    seen: Iterable[GradedVision] = (),
+    vision: Iterable[GradedVision] = (),
     concluded: Mapping[int, Sequence[Score]] | None = None,
     neighbours: Mapping[str, Sequence[OutOfFold]] | None = None,
     adjectives: Mapping[str, str] | None = None,
@@ -101,8 +101,8 @@ def score_rows(
         graded: All graded answers of a run; some variants or tasks may be absent.
         classifications: Of the property heads, by seed, those of its folds together; only test and validation count.
         out_of_fold: By candidate.
-        seen: Graded answers of vision-only models.
-        concluded: By seed, what `pipeline.evaluation.grading.conclude` graded.
+        vision: Graded answers of vision-only models.
+        concluded: By seed, the scores that `pipeline.evaluation.grading.conclude` gives.
         neighbours: By encoder, the classes of each test video's nearest neighbour.
         adjectives: By question, the adjective that it asks by.
     """
@@ -118,7 +118,7 @@ def score_rows(
                 if all(own.values()):
                     rows += _rows(own, task=ADJECTIVES, measure=f"{task}: {word}", chance=chance, **named)[-1:]
     by_model: dict[tuple[str, ...], dict[int, dict[str, Answer]]] = defaultdict(lambda: defaultdict(dict))
-    for g in seen:
+    for g in vision:
         answer = Answer(g.correct, g.objects, g.parsed, g.strict)
         by_model[g.task, g.measure, g.model, g.shown][g.seed][g.question_id] = answer
     for (task, measure, model, shown), runs in by_model.items():
@@ -142,13 +142,13 @@ def score_rows(
     for kind, by_name in ((CROSS_VALIDATION, out_of_fold or {}), (NEIGHBOURS, neighbours or {})):
         for name, records in by_name.items():
             for place, measure in enumerate(chances):
-                told = repeats(records, place if place < len(catalogue.properties) else None)
-                rows += _rows(told, task=kind, measure=measure, chance=chances[measure], encoder=name)[-1:]
+                predicted = repeats(records, place if place < len(catalogue.properties) else None)
+                rows += _rows(predicted, task=kind, measure=measure, chance=chances[measure], encoder=name)[-1:]
     for name, records in (neighbours or {}).items():
         for place, p, level in classes:
-            told = repeats([r for r in records if r.expected[place] == level], place)
+            predicted = repeats([r for r in records if r.expected[place] == level], place)
             measure = f"{p.name}: {p.levels[level]}"
-            rows += _rows(told, task=NEIGHBOURS, measure=measure, chance=chances[p.name], encoder=name)[-1:]
+            rows += _rows(predicted, task=NEIGHBOURS, measure=measure, chance=chances[p.name], encoder=name)[-1:]
     return rows
 
 
@@ -248,7 +248,7 @@ def difference(one: Runs, other: Runs) -> Difference | None:
 
 
 def repeats(records: Iterable[OutOfFold], place: int | None = None) -> dict[int, dict[str, Answer]]:
-    """Whether one property, or with None every property, was told; by repeat and video."""
+    """Whether one property, or with None every property, was predicted right; by repeat and video."""
     part = slice(None) if place is None else slice(place, place + 1)
     runs: dict[int, dict[str, Answer]] = defaultdict(dict)
     for r in records:

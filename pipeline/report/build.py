@@ -75,7 +75,7 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     videos = read_table(data / "videos.parquet", Video)
     splits = list(read_splits(data, params.split, params.ablation.seeds).values())
     graded = read_table(data / "graded.parquet", Graded)
-    seen = [*_read(data / "graded_vision.parquet", GradedVision), *_read(data / "shipped.parquet", GradedVision)]
+    vision = [*_read(data / "graded_vision.parquet", GradedVision), *_read(data / "shipped.parquet", GradedVision)]
     # By the lists in params.yaml and not by what lies there: a narrowed ablation leaves the others' files behind.
     models = params.cross_validation.models
     found = {name: _read(data / "cross_validation" / name / "out_of_fold.parquet", OutOfFold) for name in models}
@@ -95,12 +95,12 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
             named = {q.question_id: TASKS[q.task].adjective(q, catalogue) for q in asked}
             adjectives |= {question: word for question, word in named.items() if word}
     origin = provenance(params, catalogue, videos, splits, [g.objects for g in graded], root)
-    # Not those whose answers are to other questions, which were not graded.
-    rated = {(g.model, g.shown) for g in seen}
+    # Without those whose answers are to other questions than today's, which were not graded.
+    rated = {(g.model, g.shown) for g in vision}
     sources = vision_models(root / EXTERNAL / params.report_name).values()
     origin["vision"] = [s.model_dump(mode="json") for s in sources if (s.model, s.shown) in rated]
     neighbours, maps = embedded(params, data, catalogue)
-    scores = score_rows(graded, catalogue, said, out_of_fold, seen, concluded, neighbours, adjectives)
+    scores = score_rows(graded, catalogue, said, out_of_fold, vision, concluded, neighbours, adjectives)
     write_csv(folder / "scores.csv", ScoreRow, scores)
     write_csv(folder / "effects.csv", EffectRow, effect_rows(graded, catalogue, concluded))
     candidates = candidate_rows(out_of_fold, BASELINE)

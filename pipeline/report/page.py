@@ -23,7 +23,7 @@ from pipeline.core.errors import UserError
 from pipeline.core.io import write_text
 from pipeline.report.dataset import dataset_tables
 from pipeline.report.load import KEYS, Report, cells, load_report, read_frame
-from pipeline.report.readme import OTHER_MODELS, told
+from pipeline.report.readme import OTHER_MODELS, sections
 from pipeline.report.render import draw_table, render
 from pipeline.report.tables import (
     PARTS,
@@ -149,7 +149,7 @@ def _chapter(report: Report, gaps: list[Gap]) -> dict[str, Any]:
     gaps += [(name, task_title(task), "the full system was not asked") for task in TASKS if task in unasked]
     gaps += [(name, file, OLDER) for file in EXPECTED if not (report.folder / file).is_file()]
     return {
-        **told(report),
+        **sections(report),
         "report": report,
         "scale": said["scale"],
         "source": said["source"],

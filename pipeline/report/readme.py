@@ -47,7 +47,7 @@ def render_readme(report: Report, figures: Sequence[str]) -> str:
     first.columns = first.columns.str.replace("Measured", f"Measured here ({parameters} model)")
     first.columns = first.columns.str.replace(r"Published (\d+b)", r"Published (Vicuna \1)", regex=True)
     values = {
-        **told(report),
+        **sections(report),
         "shipped": shipped,
         "five_tasks": markdown(first) if len(first) else "",
         "other_models": OTHER_MODELS if len(report.published) else "",
@@ -67,7 +67,7 @@ def render_readme(report: Report, figures: Sequence[str]) -> str:
     return text
 
 
-def told(report: Report) -> dict[str, Any]:
+def sections(report: Report) -> dict[str, Any]:
     """What the README and the page say of a report in words.
 
     Returns:

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from pipeline.report.provenance import beyond_paper
-from pipeline.report.readme import CHANCE, MOST_LINES, finding, render_readme, told
+from pipeline.report.readme import CHANCE, MOST_LINES, finding, render_readme, sections
 from pipeline.scales import compose
 from tests.closure import ROOT
 from tests.report.conftest import effect, report, score
@@ -29,7 +29,7 @@ def test_who_made_the_figures_comes_first_with_size_and_teaching() -> None:
 
 
 def test_a_large_base_is_no_stand_in_and_has_no_teaching_noted() -> None:
-    said = told(report([score()], language={"parameters": 6_738_415_616, "taught": ""}))
+    said = sections(report([score()], language={"parameters": 6_738_415_616, "taught": ""}))
     assert said["finding"][0].startswith("A 6.7 B-parameter Llama made these figures.")
     assert "not noted" in said["stands_on"][0]
 
@@ -155,7 +155,7 @@ def test_what_the_figures_stand_on_is_said_in_words() -> None:
     went_on = {"language.start": "pipeline/pretrained/octopi-small"}
     said = report([], settings="", facts_told=True, intervals="Known to be narrow.", beyond_paper=went_on)
     assert "its training went on from `octopi-small`, which was trained before" in finding(said)[0]
-    facts = "\n".join(told(said)["stands_on"])
+    facts = "\n".join(sections(said)["stands_on"])
     for words in ("2 (a, b), 4 videos, split `paper`", "Nothing is noted", "Known to be narrow.", "ask for touch"):
         assert words in facts
 
@@ -165,6 +165,6 @@ def test_a_report_names_what_the_paper_does_not_train() -> None:
     found = beyond_paper(compose("small", ["lora.given=0.7"], ROOT / "conf"))
     assert found["questions.restate"] is True
     assert (found["lora.given"], found["questions.wording"]) == (0.7, "class")
-    facts = "\n".join(told(report([], beyond_paper=found))["stands_on"])
+    facts = "\n".join(sections(report([], beyond_paper=found))["stands_on"])
     assert all(f"`{key}={value}`" in facts for key, value in found.items())
-    assert "the paper has not" not in "\n".join(told(report([], beyond_paper={}))["stands_on"])
+    assert "the paper has not" not in "\n".join(sections(report([], beyond_paper={}))["stands_on"])
