@@ -122,23 +122,16 @@ def _chapters(folder: Path, gaps: list[Gap], current: str) -> list[dict[str, Any
     found: list[dict[str, Any]] = []
     for place in sorted({file.parent for name in ("scores.csv", "README.md") for file in folder.glob(f"*/{name}")}):
         try:
-            found.append(_chapter(load_report(place), gaps))
+            found.append({**_chapter(load_report(place), gaps), "current": place.name == current})
         except (UserError, ValueError) as error:
             gaps.append((place.name, "the whole report", str(error).replace(f"{folder}/", "")))
         except KeyError as error:
             gaps.append((place.name, "the whole report", f"its provenance.json lacks {error}: {OLDER}"))
-    for c in found:
-        c["current"] = c["name"] == current
-    return sorted(
-        found,
-        key=lambda c: (
-            not c["current"],
-            c["scale"] == "smoke",
-            c["looked_at"] != "",
-            c["source"] != "videos",
-            c["name"],
-        ),
-    )
+
+    def later(c: dict[str, Any]) -> tuple[bool, bool, bool, bool]:
+        return not c["current"], c["scale"] == "smoke", c["looked_at"] != "", c["source"] != "videos"
+
+    return sorted(found, key=later)
 
 
 def _chapter(report: Report, gaps: list[Gap]) -> dict[str, Any]:
@@ -148,16 +141,20 @@ def _chapter(report: Report, gaps: list[Gap]) -> dict[str, Any]:
     unasked = {*report.published["task"]} - {line["task"] for line in tasks}
     gaps += [(name, task_title(task), "the full system was not asked") for task in TASKS if task in unasked]
     gaps += [(name, file, OLDER) for file in EXPECTED if not (report.folder / file).is_file()]
+    shipped, title, frame = {}, SHIPPED_TABLE.title, SHIPPED_TABLE.build(report)
+    if len(frame):
+        html = draw_table(frame, title, f"{name}/scores.csv")
+        shipped = {"title": title, "caption": SHIPPED_TABLE.caption, "html": html}
     return {
         **sections(report),
         "report": report,
         "scale": said["scale"],
         "source": said["source"],
-        "shipped": _block(name, SHIPPED_TABLE.title, SHIPPED_TABLE.caption, SHIPPED_TABLE.build(report), "scores.csv"),
+        "shipped": shipped,
         "tasks": tasks,
         "effects": effects,
         "points": points,
-        "blocks": list(_blocks(report, gaps)),
+        "blocks": _blocks(report, gaps),
         "files": sorted(p.relative_to(report.folder).as_posix() for p in report.folder.rglob("*.*") if p.is_file()),
     }
 
@@ -207,55 +204,46 @@ def _effects(report: Report) -> tuple[dict[str, list[dict[str, Any]]], float]:
     return groups, points
 
 
-def _blocks(report: Report, gaps: list[Gap]) -> Iterator[dict[str, Any]]:
+def _blocks(report: Report, gaps: list[Gap]) -> list[dict[str, Any]]:
     """The registry's tables, then those about data and encoders; one of the registry without a row is a gap."""
-    name = report.name
-    for table in TABLES:
-        file, frame = f"{table.source}.csv", table.build(report)
-        if len(frame):
-            unfolded = report.provenance["scale"] != "smoke" and not table.folded
-            yield _block(name, table.title, table.caption, frame, file, table.key, unfolded=unfolded)
-        else:
-            gaps.append((name, table.title, f"no row of its {file} belongs there: nothing such was run"))
+    found = [(t.title, t.caption, t.build(report), f"{t.source}.csv", t.key) for t in TABLES]
+    gaps += [
+        (report.name, title, f"no row of its {file} belongs there: nothing such was run")
+        for title, _, frame, file, _ in found
+        if frame.empty
+    ]
     for file, title, caption in BESIDE:
-        path = report.folder / file
-        if path.is_file() and len(frame := _shown(pd.read_csv(path))):
-            yield _block(name, title, caption, frame, file, path.stem)
+        if (report.folder / file).is_file():
+            found.append((title, caption, _shown(pd.read_csv(report.folder / file)), file, Path(file).stem))
     for title, frame in dataset_tables(report.folder, report.provenance["dataset"]).items():
         file = "audit.csv" if "Measured" in frame else "dataset.csv"
-        yield _block(name, title, "", frame, file, re.split("[:,]", title)[0].replace(" ", "-").lower())
+        found.append((title, "", frame, file, re.split("[:,]", title)[0].replace(" ", "-").lower()))
     audit = read_frame(report.folder / "audit.csv", AUDIT)
     if len(audit):
         # Counted by check, with what needs attention first.
         rank = {"error": 0, "warning": 1, "info": 2}
         audit = audit.sort_values("severity", key=lambda s: s.map(rank).fillna(3), kind="stable")
-        checks = audit.assign(first=audit["item"] + ": " + audit["measured"].astype(str)).groupby(
-            ["severity", "check"], sort=False
-        )
-        columns = {"Findings": checks.size().astype(str), "The first of them": checks["first"].first()}
+        audit["first"] = audit["item"] + ": " + audit["measured"].astype(str)
+        checks = audit.groupby(["severity", "check"], sort=False)["first"]
+        columns = {"Findings": checks.size().astype(str), "The first of them": checks.first()}
         frame = pd.DataFrame(columns).reset_index().rename(columns=str.capitalize)
         counts = ", ".join(f"{n} {severity}" for severity, n in audit["severity"].value_counts(sort=False).items())
-        caption = f"{counts}; counted by check."
-        yield _block(name, "Data audit", caption, frame, "audit.csv", "audit", at_lines=False)
-
-
-def _block(
-    report: str,
-    title: str,
-    caption: str,
-    frame: pd.DataFrame,
-    file: str,
-    key: str = "",
-    *,
-    at_lines: bool = True,
-    unfolded: bool = False,
-) -> dict[str, Any]:
-    """A table under its heading; nothing where it has no row."""
-    if not len(frame):
-        return {}
-    file = f"{report}/{file}"
-    words = {"key": f"{report}-{key}", "title": title, "caption": caption, "file": file, "open": unfolded}
-    return {**words, "html": draw_table(frame, title, file, at_lines)}
+        found.append(("Data audit", f"{counts}; counted by check.", frame, "audit.csv", "audit"))
+    smoke = report.provenance["scale"] == "smoke"
+    unfolded = {table.key for table in TABLES if not (table.folded or smoke)}
+    return [
+        {
+            "key": f"{report.name}-{key}",
+            "title": title,
+            "caption": caption,
+            "file": f"{report.name}/{file}",
+            "open": key in unfolded,
+            # A row of the audit's table stands for many lines of the file.
+            "html": draw_table(frame, title, f"{report.name}/{file}", at_lines=key != "audit"),
+        }
+        for title, caption, frame, file, key in found
+        if len(frame)
+    ]
 
 
 def _speed(folder: Path, gaps: list[Gap]) -> Iterator[dict[str, Any]]:
