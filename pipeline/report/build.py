@@ -80,17 +80,20 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     models = params.cross_validation.models
     found = {name: _read(data / "cross_validation" / name / "out_of_fold.parquet", OutOfFold) for name in models}
     out_of_fold: dict[str, list[OutOfFold]] = {name: records for name, records in found.items() if records}
+    # The heads' classifications of each encoder; then, with the folds of a replicate pooled, the same and what follows
+    # from them by rule.
     by_encoder: dict[int, list[Classification]] = {}
-    said: dict[int, list[Classification]] = {}
+    pooled: dict[int, list[Classification]] = {}
     concluded: dict[int, list[Score]] = {}
     adjectives: dict[str, str] = {}
+    # As the stage `questions` took it.
+    taken = catalogue.asking(params.questions.scenarios).called(params.questions.names)
     for seed in sorted(params.ablation.seeds):
         if classified := _read(data / "encoder" / str(seed) / "classifications.parquet", Classification):
             asked = read_jsonl(data / "questions" / str(seed) / "evaluation.jsonl", Question)
-            taken = catalogue.asking(params.questions.scenarios).called(params.questions.names)
             replicate = params.split.replicate_of(seed)
             by_encoder[seed] = classified
-            said.setdefault(replicate, []).extend(classified)
+            pooled.setdefault(replicate, []).extend(classified)
             concluded.setdefault(replicate, []).extend(conclude(asked, classified, taken))
             named = {q.question_id: TASKS[q.task].adjective(q, catalogue) for q in asked}
             adjectives |= {question: word for question, word in named.items() if word}
@@ -100,7 +103,7 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     sources = vision_models(root / EXTERNAL / params.report_name).values()
     origin["vision"] = [s.model_dump(mode="json") for s in sources if (s.model, s.shown) in rated]
     neighbours, maps = embedded(params, data, catalogue)
-    scores = score_rows(graded, catalogue, said, out_of_fold, vision, concluded, neighbours, adjectives)
+    scores = score_rows(graded, catalogue, pooled, out_of_fold, vision, concluded, neighbours, adjectives)
     write_csv(folder / "scores.csv", ScoreRow, scores)
     write_csv(folder / "effects.csv", EffectRow, effect_rows(graded, catalogue, concluded))
     candidates = candidate_rows(out_of_fold, BASELINE)
@@ -112,7 +115,7 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     write_csv(folder / "audit.csv", Finding, read_csv(audit, Finding) if audit.is_file() else [])
     frames = {
         "dataset.csv": dataset_frame(catalogue, videos, splits),
-        "confusion.csv": confusion_frame(said, catalogue),
+        "confusion.csv": confusion_frame(pooled, catalogue),
         "described.csv": described_frame(by_encoder, params, data, catalogue),
         "curves.csv": curves_frame(data, params.ablation),
         "map.csv": maps,
@@ -156,12 +159,12 @@ def finish_report(folder: Path) -> dict[str, float]:
     return metrics
 
 
-def confusion_frame(said: dict[int, list[Classification]], catalogue: Catalogue) -> pd.DataFrame:
-    """What the heads say of test videos: a row a seed, video and property."""
+def confusion_frame(by_seed: Mapping[int, Sequence[Classification]], catalogue: Catalogue) -> pd.DataFrame:
+    """Rated and predicted class of test videos by the property heads: a row a seed, video and property."""
     levels = {p.name: p.levels for p in catalogue.properties}
     rows = [
         (seed, c.video_id, name, words[c.expected], words[c.predicted])
-        for seed, found in sorted(said.items())
+        for seed, found in sorted(by_seed.items())
         for name, words in levels.items()
         for c in found
         if c.part is Part.TEST and c.property == name

@@ -168,7 +168,10 @@ def left_to_users(reports: Iterable[Report]) -> list[Gap]:
 
 
 def _line(row: dict[str, Any], file: str, index: int, said: str, note: str, **places: float) -> dict[str, Any]:
-    """A figure that is drawn on a line, at places in percent of its width; None where there is none."""
+    """What the template draws of a row: dot, interval and chance, at `places` in percent of the line's width.
+
+    A place that the row lacks is None. `index` is that of the row in its file.
+    """
     found = {name: None if pd.isna(place) else round(float(place), 2) for name, place in places.items()}
     title = task_title(row["task"]).removesuffix(f" ({row['task']})")
     words = {"task": row["task"], "title": title, "source": f"{file}:{index + 2}", "said": said, "note": note}

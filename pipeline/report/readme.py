@@ -105,6 +105,7 @@ def at_random(said: dict[str, Any]) -> bool:
 
 
 def _against_chance(rows: pd.DataFrame, whose: str = "The full system's") -> str:
+    """In which tasks the interval lies above or below chance, and where accuracy is farthest from it."""
     if not len(rows):
         return "No answer of the full system was graded."
     over = rows["accuracy"] - rows["chance"]

@@ -237,7 +237,7 @@ def whole(frame: pd.DataFrame) -> pd.Series[bool]:
 
 
 def _differs(frame: pd.DataFrame, *axes: str) -> pd.Series[bool]:
-    """Variants that are the full system but for these axes; OPD as needed is in none of the paper's tables."""
+    """Variants that are the full system but for these axes. OPD as needed is left out: the paper's tables lack it."""
     same = frame["opd"] != "needed"
     for axis, value in FULL.items():
         same &= (frame[axis] == value) | (axis in axes)
@@ -245,9 +245,10 @@ def _differs(frame: pd.DataFrame, *axes: str) -> pd.Series[bool]:
 
 
 def _variants(*axes: str, described: bool, trained: bool | None = None) -> Select:
-    """Answers of variants that differ in these axes, beside those of vision-only models and, of choices, by rule.
+    """Rows of variants that are the full system but for these axes, and of vision-only models.
 
-    Only descriptions or only choices; with `trained` only of tasks that are trained, or of those that are not.
+    Of descriptions only, or of choices only; choices come with what follows by rule. `trained` keeps only tasks that
+    are trained on, or only those that are not.
     """
 
     def select(frame: pd.DataFrame) -> pd.Series[bool]:
@@ -262,7 +263,8 @@ def _variants(*axes: str, described: bool, trained: bool | None = None) -> Selec
 
 
 def _ablated(axis: str, *, described: bool) -> Select:
-    """Variants that differ in an axis, beside the rules; none where nothing was varied in it."""
+    """Rows of variants that are the full system but for one axis, without vision-only models; none where the run varied
+    nothing in it."""
 
     def select(frame: pd.DataFrame) -> pd.Series[bool]:
         rows = _variants(axis, described=described)(frame) & ~frame["touch"].isin(SHOWN_WORDS)

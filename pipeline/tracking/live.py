@@ -65,7 +65,7 @@ def _curves(run: Stage, store: Store, child: str) -> Any:
     from pipeline.training.trainer import measured
 
     class Curves(TrainerCallback):
-        """Logs the names of history.parquet."""
+        """Logs what history.parquet is to hold, under the same names."""
 
         def on_log(self, args: Any, state: Any, control: Any, logs: Any = None, **more: Any) -> None:
             now = milliseconds(time.time())

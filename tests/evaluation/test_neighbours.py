@@ -10,7 +10,7 @@ from sklearn.neighbors import KNeighborsClassifier
 from pipeline.core.records import Assignment, Part
 from pipeline.evaluation.neighbours import map_frame, nearest_neighbours
 from pipeline.evaluation.scores import score_rows
-from tests.tasks.shared import CATALOGUE
+from tests.evaluation.conftest import CATALOGUE
 
 
 def videos(objects: int, each: int) -> list[Assignment]:
