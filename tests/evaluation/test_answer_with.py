@@ -5,13 +5,9 @@ from __future__ import annotations
 import base64
 import io
 import json
-import os
 import re
 import runpy
 import shutil
-import signal
-import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -36,6 +32,7 @@ from tests.closure import ROOT, closure
 from tests.conftest import HUNG, deaf_port
 from tests.fake_run import fake_params, write_run
 
+pytestmark = pytest.mark.slow
 KEY = "sk-a-key-that-nobody-may-see"
 PLACE = Path("external/smoke-scenes/some-maker-sees-1-frames")
 KEPT = (7, 3, 1)
@@ -275,30 +272,19 @@ def test_budget_and_going_on_ask_nothing_twice(project: Path, server: Server) ->
     assert "0 requests" in run(server, "--limit", "0"), "what is known needs no server"
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="kills by a signal")
-def test_a_killed_run_loses_nothing(project: Path, server: Server) -> None:
-    """Killed while the sixth reply is on its way; then half of the fifth's line is lost, too."""
-    process: list[subprocess.Popen[bytes]] = []
-
-    def step(n: int) -> Response:
-        if n == 5:
-            process[0].send_signal(signal.SIGKILL)
-        return right(n)
-
-    server.step = step
-    options = ["--endpoint", server.url, "--model", "some-maker/sees-1", "--input", "frames"]
-    command = [sys.executable, "-c", "from pipeline.cli import main; main()", "answer-with", *options]
-    process.append(subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(ROOT)}))
-    assert process[0].wait(HUNG) == -signal.SIGKILL
+def test_half_a_line_that_a_killed_run_left_is_asked_for_again(project: Path, server: Server) -> None:
+    server.step = right
+    run(server, "--limit", "5")
     cache = PLACE / "cache.jsonl"
     lines = cache.read_bytes().splitlines(keepends=True)
-    assert len(lines) == 5
     cache.write_bytes(b"".join(lines[:4]) + lines[4][: len(lines[4]) // 2])
-    server.step = lambda n: right(n - 2)
-    run(server)
-    assert len(server.bodies) == 6 + 12 - 4
-    assert server.bodies[6:8] == server.bodies[4:6]
+    server.step = lambda n: right(n - 1)
+    assert "8 requests; 10 of 10" in run(server)
+    assert server.bodies[5] == server.bodies[4]
     assert all(s.correct for s in graded())
+    cache.write_bytes(b"{}\n" + cache.read_bytes())
+    assert "line 1" in (said := run(server, status=1))
+    assert said.endswith("remove that line: its question alone is asked again")
 
 
 FAILURES: dict[str, tuple[Step, str]] = {

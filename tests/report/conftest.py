@@ -39,16 +39,6 @@ def effect(part: str = "lora", change: str = "with - without", **other: Any) -> 
     return {"part": part, "change": change, "task": "PC", "measure": "choice", **figures, **counts, **other}
 
 
-def scores_of(*rows: dict[str, Any]) -> pd.DataFrame:
-    frame = pd.DataFrame(list(rows), columns=list(SCORE_COLUMNS))
-    return frame.astype(dict.fromkeys(SCORE_COLUMNS[7:], float))
-
-
-def effects_of(*rows: dict[str, Any]) -> pd.DataFrame:
-    frame = pd.DataFrame(list(rows), columns=list(EFFECT_COLUMNS))
-    return frame.astype(dict.fromkeys(EFFECT_COLUMNS[4:], float))
-
-
 def report(
     scores: Sequence[dict[str, Any]] = (),
     effects: Sequence[dict[str, Any]] = (),
@@ -68,4 +58,7 @@ def report(
     run = {"scale": "small", "command": "dvc repro", "commit": "c" * 40, "changed": False, "python": "3"}
     system = {"encoder": "the base CLIP with visual prompt tuning", "base_models": models, "facts_told": False}
     facts = {**data, **tested, **run, **system, "packages": {"torch": "2"}, "intervals": "", "properties": {}, **said}
-    return Report(Path("reports") / name, scores_of(*scores), effects_of(*effects), published(dataset), facts, {})
+    # Text columns come first, then numbers.
+    score_rows = pd.DataFrame(scores, columns=SCORE_COLUMNS).astype(dict.fromkeys(SCORE_COLUMNS[7:], float))
+    effect_rows = pd.DataFrame(effects, columns=EFFECT_COLUMNS).astype(dict.fromkeys(EFFECT_COLUMNS[4:], float))
+    return Report(Path("reports") / name, score_rows, effect_rows, published(dataset), facts, {})
