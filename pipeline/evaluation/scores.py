@@ -107,7 +107,8 @@ def score_rows(
         adjectives: By question, the adjective that it asks by.
     """
     rows: list[ScoreRow] = []
-    words = adjectives or {}
+    words, heads, embeddings = adjectives or {}, classifications or {}, neighbours or {}
+    # Answers of the language model, and those that follow by rule; of both also each adjective's own.
     for (task, measure), settings in _table(graded, catalogue, concluded or {}).items():
         chance = TASKS[task].chance(catalogue)[measure]
         for setting, runs in settings.items():
@@ -117,6 +118,7 @@ def score_rows(
                 own = {seed: {q: a for q, a in found.items() if words.get(q) == word} for seed, found in runs.items()}
                 if all(own.values()):
                     rows += _rows(own, task=ADJECTIVES, measure=f"{task}: {word}", chance=chance, **named)[-1:]
+    # Vision-only models.
     by_model: dict[tuple[str, ...], dict[int, dict[str, Answer]]] = defaultdict(lambda: defaultdict(dict))
     for g in vision:
         answer = Answer(g.correct, g.objects, g.parsed, g.strict)
@@ -124,27 +126,27 @@ def score_rows(
     for (task, measure, model, shown), runs in by_model.items():
         chance = TASKS[task].chance(catalogue)[measure]
         rows += _rows(runs, task=task, measure=measure, chance=chance, encoder=model, opd=Opd.ALL, touch=shown)
-    chances = TASKS["OPD"].chance(catalogue)  # Heads are asked what a description is.
+    # The property heads, whose chance is that of a description; then the recall of each class.
+    chances = TASKS["OPD"].chance(catalogue)
     classes = [(place, p, level) for place, p in enumerate(catalogue.properties) for level in range(len(p.levels))]
-    heads = {"encoder": Encoder.FINETUNED, "touch": Touch.REAL}
-    said = classifications or {}
+    named = {"encoder": Encoder.FINETUNED, "touch": Touch.REAL}
     for kind, part in ((HEADS, Part.TEST), (VALIDATION_HEADS, Part.VALIDATION)):
-        videos = {seed: _videos(records, part) for seed, records in said.items()}
+        videos = {seed: _videos(records, part) for seed, records in heads.items()}
         for measure, chance in chances.items():
             runs = {seed: found[measure] for seed, found in videos.items() if measure in found}
-            rows += _rows(runs, task=kind, measure=measure, chance=chance, **heads)
+            rows += _rows(runs, task=kind, measure=measure, chance=chance, **named)
     for _, p, level in classes:
-        # Recall: the accuracy on the videos whose rated class is this one.
-        rated = {seed: [c for c in records if c.expected == level] for seed, records in said.items()}
+        rated = {seed: [c for c in records if c.expected == level] for seed, records in heads.items()}
         videos = {seed: _videos(records, Part.TEST) for seed, records in rated.items()}
         runs = {seed: found[p.name] for seed, found in videos.items() if p.name in found}
-        rows += _rows(runs, task=RECALL, measure=f"{p.name}: {p.levels[level]}", chance=chances[p.name], **heads)
-    for kind, by_name in ((CROSS_VALIDATION, out_of_fold or {}), (NEIGHBOURS, neighbours or {})):
+        rows += _rows(runs, task=RECALL, measure=f"{p.name}: {p.levels[level]}", chance=chances[p.name], **named)
+    # Encoders by cross-validation and by nearest neighbours: only the rows over all repeats.
+    for kind, by_name in ((CROSS_VALIDATION, out_of_fold or {}), (NEIGHBOURS, embeddings)):
         for name, records in by_name.items():
             for place, measure in enumerate(chances):
                 predicted = repeats(records, place if place < len(catalogue.properties) else None)
                 rows += _rows(predicted, task=kind, measure=measure, chance=chances[measure], encoder=name)[-1:]
-    for name, records in (neighbours or {}).items():
+    for name, records in embeddings.items():
         for place, p, level in classes:
             predicted = repeats([r for r in records if r.expected[place] == level], place)
             measure = f"{p.name}: {p.levels[level]}"

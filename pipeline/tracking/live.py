@@ -30,7 +30,19 @@ def live(run: Stage) -> Iterator[list[Any]]:
     store, child, monitor = begun
     status = "FAILED"
     try:
-        yield [_curves(run, store, child)]
+        from transformers import TrainerCallback
+
+        from pipeline.training.trainer import measured
+
+        class Curves(TrainerCallback):
+            """Logs what history.parquet is to hold, under the same names."""
+
+            def on_log(self, args: Any, state: Any, control: Any, logs: Any = None, **more: Any) -> None:
+                now = milliseconds(time.time())
+                points = [(name, value, now, state.global_step) for name, value in measured(logs or {}).items()]
+                attempt(tracking, store.log, child, points)
+
+        yield [Curves()]
         status = "FINISHED"
     except KeyboardInterrupt:
         status = "KILLED"
@@ -41,6 +53,7 @@ def live(run: Stage) -> Iterator[list[Any]]:
 
 
 def _begin(run: Stage) -> tuple[Store, str, Any]:
+    """Begin the stage's run below this folder's reproduction, and the watch on the machine's load."""
     store = Store(run.params.tracking)
     from mlflow.system_metrics.system_metrics_monitor import SystemMetricsMonitor
 
@@ -57,19 +70,3 @@ def _begin(run: Stage) -> tuple[Store, str, Any]:
     monitor = SystemMetricsMonitor(child, tracking_uri=store.uri)
     monitor.start()
     return store, child, monitor
-
-
-def _curves(run: Stage, store: Store, child: str) -> Any:
-    from transformers import TrainerCallback
-
-    from pipeline.training.trainer import measured
-
-    class Curves(TrainerCallback):
-        """Logs what history.parquet is to hold, under the same names."""
-
-        def on_log(self, args: Any, state: Any, control: Any, logs: Any = None, **more: Any) -> None:
-            now = milliseconds(time.time())
-            points = [(name, value, now, state.global_step) for name, value in measured(logs or {}).items()]
-            attempt(run.params.tracking, store.log, child, points)
-
-    return Curves()
