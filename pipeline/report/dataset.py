@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from statistics import fmean, median
 from typing import Any
@@ -11,11 +11,12 @@ from typing import Any
 import pandas as pd
 
 from pipeline.core.records import Assignment, Part, Video
-from pipeline.report.load import published
+from pipeline.report.load import published, read_frame
 from pipeline.videos.catalogue import Catalogue
 
 SPLIT_PARTS = (Part.TRAIN, Part.VALIDATION, Part.TEST)
 COLUMNS = ("table", "row", "objects", "with_videos", "train", "validation", "test", "frames", "published")
+AUDIT = ("check", "item", "measured", "expected", "severity")
 AGREEMENT = "agreement, ICC(3,k)"
 """What the audit calls its check of the annotators."""
 TITLES = {
@@ -71,20 +72,33 @@ def dataset_frame(
     return pd.DataFrame(rows, columns=list(COLUMNS)).astype(dict.fromkeys(COLUMNS[2:7], "Int64"))
 
 
-def dataset_tables(folder: Path, dataset: str) -> dict[str, pd.DataFrame]:
-    """The tables of a report's dataset.csv and audit.csv, where there are such, by title: text in every cell."""
-    tables = {}
+def dataset_tables(folder: Path, dataset: str) -> Iterator[tuple[str, str, pd.DataFrame, str]]:
+    """The tables of a report's dataset.csv and audit.csv, where there are such: text in every cell.
+
+    Yields:
+        Title, caption, table and the name of its file.
+    """
     if (folder / "dataset.csv").is_file():
         frame = pd.read_csv(folder / "dataset.csv", dtype=str).fillna("")
         for key, rows in frame.groupby("table", sort=False):
             shown = rows.drop(columns="table").loc[:, lambda f: (f != "").any()]
-            tables[TITLES[str(key)]] = shown.rename(columns=lambda c: HEADINGS.get(c, c.capitalize()))
-    if (folder / "audit.csv").is_file():
-        found = pd.read_csv(folder / "audit.csv", dtype=str).fillna("")
-        rows = found[found["check"] == AGREEMENT]
+            yield TITLES[str(key)], "", shown.rename(columns=lambda c: HEADINGS.get(c, c.capitalize())), "dataset.csv"
+    audit = read_frame(folder / "audit.csv", AUDIT)
+    rows = audit[audit["check"] == AGREEMENT]
+    if len(rows):
         printed = published(dataset)
         values = printed[printed["task"] == "annotator_agreement"].set_index("measure")["value"].map("{:.3f}".format)
-        if len(rows):
-            shown = {"": rows["item"], "Measured": rows["measured"], "Published": rows["item"].map(values)}
-            tables[TITLES["annotator_agreement"]] = pd.DataFrame(shown).dropna(axis="columns", how="all")
-    return tables
+        shown = pd.DataFrame(
+            {"": rows["item"], "Measured": rows["measured"].astype(str), "Published": rows["item"].map(values)}
+        )
+        yield TITLES["annotator_agreement"], "", shown.dropna(axis="columns", how="all"), "audit.csv"
+    if len(audit):
+        # Counted by check, with what needs attention first.
+        rank = {"error": 0, "warning": 1, "info": 2}
+        audit = audit.sort_values("severity", key=lambda s: s.map(rank).fillna(3), kind="stable")
+        audit["first"] = audit["item"] + ": " + audit["measured"].astype(str)
+        checks = audit.groupby(["severity", "check"], sort=False)["first"]
+        columns = {"Findings": checks.size().astype(str), "The first of them": checks.first()}
+        counts = ", ".join(f"{n} {severity}" for severity, n in audit["severity"].value_counts(sort=False).items())
+        shown = pd.DataFrame(columns).reset_index().rename(columns=str.capitalize)
+        yield "Data audit", f"{counts}; counted by check.", shown, "audit.csv"

@@ -45,7 +45,6 @@ LARGEST = 1_500_000
 SPEED = ("question", "setting", "cost", "unit", "cost_ratio", "error", "error_of", "low", "high", "front")
 STABILITY = ("part", "case", "format", "finite", "error", "bound", "verdict")
 MODELS = ("7b", "13b")
-AUDIT = ("check", "item", "measured", "expected", "severity")
 EXPECTED = ("effects.csv", "audit.csv", "samples.json", "curves.csv", "confusion.csv")
 OLDER = "the report is older than this file: `dvc repro report` at its scale writes it"
 BESIDE = (
@@ -218,20 +217,9 @@ def _blocks(report: Report, gaps: list[Gap]) -> list[dict[str, Any]]:
     for file, title, caption in BESIDE:
         if (report.folder / file).is_file():
             found.append((title, caption, _shown(pd.read_csv(report.folder / file)), file, Path(file).stem))
-    for title, frame in dataset_tables(report.folder, report.provenance["dataset"]).items():
-        file = "audit.csv" if "Measured" in frame else "dataset.csv"
-        found.append((title, "", frame, file, re.split("[:,]", title)[0].replace(" ", "-").lower()))
-    audit = read_frame(report.folder / "audit.csv", AUDIT)
-    if len(audit):
-        # Counted by check, with what needs attention first.
-        rank = {"error": 0, "warning": 1, "info": 2}
-        audit = audit.sort_values("severity", key=lambda s: s.map(rank).fillna(3), kind="stable")
-        audit["first"] = audit["item"] + ": " + audit["measured"].astype(str)
-        checks = audit.groupby(["severity", "check"], sort=False)["first"]
-        columns = {"Findings": checks.size().astype(str), "The first of them": checks.first()}
-        frame = pd.DataFrame(columns).reset_index().rename(columns=str.capitalize)
-        counts = ", ".join(f"{n} {severity}" for severity, n in audit["severity"].value_counts(sort=False).items())
-        found.append(("Data audit", f"{counts}; counted by check.", frame, "audit.csv", "audit"))
+    for title, caption, frame, file in dataset_tables(report.folder, report.provenance["dataset"]):
+        key = "audit" if title == "Data audit" else re.split("[:,]", title)[0].replace(" ", "-").lower()
+        found.append((title, caption, frame, file, key))
     smoke = report.provenance["scale"] == "smoke"
     unfolded = {table.key for table in TABLES if not (table.folded or smoke)}
     return [
