@@ -53,6 +53,13 @@ KINDS = {
     "a soft gel films how an object presses into the gel.",
     Shown.PHOTOS: "In place of each tactile video you see photos of the object that was touched in it.",
 }
+PUBLISHED = {
+    "hardness": ("hard, soft or medium", {"soft": 0, "medium": 1, "hard": 2}),
+    "roughness": ("rough, smooth or medium", {"smooth": 0, "medium": 1, "rough": 2}),
+    "bumpiness": ("having big bumps, small bumps or no bumps", {"no bumps": 0, "small bumps": 1, "big bumps": 2}),
+}
+"""How the paper asks PG-InstructBLIP, which never said "moderately hard" or "slightly rough": what it chooses from, and
+the class of each (its appendix on PG-InstructBLIP's property prediction)."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +91,15 @@ class Reply(Record):
     day: str = Field(default_factory=lambda: datetime.now(UTC).date().isoformat())
 
 
-def ask_all(params: Params, endpoint: Endpoint, shown: Shown, folder: Path, limit: int | None = None) -> str:
+def ask_all(
+    params: Params,
+    endpoint: Endpoint,
+    shown: Shown,
+    folder: Path,
+    limit: int | None = None,
+    *,
+    published: bool = False,
+) -> str:
     """Ask what is not in the cache yet, and write what is answered by now to `external/<report>/<model>-<shown>/`.
 
     Each reply is in the cache before the next request leaves, so a killed run goes on where it was. The chain must
@@ -94,27 +109,38 @@ def ask_all(params: Params, endpoint: Endpoint, shown: Shown, folder: Path, limi
         params: Whose questions, seeds and frames.
         folder: Of the kept frames, or of the photos: for each object `<object>.jpg` or a folder `<object>/`.
         limit: Most requests of this call, not counting what the client sends again; None: no limit.
+        published: Only describe, by the paper's three prompts; the folder's name then ends with -published.
 
     Raises:
-        UserError: where an input is missing, or the endpoint fails (what it said before is kept and written).
+        UserError: where the catalogue has other properties than the published prompts, an input is missing, or the
+            endpoint fails (what it said before is kept and written).
     """
     _check(endpoint)
-    name = re.sub(r"[^\w.-]+", "-", f"{endpoint.model}-{shown}")
+    name = re.sub(r"[^\w.-]+", "-", f"{endpoint.model}-{shown}{'-published' if published else ''}")
     place = EXTERNAL / params.report_name / name
     try:
         with alone(f"answer-with@{name}"):
             files = {seed: DATA / "questions" / str(seed) / "evaluation.jsonl" for seed in params.ablation.seeds}
             asked = {seed: read_jsonl(file, Question) for seed, file in files.items()}
+            if published:
+                asked = {seed: [q for q in questions if q.task == "OPD"] for seed, questions in asked.items()}
             objects = sorted({o for questions in asked.values() for q in questions for o in q.objects})
             most = params.frames.per_video
             show = _frames(folder, most) if shown is Shown.FRAMES else _photos(folder, objects, most)
             catalogue = load_catalogue(Path(params.data.catalogue)).called(params.questions.names)
+            if published and [(p.name, len(p.levels)) for p in catalogue.properties] != [(n, 3) for n in PUBLISHED]:
+                raise UserError(
+                    f"--prompt published: is about {', '.join(PUBLISHED)} alone, of three classes; leave it out"
+                )
             asker, answered = _Asker(endpoint, place / CACHE_FILE, limit), {}
             for seed, questions in asked.items():
                 training = read_jsonl(files[seed].with_name("train.jsonl"), Question)
                 tasks = {q.task for q in questions}
                 told = {t: instruction(catalogue, shown, choose_examples(training, t)) for t in tasks}
-                said = (_answer(q, told[q.task], asker, show) for q in track(questions, name, "question"))
+                said = (
+                    _classify(q, catalogue, asker, show) if published else _answer(q, told[q.task], asker, show)
+                    for q in track(questions, name, "question")
+                )
                 answered[seed] = [prediction for prediction in said if prediction]
             done, total = (sum(map(len, each.values())) for each in (answered, asked))
             if done:
@@ -123,7 +149,7 @@ def ask_all(params: Params, endpoint: Endpoint, shown: Shown, folder: Path, limi
                 # Last: it says of what stands beside it that it belongs to these questions.
                 days = sorted(reply.day for reply in asker.used.values())
                 source = VisionModel(
-                    model=endpoint.model,
+                    model=f"{endpoint.model}, published prompts" if published else endpoint.model,
                     served_as=tuple(sorted({reply.model for reply in asker.used.values()})),
                     endpoint=endpoint.url,
                     temperature=endpoint.temperature,
@@ -203,6 +229,30 @@ def _answer(question: Question, told: str, asker: _Asker, show: Show) -> Predict
         question_id=question.question_id,
         task=question.task,
         outputs=(*(r.text for r in replies), *[""] * unsaid),
+        truncated=any(r.ended == "length" for r in replies),
+        tokens=sum(r.tokens for r in replies),
+    )
+
+
+def _classify(question: Question, catalogue: Catalogue, asker: _Asker, show: Show) -> Prediction | None:
+    """The published prompts about one object, told as a description; what is not one of their classes stays unknown."""
+    ((video, object_id),) = zip(question.videos, question.objects, strict=True)
+    pictures = [{"type": "image_url", "image_url": {"url": url}} for url in show(video, object_id)]
+    told, replies = {}, []
+    for prop in catalogue.properties:
+        choices, classes = PUBLISHED[prop.name]
+        prompt = f"Classify the object as {choices}? Respond unknown if you are not sure. Short answer:"
+        reply = asker.ask([{"role": "user", "content": [*pictures, {"type": "text", "text": prompt}]}])
+        if reply is None:
+            return None
+        replies.append(reply)
+        # One that names two classes has chosen none.
+        named = [level for words, level in classes.items() if re.search(rf"\b{words}\b", reply.text.lower())]
+        told[prop.name] = prop.levels[named[0]] if len(named) == 1 else "unknown"
+    return Prediction(
+        question_id=question.question_id,
+        task=question.task,
+        outputs=(catalogue.language.structured.format(**told),),
         truncated=any(r.ended == "length" for r in replies),
         tokens=sum(r.tokens for r in replies),
     )

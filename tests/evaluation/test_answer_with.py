@@ -242,6 +242,35 @@ def test_frames_and_questions_arrive_whole_and_answers_are_graded(
     assert nobody_wrote_the_key(project)
 
 
+def test_published_prompts_ask_for_one_class_a_property(project: Path, server: Server, catalogue: Catalogue) -> None:
+    # Medium is the middle class; who does not know, or names two, has told no class.
+    told = ["Medium.", "smooth", "unknown", "It is hard", "rough or smooth", "no bumps"]
+    server.step = lambda n: reply(told[n % 6])
+    assert "6 requests; 2 of 2 questions" in run(server, "--prompt", "published")
+    texts = [shown_in(body["messages"][0]["content"])[0] for body in server.bodies[:3]]
+    assert all(len(body["messages"]) == 1 for body in server.bodies)
+    assert texts == [
+        f"{{tactile}}Classify the object as {choices}? Respond unknown if you are not sure. Short answer:"
+        for choices in ("hard, soft or medium", "rough, smooth or medium", "having big bumps, small bumps or no bumps")
+    ]
+    scores = {(s.question_id, s.measure): s for s in graded()}
+    read = [{p.name: scores[q.question_id, p.name] for p in catalogue.properties} for q in asked() if q.task == "OPD"]
+    assert {s.model for s in scores.values()} == {"some-maker/sees-1, published prompts"}
+    assert [[s.parsed for s in found.values()] for found in read] == [[True, True, False], [True, False, True]]
+    first, second = (catalogue.labels(q.objects[0]) for q in asked() if q.task == "OPD")
+    assert [read[0]["hardness"].correct, read[0]["roughness"].correct] == [first[0] == 1, first[1] == 0]
+    assert [read[1]["hardness"].correct, read[1]["bumpiness"].correct] == [second[0] == 2, second[2] == 0]
+
+
+def test_published_prompts_are_refused_for_another_catalogue(
+    project: Path, server: Server, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = catalogue.model_copy(update={"properties": catalogue.properties[:2]})
+    monkeypatch.setattr("pipeline.evaluation.answer_with.load_catalogue", lambda _: other)
+    assert "--prompt published: is about hardness" in run(server, "--prompt", "published", status=1)
+    assert not server.bodies
+
+
 def test_instruction_names_every_class_and_only_its_own_example(project: Path, catalogue: Catalogue) -> None:
     training = read_jsonl(Path("data/questions/0/train.jsonl"), Question)
     (example,) = choose_examples(training, "PSS")
