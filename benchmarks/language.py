@@ -27,7 +27,7 @@ from pipeline.core.embeddings import FLIPS, EmbeddingStore
 from pipeline.core.io import save_tensors, write_table
 from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Assignment, Embedding, Opd, Part, Question
 from pipeline.core.runtime import DtypeName, seed_everything
-from pipeline.encoder.model import base_encoder
+from pipeline.encoder.clip import base_encoder
 from pipeline.language.conversations import ConversationDataset, UpdateSampler, collate
 from pipeline.language.generate import answer
 from pipeline.language.octopi import OctopiForCausalLM

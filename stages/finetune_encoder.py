@@ -7,7 +7,7 @@ from pipeline.core.records import Assignment, Classification, Measurement, Part
 from pipeline.core.runtime import resolve_device
 from pipeline.core.stage import DATA, matrix_key, stage
 from pipeline.encoder.clips import EncoderData, classify
-from pipeline.encoder.finetune import finetune, write_encoder_card
+from pipeline.encoder.finetune import Training, finetune, write_encoder_card
 from pipeline.tracking.live import live
 from pipeline.training.trainable import save_trainable
 from pipeline.videos.catalogue import load_catalogue
@@ -30,14 +30,8 @@ def main() -> None:
         inputs = [DATA / "frames" / name for name in (TABLE_FILE, REFERENCES_FILE)] + [split]
         inputs += backbone_files(params.encoder)
         with live(run) as callbacks:
-            model, history = finetune(
-                data,
-                params.encoder,
-                params.runtime,
-                seed=params.seed + seed,
-                inputs=inputs,
-                callbacks=callbacks,
-            )
+            training = Training(data, params.encoder, params.runtime, params.seed + seed, inputs, callbacks)
+            model, history = finetune(training)
         device = resolve_device(params.runtime.device)
         classified = classify(model, data, [Part.VALIDATION, Part.TEST], params.encoder.batch_size, device)
         out = DATA / "encoder" / str(seed)

@@ -14,6 +14,7 @@ from pipeline.config import PRETRAINED, EncoderConfig, Recipe, RuntimeConfig
 from pipeline.core.io import write_table
 from pipeline.core.records import Assignment, Frame, Part
 from pipeline.encoder.clips import EncoderData
+from pipeline.encoder.finetune import Training
 from pipeline.encoder.frame_classifier import FittedHeads
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.training.trainable import save_trainable
@@ -73,6 +74,11 @@ def config(weights: Path, recipe: Recipe, **changes: object) -> EncoderConfig:
             **changes,
         }
     )
+
+
+def training(data: EncoderData, setting: EncoderConfig, seed: int = 0, **more: Any) -> Training:
+    """A training on the CPU that depends on no other file."""
+    return Training(data, setting, CPU, seed, (), **more)
 
 
 def write_pretrained(seed: int = 0) -> SceneEncoder:

@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 
 from pipeline.cli import app
 from pipeline.core.errors import UserError
-from pipeline.encoder.vpt import VisualPrompts
+from pipeline.encoder.clip import VisualPrompts
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.scales import compose
 from pipeline.scales.cost import Hours, costs, measured_rate, work

@@ -1,16 +1,35 @@
-"""Loading of CLIP's visual tower from a folder in open_clip's own format, never from a hub."""
+"""The backbone `clip`, and the paper's recipe: CLIP's visual tower with visual prompts, and a linear head a property.
+
+Visual prompt tuning is the deep variant (Jia et al. 2022, arXiv 2203.12119) on an unmodified open_clip tower: at each
+transformer layer P learnable tokens join the sequence; what the layer before made of its own prompts is thrown away.
+The paper adds "a shared linear layer": each prompt passes through one linear map common to all layers. The published
+code has no such map, draws its prompts from N(0, .02), and puts the first layer's in before the tower's first
+normalisation.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+from functools import partial
+from math import prod
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from pipeline.config import EncoderConfig
 from pipeline.core.errors import UserError
 from pipeline.core.io import read_json
+from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
 from pipeline.weights import CLIP_CONFIG, GET_CLIP, check_finite, frame_side
 
 if TYPE_CHECKING:
     from open_clip.transformer import VisionTransformer
+
+PUBLISHED_DEVIATION = 0.02
 
 
 def load_visual_tower(folder: Path, embedding: str = "projected") -> VisionTransformer:
@@ -49,3 +68,111 @@ def load_visual_tower(folder: Path, embedding: str = "projected") -> VisionTrans
     if embedding == "class_token":
         visual.proj = None
     return visual
+
+
+class VisualPrompts(nn.Module):
+    """P prompts for each of L layers, and the hooks that put them there.
+
+    Args:
+        layers: L: the transformer's depth, or fewer; then the last prompts go on through the layers behind.
+        count: P, prompts a layer.
+        width: Length of a token.
+        patch_area: Pixels in a patch, times channels; sets the spread of the initial values as in VPT's code.
+        shared: Whether all prompts pass through one linear map (the paper), or are as the published code has them.
+    """
+
+    def __init__(self, layers: int, count: int, width: int, patch_area: int, *, shared: bool = True) -> None:
+        super().__init__()
+        self.prompts = nn.Parameter(torch.empty(layers, count, width))
+        self.shared: nn.Linear | None = None
+        if shared:
+            bound = math.sqrt(6.0 / (patch_area + width))
+            nn.init.uniform_(self.prompts, -bound, bound)
+            self.shared = nn.Linear(width, width)
+            nn.init.kaiming_normal_(self.shared.weight, a=0, mode="fan_out")
+            nn.init.zeros_(self.shared.bias)
+        else:
+            nn.init.normal_(self.prompts, std=PUBLISHED_DEVIATION)
+
+    def attach(self, visual: nn.Module) -> None:
+        """Hook into `visual.transformer.resblocks`: tokens enter as batch x sequence x width and leave as they came."""
+        blocks = cast(nn.ModuleList, visual.get_submodule("transformer.resblocks"))
+        count, first_norm = self.prompts.shape[1], visual.get_submodule("ln_pre")
+
+        def insert(index: int, _: nn.Module, inputs: tuple[torch.Tensor, ...]) -> tuple[torch.Tensor, ...]:
+            tokens, *rest = inputs
+            if index > 0:
+                tokens = tokens[:, :-count]
+            prompts = self.prompts[index]
+            if self.shared is not None:
+                prompts = self.shared(prompts)
+            elif index == 0:
+                prompts = first_norm(prompts)
+            return (torch.cat([tokens, prompts.to(tokens.dtype).expand(len(tokens), -1, -1)], dim=1), *rest)
+
+        for index, block in enumerate(blocks[: len(self.prompts)]):
+            block.register_forward_pre_hook(partial(insert, index))
+        blocks[-1].register_forward_hook(lambda _, __, output: output[:, :-count])
+
+
+class TactileEncoder(FrameEncoder):
+    """CLIP's frozen visual tower, with visual prompts or (the base encoder) without, read as CLIP reads it.
+
+    Args:
+        tower: The tower; it takes frames of its own side or larger ones, which are averaged over areas.
+        prompts: Prompts for it, not yet attached.
+    """
+
+    def __init__(self, tower: VisionTransformer, prompts: VisualPrompts | None = None) -> None:
+        super().__init__(tower.transformer.width if tower.proj is None else tower.proj.shape[1])
+        self.visual = tower
+        self.mean: torch.Tensor
+        self.std: torch.Tensor
+        for name in ("mean", "std"):
+            value = torch.tensor(tower.preprocess_cfg[name]).view(1, 3, 1, 1)
+            self.register_buffer(name, value, persistent=False)
+        self.prompts = prompts
+        if prompts is not None:
+            prompts.attach(self.visual)
+
+    def train(self, mode: bool = True) -> TactileEncoder:
+        """The backbone stays in evaluation mode: frozen means that it behaves the same in training."""
+        super().train(mode)
+        self.visual.eval()
+        return self
+
+    def forward(self, frames: torch.Tensor, frame_indices: torch.Tensor) -> torch.Tensor:
+        """CLIP's own embeddings: float32, batch x dim, of frames, uint8, batch x side x side x RGB."""
+        return cast(torch.Tensor, self.visual(self.pixels(frames)))
+
+    def pixels(self, frames: torch.Tensor) -> torch.Tensor:
+        """Frames as the tower takes them: batch x 3 x side x side, normalised."""
+        pixels = frames.permute(0, 3, 1, 2).to(self.mean.dtype) / 255
+        if pixels.shape[-1] != self.visual.image_size[0]:
+            pixels = F.interpolate(pixels, self.visual.image_size, mode="area")
+        return (pixels - self.mean) / self.std
+
+
+def load_backbone(config: EncoderConfig, *, tuned: bool) -> TactileEncoder:
+    """The backbone `clip`: open_clip's ViT in `encoder.weights`; fine-tuning changes prompts of its own."""
+    tower = load_visual_tower(Path(config.weights), config.embedding)
+    return TactileEncoder(tower, visual_prompts(config, tower, shared=True) if tuned else None)
+
+
+def base_encoder(config: EncoderConfig) -> TactileEncoder:
+    """The base of the recipe `paper`: CLIP as it comes."""
+    return load_backbone(config, tuned=False)
+
+
+def property_classifier(config: EncoderConfig, classes: Sequence[int]) -> PropertyClassifier:
+    """The recipe `paper`: CLIP with visual prompts that pass one shared linear map, and one linear head a property."""
+    encoder = load_backbone(config, tuned=True)
+    return PropertyClassifier(encoder, Heads(encoder.dim, classes), classes)
+
+
+def visual_prompts(config: EncoderConfig, tower: VisionTransformer, *, shared: bool) -> VisualPrompts:
+    """Fresh prompts that fit the tower, at as many of its layers as `encoder.prompt_layers` says (0: all)."""
+    deep = len(tower.transformer.resblocks)
+    layers = min(deep, config.prompt_layers or deep)
+    # A patch has its pixels times three channels.
+    return VisualPrompts(layers, config.prompts, tower.transformer.width, 3 * prod(tower.patch_size), shared=shared)

@@ -13,12 +13,15 @@ from torch.nn import functional as F
 from torch.utils.data import DataLoader
 
 from pipeline.core.errors import UserError
-from pipeline.core.records import Assignment, Classification, Part
+from pipeline.core.records import Assignment, Classification, Flip, Part
 from pipeline.core.runtime import derive_seed
 from pipeline.encoder.model import FrameEncoder, PropertyClassifier
 from pipeline.training.sampling import EpochDataset, sample_evaluation, sample_training
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
+
+AXES: dict[Flip, tuple[int, ...]] = {"none": (), "horizontal": (2,), "vertical": (1,), "both": (1, 2)}
+"""Axes of frames x height x width that a flip reverses."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +40,7 @@ class ClipDataset(EpochDataset[dict[str, torch.Tensor]]):
     Args:
         per_video: k, frames a clip.
         seed: Of the draws; None gives the evaluation clip (uniform intervals, no flips).
-        flip_probability: Chance of a horizontal and, independently, of a vertical flip of the whole clip.
+        flip_probability: As `draw_flip` takes it.
     """
 
     def __init__(
@@ -50,11 +53,8 @@ class ClipDataset(EpochDataset[dict[str, torch.Tensor]]):
         flip_probability: float = 0.0,
     ) -> None:
         super().__init__()
-        self.store = store
-        self.videos = videos
-        self.per_video = per_video
-        self.seed = seed
-        self.flip_probability = flip_probability
+        self.store, self.videos, self.per_video = store, videos, per_video
+        self.seed, self.flip_probability = seed, flip_probability
 
     def __len__(self) -> int:
         return len(self.videos)
@@ -62,23 +62,25 @@ class ClipDataset(EpochDataset[dict[str, torch.Tensor]]):
     def __getitem__(self, index: int) -> dict[str, torch.Tensor]:
         video = self.videos[index]
         rows = self.store.rows(video.video_id)
-        flips: tuple[int, ...] = ()
+        flip: Flip = "none"
         if self.seed is None:
             positions = sample_evaluation(len(rows), self.per_video)
         else:
             rng = random.Random(derive_seed(self.seed, self.epoch, video.video_id))
             positions = sample_training(len(rows), self.per_video, rng)
-            # Axes of frames x height x width: 2 mirrors left and right, 1 top and bottom.
-            flips = tuple(axis for axis in (2, 1) if rng.random() < self.flip_probability)
-        frames = self.store.pictures(video.video_id, positions)
-        frames = np.flip(frames, flips) if flips else frames
+            flip = draw_flip(rng, self.flip_probability)
+        frames = np.flip(self.store.pictures(video.video_id, positions), AXES[flip])
         return {
             "frames": torch.from_numpy(np.ascontiguousarray(frames)),
-            "frame_indices": torch.tensor(
-                [self.store.index[rows[p]].frame_index for p in positions], dtype=torch.int64
-            ),
-            "labels": torch.tensor(video.labels, dtype=torch.int64),
+            "frame_indices": torch.tensor([self.store.index[rows[p]].frame_index for p in positions]),
+            "labels": torch.tensor(video.labels),
         }
+
+
+def draw_flip(rng: random.Random, probability: float) -> Flip:
+    """Draw a horizontal and, independently, a vertical flip of a clip, each with this probability."""
+    across, down = (rng.random() < probability for _ in range(2))
+    return tuple(AXES)[across + 2 * down]
 
 
 @dataclass(frozen=True)

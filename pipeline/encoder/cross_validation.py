@@ -19,11 +19,11 @@ from pipeline.core.io import code_of, fingerprint, read_json, write_json
 from pipeline.core.records import Assignment, OutOfFold, Part, Video
 from pipeline.core.runtime import CHECKPOINTS, derive_seed, limit_threads, progress, resolve_device
 from pipeline.encoder.clips import EncoderData, classify, describe_clips
-from pipeline.encoder.finetune import finetune
+from pipeline.encoder.finetune import Training, finetune
 from pipeline.encoder.folds import Fold, Labels, Predict, cross_validate, deal
 from pipeline.encoder.frame_classifier import choose_strength, fit_frame_heads
 from pipeline.encoder.model import SideBySide, load_backbones
-from pipeline.encoder.tuned import FLIPS, Trunks, base_encoder, run_trunks
+from pipeline.encoder.tuned import Trunks, base_encoder, run_trunks
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import REFERENCES_FILE, TABLE_FILE, FrameStore
 from pipeline.weights import backbone_files
@@ -152,8 +152,8 @@ def _tuned(data: CrossValidationData) -> Predict:
         """The frozen part has seen no label, so it is run once for all folds; where a fold is left to compute."""
         if data.encoder.recipe != "tuned":
             return None
-        every, flips = data.clips({}), len(FLIPS) if data.encoder.flip_probability else 1
-        return run_trunks(base_encoder(data.encoder), every, every.videos(Part.UNUSED), device, flips=flips)
+        every, mirrored = data.clips({}), data.encoder.flip_probability > 0
+        return run_trunks(base_encoder(data.encoder), every, every.videos(Part.UNUSED), device, mirrored=mirrored)
 
     def predict(fold: Fold) -> Labels:
         seed = derive_seed("gradient", fold.repeat, fold.number) % 2**31
@@ -161,7 +161,7 @@ def _tuned(data: CrossValidationData) -> Predict:
         chosen = deal(trained, min(VALIDATION, len(trained)), seed)[0] if len(trained) > 1 else ()
         parts = dict.fromkeys(owners[fold.tested].tolist(), Part.TEST) | dict.fromkeys(trained, Part.TRAIN)
         clips = data.clips(parts | dict.fromkeys(chosen, Part.VALIDATION))
-        model, _ = finetune(clips, data.encoder, data.runtime, seed=seed, inputs=data.files, trunks=trunks())
+        model, _ = finetune(Training(clips, data.encoder, data.runtime, seed, data.files), trunks())
         found = classify(model, clips, [Part.TEST], data.encoder.batch_size, device)
         # Records come property by property, each over all tested videos in their order.
         return np.array([record.predicted for record in found]).reshape(len(data.classes), -1).T

@@ -18,6 +18,7 @@ from pipeline.core.errors import UserError
 from pipeline.core.parallel import run_with
 from pipeline.core.records import Assignment, Embedding, Flip, Part
 from pipeline.core.runtime import DeviceName, derive_seed, resolve_device
+from pipeline.encoder.clips import AXES
 from pipeline.encoder.folds import Labels, deal
 from pipeline.encoder.frame_classifier import FOLDS, Clips, choose_strength, fit_frame_heads
 from pipeline.encoder.model import FrameEncoder
@@ -26,8 +27,6 @@ from pipeline.training.trainable import load_trainable
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.frames.store import FrameStore
 
-AXES: dict[Flip, tuple[int, ...]] = {"none": (), "horizontal": (2,), "vertical": (1,), "both": (1, 2)}
-"""Axes of frames x height x width that a flip reverses."""
 PART = 2**16
 """Rows whose statistics are taken at a time."""
 

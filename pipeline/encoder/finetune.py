@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -21,11 +22,11 @@ from pipeline.config import EncoderConfig, RuntimeConfig
 from pipeline.core.card import write_card
 from pipeline.core.records import Measurement, Part
 from pipeline.core.runtime import resolve_device, seed_everything
-from pipeline.encoder.clips import ClipDataset, EncoderData
+from pipeline.encoder.clips import ClipDataset, EncoderData, check_finite
 from pipeline.encoder.frame_classifier import JointFrameClassifier, choose_strength, fit_frame_heads
 from pipeline.encoder.model import PropertyClassifier, SideBySide
 from pipeline.encoder.recipes import property_classifier
-from pipeline.encoder.tuned import FLIPS, AboveTrunks, TrunkDataset, Trunks, run_trunks
+from pipeline.encoder.tuned import TrunkDataset, Trunks, run_trunks
 from pipeline.training.sampling import EpochDataset
 from pipeline.training.trainable import trainable_state
 from pipeline.videos.catalogue import Catalogue
@@ -38,49 +39,43 @@ COMBINED = "validation_combined"
 """The measure that chooses the epoch."""
 
 
-def finetune(
-    data: EncoderData,
-    config: EncoderConfig,
-    runtime: RuntimeConfig,
-    *,
-    seed: int,
-    inputs: Sequence[Path],
-    callbacks: Sequence[TrainerCallback] = (),
-    trunks: Trunks | None = None,
-) -> tuple[PropertyClassifier, list[Measurement]]:
+@dataclass(frozen=True)
+class Training:
+    """All that a training depends on."""
+
+    data: EncoderData
+    config: EncoderConfig
+    runtime: RuntimeConfig
+    seed: int
+    inputs: Sequence[Path]
+    """Files that a training by gradients depends on, for its checkpoints' fingerprint."""
+    callbacks: Sequence[TrainerCallback] = ()
+    """Further callbacks for its Trainer, such as tracking."""
+
+
+def finetune(training: Training, trunks: Trunks | None = None) -> tuple[PropertyClassifier, list[Measurement]]:
     """Train the classifier of the recipe.
 
     Args:
-        inputs: Files that a training by gradients depends on, for its checkpoints' fingerprint.
-        callbacks: Further callbacks for its Trainer, such as tracking.
         trunks: Of the recipe `tuned`, where they have been run over these videos before.
 
     Returns:
         The classifier, and its training's curve.
     """
-    seed_everything(seed)
+    data, config = training.data, training.config
+    seed_everything(training.seed)
     model = property_classifier(config, data.classes)
-    if isinstance(model, JointFrameClassifier):
-        if trunks is None:
-            assert isinstance(model.encoder, SideBySide)
-            videos = [*data.videos(Part.TRAIN), *data.videos(Part.VALIDATION)]
-            flips = len(FLIPS) if config.flip_probability else 1
-            trunks = run_trunks(model.encoder, data, videos, resolve_device(runtime.device), flips=flips)
-        return model, tune(model, trunks, data, config, runtime, seed=seed, inputs=inputs, callbacks=callbacks)
-    return model, train_classifier(model, data, config, runtime, seed=seed, inputs=inputs, callbacks=callbacks)
+    if not isinstance(model, JointFrameClassifier):
+        return model, train_classifier(model, training)
+    if trunks is None:
+        assert isinstance(model.encoder, SideBySide)
+        videos = [*data.videos(Part.TRAIN), *data.videos(Part.VALIDATION)]
+        device = resolve_device(training.runtime.device)
+        trunks = run_trunks(model.encoder, data, videos, device, mirrored=config.flip_probability > 0)
+    return model, tune(model, training, trunks)
 
 
-def tune(
-    model: JointFrameClassifier,
-    trunks: Trunks,
-    data: EncoderData,
-    config: EncoderConfig,
-    runtime: RuntimeConfig,
-    *,
-    seed: int,
-    inputs: Sequence[Path | str],
-    callbacks: Sequence[TrainerCallback] = (),
-) -> list[Measurement]:
+def tune(model: JointFrameClassifier, training: Training, trunks: Trunks) -> list[Measurement]:
     """Fit the heads, then tune them and what is unfrozen of the encoder; the best epoch is kept (ties: the first).
 
     The fitted heads are epoch 0. Without validation videos nothing would show that tuning helps, and they are kept.
@@ -88,22 +83,33 @@ def tune(
     Args:
         trunks: Of the training and validation videos, with all flips where `encoder.flip_probability` is above 0.
     """
-    device, above = resolve_device(runtime.device), AboveTrunks(model)
-    training, validation = data.videos(Part.TRAIN), data.videos(Part.VALIDATION)
+    data, device, encoder = training.data, resolve_device(training.runtime.device), model.encoder
+    assert isinstance(encoder, SideBySide)
+    model.to(device)
     owners = {a.video_id: a.object_id for a in data.assignments}
-    features, labels = above.describe(trunks, training, device), np.array([v.labels for v in training])
-    fitted = (features, labels, [owners[v.video_id] for v in training], data.classes)
-    strength, curve = choose_strength(*fitted, seed)
+
+    @torch.inference_mode()
+    def described(part: Part) -> tuple[torch.Tensor, npt.NDArray[np.int64], list[str]]:
+        """Features of the part's evaluation clips, videos x frames x dim, with labels and objects."""
+        videos = data.videos(part)
+        rows = [encoder.stages([output.to(device) for output in trunks.of(video.video_id)]) for video in videos]
+        found = torch.stack(rows).float().cpu()
+        check_finite(found.flatten(1), videos)
+        return found, np.array([v.labels for v in videos]), [owners[v.video_id] for v in videos]
+
+    features, labels, objects = described(Part.TRAIN)
+    fitted = (features.numpy(), labels, objects, data.classes)
+    strength, curve = choose_strength(*fitted, training.seed)
     fit_frame_heads(*fitted, strength).copy_into(model)
-    if not validation:
+    if not data.videos(Part.VALIDATION):
         return curve
     probe = {name: value.clone() for name, value in trainable_state(model).items()}
-    logits = above.logits(trunks, validation, device).numpy()
-    reached = accuracies(logits, np.array([v.labels for v in validation]), model.decide, data.catalogue)
+    features, labels, _ = described(Part.VALIDATION)
+    with torch.inference_mode():
+        logits = model.from_features(features.to(device))["logits"].cpu().numpy()
+    reached = accuracies(logits, labels, model.decide, data.catalogue)
     curve += [Measurement(step=0, name=name, value=value) for name, value in sorted(reached.items())]
-    history = train_classifier(
-        model, data, config, runtime, seed=seed, inputs=inputs, callbacks=callbacks, trunks=trunks
-    )
+    history = train_classifier(model, training, trunks)
     if max(m.value for m in history if m.name == COMBINED) <= reached[COMBINED]:
         with torch.no_grad():
             for name, value in trainable_state(model).items():
@@ -111,39 +117,25 @@ def tune(
     return [*curve, *history]
 
 
-def train_classifier(
-    model: PropertyClassifier,
-    data: EncoderData,
-    config: EncoderConfig,
-    runtime: RuntimeConfig,
-    *,
-    seed: int,
-    inputs: Sequence[Path | str],
-    callbacks: Sequence[TrainerCallback] = (),
-    trunks: Trunks | None = None,
-) -> list[Measurement]:
+def train_classifier(model: PropertyClassifier, training: Training, trunks: Trunks | None = None) -> list[Measurement]:
     """Train what is not frozen; the epoch of best combined validation accuracy is kept (ties: the first).
 
     Without validation videos there is nothing to choose by, and the last epoch is kept.
 
     Args:
-        trunks: As `tune` takes them: what lies above them is trained on them, and not the whole on pictures.
+        trunks: As `tune` takes them: the model is shown these, and not the pictures.
     """
-    trained: torch.nn.Module = model
-    show: Callable[..., EpochDataset[Any]]
-    if trunks is None:
-        show = partial(ClipDataset, data.store, per_video=data.per_video)
-    else:
-        assert isinstance(model, JointFrameClassifier)
-        trained, show = AboveTrunks(model), partial(TrunkDataset, trunks)
-    training = show(data.videos(Part.TRAIN), seed=seed, flip_probability=config.flip_probability)
-    chosen = data.videos(Part.VALIDATION)
     # Imported here, since fitted heads need no Trainer, and importing it takes seconds.
-    from pipeline.training.trainer import TrainableTrainer, TrainingMonitor, checkpoint_dir, train, training_arguments
+    from pipeline.training.trainer import TrainableTrainer, checkpoint_dir, train, training_arguments
 
+    data, config = training.data, training.config
+    show: Callable[..., EpochDataset[Any]] = (
+        partial(ClipDataset, data.store, per_video=data.per_video) if trunks is None else partial(TrunkDataset, trunks)
+    )
+    chosen = data.videos(Part.VALIDATION)
     # By video: a label that was corrected must not go on with what was learnt from the wrong one.
     labelled = repr([(a.video_id, a.part, data.catalogue.labels(a.object_id)) for a in data.assignments])
-    folder = checkpoint_dir("finetune_encoder", config, seed, data.per_video, labelled, *inputs)
+    folder = checkpoint_dir("finetune_encoder", config, training.seed, data.per_video, labelled, *training.inputs)
     # The published code's cosine is as long as one epoch, so that the rate falls to a hundredth and rises again.
     waves = {
         "lr_scheduler_type": "cosine_with_min_lr",
@@ -151,8 +143,8 @@ def train_classifier(
     }
     arguments = training_arguments(
         folder,
-        runtime,
-        seed,
+        training.runtime,
+        training.seed,
         config,
         num_train_epochs=config.epochs,
         bf16=config.autocast == "bfloat16",
@@ -161,7 +153,6 @@ def train_classifier(
         eval_strategy="epoch" if chosen else "no",
         save_strategy="epoch",
         save_total_limit=2,
-        load_best_model_at_end=bool(chosen),
         metric_for_best_model=COMBINED if chosen else None,
         logging_strategy="epoch",
         **(waves if config.recipe == "release" else {}),
@@ -172,13 +163,13 @@ def train_classifier(
         return accuracies(logits, labels, model.decide, data.catalogue)
 
     trainer = TrainableTrainer(
-        model=trained,
+        model=model,
         args=arguments,
-        train_dataset=training,
+        train_dataset=show(data.videos(Part.TRAIN), seed=training.seed, flip_probability=config.flip_probability),
         eval_dataset=show(chosen) if chosen else None,
         data_collator=default_collate,
         compute_metrics=measures,
-        callbacks=[TrainingMonitor(), *callbacks],
+        callbacks=training.callbacks,
     )
     history = train(trainer).history
     shutil.rmtree(folder, ignore_errors=True)

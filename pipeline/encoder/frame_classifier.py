@@ -21,7 +21,7 @@ from pipeline.core.errors import UserError
 from pipeline.core.records import Measurement
 from pipeline.core.runtime import derive_seed
 from pipeline.encoder.folds import Labels, deal
-from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
+from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier, SideBySide
 
 FARTHEST = 5.0
 """Standardised features are held within: one wild frame must not outweigh all others."""
@@ -58,6 +58,27 @@ class JointFrameClassifier(PropertyClassifier):
         self.register_buffer("centre", torch.zeros(encoder.dim))
         self.register_buffer("spread", torch.ones(encoder.dim))
         self.register_buffer("dependence", torch.zeros(tuple(classes)))
+
+    def forward(
+        self,
+        frames: torch.Tensor | None = None,
+        frame_indices: torch.Tensor | None = None,
+        labels: torch.Tensor | None = None,
+        num_items_in_batch: torch.Tensor | int | None = None,
+        outputs: Sequence[torch.Tensor] | None = None,
+    ) -> dict[str, torch.Tensor]:
+        """As any classifier's; or, in place of frames, of what the encoder's trunks made of them.
+
+        Args:
+            outputs: Of each backbone's trunk: batch x frames x what its stage takes.
+        """
+        if outputs is None:
+            assert frames is not None
+            assert frame_indices is not None
+            return super().forward(frames, frame_indices, labels, num_items_in_batch)
+        assert isinstance(self.encoder, SideBySide)
+        features = self.encoder.stages([output.flatten(0, 1) for output in outputs])
+        return self.from_features(features.view(*outputs[0].shape[:2], -1), labels, num_items_in_batch)
 
     def standardise(self, features: torch.Tensor) -> torch.Tensor:
         """Features on the training frames' scale, within `FARTHEST`."""

@@ -1,24 +1,17 @@
-"""Tactile encoders and property classifiers, and the paper's recipe: CLIP with visual prompts and three heads."""
+"""What encoders of frames and classifiers of properties are; their backbones and recipes are modules of their own."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from importlib import import_module
-from math import prod
-from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import torch
 from torch import nn
 from torch.nn import functional as F
 
 from pipeline.config import EncoderConfig
-from pipeline.encoder.clip import load_visual_tower
-from pipeline.encoder.vpt import VisualPrompts
 from pipeline.weights import BACKBONES
-
-if TYPE_CHECKING:
-    from open_clip.transformer import VisionTransformer
 
 
 class FrameEncoder(nn.Module):
@@ -57,44 +50,6 @@ class FrameEncoder(nn.Module):
         """The embedding, batch x dim, from what `trunk` gave."""
         embedded: torch.Tensor = self(entering, torch.zeros(len(entering), dtype=torch.int64, device=entering.device))
         return embedded
-
-
-class TactileEncoder(FrameEncoder):
-    """CLIP's frozen visual tower, with visual prompts or (the base encoder) without, read as CLIP reads it.
-
-    Args:
-        tower: The tower; it takes frames of its own side or larger ones, which are averaged over areas.
-        prompts: Prompts for it, not yet attached.
-    """
-
-    def __init__(self, tower: VisionTransformer, prompts: VisualPrompts | None = None) -> None:
-        super().__init__(tower.transformer.width if tower.proj is None else tower.proj.shape[1])
-        self.visual = tower
-        self.mean: torch.Tensor
-        self.std: torch.Tensor
-        for name in ("mean", "std"):
-            value = torch.tensor(tower.preprocess_cfg[name]).view(1, 3, 1, 1)
-            self.register_buffer(name, value, persistent=False)
-        self.prompts = prompts
-        if prompts is not None:
-            prompts.attach(self.visual)
-
-    def train(self, mode: bool = True) -> TactileEncoder:
-        """The backbone stays in evaluation mode: frozen means that it behaves the same in training."""
-        super().train(mode)
-        self.visual.eval()
-        return self
-
-    def forward(self, frames: torch.Tensor, frame_indices: torch.Tensor) -> torch.Tensor:
-        """CLIP's own embeddings: float32, batch x dim, of frames, uint8, batch x side x side x RGB."""
-        return cast(torch.Tensor, self.visual(self.pixels(frames)))
-
-    def pixels(self, frames: torch.Tensor) -> torch.Tensor:
-        """Frames as the tower takes them: batch x 3 x side x side, normalised."""
-        pixels = frames.permute(0, 3, 1, 2).to(self.mean.dtype) / 255
-        if pixels.shape[-1] != self.visual.image_size[0]:
-            pixels = F.interpolate(pixels, self.visual.image_size, mode="area")
-        return (pixels - self.mean) / self.std
 
 
 class SideBySide(FrameEncoder):
@@ -141,7 +96,6 @@ class Heads(nn.ModuleList):
 class PropertyClassifier(nn.Module):
     """ViFi-CLIP's mean over frames (Rasheed et al. 2023), then the properties' heads."""
 
-    _keys_to_ignore_on_save = None  # read by transformers' Trainer when it reloads a checkpoint
     accepts_loss_kwargs = True  # has Trainer count an update's labels and give them to `forward`
 
     def __init__(self, encoder: FrameEncoder, heads: nn.Module, classes: Sequence[int]) -> None:
@@ -223,28 +177,3 @@ def load_backbones(config: EncoderConfig, *, tuned: bool = False) -> list[FrameE
         UserError: for weights that are missing or do not fit.
     """
     return [import_module(BACKBONES[name].module).load_backbone(config, tuned=tuned) for name in config.backbone]
-
-
-def load_backbone(config: EncoderConfig, *, tuned: bool) -> TactileEncoder:
-    """The backbone `clip`: open_clip's ViT in `encoder.weights`; fine-tuning changes prompts of its own."""
-    tower = load_visual_tower(Path(config.weights), config.embedding)
-    return TactileEncoder(tower, visual_prompts(config, tower, shared=True) if tuned else None)
-
-
-def base_encoder(config: EncoderConfig) -> TactileEncoder:
-    """CLIP as it comes."""
-    return load_backbone(config, tuned=False)
-
-
-def property_classifier(config: EncoderConfig, classes: Sequence[int]) -> PropertyClassifier:
-    """CLIP with visual prompts that pass one shared linear map, and one linear head a property."""
-    encoder = load_backbone(config, tuned=True)
-    return PropertyClassifier(encoder, Heads(encoder.dim, classes), classes)
-
-
-def visual_prompts(config: EncoderConfig, tower: VisionTransformer, *, shared: bool) -> VisualPrompts:
-    """Fresh prompts that fit the tower, at as many of its layers as `encoder.prompt_layers` says (0: all)."""
-    deep = len(tower.transformer.resblocks)
-    layers = min(deep, config.prompt_layers or deep)
-    # A patch has its pixels times three channels.
-    return VisualPrompts(layers, config.prompts, tower.transformer.width, 3 * prod(tower.patch_size), shared=shared)

@@ -19,7 +19,7 @@ from pipeline.core.runtime import derive_seed, seed_everything
 from pipeline.encoder.scene_encoder import SIDE, SceneEncoder
 from pipeline.encoder.synthetic import SyntheticPictures, draw_pictures
 from pipeline.training.sampling import EpochDataset
-from pipeline.training.trainer import TrainableTrainer, TrainingMonitor, checkpoint_dir, train, training_arguments
+from pipeline.training.trainer import TrainableTrainer, checkpoint_dir, train, training_arguments
 from pipeline.videos.frames.subtraction import MIDDLE
 
 HIDDEN = 192
@@ -39,17 +39,15 @@ class PretrainingModel(nn.Module):
     """The encoder with a head that predicts, from single pictures, what is known of invented objects.
 
     Args:
-        quantities: Mean and deviation of each quantity over the pictures, 2 x quantities.
-        kinds: How many flags there are.
+        drawn: What it is trained on: quantities are standardised by their mean and deviation over these.
     """
 
-    _keys_to_ignore_on_save = None  # read by transformers' Trainer when it reloads a checkpoint
-
-    def __init__(self, encoder: SceneEncoder, quantities: torch.Tensor, kinds: int) -> None:
+    def __init__(self, encoder: SceneEncoder, drawn: SyntheticPictures) -> None:
         super().__init__()
         self.encoder = encoder
-        self.scale = quantities
-        outputs = quantities.shape[1] + kinds
+        quantities = drawn.quantities.reshape(-1, drawn.quantities.shape[2])
+        self.scale = torch.from_numpy(np.stack([quantities.mean(axis=0), quantities.std(axis=0) + 1e-6]))
+        outputs = quantities.shape[1] + drawn.kinds.shape[1]
         self.head = nn.Sequential(
             nn.Dropout(0.1), nn.Linear(encoder.dim, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, outputs)
         )
@@ -82,9 +80,7 @@ class PretrainingDataset(EpochDataset[dict[str, torch.Tensor]]):
 
     def __init__(self, drawn: SyntheticPictures, *, augment: bool, seed: int) -> None:
         super().__init__()
-        self.drawn = drawn
-        self.augment = augment
-        self.seed = seed
+        self.drawn, self.augment, self.seed = drawn, augment, seed
 
     def __len__(self) -> int:
         return len(self.drawn.pictures)
@@ -92,8 +88,7 @@ class PretrainingDataset(EpochDataset[dict[str, torch.Tensor]]):
     def __getitem__(self, index: int) -> dict[str, torch.Tensor]:
         pictures = self.drawn.pictures[index]
         if self.augment:
-            rng = np.random.default_rng(derive_seed(self.seed, self.epoch, index))
-            pictures = vary(pictures, rng)
+            pictures = vary(pictures, np.random.default_rng(derive_seed(self.seed, self.epoch, index)))
         return {
             "frames": torch.from_numpy(np.ascontiguousarray(pictures)),
             "quantities": torch.from_numpy(self.drawn.quantities[index]),
@@ -126,11 +121,8 @@ def pretrain(
     shown = repr((config.objects, config.presses, config.seed))
     drawn = draw_pictures(config, frames, checkpoint_dir("pretrain", "pictures", shown, frames.fit, frames.pixels))
     border = len(drawn.pictures) - max(1, round(HELD_OUT * len(drawn.pictures)))
-    training, held = (
-        SyntheticPictures(**{name: rows[part] for name, rows in vars(drawn).items()})
-        for part in (slice(border), slice(border, None))
-    )
-    model = pretraining_model(SceneEncoder(), training)
+    training, held = (SyntheticPictures._make(a[part] for a in drawn) for part in (slice(border), slice(border, None)))
+    model = PretrainingModel(SceneEncoder(), training)
     arguments = training_arguments(
         checkpoint_dir("pretrain", config, frames.fit, frames.pixels),
         runtime,
@@ -147,26 +139,16 @@ def pretrain(
         model=model,
         args=arguments,
         train_dataset=PretrainingDataset(training, augment=config.augment, seed=config.seed),
-        callbacks=[TrainingMonitor(), *callbacks],
+        callbacks=callbacks,
     )
     history = train(trainer).history
     measured = held_out(model.cpu(), PretrainingDataset(held, augment=False, seed=0))
     return model.encoder, [*history, *(Measurement(step=config.steps, name=n, value=v) for n, v in measured.items())]
 
 
-def pretraining_model(encoder: SceneEncoder, drawn: SyntheticPictures) -> PretrainingModel:
-    """The encoder with a head scaled to these pictures."""
-    flat = drawn.quantities.reshape(-1, drawn.quantities.shape[2])
-    scale = torch.from_numpy(np.stack([flat.mean(axis=0), flat.std(axis=0) + 1e-6]))
-    return PretrainingModel(encoder, scale, drawn.kinds.shape[1])
-
-
 @torch.inference_mode()
 def held_out(model: PretrainingModel, data: PretrainingDataset) -> dict[str, float]:
     """Parts of the loss over objects, each a mean."""
     model.eval()
-    parts = []
-    for i in range(len(data)):
-        item = {name: value[None] for name, value in data[i].items()}
-        parts.append({name: float(value) for name, value in model(**item).items()})
-    return {f"held_out_{name}": float(np.mean([p[name] for p in parts])) for name in parts[0]}
+    parts = [model(**{name: value[None] for name, value in data[i].items()}) for i in range(len(data))]
+    return {f"held_out_{name}": float(np.mean([float(p[name]) for p in parts])) for name in parts[0]}

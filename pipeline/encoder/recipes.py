@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from pipeline.encoder.model import FrameEncoder, PropertyClassifier
 
 RECIPES = {
-    "paper": "pipeline.encoder.model",
+    "paper": "pipeline.encoder.clip",
     "release": "pipeline.encoder.release",
     "tuned": "pipeline.encoder.tuned",
 }

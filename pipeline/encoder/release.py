@@ -17,9 +17,8 @@ from torch import nn
 from torch.nn import functional as F
 
 from pipeline.config import EncoderConfig
-from pipeline.encoder.clip import load_visual_tower
-from pipeline.encoder.model import Heads, PropertyClassifier, TactileEncoder, visual_prompts
-from pipeline.encoder.vpt import VisualPrompts
+from pipeline.encoder.clip import TactileEncoder, VisualPrompts, load_visual_tower, visual_prompts
+from pipeline.encoder.model import Heads, PropertyClassifier
 
 if TYPE_CHECKING:
     from open_clip.transformer import VisionTransformer

@@ -8,10 +8,9 @@ but the sensor's measured light.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -65,8 +64,7 @@ CHUNK = 50
 """Objects that one process draws at a time, and that a killed drawing loses at most for each process."""
 
 
-@dataclass(frozen=True)
-class SyntheticPictures:
+class SyntheticPictures(NamedTuple):
     """Drawn pictures and what is known of them; arrays have one row an object."""
 
     pictures: npt.NDArray[np.uint8]
@@ -77,8 +75,7 @@ class SyntheticPictures:
     """Objects x `KINDS`."""
 
 
-@dataclass(frozen=True)
-class _Job:
+class _Job(NamedTuple):
     first: int
     last: int
     config: PretrainConfig
@@ -99,10 +96,10 @@ def draw_pictures(config: PretrainConfig, frames: FramesConfig, folder: Path) ->
     jobs = [_Job(i, min(i + CHUNK, config.objects), config, frames, folder / f"{i:06d}.npz") for i in borders]
     for _ in run_parallel(_draw, [job for job in jobs if not job.file.is_file()], "synthetic pictures", "chunk"):
         pass
-    names, parts = SyntheticPictures.__dataclass_fields__, []
+    parts = []
     for job in jobs:
         with np.load(job.file) as part:  # Closed one by one: a process may hold a thousand files open.
-            parts.append([part[name] for name in names])
+            parts.append([part[name] for name in SyntheticPictures._fields])
     return SyntheticPictures(*map(np.concatenate, zip(*parts, strict=True)))
 
 
@@ -120,14 +117,18 @@ def draw_object(number: int, config: PretrainConfig, frames: FramesConfig) -> Sy
         centre = [(n - 1) / 2 + rng.normal(*at) / PITCH for n, at in zip((WIDTH, HEIGHT), CENTRE_MM, strict=True)]
         skin, shown = (place(field, angle, centre, (WIDTH, HEIGHT)) for field in (whole, surface))
         touched = skin > 0.15 * max(float(skin.max()), 1e-6)
-        known = [np.log10(recipe.modulus), np.log10(force), np.log10(area / np.pi + 0.05) / 2, np.log10(rough + 5e-4)]
-        known += [
-            bump_share(skin, PITCH),
-            np.log10(float(skin.max()) + 1e-3),
-            *_bands(shown, touched),
-            *_bands(skin, touched),
-        ]
-        quantities.append(known)
+        quantities.append(
+            [  # In the order of `QUANTITIES`; what is added keeps logarithms finite.
+                np.log10(recipe.modulus),
+                np.log10(force),
+                np.log10(area / np.pi + 0.05) / 2,
+                np.log10(rough + 5e-4),
+                bump_share(skin, PITCH),
+                np.log10(float(skin.max()) + 1e-3),
+                *_bands(shown, touched),
+                *_bands(skin, touched),
+            ]
+        )
         pictures.append(_picture(skin, sensors()[int(rng.integers(SENSORS))], rng, frames))
     present = {layer.kind for layer in recipe.relief} | {recipe.body.kind}
     return SyntheticPictures(
@@ -146,10 +147,9 @@ def sensors() -> list[Sensor]:
 def _draw(job: _Job) -> None:
     cv2.setNumThreads(1)
     drawn = [draw_object(number, job.config, job.frames) for number in range(job.first, job.last)]
-    names = SyntheticPictures.__dataclass_fields__
+    rows = SyntheticPictures(*map(np.concatenate, zip(*drawn, strict=True)))
     with atomic(job.file) as temporary, temporary.open("wb") as stream:
-        rows: dict[str, Any] = {name: np.concatenate([getattr(d, name) for d in drawn]) for name in names}
-        np.savez(stream, **rows)
+        np.savez(stream, **rows._asdict())
 
 
 def _bands(field: Heights, where: npt.NDArray[np.bool_]) -> list[float]:

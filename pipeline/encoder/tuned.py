@@ -17,17 +17,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
 
 from pipeline.config import EncoderConfig
+from pipeline.core.records import Flip
 from pipeline.core.runtime import derive_seed, track
-from pipeline.encoder.clips import ClipDataset, EncoderData, LabelledVideo, check_finite
-from pipeline.encoder.frame_classifier import Clips, JointFrameClassifier
+from pipeline.encoder.clips import AXES, ClipDataset, EncoderData, LabelledVideo, draw_flip
+from pipeline.encoder.frame_classifier import JointFrameClassifier
 from pipeline.encoder.model import SideBySide, load_backbones
 from pipeline.training.sampling import EpochDataset
 
-FLIPS: tuple[tuple[int, ...], ...] = ((), (2,), (1,), (1, 2))
-"""Axes of frames x height x width that are mirrored; the first leaves a picture as it is."""
 MEMORY = 2**30
 """Bytes of trunks' outputs up to which they are kept as they are; above, in float16."""
 
@@ -48,85 +46,36 @@ class Trunks:
 
     rows: dict[str, int]
     """Of each video."""
-    outputs: list[list[torch.Tensor]]
-    """Of each flip and backbone: videos x frames x what the backbone's stage takes."""
+    outputs: dict[Flip, list[torch.Tensor]]
+    """Of each backbone: videos x frames x what the backbone's stage takes."""
 
-    def of(self, video_id: str, flip: int = 0) -> list[torch.Tensor]:
+    def of(self, video_id: str, flip: Flip = "none") -> list[torch.Tensor]:
         """Of each backbone: frames x what its stage takes."""
-        return [output[self.rows[video_id]] for output in self.outputs[flip]]
+        found = [output[self.rows[video_id]] for output in self.outputs[flip]]
+        return [output.float() if output.dtype == torch.float16 else output for output in found]
 
 
 @torch.no_grad()
 def run_trunks(
-    encoder: SideBySide,
-    data: EncoderData,
-    videos: Sequence[LabelledVideo],
-    device: torch.device,
-    *,
-    flips: int = len(FLIPS),
+    encoder: SideBySide, data: EncoderData, videos: Sequence[LabelledVideo], device: torch.device, *, mirrored: bool
 ) -> Trunks:
-    """Run the trunks over the evaluation clips of these videos, under the first so many of `FLIPS`."""
+    """Run the trunks over the evaluation clips of these videos, as they are or also mirrored in all ways."""
     encoder = encoder.to(device)
     clips = ClipDataset(data.store, videos, per_video=data.per_video)
-    outputs: list[list[torch.Tensor]] = [[] for _ in range(flips)]
+    outputs: dict[Flip, list[torch.Tensor]] = {flip: [] for flip in AXES if mirrored or flip == "none"}
     for place in track(range(len(videos)), "frozen part of the encoder", "video"):
         frames = clips[place]["frames"].numpy()
-        for flip, kept in enumerate(outputs):
-            mirrored = torch.from_numpy(np.flip(frames, FLIPS[flip]).copy())
-            found = [output.cpu() for output in encoder.trunks(mirrored.to(device))]
+        for flip, kept in outputs.items():
+            shown = torch.from_numpy(np.flip(frames, AXES[flip]).copy())
+            found = [output.cpu() for output in encoder.trunks(shown.to(device))]
             if not kept:
-                size = len(videos) * flips * sum(output.nbytes for output in found)
-                short = [output.is_floating_point() and size > MEMORY for output in found]
-                kept += [
-                    torch.empty(len(videos), *output.shape, dtype=torch.float16 if half else output.dtype)
-                    for output, half in zip(found, short, strict=True)
-                ]
+                size = len(videos) * len(outputs) * sum(output.nbytes for output in found)
+                for output in found:
+                    dtype = torch.float16 if output.is_floating_point() and size > MEMORY else output.dtype
+                    kept.append(torch.empty(len(videos), *output.shape, dtype=dtype))
             for output, whole in zip(found, kept, strict=True):
                 whole[place] = output
     return Trunks({video.video_id: row for row, video in enumerate(videos)}, outputs)
-
-
-class AboveTrunks(nn.Module):
-    """The trained part of the classifier: all that follows the frozen trunks, whose outputs are computed once."""
-
-    _keys_to_ignore_on_save = None  # read by transformers' Trainer when it reloads a checkpoint
-    accepts_loss_kwargs = True
-
-    def __init__(self, classifier: JointFrameClassifier) -> None:
-        super().__init__()
-        self.classifier = classifier
-
-    def forward(
-        self,
-        outputs: Sequence[torch.Tensor],
-        labels: torch.Tensor | None = None,
-        num_items_in_batch: torch.Tensor | int | None = None,
-    ) -> dict[str, torch.Tensor]:
-        """As `PropertyClassifier.forward`, of the trunks' outputs: each batch x frames x what its stage takes."""
-        return self.classifier.from_features(self.features(outputs), labels, num_items_in_batch)
-
-    def features(self, outputs: Sequence[torch.Tensor]) -> torch.Tensor:
-        """The frames' features: batch x frames x dim."""
-        encoder = self.classifier.encoder
-        assert isinstance(encoder, SideBySide)
-        given = [output.flatten(0, 1) for output in outputs]
-        given = [output.float() if output.dtype == torch.float16 else output for output in given]
-        return encoder.stages(given).view(*outputs[0].shape[:2], -1)
-
-    @torch.inference_mode()
-    def describe(self, trunks: Trunks, videos: Sequence[LabelledVideo], device: torch.device) -> Clips:
-        """Features of the videos' evaluation clips: float32, videos x frames x dim."""
-        self.to(device)
-        rows = [self.features([o[None].to(device) for o in trunks.of(video.video_id)]) for video in videos]
-        found = torch.cat(rows).float().cpu()
-        check_finite(found.flatten(1), videos)
-        return found.numpy()
-
-    @torch.inference_mode()
-    def logits(self, trunks: Trunks, videos: Sequence[LabelledVideo], device: torch.device) -> torch.Tensor:
-        """As `forward` gives them, of the videos' evaluation clips."""
-        features = torch.from_numpy(self.describe(trunks, videos, device)).to(device)
-        return self.classifier.from_features(features)["logits"].cpu()
 
 
 class TrunkDataset(EpochDataset[dict[str, Any]]):
@@ -146,12 +95,9 @@ class TrunkDataset(EpochDataset[dict[str, Any]]):
         return len(self.videos)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        video, flip = self.videos[index], 0
+        video = self.videos[index]
+        flip: Flip = "none"
         if self.seed is not None:
             rng = random.Random(derive_seed(self.seed, self.epoch, video.video_id))
-            across, down = (rng.random() < self.flip_probability for _ in range(2))
-            flip = across + 2 * down
-        return {
-            "outputs": self.trunks.of(video.video_id, flip),
-            "labels": torch.tensor(video.labels, dtype=torch.int64),
-        }
+            flip = draw_flip(rng, self.flip_probability)
+        return {"outputs": self.trunks.of(video.video_id, flip), "labels": torch.tensor(video.labels)}

@@ -49,7 +49,6 @@ class OctopiForCausalLM(nn.Module):
         UserError: where the tokenizer has tokens that the model has no embedding of.
     """
 
-    _keys_to_ignore_on_save = None  # read by transformers' Trainer when it reloads a checkpoint
     accepts_loss_kwargs = True  # has Trainer add up an update's weights and give their sum to `forward`
 
     def __init__(

@@ -33,7 +33,6 @@ from pipeline.language.octopi import ADAPTER_DIR, OctopiForCausalLM
 from pipeline.training.trainer import (
     TrainableTrainer,
     Trained,
-    TrainingMonitor,
     checkpoint_dir,
     train,
     training_arguments,
@@ -242,7 +241,7 @@ def fit(
         args=arguments,
         train_dataset=data,
         data_collator=collate,
-        callbacks=[TrainingMonitor(), *job.callbacks],
+        callbacks=job.callbacks,
         rates={**dict.fromkeys(trained, config.projection_learning_rate), **adapters},
         constant=("connector.projection",) if config.projection_schedule == "constant" else (),
         sampler=UpdateSampler(data.lengths, config.batch_size, job.seed, lambda: data.epoch, shared),

@@ -1,4 +1,4 @@
-"""What both trainings share: the Trainer, its arguments, checkpoints that survive a kill, and the recorded curve."""
+"""What all trainings share: the Trainer, its arguments, checkpoints that survive a kill, and the recorded curve."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import math
 import os
 import shutil
 import sys
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -42,6 +42,7 @@ class TrainableTrainer(Trainer):
     The frozen base would otherwise be written again with each checkpoint (13 GB for Vicuna-7b).
 
     Args:
+        callbacks: They come after a `TrainingMonitor`.
         rates: Learning rate of the parameters under each name.
         constant: Of those names, the ones whose rate stays as it is throughout.
         sampler: The order of the training set, where it is not simply random.
@@ -50,12 +51,13 @@ class TrainableTrainer(Trainer):
     def __init__(
         self,
         *args: Any,
+        callbacks: Sequence[TrainerCallback] = (),
         rates: Mapping[str, float] | None = None,
         constant: Collection[str] = (),
         sampler: Sampler[int] | None = None,
         **kwargs: Any,
     ) -> None:
-        super().__init__(*args, **kwargs)
+        super().__init__(*args, callbacks=[TrainingMonitor(), *callbacks], **kwargs)
         self.remove_callback(PrinterCallback)
         self._rates = rates
         self._constant = constant
@@ -121,18 +123,8 @@ class TrainableTrainer(Trainer):
             torch.save(self.lr_scheduler.state_dict(), Path(output_dir) / SCHEDULER_NAME)
 
     def _load_from_checkpoint(self, resume_from_checkpoint: str, model: torch.nn.Module | None = None) -> None:
-        if not self.is_fsdp_enabled:
-            super()._load_from_checkpoint(resume_from_checkpoint, model)
-            return
+        # The Trainer's own way warns of each frozen weight that a checkpoint lacks, and wants another format of FSDP's.
         load_trainable(model or self.model, Path(resume_from_checkpoint) / SAFE_WEIGHTS_NAME)
-
-    def _issue_warnings_after_load(self, load_result: Any) -> None:
-        # The frozen base is missing in each checkpoint by design; only what the model does not know is a mistake.
-        if load_result.unexpected_keys:
-            raise UserError(
-                f"{self.args.output_dir}: its checkpoint has {load_result.unexpected_keys[0]}, which the model lacks; "
-                "delete the folder and run again"
-            )
 
 
 def _diverged(what: str, step: int) -> UserError:
@@ -146,9 +138,6 @@ def check_finite(state: Mapping[str, torch.Tensor], step: int) -> None:
     broken = next((name for name, value in state.items() if not value.isfinite().all()), None)
     if broken:
         raise _diverged(f"{broken} is not finite", step)
-
-
-LOSSES = ("loss", "grad_norm", "validation_loss")
 
 
 class TrainingMonitor(TrainerCallback):
@@ -165,15 +154,11 @@ class TrainingMonitor(TrainerCallback):
         logs: dict[str, float] | None = None,
         **_: Any,
     ) -> None:
-        """Called by the Trainer after each logging step.
-
-        Raises:
-            UserError: where a loss or the gradient's norm is not finite.
-        """
+        """Called by the Trainer after each logging step; UserError where loss or the gradient's norm is not finite."""
         values = measured(logs or {})
-        bad = [name for name in LOSSES if not math.isfinite(values.get(name, 0.0))]
-        if bad:
-            raise _diverged(f"{bad[0]} is {values[bad[0]]}", state.global_step)
+        for name in ("loss", "grad_norm", "validation_loss"):
+            if not math.isfinite(values.get(name, 0.0)):
+                raise _diverged(f"{name} is {values[name]}", state.global_step)
         # At a terminal the Trainer has a bar of its own.
         if state.is_world_process_zero and args.disable_tqdm and "loss" in values:
             self._lines = self._lines or LogLines("training", state.max_steps, "step", after=state.global_step)
@@ -264,7 +249,10 @@ def training_arguments(
 
 
 def train(trainer: Trainer) -> Trained:
-    """Train to the end, from the last checkpoint where there is one; the stage removes them when all is written."""
+    """Train to the end, from the last checkpoint where there is one; the stage removes them when all is written.
+
+    Where the arguments name a `metric_for_best_model`, what the epoch with the best one reached is kept.
+    """
     folder = Path(str(trainer.args.output_dir))
     if trainer.is_world_process_zero():
         _drop_damaged(folder)
@@ -282,7 +270,11 @@ def train(trainer: Trainer) -> Trained:
         # A state that was read back has its names in order, one that was not has them as they were logged.
         for name, value in sorted(measured(entry).items())
     ]
-    state = whole_state(trainer.accelerator.unwrap_model(trainer.model))
+    model = trainer.accelerator.unwrap_model(trainer.model)
+    if trainer.state.best_model_checkpoint:
+        # Not by `load_best_model_at_end`, which would warn of each frozen weight that the checkpoint lacks.
+        load_trainable(model, Path(trainer.state.best_model_checkpoint) / SAFE_WEIGHTS_NAME)
+    state = whole_state(model)
     check_finite(state, trainer.state.global_step)
     return Trained(history, state)
 
@@ -292,38 +284,33 @@ def _drop_damaged(folder: Path) -> None:
     for checkpoint in folder.glob("checkpoint-*"):
         if not (checkpoint / TRAINER_STATE_NAME).is_file():  # The Trainer writes it last.
             shutil.rmtree(checkpoint)
-        elif (file := _damaged(checkpoint)) is not None:
+        elif (file := next((f for f in sorted(checkpoint.iterdir()) if not _is_whole(f)), None)) is not None:
             logger.warning("%s is damaged; training goes on from the checkpoint before it, or begins anew", file)
             shutil.rmtree(checkpoint)
 
 
-def _damaged(checkpoint: Path) -> Path | None:
-    """The first file of a checkpoint that cannot be read, or whose checksum is wrong; None where all can."""
-    for file in sorted(checkpoint.iterdir()):
-        try:
-            if file.suffix == ".json":
-                json.loads(file.read_text(encoding="utf-8"))
-            elif file.suffix == ".safetensors":
-                with safe_open(file, "pt"):
-                    pass
-            elif file.suffix in (".pt", ".pth", ".bin") and file.name != TRAINING_ARGS_NAME:
-                # torch's own format is a zip file, whose parts have checksums.
-                with ZipFile(file) as parts:
-                    if parts.testzip() is not None:
-                        return file
-        except (ValueError, BadZipFile, SafetensorError, EOFError, OSError):
-            return file
-    return None
+def _is_whole(file: Path) -> bool:
+    """Whether a file of a checkpoint can be read and, where its format has checksums, they are right."""
+    try:
+        if file.suffix == ".json":
+            json.loads(file.read_text(encoding="utf-8"))
+        elif file.suffix == ".safetensors":
+            with safe_open(file, "pt"):
+                pass
+        elif file.suffix in (".pt", ".pth", ".bin") and file.name != TRAINING_ARGS_NAME:
+            # torch's own format is a zip file, whose parts have checksums.
+            with ZipFile(file) as parts:
+                return parts.testzip() is None
+    except (ValueError, BadZipFile, SafetensorError, EOFError, OSError):
+        return False
+    return True
 
 
 def measured(entry: Mapping[str, object]) -> dict[str, float]:
     """What of a log entry is a figure of the training: not its bookkeeping, nor wall-clock times."""
-    names = {name: "validation_loss" if name == "eval_loss" else name.removeprefix("eval_") for name in entry}
+    bookkeeping = ("step", "epoch", "total_flos", "train_loss")
     return {
-        names[name]: float(value)
+        "validation_loss" if name == "eval_loss" else name.removeprefix("eval_"): float(value)
         for name, value in entry.items()
-        if isinstance(value, (int, float)) and name not in BOOKKEEPING and not name.endswith(("_runtime", "_second"))
+        if isinstance(value, (int, float)) and name not in bookkeeping and not name.endswith(("_runtime", "_second"))
     }
-
-
-BOOKKEEPING = {"step", "epoch", "total_flos", "train_loss"}

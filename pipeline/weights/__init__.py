@@ -227,7 +227,7 @@ class Backbone(NamedTuple):
 
 BACKBONES = {
     "clip": Backbone(
-        "pipeline.encoder.model",
+        "pipeline.encoder.clip",
         "the base CLIP with visual prompts",
         lambda folder: [folder / CLIP_CONFIG, clip_file(folder)],
         side=lambda told: int(told["model_cfg"]["vision_cfg"]["image_size"]),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -20,15 +19,15 @@ from pipeline.core.errors import UserError
 from pipeline.core.records import Measurement, Part
 from pipeline.core.runtime import derive_seed
 from pipeline.encoder import cross_validation as module
-from pipeline.encoder import finetune, frame_classifier
-from pipeline.encoder.clips import ClipDataset, EncoderData
+from pipeline.encoder import frame_classifier
+from pipeline.encoder.clips import ClipDataset
 from pipeline.encoder.cross_validation import CrossValidationData, cross_validate_model
-from pipeline.encoder.folds import Fold, Predict, cross_validate, deal
-from pipeline.encoder.frame_classifier import Clips, FittedHeads, fit_frame_heads
+from pipeline.encoder.finetune import Training, finetune
+from pipeline.encoder.folds import Fold, Predict, deal
 from pipeline.encoder.model import FrameEncoder, PropertyClassifier
+from pipeline.encoder.tuned import Trunks
 from pipeline.videos.catalogue import Catalogue
 from tests.conftest import fake_videos
-from tests.encoder.conftest import Hook, killed_at
 from tests.encoders import config, write_frames, write_pretrained, write_timm
 
 OBJECTS = ("baseball", "controller_base", "cotton_ball", "ice_block", "millet", "pillow", "rug")
@@ -83,45 +82,14 @@ class Telling(FrameEncoder):
         return torch.stack([frames[:, 0, 0, 0].float(), numbers, numbers**2], dim=1)
 
 
-def shown(clips: Clips) -> list[str]:
-    """Whose pictures `Telling` was shown."""
-    return [{grey(o): o for o in OBJECTS}[int(value)] for value in clips[:, 0, 0]]
-
-
-def objects_of(data: CrossValidationData, chosen: np.ndarray) -> set[str]:
-    return {o for o, c in zip(data.objects, chosen, strict=True) if c}
-
-
-def parts_of(clips: EncoderData, data: CrossValidationData, fold: Fold) -> tuple[frozenset[str], frozenset[str]]:
-    """The objects that a training learns from and those that it chooses by, after a look at who they are."""
-    train, validation, test, unused = (
-        frozenset(a.object_id for a in clips.assignments if a.part == part)
-        for part in (Part.TRAIN, Part.VALIDATION, Part.TEST, Part.UNUSED)
-    )
-    assert test == objects_of(data, fold.tested)
-    assert train | validation == objects_of(data, fold.trained)
-    assert validation
-    assert not validation & train
-    assert not unused
-    return train, validation
-
-
-@pytest.fixture
-def folds(monkeypatch: pytest.MonkeyPatch) -> list[Fold]:
-    """The folds as they are asked for; the last is the one being predicted."""
-    seen: list[Fold] = []
-
-    def spying(predict: Predict, *args: object, **settings: int) -> np.ndarray:
-        return cross_validate(lambda fold: (seen.append(fold), predict(fold))[1], *args, **settings)  # type: ignore
-
-    monkeypatch.setattr(module, "cross_validate", spying)
-    return seen
-
-
-def dealt(setting: CrossValidationConfig) -> list[set[str]]:
-    """The tested objects of every fold, whatever the model."""
-    repeats = [deal(OBJECTS, setting.folds, derive_seed(4, "folds", repeat)) for repeat in range(setting.repeats)]
-    return [set(part) for parts in repeats for part in parts]
+def relabelled(data: CrossValidationData, object_id: str) -> CrossValidationData:
+    """Another rating of one object, as a corrected objects.csv has it."""
+    own = data.catalogue.objects[object_id]
+    other = tuple(0 if level else 2 for level in own.labels)
+    ratings = tuple((level,) * 3 for level in other)
+    objects = {**data.catalogue.objects, object_id: own.model_copy(update={"ratings": ratings})}
+    assert objects[object_id].labels == other
+    return replace(data, catalogue=Catalogue(language=data.catalogue.language, objects=objects))
 
 
 # Folds
@@ -140,64 +108,56 @@ def test_folds_hold_whole_objects_and_are_even(numbers: list[int], folds: int, s
 # Who learns from what
 
 
-def test_frozen_backbones_heads_learn_from_no_object_that_they_are_tested_on(
-    data: CrossValidationData, folds: list[Fold], monkeypatch: pytest.MonkeyPatch
+def test_a_tested_objects_own_label_changes_nothing_that_is_said_of_it(
+    data: CrossValidationData, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By the objects' names and by the pictures themselves, in the final fits and in those that choose."""
+    """Each object has a grey of its own, so that heads that had learnt from one would know it again."""
     monkeypatch.setattr(module, "SideBySide", Telling)
-    fits: list[int] = []
-
-    def spy(clips: Clips, labels: np.ndarray, objects: Sequence[str], *rest: object) -> FittedHeads:
-        assert shown(clips) == list(objects)
-        assert labels.tolist() == [list(data.catalogue.labels(o)) for o in objects]
-        assert set(objects) <= objects_of(data, folds[-1].trained) - objects_of(data, folds[-1].tested)
-        fits.append(len(set(objects)))
-        fitted = fit_frame_heads(clips, labels, objects, *rest)  # type: ignore[arg-type]
-
-        class Spied(FittedHeads):
-            def predict(self, clips: Clips) -> np.ndarray:
-                assert not set(shown(clips)) & set(objects)
-                return super().predict(clips)
-
-        return Spied(**vars(fitted))
-
-    for place in (module, frame_classifier):
-        monkeypatch.setattr(place, "fit_frame_heads", spy)
-    found = cross_validate_model("backbone", data, CONFIG)
-    assert [(r.video_id, r.repeat) for r in found] == [(v.video_id, n) for v in data.videos for n in (0, 1)]
-    assert all(r.expected == data.catalogue.labels(r.object_id) for r in found)
-    assert [objects_of(data, f.tested) for f in folds] == dealt(CONFIG)
-    assert len(fits) == 6 * (2 * 2 + 1), "two strengths on two inner folds, and the fit itself"
-    assert fits[4::5] == [len(objects_of(data, f.trained)) for f in folds]
+    monkeypatch.setattr(frame_classifier, "STRENGTHS", (100.0,))
+    whole = cross_validate_model("backbone", data, CONFIG)
+    assert [(r.video_id, r.repeat) for r in whole] == [(v.video_id, n) for v in data.videos for n in (0, 1)]
+    assert all(r.expected == data.catalogue.labels(r.object_id) for r in whole)
+    changed = False
+    for name in OBJECTS[:4]:
+        other = cross_validate_model("backbone", relabelled(data, name), CONFIG)
+        said, found = ({(r.video_id, r.repeat): r.predicted for r in records} for records in (whole, other))
+        assert all(said[key] == found[key] for key in said if key[0].startswith(name))
+        changed = changed or said != found
+    assert changed, "others learn from it"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("recipe", ["paper", "release", "tuned"])
 def test_what_is_tuned_learns_from_no_object_that_it_is_tested_on(
-    recipe: Recipe, data: CrossValidationData, folds: list[Fold], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    recipe: Recipe, data: CrossValidationData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Some of a fold's objects choose the epoch; what each model says of each video by itself is what is written."""
     write_pretrained()
     folder = Path(data.encoder.weights) if recipe != "tuned" else write_timm(tmp_path / "timm")
     backbone = {"backbone": ("timm", "scenes"), "feature_stage": 2} if recipe == "tuned" else {}
     data = replace(data, encoder=config(folder, recipe, epochs=1, **backbone))
-    chosen, said = set(), {}
+    parts: list[dict[Part, set[str]]] = []
+    said: dict[str, tuple[int, ...]] = {}
 
-    def spy(clips: EncoderData, setting: EncoderConfig, *rest: object, **others: object) -> object:
-        assert setting == data.encoder
-        assert (clips.store.references is None) == (recipe != "tuned")
-        chosen.add(parts_of(clips, data, folds[-1])[1])
-        model, history = finetune.finetune(clips, setting, *rest, **others)  # type: ignore[arg-type]
-        tested = clips.videos(Part.TEST)
-        for video, item in zip(tested, ClipDataset(clips.store, tested, per_video=2), strict=True):  # type: ignore
+    def note(training: Training, *rest: Trunks) -> tuple[PropertyClassifier, list[Measurement]]:
+        assert training.config == data.encoder
+        parts.append({p: {a.object_id for a in training.data.assignments if a.part == p} for p in Part})
+        model, history = finetune(training, *rest)
+        tested = training.data.videos(Part.TEST)
+        for video, item in zip(tested, ClipDataset(training.data.store, tested, per_video=2), strict=True):  # type: ignore
             with torch.no_grad():
                 logits = model.eval()(item["frames"][None], item["frame_indices"][None])["logits"]
             said[video.video_id] = tuple(model.decide(logits)[0].tolist())
         return model, history
 
-    monkeypatch.setattr(module, "finetune", spy)
+    monkeypatch.setattr(module, "finetune", note)
     found = cross_validate_model("backbone-tuned", data, SMALL)
-    assert [objects_of(data, f.tested) for f in folds] == dealt(SMALL)
-    assert len(chosen) == 2, "drawn anew in each fold"
+    assert [p[Part.TEST] for p in parts] == [set(part) for part in deal(OBJECTS, 2, derive_seed(4, "folds", 0))]
+    for own in parts:
+        train, validation, test, unused = (own[p] for p in (Part.TRAIN, Part.VALIDATION, Part.TEST, Part.UNUSED))
+        assert validation
+        assert not unused
+        assert sorted([*train, *validation, *test]) == sorted(OBJECTS), "each in one part"
     assert [(r.video_id, r.predicted) for r in found] == [(v.video_id, said[v.video_id]) for v in data.videos]
 
 
@@ -280,13 +240,6 @@ def test_finished_folds_survive_a_kill(
     assert not any(tmp_path.glob("checkpoints/cross_validation/*")), "kept no longer than needed"
 
 
-def relabelled(data: CrossValidationData) -> CrossValidationData:
-    """Another rating of one object, as a corrected objects.csv has it."""
-    rug = data.catalogue.objects["rug"]
-    objects = {**data.catalogue.objects, "rug": rug.model_copy(update={"ratings": ((0, 0, 0), *rug.ratings[1:])})}
-    return replace(data, catalogue=Catalogue(language=data.catalogue.language, objects=objects))
-
-
 @pytest.mark.parametrize("other", ["model", "labels", "pretraining", "frames", "folds", "code"])
 def test_folds_of_other_inputs_settings_or_code_are_not_taken_for_these(
     other: str, data: CrossValidationData, versions: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
@@ -300,7 +253,7 @@ def test_folds_of_other_inputs_settings_or_code_are_not_taken_for_these(
         case "model":
             name = "backbone-tuned"
         case "labels":
-            data = relabelled(data)
+            data = relabelled(data, "rug")
         case "pretraining":
             write_pretrained(1)
         case "frames":
@@ -314,33 +267,7 @@ def test_folds_of_other_inputs_settings_or_code_are_not_taken_for_these(
     assert len(begun) == 6
 
 
-@pytest.mark.parametrize(("seed", "left"), [(4, 1), (5, 2)], ids=["the same", "other folds"])
-def test_a_killed_training_goes_on_only_with_its_own_objects(
-    seed: int, left: int, data: CrossValidationData, before_updates: Hook, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Killed in the second epoch of two. Else a model would be tested on objects that it learnt from."""
-    original, epochs = finetune.train_classifier, []
-    begun: list[int] = []
-    stop: set[int] = set()
-    before_updates(killed_at(stop, begun))
-
-    def counting(
-        model: PropertyClassifier, clips: EncoderData, config: EncoderConfig, *rest: object, **others: object
-    ) -> list[Measurement]:
-        before, epoch = len(begun), math.ceil(len(clips.videos(Part.TRAIN)) / config.batch_size)
-        if not stop:
-            stop.add(epoch)
-        history = original(model, clips, config, *rest, **others)  # type: ignore[arg-type]
-        epochs.append((len(begun) - before) / epoch)
-        return history
-
-    monkeypatch.setattr(finetune, "train_classifier", counting)
-    with pytest.raises(KeyboardInterrupt):
-        cross_validate_model("backbone-tuned", data, SMALL)
-    cross_validate_model("backbone-tuned", data, SMALL.model_copy(update={"seed": seed}))
-    assert epochs == [left, 2]
-
-
+@pytest.mark.slow
 def test_folds_need_as_many_objects_and_no_more(data: CrossValidationData) -> None:
     """With one object to train on none is left to validate by."""
     few = replace(data, videos=[v for v in data.videos if v.object_id in OBJECTS[1:3]])

@@ -33,7 +33,7 @@ from pipeline.encoder.frame_classifier import (
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
-from tests.encoders import CPU, OBJECTS, Floats, config, encoder_data, float64, random_heads, write_pretrained
+from tests.encoders import OBJECTS, Floats, config, encoder_data, float64, random_heads, training, write_pretrained
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
 
@@ -211,7 +211,7 @@ def test_tuning_begins_with_heads_fitted_to_evaluation_clips(
     parts = {o: Part.TEST if i > 4 else Part.TRAIN for i, o in enumerate(OBJECTS)}
     plain = encoder_data(tmp_path, catalogue, parts)
     data = EncoderData(FrameStore(tmp_path, "subtract"), catalogue, plain.assignments, 2)
-    model, curve = finetune(data, config(weights, "tuned"), CPU, seed=5, inputs=[])
+    model, curve = finetune(training(data, config(weights, "tuned"), seed=5))
     assert isinstance(model, JointFrameClassifier)
     with torch.no_grad():
         clips = np.stack(

@@ -14,10 +14,10 @@ from scipy.special import log_softmax
 from scipy.stats import kstest, norm, uniform
 
 from pipeline.core.runtime import seed_everything
-from pipeline.encoder.model import Heads, TactileEncoder
+from pipeline.encoder.clip import TactileEncoder, VisualPrompts
+from pipeline.encoder.model import Heads
 from pipeline.encoder.recipes import base_encoder, property_classifier
 from pipeline.encoder.release import DROPOUT, PublishedHeads
-from pipeline.encoder.vpt import VisualPrompts
 from tests.checkpoints import CLIP_CONFIG
 from tests.encoders import FRAME_INDICES, Floats, close, config, float64, write_tower
 

@@ -41,14 +41,6 @@ def test_evaluation_samples_are_uniform_from_the_first(count: int, k: int) -> No
     assert all(between in (count // k, -(-count // k)) for between in gaps)
 
 
-def test_every_kept_frame_is_drawn_equally_often() -> None:
-    rng = random.Random(0)
-    counts = np.zeros(10)
-    for _ in range(4000):
-        counts[list(sample_training(10, 5, rng))] += 1
-    assert counts == pytest.approx(2000, rel=0.08)
-
-
 def test_the_store_gives_pictures_with_and_without_the_reference(
     tiny_videos: Path, tmp_path: Path, catalogue: Catalogue
 ) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import cv2
@@ -21,7 +21,7 @@ from pipeline.config import FramesConfig, PretrainConfig
 from pipeline.core.errors import UserError
 from pipeline.core.runtime import seed_everything
 from pipeline.encoder import synthetic as module
-from pipeline.encoder.pretrain import STRENGTH, PretrainingDataset, held_out, pretraining_model, vary
+from pipeline.encoder.pretrain import STRENGTH, PretrainingDataset, PretrainingModel, vary
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.encoder.synthetic import (
     BODIES,
@@ -46,16 +46,10 @@ from tests.frame_rules import pillow
 
 CONFIG = PretrainConfig(objects=9, presses=2, seed=5)
 FRAMES = FramesConfig(pixels=32)
-ARRAYS = ("pictures", "quantities", "kinds")
 
 
-def equal(one: SyntheticPictures, other: SyntheticPictures) -> bool:
-    pairs = [(getattr(one, name), getattr(other, name)) for name in ARRAYS]
-    return all(a.dtype == b.dtype and np.array_equal(a, b) for a, b in pairs)
-
-
-def row(pictures: SyntheticPictures, number: int) -> SyntheticPictures:
-    return SyntheticPictures(*(getattr(pictures, name)[number : number + 1] for name in ARRAYS))
+def equal(one: Iterable[np.ndarray], other: Iterable[np.ndarray]) -> bool:
+    return all(a.dtype == b.dtype and np.array_equal(a, b) for a, b in zip(one, other, strict=True))
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -79,12 +73,13 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> SyntheticPictures:
 # Drawing
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [0, 8])
 def test_an_object_alone_is_the_same_as_among_others(number: int, drawn: SyntheticPictures) -> None:
     """Whatever else the settings say, and whatever was drawn before."""
     np.random.seed(number)
     other = PretrainConfig(objects=5000, presses=2, seed=5, steps=7, batch_size=1, augment=False)
-    assert equal(draw_object(number, other, FRAMES), row(drawn, number))
+    assert equal(draw_object(number, other, FRAMES), [array[[number]] for array in drawn])
 
 
 def test_pictures_differ_by_number_and_by_seed(drawn: SyntheticPictures) -> None:
@@ -94,41 +89,26 @@ def test_pictures_differ_by_number_and_by_seed(drawn: SyntheticPictures) -> None
     assert (elsewhere.quantities[0, 0, 0] != drawn.quantities[:, 0, 0]).all()
 
 
-def interrupt() -> None:
-    raise KeyboardInterrupt
-
-
-@pytest.mark.parametrize(
-    ("death", "error"),
-    [(interrupt, KeyboardInterrupt), (lambda: os._exit(9), UserError)],
-    ids=["interrupted", "killed"],
-)
+@pytest.mark.slow
 def test_a_killed_drawing_keeps_what_is_finished_and_ends_the_same(
-    death: Callable[[], None],
-    error: type[BaseException],
-    drawn: SyntheticPictures,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    drawn: SyntheticPictures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pipeline.core.parallel, "cores", lambda: 1)
     monkeypatch.setattr(module, "CHUNK", 4)
+
+    def until(number: int, config: PretrainConfig, frames: FramesConfig) -> SyntheticPictures:
+        if number == 5:
+            os._exit(9)
+        return draw_object(number, config, frames)
+
     with monkeypatch.context() as patch:
-
-        def until(number: int, config: PretrainConfig, frames: FramesConfig) -> SyntheticPictures:
-            if number == 5:
-                death()
-            return draw_object(number, config, frames)
-
         patch.setattr(module, "draw_object", until)
-        with pytest.raises(error):
+        with pytest.raises(UserError):
             draw_pictures(CONFIG, FRAMES, tmp_path)
-    finished = {int(f.stem) for f in tmp_path.glob("[0-9]*.npz")}
-    assert 0 in finished
-    assert 4 not in finished
-    assert finished <= {0, 8}
+    assert [f.name for f in tmp_path.glob("[0-9]*.npz")] == ["000000.npz"]
 
     def only_others(number: int, config: PretrainConfig, frames: FramesConfig) -> SyntheticPictures:
-        assert number // 4 * 4 not in finished, "drawn again"
+        assert number >= 4, "drawn again"
         return draw_object(number, config, frames)
 
     monkeypatch.setattr(module, "draw_object", only_others)
@@ -156,31 +136,21 @@ def test_pictures_have_their_shapes_and_ranges(drawn: SyntheticPictures) -> None
     assert ((told["bump share"] >= 0) & (told["bump share"] <= 1)).all()
 
 
-@pytest.mark.parametrize("number", [12, 15, 18])
+@pytest.mark.parametrize("number", [12, 15])
 def test_quantities_are_measured_where_they_are_shown(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Texture of the whole surface; bumps and depth of the skin in view, under each force."""
-    surfaces: list[np.ndarray] = []
-    skins: list[np.ndarray] = []
-    texture, share = module.texture, module.bump_share
-
-    def note_surface(surface: np.ndarray, pitch: float) -> float:
-        surfaces.append(surface)
-        assert pitch == PITCH
-        return texture(surface, pitch)
-
-    def note_skin(skin: np.ndarray, pitch: float) -> float:
-        skins.append(skin)
-        return share(skin, pitch)
-
-    monkeypatch.setattr(module, "texture", note_surface)
-    monkeypatch.setattr(module, "bump_share", note_skin)
+    fields: dict[str, list[np.ndarray]] = {"texture": [], "bump_share": []}
+    originals = {name: getattr(module, name) for name in fields}
+    for name, seen in fields.items():
+        original = originals[name]
+        monkeypatch.setattr(module, name, lambda f, p, own=original, seen=seen: (seen.append(f), own(f, p))[1])
     told = draw_object(number, CONFIG, FRAMES).quantities[0].astype(np.float64)
-    (surface,) = surfaces
+    (surface,) = fields["texture"]
     assert surface.shape == (SIDE, SIDE)
-    assert {skin.shape for skin in skins} == {(HEIGHT, WIDTH)}
-    for press, skin in zip(told, skins, strict=True):
-        assert 10 ** press[3] - 5e-4 == pytest.approx(texture(surface, PITCH), rel=1e-4, abs=1e-8)
-        assert press[4] == pytest.approx(share(skin, PITCH), abs=1e-6)
+    assert {skin.shape for skin in fields["bump_share"]} == {(HEIGHT, WIDTH)}
+    for press, skin in zip(told, fields["bump_share"], strict=True):
+        assert 10 ** press[3] - 5e-4 == pytest.approx(originals["texture"](surface, PITCH), rel=1e-4, abs=1e-8)
+        assert press[4] == pytest.approx(originals["bump_share"](skin, PITCH), abs=1e-6)
         assert press[5] == pytest.approx(math.log10(skin.max() + 1e-3), abs=1e-5)
 
 
@@ -215,7 +185,7 @@ def test_a_press_that_touches_nothing_shows_128(monkeypatch: pytest.MonkeyPatch)
         assert np.abs(pictures - 128).max() < 25
 
 
-@pytest.mark.parametrize(("fit", "size"), [("crop", 16), ("squash", 48), ("crop", 128), ("squash", 150)])
+@pytest.mark.parametrize(("fit", "size"), [("crop", 16), ("squash", 150)])
 def test_frames_are_fitted_as_those_of_videos(fit: str, size: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Against PIL, and in RGB; a press's frame and reference are of one sensor."""
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH] / 12
@@ -253,7 +223,7 @@ RAMPS = np.repeat(np.stack([ramp, ramp, ramp])[..., None], 3, axis=3)
 def test_presses_are_mirrored_alike_and_strengths_turn_about_the_middle() -> None:
     """128 + g (v - 128), rounded and cut at the ends: one factor a press, one of four ways for all."""
     before, ways = RAMPS.copy(), []
-    for seed in range(60):
+    for seed in range(40):
         found = vary(RAMPS, np.random.default_rng(seed))
         assert np.array_equal(found, vary(RAMPS, np.random.default_rng(seed))), "repeatable"
         # The ramps rise to the right and, more, downwards.
@@ -271,7 +241,7 @@ def test_presses_are_mirrored_alike_and_strengths_turn_about_the_middle() -> Non
             assert values[128] == 128
         assert STRENGTH[0] - 0.01 < min(gains) <= max(gains) < STRENGTH[1] + 0.01
         assert len(set(gains)) == 3, "each press has its own"
-    assert min(map(ways.count, itertools.product((False, True), repeat=2))) > 5
+    assert min(map(ways.count, itertools.product((False, True), repeat=2))) > 3
     assert np.array_equal(RAMPS, before), "what was given stays"
 
 
@@ -322,7 +292,7 @@ def test_the_loss_weighs_standardised_quantities_and_kinds() -> None:
     )
     pictures.quantities[..., 0] = 7
     seed_everything(0)
-    model = pretraining_model(SceneEncoder(), pictures).eval()
+    model = PretrainingModel(SceneEncoder(), pictures).eval()
     arrays = (pictures.pictures, pictures.quantities, pictures.kinds.astype(np.float32))
     with torch.no_grad():
         found = {n: v.item() for n, v in model(*map(torch.from_numpy, arrays)).items()}
@@ -336,17 +306,3 @@ def test_the_loss_weighs_standardised_quantities_and_kinds() -> None:
     assert found["quantities"] == pytest.approx(quantities, rel=1e-5)
     assert found["kinds"] == pytest.approx(flags, rel=1e-5)
     assert found["loss"] == pytest.approx(2 * quantities + 0.6 * flags, rel=1e-5)
-
-
-def test_held_out_parts_are_means_over_pictures(drawn: SyntheticPictures) -> None:
-    seed_everything(0)
-    model = pretraining_model(SceneEncoder(), drawn)
-    data = PretrainingDataset(drawn, augment=False, seed=0)
-    found = held_out(model, data)
-    assert not model.training
-    with torch.no_grad():
-        single = [model(**{n: v[None] for n, v in data[i].items()}) for i in range(9)]
-    assert found == pytest.approx(
-        {f"held_out_{n}": np.mean([s[n].item() for s in single]) for n in ("loss", "quantities", "kinds")}
-    )
-    assert found == held_out(model, data), "nothing is dropped at random"

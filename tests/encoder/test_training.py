@@ -14,18 +14,17 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from pydantic import ValidationError
 from sklearn.linear_model import LogisticRegression
 from sklearn.preprocessing import StandardScaler
 from transformers import TrainerCallback
 
-from pipeline.config import PRETRAINED
-from pipeline.core.embeddings import EmbeddingStore, Statistics
+from pipeline.config import PRETRAINED, EncoderConfig
+from pipeline.core.embeddings import Statistics
 from pipeline.core.errors import UserError
-from pipeline.core.io import save_tensors, write_table
-from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Assignment, Embedding, Part
+from pipeline.core.records import Assignment, Embedding, Part
 from pipeline.core.runtime import derive_seed, seed_everything
-from pipeline.encoder import finetune as training
-from pipeline.encoder.clip import load_visual_tower
+from pipeline.encoder import finetune as module
 from pipeline.encoder.clips import ClipDataset, EncoderData, LabelledVideo
 from pipeline.encoder.embed import logits_of, standardize, statistics, union
 from pipeline.encoder.finetune import accuracies, finetune, train_classifier, write_encoder_card
@@ -41,7 +40,17 @@ from pipeline.weights import check_encoder, check_language
 from tests.checkpoints import edit, write_clip, write_llama
 from tests.conftest import refused
 from tests.encoder.conftest import Hook
-from tests.encoders import CPU, FRAME_INDICES, PARTS, config, float64, random_heads, write_frames, write_pretrained
+from tests.encoders import (
+    FRAME_INDICES,
+    PARTS,
+    config,
+    float64,
+    random_heads,
+    training,
+    write_frames,
+    write_pretrained,
+    write_timm,
+)
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
 
@@ -49,25 +58,20 @@ pytestmark = pytest.mark.usefixtures("elsewhere")
 # Training
 
 
-@pytest.mark.parametrize(("recipe", "batch", "epoch"), [("paper", 2, 3), ("release", 2, 3), ("release", 8, 1)])
+@pytest.mark.slow
+@pytest.mark.parametrize("recipe", ["paper", "release"])
 def test_training_follows_its_recipe_and_leaves_the_backbone(
-    recipe: str,
-    batch: int,
-    epoch: int,
-    weights: Path,
-    data: EncoderData,
-    before_updates: Hook,
-    monkeypatch: pytest.MonkeyPatch,
+    recipe: str, weights: Path, data: EncoderData, before_updates: Hook, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Rates are those of torch's cosine annealing, which in `release` goes on and on: down in an epoch, up in the next.
 
-    Batches of 2 of 5 videos make three updates an epoch, those of 8 one; each epoch draws its own clips.
+    Batches of 2 of 5 videos make three updates an epoch; each epoch draws its own clips.
     """
     theirs = torch.optim.AdamW([torch.nn.Parameter(torch.zeros(1))], lr=1e-3)
-    length, lowest = (epoch, 1e-5) if recipe == "release" else (4 * epoch, 0.0)
+    length, lowest = (3, 1e-5) if recipe == "release" else (4 * 3, 0.0)
     annealing = torch.optim.lr_scheduler.CosineAnnealingLR(theirs, T_max=length, eta_min=lowest)
     expected: list[float] = []
-    for _ in range(4 * epoch):
+    for _ in range(4 * 3):
         expected += annealing.get_last_lr()
         theirs.step()
         annealing.step()
@@ -82,13 +86,13 @@ def test_training_follows_its_recipe_and_leaves_the_backbone(
         return draw(self, index)
 
     monkeypatch.setattr(ClipDataset, "__getitem__", spy)
-    setting = config(weights, recipe, epochs=4, batch_size=batch)
+    setting = config(weights, recipe, epochs=4, batch_size=2)
     seed_everything(0)
     model = property_classifier(setting, data.classes)
     backbone = {n: v.clone() for n, v in model.encoder.visual.state_dict().items()}
     before = {n: v.clone() for n, v in trainable_state(model).items()}
     assert not model.train().encoder.visual.training
-    train_classifier(model, data, setting, CPU, seed=1, inputs=[])
+    train_classifier(model, training(data, setting))
     assert rates == pytest.approx(expected, rel=1e-9)
     after = trainable_state(model)
     moved = (after["encoder.prompts.prompts"] - before["encoder.prompts.prompts"]).flatten(1).abs().amax(dim=1)
@@ -100,9 +104,10 @@ def test_training_follows_its_recipe_and_leaves_the_backbone(
     assert [epoch for epoch, _ in drawn] == sorted(epoch for epoch, _ in drawn)
 
 
-@pytest.mark.parametrize("recipe", ["paper", "release"])
-def test_accumulated_videos_weigh_alike(recipe: str, weights: Path, data: EncoderData, before_updates: Hook) -> None:
+@pytest.mark.slow
+def test_accumulated_videos_weigh_alike(weights: Path, data: EncoderData, before_updates: Hook) -> None:
     """The gradient of five videos in an update is that of all at once, however they are divided; some parts are odd."""
+    data = replace(data, assignments=[a for a in data.assignments if a.part == Part.TRAIN])
     gradients: list[torch.Tensor] = []
     before_updates(
         lambda _, optimizer: gradients.append(
@@ -110,19 +115,16 @@ def test_accumulated_videos_weigh_alike(recipe: str, weights: Path, data: Encode
         )
     )
     for micro in (0, 3, 2):
-        setting = config(weights, recipe, epochs=1, batch_size=6, micro_batch_size=micro)
+        setting = config(weights, "paper", epochs=1, batch_size=6, micro_batch_size=micro)
         seed_everything(0)
-        model = property_classifier(setting, data.classes).double()
-        for module in model.modules():
-            if isinstance(module, torch.nn.Dropout):
-                module.p = 0.0
-        train_classifier(model, data, setting, CPU, seed=1, inputs=[])
+        train_classifier(property_classifier(setting, data.classes).double(), training(data, setting))
     assert len(gradients) == 3
     for other in gradients[1:]:
         # The number of labels that the Trainer gives is float32's.
         torch.testing.assert_close(other, gradients[0], atol=1e-6 * float(gradients[0].abs().max()), rtol=0)
 
 
+@pytest.mark.slow
 def test_autocast_computes_in_bfloat16_and_learns_in_float32(weights: Path, data: EncoderData) -> None:
     formats: list[set[torch.dtype]] = []
     for autocast in ("none", "bfloat16"):
@@ -131,15 +133,14 @@ def test_autocast_computes_in_bfloat16_and_learns_in_float32(weights: Path, data
         seen = set[torch.dtype]()
         attended = model.encoder.visual.get_submodule("transformer.resblocks.0.mlp.c_fc")
         attended.register_forward_hook(lambda _, __, output, seen=seen: seen.add(output.dtype))
-        train_classifier(model, data, setting, CPU, seed=1, inputs=[])
+        train_classifier(model, training(data, setting))
         formats.append(seen)
         assert {value.dtype for value in trainable_state(model).values()} == {torch.float32}
     assert formats == [{torch.float32}, {torch.bfloat16}]
 
 
-@pytest.mark.parametrize(
-    ("reached", "kept"), [((0.1, 0.5, 0.5), 1), ((0.0, 0.0, 0.0), 0), ((0.1, 0.2, 0.3), 2), ((), 2)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("reached", "kept"), [((0.1, 0.5, 0.5), 1), ((0.0, 0.0, 0.0), 0), ((), 2)])
 def test_the_first_of_the_best_epochs_is_kept(
     reached: tuple[float, ...], kept: int, weights: Path, data: EncoderData, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -156,8 +157,8 @@ def test_the_first_of_the_best_epochs_is_kept(
                 seen.append({n: v.clone() for n, v in trainable_state(model).items()})
 
     script = iter(reached)
-    monkeypatch.setattr(training, "accuracies", lambda *_: {"validation_combined": next(script)})
-    history = train_classifier(model, data, setting, CPU, seed=1, inputs=[], callbacks=[Remember()])
+    monkeypatch.setattr(module, "accuracies", lambda *_: {"validation_combined": next(script)})
+    history = train_classifier(model, training(data, setting, callbacks=[Remember()]))
     found = trainable_state(model)
     assert [all(torch.equal(v, found[n]) for n, v in epoch.items()) for epoch in seen] == [i == kept for i in range(3)]
     assert [m.value for m in history if m.name == "validation_combined"] == list(reached)
@@ -190,28 +191,50 @@ def test_validation_counts_videos_that_are_right_in_everything(catalogue: Catalo
 # The registry
 
 
+@pytest.mark.slow
 def test_a_new_recipe_is_a_module_and_a_line(
     weights: Path, data: EncoderData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It trains, is saved and loaded, and embeds, without another change."""
-    module = SimpleNamespace(
+    recipe = SimpleNamespace(
         base_encoder=lambda _: SceneEncoder(),
         property_classifier=lambda _, classes: PropertyClassifier(SceneEncoder(), Heads(256, classes), classes),
     )
-    monkeypatch.setitem(sys.modules, "toy_recipe", module)  # type: ignore[misc]
+    monkeypatch.setitem(sys.modules, "toy_recipe", recipe)  # type: ignore[misc]
     monkeypatch.setitem(RECIPES, "toy", "toy_recipe")
-    check_recipe("toy")
     setting = config(weights, "toy", epochs=1)
-    model, history = finetune(data, setting, CPU, seed=0, inputs=[])
+    model, history = finetune(training(data, setting))
     assert "validation_combined" in {m.name for m in history}
     save_trainable(model, tmp_path / "toy.safetensors")
     load_trainable(property_classifier(setting, data.classes), tmp_path / "toy.safetensors")
     assert base_encoder(setting).dim == 256
 
 
-def test_an_unknown_recipe_is_one_line() -> None:
-    with pytest.raises(UserError, match=r"^encoder.recipe: papr is no recipe; did you mean paper\? known: paper, "):
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"backbone": ("timm", "timm")}, "names one twice"),
+        ({"backbone": ()}, "at least 1 item"),
+        ({"backbone": ("scenes",), "reference": "none"}, "set encoder.reference=subtract"),
+        ({"backbone": ("timm",), "recipe": "paper"}, "encoder.recipe=paper is for CLIP alone"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        EncoderConfig.model_validate({"recipe": "tuned", "weights": "w", "reference": "subtract", **changes})
+
+
+def test_unknown_names_small_frames_and_pickles_are_one_line(weights: Path, tmp_path: Path) -> None:
+    with refused(r"^encoder.recipe: papr is no recipe; did you mean paper\? known: paper, "):
         check_recipe("papr")
+    with refused(r"^encoder.backbone: tim is no backbone; did you mean timm\? known: clip, "):
+        check_encoder(weights, 32, ("scenes", "tim"))
+    with refused(r"frames\.pixels is 24 .* frames\.pixels=32$"):
+        check_encoder(weights, 24, ("clip",))
+    folder = write_llama(tmp_path / "llama")
+    (folder / "model.safetensors").rename(folder / "pytorch_model.bin")
+    with refused("only pickles"):
+        check_language(folder)
 
 
 def test_the_card_names_weights_by_hash_data_and_settings(weights: Path, data: EncoderData, tmp_path: Path) -> None:
@@ -278,40 +301,32 @@ def test_each_recipe_saves_what_is_its_own_and_reloads_exactly(
             load_trainable(property_classifier(*wrong), tmp_path / "model.safetensors")
 
 
-WEIGHTS, FORM = "open_clip_model.safetensors", "open_clip_config.json"
+def edit_clip(folder: Path, part: str, **changes: object) -> None:
+    form = folder / "open_clip_config.json"
+    model = json.loads(form.read_text())["model_cfg"]
+    edit(form, model_cfg=model | {part: model[part] | changes})
+
+
+def disguise(file: Path) -> None:
+    """Write a pickle under the name of a file of safetensors."""
+    torch.save({"a": torch.zeros(1)}, file)
 
 
 @pytest.mark.parametrize(
-    ("damage", "message"),
+    ("kind", "damage", "message"),
     [
-        (lambda f: (f / WEIGHTS).rename(f / "open_clip_pytorch_model.bin"), "pickles are refused"),
-        (lambda f: torch.save({"a": torch.zeros(1)}, f / WEIGHTS), "does not fit"),
-        (lambda f: edit_clip(f, "vision_cfg", layers=3), "does not fit its open_clip_config.json"),
-        (lambda f: edit_clip(f, "vision_cfg", unheard_of=1), "does not fit its open_clip_config.json"),
-        (lambda f: edit_clip(f, "text_cfg", hf_model_name="xlm-roberta-base"), "open_clip would ask a hub"),
+        ("clip", lambda f: disguise(f / "open_clip_model.safetensors"), "does not fit"),
+        ("clip", lambda f: edit_clip(f, "vision_cfg", layers=3), "does not fit its open_clip_config.json"),
+        ("clip", lambda f: edit_clip(f, "vision_cfg", unheard_of=1), "does not fit its open_clip_config.json"),
+        ("clip", lambda f: edit_clip(f, "text_cfg", hf_model_name="roberta"), "open_clip would ask a hub"),
+        ("timm", lambda f: disguise(f / "model.safetensors"), "does not fit its config.json"),
+        ("timm", lambda f: edit(f / "config.json", architecture="test_resnet"), "does not fit its config.json"),
     ],
-    ids=["pickle", "disguised pickle", "another model", "a key of another release", "a text tower on a hub"],
 )
-def test_bad_weights_are_one_line(damage: Callable[[Path], object], message: str, tmp_path: Path) -> None:
-    check_encoder(write_clip(tmp_path), 32, ("clip",))
-    damage(tmp_path)
+def test_bad_weights_are_one_line(kind: str, damage: Callable[[Path], object], message: str, tmp_path: Path) -> None:
+    damage(write_clip(tmp_path) if kind == "clip" else write_timm(tmp_path))
     with refused(message):
-        check_encoder(tmp_path, 32, ("clip",))
-        load_visual_tower(tmp_path)
-
-
-def edit_clip(folder: Path, part: str, **changes: object) -> None:
-    model = json.loads((folder / FORM).read_text())["model_cfg"]
-    edit(folder / FORM, model_cfg=model | {part: model[part] | changes})
-
-
-def test_small_frames_and_a_language_model_of_pickles_are_one_line(tmp_path: Path) -> None:
-    with refused(r"frames\.pixels is 24 .* frames\.pixels=32$"):
-        check_encoder(write_clip(tmp_path / "clip"), 24, ("clip",))
-    folder = write_llama(tmp_path / "llama")
-    (folder / "model.safetensors").rename(folder / "pytorch_model.bin")
-    with refused("only pickles"):
-        check_language(folder)
+        base_encoder(config(tmp_path, "tuned", backbone=(kind,)))
 
 
 # Embeddings
@@ -383,20 +398,3 @@ def test_a_video_that_any_split_trains_on_is_embedded_for_training() -> None:
     splits = [[Assignment(video_id=v, object_id=v, part=both[i]) for v, both in parts.items()] for i in (0, 1)]
     found = {a.video_id: a.part for a in union(splits)}
     assert found == {"a": train, "b": train, "c": test, "d": test, "e": unused}
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_embeddings_are_served_by_a_memory_map(tmp_path: Path) -> None:
-    tensor = torch.randn(64, 8)
-    save_tensors(tmp_path / TENSOR_FILE, {TENSOR: tensor})
-    write_table(
-        tmp_path / INDEX_FILE,
-        Embedding,
-        [Embedding(video_id="a_0", frame_index=i, flip="none", row=i) for i in range(64)],
-    )
-    store = EmbeddingStore(tmp_path)
-    maps = Path("/proc/self/maps").read_text().splitlines()
-    mapped = [line.split()[0].split("-") for line in maps if line.endswith(TENSOR_FILE)]
-    place = store.tensor.data_ptr()
-    assert any(int(low, 16) <= place < int(high, 16) for low, high in mapped), "read from the file when it is asked for"
-    assert torch.equal(store.features("a_0", [5, 2]), tensor[[5, 2]])

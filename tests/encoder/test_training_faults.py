@@ -16,58 +16,37 @@ from safetensors.torch import load_file
 from pipeline.config import FramesConfig, PretrainConfig, RuntimeConfig
 from pipeline.core.errors import UserError
 from pipeline.core.records import Measurement, Part
-from pipeline.core.runtime import seed_everything
 from pipeline.encoder import pretrain as pretraining
 from pipeline.encoder.clips import EncoderData, classify, describe_clips
 from pipeline.encoder.embed import Loaded, embed_videos
-from pipeline.encoder.finetune import finetune, train_classifier
+from pipeline.encoder.finetune import finetune
 from pipeline.encoder.frame_classifier import JointFrameClassifier
 from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
-from pipeline.encoder.pretrain import WEIGHTS, PretrainingModel, pretrain
-from pipeline.encoder.recipes import property_classifier
+from pipeline.encoder.pretrain import WEIGHTS, pretrain
 from pipeline.encoder.scene_encoder import CHANNELS, SceneEncoder
 from pipeline.encoder.synthetic import SyntheticPictures
-from pipeline.scales import compose
 from pipeline.training.trainable import trainable_state
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
-from tests.closure import ROOT
 from tests.conftest import Begun
 from tests.encoder.conftest import Hook, killed_at
-from tests.encoders import CPU, PARTS, config, encoder_data, write_timm
+from tests.encoders import PARTS, config, encoder_data, training, write_timm
 
 CLASSES = [3, 3, 3]
 DEVICE = torch.device("cpu")
-GRADIENTS = ("paper", "release")
-"""Recipes that train by gradients alone."""
-TOO_HIGH = "lower the learning rate"
 pytestmark = pytest.mark.usefixtures("elsewhere")
 
 
-def classifier(kind: str, weights: Path) -> PropertyClassifier:
-    """Equal at every call."""
-    seed_everything(0)
-    return property_classifier(config(weights, kind), CLASSES)
-
-
 def trained(
-    kind: str,
-    weights: Path,
-    data: EncoderData,
-    *,
-    factor: float = 1.0,
-    model: PropertyClassifier | None = None,
-    **changes: object,
+    kind: str, weights: Path, data: EncoderData, *, factor: float = 1.0, **changes: object
 ) -> tuple[list[Measurement], dict[str, torch.Tensor]]:
     """The history and end state of a training, with the learning rate times `factor`."""
     if kind == "tuned":
-        tuned = config(write_timm(Path("timm")), "tuned", backbone=("timm",), feature_stage=2, **changes)
-        model, history = finetune(data, tuned, CPU, seed=0, inputs=[])
-        return history, trainable_state(model)
-    setting = config(weights, kind, **changes)
+        setting = config(write_timm(Path("timm")), "tuned", backbone=("timm",), feature_stage=2, **changes)
+    else:
+        setting = config(weights, kind, **changes)
     setting = setting.model_copy(update={"learning_rate": factor * setting.learning_rate})
-    model = model or classifier(kind, weights)
-    history = train_classifier(model, data, setting, CPU, seed=0, inputs=[])
+    model, history = finetune(training(data, setting))
     return history, trainable_state(model)
 
 
@@ -120,20 +99,35 @@ def test_what_is_not_finite_is_named_by_its_video(
 # Rates that are too high
 
 
-@pytest.mark.parametrize("kind", GRADIENTS)
-def test_a_rate_too_high_ends_finite_or_in_one_line(kind: str, weights: Path, data: EncoderData) -> None:
+@pytest.mark.slow
+def test_a_rate_too_high_ends_finite_or_in_one_line(weights: Path, data: EncoderData) -> None:
     """Params allow no rate from 10 on; a model may be as badly scaled all the same.
 
     A batch of eight makes the first update the last: what diverges in it is told too.
     """
-    for factor in (100, 1e6):
-        history, state = trained(kind, weights, data, factor=factor, epochs=1, batch_size=1)
-        assert all(np.isfinite(m.value) for m in history)
-        assert all(v.isfinite().all() for v in state.values())
-    with pytest.raises(UserError, match=rf"^loss is .* at step 5: .*{TOO_HIGH}.*$"):
-        trained(kind, weights, data, factor=1e20, epochs=1, batch_size=1)
-    with pytest.raises(UserError, match=TOO_HIGH):
-        trained(kind, weights, data, factor=1e23, epochs=1, batch_size=8)
+    history, state = trained("paper", weights, data, factor=1e6, epochs=1, batch_size=1)
+    assert all(np.isfinite(m.value) for m in history)
+    assert all(v.isfinite().all() for v in state.values())
+    with pytest.raises(UserError, match=r"^loss is .* at step 5: .*lower the learning rate.*$"):
+        trained("paper", weights, data, factor=1e20, epochs=1, batch_size=1)
+    with pytest.raises(UserError, match="lower the learning rate"):
+        trained("paper", weights, data, factor=1e23, epochs=1, batch_size=8)
+
+
+@pytest.mark.slow
+def test_gradients_are_shortened_to_what_the_parameters_say(
+    weights: Path, data: EncoderData, before_updates: Hook
+) -> None:
+    norms: list[float] = []
+    before_updates(
+        lambda _, optimizer: norms.append(
+            float(torch.cat([p.grad.flatten() for g in optimizer.param_groups for p in g["params"]]).norm())
+        )
+    )
+    for limit in (0.0, 1e-3):
+        trained("paper", weights, data, epochs=1, batch_size=8, max_grad_norm=limit)
+    assert norms[0] > 0.1
+    assert norms[1] == pytest.approx(1e-3, rel=1e-2)
 
 
 # Kills
@@ -143,6 +137,7 @@ def in_order(history: list[Measurement]) -> list[tuple[int, str, float]]:
     return sorted((m.step, m.name, m.value) for m in history)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "validated"), [("paper", False), ("release", True), ("tuned", True)])
 def test_a_killed_training_ends_as_if_it_had_not_been(
     kind: str, validated: bool, weights: Path, catalogue: Catalogue, tmp_path: Path, before_updates: Hook
@@ -169,14 +164,10 @@ def test_a_killed_training_ends_as_if_it_had_not_been(
     assert not any(tmp_path.glob("checkpoints/*/*"))
 
 
-WRITTEN = ["model.safetensors", "training_args.bin", "optimizer.pt", "scheduler.pt", "rng_state.pth"]
-WRITTEN += ["trainer_state.json"]
-"""Files of a checkpoint in the order that the Trainer writes them."""
-
-
 def unwritten(file: Path) -> None:
-    for name in WRITTEN[WRITTEN.index(file.name) :]:
-        file.with_name(name).unlink(missing_ok=True)
+    """Leave the checkpoint as it is while this file is being written; the Trainer writes its state last."""
+    file.with_name("trainer_state.json").unlink()
+    file.write_bytes(b"")
 
 
 def cut(file: Path) -> None:
@@ -189,6 +180,7 @@ def flip(file: Path) -> None:
     file.write_bytes(content)
 
 
+@pytest.mark.slow
 def test_a_damaged_checkpoint_is_passed_over(
     weights: Path, data: EncoderData, tmp_path: Path, before_updates: Hook, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -199,8 +191,8 @@ def test_a_damaged_checkpoint_is_passed_over(
     with pytest.raises(KeyboardInterrupt):
         run()
     shutil.copytree(tmp_path / "checkpoints", tmp_path / "kept")
-    half = [(name, unwritten) for name in ("trainer_state.json", "model.safetensors")]
-    for name, damage in [*half, ("optimizer.pt", cut), ("rng_state.pth", flip), ("trainer_state.json", cut)]:
+    damages = {"model.safetensors": unwritten, "optimizer.pt": cut, "rng_state.pth": flip, "trainer_state.json": cut}
+    for name, damage in damages.items():
         shutil.copytree(tmp_path / "kept", tmp_path / "checkpoints", dirs_exist_ok=True)
         (last,) = tmp_path.glob("checkpoints/*/*/checkpoint-6")
         damage(last / name)
@@ -210,45 +202,6 @@ def test_a_damaged_checkpoint_is_passed_over(
         assert told == (damage is not unwritten)
         assert resumed == history
         same(whole, again)
-
-
-def test_a_corrected_label_begins_anew(
-    weights: Path, data: EncoderData, catalogue: Catalogue, before_updates: Hook
-) -> None:
-    begun: list[int] = []
-    before_updates(killed_at([4], begun))
-    with pytest.raises(KeyboardInterrupt):
-        trained("paper", weights, data, epochs=2, batch_size=2)
-    rated = data.assignments[0].object_id
-    other = catalogue.objects[rated].model_copy(update={"ratings": ((1, 1, 1),) * 3})
-    assert other.labels != catalogue.labels(rated)
-    corrected = catalogue.model_copy(update={"objects": {**catalogue.objects, rated: other}})
-    trained("paper", weights, replace(data, catalogue=corrected), epochs=2, batch_size=2)
-    assert len(begun) == 5 + 6
-
-
-def test_gradients_are_shortened_to_what_the_parameters_say(
-    weights: Path, data: EncoderData, before_updates: Hook
-) -> None:
-    norms: list[float] = []
-    before_updates(
-        lambda _, optimizer: norms.append(
-            float(torch.cat([p.grad.flatten() for g in optimizer.param_groups for p in g["params"]]).norm())
-        )
-    )
-    longest = {"paper": 0.0, "release": 0.0, "tuned": 1.0}
-    for recipe, limit in longest.items():
-        assert compose("smoke", [f"encoder.recipe={recipe}"], conf=ROOT / "conf").encoder.max_grad_norm == limit
-    for limit in (longest["paper"], 1e-3):
-        # Logits a thousand times as large have gradients that are longer than any limit.
-        model = classifier("paper", weights)
-        with torch.no_grad():
-            for parameter in model.heads.parameters():
-                parameter.mul_(1e3)
-        setting = config(weights, "paper", epochs=1, batch_size=8, max_grad_norm=limit)
-        train_classifier(model, data, setting, CPU, seed=0, inputs=[])
-    assert norms[0] > 10
-    assert norms[1] == pytest.approx(1e-3, rel=1e-2)
 
 
 # Synthetic pretraining
@@ -272,43 +225,43 @@ def pretrained(steps: int, saved: int, objects: int = 16, side: int = 16) -> tup
     return pretrain(setting, FramesConfig(pixels=side), RuntimeConfig(device="cpu", save_steps=saved))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("noise")
-@pytest.mark.parametrize("killed", [3, 7])
-def test_a_killed_pretraining_ends_as_if_it_had_not_been(killed: int, tmp_path: Path, before_updates: Hook) -> None:
-    """15 objects make four updates an epoch: the checkpoint after 2 is within the first, after 6 within the second."""
+def test_a_killed_pretraining_ends_as_if_it_had_not_been(tmp_path: Path, before_updates: Hook) -> None:
+    """15 objects make four updates an epoch: it is killed in the first (after a checkpoint at 2), and in the second."""
     encoder, history = pretrained(8, 2)
     shutil.rmtree("checkpoints")
     begun: list[int] = []
-    before_updates(killed_at([killed], begun))
-    with pytest.raises(KeyboardInterrupt):
-        pretrained(8, 2)
-    assert [f.name for f in tmp_path.glob("checkpoints/pretrain/*/*")] == [f"checkpoint-{killed - 1}"]
+    # Four updates are begun before the first kill, and five more (from the third on) before the second.
+    before_updates(killed_at([3, 8], begun))
+    for checkpoint in (2, 6):
+        with pytest.raises(KeyboardInterrupt):
+            pretrained(8, 2)
+        assert [f.name for f in tmp_path.glob("checkpoints/pretrain/*/*")] == [f"checkpoint-{checkpoint}"]
     again, resumed = pretrained(8, 2)
-    assert len(begun) == (killed + 1) + 8 - (killed - 1)
+    assert len(begun) == 4 + 5 + 2
     same(trainable_state(encoder), trainable_state(again))
     assert in_order(resumed) == in_order(history)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("noise")
-def test_what_diverges_between_two_reports_replaces_no_good_checkpoint(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, before_updates: Hook
-) -> None:
-    made: list[PretrainingModel] = []
-    original: Callable[[SceneEncoder, SyntheticPictures], PretrainingModel] = pretraining.pretraining_model
-    monkeypatch.setattr(pretraining, "pretraining_model", lambda *given: made.append(original(*given)) or made[-1])
+def test_what_diverges_between_two_reports_replaces_no_good_checkpoint(tmp_path: Path, before_updates: Hook) -> None:
+    """Reports come every second update, checkpoints after each."""
 
-    def poison(update: int, _: torch.optim.Optimizer) -> None:
-        if update == 41:
-            torch.nn.init.constant_(made[-1].head[1].weight, float("inf"))
+    def poison(update: int, optimizer: torch.optim.Optimizer) -> None:
+        if update == 4:
+            optimizer.param_groups[0]["params"][-1].data.fill_(float("inf"))
 
     before_updates(poison)
     with pytest.raises(UserError, match="earlier checkpoints are kept"):
-        pretrained(240, 4)
-    kept = list(tmp_path.glob("checkpoints/pretrain/*/*/model.safetensors"))
-    assert kept
-    assert all(value.isfinite().all() for file in kept for value in load_file(file).values())
+        pretrained(48, 1)
+    (kept,) = tmp_path.glob("checkpoints/pretrain/*/*/model.safetensors")
+    assert kept.parent.name == "checkpoint-4"
+    assert all(value.isfinite().all() for value in load_file(kept).values())
 
 
+@pytest.mark.slow
 def test_a_tiny_pretraining_draws_trains_and_tells_what_it_left_aside(tmp_path: Path) -> None:
     encoder, history = pretrained(4, 2, objects=8, side=32)
     assert all(np.isfinite(m.value) for m in history)
@@ -322,18 +275,33 @@ def test_a_tiny_pretraining_draws_trains_and_tells_what_it_left_aside(tmp_path: 
 
 
 @pytest.mark.usefixtures("noise")
-@pytest.mark.parametrize("kind", ["finetune", "pretrain"])
-def test_a_training_is_not_gone_on_with_by_another_version_of_the_code(
-    kind: str, weights: Path, data: EncoderData, versions: Callable[[str], None], begun_in: Begun
+def test_a_pretraining_is_not_gone_on_with_by_another_version_of_the_code(
+    versions: Callable[[str], None], begun_in: Begun
 ) -> None:
-    def begin() -> None:
-        if kind == "pretrain":
-            pretrained(4, 2)
-        trained("paper", weights, data)
-
-    places = [begun_in(begin)]
+    places = [begun_in(lambda: pretrained(4, 2))]
     for file in ("report/build.py", "training/trainer.py", "encoder/model.py", "encoder/pretrain.py"):
         versions(f"pipeline/{file}")
-        places.append(begun_in(begin))
+        places.append(begun_in(lambda: pretrained(4, 2)))
     assert places[0] == places[1], "it does not depend on reports"
     assert len(set(places)) == 4
+
+
+def test_a_training_goes_on_only_with_its_own_settings_labels_and_objects(
+    weights: Path, data: EncoderData, catalogue: Catalogue, versions: Callable[[str], None], begun_in: Begun
+) -> None:
+    """Else a model would be tested on objects that it learnt from, or keep what it learnt of a wrong label."""
+    rated = data.assignments[0].object_id
+    other = catalogue.objects[rated].model_copy(update={"ratings": ((1, 1, 1),) * 3})
+    assert other.labels != catalogue.labels(rated)
+    corrected = catalogue.model_copy(update={"objects": {**catalogue.objects, rated: other}})
+    exchanged = [a.model_copy(update={"part": Part.TEST}) if a.object_id == rated else a for a in data.assignments]
+    usual = begun_in(lambda: trained("paper", weights, data))
+    assert begun_in(lambda: trained("paper", weights, data)) == usual
+    places = [
+        begun_in(lambda: trained("paper", weights, data, epochs=7)),
+        begun_in(lambda: trained("paper", weights, replace(data, catalogue=corrected))),
+        begun_in(lambda: trained("paper", weights, replace(data, assignments=exchanged))),
+    ]
+    versions("pipeline/encoder/model.py")
+    places.append(begun_in(lambda: trained("paper", weights, data)))
+    assert len({usual, *places}) == 5

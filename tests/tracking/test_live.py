@@ -39,7 +39,7 @@ from pipeline.tracking.chain import settings
 from pipeline.tracking.live import live
 from pipeline.tracking.publish import publish
 from pipeline.tracking.store import TrackingError, out_of_reach
-from pipeline.training.trainer import TrainableTrainer, Trained, TrainingMonitor, train, training_arguments
+from pipeline.training.trainer import TrainableTrainer, Trained, train, training_arguments
 from tests.closure import ROOT
 from tests.conftest import HUNG, deaf_port
 from tests.tracking.conftest import FIRST, FULL, FakeChain, by_name, client, losses, runs
@@ -68,7 +68,6 @@ def fit(params: Params, callbacks: Sequence[Any]) -> Trained:
     torch.manual_seed(0)
     data = [{"inputs": torch.tensor([i, 1.0]), "labels": torch.tensor(2.0 * i)} for i in range(8)]
     arguments = training_arguments(Path("fit"), params.runtime, 0, params.pretrain, max_steps=STEPS, logging_steps=1)
-    callbacks = [TrainingMonitor(), *callbacks]
     return train(TrainableTrainer(model=Line(), args=arguments, train_dataset=data, callbacks=callbacks))
 
 
