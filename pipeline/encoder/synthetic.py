@@ -164,21 +164,16 @@ def _bands(field: Heights, where: npt.NDArray[np.bool_]) -> list[float]:
 
 
 def _picture(skin: Heights, sensor: Sensor, rng: np.random.Generator, frames: FramesConfig) -> Image:
-    """The difference picture of one press: size x size x RGB."""
+    """The difference picture of one press: size x size x RGB, fitted as `pipeline.videos.frames.fit` does it."""
     frame = shade(skin, sensor, PITCH, int(rng.integers(2**40)))
     coded = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(*QUALITY))])[1]
-    frame = np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR), dtype=np.uint8)
-    reference = np.asarray(cv2.convertScaleAbs(sensor.background), dtype=np.uint8)
-    fitted, untouched = (_fit(picture, frames)[:, :, ::-1] for picture in (frame, reference))
-    picture: Image = subtract(fitted[None], untouched)[0]
-    return picture
-
-
-def _fit(picture: Image, frames: FramesConfig) -> Image:
-    """As `pipeline.videos.frames.fit` does it with frames of a video."""
-    if frames.fit == "crop":
-        left = (WIDTH - HEIGHT) // 2
-        picture = picture[:, left : left + HEIGHT]
-    way = cv2.INTER_AREA if frames.pixels < HEIGHT else cv2.INTER_LINEAR
-    fitted: Image = cv2.resize(picture, (frames.pixels, frames.pixels), interpolation=way)
-    return fitted
+    fitted = []
+    for picture in (np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR)), cv2.convertScaleAbs(sensor.background)):
+        if frames.fit == "crop":
+            left = (WIDTH - HEIGHT) // 2
+            picture = picture[:, left : left + HEIGHT]
+        way = cv2.INTER_AREA if frames.pixels < HEIGHT else cv2.INTER_LINEAR
+        fitted.append(cv2.resize(picture, (frames.pixels, frames.pixels), interpolation=way)[:, :, ::-1])
+    shown, untouched = np.asarray(fitted, dtype=np.uint8)
+    difference: Image = subtract(shown[None], untouched)[0]
+    return difference

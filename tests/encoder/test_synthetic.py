@@ -39,7 +39,6 @@ from pipeline.encoder.synthetic import (
 )
 from pipeline.scenes.geometry import heights
 from pipeline.scenes.invent import MODULUS_MPA, invent
-from pipeline.scenes.light import Sensor
 from pipeline.scenes.recipe import Recipe
 from pipeline.videos.frames.subtraction import subtract
 from tests.frame_rules import pillow
@@ -186,30 +185,20 @@ def test_a_press_that_touches_nothing_shows_128(monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.parametrize(("fit", "size"), [("crop", 16), ("squash", 150)])
-def test_frames_are_fitted_as_those_of_videos(fit: str, size: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Against PIL, and in RGB; a press's frame and reference are of one sensor."""
+def test_pictures_are_fitted_as_frames_of_videos(fit: str, size: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Against PIL, and in RGB: the difference of what is lit to the same sensor's background."""
+    sensor = sensors()[0]
+    background = cv2.convertScaleAbs(sensor.background)
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH] / 12
-    waves = np.stack([120 + 60 * np.sin(x + c) * np.cos(y) + 20 * np.sin(y) for c in range(3)], axis=2).astype(np.uint8)
-    seen: list[Sensor] = []
-    taken: list[tuple[np.ndarray, np.ndarray]] = []
-
-    def light(_: np.ndarray, sensor: Sensor, pitch: float, seed: int) -> np.ndarray:
-        seen.append(sensor)
-        return waves
-
-    def note(frames: np.ndarray, reference: np.ndarray) -> np.ndarray:
-        taken.append((frames[0], reference))
-        return subtract(frames, reference)
-
-    monkeypatch.setattr(module, "shade", light)
-    monkeypatch.setattr(module, "subtract", note)
-    found = draw_object(2, CONFIG, FramesConfig(pixels=size, fit=fit))
-    assert found.pictures.shape == (1, 2, size, size, 3)
-    for sensor, (frame, reference), shown in zip(seen, taken, found.pictures[0], strict=True):
-        for found, whole in ((frame, waves), (reference, cv2.convertScaleAbs(sensor.background))):
-            expected = pillow(np.ascontiguousarray(whole[..., ::-1]), size, fit).astype(float)
-            assert np.abs(found - expected).mean() < 2.5, "coding included"
-        np.testing.assert_array_equal(shown, subtract(frame[None], reference)[0])
+    waves = np.stack([30 * np.sin(x + c) * np.cos(y) + 10 * np.sin(y) for c in range(3)], axis=2)
+    lit = np.clip(background + waves, 0, 255).astype(np.uint8)
+    monkeypatch.setattr(module, "shade", lambda *_: lit)
+    skin = np.zeros((HEIGHT, WIDTH), np.float32)
+    found = module._picture(skin, sensor, np.random.default_rng(0), FramesConfig(pixels=size, fit=fit)).astype(float)
+    frame, reference = (pillow(np.ascontiguousarray(picture[..., ::-1]), size, fit) for picture in (lit, background))
+    expected = subtract(frame[None], reference)[0]
+    assert np.abs(found - expected).mean() < 2 * 2.5, "a difference is shown doubled; coding included"
+    assert np.abs(found - expected[..., ::-1]).mean() > 4 * 2.5
 
 
 # Varying
