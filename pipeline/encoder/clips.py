@@ -1,4 +1,4 @@
-"""Clips for the encoder: a few frames of each video, drawn for training or at even distances, and what models say."""
+"""Clips: a few frames of each video, drawn at random for training or at even distances for evaluation."""
 
 from __future__ import annotations
 
@@ -108,10 +108,11 @@ class EncoderData:
 def describe_clips(
     encoder: FrameEncoder, data: EncoderData, videos: Sequence[LabelledVideo], batch_size: int, device: torch.device
 ) -> npt.NDArray[np.float32]:
-    """What the encoder says of the frames of each video's evaluation clip: float32, videos x frames x features."""
+    """Features of the frames of each video's evaluation clip: float32, videos x frames x features."""
     encoder = encoder.to(device).eval()
     clips = ClipDataset(data.store, videos, per_video=data.per_video)
     features = []
+    # `batch_size` counts frames, a loader clips.
     for batch in DataLoader(clips, batch_size=max(1, batch_size // data.per_video)):
         frames, frame_indices = batch["frames"].to(device), batch["frame_indices"].to(device)
         described = encoder.describe(frames.flatten(0, 1), frame_indices.flatten())
@@ -125,7 +126,7 @@ def describe_clips(
 def classify(
     model: PropertyClassifier, data: EncoderData, parts: Sequence[Part], batch_size: int, device: torch.device
 ) -> list[Classification]:
-    """What the heads say about the evaluation clip of each video of these parts."""
+    """Classify the evaluation clips of these parts: part by part and property by property, a record a video."""
     model = model.to(device).eval()
     objects = {a.video_id: a.object_id for a in data.assignments}
     records = []

@@ -119,7 +119,7 @@ def cross_validate_model(name: Compared, data: CrossValidationData, config: Cros
 
 
 def _constant(data: CrossValidationData) -> Predict:
-    """The training objects' most frequent combination of classes; of equals the lowest."""
+    """Predict the training objects' most frequent combination of classes; of equals the lowest."""
 
     def predict(fold: Fold) -> Labels:
         labels = dict(zip(np.array(data.objects)[fold.trained], map(tuple, data.labels[fold.trained]), strict=True))

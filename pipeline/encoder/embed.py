@@ -126,7 +126,7 @@ def _embed_video(loaded: Loaded, assignment: Assignment) -> np.ndarray:
 
 
 def union(splits: Iterable[Sequence[Assignment]]) -> list[Assignment]:
-    """What several splits of the same videos want embedded: a video is mirrored where any of them trains on it."""
+    """One assignment a video for several splits: it is embedded where any uses it, mirrored where any trains on it."""
     found: dict[str, Assignment] = {}
     for assignment in chain.from_iterable(splits):
         known = found.get(assignment.video_id)

@@ -40,9 +40,9 @@ class FrameEncoder(nn.Module):
         return described
 
     def trunk(self, frames: torch.Tensor) -> torch.Tensor:
-        """What lies below all that fine-tuning changes, computed once a picture: batch x anything.
+        """What the frozen layers below all that fine-tuning changes make of frames: batch x anything.
 
-        By default that is nothing, and the frames themselves.
+        It is computed once a picture. By default there are no such layers, and the frames are given back.
         """
         return frames
 
