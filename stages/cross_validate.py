@@ -3,11 +3,14 @@
 from pathlib import Path
 
 from pipeline.core.io import read_table, write_table
-from pipeline.core.records import OutOfFold, Video
+from pipeline.core.records import Assignment, OutOfFold, Part, Video
 from pipeline.core.stage import DATA, matrix_key, stage
-from pipeline.encoder.cross_validation import MODELS, CrossValidationData, cross_validate_model
+from pipeline.encoder.clips import EncoderData
+from pipeline.encoder.cross_validation import MODELS, cross_validate_model
+from pipeline.encoder.finetune import Training
 from pipeline.videos.catalogue import load_catalogue
-from pipeline.weights import check_encoder
+from pipeline.videos.frames.store import REFERENCES_FILE, TABLE_FILE, FrameStore
+from pipeline.weights import backbone_files, check_encoder
 
 
 def main() -> None:
@@ -15,16 +18,16 @@ def main() -> None:
     with stage("cross_validate", name) as run:
         params = run.params
         check_encoder(Path(params.encoder.weights), params.frames.pixels, params.encoder.backbone)
-        catalogue = load_catalogue(Path(params.data.catalogue))
-        data = CrossValidationData(
-            videos=read_table(DATA / "videos.parquet", Video),
-            catalogue=catalogue,
-            frames=DATA / "frames",
+        videos = read_table(DATA / "videos.parquet", Video)
+        data = EncoderData(
+            store=FrameStore(DATA / "frames", params.encoder.reference),
+            catalogue=load_catalogue(Path(params.data.catalogue)),
+            assignments=[Assignment(video_id=v.video_id, object_id=v.object_id, part=Part.UNUSED) for v in videos],
             per_video=params.frames.per_video,
-            encoder=params.encoder,
-            runtime=params.runtime,
         )
-        predictions = cross_validate_model(name, data, params.cross_validation)
+        inputs = [DATA / "frames" / file for file in (TABLE_FILE, REFERENCES_FILE)] + backbone_files(params.encoder)
+        training = Training(data, params.encoder, params.runtime, params.cross_validation.seed, inputs)
+        predictions = cross_validate_model(name, training, params.cross_validation)
         write_table(DATA / "cross_validation" / name / "out_of_fold.parquet", OutOfFold, predictions)
         right = [p.expected == p.predicted for p in predictions]
         run.metrics["combined.accuracy"] = sum(right) / len(right)

@@ -14,21 +14,22 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.config import Compared, CrossValidationConfig, EncoderConfig, Recipe, RuntimeConfig
+from pipeline.config import Compared, CrossValidationConfig, EncoderConfig, Recipe
 from pipeline.core.errors import UserError
-from pipeline.core.records import Measurement, Part
+from pipeline.core.records import Assignment, Measurement, Part
 from pipeline.core.runtime import derive_seed
 from pipeline.encoder import cross_validation as module
 from pipeline.encoder import frame_classifier
-from pipeline.encoder.clips import ClipDataset
-from pipeline.encoder.cross_validation import CrossValidationData, cross_validate_model
+from pipeline.encoder.clips import ClipDataset, EncoderData
+from pipeline.encoder.cross_validation import cross_validate_model
 from pipeline.encoder.finetune import Training, finetune
 from pipeline.encoder.folds import Fold, Predict, deal
 from pipeline.encoder.model import FrameEncoder, PropertyClassifier
 from pipeline.encoder.tuned import Trunks
 from pipeline.videos.catalogue import Catalogue
-from tests.conftest import fake_videos
-from tests.encoders import config, write_frames, write_pretrained, write_timm
+from pipeline.videos.frames.store import FrameStore
+from pipeline.weights import backbone_files
+from tests.encoders import CPU, config, write_frames, write_pretrained, write_timm
 
 OBJECTS = ("baseball", "controller_base", "cotton_ball", "ice_block", "millet", "pillow", "rug")
 CONFIG = CrossValidationConfig(folds=3, repeats=2, seed=4)
@@ -45,30 +46,28 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def data(weights: Path, catalogue: Catalogue, tmp_path: Path) -> CrossValidationData:
+def training(weights: Path, catalogue: Catalogue) -> Training:
     """Two videos an object and one more of the first; the pictures of an object are all of one grey of its own."""
-    videos = [v for v in fake_videos(OBJECTS, 3) if v.video_id.endswith(("_0", "_1")) or v.object_id == "baseball"]
-    folder = write_frames(tmp_path / "frames", {v.video_id: 3 for v in videos})
-    paint(folder, [grey(v.object_id) for v in videos])
-    return CrossValidationData(
-        videos=videos,
-        catalogue=catalogue,
-        frames=folder,
-        per_video=2,
-        encoder=EncoderConfig(weights=str(weights), prompts=2, epochs=2, batch_size=4),
-        runtime=RuntimeConfig(device="cpu"),
-    )
+    videos = {f"{o}_{i}": o for o in OBJECTS for i in range(3 if o == "baseball" else 2)}
+    write_frames(Path("frames"), dict.fromkeys(videos, 3))
+    assignments = [Assignment(video_id=v, object_id=o, part=Part.UNUSED) for v, o in videos.items()]
+    data = EncoderData(FrameStore(Path("frames")), catalogue, assignments, 2)
+    setting = EncoderConfig(weights=str(weights), prompts=2, epochs=2, batch_size=4)
+    return painted(Training(data, setting, CPU, 0, ()), [20 + 30 * OBJECTS.index(o) for o in videos.values()])
 
 
-def paint(folder: Path, greys: Sequence[int]) -> None:
+def painted(training: Training, greys: Sequence[int]) -> Training:
     """Give the three frames of each video one grey."""
-    pixels = np.load(folder / "frames.npy")
+    pixels = np.load("frames/frames.npy")
     pixels[:] = np.repeat(greys, 3)[:, None, None, None]
-    np.save(folder / "frames.npy", pixels)
+    np.save("frames/frames.npy", pixels)
+    return encoded(training, training.config)
 
 
-def grey(object_id: str) -> int:
-    return 20 + 30 * OBJECTS.index(object_id)
+def encoded(training: Training, setting: EncoderConfig) -> Training:
+    """The same videos for another encoder."""
+    data = replace(training.data, store=FrameStore(Path("frames"), setting.reference))
+    return replace(training, data=data, config=setting, inputs=backbone_files(setting))
 
 
 class Telling(FrameEncoder):
@@ -82,14 +81,16 @@ class Telling(FrameEncoder):
         return torch.stack([frames[:, 0, 0, 0].float(), numbers, numbers**2], dim=1)
 
 
-def relabelled(data: CrossValidationData, object_id: str) -> CrossValidationData:
+def relabelled(training: Training, object_id: str) -> Training:
     """Another rating of one object, as a corrected objects.csv has it."""
-    own = data.catalogue.objects[object_id]
+    catalogue = training.data.catalogue
+    own = catalogue.objects[object_id]
     other = tuple(0 if level else 2 for level in own.labels)
     ratings = tuple((level,) * 3 for level in other)
-    objects = {**data.catalogue.objects, object_id: own.model_copy(update={"ratings": ratings})}
+    objects = {**catalogue.objects, object_id: own.model_copy(update={"ratings": ratings})}
     assert objects[object_id].labels == other
-    return replace(data, catalogue=Catalogue(language=data.catalogue.language, objects=objects))
+    corrected = Catalogue(language=catalogue.language, objects=objects)
+    return replace(training, data=replace(training.data, catalogue=corrected))
 
 
 # Folds
@@ -109,18 +110,18 @@ def test_folds_hold_whole_objects_and_are_even(numbers: list[int], folds: int, s
 
 
 def test_a_tested_objects_own_label_changes_nothing_that_is_said_of_it(
-    data: CrossValidationData, monkeypatch: pytest.MonkeyPatch
+    training: Training, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each object has a grey of its own, so that heads that had learnt from one would know it again."""
     monkeypatch.setattr(module, "SideBySide", Telling)
     monkeypatch.setattr(frame_classifier, "STRENGTHS", (100.0,))
     once = CONFIG.model_copy(update={"repeats": 1})
-    whole = cross_validate_model("backbone", data, once)
-    assert [r.video_id for r in whole] == [v.video_id for v in data.videos]
-    assert all(r.expected == data.catalogue.labels(r.object_id) for r in whole)
+    whole = cross_validate_model("backbone", training, once)
+    assert [r.video_id for r in whole] == [v.video_id for v in training.data.assignments]
+    assert all(r.expected == training.data.catalogue.labels(r.object_id) for r in whole)
     changed = False
     for name in OBJECTS[:4]:
-        other = cross_validate_model("backbone", relabelled(data, name), once)
+        other = cross_validate_model("backbone", relabelled(training, name), once)
         said, found = ({r.video_id: r.predicted for r in records} for records in (whole, other))
         assert all(said[video] == found[video] for video in said if video.startswith(name))
         changed = changed or said != found
@@ -130,74 +131,80 @@ def test_a_tested_objects_own_label_changes_nothing_that_is_said_of_it(
 @pytest.mark.slow
 @pytest.mark.parametrize("recipe", ["paper", "release", "tuned"])
 def test_what_is_tuned_learns_from_no_object_that_it_is_tested_on(
-    recipe: Recipe, data: CrossValidationData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    recipe: Recipe, training: Training, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Some of a fold's objects choose the epoch; what each model says of each video by itself is what is written."""
     write_pretrained()
-    folder = Path(data.encoder.weights) if recipe != "tuned" else write_timm(tmp_path / "timm")
+    folder = Path(training.config.weights) if recipe != "tuned" else write_timm(tmp_path / "timm")
     backbone = {"backbone": ("timm", "scenes"), "feature_stage": 2} if recipe == "tuned" else {}
-    data = replace(data, encoder=config(folder, recipe, epochs=1, **backbone))
+    training = encoded(training, config(folder, recipe, epochs=1, **backbone))
     parts: list[dict[Part, set[str]]] = []
     said: dict[str, tuple[int, ...]] = {}
 
-    def note(training: Training, *rest: Trunks) -> tuple[PropertyClassifier, list[Measurement]]:
-        assert training.config == data.encoder
-        parts.append({p: {a.object_id for a in training.data.assignments if a.part == p} for p in Part})
-        model, history = finetune(training, *rest)
-        tested = training.data.videos(Part.TEST)
-        for video, item in zip(tested, ClipDataset(training.data.store, tested, per_video=2), strict=True):  # type: ignore
+    def note(own: Training, *rest: Trunks) -> tuple[PropertyClassifier, list[Measurement]]:
+        assert own.config == training.config
+        parts.append({p: {a.object_id for a in own.data.assignments if a.part == p} for p in Part})
+        model, history = finetune(own, *rest)
+        tested = own.data.videos(Part.TEST)
+        for video, item in zip(tested, ClipDataset(own.data.store, tested, per_video=2), strict=True):  # type: ignore
             with torch.no_grad():
                 logits = model.eval()(item["frames"][None], item["frame_indices"][None])["logits"]
             said[video.video_id] = tuple(model.decide(logits)[0].tolist())
         return model, history
 
     monkeypatch.setattr(module, "finetune", note)
-    found = cross_validate_model("backbone-tuned", data, SMALL)
+    found = cross_validate_model("backbone-tuned", training, SMALL)
     assert [p[Part.TEST] for p in parts] == [set(part) for part in deal(OBJECTS, 2, derive_seed(4, "folds", 0))]
     for own in parts:
         train, validation, test, unused = (own[p] for p in (Part.TRAIN, Part.VALIDATION, Part.TEST, Part.UNUSED))
         assert validation
         assert not unused
         assert sorted([*train, *validation, *test]) == sorted(OBJECTS), "each in one part"
-    assert [(r.video_id, r.predicted) for r in found] == [(v.video_id, said[v.video_id]) for v in data.videos]
+    assert [(r.video_id, r.predicted) for r in found] == [
+        (v.video_id, said[v.video_id]) for v in training.data.assignments
+    ]
 
 
 # What they say
 
 
-def test_constant_by_hand(data: CrossValidationData) -> None:
+def test_constant_by_hand(training: Training) -> None:
     """Each object counts once, however many videos it has; of equals the lowest classes."""
-    found = cross_validate_model("constant", data, CONFIG)
-    assert [(r.video_id, r.repeat) for r in found] == [(v.video_id, n) for v in data.videos for n in (0, 1)]
+    found = cross_validate_model("constant", training, CONFIG)
+    assert [(r.video_id, r.repeat) for r in found] == [
+        (v.video_id, n) for v in training.data.assignments for n in (0, 1)
+    ]
     for repeat in range(2):
         for held in deal(OBJECTS, 3, derive_seed(4, "folds", repeat)):
-            counts = Counter(data.catalogue.labels(o) for o in OBJECTS if o not in held)
+            counts = Counter(training.data.catalogue.labels(o) for o in OBJECTS if o not in held)
             expected = min(c for c, n in counts.items() if n == max(counts.values()))
             assert {r.predicted for r in found if r.repeat == repeat and r.object_id in held} == {expected}
     assert len({r.predicted for r in found}) > 1, "folds differ here"
 
 
-def test_what_the_pictures_show_is_found(data: CrossValidationData, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_the_pictures_show_is_found(training: Training, monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures that show the class itself."""
-    paint(data.frames, [100 * data.catalogue.labels(o)[0] for o in data.objects])
+    hardness = {o: training.data.catalogue.labels(o)[0] for o in OBJECTS}
+    training = painted(training, [100 * hardness[a.object_id] for a in training.data.assignments])
     monkeypatch.setattr(module, "SideBySide", Telling)
     monkeypatch.setattr(frame_classifier, "STRENGTHS", (10.0,))
-    found = cross_validate_model("backbone", data, CrossValidationConfig(folds=7, repeats=1))
-    shared = [r for r in found if sum(data.catalogue.labels(o)[0] == r.expected[0] for o in OBJECTS) > 1]
+    found = cross_validate_model("backbone", training, CrossValidationConfig(folds=7, repeats=1))
+    shared = [r for r in found if list(hardness.values()).count(r.expected[0]) > 1]
     assert len(shared) > 8
     assert all(r.predicted[0] == r.expected[0] for r in shared), "classes that another object has, too"
 
 
-def test_results_are_repeatable_and_independent_of_the_order(data: CrossValidationData) -> None:
+def test_results_are_repeatable_and_independent_of_the_order(training: Training) -> None:
     write_pretrained()
-    data = replace(data, encoder=config(Path("none"), "tuned"))
-    pixels = np.load(data.frames / "frames.npy")
+    pixels = np.load("frames/frames.npy")
     pixels += np.random.default_rng(0).integers(0, 20, pixels.shape, dtype=np.uint8)
-    np.save(data.frames / "frames.npy", pixels)
-    first = cross_validate_model("backbone", data, SMALL)
+    np.save("frames/frames.npy", pixels)
+    training = encoded(training, config(Path("none"), "tuned"))
+    first = cross_validate_model("backbone", training, SMALL)
     torch.rand(7)
-    assert cross_validate_model("backbone", data, SMALL) == first
-    turned = cross_validate_model("backbone", replace(data, videos=data.videos[::-1]), SMALL)
+    assert cross_validate_model("backbone", training, SMALL) == first
+    data = replace(training.data, assignments=training.data.assignments[::-1])
+    turned = cross_validate_model("backbone", replace(training, data=data), SMALL)
     assert sorted(turned, key=lambda r: r.video_id) == sorted(first, key=lambda r: r.video_id)
 
 
@@ -208,12 +215,12 @@ def kill_after(count: int, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, i
     """Make all models constant and interrupt them when asked for one more fold; returns the folds begun."""
     begun: list[tuple[int, int]] = []
 
-    def until(data: CrossValidationData) -> Predict:
+    def until(training: Training) -> Predict:
         def counting(fold: Fold) -> np.ndarray:
             if len(begun) == count:
                 raise KeyboardInterrupt
             begun.append((fold.repeat, fold.number))
-            return CONSTANT(data)(fold)
+            return CONSTANT(training)(fold)
 
         return counting
 
@@ -222,57 +229,58 @@ def kill_after(count: int, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, i
     return begun
 
 
-def killed(count: int, name: Compared, data: CrossValidationData, monkeypatch: pytest.MonkeyPatch) -> None:
+def killed(count: int, name: Compared, training: Training, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         kill_after(count, patch)
         with pytest.raises(KeyboardInterrupt):
-            cross_validate_model(name, data, CONFIG)
+            cross_validate_model(name, training, CONFIG)
 
 
 @pytest.mark.parametrize("count", [0, 4])
 def test_finished_folds_survive_a_kill(
-    count: int, data: CrossValidationData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    count: int, training: Training, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = cross_validate_model("constant", data, CONFIG)
-    killed(count, "constant", data, monkeypatch)
+    whole = cross_validate_model("constant", training, CONFIG)
+    killed(count, "constant", training, monkeypatch)
     begun = kill_after(99, monkeypatch)
     fewer = CONFIG.model_copy(update={"models": ("constant", "backbone")})
-    assert cross_validate_model("constant", data, fewer) == whole, "other models are no matter"
+    assert cross_validate_model("constant", training, fewer) == whole, "other models are no matter"
     assert begun == [(r, n) for r in range(2) for n in range(3)][count:]
     assert not any(tmp_path.glob("checkpoints/cross_validation/*")), "kept no longer than needed"
 
 
 @pytest.mark.parametrize("other", ["model", "labels", "pretraining", "frames", "folds", "code"])
 def test_folds_of_other_inputs_settings_or_code_are_not_taken_for_these(
-    other: str, data: CrossValidationData, versions: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
+    other: str, training: Training, versions: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     name: Compared = "backbone"
     setting = CONFIG
     write_pretrained()
-    data = replace(data, encoder=config(Path("none"), "tuned"))
-    killed(2, name, data, monkeypatch)
+    training = encoded(training, config(Path("none"), "tuned"))
+    killed(2, name, training, monkeypatch)
     match other:
         case "model":
             name = "backbone-tuned"
         case "labels":
-            data = relabelled(data, "rug")
+            training = relabelled(training, "rug")
         case "pretraining":
             write_pretrained(1)
         case "frames":
-            data = replace(data, per_video=3)
+            training = replace(training, data=replace(training.data, per_video=3))
         case "folds":
             setting = CONFIG.model_copy(update={"seed": 5})
         case "code":
             versions("pipeline/training/trainer.py")
     begun = kill_after(99, monkeypatch)
-    cross_validate_model(name, data, setting)
+    cross_validate_model(name, training, setting)
     assert len(begun) == 6
 
 
 @pytest.mark.slow
-def test_folds_need_as_many_objects_and_no_more(data: CrossValidationData) -> None:
+def test_folds_need_as_many_objects_and_no_more(training: Training) -> None:
     """With one object to train on none is left to validate by."""
-    few = replace(data, videos=[v for v in data.videos if v.object_id in OBJECTS[1:3]])
+    data = replace(training.data, assignments=[a for a in training.data.assignments if a.object_id in OBJECTS[1:3]])
+    few = replace(training, data=data)
     assert len(cross_validate_model("backbone-tuned", few, SMALL)) == 4
     with pytest.raises(UserError, match=r"cross_validation.folds is 8 but only 7 objects have videos"):
-        cross_validate_model("constant", data, CrossValidationConfig(folds=8))
+        cross_validate_model("constant", training, CrossValidationConfig(folds=8))
