@@ -256,7 +256,7 @@ def test_copies_of_public_videos_are_found(real_data: Path, tmp_path: Path, cata
             frames = [cv2.add(frame, np.full_like(frame, 12)) for frame in frames[len(frames) // 12 :]]
         path = encode(tmp_path / f"copy{number}_0.mp4", frames, "mpeg4", "yuv420p", bits=400_000)
         probes.append(look_at(path, f"copy{number}_0"))
-    named = [f.item for f in leakage._near_copies(probes, {}) if f.item != "all"]
+    named = [f.item for f in leakage.near_copies(probes, {}) if f.item != "all"]
     assert len(named) >= 12
     assert set(named) <= {f"copy{number}_0.mp4" for number in range(24)}
     assert len(named) == len(set(named))

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from pipeline.core.records import Finding, Part, Probe
 from pipeline.videos.audit.files import FOUND, by_rate, check_files
-from pipeline.videos.audit.labels import check_labels, similar_names
+from pipeline.videos.audit.labels import check_labels
 from pipeline.videos.audit.leakage import check_leakage, sessions
 from pipeline.videos.catalogue import Catalogue
 from tests.audit_records import ERROR, INFO, OBJECTS, OTHER, PHYSICLEAR, WARNING, leaks, odd, of, probe, probes
@@ -214,11 +214,3 @@ def test_classes_that_nobody_chose_and_stated_labels() -> None:
     right = {o: e.model_copy(update={"stated": e.labels}) for o, e in OTHER.objects.items()}
     for silent in (relabel(OTHER, stated=(None,) * 3), Catalogue(language=OTHER.language, objects=right)):
         assert labels(silent, "stated label") == []
-
-
-def test_a_name_that_is_nearly_in_the_catalogue(catalogue: Catalogue) -> None:
-    found = list(similar_names(["cotton_bal", "yoyo", "hairbrush_handles"], catalogue))
-    assert [(f.item, f.expected, f.severity) for f in found] == [
-        ("cotton_bal", "cotton_ball?", WARNING),
-        ("hairbrush_handles", "hairbrush_handle?", WARNING),
-    ]

@@ -73,9 +73,9 @@ def presses(tmp_path_factory: pytest.TempPathFactory) -> list[Probe]:
 
 def test_different_presses_have_no_near_duplicates(presses: list[Probe]) -> None:
     assert len(presses) == 16
-    touched = [f for f in leakage._near_copies(presses, {}) if f.item == "all"]
+    touched = [f for f in leakage.near_copies(presses, {}) if f.item == "all"]
     assert int(re.findall(r"of (\d+) videos", touched[0].measured)[0]) >= 10, "most show contact, so most are compared"
-    assert {f.severity for f in leakage._near_copies(presses, {})} == {INFO}, (
+    assert {f.severity for f in leakage.near_copies(presses, {})} == {INFO}, (
         "an object pressed twice alike is no warning"
     )
 
@@ -99,7 +99,7 @@ def test_a_changed_copy_is_found(tmp_path: Path, presses: list[Probe], start: in
         pairs = [*presses, original, others]
         parts = {original.video_id: one, others.video_id: two}
         known = {p.path for p in presses} | {"all"}
-        near = [f for f in leakage._near_copies(pairs, parts) if f.item not in known]
+        near = [f for f in leakage.near_copies(pairs, parts) if f.item not in known]
         assert [(f.item, f.severity) for f in near] == [(others.path, severity)]
         assert "baseball_0.avi" in near[0].measured
 
@@ -123,7 +123,7 @@ def drawn_contacts(videos: int, seed: int) -> list[Probe]:
 
 def named(found: list[Probe]) -> tuple[list[str], float]:
     """The videos that are called near-duplicates, and the bound."""
-    *near, summary = leakage._near_copies(found, {})
+    *near, summary = leakage.near_copies(found, {})
     return [f.item for f in near], float(summary.expected.split()[-1])
 
 
@@ -201,21 +201,6 @@ def test_more_videos_than_are_clustered_go_with_the_nearest(monkeypatch: pytest.
     monkeypatch.setattr(leakage, "SAMPLE", 20)
     assert sessions(found_videos) == whole
     assert len(set(zip(truth, whole, strict=True))) == 3
-
-
-@pytest.mark.parametrize("block", [1, 2, 5])
-def test_copies_are_found_whatever_is_compared_at_a_time(
-    presses: list[Probe], monkeypatch: pytest.MonkeyPatch, block: int
-) -> None:
-    first, *others = presses
-    twin = first.model_copy(
-        update={"video_id": "lemon_9", "object_id": "lemon", "path": "lemon_9.avi", "sha256": "its own"}
-    )
-    found = [*others, twin, first]
-    whole = list(leakage._near_copies(found, {}))
-    assert [f.item for f in whole[:-1]] == [first.path]
-    monkeypatch.setattr(leakage, "BLOCK", block)
-    assert list(leakage._near_copies(found, {})) == whole
 
 
 def test_formats_and_names_are_sessions_of_their_own() -> None:

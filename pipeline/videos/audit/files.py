@@ -32,11 +32,21 @@ DEVIATION = 1.4826
 
 def check_files(probes: Sequence[Probe], catalogue: Catalogue) -> Iterator[Finding]:
     """All checks of this module, over videos that decode."""
-    if probes:
-        yield from _overview(probes, catalogue)
-        for rate, group in by_rate(probes).items():
-            yield from _beside_others(rate, group)
-        yield from _each(probes)
+    if not probes:
+        return
+    yield from _overview(probes, catalogue)
+    for rate, group in by_rate(probes).items():
+        usual, middle = median(p.frames for p in group), median(p.brightness for p in group)
+        # At least one step: where all videos are equally bright, rounding is no outlier.
+        spread = max(1.0, DEVIATION * median(abs(p.brightness - middle) for p in group))
+        others = f"as others at {rate:.4g} frames/s"
+        for p in group:
+            if p.frames < SHORT * usual:
+                yield finding("length", p.path, f"{p.frames} frames", f"about {usual:g}, {others}", Severity.WARNING)
+            if abs(p.brightness - middle) > DARK_OR_BRIGHT * spread:
+                measured, expected = f"{p.brightness:.1f} of 255", f"{middle:.1f} +- {spread:.1f}, {others}"
+                yield finding("brightness", p.path, measured, expected, Severity.WARNING)
+    yield from _each(probes)
 
 
 def quiet_level(probes: Sequence[Probe]) -> float:
@@ -86,28 +96,17 @@ def by_rate(probes: Sequence[Probe]) -> dict[float, list[Probe]]:
     return {median(p.fps for p in group): group for group in groups}
 
 
-def _beside_others(rate: float, group: Sequence[Probe]) -> Iterator[Finding]:
-    usual, middle = median(p.frames for p in group), median(p.brightness for p in group)
-    # At least one step: where all videos are equally bright, rounding is no outlier.
-    spread = max(1.0, DEVIATION * median(abs(p.brightness - middle) for p in group))
-    for p in group:
-        if p.frames < SHORT * usual:
-            expected = f"about {usual:g}, as others at {rate:.4g} frames/s"
-            yield finding("length", p.path, f"{p.frames} frames", expected, Severity.WARNING)
-        if abs(p.brightness - middle) > DARK_OR_BRIGHT * spread:
-            expected = f"{middle:.1f} +- {spread:.1f}, as others at {rate:.4g} frames/s"
-            yield finding("brightness", p.path, f"{p.brightness:.1f} of 255", expected, Severity.WARNING)
-
-
 def _each(probes: Sequence[Probe]) -> Iterator[Finding]:
     """What is odd about a video by itself, or by the quiet level of its data set."""
     level, bright = quiet_level(probes), f"at most {100 * SATURATED:g} %"
+    # Some containers promise no number (0): nothing to hold them to.
+    differing = {p.path for p in probes if p.header_frames not in (0, p.frames)}
     for p in probes:
         touched, released = touches(p, level), STILL * p.contact
         pressed = touched and p.contact_end > max(FOUND * level, released)
         from_end = "touched from the first frame: the reference comes from the end"
         for check, odd, measured, expected in (
-            ("frames that decode", _header_lies(p), str(p.frames), f"{p.header_frames}, by the header"),
+            ("frames that decode", p.path in differing, str(p.frames), f"{p.header_frames}, by the header"),
             ("rotation", p.rotation, f"{p.rotation} degrees in the metadata, applied", "0"),
             ("colours", p.hdr, "HDR, which looks flat beside other videos", "SDR; record or export it as such"),
             ("frame rate", p.irregular > IRREGULAR, f"varies by a factor of {p.irregular:.1f}", "even"),
@@ -121,11 +120,6 @@ def _each(probes: Sequence[Probe]) -> Iterator[Finding]:
         ):
             if odd:
                 yield finding(check, p.path, measured, expected, Severity.WARNING)
-    differing = sum(_header_lies(p) for p in probes)
-    yield finding("frames that decode", "all", f"{differing} of {len(probes)} videos differ from their header", "0")
+    counted = f"{len(differing)} of {len(probes)} videos differ from their header"
+    yield finding("frames that decode", "all", counted, "0")
     yield finding("contact", "all", f"quiet level {level:.2f}, median contact {median(p.contact for p in probes):.2f}")
-
-
-def _header_lies(probe: Probe) -> bool:
-    # Some containers promise no number (0): nothing to hold them to.
-    return probe.header_frames not in (0, probe.frames)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from difflib import get_close_matches
 from itertools import product
 from statistics import fmean
 
@@ -18,22 +17,44 @@ TINY = 1e-12
 
 def check_labels(catalogue: Catalogue) -> Iterator[Finding]:
     """All checks of this module; none needs a video."""
-    yield from _agreement(catalogue)
+    objects = catalogue.objects.values()
     for place, prop in enumerate(catalogue.properties):
-        counts = Counter(o.labels[place] for o in catalogue.objects.values())
+        ratings = [o.ratings[place] for o in objects]
+        as_many = len({len(r) for r in ratings}) == 1
+        found = icc3k(ratings) if as_many else None
+        if found is None:
+            why = "one rating, or no variance" if as_many else "objects have different numbers of ratings"
+            yield finding("agreement, ICC(3,k)", prop.name, f"undefined: {why}")
+            continue
+        value, low, high = found
+        yield finding("agreement, ICC(3,k)", prop.name, f"{value:.3f} ({low:.3f} to {high:.3f})")
+        disputed = sum(len(set(r)) > 1 for r in ratings)
+        yield finding("disputed ratings", prop.name, f"{disputed} of {len(ratings)} objects")
+    for place, prop in enumerate(catalogue.properties):
+        counts = Counter(o.labels[place] for o in objects)
         for level, name in enumerate(prop.levels):
             severity = Severity.INFO if counts[level] else Severity.WARNING
             yield finding("objects of a class", f"{prop.name}: {name}", str(counts[level]), "", severity)
-    yield from _stated(catalogue)
-    yield from _described(catalogue)
+    differing, contradicting = [], []
+    for o in objects:
+        for prop, stated, label, rated in zip(catalogue.properties, o.stated, o.labels, o.ratings, strict=True):
+            where, name = f"{o.object_id}: {prop.name}", prop.levels[label]
+            if stated not in (None, label):
+                measured = f"{name} (mean rating {fmean(rated):.2f})"
+                differing.append(finding("stated label", where, measured, prop.levels[stated], Severity.WARNING))
+            if named := contradiction(o.description, prop, label):
+                measured = f"rated {name} ({' '.join(map(str, rated))})"
+                expected = "described as " + " or ".join(prop.levels[level] for level in sorted(named))
+                contradicting.append(finding("description", where, measured, expected, Severity.WARNING))
+    yield from (*differing, *contradicting)
     yield from _splits(catalogue)
 
 
 def icc3k(ratings: Sequence[Sequence[float]]) -> tuple[float, float, float] | None:
     """Agreement of the mean of k raters and its 95 % interval: two-way mixed, consistency (Shrout and Fleiss 1979).
 
-    Written out, as the import of pingouin, whose `intraclass_corr` gives the same, takes longer than the whole audit of
-    the labels.
+    Written out: pingouin's `intraclass_corr` rounds the interval to two places, and importing it takes longer than the
+    whole audit of the labels.
 
     Args:
         ratings: Targets x raters, all rows of equal length.
@@ -60,56 +81,13 @@ def icc3k(ratings: Sequence[Sequence[float]]) -> tuple[float, float, float] | No
     return 1 - unlike, low, high
 
 
-def similar_names(unknown: Sequence[str], catalogue: Catalogue) -> Iterator[Finding]:
-    """Objects of the folder that the catalogue lacks, but nearly has."""
-    for name in unknown:
-        for close in get_close_matches(name, catalogue.objects, n=1, cutoff=0.9):
-            yield finding("spelling", name, "not in the catalogue", f"{close}?", Severity.WARNING)
-
-
-def _agreement(catalogue: Catalogue) -> Iterator[Finding]:
-    for place, prop in enumerate(catalogue.properties):
-        ratings = [o.ratings[place] for o in catalogue.objects.values()]
-        as_many = len({len(r) for r in ratings}) == 1
-        found = icc3k(ratings) if as_many else None
-        if found is None:
-            why = "one rating, or no variance" if as_many else "objects have different numbers of ratings"
-            yield finding("agreement, ICC(3,k)", prop.name, f"undefined: {why}")
-            continue
-        value, low, high = found
-        yield finding("agreement, ICC(3,k)", prop.name, f"{value:.3f} ({low:.3f} to {high:.3f})")
-        disputed = sum(len(set(r)) > 1 for r in ratings)
-        yield finding("disputed ratings", prop.name, f"{disputed} of {len(ratings)} objects")
-
-
-def _stated(catalogue: Catalogue) -> Iterator[Finding]:
-    for o in catalogue.objects.values():
-        for prop, stated, label, ratings in zip(catalogue.properties, o.stated, o.labels, o.ratings, strict=True):
-            if stated not in (None, label):
-                measured = f"{prop.levels[label]} (mean rating {fmean(ratings):.2f})"
-                where = f"{o.object_id}: {prop.name}"
-                yield finding("stated label", where, measured, prop.levels[stated], Severity.WARNING)
-
-
-def _described(catalogue: Catalogue) -> Iterator[Finding]:
-    for o in catalogue.objects.values():
-        for prop, label, ratings in zip(catalogue.properties, o.labels, o.ratings, strict=True):
-            if named := contradiction(o.description, prop, label):
-                words = " or ".join(prop.levels[level] for level in sorted(named))
-                measured = f"rated {prop.levels[label]} ({' '.join(map(str, ratings))})"
-                where = f"{o.object_id}: {prop.name}"
-                yield finding("description", where, measured, f"described as {words}", Severity.WARNING)
-
-
 def _splits(catalogue: Catalogue) -> Iterator[Finding]:
     """Where the catalogue's splits disagree, and parts that lack a class."""
-    objects = catalogue.objects.values()
-    names = list(dict.fromkeys(name for o in objects for name in o.splits))
-    for name in names[1:]:
-        for o in objects:
-            one, other = o.splits[names[0]], o.splits[name]
-            if one != other:
-                yield finding("splits differ", o.object_id, f"{one} in {names[0]}", f"{other} in {name}")
+    names, objects = catalogue.split_names, catalogue.objects.values()
+    for name, o in product(names[1:], objects):
+        one, other = o.splits[names[0]], o.splits[name]
+        if one != other:
+            yield finding("splits differ", o.object_id, f"{one} in {names[0]}", f"{other} in {name}")
     for name, part in product(names, (Part.TRAIN, Part.VALIDATION, Part.TEST)):
         members = [o for o in objects if o.splits[name] == part]
         for place, prop in enumerate(catalogue.properties):

@@ -27,8 +27,6 @@ FOLDS = 5
 RIDGE = 1.0
 FEWEST = 16
 """Likenesses that a tail is told from; `DUPLICATE` alone counts below 256 pairs of videos."""
-BLOCK = 512
-"""Videos that are compared at a time with all others: a table of all pairs of 100,000 would take 80 GB."""
 SAMPLE = 5000
 """Most videos that sessions are told apart by, and that labels are predicted on: the first takes memory and time by the
 square, the second by 2000 permutations. Of more, a sample is taken."""
@@ -36,8 +34,6 @@ ALPHA = 0.1
 """Below this p value a prediction from nothing but the untouched sensor is a warning. Generous: a leak that is missed
 costs more than one that is looked into, and a few dozen objects give such a test little power."""
 LEARNT_FROM = (Part.TRAIN, Part.VALIDATION)
-
-
 Parts = Mapping[str, Part]
 """By video id; empty where no split was asked for."""
 
@@ -51,9 +47,17 @@ def check_leakage(
     recorded = sessions(probes)
     for assignments in splits or [()]:
         parts = {a.video_id: a.part for a in assignments}
-        yield from _objects(probes, parts)
+        stands: dict[str, set[Part]] = defaultdict(set)
+        for p in probes:
+            if parts.get(p.video_id, Part.UNUSED) != Part.UNUSED:
+                stands[p.object_id].add(parts[p.video_id])
+        crossing = [name for name in sorted(stands) if len(stands[name]) > 1]
+        for name in crossing:
+            yield finding("object in two parts", name, ", ".join(sorted(stands[name])), "one part", Severity.ERROR)
+        if parts:
+            yield finding("object in two parts", "all", f"{len(crossing)} of {len(stands)} objects", "0")
         yield from _copies(probes, parts)
-        yield from _near_copies(probes, parts)
+        yield from near_copies(probes, parts)
         yield from _sessions(probes, parts, recorded, catalogue)
     yield from _untouched_predictions(probes, recorded, catalogue)
 
@@ -65,21 +69,21 @@ def sessions(probes: Sequence[Probe]) -> list[str]:
     """
     names = [p.session for p in probes]
     rates = {p.video_id: rate for rate, group in by_rate([p for p in probes if not p.session]).items() for p in group}
-    groups: dict[tuple[float, int, int], list[int]] = defaultdict(list)
+    formats: dict[tuple[float, int, int], list[int]] = defaultdict(list)
     for place, p in enumerate(probes):
         if not p.session:
-            groups[rates[p.video_id], p.width, p.height].append(place)
-    for (rate, width, height), places in groups.items():
+            formats[rates[p.video_id], p.width, p.height].append(place)
+    for (rate, width, height), places in formats.items():
         pictures = np.array([probes[i].thumbnail for i in places]).reshape(len(places), -1, 3)
         clusters = _clusters((pictures - pictures.mean(1, keepdims=True)).reshape(len(places), -1))
-        members: dict[int, list[int]] = defaultdict(list)
+        looks: dict[int, list[int]] = defaultdict(list)
         for i, cluster in zip(places, clusters.tolist(), strict=True):
-            members[cluster].append(i)
+            looks[cluster].append(i)
         # The largest cluster is the first, so that names do not depend on the order of the videos.
-        ordered = sorted(members.values(), key=lambda own: (-len(own), min(probes[i].video_id for i in own)))
-        for look, own in enumerate(ordered, 1):
+        ordered = sorted(looks.values(), key=lambda own: (-len(own), min(probes[i].video_id for i in own)))
+        for number, own in enumerate(ordered, 1):
             for i in own:
-                names[i] = f"{rate:.4g} frames/s, {width}x{height}, look {look}"
+                names[i] = f"{rate:.4g} frames/s, {width}x{height}, look {number}"
     return names
 
 
@@ -149,18 +153,6 @@ def predictability(
     return float(shares[0]), shares[1:].tolist()
 
 
-def _objects(probes: Sequence[Probe], parts: Parts) -> Iterator[Finding]:
-    stands: dict[str, set[Part]] = defaultdict(set)
-    for p in probes:
-        if parts.get(p.video_id, Part.UNUSED) != Part.UNUSED:
-            stands[p.object_id].add(parts[p.video_id])
-    crossing = [name for name in sorted(stands) if len(stands[name]) > 1]
-    for name in crossing:
-        yield finding("object in two parts", name, ", ".join(sorted(stands[name])), "one part", Severity.ERROR)
-    if parts:
-        yield finding("object in two parts", "all", f"{len(crossing)} of {len(stands)} objects", "0")
-
-
 def _copies(probes: Sequence[Probe], parts: Parts) -> Iterator[Finding]:
     earlier: dict[str, list[Probe]] = defaultdict(list)
     for video in probes:
@@ -171,7 +163,8 @@ def _copies(probes: Sequence[Probe], parts: Parts) -> Iterator[Finding]:
     yield finding("same content", "all", f"{len(probes) - len(earlier)} of {len(probes)} files", "0")
 
 
-def _near_copies(probes: Sequence[Probe], parts: Parts) -> Iterator[Finding]:
+def near_copies(probes: Sequence[Probe], parts: Parts) -> Iterator[Finding]:
+    """Videos whose contact looks as no two videos' does by chance; the last finding is the closest pair's likeness."""
     level = quiet_level(probes)
     shown = [p for p in probes if touches(p, level)]
     if len(shown) < 2:
@@ -180,19 +173,17 @@ def _near_copies(probes: Sequence[Probe], parts: Parts) -> Iterator[Finding]:
     own = likeness_vectors(np.array([p.signature for p in shown]))
     objects = np.unique([p.object_id for p in shown], return_inverse=True)[1]
     pairs = (len(objects) ** 2 - int((np.bincount(objects) ** 2).sum())) // 2
-    largest = np.empty(0)
-    close: list[tuple[int, int, float]] = []
-    closest = 0.0
-    for start in range(0, len(shown), BLOCK):
-        alike = np.triu(own[start : start + BLOCK] @ own[start:].T, 1)
+    closest, largest, close = 0.0, np.empty(0), list[tuple[Probe, Probe, float]]()
+    # A video at a time with all behind it: a table of all pairs of 100,000 would take 80 GB.
+    for i, vector in enumerate(own[:-1]):
+        alike = own[i + 1 :] @ vector
         closest = max(closest, float(alike.max()))
-        close += [(start + i, start + j, alike[i, j]) for i, j in np.argwhere(alike > DUPLICATE).tolist()]
-        # Below the diagonal stand zeros: never among the largest.
-        chance = alike[objects[start : start + BLOCK, None] != objects[start:]]
+        close += [(shown[i], shown[i + 1 + j], alike[j]) for j in np.flatnonzero(alike > DUPLICATE).tolist()]
+        # By pairs of different objects the bound is told; only their largest count.
+        chance = alike[objects[i + 1 :] != objects[i]]
         largest = np.sort(np.concatenate([largest, chance]))[-math.isqrt(pairs) - 1 :]
     bound = likeness_bound(largest[::-1], pairs)
-    for i, j, likeness in close:
-        one, other = shown[i], shown[j]
+    for one, other, likeness in close:
         # What has equal bytes `_copies` names.
         if likeness > bound and one.sha256 != other.sha256:
             measured, crosses = f"contact is alike by {likeness:.3f}", _crosses(parts, one, other)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 
@@ -12,10 +13,10 @@ from pipeline.core.errors import UserError
 from pipeline.core.parallel import run_parallel
 from pipeline.core.records import Assignment, Finding, Probe, Severity, finding
 from pipeline.videos.audit.files import check_files
-from pipeline.videos.audit.labels import check_labels, similar_names
+from pipeline.videos.audit.labels import check_labels
 from pipeline.videos.audit.leakage import check_leakage
 from pipeline.videos.catalogue import Catalogue
-from pipeline.videos.files import Listing, VideoFile, list_videos
+from pipeline.videos.files import VideoFile, list_videos
 from pipeline.videos.frames.scan import Scan, scan
 from pipeline.videos.split import assign
 
@@ -29,8 +30,7 @@ def audit_folder(folder: Path, catalogue: Catalogue, split: SplitConfig | None =
     Args:
         split: also look for what leaks between its parts, with kfold of every fold.
     """
-    listing = list_videos(folder, catalogue)
-    probes, wrong = _scan_all(listing.files)
+    probes, wrong = _scan_all(list_videos(folder, catalogue).files)
     splits = []
     if split is not None and probes:
         try:
@@ -38,7 +38,31 @@ def audit_folder(folder: Path, catalogue: Catalogue, split: SplitConfig | None =
             splits = [assign(catalogue, probes, split, fold) for fold in folds]
         except UserError as error:
             wrong.append(finding("split", split.name, str(error), severity=Severity.ERROR))
-    return _audit(listing, wrong, probes, splits, catalogue)
+    return audit_chain(folder, probes, splits, catalogue, wrong)
+
+
+def audit_chain(
+    folder: Path,
+    probes: Sequence[Probe],
+    splits: Sequence[Sequence[Assignment]],
+    catalogue: Catalogue,
+    wrong: Sequence[Finding] = (),
+) -> list[Finding]:
+    """The audit of what is decoded and split already, errors first; opens no video.
+
+    Args:
+        splits: one, or with kfold one a fold.
+        wrong: what decoding and splitting found.
+    """
+    listing = list_videos(folder, catalogue)
+    found = list(listing.findings)
+    for name in listing.unknown_objects:
+        for close in get_close_matches(name, catalogue.objects, n=1, cutoff=0.9):
+            found.append(finding("spelling", name, "not in the catalogue", f"{close}?", Severity.WARNING))
+    found += [*wrong, *check_labels(catalogue), *check_files(probes, catalogue)]
+    found += check_leakage(probes, splits, catalogue)
+    # Most findings are the same under every split.
+    return by_severity(dict.fromkeys(found))
 
 
 def check_folder(folder: Path, catalogue: Catalogue) -> list[Finding]:
@@ -46,13 +70,6 @@ def check_folder(folder: Path, catalogue: Catalogue) -> list[Finding]:
     listing = list_videos(folder, catalogue)
     probes, wrong = _scan_all(listing.files)
     return by_severity([*listing.findings, *wrong, *check_files(probes, catalogue)])
-
-
-def audit_chain(
-    folder: Path, probes: Sequence[Probe], splits: Sequence[Sequence[Assignment]], catalogue: Catalogue
-) -> list[Finding]:
-    """The audit of what the chain has decoded and split, once a fold with kfold, errors first; opens no video."""
-    return _audit(list_videos(folder, catalogue), [], probes, splits, catalogue)
 
 
 def by_severity(findings: Iterable[Finding]) -> list[Finding]:
@@ -71,19 +88,6 @@ def summary(findings: Sequence[Finding]) -> dict[str, float]:
     """How many findings there are of each severity, as flat metrics."""
     counts = Counter(f.severity for f in findings)
     return {f"{severity}s": counts[severity] for severity in (Severity.ERROR, Severity.WARNING)}
-
-
-def _audit(
-    listing: Listing,
-    wrong: Sequence[Finding],
-    probes: Sequence[Probe],
-    splits: Sequence[Sequence[Assignment]],
-    catalogue: Catalogue,
-) -> list[Finding]:
-    found = [*listing.findings, *similar_names(listing.unknown_objects, catalogue), *wrong, *check_labels(catalogue)]
-    found += [*check_files(probes, catalogue), *check_leakage(probes, splits, catalogue)]
-    # Most findings are the same under every split.
-    return by_severity(dict.fromkeys(found))
 
 
 def _scan_all(files: Sequence[VideoFile]) -> tuple[list[Probe], list[Finding]]:
