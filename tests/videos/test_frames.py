@@ -16,8 +16,8 @@ from pipeline.videos.decoding import Decoder, picture
 from pipeline.videos.frames import selection
 from pipeline.videos.frames.fit import fit
 from pipeline.videos.frames.reference import reference_indices, thumbnail
+from pipeline.videos.frames.scan import VideoPass, run_pass
 from pipeline.videos.frames.selection import kept_count
-from pipeline.videos.frames.video_pass import VideoPass, run_pass
 from tests.conftest import moving_square, write_video
 from tests.frame_rules import CONFIG, constant, frames_of, luma, pillow, pressing, published, salience
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import json
 import logging
 import shutil
 from dataclasses import dataclass
@@ -37,46 +39,13 @@ class Extraction:
 
 
 class _Done(Record):
-    """A finished video, as it stands in the header of the file with its pixels."""
+    """A finished video, as it stands in the header of its file in `partial`, beside `reference` and `frames`."""
 
-    stamp: tuple[str, str, str, str, int, int]
-    """What the file was listed as, its size and time of change."""
+    stamp: str
+    """Tells whether the file, or what videos.csv says of it, has changed since (`_stamp`)."""
     probe: Probe
     places: tuple[tuple[int, float], ...]
     """Index and score of each kept frame."""
-
-
-@dataclass(frozen=True)
-class _Job:
-    file: VideoFile
-    config: FramesConfig
-    work: Path
-
-    def __str__(self) -> str:
-        return str(self.file)
-
-    @property
-    def pixels(self) -> Path:
-        """Where the process that scans leaves what it found: `reference`, `frames` and a `_Done`."""
-        return self.work / f"{self.file.video_id}.safetensors"
-
-    def finished(self) -> _Done | None:
-        """What an earlier extraction found; None where there was none, or the video has changed since."""
-        try:
-            with safe_open(self.pixels, "np") as stored:
-                done = _Done.model_validate_json(stored.metadata()["done"])
-        except (OSError, SafetensorError, ValidationError):  # Not there, or cut off when the machine lost its power.
-            return None
-        return done if done.stamp == self.stamp() else None
-
-    def stamp(self) -> tuple[str, str, str, str, int, int]:
-        """What tells whether the file, or what videos.csv says of it, has changed; a file that is gone has size -1."""
-        file = self.file
-        try:
-            status = file.path.stat()
-        except OSError:
-            return file.relative, file.video_id, file.object_id, file.session, -1, 0
-        return file.relative, file.video_id, file.object_id, file.session, status.st_size, status.st_mtime_ns
 
 
 def extract_frames(folder: Path, catalogue: Catalogue, config: FramesConfig, out: Path, partial: Path) -> Extraction:
@@ -97,51 +66,75 @@ def extract_frames(folder: Path, catalogue: Catalogue, config: FramesConfig, out
         log.warning("%s: %s", finding.item, finding.measured)
     work = partial / fingerprint(config, str(folder.resolve()), *code_of("extract_frames"))
     work.mkdir(parents=True, exist_ok=True)
-    jobs = [_Job(file, config, work) for file in listing.files]
-    found = [job.finished() for job in jobs]
-    rest = [place for place, earlier in enumerate(found) if earlier is None]
-    for place, result in zip(rest, run_parallel(_work, [jobs[p] for p in rest], "videos", "video"), strict=True):
+    found = {file: _finished(file, work) for file in listing.files}
+    rest = [file for file, earlier in found.items() if earlier is None]
+    scan_one = functools.partial(_work, config=config, work=work)
+    for file, result in zip(rest, run_parallel(scan_one, rest, "videos", "video"), strict=True):
         if isinstance(result, Finding):
             raise_errors(folder, [result])
-        else:
-            found[place] = result
-            name, probe = jobs[place].file.relative, result.probe
-            if probe.header_frames > probe.frames:
-                lost = f"{probe.frames} of the {probe.header_frames} frames in its header decode"
-                log.warning("%s: %s; is it cut off? The %d are used", name, lost, probe.frames)
-            if probe.kept == 0:
-                log.warning("%s: %d frames are too few for frames.selection=release; left out", name, probe.frames)
-    done = [each for each in found if each is not None]
-    used = [(job, each) for job, each in zip(jobs, done, strict=True) if each.places]
+            continue
+        found[file], probe = result, result.probe
+        if probe.header_frames > probe.frames:
+            lost = f"{probe.frames} of the {probe.header_frames} frames in its header decode"
+            log.warning("%s: %s; is it cut off? The %d are used", file, lost, probe.frames)
+        if probe.kept == 0:
+            log.warning("%s: %d frames are too few for frames.selection=release; left out", file, probe.frames)
+    done = [each for each in found.values() if each is not None]
+    used = [each for each in done if each.places]
     if not used:
         raise UserError(f"{folder}: no video has a frame to keep; choose another frames.selection")
     frames: list[Frame] = []
-    for _, each in used:
+    for each in used:
         for index, score in each.places:
             frames.append(Frame(video_id=each.probe.video_id, frame_index=index, score=score, row=len(frames)))
-    for file, name, count in ((FRAMES_FILE, "frames", len(frames)), (REFERENCES_FILE, "reference", len(used))):
-        with atomic(out / file) as temporary, temporary.open("wb") as stream:
+    for name, tensor, count in ((FRAMES_FILE, "frames", len(frames)), (REFERENCES_FILE, "reference", len(used))):
+        with atomic(out / name) as temporary, temporary.open("wb") as stream:
             shape = (count, config.pixels, config.pixels, 3)
             np.lib.format.write_array_header_1_0(stream, {"descr": "|u1", "fortran_order": False, "shape": shape})
-            for job, _ in used:
-                with safe_open(job.pixels, "np") as stored:
-                    stream.write(stored.get_tensor(name).data)
+            for each in used:
+                with safe_open(_pixels(work, each.probe.video_id), "np") as stored:
+                    stream.write(stored.get_tensor(tensor).data)
     write_table(out / TABLE_FILE, Frame, frames)
     write_table(out / PROBES_FILE, Probe, [each.probe for each in done])
     shutil.rmtree(work)
-    return Extraction(tuple(each.probe for _, each in used), tuple(each.probe for each in done), tuple(frames))
+    return Extraction(tuple(each.probe for each in used), tuple(each.probe for each in done), tuple(frames))
 
 
-def _work(job: _Job) -> _Done | Finding:
-    """Scan one video in a process of its own."""
-    stamp = job.stamp()
-    result = scan(job.file, job.config)
+def _pixels(work: Path, video_id: str) -> Path:
+    """Where a finished video waits until all are."""
+    return work / f"{video_id}.safetensors"
+
+
+def _stamp(file: VideoFile) -> str:
+    """What a file is listed as, its size and its time of change; of one that is gone, what it is listed as."""
+    try:
+        status = file.path.stat()
+        changed = (status.st_size, status.st_mtime_ns)
+    except OSError:
+        changed = (-1, 0)
+    return json.dumps((file.relative, file.video_id, file.object_id, file.session, *changed))
+
+
+def _finished(file: VideoFile, work: Path) -> _Done | None:
+    """What an earlier extraction found; None where there was none, or the video has changed since."""
+    try:
+        with safe_open(_pixels(work, file.video_id), "np") as stored:
+            done = _Done.model_validate_json(stored.metadata()["done"])
+    except (OSError, SafetensorError, ValidationError):  # Not there, or cut off when the machine lost its power.
+        return None
+    return done if done.stamp == _stamp(file) else None
+
+
+def _work(file: VideoFile, config: FramesConfig, work: Path) -> _Done | Finding:
+    """Scan one video in a process of its own, and leave its pixels in `work`."""
+    stamp = _stamp(file)  # Before it is read: what changes meanwhile is read anew by the next extraction.
+    result = scan(file, config)
     if isinstance(result, Finding):
         return result
     done = _Done(stamp=stamp, probe=result.probe, places=tuple((kept.index, kept.score) for kept in result.kept))
     pixels = {"reference": result.reference}
     if result.kept:
         pixels["frames"] = np.stack([kept.image for kept in result.kept])
-    with atomic(job.pixels) as temporary:
+    with atomic(_pixels(work, file.video_id)) as temporary:
         save_file(pixels, temporary, {"done": done.model_dump_json()})
     return done

@@ -63,24 +63,20 @@ def is_steady(thumbs: Sequence[Image]) -> bool:
 
 def thumbnail(frame: av.VideoFrame) -> Image:
     """A frame with its longer side at `THUMB` pixels: uint8, height x width x (brightness, two colour differences)."""
-    shown = planes(frame)
-    size = _size(shown[0])
-    small: Image = cv2.merge([cv2.resize(plane, size, interpolation=cv2.INTER_LINEAR) for plane in shown])
+    small: Image = cv2.merge(_small(planes(frame)))
     return small
 
 
 def brightness_thumbnail(frame: av.VideoFrame) -> Image:
     """The brightness of `thumbnail` alone, for a third of its cost: uint8, height x width."""
-    shown = brightness(frame)
-    small: Image = cv2.resize(shown, _size(shown), interpolation=cv2.INTER_LINEAR)
-    return small
+    return _small([brightness(frame)])[0]
 
 
-def _size(plane: Image) -> tuple[int, int]:
-    """Width and height of a thumbnail."""
-    height, width = plane.shape
+def _small(shown: Sequence[Image]) -> list[Image]:
+    height, width = shown[0].shape
     scale = THUMB / max(height, width)
-    return max(1, round(width * scale)), max(1, round(height * scale))
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    return [np.asarray(cv2.resize(plane, size, interpolation=cv2.INTER_LINEAR), dtype=np.uint8) for plane in shown]
 
 
 def contact_strength(thumb: Image, reference: Image) -> float:

@@ -3,27 +3,36 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 
 from pipeline.config import FramesConfig
 from pipeline.core.io import sha256
 from pipeline.core.records import Finding, Probe, Severity, finding
-from pipeline.videos.decoding import Decoder, Image
+from pipeline.videos.decoding import Decoder, Header, Image, turns
 from pipeline.videos.files import VideoFile
+from pipeline.videos.frames.fit import fit
 from pipeline.videos.frames.reference import (
+    brightness_thumbnail,
     contact_strength,
     detail,
+    is_steady,
     reference_indices,
     starts_touching,
     thumbnail,
     unsteady_frames,
 )
-from pipeline.videos.frames.selection import Kept
-from pipeline.videos.frames.video_pass import reference_of, run_pass
+from pipeline.videos.frames.selection import RELEASE_FEWEST, BestFrames, Kept
 
+PROBES = 8
+"""Frames of a video that are measured for the audit, besides the reference's and the last."""
+SIGNATURE_FRAMES = 64
+"""Frames of a video that the signature is made from, which tells copies."""
 THUMBNAIL_SIZE = (8, 6)
 SIGNATURE_SIZE = (24, 18)
 
@@ -36,6 +45,43 @@ class Scan:
     kept: tuple[Kept, ...]
     reference: Image
     """size x size x RGB."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The no-contact picture: size x size x RGB as encoders see it, and the thumbnail that contact is measured on."""
+
+    picture: Image
+    thumb: Image
+
+
+@dataclass
+class VideoPass:
+    """What one decode of a video found; `first` and `last` are set where there are frames."""
+
+    header: Header
+    frames: int = 0
+    sizes: set[tuple[int, int]] = field(default_factory=set)
+    """Height and width of the pictures; more than one where the video changes."""
+    rotation: int = 0
+    """Degrees against the clock."""
+    reference: Reference | None = None
+    steady: bool = True
+    """Whether the light stays the same in the frames whose mean is the reference."""
+    first: Image = field(init=False)
+    last: Image = field(init=False)
+    """Thumbnails: the mean of the first frames, and the last frame."""
+    contact: float = 0.0
+    strongest: Image | None = None
+    """Largest contact strength so far, and the thumbnail that shows it."""
+    strengths: list[float] = field(default_factory=list)
+    """In probed frames after the reference's."""
+    brightness: list[float] = field(default_factory=list)
+    times: list[tuple[int, float]] = field(default_factory=list)
+    """Index and time stamp (s) of probed frames that have one."""
+    brightness_thumbnails: list[Image] = field(default_factory=list)
+    """Taken after the reference's frames."""
+    kept: list[Kept] = field(default_factory=list)
 
 
 def scan(file: VideoFile, config: FramesConfig) -> Scan | Finding:
@@ -107,6 +153,77 @@ def scan(file: VideoFile, config: FramesConfig) -> Scan | Finding:
         signature=_signature(found.brightness_thumbnails, reference),
     )
     return Scan(probe, tuple(found.kept), found.reference.picture)
+
+
+def run_pass(
+    path: Path, config: FramesConfig, promised: int | None = None, given: Reference | None = None, unsteady: int = 0
+) -> VideoPass:
+    """Decode a video once.
+
+    Args:
+        promised: how many frames it has, where the header is not to be trusted.
+        given: its no-contact reference; None takes it from the first frames.
+        unsteady: first frames that are not looked at; only the published rule, which knows no light, may choose them.
+    """
+    with Decoder(path) as decoder:
+        found = VideoPass(decoder.header, reference=given)
+        count = decoder.header.frames if promised is None else promised
+        best = BestFrames(count, config)
+        places = [unsteady + i for i in reference_indices(count)]
+        stride, often = max(1, count // PROBES), max(1, count // SIGNATURE_FRAMES)
+        by_contact = config.selection == "contact"  # at every frame, not only where the audit does
+        untouched: list[av.VideoFrame] = []
+        own, frame = None, None
+        for index, frame in enumerate(decoder.frames()):
+            found.frames = index + 1
+            found.rotation = 90 * turns(frame)
+            found.sizes.add((frame.height, frame.width) if found.rotation % 180 == 0 else (frame.width, frame.height))
+            if len(found.sizes) > 1:
+                return found
+            if config.selection == "release" or (index >= unsteady and not by_contact):
+                best.look(index, frame)
+            if index < unsteady:
+                continue
+            if index in places:
+                untouched.append(frame)
+            elif index == places[-1] + 1:
+                found.steady = is_steady([thumbnail(each) for each in (*untouched, frame)])
+                own = reference_of(untouched, config)
+                found.reference = given or own
+            probed = index % stride == 0
+            if probed or by_contact:
+                thumb = thumbnail(frame)
+                if found.reference:
+                    strength = contact_strength(thumb, found.reference.thumb)
+                    if found.strongest is None or strength > found.contact:
+                        found.contact, found.strongest = strength, thumb
+                    if probed:
+                        found.strengths.append(strength)
+                    if by_contact:
+                        best.offer(strength, index, frame)
+                if probed:
+                    found.brightness.append(cv2.mean(thumb)[0])
+                    if frame.time is not None:
+                        found.times.append((index, frame.time))
+            if found.reference and index % often == 0:
+                found.brightness_thumbnails.append(brightness_thumbnail(frame))
+        if frame is None:
+            return found
+        own = own or reference_of(untouched, config)
+        found.reference, found.first, found.last = given or own, own.thumb, thumbnail(frame)
+        found.kept = best.kept()
+        if config.selection == "release" and len(found.kept) < RELEASE_FEWEST:
+            found.kept = []
+        elif not found.kept:
+            # A single frame has no predecessor and shows no contact; it is kept because it is all there is.
+            found.kept = [Kept(unsteady, 0.0, fit(untouched[0], config))]
+    return found
+
+
+def reference_of(frames: Sequence[av.VideoFrame], config: FramesConfig) -> Reference:
+    """The mean of frames."""
+    pictures, thumbs = [fit(frame, config) for frame in frames], [thumbnail(frame) for frame in frames]
+    return Reference(*(np.rint(np.mean(p, axis=0)).astype(np.uint8) for p in (pictures, thumbs)))
 
 
 def _irregular(times: list[tuple[int, float]]) -> float:

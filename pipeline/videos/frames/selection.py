@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from pipeline.config import FramesConfig
-from pipeline.videos.decoding import Image
+from pipeline.videos.decoding import Image, brightness, picture
 from pipeline.videos.frames.fit import fit
 
 RELEASE_FEWEST = 5
@@ -65,30 +65,47 @@ class BestFrames:
 
     Frames are held as the codec left them and fitted at the end, since most that come are pushed out again; only where
     all that may be held would take more than `HELD_BYTES`, they are fitted at once.
+
+    Args:
+        frames: how many the video has, by what it promises or by a first pass.
     """
 
-    def __init__(self, capacity: int, config: FramesConfig) -> None:
-        self.capacity = capacity
-        self.config = config
+    def __init__(self, frames: int, config: FramesConfig) -> None:
+        self.frames, self.config = frames, config
+        self.capacity = kept_count(frames, config)
         self._heap: list[tuple[float, int, int]] = []  # Smallest (score, -index) first: the next to go. Then the slot.
         self._held: list[av.VideoFrame | Image] = []
+        self._before: tuple[av.VideoFrame, Image] | None = None
+
+    def look(self, index: int, frame: av.VideoFrame) -> None:
+        """Score a frame, or by the published rule the one before it, by the change between the two, and offer it."""
+        salient = self.config.selection == "salient"
+        now = brightness(frame) if salient else cv2.cvtColor(picture(frame), cv2.COLOR_BGR2GRAY)
+        if self._before is not None:
+            earlier, shown = self._before
+            if salient:
+                self.offer(difference(now, shown), index, frame)
+            elif index < self.frames:
+                self.offer(changed_pixels(now, shown), index - 1, earlier)
+        self._before = frame, now
 
     def offer(self, score: float, index: int, frame: av.VideoFrame) -> None:
         """Keep a frame if it is among the best."""
-        if len(self._heap) < self.capacity:
-            heapq.heappush(self._heap, (score, -index, len(self._held)))
-            self._held.append(self._hold(frame))
-        elif self._heap and (score, -index) > self._heap[0][:2]:
+        full = len(self._heap) >= self.capacity
+        if full and (not self._heap or (score, -index) <= self._heap[0][:2]):
+            return
+        heavy = self.capacity * frame.width * frame.height * 1.5 > HELD_BYTES
+        held = fit(frame, self.config) if heavy else frame
+        if full:
             slot = self._heap[0][2]
             heapq.heapreplace(self._heap, (score, -index, slot))
-            self._held[slot] = self._hold(frame)
+            self._held[slot] = held
+        else:
+            heapq.heappush(self._heap, (score, -index, len(self._held)))
+            self._held.append(held)
 
     def kept(self) -> list[Kept]:
         """What was kept, in time order."""
         chosen = sorted((-back, score, slot) for score, back, slot in self._heap)
         held = ((index, score, self._held[slot]) for index, score, slot in chosen)
         return [Kept(i, score, h if isinstance(h, np.ndarray) else fit(h, self.config)) for i, score, h in held]
-
-    def _hold(self, frame: av.VideoFrame) -> av.VideoFrame | Image:
-        heavy = self.capacity * frame.width * frame.height * 1.5 > HELD_BYTES
-        return fit(frame, self.config) if heavy else frame

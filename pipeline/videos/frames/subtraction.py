@@ -28,14 +28,11 @@ def subtract(frames: Pictures, reference: Pictures) -> Pictures:
         uint8, as `frames`.
     """
     difference = frames.astype(np.int16) - reference.astype(np.int16)
+    height, width = reference.shape[:2]
+    top, left = max(1, height // RING), max(1, width // RING)
+    ring = np.ones((height, width), dtype=bool)
+    ring[top : height - top, left : width - left] = False
     # Halves go up, not to the even number: then a change of the light by one step shifts the median by just that.
-    shift = np.floor(np.median(difference[:, _ring(*reference.shape[:2])], axis=1) + 0.5).astype(np.int16)
+    shift = np.floor(np.median(difference[:, ring], axis=1) + 0.5).astype(np.int16)
     pictures: Pictures = np.clip(MIDDLE + GAIN * (difference - shift[:, None, None]), 0, 255).astype(np.uint8)
     return pictures
-
-
-def _ring(height: int, width: int) -> np.ndarray:
-    ring = np.ones((height, width), dtype=bool)
-    top, left = max(1, height // RING), max(1, width // RING)
-    ring[top : height - top, left : width - left] = False
-    return ring
