@@ -34,6 +34,9 @@ FULL_RANGE, BT709 = 2, 1
 HDR = (16, 18)
 """PQ and HLG, as ITU-T H.273 numbers transfer characteristics."""
 
+REFORMATTER = VideoReformatter()
+"""One a process: it keeps its tables from frame to frame."""
+
 
 @dataclass(frozen=True)
 class Header:
@@ -158,10 +161,4 @@ def _colours(full: bool, bt709: bool) -> npt.NDArray[np.float64]:
 
 def _reformat(frame: av.VideoFrame, pixels: str) -> av.VideoFrame:
     """In one thread: a forked process that inherits threads which are not in it waits for them for ever."""
-    return _reformatter().reformat(frame, format=pixels, threads=1)
-
-
-@cache
-def _reformatter() -> VideoReformatter:
-    """One a process: it keeps its tables from frame to frame."""
-    return VideoReformatter()
+    return REFORMATTER.reformat(frame, format=pixels, threads=1)

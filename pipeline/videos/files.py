@@ -86,7 +86,11 @@ def list_videos(folder: Path, catalogue: Catalogue) -> Listing:
         message = f"{counted} are left out; list them in objects.csv to use them: {names}"
         findings.append(finding("name", str(folder), message, severity=Severity.WARNING))
     files.sort(key=lambda f: (f.object_id, int(f.video_id.rpartition("_")[2]), f.relative))
-    return Listing(tuple(files), (*findings, *_same_id(files)), tuple(sorted(unknown_objects)))
+    for video_id, group in groupby(files, lambda f: f.video_id):
+        first, *others = (f.relative for f in group)
+        if others:
+            findings.append(_error(first, f"{video_id} is also {', '.join(others)}; keep one of them"))
+    return Listing(tuple(files), tuple(findings), tuple(sorted(unknown_objects)))
 
 
 def raise_errors(folder: Path, findings: Sequence[Finding]) -> None:
@@ -193,9 +197,3 @@ def _from_list(listed: Path, folder: Path, paths: Sequence[Path]) -> tuple[list[
         message = f"{unlisted} videos of the folder are not listed and are left out"
         findings.append(finding("name", LIST_FILE, message, severity=Severity.WARNING))
     return list(files.values()), findings
-
-
-def _same_id(files: Sequence[VideoFile]) -> list[Finding]:
-    """Of files that are sorted by their ids."""
-    groups = [(video_id, [f.relative for f in group]) for video_id, group in groupby(files, lambda f: f.video_id)]
-    return [_error(n[0], f"{v} is also {', '.join(n[1:])}; keep one of them") for v, n in groups if len(n) > 1]

@@ -54,21 +54,24 @@ def assign_objects(
     Raises:
         UserError: as `assign`.
     """
-    check_split(catalogue, config.name)
+    columns, name = catalogue.split_names, config.name
+    ruled = [rule for rule in RULED_SPLITS if rule != "development" or ORIGIN in columns]
+    if name not in (*columns, *ruled):
+        why = f" needs the column split_{ORIGIN}" if name in RULED_SPLITS else " is no split of the catalogue"
+        raise UserError(f"split.name={name}{why}; allowed: {', '.join((*columns, *ruled))} (see objects.csv)")
     fold = config.fold_of(seed)
     if fold is not None:
         parts = _deal(catalogue, present, config, fold)
-    elif config.name == "development":
+    elif name == "development":
         parts = _develop(catalogue, present, config)
     else:
-        parts = {o.object_id: o.splits[config.name] for o in catalogue.objects.values()}
+        parts = {o.object_id: o.splits[name] for o in catalogue.objects.values()}
     if config.missing == "error" and (lacking := without_videos(parts, present)):
         raise UserError(
-            f"split.name={config.name}: {lacking}; add videos to data.dir, or set split.missing=report to go on "
-            "without them"
+            f"split.name={name}: {lacking}; add videos to data.dir, or set split.missing=report to go on without them"
         )
     if not any(parts.get(object_id) == Part.TRAIN for object_id in present):
-        raise UserError(f"split {config.name}: no video of a training object; add videos, or choose another split.name")
+        raise UserError(f"split {name}: no video of a training object; add videos, or choose another split.name")
     return parts
 
 
@@ -92,19 +95,6 @@ def without_videos(parts: Mapping[str, Part], present: Collection[str]) -> str:
         elif not known and part is Part.TEST:
             said.append("no object is for test")
     return "; ".join(said)
-
-
-def check_split(catalogue: Catalogue, name: str) -> None:
-    """Make sure that the catalogue allows a split of this name.
-
-    Raises:
-        UserError: listing the names that it allows.
-    """
-    columns = catalogue.split_names
-    ruled = [rule for rule in RULED_SPLITS if rule != "development" or ORIGIN in columns]
-    if name not in (*columns, *ruled):
-        why = f" needs the column split_{ORIGIN}" if name in RULED_SPLITS else " is no split of the catalogue"
-        raise UserError(f"split.name={name}{why}; allowed: {', '.join((*columns, *ruled))} (see objects.csv)")
 
 
 def read_splits(data: Path, config: SplitConfig, seeds: Sequence[int]) -> dict[int, list[Assignment]]:
@@ -153,23 +143,21 @@ def _develop(catalogue: Catalogue, present: Collection[str], config: SplitConfig
             f"split.test_objects is {config.test_objects}, but {len(candidates)} training objects with videos allow "
             f"{max(most, 0)} ({FEWEST_TRAINING_OBJECTS} must be left to train on); lower it or add videos"
         )
-    rng = random.Random(derive_seed(config.seed, "development"))
-    drawn = (rng.sample(candidates, config.test_objects) for _ in range(CANDIDATES))
-    whole = _shares(catalogue, candidates)
-    chosen = min(drawn, key=lambda objects: _distance(_shares(catalogue, objects), whole))
+
+    def shares(objects: Collection[str]) -> dict[tuple[int, int], float]:
+        """The share of each class (property index, level) among the objects."""
+        found: dict[tuple[int, int], float] = defaultdict(float)
+        for object_id in objects:
+            for key in enumerate(catalogue.labels(object_id)):
+                found[key] += 1 / len(objects)
+        return found
+
+    def distance(objects: Collection[str]) -> float:
+        """Sum of squared differences of shares; a choice has no class that the whole lacks."""
+        some = shares(objects)
+        return sum((some.get(key, 0.0) - share) ** 2 for key, share in whole.items())
+
+    whole, rng = shares(candidates), random.Random(derive_seed(config.seed, "development"))
+    chosen = min((rng.sample(candidates, config.test_objects) for _ in range(CANDIDATES)), key=distance)
     held_out = {**dict.fromkeys(candidates, Part.TRAIN), **dict.fromkeys(chosen, Part.TEST)}
     return {o: held_out.get(o, Part.UNUSED if part == Part.TEST else part) for o, part in paper.items()}
-
-
-def _shares(catalogue: Catalogue, objects: Collection[str]) -> dict[tuple[int, int], float]:
-    """The share of each class (property index, level) among the objects."""
-    shares: dict[tuple[int, int], float] = defaultdict(float)
-    for object_id in objects:
-        for key in enumerate(catalogue.labels(object_id)):
-            shares[key] += 1 / len(objects)
-    return shares
-
-
-def _distance(some: dict[tuple[int, int], float], whole: dict[tuple[int, int], float]) -> float:
-    """Sum of squared differences; `some` is drawn from `whole`, so it has no class that `whole` lacks."""
-    return sum((some.get(key, 0.0) - share) ** 2 for key, share in whole.items())

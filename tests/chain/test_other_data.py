@@ -13,6 +13,7 @@ import pytest
 import yaml
 from safetensors.numpy import load_file
 
+from pipeline.config import SplitConfig
 from pipeline.core.errors import UserError
 from pipeline.core.io import read_jsonl, read_table
 from pipeline.core.records import Assignment, Opd, Part, Prediction, Question
@@ -23,7 +24,7 @@ from pipeline.tasks.base import Pool
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.catalogue.wording import levels_named
 from pipeline.videos.files import list_videos
-from pipeline.videos.split import check_split
+from pipeline.videos.split import assign_objects
 from tests.closure import ROOT
 from tests.fake_run import fake_params, write_run
 from tests.project import OBJECTS, REDUCED, Project, copy_project
@@ -215,7 +216,7 @@ def test_the_documented_example_is_valid(tmp_path: Path) -> None:
     assert example.describe("tile").endswith("Overall, it is not sticky and feels cold.")
     named = {p.name: levels_named(example.objects["tape"].description, p) for p in example.properties}
     assert named == {"stickiness": {1}, "warmth": set()}
-    check_split(example, "lab")
+    assert assign_objects(example, set(example.objects), SplitConfig(name="lab"))
     for name in ("monday/tape first try", "monday/tape second try", "tuesday/foam", "tuesday/tile"):
         (tmp_path / "videos" / f"{name}.mp4").parent.mkdir(exist_ok=True)
         (tmp_path / "videos" / f"{name}.mp4").touch()

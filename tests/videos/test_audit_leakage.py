@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import random
 import re
 from pathlib import Path
 
@@ -62,26 +61,16 @@ def test_videos_without_any_contact_are_not_compared() -> None:
 
 @pytest.fixture(scope="module")
 def presses(tmp_path_factory: pytest.TempPathFactory) -> list[Probe]:
-    """Sixteen synthetic presses of eight objects."""
+    """Eight synthetic presses of four objects."""
     folder = tmp_path_factory.mktemp("presses")
-    names = [f"{o}_{i}" for o in sorted(made.PHYSICLEAR.objects)[::10] for i in range(2)]
+    names = [f"{o}_{i}" for o in sorted(made.PHYSICLEAR.objects)[::20] for i in range(2)]
     return [
         look_at(write_video(folder / f"{name}.avi", made.recorded(name[:-2], seed)), name)
         for seed, name in enumerate(names)
     ]
 
 
-def test_different_presses_have_no_near_duplicates(presses: list[Probe]) -> None:
-    assert len(presses) == 16
-    touched = [f for f in leakage.near_copies(presses, {}) if f.item == "all"]
-    assert int(re.findall(r"of (\d+) videos", touched[0].measured)[0]) >= 10, "most show contact, so most are compared"
-    assert {f.severity for f in leakage.near_copies(presses, {})} == {INFO}, (
-        "an object pressed twice alike is no warning"
-    )
-
-
-@pytest.mark.parametrize("start", [0, 2], ids=["whole", "shortened"])
-@pytest.mark.parametrize("steps", [0, 12], ids=["recoded", "brighter"])
+@pytest.mark.parametrize(("start", "steps"), [(0, 0), (2, 12)], ids=["recoded", "shortened and brighter"])
 def test_a_changed_copy_is_found(tmp_path: Path, presses: list[Probe], start: int, steps: int) -> None:
     frames = made.recorded("baseball", 5)
     changed = [cv2.add(frame, np.full_like(frame, steps)) for frame in frames[start:]]
@@ -94,14 +83,16 @@ def test_a_changed_copy_is_found(tmp_path: Path, presses: list[Probe], start: in
         (copy, Part.TRAIN, Part.TEST, ERROR),
         (copy, Part.TRAIN, Part.TRAIN, WARNING),
         (copy, Part.UNUSED, Part.TEST, WARNING),
-        (twice, Part.TRAIN, Part.TRAIN, INFO),
+        (twice, Part.TRAIN, Part.TRAIN, INFO),  # One object pressed twice alike is no warning.
     ):
-        pairs = [*presses, original, others]
         parts = {original.video_id: one, others.video_id: two}
-        known = {p.path for p in presses} | {"all"}
-        near = [f for f in leakage.near_copies(pairs, parts) if f.item not in known]
-        assert [(f.item, f.severity) for f in near] == [(others.path, severity)]
-        assert "baseball_0.avi" in near[0].measured
+        *near, _ = leakage.near_copies([*presses, original, others], parts)
+        found = [f for f in near if f.item not in {p.path for p in presses}]
+        assert [(f.item, f.severity) for f in found] == [(others.path, severity)]
+        assert "baseball_0.avi" in found[0].measured
+        assert {f.severity for f in near if f not in found} <= {INFO}, "different presses are no copies"
+    many = [p.model_copy(update={"contact": copy.contact, "quiet": copy.quiet}) for p in drawn_contacts(500, 7)]
+    assert named([*many, *presses, original, copy])[0] == [copy.path], "nor does a crowd hide it"
 
 
 def drawn_contacts(videos: int, seed: int) -> list[Probe]:
@@ -128,11 +119,11 @@ def named(found: list[Probe]) -> tuple[list[str], float]:
 
 
 def test_smooth_blobs_are_no_copies_however_many_there_are() -> None:
-    """Of 40 sets without copies hardly one may have any by chance, though their plain correlations reach .99."""
-    sets = [drawn_contacts(250, seed) for seed in range(40)]
+    """Of 20 sets without copies hardly one may have any by chance, though their plain correlations reach .99."""
+    sets = [drawn_contacts(120, seed) for seed in range(20)]
     assert max(float(np.triu(s @ s.T, 1).max()) for s in (np.array([p.signature for p in f]) for f in sets)) > 0.99
-    assert sum(bool(named(found)[0]) for found in sets) <= 2
-    many = [p for found in sets[:6] for p in found]
+    assert sum(bool(named(found)[0]) for found in sets) <= 1
+    many = [p for found in sets[:5] for p in found]
     many = [p.model_copy(update={"video_id": f"t{i}_0", "object_id": f"t{i}"}) for i, p in enumerate(many)]
     assert named(many)[0] == []
     assert named(many[:12]) == ([], leakage.DUPLICATE)
@@ -163,16 +154,7 @@ def test_likeness_divides_out_what_is_shared() -> None:
     assert own[0] @ own[30] == pytest.approx(1)
 
 
-def test_a_changed_copy_is_found_among_a_thousand(tmp_path: Path, presses: list[Probe]) -> None:
-    frames = made.recorded("baseball", 5)
-    original = look_at(write_video(tmp_path / "baseball_0.avi", frames), "baseball_0")
-    changed = [cv2.add(frame, np.full_like(frame, 12)) for frame in frames[2:]]
-    copy = look_at(encode(tmp_path / "potato_0.mp4", changed, "mpeg4", "yuv420p", bits=400_000), "potato_0")
-    thousand = [p.model_copy(update={"contact": copy.contact, "quiet": copy.quiet}) for p in drawn_contacts(1000, 7)]
-    assert named([*thousand, *presses, original, copy])[0] == [copy.path]
-
-
-def three_sensors(videos: int = 12) -> tuple[list[Probe], list[int]]:
+def three_sensors(videos: int) -> tuple[list[Probe], list[int]]:
     rng = np.random.default_rng(5)
     looks = rng.normal(90, 8, (3, 144))
     found_videos, truth = [], []
@@ -185,22 +167,15 @@ def three_sensors(videos: int = 12) -> tuple[list[Probe], list[int]]:
     return found_videos, truth
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_sessions_are_told_apart_by_the_untouched_picture(seed: int) -> None:
-    found_videos, truth = three_sensors()
-    names = dict(zip((p.video_id for p in found_videos), sessions(found_videos), strict=True))
-    assert len(set(names.values())) == 3
-    assert len({(own, names[p.video_id]) for own, p in zip(truth, found_videos, strict=True)}) == 3
-    shuffled = random.Random(seed).sample(found_videos, len(found_videos))
-    assert dict(zip((p.video_id for p in shuffled), sessions(shuffled), strict=True)) == names
-
-
-def test_more_videos_than_are_clustered_go_with_the_nearest(monkeypatch: pytest.MonkeyPatch) -> None:
-    found_videos, truth = three_sensors(videos=60)
-    whole = sessions(found_videos)
+def test_sessions_are_told_apart_by_the_untouched_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In whatever order the videos come, and where most of them only go with the nearest of a sample."""
+    found, truth = three_sensors(videos=60)
+    names = sessions(found)
+    assert len(set(names)) == len(set(zip(truth, names, strict=True))) == 3
+    order = np.random.default_rng(0).permutation(60)
+    assert sessions([found[i] for i in order]) == [names[i] for i in order]
     monkeypatch.setattr(leakage, "SAMPLE", 20)
-    assert sessions(found_videos) == whole
-    assert len(set(zip(truth, whole, strict=True))) == 3
+    assert sessions(found) == names
 
 
 def test_formats_and_names_are_sessions_of_their_own() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -77,7 +76,7 @@ def test_noise_gives_uniform_p_values(monkeypatch: pytest.MonkeyPatch, own: floa
     """Also where videos of one object look alike: labels are permuted among objects, not among videos."""
     monkeypatch.setattr(leakage, "PERMUTATIONS", 79)
     values = []
-    for seed in range(60):
+    for seed in range(40):
         data = planted(seed, leak=0.0, own=own)
         values.append(p_value(*predictability(*data, seed)))
     assert np.mean(np.array(values) <= 0.05) <= 0.15
@@ -119,35 +118,29 @@ def coloured(catalogue: Catalogue, leak: float) -> list[Probe]:
     return made
 
 
-def test_a_picture_that_tells_the_label_is_a_warning(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("sample", [leakage.SAMPLE, 50])
+def test_a_picture_that_tells_the_label_is_a_warning(
+    catalogue: Catalogue, sample: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where a sample of the videos is predicted, as of very many."""
     monkeypatch.setattr(leakage, "PERMUTATIONS", 200)
+    monkeypatch.setattr(leakage, "SAMPLE", sample)
     check = "predicted from the no-contact reference alone"
     hardness, *others = of(leaks(coloured(catalogue, 1.0), {}, catalogue), check)
     assert (hardness.item, hardness.severity) == ("hardness", WARNING)
-    assert float(hardness.measured.rpartition("p = ")[2]) < 0.01
-    assert re.fullmatch(r"\d+\.\d \+- \d+\.\d % if it told nothing", hardness.expected)
     assert [f.item for f in others] == ["roughness", "bumpiness"]
-    quiet = of(leaks(coloured(catalogue, 0.0), {}, catalogue), check)
-    assert [f.severity for f in quiet] == [INFO] * 3
-    assert quiet == of(leaks(coloured(catalogue, 0.0), {}, catalogue), check)
-
-
-def test_of_many_videos_a_sample_is_predicted(catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(leakage, "PERMUTATIONS", 200)
-    monkeypatch.setattr(leakage, "SAMPLE", 50)
-    check = "predicted from the no-contact reference alone"
-    videos = coloured(catalogue, 1.0)
-    hardness, *_ = of(leaks(videos, {}, catalogue), check)
-    share = float(hardness.measured.partition(" ")[0]) / 100
-    assert len(videos) > 100
-    assert share * 50 == pytest.approx(round(share * 50), abs=0.05), "a share of fifty"
-    assert hardness.severity == WARNING
+    if sample == leakage.SAMPLE:
+        assert float(hardness.measured.rpartition("p = ")[2]) < 0.01
+        assert [f.severity for f in of(leaks(coloured(catalogue, 0.0), {}, catalogue), check)] == [INFO] * 3
+    else:
+        right = float(hardness.measured.partition(" ")[0]) / 100 * sample
+        assert right == pytest.approx(round(right), abs=0.05), "a share of fifty"
 
 
 def test_what_cannot_be_predicted_is_undefined() -> None:
-    alike = "undefined: too few objects, classes or sessions"
-    few = [f for f in leaks(probes(2, OBJECTS[:4]), {}, OTHER) if f.check.startswith("predicted")]
-    assert [(f.measured, f.severity) for f in few] == [(alike, INFO)] * 6
-    one_class = relabelled(OTHER, ratings=((0, 0), (1, 1), (2, 2)))
-    same = [f for f in leaks(probes(), {}, one_class) if f.check.startswith("predicted")]
-    assert [(f.measured, f.severity) for f in same] == [(alike, INFO)] * 6
+    """Of too few objects, and where all have one class."""
+    few = leaks(probes(2, OBJECTS[:4]), {}, OTHER)
+    same = leaks(probes(), {}, relabelled(OTHER, ratings=((0, 0), (1, 1), (2, 2))))
+    for findings in (few, same):
+        found = [f for f in findings if f.check.startswith("predicted")]
+        assert [(f.measured.partition(":")[0], f.severity) for f in found] == [("undefined", INFO)] * 6

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 import shutil
 from collections import Counter
@@ -15,11 +16,10 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.errors import UserError
 from pipeline.core.records import Part
 from pipeline.videos.catalogue import Catalogue, load_catalogue
-from pipeline.videos.catalogue.wording import contradiction, levels_named, mentioned
-from tests.conftest import ROOT
+from pipeline.videos.catalogue.wording import levels_named, mentioned
+from tests.conftest import ROOT, refused
 
 PHYSICLEAR = ROOT / "pipeline" / "physiclear"
 PAPER_TEST = {
@@ -100,49 +100,41 @@ def write(folder: Path, *lines: str, described: Sequence[str] = (), encoding: st
     return folder
 
 
-def refused(folder: Path, words: Sequence[str]) -> None:
-    """The folder's catalogue is refused in one line with all of these words."""
-    with pytest.raises(UserError) as caught:
-        load_catalogue(folder)
-    message = str(caught.value)
-    assert "\n" not in message
-    assert all(word in message for word in words), message
-
-
 @pytest.mark.parametrize(
     ("lines", "words"),
     [
-        ([HEADER], ["objects.csv", "no object"]),
-        ([""], ["objects.csv", "object_id", "missing"]),
-        ([HEADER.replace(",hardness", ""), GOOD], ["objects.csv", "hardness", "missing"]),
-        ([HEADER.replace(",", ";"), GOOD], ["objects.csv", "missing", "commas"]),
-        ([HEADER + ",hardness", GOOD + ",1"], ["hardness", "twice"]),
-        ([HEADER, GOOD, GOOD], ["line 3", "ball", "twice"]),
-        ([HEADER, GOOD, GOOD.replace("ball,a ball", "bowl,A Ball")], ["line 3", "A Ball", "name of ball"]),
-        ([HEADER, GOOD.replace("1 1 2", "1 1 3")], ["line 2", "hardness", "0 to 2"]),
-        ([HEADER, GOOD.replace("1 1 2", "-1")], ["line 2", "hardness", "0 to 2"]),
-        ([HEADER, GOOD.replace("1 1 2", "1.5")], ["line 2", "hardness", "0 to 2"]),
-        ([HEADER, GOOD.replace("1 1 2", "1 one 2")], ["line 2", "hardness"]),
-        ([HEADER, GOOD.replace("1 1 2", "")], ["line 2", "hardness"]),
-        ([HEADER, "ball,a ball"], ["line 2", "hardness"]),
-        ([HEADER, GOOD.replace("a ball", "a ball, red")], ["line 2", "11 fields for 10 columns", "quotation marks"]),
-        ([HEADER, GOOD.replace("train,train", "train,trian")], ["line 2", "split_release", "trian", "validation"]),
-        ([HEADER, GOOD.replace("a ball", "")], ["line 2", "name"]),
-        ([HEADER, "," + GOOD.partition(",")[2]], ["line 2", "object_id"]),
-        ([HEADER, GOOD.replace("ball,", "../../evil,", 1)], ["line 2", "'../../evil'", "letters, digits"]),
+        ([HEADER], r"objects\.csv.*no object"),
+        ([""], r"objects\.csv.*object_id.*missing"),
+        ([HEADER.replace(",hardness", ""), GOOD], r"objects\.csv.*hardness.*missing"),
+        ([HEADER.replace(",", ";"), GOOD], r"objects\.csv.*missing.*commas"),
+        ([HEADER + ",hardness", GOOD + ",1"], "hardness.*twice"),
+        ([HEADER, GOOD, GOOD], "line 3.*ball.*twice"),
+        ([HEADER, GOOD, GOOD.replace("ball,a ball", "bowl,A Ball")], "line 3.*A Ball.*name of ball"),
+        ([HEADER, GOOD.replace("1 1 2", "1 1 3")], "line 2.*hardness.*0 to 2"),
+        ([HEADER, GOOD.replace("1 1 2", "-1")], "line 2.*hardness.*0 to 2"),
+        ([HEADER, GOOD.replace("1 1 2", "1.5")], "line 2.*hardness.*0 to 2"),
+        ([HEADER, GOOD.replace("1 1 2", "1 one 2")], "line 2.*hardness"),
+        ([HEADER, GOOD.replace("1 1 2", "")], "line 2.*hardness"),
+        ([HEADER, "ball,a ball"], "line 2.*hardness"),
+        ([HEADER, GOOD.replace("a ball", "a ball, red")], "line 2.*11 fields for 10 columns.*quotation marks"),
+        ([HEADER, GOOD.replace("train,train", "train,trian")], "line 2.*split_release.*trian.*validation"),
+        ([HEADER, GOOD.replace("a ball", "")], "line 2.*name"),
+        ([HEADER, "," + GOOD.partition(",")[2]], "line 2.*object_id"),
+        ([HEADER, GOOD.replace("ball,", "../../evil,", 1)], r"line 2.*'\.\./\.\./evil'.*letters, digits"),
         (
             [HEADER, GOOD.replace("a ball", '"a ball'), *[GOOD.replace("ball", "b") for _ in range(3)]],
-            ["line 2", "open"],
+            "line 2.*open",
         ),
-        ([f"{SHORT},label_hardness", f"{BALL},3"], ["line 2", "label_hardness", "'3'", "0 to 2"]),
-        ([f"{SHORT},label_hardness", f"{BALL},1 2"], ["line 2", "label_hardness", "one number"]),
-        ([f"{SHORT},label_hardnes", f"{BALL},1"], ["objects.csv", "label_hardnes ", "no property"]),
-        ([f"{SHORT},split_kfold", f"{BALL},train"], ["split_kfold", "rename"]),
-        ([f"{SHORT},split_My own", f"{BALL},train"], ["split_My own", "small letter"]),
+        ([f"{SHORT},label_hardness", f"{BALL},3"], "line 2.*label_hardness.*'3'.*0 to 2"),
+        ([f"{SHORT},label_hardness", f"{BALL},1 2"], "line 2.*label_hardness.*one number"),
+        ([f"{SHORT},label_hardnes", f"{BALL},1"], r"objects\.csv.*label_hardnes .*no property"),
+        ([f"{SHORT},split_kfold", f"{BALL},train"], "split_kfold.*rename"),
+        ([f"{SHORT},split_My own", f"{BALL},train"], "split_My own.*small letter"),
     ],
 )
-def test_a_bad_table_is_one_clear_line(tmp_path: Path, lines: list[str], words: list[str]) -> None:
-    refused(write(tmp_path, *lines), words)
+def test_a_bad_table_is_one_clear_line(tmp_path: Path, lines: list[str], words: str) -> None:
+    with refused(words):
+        load_catalogue(write(tmp_path, *lines))
 
 
 def test_a_table_of_what_is_needed_alone_will_do(tmp_path: Path) -> None:
@@ -177,29 +169,35 @@ def test_a_spreadsheet_s_csv_is_read(tmp_path: Path) -> None:
     assert as_decimals != BALL
     assert load_catalogue(write(tmp_path, SHORT, as_decimals)).objects == loaded.objects
     write(tmp_path, SHORT, BALL.replace("a ball", "a käse"), encoding="latin-1")
-    with pytest.raises(UserError, match=r"objects\.csv.*UTF-8"):
+    with refused(r"objects\.csv.*UTF-8"):
         load_catalogue(tmp_path)
 
 
 @pytest.mark.parametrize(
     ("described", "words"),
     [
-        (["object_id,text", "ball,round"], ["description", "missing"]),
-        (["object_id,description", "ball,round", "balll,round"], ["line 3", "'balll'", "objects.csv"]),
-        (["object_id,description", "ball,round", "ball,round"], ["line 3", "ball", "twice"]),
-        (["object_id,description", "ball,round, red"], ["line 2", "quotation marks"]),
+        (["object_id,text", "ball,round"], "description.*missing"),
+        (["object_id,description", "ball,round", "balll,round"], r"line 3.*'balll'.*objects\.csv"),
+        (["object_id,description", "ball,round", "ball,round"], "line 3.*ball.*twice"),
+        (["object_id,description", "ball,round, red"], "line 2.*quotation marks"),
     ],
 )
-def test_a_bad_description_is_one_clear_line(tmp_path: Path, described: list[str], words: list[str]) -> None:
-    refused(write(tmp_path, SHORT, BALL, described=described), ["descriptions.csv", *words])
+def test_a_bad_description_is_one_clear_line(tmp_path: Path, described: list[str], words: str) -> None:
+    with refused(rf"descriptions\.csv.*{words}"):
+        load_catalogue(write(tmp_path, SHORT, BALL, described=described))
 
 
 def test_a_missing_or_broken_language_is_one_line(tmp_path: Path) -> None:
-    refused(tmp_path, ["properties.yaml", "data.catalogue"])
+    with refused(r"properties\.yaml.*data\.catalogue"):
+        load_catalogue(tmp_path)
     shutil.copy(PHYSICLEAR / "objects.csv", tmp_path)
     for text in ("properties: [", "properties: []\nunstructured: x\nstructured: y\n", ""):
         (tmp_path / "properties.yaml").write_text(text)
-        refused(tmp_path, ["properties.yaml"])
+        with refused(r"properties\.yaml"):
+            load_catalogue(tmp_path)
+
+
+LANGUAGE = yaml.safe_load((PHYSICLEAR / "properties.yaml").read_text())
 
 
 def change(**changes: object) -> Callable[[dict[str, Any]], None]:
@@ -210,34 +208,35 @@ def change(**changes: object) -> Callable[[dict[str, Any]], None]:
 @pytest.mark.parametrize(
     ("edit", "words"),
     [
-        (change(name="Bumps"), ["properties.2.name"]),
-        (change(name="combined"), ["combined", "rename"]),
-        (change(name="label_x"), ["label_x", "rename"]),
-        (change(name="hardness"), ["hardness", "twice"]),
-        (change(levels=["flat"]), ["properties.2.levels"]),
-        (change(levels=["flat", "bumpy"]), ["bumpiness", "phrases", "a level"]),
-        (change(levels=["flat", "hard to grip", "bumpy"]), ["hardness", "'hard'", "'hard to grip'"]),
-        (change(levels=["surface", "raised", "bumpy"]), ["bumpiness", "'surface'", "structured"]),
-        (change(cues=[["even"]]), ["bumpiness", "cues"]),
-        (change(cues=[["even"], [], ["small bumps"]]), ["bumpiness", "'small bumps'", "two levels"]),
-        (change(alone="Overall, it has bumps."), ["bumpiness", "alone", "{level}"]),
-        (change(colour="red"), ["properties.2.colour"]),
-        (lambda x: x.update(structured="It is {hardness}, {roughness}, {bumpiness}."), ["structured", "Overall"]),
-        (lambda x: x.update(unstructured="{hardness}, {roughness}, {bumpiness}, {warmth}."), ["warmth"]),
-        (lambda x: x.update(unstructured="{hardness}, {roughness}."), ["does not name bumpiness"]),
-        (lambda x: x.update(unstructured="{hardness, {roughness}, {bumpiness}"), ["properties.yaml"]),
-        (lambda x: x["scenarios"][0]["target"].update(warmth=[1]), ["stains", "warmth"]),
-        (lambda x: x["scenarios"][0]["target"].update(hardness=[3]), ["stains", "hardness", "0 to 2"]),
+        (change(name="Bumps"), r"properties\.2\.name"),
+        (change(name="combined"), "combined.*rename"),
+        (change(name="label_x"), "label_x.*rename"),
+        (change(name="hardness"), "hardness.*twice"),
+        (change(levels=["flat"]), r"properties\.2\.levels"),
+        (change(levels=["flat", "bumpy"]), "bumpiness.*phrases.*a level"),
+        (change(levels=["flat", "hard to grip", "bumpy"]), "hardness.*'hard'.*'hard to grip'"),
+        (change(levels=["surface", "raised", "bumpy"]), "bumpiness.*'surface'.*structured"),
+        (change(cues=[["even"]]), "bumpiness.*cues"),
+        (change(cues=[["even"], [], ["small bumps"]]), "bumpiness.*'small bumps'.*two levels"),
+        (change(alone="Overall, it has bumps."), r"bumpiness.*alone.*\{level\}"),
+        (change(colour="red"), r"properties\.2\.colour"),
+        (lambda x: x.update(structured="It is {hardness}, {roughness}, {bumpiness}."), "structured.*Overall"),
+        (lambda x: x.update(unstructured="{hardness}, {roughness}, {bumpiness}, {warmth}."), "warmth"),
+        (lambda x: x.update(unstructured="{hardness}, {roughness}."), "does not name bumpiness"),
+        (lambda x: x.update(unstructured="{hardness, {roughness}, {bumpiness}"), r"properties\.yaml"),
+        (lambda x: x["scenarios"][0]["target"].update(warmth=[1]), "stains.*warmth"),
+        (lambda x: x["scenarios"][0]["target"].update(hardness=[3]), "stains.*hardness.*0 to 2"),
     ],
 )
 def test_a_language_that_cannot_be_graded_is_refused(
-    tmp_path: Path, edit: Callable[[dict[str, Any]], None], words: list[str]
+    tmp_path: Path, edit: Callable[[dict[str, Any]], None], words: str
 ) -> None:
-    language = yaml.safe_load((PHYSICLEAR / "properties.yaml").read_text())
+    language = copy.deepcopy(LANGUAGE)
     edit(language)
     write(tmp_path, SHORT, BALL)
     (tmp_path / "properties.yaml").write_text(yaml.safe_dump(language))
-    refused(tmp_path, words)
+    with refused(words):
+        load_catalogue(tmp_path)
 
 
 # Free text
@@ -267,13 +266,6 @@ def test_classes_are_read_from_free_text(
     text: str, hardness: set[int], roughness: set[int], bumpiness: set[int]
 ) -> None:
     assert [levels_named(text, p) for p in CATALOGUE.properties] == [hardness, roughness, bumpiness]
-
-
-def test_a_text_contradicts_a_label_that_it_names_another_class_for() -> None:
-    assert contradiction("It is soft.", CATALOGUE.properties[0], 2) == {0}
-    assert not contradiction("It is soft.", CATALOGUE.properties[0], 0)
-    assert not contradiction("It is soft on a hard core.", CATALOGUE.properties[0], 2)
-    assert not contradiction("It is red.", CATALOGUE.properties[0], 2)
 
 
 @given(

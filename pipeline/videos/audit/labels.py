@@ -9,7 +9,7 @@ from statistics import fmean
 
 from pipeline.core.records import Finding, Part, Severity, finding
 from pipeline.videos.catalogue import Catalogue
-from pipeline.videos.catalogue.wording import contradiction
+from pipeline.videos.catalogue.wording import levels_named
 
 TINY = 1e-12
 """Variances up to it are rounding."""
@@ -42,7 +42,8 @@ def check_labels(catalogue: Catalogue) -> Iterator[Finding]:
             if stated not in (None, label):
                 measured = f"{name} (mean rating {fmean(rated):.2f})"
                 differing.append(finding("stated label", where, measured, prop.levels[stated], Severity.WARNING))
-            if named := contradiction(o.description, prop, label):
+            named = levels_named(o.description, prop)
+            if named and label not in named:
                 measured = f"rated {name} ({' '.join(map(str, rated))})"
                 expected = "described as " + " or ".join(prop.levels[level] for level in sorted(named))
                 contradicting.append(finding("description", where, measured, expected, Severity.WARNING))

@@ -192,11 +192,5 @@ def levels_named(text: str, prop: Property) -> frozenset[int]:
     return frozenset(wordings[phrase] for phrase in mentioned(text, wordings))
 
 
-def contradiction(text: str, prop: Property, label: int) -> frozenset[int]:
-    """The classes that a text names in place of `label`; empty where it names that one too, or none."""
-    named = levels_named(text, prop)
-    return frozenset() if label in named else named
-
-
 def _placeholders(template: str) -> set[str]:
     return {name for _, name, _, _ in Formatter().parse(template) if name is not None}

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from pipeline.core.errors import UserError
-from pipeline.core.io import atomic, remove_rests, write_csv
+from pipeline.core.io import remove_rests, write_csv
 from pipeline.core.records import Record
 from pipeline.videos.audit.files import FOUND
 from pipeline.videos.catalogue.csv_reader import read_rows
@@ -116,29 +116,28 @@ def cut(
     fps = _rate(name, stamped, received)
     out.mkdir(parents=True, exist_ok=True)
     remove_rests(out)
-    first, source, position, written = _next_number(out, object_id), read(), 0, []
+    taken = [re.fullmatch(rf"{re.escape(object_id)}_(\d+)", path.stem) for path in out.iterdir() if is_video(path)]
+    first = max((int(match[1]) + 1 for match in taken if match), default=0)
+    source, position, written = read(), 0, []
     for number, (begin, end) in enumerate(ranges, first):
-        path, rows = out / f"{object_id}_{number}.mp4", list[FrameTime]()
+        path = out / f"{object_id}_{number}.mp4"
         pressed = itertools.islice(source, begin - position, end - position)
-        with atomic(path.with_suffix(".csv")) as table:
-            # The suffix says the container, so the unfinished file bears it, too.
-            part = path.with_name(f".{path.stem}.{os.getpid()}.part.mp4")
-            try:
-                write_film(part, _noting(pressed, strengths[begin:end], rows), fps)
-                write_csv(table, FrameTime, rows)
-                os.replace(part, path)
-            finally:
-                part.unlink(missing_ok=True)
-        written.append(path)
         position = end
+        times_of = zip(received[begin:end], stamped[begin:end], strengths[begin:end].tolist(), strict=True)
+        rows = [
+            FrameTime(frame=frame, recorded_ns=arrived, stamped_ns=stamp, contact=round(strength, 3))
+            for frame, (arrived, stamp, strength) in enumerate(times_of)
+        ]
+        # The suffix says the container, so the unfinished file bears it, too.
+        part = path.with_name(f".{path.stem}.{os.getpid()}.part.mp4")
+        try:
+            write_film(part, (shot.picture for shot in pressed), fps)
+            write_csv(path.with_suffix(".csv"), FrameTime, rows)
+            os.replace(part, path)
+        finally:
+            part.unlink(missing_ok=True)
+        written.append(path)
     return written
-
-
-def _noting(pressed: Iterator[Shot], strengths: npt.NDArray[np.float64], rows: list[FrameTime]) -> Iterator[Image]:
-    for frame, (shot, strength) in enumerate(zip(pressed, strengths.tolist(), strict=True)):
-        times = {"recorded_ns": shot.recorded, "stamped_ns": shot.stamped}
-        rows.append(FrameTime(frame=frame, contact=round(strength, 3), **times))
-        yield shot.picture
 
 
 def cut_listed(listed: Path, out: Path, fps: float = 0.0) -> list[Path]:
@@ -288,9 +287,3 @@ def _rate(name: str, stamped: Sequence[int], received: Sequence[int]) -> float:
     if by_arrival <= 0:
         raise UserError(f"{name}: its pictures bear no rising times; record it again")
     return min(fastest, max(slowest, round(1e9 / by_arrival, 3)))
-
-
-def _next_number(folder: Path, object_id: str) -> int:
-    """One more than the largest number that the object's videos in the folder have."""
-    names = [re.fullmatch(rf"{re.escape(object_id)}_(\d+)", p.stem) for p in folder.iterdir() if is_video(p)]
-    return max((int(m[1]) + 1 for m in names if m), default=0)
