@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import shutil
 import struct
 from pathlib import Path
@@ -15,12 +14,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.config import FramesConfig
-from pipeline.videos.audit.run import check_folder
-from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.decoding import Decoder, Header, brightness, decode, picture, planes, to_rgb, turns
-from pipeline.videos.film import write_film
+from pipeline.videos.film import KEY_EVERY, write_film
 from pipeline.videos.frames.fit import fit
-from tests.conftest import HUNG, encode, moving_square, write_video
+from tests.conftest import encode, moving_square, refused, write_video
 from tests.frame_rules import frames_of, pillow
 
 ONE = 1 << 16
@@ -69,8 +66,7 @@ def turn(path: Path, degrees: int) -> None:
     path.write_bytes(data)
 
 
-@pytest.mark.parametrize("count", [1, 3, 40])
-@pytest.mark.parametrize(("width", "height"), [(48, 36), (34, 98)])
+@pytest.mark.parametrize(("count", "width", "height"), [(1, 48, 36), (40, 48, 36), (3, 34, 98)])
 def test_pictures_of_motion_jpeg_are_opencvs_bit_for_bit(tmp_path: Path, count: int, width: int, height: int) -> None:
     path = write_video(tmp_path / "v.avi", moving_square(count, 3, width, height))
     expected = opencv(path)
@@ -81,14 +77,12 @@ def test_pictures_of_motion_jpeg_are_opencvs_bit_for_bit(tmp_path: Path, count: 
     np.testing.assert_array_equal(views, [brightness(frame).copy() for frame in frames_of(path)], "views keep frames")
 
 
-@pytest.mark.parametrize(("transfer", "hdr"), [(0, False), (1, False), (16, True), (18, True)])
 @pytest.mark.parametrize(("codec", "pixels", "suffix"), [("libx264", "yuv420p", "mp4"), ("ffv1", "yuv444p", "mkv")])
-def test_a_recording_in_hdr_is_known(
-    tmp_path: Path, transfer: int, hdr: bool, codec: str, pixels: str, suffix: str
-) -> None:
-    path = encode(tmp_path / f"v.{suffix}", moving_square(3), codec, pixels, transfer=transfer)
-    with Decoder(path) as decoder:
-        assert decoder.header.hdr == hdr
+def test_a_recording_in_hdr_is_known(tmp_path: Path, codec: str, pixels: str, suffix: str) -> None:
+    for transfer, hdr in ((0, False), (1, False), (16, True), (18, True)):
+        path = encode(tmp_path / f"v{transfer}.{suffix}", moving_square(3), codec, pixels, transfer=transfer)
+        with Decoder(path) as decoder:
+            assert decoder.header.hdr == hdr
 
 
 @pytest.mark.parametrize(
@@ -192,24 +186,20 @@ def test_what_is_no_video_has_no_frames(tmp_path: Path, content: bytes) -> None:
     with Decoder(path) as decoder:
         assert list(decoder.frames()) == []
         assert decoder.header == Header()
-    assert [list(decode(p)) for p in (path, tmp_path / "gone.mov", tmp_path)] == [[], [], []], "a folder neither"
 
 
-def test_sound_alone_is_no_video(tmp_path: Path) -> None:
+def test_nothing_a_folder_and_sound_alone_are_no_videos(tmp_path: Path) -> None:
     with av.open(str(tmp_path / "v.mkv"), "w") as container:
         stream = container.add_stream("pcm_s16le", rate=8000)
         frame = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), format="s16", layout="mono")
         frame.rate = 8000
         container.mux(stream.encode(frame))
-    assert list(decode(tmp_path / "v.mkv")) == []
+    assert [list(decode(p)) for p in (tmp_path / "v.mkv", tmp_path / "gone.mov", tmp_path)] == [[], [], []]
 
 
-@pytest.mark.parametrize("codec", ["mpeg4", "libx264", "mjpeg"])
-@pytest.mark.parametrize("suffix", ["mp4", "mov"])
+@pytest.mark.parametrize(("codec", "suffix"), [("mpeg4", "mp4"), ("libx264", "mov"), ("mjpeg", "mov")])
 @pytest.mark.parametrize(("first", "shown"), [(10, 40), (0, 60), (20, 40), (0, 1)])
-def test_a_trimmed_file_promises_what_it_shows(
-    tmp_path: Path, catalogue: Catalogue, codec: str, suffix: str, first: int, shown: int
-) -> None:
+def test_a_trimmed_file_promises_what_it_shows(tmp_path: Path, codec: str, suffix: str, first: int, shown: int) -> None:
     """A lossless trim leaves all frames in the file, with an edit list (ISO 14496-12, 8.6.6) of those shown."""
     path = tmp_path / f"rug_0.{suffix}"
     whole = list(decode(encode(path, moving_square(60), codec, "yuvj420p" if codec == "mjpeg" else "yuv420p")))
@@ -224,7 +214,6 @@ def test_a_trimmed_file_promises_what_it_shows(
         assert decoder.header.frames == shown
         found = [picture(frame) for frame in decoder.frames()]
     np.testing.assert_array_equal(found, whole[first : first + shown])
-    assert not [f for f in check_folder(tmp_path, catalogue) if f.check == "frames that decode" and f.item != "all"]
 
 
 @pytest.mark.parametrize(
@@ -241,19 +230,6 @@ def test_a_name_is_no_address(name: str, tmp_path: Path, monkeypatch: pytest.Mon
     assert len(list(decode(written))) == 5
 
 
-def test_a_fork_decodes_after_its_parent_has(tmp_path: Path) -> None:
-    """What converts pixels is kept from frame to frame: a fork would wait for ever for threads that it kept."""
-    for name, side in (("parent", 512), ("child", 64)):
-        encode(tmp_path / f"{name}.mkv", [gradient(side, side)] * 2, "ffv1", "bgr0")
-    assert len(frames_of(tmp_path / "parent.mkv")) == 2
-    child = multiprocessing.get_context("fork").Process(target=frames_of, args=(tmp_path / "child.mkv",))
-    child.start()
-    child.join(HUNG)
-    child.kill()
-    child.join()
-    assert child.exitcode == 0
-
-
 def test_damage_in_the_middle_costs_no_more_than_what_it_hits(tmp_path: Path) -> None:
     path = write_video(tmp_path / "v.avi", moving_square(40))
     data = bytearray(path.read_bytes())
@@ -263,7 +239,7 @@ def test_damage_in_the_middle_costs_no_more_than_what_it_hits(tmp_path: Path) ->
     assert max(21, len(opencv(path))) <= len(list(decode(path))) < 41
 
 
-@pytest.mark.parametrize("suffix", ["mov", "mp4", "avi", "mkv"])
+@pytest.mark.parametrize("suffix", ["mov", "avi", "mkv"])
 def test_a_cut_off_file_gives_what_is_there(tmp_path: Path, suffix: str) -> None:
     whole = encode(tmp_path / f"w.{suffix}", moving_square(30), "mpeg4", "yuv420p").read_bytes()
     path = tmp_path / f"v.{suffix}"
@@ -274,7 +250,7 @@ def test_a_cut_off_file_gives_what_is_there(tmp_path: Path, suffix: str) -> None
 
 @pytest.mark.parametrize(
     ("height", "width", "size"),
-    [(240, 320, 64), (240, 320, 224), (321, 241, 64), (97, 130, 48), (480, 640, 48), (540, 300, 56)],
+    [(240, 320, 64), (240, 320, 224), (321, 241, 64), (97, 130, 48), (540, 300, 56)],
 )
 def test_fitted_frames_are_near_a_bicubic_resize(tmp_path: Path, height: int, width: int, size: int) -> None:
     """At most 2 of 255 steps apart on average; 4 where odd sides shift a small picture's colour by half a pixel."""
@@ -291,7 +267,7 @@ def test_fitted_frames_are_near_a_bicubic_resize(tmp_path: Path, height: int, wi
 @pytest.mark.parametrize("mode", ["crop", "squash"])
 def test_one_colour_fills_every_square(pixels: str, mode: str) -> None:
     expected = (1.164 * 84 + 1.596 * 72, 1.164 * 84 + 0.392 * 38 - 0.813 * 72, 1.164 * 84 - 2.017 * 38)
-    for height, width in ((36, 48), (48, 36), (17, 97), (240, 321), (5, 5), (1, 9), (1, 1), (2, 2), (3, 200)):
+    for height, width in ((36, 48), (17, 97), (240, 321), (1, 9), (1, 1), (2, 2), (3, 200)):
         frame = av.VideoFrame(width, height, pixels)
         for plane, value in zip(frame.planes, (100, 90, 200), strict=True):
             plane.update(bytes([value]) * plane.buffer_size)
@@ -305,3 +281,21 @@ def test_one_colour_fills_every_square(pixels: str, mode: str) -> None:
 def test_real_pictures_are_opencvs_bit_for_bit(real_data: Path) -> None:
     for name in ("hairbrush_bristles_side_4", "tv_remote_back_3"):
         np.testing.assert_array_equal(list(decode(real_data / f"{name}.mov")), opencv(real_data / f"{name}.mov"))
+
+
+@pytest.mark.parametrize(("count", "fps", "size"), [(2, 25.0, (48, 64)), (30, 10.0, (48, 64)), (13, 12.5, (47, 65))])
+def test_what_is_written_is_read(tmp_path: Path, count: int, fps: float, size: tuple[int, int]) -> None:
+    """Files as the real videos are coded: MPEG-4 part 2, a whole picture every twelve; sides may be odd."""
+    y, x = np.mgrid[: size[0], : size[1]]
+    frames = [np.stack([x + 50, y + 60, x + y + 2 * n], axis=-1).astype(np.uint8) for n in range(count)]
+    write_film(path := tmp_path / "a b.avi", frames, fps)
+    with Decoder(path) as decoder:
+        kinds = [frame.key_frame for frame in decoder.frames()]
+        assert (decoder.header.frames, decoder.header.fps) == (count, fps)
+    assert kinds == [n % KEY_EVERY == 0 for n in range(count)]
+    with av.open(str(path)) as container:
+        assert container.streams.video[0].codec_context.name == "mpeg4"
+    error = np.stack(list(decode(path))).astype(int) - np.stack(frames)
+    assert np.abs(error).mean() < 3, "colour is coded at half the resolution"
+    with refused("cannot be written"):
+        write_film(tmp_path / "none" / "a.avi", frames, fps)

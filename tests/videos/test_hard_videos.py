@@ -40,12 +40,11 @@ def one(folder: Path, catalogue: Catalogue, selection: str = "salient") -> tuple
         (constant(30), 0.0),
         (constant(30, 0), 1.0),
         (constant(30, 255), 1.0),
-        (constant(1), 0.0),
+        (constant(2), 0.0),
         (moving_square(1), None),
         (moving_square(3), None),
-        (constant(2), 0.0),
     ],
-    ids=["grey", "black", "white", "one grey", "one", "three", "two"],
+    ids=["grey", "black", "white", "two", "one", "three"],
 )
 def test_hard_videos(
     tmp_path: Path, catalogue: Catalogue, frames: list[np.ndarray], saturated: float | None, selection: str

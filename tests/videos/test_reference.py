@@ -79,7 +79,7 @@ def test_the_reference_of_usual_lengths(tmp_path: Path, count: int, expected: tu
         assert found.probe.quiet < 1
 
 
-@pytest.mark.parametrize(("count", "name"), [(12, "contact"), (50, "salient"), (50, "contact"), (126, "contact")])
+@pytest.mark.parametrize(("count", "name"), [(12, "contact"), (50, "salient"), (126, "contact")])
 def test_a_video_that_starts_in_contact_takes_its_reference_from_the_end(tmp_path: Path, count: int, name: str) -> None:
     backward = rise(count)[::-1]
     found = scanned(tmp_path / "back.avi", film(backward), name)
@@ -109,13 +109,7 @@ def test_a_step_of_the_light_is_no_contact(tmp_path: Path) -> None:
     assert found.probe.contact < without.probe.contact + 0.5 < touched.probe.contact / 3
 
 
-WARM_UPS = [
-    ("salient", [0.25 + 0.75 * i / 8 for i in range(8)]),
-    ("contact", [0.25 + 0.75 * i / 8 for i in range(8)]),
-    ("contact", [1 - 0.6 * 0.8**i for i in range(18)]),
-    ("salient", [0.0]),
-    ("release", [1.3, 1.3, 1.2, 1.2, 1.1]),
-]
+WARM_UP = [0.25 + 0.75 * i / 8 for i in range(8)]
 
 
 def warmed(frames: list[np.ndarray], gains: list[float]) -> list[np.ndarray]:
@@ -131,8 +125,17 @@ def lossless(path: Path, frames: list[np.ndarray], name: str) -> Scan:
     return found
 
 
-@pytest.mark.parametrize(("name", "gains"), WARM_UPS)
-@pytest.mark.parametrize("shape", ["press", "throughout", "start"])
+@pytest.mark.parametrize(
+    ("name", "gains", "shape"),
+    [
+        ("salient", WARM_UP, "press"),
+        ("contact", WARM_UP, "start"),
+        ("contact", [1 - 0.6 * 0.8**i for i in range(18)], "throughout"),
+        ("contact", [1 - 0.6 * 0.8**i for i in range(18)], "press"),
+        ("salient", [0.0], "start"),
+        ("release", [1.3, 1.3, 1.2, 1.2, 1.1], "press"),
+    ],
+)
 def test_a_warm_up_changes_neither_contact_nor_what_is_kept(
     tmp_path: Path, name: str, gains: list[float], shape: str
 ) -> None:
@@ -153,20 +156,21 @@ def test_a_warm_up_changes_neither_contact_nor_what_is_kept(
         assert min(k.index for k in found.kept) >= cold + (name == "salient"), "no difference in light is kept"
 
 
+@pytest.mark.slow
 @pytest.mark.real
-@pytest.mark.parametrize("name", ["baseball_0", "potato_1", "rug_2", "masking_tape_0"])
+@pytest.mark.parametrize("name", ["potato_1", "masking_tape_0"])
 def test_real_presses_after_a_warm_up(real_data: Path, tmp_path: Path, name: str) -> None:
     """At 25 and at 10 frames a second, where contact begins before a tenth of the video is steady."""
     frames = list(decode(real_data / f"{name}.mov"))
     steady = lossless(tmp_path / "steady.avi", frames, "contact")
-    warm = lossless(tmp_path / "warm.avi", warmed(frames, WARM_UPS[0][1]), "contact")
+    warm = lossless(tmp_path / "warm.avi", warmed(frames, WARM_UP), "contact")
     assert (steady.probe.unsteady, warm.probe.unsteady) == (0, 8)
     assert warm.probe.contact == pytest.approx(steady.probe.contact, rel=0.1)
     assert np.abs(warm.reference.astype(int) - steady.reference).mean() < 1
 
 
 def test_a_warm_up_is_noted_and_hides_no_lack_of_contact(tmp_path: Path) -> None:
-    frames = warmed(film([0.0] * 60), WARM_UPS[0][1])
+    frames = warmed(film([0.0] * 60), WARM_UP)
     seen = prepare_video(encode(tmp_path / "v.avi", frames), FramesConfig(pixels=32), subtracts=True, quiet=1.0)
     assert not seen.touched
     first, second = seen.touch.notes
@@ -189,7 +193,7 @@ def test_a_light_that_never_settles_is_named_and_measured_as_before(tmp_path: Pa
     assert (found.probe.unsteady, found.probe.untouched) == (60, reference_indices(60))
 
 
-@pytest.mark.parametrize(("height", "width"), [(240, 320), (17, 97), (1, 9), (1, 1), (600, 4), (13, 17)])
+@pytest.mark.parametrize(("height", "width"), [(240, 320), (17, 97), (1, 1), (600, 4)])
 def test_thumbnails_keep_the_shape(tmp_path: Path, height: int, width: int) -> None:
     (frame,) = frames_of(encode(tmp_path / "v.mkv", [np.full((height, width, 3), 128, np.uint8)], "ffv1", "yuv420p"))
     thumb = thumbnail(frame)
