@@ -95,16 +95,12 @@ class Property(Entry):
         }
 
     @model_validator(mode="after")
-    def _name_is_free(self) -> Self:
+    def _name_is_free_and_words_fit(self) -> Self:
         if self.name in TAKEN or self.name.startswith(PREFIXES):
             raise ValueError(
                 f"{self.name}: no name for a property, nor is {', '.join(TAKEN)} or what begins with "
                 f"{' or '.join(PREFIXES)}; rename it"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _words_fit(self) -> Self:
         if len(self.phrases) != len(self.levels) or not all(self.phrases):
             raise ValueError(f"{self.name}: phrases need one non-empty list a level")
         if self.cues and len(self.cues) != len(self.levels):
