@@ -43,11 +43,11 @@ def unsteady_frames(thumbs: Iterable[Image], frames: int) -> int:
         frames: how many the video has.
     """
     places = [*reference_indices(frames), reference_indices(frames)[-1] + 1]
-    seen: list[Image] = []
+    drawn: list[Image] = []
     for thumb in thumbs:
-        seen.append(thumb)
-        begin = len(seen) - 1 - places[-1]
-        if begin >= 0 and is_steady([seen[begin + place] for place in places]):
+        drawn.append(thumb)
+        begin = len(drawn) - 1 - places[-1]
+        if begin >= 0 and is_steady([drawn[begin + place] for place in places]):
             return begin
     return frames
 

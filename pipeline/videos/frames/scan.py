@@ -125,6 +125,9 @@ def scan(file: VideoFile, config: FramesConfig) -> Scan | Finding:
     reference = found.reference.thumb
     shown = found.last if found.strongest is None else found.strongest
     ((height, width),) = found.sizes
+    # The time a frame takes, between probed ones; unknown (0) where time stamps do not rise.
+    steps = [(b[1] - a[1]) / (b[0] - a[0]) for a, b in itertools.pairwise(found.times)]
+    rising = bool(steps) and min(steps) > 0
     probe = Probe(
         video_id=file.video_id,
         object_id=file.object_id,
@@ -138,7 +141,7 @@ def scan(file: VideoFile, config: FramesConfig) -> Scan | Finding:
         header_frames=found.header.frames,
         hdr=found.header.hdr,
         rotation=found.rotation,
-        irregular=_irregular(found.times),
+        irregular=max(steps) / min(steps) if rising else 0.0,
         kept=len(found.kept),
         brightness=float(reference[:, :, 0].mean()),
         brightness_step=max((abs(b - a) for a, b in itertools.pairwise(found.brightness)), default=0.0),
@@ -224,12 +227,6 @@ def reference_of(frames: Sequence[av.VideoFrame], config: FramesConfig) -> Refer
     """The mean of frames."""
     pictures, thumbs = [fit(frame, config) for frame in frames], [thumbnail(frame) for frame in frames]
     return Reference(*(np.rint(np.mean(p, axis=0)).astype(np.uint8) for p in (pictures, thumbs)))
-
-
-def _irregular(times: list[tuple[int, float]]) -> float:
-    """Longest over shortest time a frame between probed frames; 0 where the file has no rising time stamps."""
-    steps = [(b[1] - a[1]) / (b[0] - a[0]) for a, b in itertools.pairwise(times)]
-    return max(steps) / min(steps) if steps and min(steps) > 0 else 0.0
 
 
 def _signature(pictures: list[Image], reference: Image) -> tuple[float, ...]:
