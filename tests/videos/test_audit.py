@@ -168,16 +168,6 @@ def test_an_error_stops_the_chain_in_one_line(workplace: Path) -> None:
     assert [f.item for f in findings if f.severity is ERROR] == ["baseball", "rug"]
 
 
-def test_the_chains_audit_and_the_folders_agree(tmp_path: Path, catalogue: Catalogue) -> None:
-    names = ("baseball", "potato", "rug")
-    for seed, name in enumerate(names):
-        write_video(tmp_path / f"{name}_0.avi", moving_square(20, seed))
-    both = [look_at(tmp_path / f"{n}_0.avi", f"{n}_0") for n in names]
-    parts = assigned(both, {o: catalogue.objects[o].splits["paper"] for o in names})
-    chained = audit_chain(tmp_path, both, [parts], catalogue)
-    assert chained == audit_folder(tmp_path, catalogue, PAPER)
-
-
 def test_every_fold_is_audited(workplace: Path, catalogue: Catalogue) -> None:
     """Two equal files of different objects leak only where a fold parts them; what folds share is said once."""
     twins = {"baseball_0", "rug_0"}

@@ -43,8 +43,8 @@ def film(depths: list[float], seed: int = 0, light: list[float] | None = None) -
     return frames
 
 
-def scanned(path: Path, frames: list[np.ndarray], name: str = "contact") -> Scan:
-    write_video(path, frames)
+def scanned(path: Path, frames: list[np.ndarray], name: str = "contact", *, lossless: bool = False) -> Scan:
+    (encode if lossless else write_video)(path, frames)
     found = scan(VideoFile(path, path.name, "rug", "rug_0"), FramesConfig(pixels=32, selection=name))
     assert isinstance(found, Scan)
     return found
@@ -118,13 +118,6 @@ def warmed(frames: list[np.ndarray], gains: list[float]) -> list[np.ndarray]:
     return [np.clip(np.rint(f * gain), 0, 255).astype(np.uint8) for f, gain in zip(frames, gains, strict=True)]
 
 
-def lossless(path: Path, frames: list[np.ndarray], name: str) -> Scan:
-    encode(path, frames)
-    found = scan(VideoFile(path, path.name, "rug", "rug_0"), FramesConfig(pixels=32, selection=name))
-    assert isinstance(found, Scan)
-    return found
-
-
 @pytest.mark.parametrize(
     ("name", "gains", "shape"),
     [
@@ -142,11 +135,11 @@ def test_a_warm_up_changes_neither_contact_nor_what_is_kept(
     """Against the same press without the frames whose light is not yet that of the others."""
     depths = {"press": rise(100), "throughout": [0.0] * 100, "start": rise(100)[::-1]}[shape]
     steady = film(depths)
-    found = lossless(tmp_path / "warm.avi", warmed(steady, gains), name)
+    found = scanned(tmp_path / "warm.avi", warmed(steady, gains), name, lossless=True)
     cold = found.probe.unsteady
     # At the end of a slow rise a change of a step in eight frames is left in.
     assert max(1, len(gains) - 6) <= cold <= len(gains)
-    expected = lossless(tmp_path / "cut.avi", warmed(steady, gains)[cold:], name)
+    expected = scanned(tmp_path / "cut.avi", warmed(steady, gains)[cold:], name, lossless=True)
     assert found.probe.untouched == tuple(i + cold for i in expected.probe.untouched)
     np.testing.assert_array_equal(found.reference, expected.reference)
     for measure in ("contact", "contact_end", "starts_touching", "brightness", "thumbnail"):
@@ -162,8 +155,8 @@ def test_a_warm_up_changes_neither_contact_nor_what_is_kept(
 def test_real_presses_after_a_warm_up(real_data: Path, tmp_path: Path, name: str) -> None:
     """At 25 and at 10 frames a second, where contact begins before a tenth of the video is steady."""
     frames = list(decode(real_data / f"{name}.mov"))
-    steady = lossless(tmp_path / "steady.avi", frames, "contact")
-    warm = lossless(tmp_path / "warm.avi", warmed(frames, WARM_UP), "contact")
+    steady = scanned(tmp_path / "steady.avi", frames, "contact", lossless=True)
+    warm = scanned(tmp_path / "warm.avi", warmed(frames, WARM_UP), "contact", lossless=True)
     assert (steady.probe.unsteady, warm.probe.unsteady) == (0, 8)
     assert warm.probe.contact == pytest.approx(steady.probe.contact, rel=0.1)
     assert np.abs(warm.reference.astype(int) - steady.reference).mean() < 1
@@ -182,14 +175,14 @@ def test_a_steady_press_has_the_reference_that_it_had(tmp_path: Path) -> None:
     """Also where contact begins at once, and under a light that only ever changes later."""
     late = [0.0] * 30 + [20.0] * 70
     for number, frames in enumerate((film([4.0 * i for i in range(60)]), film(rise(100)), film(rise(100), light=late))):
-        found = lossless(tmp_path / f"{number}.avi", frames, "salient")
+        found = scanned(tmp_path / f"{number}.avi", frames, "salient", lossless=True)
         assert found.probe.unsteady == 0
         assert found.probe.untouched == reference_indices(len(frames))
 
 
 def test_a_light_that_never_settles_is_named_and_measured_as_before(tmp_path: Path) -> None:
     flicker = [15.0 * (i % 2) for i in range(60)]
-    found = lossless(tmp_path / "v.avi", film(rise(60), light=flicker), "salient")
+    found = scanned(tmp_path / "v.avi", film(rise(60), light=flicker), "salient", lossless=True)
     assert (found.probe.unsteady, found.probe.untouched) == (60, reference_indices(60))
 
 
