@@ -26,7 +26,7 @@ Image = npt.NDArray[np.uint8]
 SUFFIXES = (".avi", ".m4v", ".mjpg", ".mkv", ".mov", ".mp4", ".webm")
 """What is a video by its name, wherever it comes from."""
 CONTAINERS = {"format_whitelist": "avi,matroska,mjpeg,mov"}
-"""And by what it holds, in FFmpeg's words. All hold their own pictures; a playlist would make it read other files."""
+"""What is a video by its content, by FFmpeg's names for containers. None refers to other files, as a playlist does."""
 PLANAR = frozenset(f"yuv{j}{kind}p" for j in ("", "j") for kind in ("420", "422", "444", "440", "411", "410"))
 """Formats whose first plane is brightness and whose second and third are colour, 8 bits each."""
 FULL_RANGE, BT709 = 2, 1

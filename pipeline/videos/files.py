@@ -67,7 +67,7 @@ def list_videos(folder: Path, catalogue: Catalogue) -> Listing:
         kinds = ", ".join(SUFFIXES)
         empty = _error(str(folder), f"holds no video ({kinds}); set data.dir to the folder of the videos")
         return Listing((), (*findings, empty))
-    # A table cannot hold such a name; `octopi describe` writes its escapes.
+    # The chain's tables are UTF-8 and cannot hold such a name; `octopi describe` lists it with escapes.
     named_so = {path: path.relative_to(folder).as_posix() for path in paths}
     no_text = {path: name for path, name in named_so.items() if readable(name) != name}
     findings += [_error(name, "its name is no text in UTF-8; rename it") for name in no_text.values()]

@@ -19,7 +19,8 @@ from pipeline.core.errors import UserError
 KEY_EVERY = 12
 """Frames from one whole picture to the next: in each of the public videos looked at, and libavcodec's own default."""
 BITS_A_SECOND = 200_000
-"""libavcodec's default. The public videos need 40 to 120 thousand, so that quality is at its best and not the limit."""
+"""libavcodec's default. Videos like the public ones need 40 to 120 thousand at the encoder's best quality, which is so
+what they get."""
 
 
 def write_film(path: Path, frames: Iterable[npt.NDArray[np.uint8]], fps: float) -> None:

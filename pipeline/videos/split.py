@@ -20,7 +20,8 @@ CANDIDATES = 2000
 FEWEST_TRAINING_OBJECTS = 3
 """A superlative or a matching question needs three objects."""
 VALIDATION = 8
-"""kfold: one in so many of a seed's training objects is for validation, as a whole fold would be missed in training."""
+"""With kfold, one in so many of the objects that are not tested is for validation; a whole fold would leave too few to
+train on."""
 ORIGIN = "paper"
 """The split of the catalogue that the development split is made from."""
 

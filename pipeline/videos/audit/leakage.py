@@ -15,24 +15,26 @@ from pipeline.videos.audit.files import by_rate, quiet_level, touches
 from pipeline.videos.catalogue import Catalogue
 
 DUPLICATE = 0.91
-"""Likeness of two videos' contacts up to which they are no near-duplicates, however few videos there are. Of 354 real
-ones, those of different objects reach .905, whichever others they are compared among."""
+"""Two videos are no near-duplicates while their contacts are alike by less, however few videos there are. Among 354
+real videos, pairs of different objects reach .905."""
 CHANCE = 0.01
-"""How likely one or more pairs of different objects may be called near-duplicates by chance, in a whole data set."""
+"""The probability that any pair of different objects in a data set is called a near-duplicate by chance."""
 SPREAD = 2.0
 """Sessions are told apart where references lie farther from each other than this many times the usual distance between
 nearest neighbours (average linkage)."""
 PERMUTATIONS = 2000
 FOLDS = 5
 RIDGE = 1.0
+"""Of the regression that predicts labels, whose features have a total variance of one."""
 FEWEST = 16
-"""Likenesses that a tail is told from; `DUPLICATE` alone counts below 256 pairs of videos."""
+"""Likenesses that the tail of their distribution is fitted to, at least: with fewer than 256 pairs of videos only
+`DUPLICATE` counts."""
 SAMPLE = 5000
-"""Most videos that sessions are told apart by, and that labels are predicted on: the first takes memory and time by the
-square, the second by 2000 permutations. Of more, a sample is taken."""
+"""Most videos that sessions are told apart by, and that labels are predicted on; of more, a random sample is taken.
+Memory and time of the first grow with the square of the number, and the second is repeated 2000 times."""
 ALPHA = 0.1
-"""Below this p value a prediction from nothing but the untouched sensor is a warning. Generous: a leak that is missed
-costs more than one that is looked into, and a few dozen objects give such a test little power."""
+"""Below this p value a prediction from nothing but the untouched sensor is a warning. It is not .05, as a few dozen
+objects give the test little power, and to miss a leak costs more than to look into a false one."""
 LEARNT_FROM = (Part.TRAIN, Part.VALIDATION)
 Parts = Mapping[str, Part]
 """By video id; empty where no split was asked for."""
@@ -179,7 +181,7 @@ def near_copies(probes: Sequence[Probe], parts: Parts) -> Iterator[Finding]:
         alike = own[i + 1 :] @ vector
         closest = max(closest, float(alike.max()))
         close += [(shown[i], shown[i + 1 + j], alike[j]) for j in np.flatnonzero(alike > DUPLICATE).tolist()]
-        # By pairs of different objects the bound is told; only their largest count.
+        # The bound follows from the largest likenesses of different objects, so no others are kept.
         chance = alike[objects[i + 1 :] != objects[i]]
         largest = np.sort(np.concatenate([largest, chance]))[-math.isqrt(pairs) - 1 :]
     bound = likeness_bound(largest[::-1], pairs)

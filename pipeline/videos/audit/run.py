@@ -21,7 +21,6 @@ from pipeline.videos.frames.scan import Scan, scan
 from pipeline.videos.split import assign
 
 AUDIT_FILE = "audit.csv"
-ORDER = (Severity.ERROR, Severity.WARNING, Severity.INFO)
 
 
 def audit_folder(folder: Path, catalogue: Catalogue, split: SplitConfig | None = None) -> list[Finding]:
@@ -73,8 +72,9 @@ def check_folder(folder: Path, catalogue: Catalogue) -> list[Finding]:
 
 
 def by_severity(findings: Iterable[Finding]) -> list[Finding]:
-    """Errors first, then warnings, otherwise in the order found."""
-    return sorted(findings, key=lambda f: ORDER.index(f.severity))
+    """Errors first, then warnings, as `Severity` lists them; otherwise in the order found."""
+    order = list(Severity)
+    return sorted(findings, key=lambda f: order.index(f.severity))
 
 
 def stop_on_errors(findings: Sequence[Finding], path: Path) -> None:

@@ -195,13 +195,10 @@ def _split_columns(file: Path, header: Sequence[str], language: Language) -> dic
     return splits
 
 
-OBJECT_ID = re.compile(r"[\w-]+")
-
-
 def _read_object(row: Row, language: Language, splits: dict[str, str], where: str) -> Object:
     if not row["object_id"] or not row["name"]:
         raise UserError(f"{where}: object_id and name must not be empty")
-    if not OBJECT_ID.fullmatch(row["object_id"]):
+    if not re.fullmatch(r"[\w-]+", row["object_id"]):
         raise UserError(f"{where}: object_id {row['object_id']!r} names files; write letters, digits, _ and - alone")
     ratings, stated = [], []
     for p in language.properties:

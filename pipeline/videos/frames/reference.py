@@ -18,7 +18,7 @@ from pipeline.videos.decoding import Image, brightness, planes
 SHARE, LONGEST = 10, 8
 """The reference spans the first tenth of a video, at most 8 frames: a third to half a second at 10 and 25 a second."""
 MOST_FRAMES = 4
-"""Of these, at equal distances: neighbours of a video without motion are copies of each other."""
+"""The mean is of at most so many of these, at equal distances: without motion, neighbours are copies of each other."""
 THUMB = 80
 """Longer side of the small picture that contact is measured on, in pixels."""
 DETAILED = 1.12
