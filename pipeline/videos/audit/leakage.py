@@ -166,7 +166,7 @@ def _copies(probes: Sequence[Probe], parts: Parts) -> Iterator[Finding]:
 
 
 def near_copies(probes: Sequence[Probe], parts: Parts) -> Iterator[Finding]:
-    """Videos whose contact looks as no two videos' does by chance; the last finding is the closest pair's likeness."""
+    """Pairs of videos whose contacts are more alike than different objects are by chance; last, the closest pair."""
     level = quiet_level(probes)
     shown = [p for p in probes if touches(p, level)]
     if len(shown) < 2:
