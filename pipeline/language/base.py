@@ -13,20 +13,14 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError
-from transformers import (
-    AutoModelForCausalLM,
-    AutoTokenizer,
-    BitsAndBytesConfig,
-    PreTrainedModel,
-    PreTrainedTokenizerBase,
-)
+from transformers import AutoTokenizer, BitsAndBytesConfig, PreTrainedModel, PreTrainedTokenizerBase
 
 from pipeline.core.errors import UserError
 from pipeline.core.io import read_json, tensor_shapes, write_json
 from pipeline.core.records import Turn
 from pipeline.core.runtime import Quantization
 from pipeline.language.chat import add_tactile_tokens, render
-from pipeline.weights import GET_LLM, again, check_finite, check_language
+from pipeline.weights import again, check_finite, check_language, first_words, load_language
 
 ADAPTER_CONFIG = "adapter_config.json"
 ADAPTER_WEIGHTS = "adapter_model.safetensors"
@@ -46,9 +40,8 @@ def load_tokenizer(folder: Path) -> PreTrainedTokenizerBase:
     try:
         tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True, use_fast=True, trust_remote_code=False)
     except Exception as error:  # The library for tokenizers raises nothing narrower.
-        reason = " ".join(str(error).split())[:200]
         raise UserError(
-            f"language.weights: the tokenizer in {folder} cannot be read ({reason}); {again(folder)}"
+            f"language.weights: the tokenizer in {folder} cannot be read ({first_words(error)}); {again(folder)}"
         ) from None
     if tokenizer.eos_token is None:
         raise UserError(
@@ -73,65 +66,42 @@ def load_llm(folder: Path, dtype: torch.dtype, quantization: Quantization = "non
             four bits where they cannot be had.
     """
     check_language(folder, exists=True)
-    own = _four_bits(dtype) if quantization == "nf4" else {}
-    try:
-        model, info = AutoModelForCausalLM.from_pretrained(
-            folder,
-            dtype=dtype,
-            local_files_only=True,
-            use_safetensors=True,
-            trust_remote_code=False,
-            output_loading_info=True,
-            **own,
+    own: dict[str, Any] = {}
+    if quantization == "nf4":
+        needed = {
+            "bitsandbytes (`pip install bitsandbytes`)": find_spec("bitsandbytes"),
+            "a CUDA device": torch.cuda.is_available(),
+        }
+        if lacking := [name for name, found in needed.items() if not found]:
+            raise UserError(
+                f"language.quantization: nf4 needs {' and '.join(lacking)}; or set language.quantization=none"
+            )
+        own["quantization_config"] = BitsAndBytesConfig(
+            load_in_4bit=True,
+            bnb_4bit_quant_type="nf4",
+            bnb_4bit_use_double_quant=True,
+            bnb_4bit_compute_dtype=dtype,
         )
-    except Exception as error:  # transformers and what it asks for raise nearly any of them.
-        reason = " ".join(str(error).split())[:200]
-        raise UserError(
-            f"language.weights: {folder} cannot be loaded ({reason}); {GET_LLM.format(folder=folder)}"
-        ) from None
-    wrong = sorted(map(str, [*info["missing_keys"], *info["mismatched_keys"]]))
-    if wrong:
-        raise UserError(
-            f"language.weights: {folder} does not fit its config.json ({wrong[0]} is missing or of another shape); "
-            f"{GET_LLM.format(folder=folder)}"
-        )
+        own["device_map"] = {"": torch.cuda.current_device()}
+    model = load_language(folder, "language.weights", dtype=dtype, use_safetensors=True, **own)
     check_finite(folder, "language.weights", model.named_parameters())
     return model.requires_grad_(False).eval()
 
 
-def _four_bits(dtype: torch.dtype) -> dict[str, Any]:
-    needed = {
-        "bitsandbytes (`pip install bitsandbytes`)": find_spec("bitsandbytes"),
-        "a CUDA device": torch.cuda.is_available(),
-    }
-    if lacking := [name for name, found in needed.items() if not found]:
-        raise UserError(f"language.quantization: nf4 needs {' and '.join(lacking)}; or set language.quantization=none")
-    config = BitsAndBytesConfig(
-        load_in_4bit=True,
-        bnb_4bit_quant_type="nf4",
-        bnb_4bit_use_double_quant=True,
-        bnb_4bit_compute_dtype=dtype,
-    )
-    return {"quantization_config": config, "device_map": {"": torch.cuda.current_device()}}
-
-
 def save_adapter(llm: PreTrainedModel, folder: Path, state: Mapping[str, torch.Tensor]) -> None:
-    """Write the adapter of a PEFT model, the same bytes for the same values; of others nothing.
+    """Write the adapter of a PEFT model, the same bytes for the same values.
 
     Args:
         state: The language model's parameters by name, whole even where its own are sharded.
     """
-    from peft import PeftModel
-
-    if isinstance(llm, PeftModel):
-        # In the base's own number format, in which it is added; it was trained in float32.
-        dtype = llm.get_input_embeddings().weight.dtype
-        own = {name: value.to(dtype) if "lora_" in name else value for name, value in state.items()}
-        llm.save_pretrained(str(folder), state_dict=own)
-        # PEFT writes a set, whose order differs from process to process, and an empty model card.
-        values = read_json(folder / ADAPTER_CONFIG)
-        write_json(folder / ADAPTER_CONFIG, {**values, "target_modules": sorted(values["target_modules"])})
-        (folder / "README.md").unlink(missing_ok=True)
+    # In the base's own number format, in which it is added; it was trained in float32.
+    dtype = llm.get_input_embeddings().weight.dtype
+    own = {name: value.to(dtype) if "lora_" in name else value for name, value in state.items()}
+    llm.save_pretrained(str(folder), state_dict=own)
+    # PEFT writes a set, whose order differs from process to process, and an empty model card.
+    values = read_json(folder / ADAPTER_CONFIG)
+    write_json(folder / ADAPTER_CONFIG, {**values, "target_modules": sorted(values["target_modules"])})
+    (folder / "README.md").unlink(missing_ok=True)
 
 
 def load_adapter(llm: PreTrainedModel, folder: Path) -> PreTrainedModel:
@@ -148,9 +118,8 @@ def load_adapter(llm: PreTrainedModel, folder: Path) -> PreTrainedModel:
     try:
         model = PeftModel.from_pretrained(llm, str(folder))
     except (OSError, RuntimeError, ValueError, KeyError, TypeError, SafetensorError) as error:
-        reason = " ".join(str(error).split())[:200]
         raise UserError(
-            f"{folder}: its adapter is broken or of another language model ({reason}); run `dvc repro`"
+            f"{folder}: its adapter is broken or of another language model ({first_words(error)}); run `dvc repro`"
         ) from None
     # PEFT only warns of tensors that are missing, and says nothing of those that are too many.
     own = get_peft_model_state_dict(model, save_embedding_layers=False).keys()

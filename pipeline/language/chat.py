@@ -41,8 +41,6 @@ class Rendered:
 
     text: str
     answers: tuple[tuple[int, int], ...]
-    templated: bool = False
-    """Written by the tokenizer's template, which writes the begin token too where there is one."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +98,7 @@ def render(
         if not stops:
             raise UserError(f"{where} ends an answer with none of {', '.join(ends)}; the model could not learn to stop")
         answers.append((start, min(stops)))
-    return Rendered(text if complete else text + lead, tuple(answers), templated=bool(tokenizer.chat_template))
+    return Rendered(text if complete else text + lead, tuple(answers))
 
 
 def end_ids(tokenizer: PreTrainedTokenizerBase) -> tuple[int, ...]:
@@ -120,10 +118,14 @@ def encode(rendered: Rendered, tokenizer: PreTrainedTokenizerBase, *, bos: bool 
 
     Tokenising in one piece keeps prompt tokens equal in training and evaluation, whatever the tokenizer does at
     the borders of pieces. Needs a fast tokenizer, since only those know offsets.
+
+    Args:
+        bos: Begin with the begin token. What a template of the tokenizer's writes has its own, where it wants one.
     """
     if not tokenizer.is_fast:
         raise UserError(f"{tokenizer.name_or_path}: has no fast tokenizer (tokenizer.json); labels need its offsets")
-    batch = tokenizer(rendered.text, return_offsets_mapping=True, add_special_tokens=bos and not rendered.templated)
+    begin = bos and not tokenizer.chat_template
+    batch = tokenizer(rendered.text, return_offsets_mapping=True, add_special_tokens=begin)
     ids: list[int] = batch["input_ids"]
     labels = [
         token if any(start <= a and b <= stop and a < b for start, stop in rendered.answers) else IGNORE_INDEX
@@ -132,31 +134,16 @@ def encode(rendered: Rendered, tokenizer: PreTrainedTokenizerBase, *, bos: bool 
     return Encoded(tuple(ids), tuple(labels))
 
 
-def encode_turns(
-    turns: Sequence[Turn],
-    tokenizer: PreTrainedTokenizerBase,
-    *,
-    system_prompt: str,
-    frames: int,
-    bos: bool = True,
-    descriptions: bool = True,
-) -> Encoded:
-    """Render and encode a whole conversation.
-
-    Args:
-        descriptions: Label them too. Without, only what is concluded from them has labels, and its end token.
-    """
-    rendered = render(turns, tokenizer, system_prompt=system_prompt, frames=frames, complete=True)
-    if not descriptions:
-        spans = []
-        for (start, stop), turn in zip(rendered.answers, turns, strict=True):
-            if turn.described:
-                # The space before a word belongs to its token.
-                start = rendered.text.index(turn.assistant, start) + turn.described
-            if turn.described < len(turn.assistant):
-                spans.append((start, stop))
-        rendered = replace(rendered, answers=tuple(spans))
-    return encode(rendered, tokenizer, bos=bos)
+def conclusions(rendered: Rendered, turns: Sequence[Turn]) -> Rendered:
+    """The conversation with what is concluded from descriptions, and its end token, as all that the assistant says."""
+    spans = []
+    for (start, stop), turn in zip(rendered.answers, turns, strict=True):
+        if turn.described:
+            # The space before a word belongs to its token.
+            start = rendered.text.index(turn.assistant, start) + turn.described
+        if turn.described < len(turn.assistant):
+            spans.append((start, stop))
+    return replace(rendered, answers=tuple(spans))
 
 
 def _templated(messages: Sequence[dict[str, str]], tokenizer: PreTrainedTokenizerBase, *, ask: bool) -> str:

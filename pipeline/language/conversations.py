@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from functools import partial
 
 import torch
 from torch.nn import functional as F
@@ -16,7 +15,7 @@ from pipeline.core.embeddings import FLIPS, EmbeddingStore
 from pipeline.core.errors import UserError
 from pipeline.core.records import Opd, Question
 from pipeline.core.runtime import derive_seed
-from pipeline.language.chat import IGNORE_INDEX, Encoded, encode_turns
+from pipeline.language.chat import IGNORE_INDEX, Encoded, conclusions, encode, render
 from pipeline.training.sampling import EpochDataset, sample_evaluation, sample_training
 
 FILLER = -1
@@ -66,17 +65,16 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
         for question in self.questions:
             dialogue = question.dialogue(opd)
             assert dialogue is not None
-            write = partial(
-                encode_turns, dialogue.turns, tokenizer, system_prompt=system_prompt, frames=per_video, bos=bos
-            )
-            encoded = write()
+            rendered = render(dialogue.turns, tokenizer, system_prompt=system_prompt, frames=per_video, complete=True)
+            encoded = encode(rendered, tokenizer, bos=bos)
             check_length(question.question_id, len(encoded.input_ids), positions)
             if all(label == IGNORE_INDEX for label in encoded.labels):
                 raise UserError(f"{question.question_id}: has no answer to learn from; run `dvc repro questions -f`")
             self.encoded.append(encoded)
             weights = torch.ones(len(encoded.labels))
             if question.question_id in given and any(turn.described for turn in dialogue.turns):
-                weights[torch.tensor(write(descriptions=False).labels) == IGNORE_INDEX] = 0
+                learnt = encode(conclusions(rendered, dialogue.turns), tokenizer, bos=bos)
+                weights[torch.tensor(learnt.labels) == IGNORE_INDEX] = 0
             self.weights.append(weights)
 
     @property

@@ -10,6 +10,7 @@ from collections.abc import Collection, Iterator, Sequence
 
 import torch
 from torch.nn import functional as F
+from torch.nn.utils.rnn import pad_sequence
 from transformers import Cache
 
 from pipeline.language.cache import extendable, roomy_cache
@@ -92,47 +93,39 @@ def _read(
 ) -> tuple[torch.Tensor, Cache, torch.Tensor]:
     """Logits behind each prompt, the cache, and which of its columns a row sees; prompts are padded on the left."""
     device, config = model.connector.delimiters.device, model.llm.config
-    if not extendable(config):
-        cache = roomy_cache(config)
-        logits, mask = _read_part(model, prompts, features, 0, cache)
-        return logits, cache, mask
-    shared = _shared(prompts, model.start_id)
+    shared, parts = 0, [list(range(len(prompts)))]
+    # Layers that forget what lies behind their window can neither share a beginning nor be joined.
+    if extendable(config):
+        shared = _shared(prompts, model.start_id)
+        parts = _parts([len(p) - shared for p in prompts])
     begun = roomy_cache(config)
     if shared:
         ids = torch.tensor([prompts[0][:shared]], device=device)
         _step(model, model.embed_words(ids), torch.ones_like(ids), begun)
-    parts: list[tuple[torch.Tensor, torch.Tensor, Cache]] = []
-    for rows in _parts([len(p) - shared for p in prompts]):
+    logits: list[torch.Tensor] = []
+    masks: list[torch.Tensor] = []
+    caches: list[Cache] = []
+    for rows in parts:
         cache = copy.deepcopy(begun)
         if shared:
             cache.batch_repeat_interleave(len(rows))
-        suffixes = [prompts[r][shared:] for r in rows]
-        logits, mask = _read_part(model, suffixes, [features[r] for r in rows], shared, cache)
-        parts.append((logits, mask, cache))
-    width = max(mask.shape[1] for _, mask, _ in parts)
+        suffixes = [torch.tensor(prompts[row][shared:]) for row in rows]
+        ids = pad_sequence(suffixes, batch_first=True, padding_side="left").to(device)
+        real = pad_sequence([torch.ones_like(s) for s in suffixes], batch_first=True, padding_side="left").to(device)
+        mask = F.pad(real, (shared, 0), value=1)
+        embeddings = model.embed(ids, pad_sequence([features[row] for row in rows], batch_first=True).to(device))
+        logits.append(_step(model, embeddings, mask, cache))
+        masks.append(mask)
+        caches.append(cache)
+    if len(parts) == 1:
+        return logits[0], caches[0], masks[0]
+    width = max(mask.shape[1] for mask in masks)
     whole = roomy_cache(config)
     for layer in whole.layers:
-        own = [part[2].layers.pop(0) for part in parts]  # Or all would be held twice.
-        layer.update(*(torch.cat([_widen(getattr(x, kind), width) for x in own]) for kind in ("keys", "values")))
-    masks = [F.pad(mask, (width - mask.shape[1], 0)) for _, mask, _ in parts]
-    return torch.cat([logits for logits, _, _ in parts]), whole, torch.cat(masks)
-
-
-def _read_part(
-    model: OctopiForCausalLM,
-    prompts: Sequence[Sequence[int]],
-    features: Sequence[torch.Tensor],
-    before: int,
-    cache: Cache,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Logits behind prompts that follow on `before` columns of the cache, and the mask of all columns."""
-    device, longest = model.connector.delimiters.device, max(map(len, prompts))
-    ids = torch.tensor([[0] * (longest - len(p)) + list(p) for p in prompts], device=device)
-    lengths = torch.tensor([len(p) for p in prompts], device=device)
-    mask = (torch.arange(longest, device=device) >= longest - lengths[:, None]).long()
-    mask = F.pad(mask, (before, 0), value=1)
-    padded = torch.nn.utils.rnn.pad_sequence(list(features), batch_first=True).to(device)
-    return _step(model, model.embed(ids, padded), mask, cache), mask
+        own = [cache.layers.pop(0) for cache in caches]  # Or all would be held twice.
+        keys, values = ([getattr(each, kind) for each in own] for kind in ("keys", "values"))
+        layer.update(*(torch.cat([F.pad(s, (0, 0, width - s.shape[-2], 0)) for s in x]) for x in (keys, values)))
+    return torch.cat(logits), whole, torch.cat([F.pad(mask, (width - mask.shape[1], 0)) for mask in masks])
 
 
 def _shared(prompts: Sequence[Sequence[int]], stop: int) -> int:
@@ -145,15 +138,11 @@ def _shared(prompts: Sequence[Sequence[int]], stop: int) -> int:
 
 def _parts(lengths: Sequence[int]) -> list[list[int]]:
     """Neighbours, of at most `READ` tokens together with their padding, at least one."""
-    parts: list[list[int]] = []
+    parts: list[list[int]] = [[]]
     for row in range(len(lengths)):
-        last = [*parts[-1], row] if parts else []
-        if parts and len(last) * max(lengths[r] for r in last) <= READ:
-            parts[-1] = last
-        else:
+        longer = [*parts[-1], row]
+        if parts[-1] and len(longer) * max(lengths[r] for r in longer) > READ:
             parts.append([row])
+        else:
+            parts[-1] = longer
     return parts
-
-
-def _widen(states: torch.Tensor, width: int) -> torch.Tensor:
-    return F.pad(states, (0, 0, width - states.shape[-2], 0))

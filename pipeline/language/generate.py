@@ -143,7 +143,8 @@ def reply(
     for start in range(0, len(order), language.generation_batch_size):
         places = order[start : start + language.generation_batch_size]
         chosen = [prompts[place] for place in places]
-        batches.append(Batch(chosen, [features[place] for place in places], _room(model, chosen, language)))
+        limits = [_room(model, prompt, language) for prompt in chosen]
+        batches.append(Batch(chosen, [features[place] for place in places], limits))
     said = [row for rows in run_with(model, source, _reply_batch, batches, label, "batch") for row in rows]
     return [text for _, text in sorted(zip(order, said, strict=True), key=lambda pair: pair[0])]
 
@@ -183,7 +184,7 @@ class Stream:
             if not order:
                 continue
             rows = [streams[place] for place in order]
-            room = [_room(model, [s.prompt], s.language)[0] for s in rows]
+            room = [_room(model, s.prompt, s.language) for s in rows]
             tokens: list[list[int]] = [[] for _ in rows]
             given = [""] * len(rows)
             prompts, features = [s.prompt for s in rows], [s.features for s in rows]
@@ -203,10 +204,10 @@ class Stream:
                     yield place, None
 
 
-def _room(model: OctopiForCausalLM, prompts: Sequence[Sequence[int]], language: LanguageConfig) -> list[int]:
-    """Most tokens that each answer may have."""
+def _room(model: OctopiForCausalLM, prompt: Sequence[int], language: LanguageConfig) -> int:
+    """Most tokens that an answer may have."""
     most = language.max_new_tokens
-    return [most if model.positions is None else min(most, model.positions - len(p)) for p in prompts]
+    return most if model.positions is None else min(most, model.positions - len(prompt))
 
 
 def _said(tokens: list[int], ends: Collection[int], tokenizer: PreTrainedTokenizerBase) -> Generated:

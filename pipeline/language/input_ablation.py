@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from itertools import accumulate, chain, pairwise
 
 import torch
@@ -21,38 +21,34 @@ def ablate_input(store: EmbeddingStore, touch: Touch, questions: Sequence[Questi
       object keeps its own. It may have the same classes all the same.
     - `noise`: normal noise with the mean and deviation of each dimension over all embeddings, the same at each call.
     - `removed` is no matter of the embeddings but of the prompt, which then has no frame to put one at.
+
+    Raises:
+        UserError: where touch is to be swapped, and the questions are about one object alone.
     """
-    videos = _videos(questions)
-    if touch is Touch.SWAPPED:
-        return store.with_rows({v: store.rows(other) for v, other in _ring(videos, seed).items()}, store.tensor)
-    if touch is Touch.NOISE:
-        names = list(chain.from_iterable(videos.values()))
-        ends = list(accumulate(map(store.count, names), initial=0))
-        drawn = torch.Generator().manual_seed(derive_seed(seed, "noise"))
-        noise = torch.randn(ends[-1], store.dim, generator=drawn)
-        tensor = store.tensor.mean(0) + store.tensor.std(0, correction=0) * noise
-        return store.with_rows({v: range(*span) for v, span in zip(names, pairwise(ends), strict=True)}, tensor)
-    return store
-
-
-def _videos(questions: Iterable[Question]) -> dict[str, list[str]]:
-    """Object to its videos, both in alphabetical order."""
+    if touch not in (Touch.SWAPPED, Touch.NOISE):
+        return store
     found: dict[str, set[str]] = {}
     for question in questions:
         for object_id, video_id in zip(question.objects, question.videos, strict=True):
             found.setdefault(object_id, set()).add(video_id)
-    return {o: sorted(found[o]) for o in sorted(found)}
-
-
-def _ring(videos: Mapping[str, Sequence[str]], seed: int) -> dict[str, str]:
-    objects = list(videos)
-    if len(objects) == 1:
-        raise UserError(
-            "ablation.touch: swapped needs questions about two objects at least; leave it out or add objects"
-        )
-    random.Random(derive_seed(seed, "swapped")).shuffle(objects)
-    return {
-        video: videos[other][i % len(videos[other])]
-        for own, other in zip(objects, objects[1:] + objects[:1], strict=True)
-        for i, video in enumerate(videos[own])
-    }
+    # In alphabetical order, so that what is drawn follows from the seed.
+    videos = {o: sorted(found[o]) for o in sorted(found)}
+    if touch is Touch.SWAPPED:
+        ring = list(videos)
+        if len(ring) == 1:
+            raise UserError(
+                "ablation.touch: swapped needs questions about two objects at least; leave it out or add objects"
+            )
+        random.Random(derive_seed(seed, "swapped")).shuffle(ring)
+        rows = {
+            video: store.rows(videos[other][i % len(videos[other])])
+            for own, other in zip(ring, ring[1:] + ring[:1], strict=True)
+            for i, video in enumerate(videos[own])
+        }
+        return store.with_rows(rows, store.tensor)
+    names = list(chain.from_iterable(videos.values()))
+    ends = list(accumulate(map(store.count, names), initial=0))
+    drawn = torch.Generator().manual_seed(derive_seed(seed, "noise"))
+    noise = torch.randn(ends[-1], store.dim, generator=drawn)
+    tensor = store.tensor.mean(0) + store.tensor.std(0, correction=0) * noise
+    return store.with_rows({v: range(*span) for v, span in zip(names, pairwise(ends), strict=True)}, tensor)

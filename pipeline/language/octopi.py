@@ -5,26 +5,67 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Self, cast
+from typing import Any, Self, cast
 
 import torch
+from pydantic import Field, ValidationError
 from torch import nn
 from torch.distributed.fsdp import FSDPModule
 from torch.nn import functional as F
 from transformers import DynamicCache, PreTrainedModel, PreTrainedTokenizerBase
 from transformers.modeling_outputs import CausalLMOutput
 
-from pipeline.core.errors import UserError
-from pipeline.core.io import save_tensors, write_json
+from pipeline.config import TrainedEmbeddings
+from pipeline.core.errors import UserError, first_problem
+from pipeline.core.io import read_json, save_tensors, write_json
+from pipeline.core.records import Record
 from pipeline.core.runtime import DtypeName, Quantization, resolve_dtype
 from pipeline.language.base import load_adapter, load_llm, load_tokenizer, save_adapter
 from pipeline.language.cache import extendable
 from pipeline.language.chat import IGNORE_INDEX, TACTILE_TOKENS
-from pipeline.language.connector import CONFIG_FILE, Connector, OctopiConfig, read_config
 from pipeline.training.trainable import load_trainable
 
-CONNECTOR_FILE, WORDS_FILE = "connector.safetensors", "words.safetensors"
+CONFIG_FILE, CONNECTOR_FILE, WORDS_FILE = "config.json", "connector.safetensors", "words.safetensors"
 ADAPTER_DIR = "adapter"
+
+
+class OctopiConfig(Record):
+    """config.json of a saved model: what it stands on, and its shapes."""
+
+    model_type: str = "octopi"
+    architectures: tuple[str, ...] = ("OctopiForCausalLM",)
+    base_model: str
+    """Folder of the language model, as `language.weights` named it."""
+    tactile_dim: int = Field(ge=1)
+    """Length of a tactile embedding."""
+    hidden_size: int = Field(ge=1)
+    """Length of a word embedding."""
+    tactile_tokens: tuple[str, ...] = TACTILE_TOKENS
+    normalized: bool = False
+    """Whether projected embeddings are as long as the language model's words (`language.normalize_touch`)."""
+    trained_embeddings: TrainedEmbeddings = "new"
+    """Whether words.safetensors holds embeddings of all words, or the language model's own are used."""
+
+
+class Connector(nn.Module):
+    """The paper's projection (two linear layers, GELU between) and the embeddings of the two new tokens.
+
+    The new tokens' embeddings live here, not in the language model's matrix, whether its rows are trained too or not:
+    the matrix keeps its shape, and a plain PEFT adapter stays loadable on the untouched base.
+    """
+
+    def __init__(self, tactile_dim: int, hidden: int) -> None:
+        super().__init__()
+        self.projection = nn.Sequential(nn.Linear(tactile_dim, hidden), nn.GELU(), nn.Linear(hidden, hidden))
+        self.delimiters = nn.Parameter(torch.zeros(2, hidden))
+
+
+def read_config(folder: Path) -> OctopiConfig:
+    """config.json of a folder that `OctopiForCausalLM.save_pretrained` wrote; anything else is a UserError."""
+    try:
+        return OctopiConfig.model_validate(read_json(folder / CONFIG_FILE))
+    except ValidationError as error:
+        raise UserError(f"{folder / CONFIG_FILE}: {first_problem(error)}; run `dvc repro`") from None
 
 
 class OctopiForCausalLM(nn.Module):
@@ -150,14 +191,17 @@ class OctopiForCausalLM(nn.Module):
             state_dict: The parameters by name where the model's own are sharded over processes. An adapter that is not
                 among them is not written.
         """
-        folder, state = Path(folder), self.state_dict() if state_dict is None else state_dict
+        folder = Path(folder)
+        parts: dict[str, dict[str, torch.Tensor]] = {"connector": {}, "words": {}, "llm": {}}
+        for name, value in (self.state_dict() if state_dict is None else state_dict).items():
+            part, _, rest = name.partition(".")
+            parts[part][rest] = value
         write_json(folder / CONFIG_FILE, self.octopi_config.model_dump(mode="json"))
-        save_tensors(folder / CONNECTOR_FILE, _below("connector", state))
+        save_tensors(folder / CONNECTOR_FILE, parts["connector"])
         if self.words is not None:
-            save_tensors(folder / WORDS_FILE, _below("words", state))
-        adapter = _below("llm", state)
-        if any("lora_" in name for name in adapter):
-            save_adapter(self.llm, folder / ADAPTER_DIR, adapter)
+            save_tensors(folder / WORDS_FILE, parts["words"])
+        if any("lora_" in name for name in parts["llm"]):
+            save_adapter(self.llm, folder / ADAPTER_DIR, parts["llm"])
 
     def train_words(self) -> nn.Embedding:
         """Have all word embeddings trained: a copy in float32, which begins as the language model's own.
@@ -219,7 +263,6 @@ class OctopiForCausalLM(nn.Module):
         self,
         input_ids: torch.Tensor,
         features: torch.Tensor,
-        attention_mask: torch.Tensor | None = None,
         labels: torch.Tensor | None = None,
         weights: torch.Tensor | None = None,
         num_items_in_batch: torch.Tensor | int | None = None,
@@ -227,9 +270,8 @@ class OctopiForCausalLM(nn.Module):
         """Logits, or with labels the cross-entropy over the answers' tokens alone.
 
         Args:
-            input_ids: batch x length.
+            input_ids: batch x length, padded on the right where rows differ: no token sees a later one.
             features: batch x frames x tactile_dim, as `embed` wants them.
-            attention_mask: batch x length. Rows that are padded on the right need none: no token sees a later one.
             labels: batch x length, each token its own label; `IGNORE_INDEX` is left out.
             weights: batch x length, how much each labelled token counts; by default 1.
             num_items_in_batch: Sum of the weights of the whole update, of which this may be a part; by default that
@@ -241,12 +283,17 @@ class OctopiForCausalLM(nn.Module):
             that some row needs: in long prompts that saves the larger part of them.
         """
         embeddings = self.embed(input_ids, features)
-        call = {"attention_mask": attention_mask, "use_cache": False}
         if labels is None:
-            return CausalLMOutput(logits=self.llm(inputs_embeds=embeddings, **call).logits)
-        shared = self._shared(input_ids, labels) if attention_mask is None else 0
+            return CausalLMOutput(logits=self.llm(inputs_embeds=embeddings, use_cache=False).logits)
+        call: dict[str, Any] = {"use_cache": False}
+        shared = self._shared(input_ids, labels)
         if shared:
-            call = {"past_key_values": self._begin(embeddings[:, :shared]), "use_cache": True}
+            # What all rows begin with is read for one of them; only trained words have a gradient there.
+            first = embeddings[:1, :shared] if self.words is not None else embeddings[:1, :shared].detach()
+            cache = DynamicCache(config=self.llm.config)
+            self.llm(inputs_embeds=first, past_key_values=cache, use_cache=True, logits_to_keep=1)
+            cache.batch_repeat_interleave(len(embeddings))
+            call = {"past_key_values": cache, "use_cache": True}
         targets = labels[:, shared + 1 :]
         learned = targets != IGNORE_INDEX
         columns = learned.any(0).nonzero().flatten()
@@ -269,15 +316,3 @@ class OctopiForCausalLM(nn.Module):
             return 0
         alike = (input_ids == input_ids[:1]) & (input_ids != self.start_id) & (labels == IGNORE_INDEX)
         return max(0, int(alike.all(0).long().cumprod(0).sum()) - 1)
-
-    def _begin(self, embeddings: torch.Tensor) -> DynamicCache:
-        """Keys and values of what all rows begin with, of one row; only trained words have a gradient there."""
-        cache = DynamicCache(config=self.llm.config)
-        first = embeddings[:1] if self.words is not None else embeddings[:1].detach()
-        self.llm(inputs_embeds=first, past_key_values=cache, use_cache=True, logits_to_keep=1)
-        cache.batch_repeat_interleave(len(embeddings))
-        return cache
-
-
-def _below(prefix: str, state: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    return {name.removeprefix(f"{prefix}."): v for name, v in state.items() if name.startswith(f"{prefix}.")}

@@ -27,9 +27,8 @@ from pipeline.core.io import fingerprint, read_jsonl
 from pipeline.core.records import TENSOR_FILE, Encoder, Opd, Question
 from pipeline.core.runtime import derive_seed, name_dtype, seed_everything
 from pipeline.language.base import ADAPTER_WEIGHTS
-from pipeline.language.connector import CONFIG_FILE, read_config
 from pipeline.language.conversations import ConversationDataset, UpdateSampler, collate
-from pipeline.language.octopi import ADAPTER_DIR, OctopiForCausalLM
+from pipeline.language.octopi import ADAPTER_DIR, CONFIG_FILE, OctopiForCausalLM, read_config
 from pipeline.training.trainer import (
     TrainableTrainer,
     Trained,

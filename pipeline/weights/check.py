@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pipeline.core.errors import UserError
 from pipeline.core.io import tensor_shapes
 from pipeline.core.runtime import quiet_libraries
-from pipeline.weights import BACKBONES, again
-from pipeline.weights.shapes import CLIP_CONFIG, LLM_CONFIG, first_words, read_form, read_tower
+from pipeline.weights import BACKBONES, again, first_words, load_language
+from pipeline.weights.shapes import CLIP_CONFIG, LLM_CONFIG, read_form, read_tower
 
 if TYPE_CHECKING:
     from tokenizers import Tokenizer
-    from transformers import PreTrainedModel
 
 TOKENIZER = "tokenizer.json"
+SHAPES: dict[str, Any] = {"device_map": "meta", "ignore_mismatched_sizes": True}
+"""Has transformers read no values, and report shapes that do not fit rather than stop at them."""
 
 
 def check_language_files(folder: Path, key: str = "language.weights") -> None:
@@ -33,47 +34,18 @@ def check_language_files(folder: Path, key: str = "language.weights") -> None:
     config = read_form(folder / LLM_CONFIG)
     read_form(folder / "tokenizer_config.json")
     last = max(read_tokenizer(folder).get_vocab(with_added_tokens=False).values(), default=0)
-    shapes_of(folder.glob("*.safetensors"), key)
+    for file in sorted(folder.glob("*.safetensors")):
+        tensor_shapes(file, again(folder))  # transformers would not say which file is broken.
     if "quantization_config" in config:
         return  # Its tensors are in the form of a quantizer, which may not be installed.
-    words = check_fit(folder, key).get_input_embeddings().num_embeddings
+    quiet_libraries()
+    model = load_language(folder, key, use_safetensors=True, **SHAPES)
+    words = model.get_input_embeddings().num_embeddings
     if last >= words:
         raise UserError(
             f"{key}: {folder / TOKENIZER} has words up to number {last}, but vocab_size of {folder / LLM_CONFIG} is "
             f"{words}; take both from one model"
         )
-
-
-def check_fit(folder: Path, key: str, *, safe: bool = True) -> PreTrainedModel:
-    """The language model of a folder on the meta device, for which transformers reads names and shapes alone.
-
-    Args:
-        safe: Whether it lies in safetensors; in pickles else, of which no code is run.
-
-    Raises:
-        UserError: where shards, index or configuration are broken, or a tensor is missing or of another shape.
-    """
-    from transformers import AutoModelForCausalLM
-
-    quiet_libraries()
-    try:
-        model, told = AutoModelForCausalLM.from_pretrained(
-            folder,
-            device_map="meta",
-            use_safetensors=safe,
-            output_loading_info=True,
-            ignore_mismatched_sizes=True,
-            local_files_only=True,
-            trust_remote_code=False,
-        )
-    except Exception as error:  # transformers and what it asks for raise nearly any of them.
-        raise UserError(f"{key}: {folder} cannot be loaded ({first_words(error)}); {again(folder)}") from None
-    wrong = [f"{name} is missing" for name in sorted(told["missing_keys"])]
-    wrong += [f"{name} is {[*own]}, not {[*wanted]}" for name, own, wanted in sorted(told["mismatched_keys"])]
-    if wrong:
-        raise UserError(f"{key}: {folder} does not fit its {LLM_CONFIG} ({wrong[0]}); take both from one model")
-    loaded: PreTrainedModel = model
-    return loaded
 
 
 def check_encoder_files(folder: Path, backbone: Collection[str], key: str = "encoder.weights") -> None:
@@ -92,28 +64,26 @@ def check_encoder_files(folder: Path, backbone: Collection[str], key: str = "enc
     if not folder.is_dir():
         return
     read = [BACKBONES[name] for name in backbone if BACKBONES[name].key == "weights"]
-    found = shapes_of({f for each in read for f in each.files(folder) if f.suffix == ".safetensors"}, key)
+    stored: dict[str, tuple[int, ...]] = {}
+    for file in sorted({f for each in read for f in each.files(folder) if f.suffix == ".safetensors"}):
+        stored |= tensor_shapes(file, again(folder))
     if "clip" not in backbone:
         return
     tower = read_tower(folder)
     if tower is None:
         raise UserError(f"{key}: {folder} is no vision transformer; visual prompts need one such as ViT-L/14")
-    visual = {name.removeprefix("visual."): shape for name, shape in found.items() if name.startswith("visual.")}
+    visual = {
+        name.removeprefix("visual."): torch.empty(shape, device="meta")
+        for name, shape in stored.items()
+        if name.startswith("visual.")
+    }
     try:
-        tower.load_state_dict({name: torch.empty(shape, device="meta") for name, shape in visual.items()}, assign=True)
-    except RuntimeError as error:  # torch names what is missing or of another shape.
+        tower.load_state_dict(visual, assign=True)
+    except RuntimeError as error:  # torch names what is missing or of another shape, from the second line on.
         reason = first_words(str(error).partition("\n")[2])
         raise UserError(
             f"{key}: {folder} does not fit its {CLIP_CONFIG} ({reason}); take both from one model"
         ) from None
-
-
-def shapes_of(files: Iterable[Path], key: str) -> dict[str, tuple[int, ...]]:
-    """The tensors of safetensors files, by their headers; raises UserError where one is broken or cut off."""
-    try:
-        return {name: shape for f in sorted(files) for name, shape in tensor_shapes(f, again(f.parent)).items()}
-    except UserError as error:
-        raise UserError(f"{key}: {error}") from None
 
 
 def read_tokenizer(folder: Path) -> Tokenizer:

@@ -5,6 +5,7 @@ A pickle is read on the user's word alone, and then for its tensors: no code of 
 
 from __future__ import annotations
 
+import re
 import shutil
 import zipfile
 from collections.abc import Mapping
@@ -12,24 +13,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.core.errors import UserError
-from pipeline.core.io import atomic_folder, load_tensors, save_tensors, sha256, write_json, write_text
-from pipeline.weights import CLIP_WEIGHTS, DOWNLOADED, check_language, clip_file, openai_clip
-from pipeline.weights.check import (
-    TOKENIZER,
-    check_encoder_files,
-    check_fit,
-    check_language_files,
-    read_tokenizer,
-    shapes_of,
-)
-from pipeline.weights.shapes import (
-    CLIP_CONFIG,
-    LLM_CONFIG,
-    PUBLISHED_CLIP,
-    PUBLISHED_LANGUAGE,
-    read_form,
-    read_tower,
-)
+from pipeline.core.io import atomic_folder, load_tensors, save_tensors, sha256, tensor_shapes, write_json, write_text
+from pipeline.weights import CLIP_WEIGHTS, DOWNLOADED, again, check_language, clip_file, load_language
+from pipeline.weights.check import SHAPES, TOKENIZER, check_encoder_files, check_language_files, read_tokenizer
+from pipeline.weights.shapes import CLIP_CONFIG, LLM_CONFIG, PUBLISHED_CLIP, PUBLISHED_LANGUAGE, read_form, read_tower
 
 if TYPE_CHECKING:
     import torch
@@ -47,6 +34,25 @@ TEXTS = (
     "USER: Which is rougher, 1 or 23?\nASSISTANT: 東京, Überraschung; \ttwo  spaces 😀",
 )
 """Read with the fast tokenizer and the slow one. Neither begins with a blank, which they read differently."""
+OPEN_CLIP_NAMES = (
+    (r"^vision_model\.", "visual."),
+    (r"^text_model\.", ""),
+    (r"^visual_projection\.weight", "visual.proj"),
+    (r"^text_projection\.weight", "text_projection"),
+    (r"encoder\.layers\.", "transformer.resblocks."),
+    (r"self_attn\.", "attn."),
+    (r"layer_norm(?=[12]\.)", "ln_"),
+    (r"mlp\.fc1", "mlp.c_fc"),
+    (r"mlp\.fc2", "mlp.c_proj"),
+    (r"embeddings\.class_embedding", "class_embedding"),
+    (r"embeddings\.patch_embedding", "conv1"),
+    (r"embeddings\.token_embedding", "token_embedding"),
+    (r"embeddings\.position_embedding\.weight", "positional_embedding"),
+    (r"pre_layrnorm", "ln_pre"),
+    (r"post_layernorm", "ln_post"),
+    (r"final_layer_norm", "ln_final"),
+)
+"""Patterns of names in transformers' CLIP, and what open_clip has in their place; one after the other."""
 
 
 def new_folder(to: Path) -> Path:
@@ -102,31 +108,55 @@ def write_sums(folder: Path) -> None:
     write_text(folder / SUMS, "".join(f"{sha256(folder / n)}  {n.as_posix()}\n" for n in shown))
 
 
-# ---- language models ----
-
-
 def check_vicuna(folder: Path, known: str, key: str) -> None:
-    """Raise UserError where a folder in the chain's form is not what was published as `known`."""
+    """Raise UserError where a folder in the chain's form is not what was published as `known`.
+
+    Its fast tokenizer must read texts as SentencePiece's file does, where that is there.
+    """
+    from sentencepiece import SentencePieceProcessor
+
+    published = PUBLISHED_LANGUAGE[known]
     check_language(folder, key, exists=True)
-    check_values(read_form(folder / LLM_CONFIG), PUBLISHED_LANGUAGE[known], folder, known, key)
+    check_values(read_form(folder / LLM_CONFIG), published, folder, known, key)
     check_language_files(folder, key)
-    check_tokenizer(folder, PUBLISHED_LANGUAGE[known]["vocab_size"], key)
+    file, words = folder / PIECES, published["vocab_size"]
+    if not file.is_file():
+        return
+    try:
+        slow = SentencePieceProcessor(model_file=str(file))
+    except (OSError, RuntimeError):
+        raise UserError(f"{key}: {file} is no SentencePiece model; download it again") from None
+    if (own := slow.get_piece_size()) != words:
+        raise UserError(f"{key}: {file} has {own} words, but was published with {words}; download it again")
+    fast = read_tokenizer(folder)
+    if any(fast.encode(text, add_special_tokens=False).ids != slow.encode(text) for text in TEXTS):
+        raise UserError(
+            f"{key}: {folder / TOKENIZER} reads texts otherwise than {file.name}; remove it to convert that anew"
+        )
 
 
 def write_vicuna(source: Path, target: Path, known: str, key: str, trust_pickle: bool) -> None:
     """Write a downloaded language model with a fast tokenizer and safetensors."""
+    from transformers import AutoTokenizer
+
     # First, before many gigabytes of another model are read.
     read_form(source / "tokenizer_config.json")
     check_values(read_form(source / LLM_CONFIG), PUBLISHED_LANGUAGE[known], source, known, key)
     copy(source, target, *SETTINGS, ".safetensors")
     if not (source / TOKENIZER).is_file():
-        write_tokenizer(source, target, key)
+        if not (source / PIECES).is_file():
+            raise UserError(f"{key}: {source} has neither {TOKENIZER} nor {PIECES}; download them again")
+        try:
+            tokenizer = AutoTokenizer.from_pretrained(source, local_files_only=True, trust_remote_code=False)
+        except Exception:  # For a file that is cut off, transformers asks for other packages.
+            raise UserError(f"{key}: {source / PIECES} is no SentencePiece model; download it again") from None
+        tokenizer.save_pretrained(target)
     if any(source.glob("*.safetensors")):
         return
-    files = sorted(source.glob("pytorch_model*.bin"))
-    # Mapped from disk, tensors pass through in their own number format without taking memory.
-    shards = {file: read_pickle(file, key, trust_pickle) for file in files}
-    check_fit(source, key, safe=False)
+    # Mapped from disk, tensors pass through in their own number format without taking memory; `save_pretrained` would
+    # take twice the model's.
+    shards = {file: read_pickle(file, key, trust_pickle) for file in sorted(source.glob("pytorch_model*.bin"))}
+    load_language(source, key, use_safetensors=False, **SHAPES)
     places: dict[str, str] = {}
     for file, state in shards.items():
         kept = {name: value for name, value in state.items() if not name.endswith(COMPUTED)}
@@ -137,41 +167,6 @@ def write_vicuna(source: Path, target: Path, known: str, key: str, trust_pickle:
         size = sum(value.nbytes for state in shards.values() for name, value in state.items() if name in places)
         index = {"metadata": {"total_size": size}, "weight_map": places}
         write_json(target / "model.safetensors.index.json", index)
-
-
-def write_tokenizer(source: Path, target: Path, key: str) -> None:
-    """Write the fast tokenizer of a SentencePiece model."""
-    from transformers import AutoTokenizer
-
-    if not (source / PIECES).is_file():
-        raise UserError(f"{key}: {source} has neither {TOKENIZER} nor {PIECES}; download them again")
-    try:
-        tokenizer = AutoTokenizer.from_pretrained(source, local_files_only=True, trust_remote_code=False)
-    except Exception:  # For a file that is cut off, transformers asks for other packages.
-        raise UserError(f"{key}: {source / PIECES} is no SentencePiece model; download it again") from None
-    tokenizer.save_pretrained(target)
-
-
-def check_tokenizer(folder: Path, words: int, key: str) -> None:
-    """Raise UserError where SentencePiece's file is there, and has not as many words or reads texts otherwise."""
-    from sentencepiece import SentencePieceProcessor
-
-    fast, file = read_tokenizer(folder), folder / PIECES
-    if not file.is_file():
-        return
-    try:
-        slow = SentencePieceProcessor(model_file=str(file))
-    except (OSError, RuntimeError):
-        raise UserError(f"{key}: {file} is no SentencePiece model; download it again") from None
-    if (own := slow.get_piece_size()) != words:
-        raise UserError(f"{key}: {file} has {own} words, but was published with {words}; download it again")
-    if any(fast.encode(text, add_special_tokens=False).ids != slow.encode(text) for text in TEXTS):
-        raise UserError(
-            f"{key}: {folder / TOKENIZER} reads texts otherwise than {file.name}; remove it to convert that anew"
-        )
-
-
-# ---- CLIP ----
 
 
 def check_clip(folder: Path, known: str, key: str) -> None:
@@ -200,8 +195,8 @@ def write_clip(source: Path, target: Path, known: str, key: str, trust_pickle: b
     import open_clip
 
     copy(source, target, *SETTINGS)
-    own = (source / CLIP_CONFIG).is_file()
-    if not own:
+    theirs = not (source / CLIP_CONFIG).is_file()
+    if theirs:
         model, pictures = (read_form(source / name) for name in (LLM_CONFIG, "preprocessor_config.json"))
         # Shapes are those that were published, to which the tensors are held; what they do not show is read.
         form = open_clip.get_model_config(PUBLISHED_CLIP[known])
@@ -214,14 +209,30 @@ def write_clip(source: Path, target: Path, known: str, key: str, trust_pickle: b
     if not files:
         raise UserError(f"{key}: {source} has no weights, neither safetensors nor a pickle; download them again")
     if files[0].suffix == ".safetensors":
-        shapes_of(files[:1], key)
+        tensor_shapes(files[0], again(source))  # Raises for a broken file.
         state = load_tensors(files[0])
     else:
         state = read_pickle(files[0], key, trust_pickle)
-    save_tensors(target / CLIP_WEIGHTS[0], state if own else openai_clip.renamed(state), {"format": "pt"})
+    save_tensors(target / CLIP_WEIGHTS[0], to_open_clip(state) if theirs else state, {"format": "pt"})
 
 
-# ---- both ----
+def to_open_clip(state: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """All tensors of transformers' CLIPModel under open_clip's names, a layer's three maps of attention in one."""
+    import torch
+
+    found = {}
+    for name, value in state.items():
+        for pattern, there in OPEN_CLIP_NAMES:
+            name = re.sub(pattern, there, name)
+        if name.endswith("position_ids"):
+            continue  # Once stored; they are the numbers 0, 1, 2 and so on.
+        # open_clip multiplies by its projections from the other side.
+        found[name] = value.T.contiguous() if name in ("visual.proj", "text_projection") else value
+    for first in [name for name in found if ".attn.q_proj." in name]:
+        names = [first.replace("q_proj", part) for part in ("q_proj", "k_proj", "v_proj")]
+        # Where one is missing, the sum is too short, which the check of shapes sees.
+        found[first.replace("q_proj.", "in_proj_")] = torch.cat([found.pop(name) for name in names if name in found])
+    return found
 
 
 def check_values(found: Mapping[str, Any], known: Mapping[str, Any], folder: Path, name: str, key: str) -> None:

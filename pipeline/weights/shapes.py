@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.core.errors import UserError
+from pipeline.weights import first_words
 
 if TYPE_CHECKING:
     from open_clip.transformer import VisionTransformer
@@ -104,11 +105,6 @@ def read_form(file: Path) -> dict[str, Any]:
     if not isinstance(form, dict):
         raise UserError(f"{file} is not a JSON object; {AGAIN}")
     return form
-
-
-def first_words(error: object) -> str:
-    """What a library says of a fault, in one line that is not too long."""
-    return " ".join(str(error).split())[:200] or type(error).__name__
 
 
 PUBLISHED_CLIP = {"clip-vit-large-patch14": "ViT-L-14-quickgelu"}

@@ -10,14 +10,11 @@ from pipeline.core.errors import UserError
 from pipeline.core.io import save_tensors, write_json
 from pipeline.core.runtime import derive_seed
 from pipeline.weights import CLIP_CONFIG, CLIP_WEIGHTS, MADE
-from pipeline.weights.source import Given
 
 if TYPE_CHECKING:
     from transformers import PreTrainedTokenizerFast
 
 TAUGHT = "drawn at random and taught nothing"
-CLIP_CARD = {"license": "mit", "library_name": "open_clip", "taught": TAUGHT}
-LLAMA_CARD = {"license": "mit", "library_name": "transformers", "taught": TAUGHT}
 ABOUT = "A tiny model with random weights. It knows nothing: figures that it makes are chance."
 CLIP: dict[str, dict[str, Any]] = {
     "model_cfg": {
@@ -46,27 +43,27 @@ SPECIAL = PAD, BOS, EOS, UNK = ("<pad>", "<s>", "</s>", "<unk>")
 MOST_TOKENS = 2048
 
 
-def write_clip(folder: Path, given: Given) -> None:
+def write_clip(folder: Path, source: Path, seed: int) -> None:
     """Write a CLIP with a vision transformer as open_clip lays it out."""
     import open_clip
     import torch
 
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(derive_seed("tiny-clip", given.seed))
+        torch.manual_seed(derive_seed("tiny-clip", seed))
         model = open_clip.CLIP(**CLIP["model_cfg"])
     write_json(folder / CLIP_CONFIG, CLIP)
     save_tensors(folder / CLIP_WEIGHTS[0], model.state_dict(), {"format": "pt"})
 
 
-def write_llama(folder: Path, given: Given) -> None:
+def write_llama(folder: Path, catalogue: Path, seed: int) -> None:
     """Write a Llama in float32 with a tokenizer as transformers lays them out."""
     import torch
     from transformers import LlamaConfig, LlamaForCausalLM
 
-    tokenizer = make_tokenizer(given.source)
+    tokenizer = make_tokenizer(catalogue)
     ends = {f"{kind}_token_id": getattr(tokenizer, f"{kind}_token_id") for kind in ("pad", "bos", "eos")}
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(derive_seed("tiny-llama", given.seed))
+        torch.manual_seed(derive_seed("tiny-llama", seed))
         model = LlamaForCausalLM(LlamaConfig(vocab_size=len(tokenizer), **LLAMA, **ends))
     model.save_pretrained(folder)
     tokenizer.save_pretrained(folder)
