@@ -198,7 +198,7 @@ def single_turn(user: Mapping[Opd, str], answer: Mapping[Opd, str]) -> dict[Opd,
     return {mode: [Turn(user=user[mode], assistant=answer[mode], described=before[mode])] for mode in user}
 
 
-def in_turns(draft: Draft, more: Sequence[Draft] = ()) -> Draft:
+def in_turns(draft: Draft, more: Sequence[Draft], catalogue: Catalogue) -> Draft:
     """The question whose answer describes everything in a first turn, and concludes in a second.
 
     A question about one video, without a description or a mode that has none, or of several turns, stays as it is.
@@ -213,17 +213,14 @@ def in_turns(draft: Draft, more: Sequence[Draft] = ()) -> Draft:
     (whole,), _ = asked[Opd.ALL], asked[Opd.NONE]
     if not whole.described or not 1 < len(draft.videos) <= len(LETTERS):
         return draft
-    first = whole.assistant[: whole.described]
-    for ordinal, letter in zip(ORDINALS, LETTERS, strict=False):
-        first = first.replace(f"{ordinal} object:", f"{letter})")
+    first = descriptions(catalogue, draft.objects)
     turns = [Turn(user=described_first(len(draft.videos)), assistant=first, described=len(first))]
     for one in (draft, *more):
         (bare,), (told,) = (d.turns for mode in (Opd.NONE, Opd.ALL) for d in one.dialogues if d.opd is mode)
-        question = bare.user
-        for letter in LETTERS[: len(draft.videos)]:
-            question = question.replace(f"{letter}) {{tactile}}", f"{letter})")
-        for letter in LETTERS[: len(draft.videos)]:
-            question = question.replace("{tactile}", f"{letter})", 1)
+        # Felt in the first turn, videos are named by their letters, which a list has before each of them already.
+        *texts, end = bare.user.split("{tactile}")
+        named = [text.removesuffix(f"{x}) ") + f"{x})" for text, x in zip(texts, LETTERS, strict=False)]
+        question = "".join([*named, end])
         turns.append(Turn(user=question, assistant=told.assistant[told.described :].strip()))
     return replace(
         draft,

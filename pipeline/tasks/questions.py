@@ -94,7 +94,7 @@ def build_questions(
                 choices = (definition.as_choice(d, pool.catalogue) for d in (draft, *more))
                 # A choice may stand anywhere, also first, where a scenario's stands.
                 more += islice(filter(None, choices), CHOICES)
-                draft = in_turns(draft, turns.sample(more, len(more)))
+                draft = in_turns(draft, turns.sample(more, len(more)), pool.catalogue)
             if facts:
                 draft = definition.with_facts(draft, pool.catalogue, order, inexact)
             questions.append(draft.numbered(f"{task}-{place}-{number:05d}", task, pool.part))
