@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.language.base import load_llm, load_tokenizer
-from pipeline.weights import MADE, MADE_DIR, check_encoder, check_language
-from pipeline.weights.make import RECIPES
+from pipeline.weights import MADE_DIR, check_encoder, check_language
 from tests.checkpoints import write_clip, write_llama
 from tests.conftest import refused
 
@@ -28,12 +27,6 @@ def test_what_can_be_made_need_not_be_there() -> None:
     check_encoder(MADE_DIR / "efficientnet-lite0", 32, ("timm", "scenes"))
     check_language(MADE_DIR / "smollm2")
     check_language(MADE_DIR / "tiny-llama", "language.weights")
-
-
-def test_every_kind_that_is_checked_has_a_recipe_of_the_same_package() -> None:
-    assert {name: made.package for name, made in MADE.items()} == {
-        name: recipe.origin and recipe.origin.package for name, recipe in RECIPES.items()
-    }
 
 
 def test_what_cannot_be_made_is_refused() -> None:

@@ -36,9 +36,8 @@ FIRST, SECOND = "pytorch_model-00001-of-00002.bin", "pytorch_model-00002-of-0000
 INDEX = "pytorch_model.bin.index.json"
 TO = Path("weights/vicuna-7b-v1.5")
 CONFIG = """{"architectures": ["LlamaForCausalLM"], "model_type": "llama", "hidden_act": "silu", "bos_token_id": 1,
-"eos_token_id": 2, "pad_token_id": 0, "initializer_range": 0.02, "max_position_embeddings": 4096, "pretraining_tp": 1,
-"num_key_value_heads": 4, "rms_norm_eps": 1e-05, "rope_scaling": null, "tie_word_embeddings": false,
-"torch_dtype": "float16", "use_cache": true}"""
+"eos_token_id": 2, "pad_token_id": 0, "max_position_embeddings": 4096, "num_key_value_heads": 4, "rms_norm_eps": 1e-05,
+"tie_word_embeddings": false, "torch_dtype": "float16", "use_cache": true}"""
 TOKENIZER_CONFIG = """{"add_bos_token": true, "add_eos_token": false, "clean_up_tokenization_spaces": false,
 "legacy": false, "model_max_length": 4096, "pad_token": null, "padding_side": "right", "sp_model_kwargs": {},
 "tokenizer_class": "LlamaTokenizer"}"""
@@ -147,16 +146,9 @@ def test_a_downloaded_vicuna_becomes_what_the_chain_reads(vicuna: Path, pieces: 
     before = contents(vicuna)
     assert "weights/vicuna-7b-v1.5: written, with SHA256SUMS" in octopi("vicuna-7b", str(vicuna), "--trust-pickle")
     assert contents(vicuna) == before
-    assert sorted(contents(Path("weights"))) == sorted(
-        f"vicuna-7b-v1.5/{name}"
-        for name in (
-            *("README.md", "SHA256SUMS", "config.json", "generation_config.json", "model-00001-of-00002.safetensors"),
-            *("model-00002-of-00002.safetensors", "model.safetensors.index.json", "special_tokens_map.json"),
-            *("tokenizer.json", "tokenizer.model", "tokenizer_config.json"),
-        )
-    )
+    assert not list(TO.glob("*.bin*"))
     subprocess.run(["sha256sum", "--check", "--strict", "--quiet", "SHA256SUMS"], cwd=TO, check=True)
-    assert len((TO / "SHA256SUMS").read_text().splitlines()) == 10
+    assert len((TO / "SHA256SUMS").read_text().splitlines()) == len(contents(TO)) - 1
     check_language_files(TO)
 
     model = load_llm(TO, torch.float16)
@@ -173,13 +165,12 @@ def test_a_downloaded_vicuna_becomes_what_the_chain_reads(vicuna: Path, pieces: 
         for text in [*(line.strip() for line in LINES[::20]), *HARD]:
             assert tokenizer(text).input_ids == [1, *slow.encode(text)], text
             assert tokenizer(text, add_special_tokens=False).input_ids == slow.encode(text), text
-    # An end token within a conversation is one, and what follows it is no new word.
     said = plain("ASSISTANT: soft</s>USER: and", add_special_tokens=False).input_ids
-    assert said.count(2) == 1
-    assert plain.decode(said) == "ASSISTANT: soft</s>USER: and"
+    assert said.count(2) == 1, "an end token within a conversation is one"
+    assert plain.decode(said) == "ASSISTANT: soft</s>USER: and", "what follows it is no new word"
 
 
-def test_what_was_converted_is_checked_where_it_lies(vicuna: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_was_converted_is_checked_where_it_lies(vicuna: Path) -> None:
     octopi("vicuna-7b", str(vicuna), "--to", "elsewhere", "--trust-pickle")
     before = contents(Path("elsewhere"))
     assert "elsewhere: checked, with SHA256SUMS" in octopi("vicuna-7b", "elsewhere")
@@ -188,22 +179,17 @@ def test_what_was_converted_is_checked_where_it_lies(vicuna: Path, monkeypatch: 
     assert contents(Path("copy")) == before
     with refused("elsewhere has hidden_size 32, but vicuna-13b-v1.5 was published with 5120"):
         octopi("vicuna-13b", "elsewhere")
-    cut(Path("elsewhere/model-00002-of-00002.safetensors"))
-    with refused("vicuna-7b: elsewhere/model-00002-of-00002.safetensors is cut off"):
-        octopi("vicuna-7b", "elsewhere")
-    with refused("vicuna-7b: elsewhere/model-00002-of-00002.safetensors is cut off"):
-        octopi("vicuna-7b", "elsewhere", "--to", "other")
-    assert not list(Path().glob("*other*"))
-
-
-def test_another_models_fast_tokenizer_is_noticed(vicuna: Path) -> None:
-    octopi("vicuna-7b", str(vicuna), "--trust-pickle")
-    file = TO / "tokenizer.json"
-    form = json.loads(file.read_text())
+    tokenizer = Path("copy/tokenizer.json")
+    form = json.loads(tokenizer.read_text())
     form["model"]["merges"] = form["model"]["merges"][::-1]
-    file.write_text(json.dumps(form))
-    with refused(f"{file} reads texts otherwise than tokenizer.model"):
-        octopi("vicuna-7b", str(TO))
+    tokenizer.write_text(json.dumps(form))
+    with refused(f"{tokenizer} reads texts otherwise than tokenizer.model"):
+        octopi("vicuna-7b", "copy")
+    cut(Path("elsewhere/model-00002-of-00002.safetensors"))
+    for to in ((), ("--to", "other")):
+        with refused("elsewhere/model-00002-of-00002.safetensors is cut off"):
+            octopi("vicuna-7b", "elsewhere", *to)
+    assert not list(Path().glob("*other*"))
 
 
 def test_safetensors_with_a_slow_tokenizer_need_no_trust(vicuna: Path) -> None:
@@ -245,27 +231,22 @@ def fewer_words(folder: Path) -> None:
     train_pieces(folder, "a b c d e f g h", vocab_size=WORDS - 1, hard_vocab_limit=False)
 
 
-VICUNA: dict[str, tuple[Callable[[Path], object], str]] = {
-    "evil": (lambda f: torch.save({"a": Evil()}, f / SECOND), f"{SECOND} is cut off, or holds more than tensors"),
-    "cut": (lambda f: cut(f / SECOND), f"{SECOND} is cut off"),
-    "empty": (lambda f: (f / FIRST).write_bytes(b""), f"{FIRST} is cut off"),
-    "a list": (lambda f: torch.save([torch.zeros(1)], f / FIRST), f"{FIRST} is cut off, or holds more"),
-    "a number": (lambda f: torch.save({"a": 1}, f / FIRST), f"{FIRST} is cut off, or holds more"),
-    "no shard": (lambda f: (f / FIRST).unlink(), f"No such file .*{FIRST}"),
-    "no index": (lambda f: (f / INDEX).unlink(), "no file named .* pytorch_model.bin"),
-    "narrower": (narrower, r"does not fit its config.json .model.layers.1.mlp.up_proj.weight is \[48, 31\]"),
-    "lacking": (lacking, "does not fit its config.json .model.norm.weight is missing"),
-    "wider": (lambda f: edit(f / "config.json", hidden_size=64), "download has hidden_size 64, but .* with 32"),
-    "another norm": (lambda f: edit(f / "config.json", rms_norm_eps=1e-6), "download has rms_norm_eps 1e-06, but"),
-    "no config": (lambda f: (f / "config.json").unlink(), "config.json does not exist"),
-    "config cut": (lambda f: cut(f / "config.json", 9), "config.json is not a JSON object"),
-    "no tokenizer_config": (lambda f: (f / "tokenizer_config.json").unlink(), "tokenizer_config.json does not exist"),
-    "no tokenizer": (lambda f: (f / "tokenizer.model").unlink(), "neither tokenizer.json nor tokenizer.model"),
-    "tokenizer cut": (lambda f: cut(f / "tokenizer.model"), "tokenizer.model is no SentencePiece model"),
-    "tokenizer empty": (lambda f: (f / "tokenizer.model").write_bytes(b""), "tokenizer.model is no SentencePiece"),
-    "fewer words": (fewer_words, "tokenizer.model has [0-9]+ words, but was published with 600"),
-    "fast one empty": (lambda f: (f / "tokenizer.json").write_text(""), "tokenizer.json is no fast tokenizer"),
-}
+Damage = tuple[Callable[[Path], object], str]
+VICUNA: list[Damage] = [
+    (lambda f: torch.save({"a": Evil()}, f / SECOND), f"{SECOND} is cut off, or holds more than tensors"),
+    (lambda f: cut(f / SECOND), f"{SECOND} is cut off"),
+    (lambda f: torch.save({"a": 1}, f / FIRST), f"{FIRST} is cut off, or holds more"),
+    (lambda f: (f / FIRST).unlink(), f"No such file .*{FIRST}"),
+    (narrower, r"does not fit its config.json .model.layers.1.mlp.up_proj.weight is \[48, 31\]"),
+    (lacking, "does not fit its config.json .model.norm.weight is missing"),
+    (lambda f: edit(f / "config.json", hidden_size=64), "download has hidden_size 64, but .* with 32"),
+    (lambda f: edit(f / "config.json", rms_norm_eps=1e-6), "download has rms_norm_eps 1e-06, but"),
+    (lambda f: (f / "config.json").unlink(), "config.json does not exist"),
+    (lambda f: (f / "tokenizer_config.json").unlink(), "tokenizer_config.json does not exist"),
+    (lambda f: (f / "tokenizer.model").unlink(), "neither tokenizer.json nor tokenizer.model"),
+    (lambda f: cut(f / "tokenizer.model"), "tokenizer.model is no SentencePiece model"),
+    (fewer_words, "tokenizer.model has [0-9]+ words, but was published with 600"),
+]
 
 
 def test_pickles_are_read_on_the_users_word_alone(vicuna: Path) -> None:
@@ -394,28 +375,6 @@ def own(folder: Path, **changes: Any) -> None:
     edit(folder / FORM, model_cfg=json.loads((folder / FORM).read_text())["model_cfg"] | changes)
 
 
-def pictures(folder: Path, **changes: Any) -> None:
-    edit(folder / FORM, preprocess_cfg=PICTURES | changes)
-
-
-HALVES = [0.5, 0.5, 0.5]
-CLIP: dict[str, tuple[Callable[[Path], object], str]] = {
-    "GELU": (lambda f: own(f, quick_gelu=False), "clip has quick_gelu False, but .* with True"),
-    "no word of it": (lambda f: own(f, quick_gelu=None), "clip has quick_gelu None, but .* with True"),
-    "another mean": (lambda f: pictures(f, mean=HALVES), r"clip has mean \[0.5, 0.5, 0.5\], but"),
-    "another deviation": (lambda f: pictures(f, std=HALVES), r"clip has std \[0.5, 0.5, 0.5\], but"),
-    "another length": (lambda f: own(f, embed_dim=8), "has embed_dim 8, but clip-vit-large-patch14 was .* with 16"),
-    "cut": (lambda f: cut(f / FILE), f"clip-vit-large: clip/{FILE} is cut off"),
-    "other patches": (
-        lambda f: replace(f / FILE, "visual.conv1.weight", torch.zeros(32, 3, 8, 8)),
-        r"does not fit its open_clip_config.json .*conv1.weight: .*\[32, 3, 8, 8\]",
-    ),
-    "settings cut": (lambda f: cut(f / FORM, 9), "open_clip_config.json is not a JSON object"),
-    "no settings": (lambda f: (f / FORM).unlink(), "clip/config.json does not exist"),
-    "no weights": (lambda f: (f / FILE).unlink(), "no weights, neither safetensors nor a pickle"),
-}
-
-
 def other_activation(folder: Path) -> None:
     form = json.loads((folder / "config.json").read_text())
     edit(folder / "config.json", vision_config=form["vision_config"] | {"hidden_act": "gelu"})
@@ -426,30 +385,40 @@ def without(folder: Path, name: str) -> None:
     save_file({n: value for n, value in load_file(file).items() if n != name}, file)
 
 
-HUGGING_FACE: dict[str, tuple[Callable[[Path], object], str]] = {
-    "gelu": (other_activation, "clip-hf has quick_gelu False, but .* was published with True"),
-    "another mean": (
-        lambda f: edit(f / "preprocessor_config.json", image_mean=[0, 0, 0]),
-        r"has mean \[0, 0, 0\], but",
+CLIP: list[Damage] = [
+    (lambda f: own(f, quick_gelu=False), "clip has quick_gelu False, but .* with True"),
+    (lambda f: own(f, quick_gelu=None), "clip has quick_gelu None, but .* with True"),
+    (lambda f: edit(f / FORM, preprocess_cfg=PICTURES | {"std": [0.5] * 3}), r"clip has std \[0.5, 0.5, 0.5\], but"),
+    (lambda f: own(f, embed_dim=8), "has embed_dim 8, but clip-vit-large-patch14 was .* with 16"),
+    (lambda f: cut(f / FILE), f"clip/{FILE} is cut off"),
+    (
+        lambda f: replace(f / FILE, "visual.conv1.weight", torch.zeros(32, 3, 8, 8)),
+        r"does not fit its open_clip_config.json .*conv1.weight: .*\[32, 3, 8, 8\]",
     ),
-    "no mean": (lambda f: edit(f / "preprocessor_config.json", image_mean=None), "clip-hf has mean None, but"),
-    "no pictures": (lambda f: (f / "preprocessor_config.json").unlink(), "preprocessor_config.json does not exist"),
-    "no keys": (
-        lambda f: without(f, "vision_model.encoder.layers.1.self_attn.k_proj.bias"),
-        "resblocks.1.attn.in_proj_bias",
-    ),
-    "no class": (lambda f: without(f, "vision_model.embeddings.class_embedding"), "Missing key.* .class_embedding"),
-}
+    (lambda f: cut(f / FORM, 9), "open_clip_config.json is not a JSON object"),
+    (lambda f: (f / FORM).unlink(), "clip/config.json does not exist"),
+    (lambda f: (f / FILE).unlink(), "no weights, neither safetensors nor a pickle"),
+]
+HUGGING_FACE: list[Damage] = [
+    (other_activation, "clip-hf has quick_gelu False, but .* was published with True"),
+    (lambda f: edit(f / "preprocessor_config.json", image_mean=None), "clip-hf has mean None, but"),
+    (lambda f: (f / "preprocessor_config.json").unlink(), "preprocessor_config.json does not exist"),
+    (lambda f: without(f, "vision_model.encoder.layers.1.self_attn.k_proj.bias"), "resblocks.1.attn.in_proj_bias"),
+    (lambda f: without(f, "vision_model.embeddings.class_embedding"), "Missing key.* .class_embedding"),
+]
 
 
 @pytest.mark.parametrize(
-    ("kind", "name"),
-    [(kind, n) for kind, table in (("vicuna", VICUNA), ("clip", CLIP), ("hugging_face", HUGGING_FACE)) for n in table],
+    ("kind", "damage", "words"),
+    [(kind, *each) for kind, table in (("vicuna", VICUNA), ("clip", CLIP), ("hf", HUGGING_FACE)) for each in table],
 )
-def test_a_broken_download_is_one_line_and_leaves_nothing(kind: str, name: str, request: pytest.FixtureRequest) -> None:
-    damage, words = {"vicuna": VICUNA, "clip": CLIP, "hugging_face": HUGGING_FACE}[kind][name]
-    made = published_clip() if kind == "clip" else request.getfixturevalue(kind)
-    folder = made[0] if kind == "hugging_face" else made
+def test_a_broken_download_is_one_line_and_leaves_nothing(
+    kind: str, damage: Callable[[Path], object], words: str, request: pytest.FixtureRequest
+) -> None:
+    if kind == "clip":
+        folder = published_clip()
+    else:
+        folder = request.getfixturevalue("vicuna") if kind == "vicuna" else request.getfixturevalue("hugging_face")[0]
     damage(folder)
     model = "vicuna-7b" if kind == "vicuna" else "clip-vit-large"
     for to in ((), ("--to", "there")):

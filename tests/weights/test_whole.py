@@ -6,7 +6,7 @@ import json
 import re
 from collections.abc import Callable
 from pathlib import Path
-from shutil import copyfile
+from shutil import copytree
 from typing import Any
 
 import pytest
@@ -35,62 +35,41 @@ def renamed(file: Path, old: str, new: str) -> None:
 
 ONE = "model.safetensors"
 INDEX = "model.safetensors.index.json"
-LANGUAGE: dict[str, tuple[Callable[[Path], object], str]] = {
-    "cut by a byte": (lambda f: cut(f / ONE), "model.safetensors is cut off or not a safetensors file .*; download it"),
-    "a byte too many": (lambda f: (f / ONE).write_bytes((f / ONE).read_bytes() + b"x"), "model.safetensors is cut off"),
-    "nothing in the weights": (lambda f: (f / ONE).write_bytes(b""), "model.safetensors is cut off"),
-    "a pointer of Git LFS": (lambda f: (f / ONE).write_text("version https://git-lfs"), "model.safetensors is cut off"),
-    "no tokenizer": (lambda f: (f / "tokenizer.json").unlink(), "tokenizer.json does not exist"),
-    "empty tokenizer": (lambda f: (f / "tokenizer.json").write_text(""), "tokenizer.json is no fast tokenizer"),
-    "tokenizer of nothing": (lambda f: (f / "tokenizer.json").write_text("{}"), "tokenizer.json is no fast tokenizer"),
-    "tokenizer's settings": (lambda f: (f / "tokenizer_config.json").write_text("{"), "_config.json is not a JSON obj"),
-    "settings cut": (lambda f: cut(f / "config.json", 9), "/config.json is not a JSON object"),
-    "settings in UTF-16": (lambda f: (f / "config.json").write_bytes("{}".encode("utf-16")), "is not a JSON object"),
-    "settings are a list": (lambda f: (f / "config.json").write_text("[]"), "/config.json is not a JSON object"),
-    "no kind": (lambda f: edit(f / "config.json", model_type=None), "cannot be loaded .*model_type"),
-    "no hidden_size": (
-        lambda f: edit(f / "config.json", hidden_size=None),
-        r"lm_head.weight is \[260, 32\], not \[260, 40",
-    ),
-    "a size that is a text": (
-        lambda f: edit(f / "config.json", vocab_size="260"),
-        "'vocab_size' expected int, got str",
-    ),
-    "no heads": (lambda f: edit(f / "config.json", num_attention_heads=0), "cannot be loaded .*zero"),
-    "wider": (
-        lambda f: edit(f / "config.json", intermediate_size=65),
-        r"mlp.down_proj.weight is \[32, 64\], not .*; take",
-    ),
-    "deeper": (
-        lambda f: edit(f / "config.json", num_hidden_layers=3),
-        "model.layers.2.input_layernorm.weight is missing",
-    ),
-    "a tensor under another name": (lambda f: renamed(f / ONE, "lm_head.weight", "x"), "lm_head.weight is missing"),
-    "fewer words than the tokenizer": (
-        lambda f: (
-            edit(f / "config.json", vocab_size=259),
-            *(replace(f / ONE, name, torch.zeros(259, 32)) for name in ("lm_head.weight", "model.embed_tokens.weight")),
-        ),
-        "tokenizer.json has words up to number 259, but vocab_size of .*/config.json is 259",
-    ),
-    "neither file nor index": (
-        lambda f: (f / ONE).rename(f / "model-1-of-1.safetensors"),
-        "no file named model.safete",
-    ),
-}
-SHARDS: dict[str, tuple[Callable[[Path], object], str]] = {
-    "no shard": (
-        lambda f: (f / "model-00002-of-00007.safetensors").unlink(),
-        "No such file.*model-00002-of-00007",
-    ),
-    "a shard cut by a byte": (lambda f: cut(f / "model-00003-of-00007.safetensors"), "model-00003-of-00007.* is cut"),
-    "a broken index": (lambda f: cut(f / INDEX, 9), "llama cannot be loaded"),
-    "an empty index": (lambda f: edit(f / INDEX, weight_map={}), "llama cannot be loaded"),
-    "a shard twice": (
-        lambda f: copyfile(f / "model-00003-of-00007.safetensors", f / "model-00004-of-00007.safetensors"),
-        r"model.layers\S+ is missing",
-    ),
-}
+
+
+def other_vocabulary(folder: Path) -> None:
+    edit(folder / "config.json", vocab_size=259)
+    for name in ("lm_head.weight", "model.embed_tokens.weight"):
+        replace(folder / ONE, name, torch.zeros(259, 32))
+
+
+Damage = tuple[Callable[[Path], object], str]
+EMPTY_TOKENIZER: Damage = (lambda f: (f / "tokenizer.json").write_text(""), "tokenizer.json is no fast tokenizer")
+NO_WIDTH: Damage = (
+    lambda f: edit(f / "config.json", hidden_size=None),
+    r"lm_head.weight is \[260, 32\], not \[260, 40",
+)
+LANGUAGE: list[Damage] = [
+    EMPTY_TOKENIZER,
+    NO_WIDTH,
+    (lambda f: cut(f / ONE), "model.safetensors is cut off or not a safetensors file .*; download it"),
+    (lambda f: (f / ONE).write_bytes((f / ONE).read_bytes() + b"x"), "model.safetensors is cut off"),
+    (lambda f: (f / ONE).write_text("version https://git-lfs"), "model.safetensors is cut off"),
+    (lambda f: (f / "tokenizer.json").unlink(), "tokenizer.json does not exist"),
+    (lambda f: (f / "tokenizer_config.json").write_text("{"), "_config.json is not a JSON object"),
+    (lambda f: (f / "config.json").write_bytes("{}".encode("utf-16")), "is not a JSON object"),
+    (lambda f: (f / "config.json").write_text("[]"), "/config.json is not a JSON object"),
+    (lambda f: edit(f / "config.json", model_type=None), "cannot be loaded .*model_type"),
+    (lambda f: edit(f / "config.json", num_attention_heads=0), "cannot be loaded .*zero"),
+    (lambda f: edit(f / "config.json", intermediate_size=65), r"mlp.down_proj.weight is \[32, 64\], not .*; take"),
+    (lambda f: renamed(f / ONE, "lm_head.weight", "x"), "lm_head.weight is missing"),
+    (other_vocabulary, "tokenizer.json has words up to number 259, but vocab_size of .*/config.json is 259"),
+]
+SHARDS: list[Damage] = [
+    (lambda f: (f / "model-00002-of-00007.safetensors").unlink(), "No such file.*model-00002-of-00007"),
+    (lambda f: cut(f / "model-00003-of-00007.safetensors"), "model-00003-of-00007.* is cut"),
+    (lambda f: edit(f / INDEX, weight_map={}), "shards cannot be loaded"),
+]
 CLIP_FILE, CLIP_FORM = "open_clip_model.safetensors", "open_clip_config.json"
 
 
@@ -101,18 +80,17 @@ def vision(folder: Path, **changes: Any) -> None:
     (folder / CLIP_FORM).write_text(json.dumps(form | {"model_cfg": form["model_cfg"] | {"vision_cfg": vision}}))
 
 
-CLIP: dict[str, tuple[Callable[[Path], object], str]] = {
-    "cut by a byte": (lambda f: cut(f / CLIP_FILE), "open_clip_model.safetensors is cut off"),
-    "deeper": (lambda f: vision(f, layers=3), 'Missing key.* "transformer.resblocks.2'),
-    "wider": (lambda f: vision(f, width=48), "does not fit its open_clip_config.json .*mismatch for class_embedding"),
-    "other patches": (lambda f: vision(f, patch_size=8), "mismatch for positional_embedding"),
-    "a narrower middle": (lambda f: vision(f, mlp_ratio=2.0), "mismatch for transformer.resblocks.0.mlp.c_fc.weight"),
-    "a width of letters": (lambda f: vision(f, width="x"), "open_clip_config.json is no configuration of open_clip's"),
-    "a ResNet": (lambda f: vision(f, layers=[3, 4, 6, 3]), "is no vision transformer"),
-    "a network of timm's": (lambda f: vision(f, timm_model_name="test_vit"), "is no vision transformer"),
-    "settings cut": (lambda f: cut(f / CLIP_FORM, 9), "open_clip_config.json"),
-    "no settings": (lambda f: (f / CLIP_FORM).write_text("{}"), "open_clip_config.json"),
-}
+CUT_TOWER: Damage = (lambda f: cut(f / CLIP_FILE), "open_clip_model.safetensors is cut off")
+NO_NUMBER: Damage = (lambda f: vision(f, width="x"), "open_clip_config.json is no configuration of open_clip's")
+CLIP: list[Damage] = [
+    CUT_TOWER,
+    NO_NUMBER,
+    (lambda f: vision(f, layers=3), 'Missing key.* "transformer.resblocks.2'),
+    (lambda f: vision(f, width=48), "does not fit its open_clip_config.json .*mismatch for class_embedding"),
+    (lambda f: vision(f, layers=[3, 4, 6, 3]), "is no vision transformer"),
+    (lambda f: vision(f, timm_model_name="test_vit"), "is no vision transformer"),
+    (lambda f: (f / CLIP_FORM).write_text("{}"), "open_clip_config.json"),
+]
 
 
 @pytest.fixture(autouse=True)
@@ -144,17 +122,15 @@ def check(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "name"),
-    [*(("llama", name) for name in LANGUAGE), *(("shards", name) for name in SHARDS), *(("clip", n) for n in CLIP)],
+    ("kind", "damage", "words"),
+    [(kind, *each) for kind, table in (("llama", LANGUAGE), ("shards", SHARDS), ("clip", CLIP)) for each in table],
 )
-def test_a_broken_folder_is_one_line(kind: str, name: str) -> None:
-    tables = {"llama": LANGUAGE, "shards": SHARDS, "clip": CLIP}
+def test_a_broken_folder_is_one_line(kind: str, damage: Callable[[Path], object], words: str) -> None:
     if kind == "clip":
-        folder = write_clip(Path("clip"))
+        folder = write_clip(Path(kind))
     else:
-        folder = write_llama(Path("llama"), shard="20KB" if kind == "shards" else "5GB")
+        folder = write_llama(Path(kind), shard="20KB" if kind == "shards" else "5GB")
     check(folder)
-    damage, words = tables[kind][name]
     damage(folder)
     with refused(words) as caught:
         check(folder)
@@ -163,18 +139,14 @@ def test_a_broken_folder_is_one_line(kind: str, name: str) -> None:
 
 def test_the_command_names_what_is_broken_before_it_writes() -> None:
     """Also where counting memory reads the same file before."""
-    for name in ("empty tokenizer", "no hidden_size"):
-        damage, words = LANGUAGE[name]
-        folder = write_llama(Path(name))
-        damage(folder)
-        assert re.search(words, scale(f"language.weights={folder}") or "")
-    for name in ("cut by a byte", "a width of letters"):
-        damage, words = CLIP[name]
-        folder = write_clip(Path(name) / "clip")
-        damage(folder)
-        assert re.search(words, scale(f"encoder.weights={folder}") or "")
-    whole = write_llama(Path("llama")), write_clip(Path("clip"))
-    assert scale(f"language.weights={whole[0]}", f"encoder.weights={whole[1]}") is None
+    whole = {"language": write_llama(Path("llama")), "encoder": write_clip(Path("clip"))}
+    spoiled = {"language": (EMPTY_TOKENIZER, NO_WIDTH), "encoder": (CUT_TOWER, NO_NUMBER)}
+    for number, (part, (damage, words)) in enumerate((part, each) for part, both in spoiled.items() for each in both):
+        broken = Path(str(number)) / whole[part].name
+        copytree(whole[part], broken)
+        damage(broken)
+        assert re.search(words, scale(f"{part}.weights={broken}") or "")
+    assert scale(*(f"{part}.weights={folder}" for part, folder in whole.items())) is None
 
 
 def test_a_timm_file_that_is_cut_off_is_named_when_the_scale_is_chosen() -> None:
@@ -182,7 +154,7 @@ def test_a_timm_file_that_is_cut_off_is_named_when_the_scale_is_chosen() -> None
     check_encoder_files(folder, ("timm", "scenes"))
     cut(folder / ONE)
     check_encoder_files(folder, ("scenes",))
-    with pytest.raises(UserError, match=r"^encoder.weights: timm/model.safetensors is cut off"):
+    with refused("timm/model.safetensors is cut off"):
         check_encoder_files(folder, ("timm", "scenes"))
 
 
@@ -190,7 +162,7 @@ def test_a_timm_file_that_is_cut_off_is_named_when_the_scale_is_chosen() -> None
 
 
 @pytest.mark.parametrize("tied", [True, False])
-@pytest.mark.parametrize("kind", ["llama", "mistral", "qwen2", "gpt_neox"])
+@pytest.mark.parametrize("kind", ["llama", "gpt_neox"])
 def test_whole_models_of_several_kinds_pass(kind: str, tied: bool) -> None:
     folder = write_llama(Path("llama"))
     sizes = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 4}
@@ -212,12 +184,12 @@ def test_a_padding_token_beyond_the_words_passes() -> None:
 # At loading
 
 
-@pytest.mark.parametrize("name", [name for name in LANGUAGE if "tokenizer" in name and "words" not in name])
-def test_a_broken_tokenizer_is_one_line_at_loading_too(name: str) -> None:
+def test_a_broken_tokenizer_is_one_line_at_loading_too() -> None:
     folder = write_llama(Path("llama"))
-    LANGUAGE[name][0](folder)
-    with pytest.raises(UserError, match=r"\Alanguage.weights: [^\n]*llama[^\n]*\Z"):
-        load_tokenizer(folder)
+    for content in ("", "{}"):
+        (folder / "tokenizer.json").write_text(content)
+        with refused("^language.weights: .*llama"):
+            load_tokenizer(folder)
 
 
 def test_values_that_are_not_finite_are_named_at_loading() -> None:
@@ -232,8 +204,8 @@ def test_values_that_are_not_finite_are_named_at_loading() -> None:
         load_llm(folder, torch.float32)
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
-@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32])
+@pytest.mark.parametrize("bad", [float("nan"), -float("inf")])
 def test_one_value_that_is_not_finite_is_found_wherever_it_stands(bad: float, dtype: torch.dtype) -> None:
     draw = torch.Generator().manual_seed(0)
     largest = torch.finfo(dtype).max
