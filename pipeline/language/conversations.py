@@ -34,7 +34,7 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
         by_question: Divide the weights of a conversation by their sum, so that all conversations weigh alike.
 
     Raises:
-        UserError: naming the question that is too long, or has nothing to learn from.
+        UserError: naming the question that is too long.
     """
 
     def __init__(
@@ -68,8 +68,6 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
             rendered = render(dialogue.turns, tokenizer, system_prompt=system_prompt, frames=per_video, complete=True)
             encoded = encode(rendered, tokenizer, bos=bos)
             check_length(question.question_id, len(encoded.input_ids), positions)
-            if all(label == IGNORE_INDEX for label in encoded.labels):
-                raise UserError(f"{question.question_id}: has no answer to learn from; run `dvc repro questions -f`")
             self.encoded.append(encoded)
             weights = torch.ones(len(encoded.labels))
             if question.question_id in given and any(turn.described for turn in dialogue.turns):

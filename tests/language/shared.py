@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -99,12 +98,6 @@ def assert_comes_back(model: OctopiForCausalLM, folder: Path, **how: str) -> Oct
     assert not again.training
     assert torch.equal(again(**call(again)).logits, model.eval()(**call(model)).logits)
     return again
-
-
-def digests(folder: Path) -> dict[str, str]:
-    """Hash of each file of a folder."""
-    files = sorted(f for f in folder.rglob("*") if f.is_file())
-    return {str(f.relative_to(folder)): hashlib.sha256(f.read_bytes()).hexdigest() for f in files}
 
 
 def by_transformers(

@@ -7,9 +7,11 @@ from pathlib import Path
 import pytest
 import torch
 from torch.nn import functional as F
+from transformers import DynamicCache, LlamaForCausalLM
 
 from pipeline.config import LanguageConfig
 from pipeline.language import decoding
+from pipeline.language.cache import AHEAD, roomy_cache
 from pipeline.language.chat import IGNORE_INDEX
 from pipeline.language.decoding import greedy
 from pipeline.language.octopi import OctopiForCausalLM
@@ -45,8 +47,7 @@ def steady(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     return OctopiForCausalLM.from_base(folder, DIM).eval()
 
 
-@pytest.mark.parametrize("shared", [0, 1, 25])
-@pytest.mark.parametrize("read", [1, 60, 1024])
+@pytest.mark.parametrize(("shared", "read"), [(0, 1024), (1, 60), (25, 1), (25, 60)])
 def test_each_row_is_decoded_as_it_is_alone(
     steady: OctopiForCausalLM, shared: int, read: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -72,13 +73,15 @@ def test_equal_prompts_and_a_prompt_that_begins_another(steady: OctopiForCausalL
     assert greedy(steady, prompts[:3], none[:3], (), [6] * 3) == alone[:3]
 
 
-@pytest.mark.parametrize("lora", [False, True])
+@pytest.mark.parametrize("trained", ["connector", "lora", "words"])
 @pytest.mark.parametrize("kind", ["shared", "one row", "nothing shared", "no frames"])
-def test_loss_and_gradients_are_those_of_all_at_once(language: LanguageConfig, lora: bool, kind: str) -> None:
+def test_loss_and_gradients_are_those_of_all_at_once(language: LanguageConfig, trained: str, kind: str) -> None:
     torch.manual_seed(3)
     model = OctopiForCausalLM.from_base(language.weights, DIM).eval()
-    if lora:
+    if trained == "lora":
         adapted(model, LORA.model_copy(update={"target_modules": "all-linear"}))
+    if trained == "words":
+        model.train_words()
     model.double()
     ids = torch.randint(4, 250, (3, 24))
     ids[:, :10] = ids[0, :10]
@@ -91,17 +94,17 @@ def test_loss_and_gradients_are_those_of_all_at_once(language: LanguageConfig, l
         ids[:, 12:16] = torch.tensor([model.start_id, model.frame_id, model.frame_id, model.end_id])
     labels = ids.clone()
     labels[:, :17] = IGNORE_INDEX
-    trained = [p for p in model.parameters() if p.requires_grad]
+    parameters = [p for p in model.parameters() if p.requires_grad]
 
     def gradients(loss: torch.Tensor) -> list[torch.Tensor]:
-        found = torch.autograd.grad(loss, trained, allow_unused=True)
-        return [torch.zeros_like(p) if g is None else g for p, g in zip(trained, found, strict=True)]
+        found = torch.autograd.grad(loss, parameters, allow_unused=True)
+        return [torch.zeros_like(p) if g is None else g for p, g in zip(parameters, found, strict=True)]
 
     loss = model(ids, features, labels=labels).loss
     logits = model(ids, features).logits
     expected = F.cross_entropy(logits[:, :-1].flatten(0, 1), labels[:, 1:].flatten())
     torch.testing.assert_close(loss, expected, atol=1e-6, rtol=0)
-    if kind == "no frames" and not lora:
+    if kind == "no frames" and trained == "connector":
         assert not loss.requires_grad or max(float(g.abs().max()) for g in gradients(loss)) == 0
         return
     for found, whole in zip(gradients(loss), gradients(expected), strict=True):
@@ -142,3 +145,36 @@ def test_gradient_checkpointing_still_gives_the_loss(tmp_path: Path) -> None:
     saving.backward()
     torch.testing.assert_close(saving, plain, atol=1e-6, rtol=0)
     assert model.connector.delimiters.grad is not None
+
+
+@pytest.mark.parametrize("tied", [False, True])
+def test_answers_are_those_of_a_llama_with_these_embeddings(tied: bool, tmp_path: Path) -> None:
+    """Prompts that begin alike, read without a cache by transformers' own Llama, whose head is the old one."""
+    folder = write_llama(tmp_path, tie_word_embeddings=tied)
+    model = OctopiForCausalLM.from_base(folder, DIM).eval()
+    torch.nn.init.normal_(model.train_words().weight, generator=torch.manual_seed(5))
+    plain = LlamaForCausalLM.from_pretrained(folder)
+    head = plain.lm_head.weight.detach().clone()
+    plain.lm_head.weight = torch.nn.Parameter(head)
+    plain.model.embed_tokens.weight = torch.nn.Parameter(model.words.weight.detach().clone())
+    prompts = [[1, 50, 60, 70, 80, 90], [1, 50, 60, 71, 80, 93, 94]]
+    said = greedy(model, prompts, [torch.zeros(0, DIM)] * 2, (), [8, 8])
+    for prompt, tokens in zip(prompts, said, strict=True):
+        ids = list(prompt)
+        while len(ids) < len(prompt) + 8:
+            ids.append(int(plain(torch.tensor([ids])).logits[0, -1].argmax()))
+        assert tokens == ids[len(prompt) :]
+    assert len({tuple(tokens) for tokens in said}) == 2
+
+
+@pytest.mark.parametrize("window", [None, 8])
+def test_the_cache_gives_back_what_transformers_own_does(window: int | None) -> None:
+    torch.manual_seed(0)
+    llm = mistral(50, window).eval()
+    own, other = roomy_cache(llm.config), DynamicCache(config=llm.config)
+    for start, stop in ((0, 5), (5, 6), (6, 7), (7, 7 + AHEAD), (7 + AHEAD, 8 + AHEAD)):
+        ids = torch.randint(0, 50, (3, stop - start), generator=torch.manual_seed(stop))
+        with torch.no_grad():
+            found, expected = (llm(ids, past_key_values=cache, use_cache=True).logits for cache in (own, other))
+        torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
+        assert own.get_seq_length() == other.get_seq_length() == stop
