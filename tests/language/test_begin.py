@@ -29,13 +29,18 @@ def felt(labels: tuple[int, ...], drawn: torch.Generator) -> torch.Tensor:
 
 @pytest.mark.parametrize("normalize", [False, True])
 def test_frames_read_like_the_words_of_their_classes(
-    normalize: bool, language: LanguageConfig, questions: list[Question], tmp_path: Path
+    normalize: bool,
+    language: LanguageConfig,
+    questions: list[Question],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     labels = {v: label for q in questions for v, label in zip(q.videos, q.gold.labels, strict=True)}
     drawn = torch.Generator().manual_seed(0)
     frames = [(v, f, "none") for v in sorted(labels) for f in range(3)]
     store = write_store(tmp_path, frames, torch.stack([felt(labels[v], drawn) for v, _, _ in frames]))
     held = material(language.model_copy(update={"normalize_touch": normalize}), questions, store)
+    monkeypatch.setattr("pipeline.language.words.STEPS", 150)
     model, data = assemble(held, taking(14), "test")
     begin_with_words(model, data, CATALOGUE, seed=1)
     assert all(p.grad is None for p in model.parameters())
