@@ -106,24 +106,21 @@ def end_ids(tokenizer: PreTrainedTokenizerBase) -> tuple[int, ...]:
 
     They differ for some: Llama-3's instruct models end a turn with `<|eot_id|>`, a text with `<|end_of_text|>`.
     """
-    eos = [] if tokenizer.eos_token_id is None else [int(tokenizer.eos_token_id)]
     _, rest = _around_answers(tokenizer)
     special = {i for i, token in tokenizer.added_tokens_decoder.items() if token.special}
     behind = [i for i in tokenizer(rest, add_special_tokens=False)["input_ids"] if i in special]
-    return tuple(dict.fromkeys(eos + behind[:1]))
+    return tuple(dict.fromkeys([int(tokenizer.eos_token_id), *behind[:1]]))
 
 
 def encode(rendered: Rendered, tokenizer: PreTrainedTokenizerBase, *, bos: bool = True) -> Encoded:
     """Tokenise a whole conversation at once and label the answers' tokens by their character offsets.
 
     Tokenising in one piece keeps prompt tokens equal in training and evaluation, whatever the tokenizer does at
-    the borders of pieces. Needs a fast tokenizer, since only those know offsets.
+    the borders of pieces. The tokenizer is a fast one, since only those know offsets.
 
     Args:
         bos: Begin with the begin token. What a template of the tokenizer's writes has its own, where it wants one.
     """
-    if not tokenizer.is_fast:
-        raise UserError(f"{tokenizer.name_or_path}: has no fast tokenizer (tokenizer.json); labels need its offsets")
     begin = bos and not tokenizer.chat_template
     batch = tokenizer(rendered.text, return_offsets_mapping=True, add_special_tokens=begin)
     ids: list[int] = batch["input_ids"]

@@ -15,7 +15,7 @@ from pipeline.core.embeddings import FLIPS, EmbeddingStore
 from pipeline.core.errors import UserError
 from pipeline.core.records import Opd, Question
 from pipeline.core.runtime import derive_seed
-from pipeline.language.chat import IGNORE_INDEX, Encoded, conclusions, encode, render
+from pipeline.language.chat import IGNORE_INDEX, conclusions, encode, render
 from pipeline.training.sampling import EpochDataset, sample_evaluation, sample_training
 
 FILLER = -1
@@ -48,62 +48,57 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
         per_video: int,
         flip_probability: float,
         seed: int,
-        positions: int | None = None,
+        positions: int | None,
         bos: bool = True,
         given: Collection[str] = (),
-        by_question: bool = True,
+        by_question: bool,
     ) -> None:
         super().__init__()
-        self.questions = [q for q in questions if q.dialogue(opd)]
+        asked = [(q, dialogue) for q in questions if (dialogue := q.dialogue(opd))]
+        self.questions = [question for question, _ in asked]
         self.store = store
         self.per_video = per_video
         self.flip_probability = flip_probability
         self.seed = seed
-        self.by_question = by_question
-        self.encoded: list[Encoded] = []
-        self.weights: list[torch.Tensor] = []
-        for question in self.questions:
-            dialogue = question.dialogue(opd)
-            assert dialogue is not None
+        self.written: list[dict[str, torch.Tensor]] = []
+        """Of each question all that is the same in every epoch."""
+        for question, dialogue in asked:
             rendered = render(dialogue.turns, tokenizer, system_prompt=system_prompt, frames=per_video, complete=True)
             encoded = encode(rendered, tokenizer, bos=bos)
             check_length(question.question_id, len(encoded.input_ids), positions)
-            self.encoded.append(encoded)
-            weights = torch.ones(len(encoded.labels))
+            learnt = encoded.labels
             if question.question_id in given and any(turn.described for turn in dialogue.turns):
-                learnt = encode(conclusions(rendered, dialogue.turns), tokenizer, bos=bos)
-                weights[torch.tensor(learnt.labels) == IGNORE_INDEX] = 0
-            self.weights.append(weights)
+                learnt = encode(conclusions(rendered, dialogue.turns), tokenizer, bos=bos).labels
+            weights = (torch.tensor(learnt) != IGNORE_INDEX).float()
+            if by_question:
+                weights = F.normalize(weights, p=1.0, dim=0)
+            ids, labels = torch.tensor(encoded.input_ids), torch.tensor(encoded.labels)
+            self.written.append({"input_ids": ids, "labels": labels, "weights": weights})
 
     @property
     def lengths(self) -> list[int]:
         """Tokens of each conversation."""
-        return [len(e.input_ids) for e in self.encoded]
+        return [len(each["input_ids"]) for each in self.written]
 
     def __len__(self) -> int:
-        return len(self.encoded)
+        return len(self.written)
 
     def __getitem__(self, index: int) -> dict[str, torch.Tensor]:
+        parts = [torch.zeros(0, self.store.dim)]
         if index == FILLER:
-            return self._tensors(Encoded((0,), (IGNORE_INDEX,)), torch.zeros(0, self.store.dim), torch.zeros(1))
+            nothing = {
+                "input_ids": torch.tensor([0]),
+                "labels": torch.tensor([IGNORE_INDEX]),
+                "weights": torch.zeros(1),
+            }
+            return {**nothing, "features": parts[0]}
         question = self.questions[index]
         rng = random.Random(derive_seed(self.seed, self.epoch, question.question_id))
-        parts = [torch.zeros(0, self.store.dim)]
         for video_id in question.videos:
             positions = sample_training(self.store.count(video_id), self.per_video, rng)
             horizontal, vertical = (rng.random() < self.flip_probability for _ in range(2))
             parts.append(self.store.features(video_id, positions, FLIPS[horizontal + 2 * vertical]))
-        return self._tensors(self.encoded[index], torch.cat(parts), self.weights[index])
-
-    def _tensors(self, encoded: Encoded, features: torch.Tensor, weights: torch.Tensor) -> dict[str, torch.Tensor]:
-        labels = torch.tensor(encoded.labels)
-        weights = weights * (labels != IGNORE_INDEX)
-        return {
-            "input_ids": torch.tensor(encoded.input_ids),
-            "labels": labels,
-            "features": features,
-            "weights": F.normalize(weights, p=1.0, dim=0) if self.by_question else weights,
-        }
+        return {**self.written[index], "features": torch.cat(parts)}
 
 
 def check_length(question_id: str, tokens: int, positions: int | None) -> None:

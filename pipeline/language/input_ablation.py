@@ -20,7 +20,7 @@ def ablate_input(store: EmbeddingStore, touch: Touch, questions: Sequence[Questi
     - `swapped`: the objects of the questions are put in a random ring and each is given the touch of the next, so no
       object keeps its own. It may have the same classes all the same.
     - `noise`: normal noise with the mean and deviation of each dimension over all embeddings, the same at each call.
-    - `removed` is no matter of the embeddings but of the prompt, which then has no frame to put one at.
+    - `removed` leaves the embeddings as they are: it is the prompt that has no frames then.
 
     Raises:
         UserError: where touch is to be swapped, and the questions are about one object alone.

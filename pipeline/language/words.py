@@ -40,7 +40,7 @@ def begin_with_words(model: OctopiForCausalLM, data: ConversationDataset, catalo
         wanted.append(mean.expand(len(found), -1))
     device = model.connector.delimiters.device
     x, y = torch.cat(frames).to(device), torch.cat(wanted).to(device)
-    # Words are short: a step of the optimizer would be longer than they are.
+    # Word embeddings are far smaller than the optimizer's steps: those of length 1 are fitted, and scaled at the end.
     length = y.square().mean().sqrt()
     projection, drawn = model.connector.projection, torch.Generator().manual_seed(seed)
     optimizer = torch.optim.AdamW(projection.parameters(), lr=RATE)

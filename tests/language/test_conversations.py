@@ -36,7 +36,7 @@ def test_without_a_begin_token_all_else_is_the_same(held: Material) -> None:
     assert (without.input_ids, without.labels) == (usual.input_ids[1:], usual.labels[1:])
     _, theirs = assemble(replace(held, language=held.language.model_copy(update={"bos": False})), taking(6), "test")
     _, ours = assemble(held, taking(6), "test")
-    assert [(1, *e.input_ids) for e in theirs.encoded] == [e.input_ids for e in ours.encoded]
+    assert [[1, *e["input_ids"].tolist()] for e in theirs.written] == [e["input_ids"].tolist() for e in ours.written]
     asked = write_prompt(turns, tokenizer, generation(1).model_copy(update={"bos": False}), FRAMES)
     assert asked == tuple(
         i for i, label in zip(without.input_ids, without.labels, strict=True) if label == IGNORE_INDEX
@@ -95,15 +95,14 @@ def test_given_descriptions_are_not_learnt_and_stand_beside_other_touches(share:
             continue
         changed += 1
         assert question.videos in {q.videos for q in usual.questions if len(q.videos) == len(own.videos) > 1}
-        said = data.encoded[index]
-        text = held_text(said.input_ids, learnt, held)
+        text = held_text(data.written[index]["input_ids"].tolist(), learnt, held)
         dialogue = question.dialogue(held.opd)
         assert text.split() == " ".join(t.assistant[t.described :] for t in dialogue.turns).split()
     assert several
     assert changed == pytest.approx(share * several, abs=1)
 
 
-def held_text(ids: tuple[int, ...], learnt: torch.Tensor, held: Material) -> str:
+def held_text(ids: list[int], learnt: torch.Tensor, held: Material) -> str:
     """The words that are learnt, without the tokens that end a turn."""
     tokenizer = load_tokenizer(Path(held.language.weights))
     return tokenizer.decode([i for i, one in zip(ids, learnt, strict=True) if one], skip_special_tokens=True)

@@ -189,7 +189,7 @@ def test_an_updates_gradient_is_that_of_its_questions_one_at_a_time(
     own = {"epochs": 2, "samples": 9, "max_grad_norm": 0.0, "weighting": weighting}
     config = LoraTrainConfig(**{**SMALL.model_dump(), **own, "given": 1.0})  # Descriptions weigh nothing.
     model, data = assemble(held, config, "test")
-    assert {bool(weights.eq(0).any()) for weights in data.weights} == {False, True}
+    assert {torch.equal(e["weights"] > 0, e["labels"] != IGNORE_INDEX) for e in data.written} == {False, True}
     matrix = model.train_words() if words else model.llm.get_input_embeddings()
     parameters, gaps, counts, drawn = [p for p in model.double().parameters() if p.requires_grad], [], [], []
 
@@ -303,7 +303,7 @@ def test_word_embeddings_are_trained_and_the_base_is_not(
     fit(model, data, SMALL.model_copy(update={"epochs": 1}), CPU, Job("align", "x", 0))
     changed = (model.words.weight != start).any(1)
     read = torch.zeros_like(changed)
-    read[[i for encoded in data.encoded for i in encoded.input_ids if i < len(read)]] = True
+    read[[i for each in data.written for i in each["input_ids"].tolist() if i < len(read)]] = True
     assert changed.sum() > 20
     assert not changed[~read].any()
     assert all(torch.equal(p, base[n]) for n, p in model.llm.named_parameters())
