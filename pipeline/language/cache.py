@@ -55,7 +55,10 @@ class RoomyLayer(DynamicLayer):
 
 
 def extendable(config: PretrainedConfig) -> bool:
-    """Whether each layer keeps all it has read, so that what is read first may be kept apart from what follows."""
+    """Whether every layer keeps all that it has read, as none with a sliding window does.
+
+    Only then can a beginning that prompts share be read once and continued for each of them.
+    """
     return all(type(layer) is DynamicLayer for layer in DynamicCache(config=config).layers)
 
 

@@ -36,7 +36,7 @@ IGNORE_INDEX = -100
 class Rendered:
     """A conversation as text, with the character spans that the assistant says, end token included.
 
-    What a template writes of its own before an answer, as an empty block of thoughts, is asked and not said.
+    What a template writes of its own before an answer, such as an empty block of thoughts, belongs to the prompt.
     """
 
     text: str
@@ -89,7 +89,8 @@ def render(
         if not longer.startswith(before):
             raise UserError(f"{where} writes a prompt otherwise once it is answered; take one that only appends")
         added = longer.removeprefix(before)
-        # Some write the lead before the last answer alone, but every answer is the last one when it is asked for.
+        # Some templates (Qwen3's) write their lead before the last answer alone. Every answer is the last one when it
+        # is asked for, so each of them gets it here.
         text += added if not before or added.startswith(lead) else lead + added
         starts.append(len(text) + len(lead))
     ends, answers = [str(tokenizer.convert_ids_to_tokens(i)) for i in end_ids(tokenizer)], []

@@ -119,7 +119,7 @@ def evaluation_features(question: Question, store: EmbeddingStore, per_video: in
 def collate(samples: Sequence[Mapping[str, torch.Tensor]]) -> dict[str, torch.Tensor]:
     """Stack what is of unequal length, padded on the right: with zeros, and labels left out of the loss.
 
-    There is no attention mask: no token of a causal model sees what comes behind it, whichever it is.
+    There is no attention mask: no token of a causal model sees the padding behind it.
     """
     padding = {name: IGNORE_INDEX if name == "labels" else 0 for name in samples[0]}
     return {name: pad_sequence([s[name] for s in samples], True, value) for name, value in padding.items()}

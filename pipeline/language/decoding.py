@@ -19,7 +19,8 @@ from pipeline.language.octopi import OctopiForCausalLM
 READ = 1024
 """Tokens of prompts that are read at once: enough for a processor, and neighbours of like length pad little."""
 STAYING = 7 / 8
-"""Rows leave when no more than this share goes on: their neighbours' keys and values are copied then."""
+"""Rows that ended are dropped once no more than this share goes on. Dropping copies the keys and values of all others,
+so it is not done for each row by itself."""
 
 
 def greedy(

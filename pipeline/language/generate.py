@@ -32,7 +32,8 @@ class ModelSource:
     quantization: Quantization
     device: DeviceName
     run: float = 0.0
-    """When the stage began: a worker that outlives a run finds the next one's files at the same place."""
+    """When the stage began. A worker may outlive a run; by this it knows the next run's model in the same folder as
+    another one."""
 
     def __call__(self) -> OctopiForCausalLM:
         """Load it, as `OctopiForCausalLM.from_pretrained` does."""
