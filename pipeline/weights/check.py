@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,8 +34,7 @@ def check_language_files(folder: Path, key: str = "language.weights") -> None:
     config = read_form(folder / LLM_CONFIG)
     read_form(folder / "tokenizer_config.json")
     last = max(read_tokenizer(folder).get_vocab(with_added_tokens=False).values(), default=0)
-    for file in sorted(folder.glob("*.safetensors")):
-        tensor_shapes(file, again(folder))  # transformers would not say which file is broken.
+    stored_shapes(folder.glob("*.safetensors"), key)  # transformers would not say which file is broken.
     if "quantization_config" in config:
         return  # Its tensors are in the form of a quantizer, which may not be installed.
     quiet_libraries()
@@ -64,9 +63,7 @@ def check_encoder_files(folder: Path, backbone: Collection[str], key: str = "enc
     if not folder.is_dir():
         return
     read = [BACKBONES[name] for name in backbone if BACKBONES[name].key == "weights"]
-    stored: dict[str, tuple[int, ...]] = {}
-    for file in sorted({f for each in read for f in each.files(folder) if f.suffix == ".safetensors"}):
-        stored |= tensor_shapes(file, again(folder))
+    stored = stored_shapes({f for each in read for f in each.files(folder) if f.suffix == ".safetensors"}, key)
     if "clip" not in backbone:
         return
     tower = read_tower(folder)
@@ -84,6 +81,14 @@ def check_encoder_files(folder: Path, backbone: Collection[str], key: str = "enc
         raise UserError(
             f"{key}: {folder} does not fit its {CLIP_CONFIG} ({reason}); take both from one model"
         ) from None
+
+
+def stored_shapes(files: Iterable[Path], key: str) -> dict[str, tuple[int, ...]]:
+    """The tensors of safetensors files, by their headers; raises UserError where one is broken or cut off."""
+    try:
+        return {name: shape for f in sorted(files) for name, shape in tensor_shapes(f, again(f.parent)).items()}
+    except UserError as error:
+        raise UserError(f"{key}: {error}") from None
 
 
 def read_tokenizer(folder: Path) -> Tokenizer:

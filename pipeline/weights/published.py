@@ -13,9 +13,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.core.errors import UserError
-from pipeline.core.io import atomic_folder, load_tensors, save_tensors, sha256, tensor_shapes, write_json, write_text
-from pipeline.weights import CLIP_WEIGHTS, DOWNLOADED, again, check_language, clip_file, load_language
-from pipeline.weights.check import SHAPES, TOKENIZER, check_encoder_files, check_language_files, read_tokenizer
+from pipeline.core.io import atomic_folder, load_tensors, save_tensors, sha256, write_json, write_text
+from pipeline.weights import CLIP_WEIGHTS, DOWNLOADED, check_language, clip_file, load_language
+from pipeline.weights.check import (
+    SHAPES,
+    TOKENIZER,
+    check_encoder_files,
+    check_language_files,
+    read_tokenizer,
+    stored_shapes,
+)
 from pipeline.weights.shapes import CLIP_CONFIG, LLM_CONFIG, PUBLISHED_CLIP, PUBLISHED_LANGUAGE, read_form, read_tower
 
 if TYPE_CHECKING:
@@ -209,7 +216,7 @@ def write_clip(source: Path, target: Path, known: str, key: str, trust_pickle: b
     if not files:
         raise UserError(f"{key}: {source} has no weights, neither safetensors nor a pickle; download them again")
     if files[0].suffix == ".safetensors":
-        tensor_shapes(files[0], again(source))  # Raises for a broken file.
+        stored_shapes(files[:1], key)  # Raises for a broken file.
         state = load_tensors(files[0])
     else:
         state = read_pickle(files[0], key, trust_pickle)
