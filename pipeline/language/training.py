@@ -187,6 +187,9 @@ def assemble(
 def with_given(questions: Sequence[Question], opd: Opd, share: float, seed: int) -> tuple[list[Question], set[str]]:
     """Exchange the touches of a share of the questions that describe several videos, among those with as many.
 
+    Their descriptions, which are not learnt, then no longer fit what is touched: the model learns to conclude from the
+    description in front of it, and not to take the answer from touch.
+
     Returns:
         All questions in their order, and the ids of those whose touches were exchanged.
     """
@@ -234,6 +237,7 @@ def fit(
         warmup_steps=round(config.warmup_ratio * steps),
         logging_steps=max(1, steps // 50),
     )
+    # Devices compute so many questions at once, and each must have as many, or one would wait for the others.
     shared = config.micro_batch_size * arguments.world_size if arguments.world_size > 1 else 1
     trainer = TrainableTrainer(
         model=model,

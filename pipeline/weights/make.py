@@ -66,8 +66,8 @@ class Recipe(NamedTuple):
     """How a base model is made."""
 
     write: Callable[[Path, Path, int], None]
-    """Writes configuration and weights into an empty folder, from a file with the published weights; those that are
-    drawn, from the catalogue's folder and a seed."""
+    """Writes configuration and weights into a folder that is empty. Its further arguments are the file with the
+    published weights (for a model that is drawn the catalogue's folder) and the seed."""
     card: Mapping[str, object]
     """Front matter of its card, in Hugging Face's keys; `taught` is what reports say of it."""
     about: str

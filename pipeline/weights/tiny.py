@@ -43,8 +43,8 @@ SPECIAL = PAD, BOS, EOS, UNK = ("<pad>", "<s>", "</s>", "<unk>")
 MOST_TOKENS = 2048
 
 
-def write_clip(folder: Path, source: Path, seed: int) -> None:
-    """Write a CLIP with a vision transformer as open_clip lays it out."""
+def write_clip(folder: Path, catalogue: Path, seed: int) -> None:
+    """Write a CLIP with a vision transformer as open_clip lays it out. It has no words, so needs no catalogue."""
     import open_clip
     import torch
 
@@ -56,7 +56,7 @@ def write_clip(folder: Path, source: Path, seed: int) -> None:
 
 
 def write_llama(folder: Path, catalogue: Path, seed: int) -> None:
-    """Write a Llama in float32 with a tokenizer as transformers lays them out."""
+    """Write a Llama in float32, and a tokenizer of the catalogue's words, as transformers lays them out."""
     import torch
     from transformers import LlamaConfig, LlamaForCausalLM
 
