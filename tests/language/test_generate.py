@@ -85,10 +85,12 @@ def test_a_question_longer_than_the_positions_is_named_with_the_key(
 def test_batch_size_changes_no_answer(
     model: OctopiForCausalLM, questions: list[Question], store: EmbeddingStore, opd: Opd
 ) -> None:
-    one = answer(model, store, questions, opd, generation(1, 6), FRAMES)
-    mixed = answer(model, store, questions[::-1], opd, generation(len(questions), 6), FRAMES)
+    asked = questions[::2]
+    assert {"OPD", "PSR"} < {q.task for q in asked}, "one and several turns"
+    one = answer(model, store, asked, opd, generation(1, 6), FRAMES)
+    mixed = answer(model, store, asked[::-1], opd, generation(len(asked), 6), FRAMES)
     assert mixed[::-1] == one
-    turns = {q.question_id: len(d.turns) for q in questions if (d := q.dialogue(opd))}
+    turns = {q.question_id: len(d.turns) for q in asked if (d := q.dialogue(opd))}
     assert {p.question_id: len(p.outputs) for p in one} == turns
     if opd is Opd.NONE:
         assert not [p for p in one if p.task == "OPD"], "without descriptions there is nothing to ask"
