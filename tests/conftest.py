@@ -14,6 +14,9 @@ from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+# Before any library reads it: make test runs a process a core, and small sums lose by a second thread.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 import av
 import cv2
 import numpy as np

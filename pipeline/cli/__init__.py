@@ -95,8 +95,8 @@ def weights(
     name: Annotated[
         str,
         typer.Argument(
-            help="vicuna-7b, vicuna-13b or clip-vit-large of SOURCE; or smollm2, efficientnet-lite0, tiny-clip or "
-            "tiny-llama, which are made here."
+            help="vicuna-7b, vicuna-13b, clip-vit-large or sparsh of SOURCE; or smollm2, efficientnet-lite0 or one "
+            "with random weights (tiny-clip, tiny-llama, random-clip-vit-large, random-vicuna-7b), which are made here."
         ),
     ],
     source: Annotated[Path | None, typer.Argument(help="Folder that it was downloaded to.")] = None,

@@ -75,6 +75,9 @@ MADE = {
     ),
     "tiny-clip": Made("clip", size=64),
     "tiny-llama": Made("language"),
+    # Of the paper's shapes, for the scale `rehearsal`.
+    "random-clip-vit-large": Made("clip", size=224),
+    "random-vicuna-7b": Made("language"),
 }
 """By the name of the folder; `pipeline.weights.make.RECIPES` has the code of each."""
 
@@ -92,6 +95,7 @@ DOWNLOADED = {
     "vicuna-7b": Downloaded("lmsys/vicuna-7b-v1.5", "vicuna-7b-v1.5"),
     "vicuna-13b": Downloaded("lmsys/vicuna-13b-v1.5", "vicuna-13b-v1.5"),
     "clip-vit-large": Downloaded("timm/vit_large_patch14_clip_224.openai", "clip-vit-large-patch14"),
+    "sparsh": Downloaded("facebook/sparsh-dino-base", "sparsh-dino-base"),
 }
 """By the name that `octopi weights` takes; `pipeline.weights.published` checks and converts them."""
 
@@ -116,8 +120,9 @@ def made(folder: Path) -> str | None:
 
 
 def is_tiny(folder: str | Path) -> bool:
-    """Whether `folder` is of a tiny random model that the chain makes."""
-    return (made(Path(folder)) or "").startswith("tiny-")
+    """Whether `folder` is of a model with random weights that the chain makes."""
+    own = MADE.get(made(Path(folder)) or "")
+    return own is not None and own.origin is None
 
 
 def clip_file(folder: Path) -> Path:

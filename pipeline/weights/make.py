@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -15,6 +16,7 @@ import yaml
 from pipeline.core.errors import UserError
 from pipeline.core.io import atomic_folder, write_text
 from pipeline.weights import DOWNLOADED, MADE, installed, tiny
+from pipeline.weights.shapes import PUBLISHED_LANGUAGE
 
 if TYPE_CHECKING:
     import torch
@@ -99,12 +101,25 @@ RECIPES = {
         "published\nweights were rounded to blocks of four bits (Q4_1) before they came into the package; here they "
         "are widened and\nstay rounded.",
     ),
-    "tiny-clip": Recipe(
-        tiny.write_clip, {"license": "mit", "library_name": "open_clip", "taught": tiny.TAUGHT}, tiny.ABOUT
-    ),
-    "tiny-llama": Recipe(
-        tiny.write_llama, {"license": "mit", "library_name": "transformers", "taught": tiny.TAUGHT}, tiny.ABOUT
-    ),
+    **{
+        name: Recipe(
+            partial(tiny.write_clip, name=name, form=form),
+            {"license": "mit", "library_name": "open_clip", "taught": tiny.TAUGHT},
+            tiny.ABOUT,
+        )
+        for name, form in (("tiny-clip", tiny.CLIP), ("random-clip-vit-large", tiny.VIT_LARGE))
+    },
+    **{
+        name: Recipe(
+            partial(tiny.write_llama, name=name, form=form, dtype=dtype),
+            {"license": "mit", "library_name": "transformers", "taught": tiny.TAUGHT},
+            tiny.ABOUT,
+        )
+        for name, form, dtype in (
+            ("tiny-llama", tiny.LLAMA, "float32"),
+            ("random-vicuna-7b", PUBLISHED_LANGUAGE["vicuna-7b-v1.5"], "bfloat16"),
+        )
+    },
 }
 """By name; `pipeline.weights.MADE` says which kind each is, and where its weights come from."""
 PACKAGED = {name for name, made in MADE.items() if made.origin}

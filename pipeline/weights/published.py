@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.core.errors import UserError
 from pipeline.core.io import atomic_folder, load_tensors, save_tensors, sha256, write_json, write_text
-from pipeline.weights import CLIP_WEIGHTS, DOWNLOADED, check_language, clip_file, load_language
+from pipeline.weights import CLIP_WEIGHTS, DOWNLOADED, check_language, clip_file, load_language, sparsh
 from pipeline.weights.check import (
     SHAPES,
     TOKENIZER,
@@ -90,6 +90,8 @@ def adopt(name: str, source: Path, to: Path | None = None, *, trust_pickle: bool
     if known in PUBLISHED_CLIP:
         ready = (source / CLIP_CONFIG).is_file() and clip_file(source).is_file()
         check, write = check_clip, write_clip
+    elif name == "sparsh":
+        ready, check, write = False, check_sparsh, write_sparsh
     else:
         ready = (source / TOKENIZER).is_file() and any(source.glob("*.safetensors"))
         check, write = check_vicuna, write_vicuna
@@ -240,6 +242,26 @@ def to_open_clip(state: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         # Where one is missing, the sum is too short, which the check of shapes sees.
         found[first.replace("q_proj.", "in_proj_")] = torch.cat([found.pop(name) for name in names if name in found])
     return found
+
+
+# ---- Sparsh ----
+
+
+def check_sparsh(folder: Path, known: str, key: str) -> None:
+    """Raise UserError where the written folder is not whole; what was read was held to its layout before."""
+    check_encoder_files(folder, ("timm",), key)
+
+
+def write_sparsh(source: Path, target: Path, known: str, key: str, trust_pickle: bool) -> None:
+    """Write a downloaded Sparsh encoder as timm lays out its own networks."""
+    files = sorted(source.glob("*.safetensors"))
+    if len(files) != 1:
+        raise UserError(
+            f"{key}: {source} has {len(files)} files *.safetensors, not the one published; download it again"
+        )
+    stored_shapes(files, key)
+    copy(source, target, ".md", ".txt", "")
+    sparsh.write(target, load_tensors(files[0]), key)
 
 
 def check_values(found: Mapping[str, Any], known: Mapping[str, Any], folder: Path, name: str, key: str) -> None:

@@ -107,7 +107,7 @@ def read_form(file: Path) -> dict[str, Any]:
     return form
 
 
-PUBLISHED_CLIP = {"clip-vit-large-patch14": "ViT-L-14-quickgelu"}
+PUBLISHED_CLIP = dict.fromkeys(("clip-vit-large-patch14", "random-clip-vit-large"), "ViT-L-14-quickgelu")
 """By the folder's name: what open_clip calls OpenAI's model, whose configuration it ships."""
 VICUNA: dict[str, Any] = {
     "model_type": "llama",
@@ -118,7 +118,9 @@ VICUNA: dict[str, Any] = {
 }
 SIZES = ("hidden_size", "intermediate_size", "num_hidden_layers", "num_attention_heads")
 PUBLISHED_LANGUAGE: dict[str, dict[str, Any]] = {
-    "vicuna-7b-v1.5": dict(zip(SIZES, (4096, 11008, 32, 32), strict=True)) | VICUNA,
+    **dict.fromkeys(
+        ("vicuna-7b-v1.5", "random-vicuna-7b"), dict(zip(SIZES, (4096, 11008, 32, 32), strict=True)) | VICUNA
+    ),
     "vicuna-13b-v1.5": dict(zip(SIZES, (5120, 13824, 40, 40), strict=True)) | VICUNA,
     "smollm2": {
         **dict(zip(SIZES, (576, 1536, 30, 9), strict=True)),

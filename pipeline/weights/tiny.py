@@ -1,8 +1,9 @@
-"""Tiny models with random weights, for runs that show that the chain works and nothing else."""
+"""Models with random weights: tiny ones show that the chain works, ones of published shapes what these will take."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from transformers import PreTrainedTokenizerFast
 
 TAUGHT = "drawn at random and taught nothing"
-ABOUT = "A tiny model with random weights. It knows nothing: figures that it makes are chance."
+ABOUT = "A model with random weights. It knows nothing: figures that it makes are chance."
 CLIP: dict[str, dict[str, Any]] = {
     "model_cfg": {
         "embed_dim": 64,
@@ -31,6 +32,16 @@ CLIP: dict[str, dict[str, Any]] = {
     "preprocess_cfg": {"mean": [0.481, 0.458, 0.408], "std": [0.269, 0.261, 0.276]},
 }
 """Pictures are normalised as for OpenAI's CLIP. The text tower is never read, so it is as small as it goes."""
+VIT_LARGE = {
+    "model_cfg": {
+        "embed_dim": 768,
+        "quick_gelu": True,
+        "vision_cfg": {"image_size": 224, "patch_size": 14, "width": 1024, "layers": 24},
+        "text_cfg": CLIP["model_cfg"]["text_cfg"],
+    },
+    "preprocess_cfg": CLIP["preprocess_cfg"],
+}
+"""CLIP ViT-L/14's vision tower."""
 LLAMA = {
     "hidden_size": 192,
     "intermediate_size": 480,
@@ -43,28 +54,42 @@ SPECIAL = PAD, BOS, EOS, UNK = ("<pad>", "<s>", "</s>", "<unk>")
 MOST_TOKENS = 2048
 
 
-def write_clip(folder: Path, catalogue: Path, seed: int) -> None:
-    """Write a CLIP with a vision transformer as open_clip lays it out. It has no words, so needs no catalogue."""
+def write_clip(folder: Path, catalogue: Path, seed: int, *, name: str, form: Mapping[str, Any]) -> None:
+    """Write a CLIP with a vision transformer as open_clip lays it out. It has no words, so needs no catalogue.
+
+    Args:
+        name: Its name in `MADE`, of which its draws depend.
+        form: Its configuration.
+    """
     import open_clip
     import torch
 
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(derive_seed("tiny-clip", seed))
-        model = open_clip.CLIP(**CLIP["model_cfg"])
-    write_json(folder / CLIP_CONFIG, CLIP)
+        torch.manual_seed(derive_seed(name, seed))
+        model = open_clip.CLIP(**form["model_cfg"])
+    write_json(folder / CLIP_CONFIG, dict(form))
     save_tensors(folder / CLIP_WEIGHTS[0], model.state_dict(), {"format": "pt"})
 
 
-def write_llama(folder: Path, catalogue: Path, seed: int) -> None:
-    """Write a Llama in float32, and a tokenizer of the catalogue's words, as transformers lays them out."""
+def write_llama(
+    folder: Path, catalogue: Path, seed: int, *, name: str, form: Mapping[str, Any], dtype: str = "float32"
+) -> None:
+    """Write a Llama, and a tokenizer of the catalogue's words, as transformers lays them out.
+
+    Args:
+        name: Its name in `MADE`, of which its draws depend.
+        form: What `LlamaConfig` takes; without `vocab_size` it has as many words as the tokenizer.
+        dtype: Of what is drawn and written: a model of 7 billion weights takes 27 GB in float32.
+    """
     import torch
-    from transformers import LlamaConfig, LlamaForCausalLM
+    from transformers import AutoModelForCausalLM, LlamaConfig
 
     tokenizer = make_tokenizer(catalogue)
     ends = {f"{kind}_token_id": getattr(tokenizer, f"{kind}_token_id") for kind in ("pad", "bos", "eos")}
+    config = LlamaConfig(**{"vocab_size": len(tokenizer), **form, **ends})
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(derive_seed("tiny-llama", seed))
-        model = LlamaForCausalLM(LlamaConfig(vocab_size=len(tokenizer), **LLAMA, **ends))
+        torch.manual_seed(derive_seed(name, seed))
+        model = AutoModelForCausalLM.from_config(config, dtype=getattr(torch, dtype))
     model.save_pretrained(folder)
     tokenizer.save_pretrained(folder)
 
