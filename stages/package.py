@@ -3,7 +3,8 @@
 from pathlib import Path
 
 from pipeline.core.stage import DATA, stage
-from pipeline.use.package import describe_base, package
+from pipeline.use.folder import Base
+from pipeline.use.package import package
 
 MODELS = Path("models")
 
@@ -11,7 +12,7 @@ MODELS = Path("models")
 def main() -> None:
     with stage("package") as run:
         params = run.params
-        base = describe_base(Path(params.language.weights))
+        base = Base.of(Path(params.language.weights))
         wanted = [v for v in params.ablation.variants() if v.full or params.packaged == "all"]
         for variant in wanted:
             package(DATA, params, variant, base, MODELS / variant.key)

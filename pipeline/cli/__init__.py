@@ -525,7 +525,7 @@ def serve(
 ) -> None:
     """Answer questions about touches over HTTP, in the form of OpenAI's chat completions."""
     from pipeline.use.folder import SHIPPED
-    from pipeline.use.server import serve
+    from pipeline.use.serve import serve
 
     serve(lambda: _load(folder, base, device), (folder or SHIPPED).resolve().name, host, port, token_file, places)
 

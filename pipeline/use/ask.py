@@ -93,19 +93,23 @@ class Chat:
             except KeyboardInterrupt:
                 self.say("\n(stopped; the question is forgotten)\n")
 
-    def add(self, file: str) -> None:
-        """Take a video for the next question, unless it cannot be used."""
-        touch = self.model.look(file)
-        self.waiting.append(file)
-        self.say("".join(f"{file}: {note}\n" for note in touch.notes))
-        self.say(f"{len(self.waiting)} for the next question: {{tactile}} once for each, or they stand in front\n")
-
     def _command(self, name: str, rest: str) -> None:
         match name:
-            case "/add" if rest.strip():
-                self.add(rest.strip())
+            case "/add" if file := rest.strip():
+                touch = self.model.look(file)  # Refused here where it cannot be used, and not at the next question.
+                self.waiting.append(file)
+                self.say("".join(f"{file}: {note}\n" for note in touch.notes))
+                many = len(self.waiting)
+                self.say(f"{many} for the next question: {{tactile}} once for each, or they stand in front\n")
             case "/frames":
-                self._frames()
+                videos = [*(v for exchange in self.history for v in exchange.videos), *self.waiting]
+                for video in videos:
+                    touch = self.model.look(video)
+                    numbers = ", ".join(map(str, touch.numbers))
+                    self.say(f"{video}: frames {numbers}; touched {touch.contact:.0%} of the picture\n")
+                    self.say("".join(f"  {note}\n" for note in touch.notes))
+                if not videos:
+                    self.say("no video yet: /add FILE\n")
             case "/reset":
                 self.history, self.waiting = [], []
                 self.say("a new conversation\n")
@@ -120,16 +124,6 @@ class Chat:
         self.say("\n")
         self.history.append(Exchange(question, tuple(self.waiting), said))
         self.waiting = []
-
-    def _frames(self) -> None:
-        videos = [*(v for exchange in self.history for v in exchange.videos), *self.waiting]
-        for video in videos:
-            touch = self.model.look(video)
-            numbers = ", ".join(map(str, touch.numbers))
-            self.say(f"{video}: frames {numbers}; touched {touch.contact:.0%} of the picture\n")
-            self.say("".join(f"  {note}\n" for note in touch.notes))
-        if not videos:
-            self.say("no video yet: /add FILE\n")
 
 
 def named_objects(text: str) -> list[str] | dict[str, list[str]]:
@@ -149,10 +143,9 @@ def describe_folder(model: Octopi, paths: Sequence[Path], out: Path) -> tuple[in
     Raises:
         UserError: for a folder without videos, or a file that another model or something else wrote.
     """
-    files = videos_of(paths)
-    levels = {p.name: p.levels for p in model.catalogue.properties}
-    probabilities = [f"{name}: {level}" for name, known in levels.items() for level in known]
-    columns = ["file", *levels, *probabilities, "sentence", "frames", "notes", "error", "model"]
+    files, known = videos_of(paths), model.catalogue.properties
+    probabilities = [f"{p.name}: {level}" for p in known for level in p.levels]
+    columns = ["file", *model.properties, *probabilities, "sentence", "frames", "notes", "error", "model"]
     done = _done(out, columns, _whose(model))
     rest = [(file, name) for file, name in files if name not in done]
     failed = sum(bool(error) for error in done.values())

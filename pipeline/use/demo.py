@@ -9,7 +9,7 @@ import base64
 import re
 import shutil
 import tempfile
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import aclosing, asynccontextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,8 +30,7 @@ from pipeline.scenes.recipe import Recipe, load_recipes
 from pipeline.scenes.render import make_scene, render
 from pipeline.tasks.opd import TEMPLATES
 from pipeline.use.results import Exchange, Pictures, Touch
-from pipeline.use.server import listen, make_server
-from pipeline.use.worker import Failed, Worker
+from pipeline.use.server import Failed, Worker, listen, make_server
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.film import write_film
 
@@ -130,16 +129,18 @@ class Session:
         turns = [Exchange(t.question, self._find(t.touches), t.answer) for t in asked.history]
         videos = self._find(asked.touches)
         pieces = self.worker.answer(lambda: self.model.stream(asked.question, videos, history=turns))
-        return self._rest(await anext(pieces, ""), pieces)
+        first = await anext(pieces, "")
 
-    async def _rest(self, first: str, pieces: AsyncGenerator[str]) -> AsyncIterator[str]:
-        async with aclosing(pieces):
-            try:
-                yield first
-                async for piece in pieces:
-                    yield piece
-            except (UserError, Failed) as error:
-                yield f"\n[{error}]"
+        async def rest() -> AsyncIterator[str]:
+            async with aclosing(pieces):
+                try:
+                    yield first
+                    async for piece in pieces:
+                        yield piece
+                except (UserError, Failed) as error:
+                    yield f"\n[{error}]"
+
+        return rest()
 
     def _find(self, keys: Sequence[str]) -> tuple[Path, ...]:
         if unknown := [key for key in keys if key not in self.videos]:
@@ -230,7 +231,7 @@ def serve_demo(load: Callable[[], Octopi], catalogue: Path, port: int) -> None:
     Raises:
         UserError: where the port, the catalogue or the model cannot be used.
     """
-    with listen("127.0.0.1", port, "") as listening:
+    with listen("127.0.0.1", port) as listening:
         known = load_catalogue(catalogue)
         app = make_app(Session(load(), known, load_recipes(catalogue, known, seed=0)))
         print(f"http://127.0.0.1:{listening.getsockname()[1]} shows the demo; Ctrl-C ends it", flush=True)

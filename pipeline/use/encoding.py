@@ -45,7 +45,7 @@ class EncodedVideo(NamedTuple):
     def size(self) -> int:
         """Bytes of its pictures."""
         touch = self.prepared.touch
-        return touch.frames.nbytes + touch.reference.nbytes + touch.difference.nbytes
+        return sum(pictures.nbytes for pictures in (touch.frames, touch.reference, touch.difference))
 
 
 class Classified(NamedTuple):
@@ -80,11 +80,12 @@ class VideoEncoder:
             raw = self._encoder(*self._frames(prepared)).float().cpu()
             if not raw.isfinite().all():
                 raise UserError(f"{prepared.name}: its embedding is not finite; check the video")
-            standard = standardize(raw, self.statistics)
+            standard, notes = standardize(raw, self.statistics), prepared.touch.notes
+            if (far := distance(standard.double().numpy())) > (usual := config.usual):
+                unlike = f"{far:.1f} deviations from its mean, where its own videos reach {usual:.1f}"
+                notes = (*notes, f"unlike training: {unlike}")
             features = standard if config.encoder.standardize else raw
-            self._encoded[name] = EncodedVideo(
-                prepared, features, (*prepared.touch.notes, *self._unlike(standard)), raw.mean(0)
-            )
+            self._encoded[name] = EncodedVideo(prepared, features, notes, raw.mean(0))
         self._encoded.move_to_end(name)
         while len(self._encoded) > 1 and sum(encoded.size for encoded in self._encoded.values()) > REMEMBERED:
             self._encoded.popitem(last=False)
@@ -96,22 +97,15 @@ class VideoEncoder:
         frames, numbers = self._frames(self.encode(video).prepared)
         logits = self._classifier(frames[None], numbers[None])["logits"].cpu()
         parts = logits.double().split([len(p.levels) for p in self.catalogue.properties], dim=1)
-        probabilities = (
-            rescale(part.softmax(1)[0].numpy(), self.config.temperatures[p.name]).tolist()
+        probabilities = tuple(
+            tuple(rescale(part.softmax(1)[0].numpy(), self.config.temperatures[p.name]).tolist())
             for part, p in zip(parts, self.catalogue.properties, strict=True)
         )
-        return Classified(tuple(map(tuple, probabilities)), tuple(self._classifier.decide(logits)[0].tolist()))
-
-    def _unlike(self, standard: torch.Tensor) -> tuple[str, ...]:
-        far, usual = distance(standard.double().numpy()), self.config.usual
-        if far <= usual:
-            return ()
-        return (f"unlike training: {far:.1f} deviations from its mean, where its own videos reach {usual:.1f}",)
+        return Classified(probabilities, tuple(self._classifier.decide(logits)[0].tolist()))
 
     def _frames(self, prepared: PreparedVideo) -> tuple[torch.Tensor, torch.Tensor]:
-        return torch.from_numpy(prepared.pictures).to(self.device), torch.tensor(
-            prepared.touch.numbers, device=self.device
-        )
+        numbers = torch.tensor(prepared.touch.numbers, device=self.device)
+        return torch.from_numpy(prepared.pictures).to(self.device), numbers
 
     @property
     def _own(self) -> EncoderConfig:

@@ -58,6 +58,12 @@ class Base(Record):
     files: dict[str, str]
     """sha256 by name, of `IDENTITY`."""
 
+    @classmethod
+    def of(cls, folder: Path) -> Base:
+        """Hash what lies in a folder; one that is not there has no files."""
+        found = [file for pattern in IDENTITY for file in sorted(folder.glob(pattern))]
+        return cls(folder=folder.as_posix(), files={file.name: sha256(file) for file in found})
+
 
 class ModelConfig(Record):
     """config.json."""
@@ -97,11 +103,6 @@ class ModelConfig(Record):
     def digest(self) -> str:
         """A hash of all that answers depend on, by which two trainings of one variant are told apart."""
         return fingerprint(self.model_copy(update={"scores": {}, "versions": {}}))
-
-
-def identify(folder: Path) -> dict[str, str]:
-    """sha256 of the files that a base language model is known by."""
-    return {file.name: sha256(file) for pattern in IDENTITY for file in sorted(folder.glob(pattern))}
 
 
 def read_folder(folder: Path) -> tuple[ModelConfig, Catalogue]:
@@ -149,7 +150,7 @@ def find_base(folder: Path, base: Base, given: Path | None = None) -> Path:
         make(named.name, cached)
     for place in places:
         if any(place.glob("*.safetensors")):
-            if not (wrong := sorted(set(identify(place).items()) ^ set(base.files.items()))):
+            if not (wrong := sorted(set(Base.of(place).files.items()) ^ set(base.files.items()))):
                 return place
             other = f"{place}: is another language model than {folder} was trained on ({wrong[0][0]} differs)"
     if other:

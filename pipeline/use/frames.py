@@ -90,9 +90,9 @@ def prepare_video(video: Video, frames: FramesConfig, *, subtracts: bool, quiet:
 @contextmanager
 def _as_file(video: Video) -> Iterator[Path]:
     """The file of a video; an array becomes a lossless one, so that both take the same way."""
+    if not isinstance(video, np.ndarray | str | os.PathLike):
+        raise UserError(f"a {type(video).__name__} is no video; give a file, or an array of uint8")
     if not isinstance(video, np.ndarray):
-        if not isinstance(video, (str, os.PathLike)):
-            raise UserError(f"a {type(video).__name__} is no video; give a file, or an array of uint8")
         path = Path(video)
         # A pipe or a device is not opened: reading it may never end.
         if not os.path.isfile(path):  # pathlib's raises where a name is too long.

@@ -74,39 +74,35 @@ def presses(shots: Iterable[Shot], times: float = FOUND) -> Iterator[list[Shot]]
     touched = behind = 0
     first, recent = np.zeros((1, 1, 3), np.uint8), deque[np.ndarray](maxlen=LONGEST)
     gone: UserError | None = None
-    source = iter(shots)
-    while True:
-        try:
-            shot = next(source)
-        except StopIteration:
-            break
-        except UserError as error:  # What was pressed until then is no less a press.
-            gone = error
-            break
-        thumb = thumbnail(av.VideoFrame.from_ndarray(shot.picture, format="bgr24").reformat(format="yuv444p"))
-        if len(before) < LONGEST:
-            before.append((shot, thumb))
-            continue
-        strength = contact_strength(thumb, mean([old for _, old in list(before)[:LONGEST]]))
-        threshold = times * max(ROUNDING, float(np.median(quiet or [0])))
-        if not press and (strength <= threshold or len(quiet) < LONGEST):
-            before.append((shot, thumb))
-            quiet.append(strength)
-            continue
-        if not press:
-            press, first = [old for old, _ in list(before)[-LONGEST:]], mean([old for _, old in list(before)[:LONGEST]])
-        press.append(shot)
-        recent.append(thumb)
-        held = strength > RELEASED * threshold
-        touched, behind = touched + held, 0 if held else behind + 1
-        released = touched == LONGEST and starts_touching(first, mean(recent))
-        if behind == SHORTEST or len(press) == MOST or released:
-            if released or len(press) == MOST:
-                before.clear()
-                quiet.clear()
-            elif touched >= SHORTEST:
-                yield press
-            press, touched, behind = [], 0, 0
+    try:
+        for shot in shots:
+            thumb = thumbnail(av.VideoFrame.from_ndarray(shot.picture, format="bgr24").reformat(format="yuv444p"))
+            if len(before) < LONGEST:
+                before.append((shot, thumb))
+                continue
+            strength = contact_strength(thumb, mean([old for _, old in list(before)[:LONGEST]]))
+            threshold = times * max(ROUNDING, float(np.median(quiet or [0])))
+            if not press and (strength <= threshold or len(quiet) < LONGEST):
+                before.append((shot, thumb))
+                quiet.append(strength)
+                continue
+            if not press:
+                press = [old for old, _ in list(before)[-LONGEST:]]
+                first = mean([old for _, old in list(before)[:LONGEST]])
+            press.append(shot)
+            recent.append(thumb)
+            held = strength > RELEASED * threshold
+            touched, behind = touched + held, 0 if held else behind + 1
+            released = touched == LONGEST and starts_touching(first, mean(recent))
+            if behind == SHORTEST or len(press) == MOST or released:
+                if released or len(press) == MOST:
+                    before.clear()
+                    quiet.clear()
+                elif touched >= SHORTEST:
+                    yield press
+                press, touched, behind = [], 0, 0
+    except UserError as error:  # What was pressed until the camera was gone is no less a press.
+        gone = error
     if touched >= SHORTEST:
         yield press
     if gone:

@@ -34,17 +34,7 @@ from pipeline.tasks.base import LETTERS
 from pipeline.use.encoding import EncodedVideo, VideoEncoder
 from pipeline.use.folder import ENCODER_DIR, SHIPPED, ModelConfig, chat_sample, find_base, read_folder
 from pipeline.use.memory import Remembered, most_similar, recall, remember
-from pipeline.use.results import (
-    Choice,
-    Comparison,
-    Description,
-    Exchange,
-    Matching,
-    Ranking,
-    Recognition,
-    Touch,
-    Video,
-)
+from pipeline.use.results import Choice, Comparison, Description, Exchange, Matching, Ranking, Recognition, Touch, Video
 from pipeline.videos.catalogue import Catalogue, Object, Property
 from pipeline.weights import is_tiny
 
@@ -210,8 +200,18 @@ class Octopi:
     def describe_all(self, videos: Sequence[Video], *, sentence: bool = True) -> list[Description]:
         """As `describe`, of many videos in one batch. A video without contact is described with a note."""
         described, asked = [], []
+        silent = ("this variant was not trained to describe, so there is no sentence",)
         for video in videos:  # All of a video at once, as not all may be remembered.
-            described.append(self._described(video))
+            encoded, classified = self.encoder.encode(video), self.encoder.classify(video)
+            each = list(zip(self.catalogue.properties, classified.probabilities, classified.levels, strict=True))
+            description = Description(
+                levels={p.name: p.levels[level] for p, _, level in each},
+                probabilities={p.name: dict(zip(p.levels, found, strict=True)) for p, found, _ in each},
+                sentence="",
+                frames=encoded.prepared.touch.numbers,
+                notes=(*self.doubts, *encoded.notes, *(silent if self.config.opd is Opd.NONE else ())),
+            )
+            described.append(description)
             if sentence and self.config.opd is not Opd.NONE:
                 asked.append(self._prompt([Exchange(opd.TEMPLATES[0], (video,), "")], untouched=True))
         said = self._reply(asked, None) or [""] * len(videos)
@@ -237,9 +237,9 @@ class Octopi:
         expected: list[float] = []
         notes: list[str] = []
         for video in videos:  # All of a video at once, as not all may be remembered.
-            self.touched(video)
+            encoded = self.touched(video)
+            notes += [f"{encoded.prepared.name}: {note}" for note in encoded.notes]
             expected.append(self._classes(video)[place][1])
-            notes += self.notes(video)[len(self.doubts) :]
         answer, most = "", None
         if len(videos) == 3:
             answer = self.ask(pss.asked(pss.TEMPLATES[0], known.most, known.spoken)[self.config.opd], videos)
@@ -247,8 +247,7 @@ class Octopi:
             most = None if letter is None else LETTERS.index(letter)
         elif len(videos) == 2:
             compared = self.compare(videos[0], videos[1], property)
-            answer = compared.answer
-            most = {"yes": 0, "no": 1}.get(compared.choice or "")
+            answer, most = compared.answer, {"yes": 0, "no": 1}.get(compared.choice or "")
         order = sorted(range(len(videos)), key=expected.__getitem__)
         if most is not None and most != order[-1]:
             notes.append(APART)
@@ -271,7 +270,6 @@ class Octopi:
             names: Names or ids of objects of the catalogue; or any names, each with its class of every property. A
                 model that knows numbers alone is asked about "object 1", ...; its answer has the names.
         """
-        called: dict[str, str] = {}
         if len(videos) != len(names) or len(videos) not in (2, 3):
             given = f"{counted(len(videos), 'video')} and {counted(len(names), 'name')} ({'; '.join(names)})"
             raise UserError(f"{given}: two or three of each can be matched; write {self._example()}; ...")
@@ -279,12 +277,12 @@ class Octopi:
             objects = [self._told(name, classes) for name, classes in names.items()]
         else:
             objects = [self._object(name) for name in names]
-        if self.numbered:
-            called = {f"object {number}": o.name for number, o in enumerate(objects, 1)}
-            objects = [o.model_copy(update={"name": name}) for o, name in zip(objects, called, strict=True)]
-        found = {o.object_id: o for o in sorted(objects, key=lambda o: o.name.lower())}
-        if len(found) < len(names):
+        if len({o.object_id for o in objects}) < len(names):
             raise UserError(f"{', '.join(names)}: a name is given twice; name {len(names)} objects")
+        # What the question calls each object, and its own name, which the answer is given in.
+        called = {f"object {n}" if self.numbered else o.name: o.name for n, o in enumerate(objects, 1)}
+        objects = [o.model_copy(update={"name": name}) for o, name in zip(objects, called, strict=True)]
+        found = {o.object_id: o for o in sorted(objects, key=lambda o: o.name.lower())}
         listed = [o.name for o in found.values()]
         catalogue = Catalogue(language=self.catalogue.language, objects=found)
         question = pom.asked(pom.OPENINGS[len(listed) == 2], listed)[self.config.opd]
@@ -293,12 +291,10 @@ class Octopi:
             question = f"{facts} {question}"
         answer = self.ask(question, videos)
         read = pom.read(answer, listed)
-        said = None if read is None else tuple(listed[read[letter]] for letter in LETTERS[: len(listed)])
+        said = None if read is None else tuple(called[listed[read[letter]]] for letter in LETTERS[: len(listed)])
         nearest = pom.nearest([self._classes(video) for video in videos], catalogue)
-        heads = tuple(found[i].name for i in nearest)
+        heads = tuple(called[found[i].name] for i in nearest)
         answer = NUMBERED.sub(lambda name: called.get(name[0], name[0]), answer)
-        said = said and tuple(called.get(name, name) for name in said)
-        heads = tuple(called.get(name, name) for name in heads)
         untrained = () if len(listed) == 3 else ("it was trained to match three videos, not two",)
         apart = (APART,) if said not in (None, heads) else ()
         notes = (*untrained, *apart, *self.notes(videos))
@@ -311,16 +307,10 @@ class Octopi:
             UserError: for a video in which nothing is touched, or a memory that is broken or another encoder's.
         """
         encoded = self.touched(video)
-        levels = self._described(video).levels
-        return remember(
-            Path(memory),
-            Remembered(
-                name=name,
-                classes=tuple(levels[p] for p in self.properties),
-                encoder=self._encoder_name,
-                embedding=tuple(encoded.embedding.tolist()),
-            ),
-        )
+        classes = tuple(self.describe(video, sentence=False).levels.values())
+        embedding = tuple(encoded.embedding.tolist())
+        touch = Remembered(name=name, classes=classes, encoder=self._encoder_name, embedding=embedding)
+        return remember(Path(memory), touch)
 
     def recognise(self, video: Video, memory: Path | str) -> Recognition:
         """Which remembered objects a touch is like, the most similar first. An object that was never remembered is like
@@ -386,18 +376,6 @@ class Octopi:
         if not encoded.prepared.touched:
             raise UserError(f"{encoded.prepared.name}: {encoded.notes[0]}; record the sensor being pressed")
         return encoded
-
-    def _described(self, video: Video) -> Description:
-        encoded, classified = self.encoder.encode(video), self.encoder.classify(video)
-        each = list(zip(self.catalogue.properties, classified.probabilities, classified.levels, strict=True))
-        silent = ("this variant was not trained to describe, so there is no sentence",)
-        return Description(
-            levels={p.name: p.levels[level] for p, _, level in each},
-            probabilities={p.name: dict(zip(p.levels, found, strict=True)) for p, found, _ in each},
-            sentence="",
-            frames=encoded.prepared.touch.numbers,
-            notes=(*self.doubts, *encoded.notes, *(silent if self.config.opd is Opd.NONE else ())),
-        )
 
     def _classes(self, video: Video) -> list[tuple[int, float]]:
         """What the heads take a video for: a class and a mean class of each property."""

@@ -35,7 +35,6 @@ from pipeline.use.folder import (
     chat_sample,
     distance,
     find_base,
-    identify,
     read_folder,
 )
 from pipeline.videos.audit.files import quiet_level
@@ -58,7 +57,7 @@ def package(data: Path, params: Params, variant: Variant, base: Base, out: Path)
 
     Args:
         data: The chain's folder of data.
-        base: The language model, as `describe_base` says.
+        base: The language model.
         out: The folder, made anew.
     """
     encoder, language = params.encoder, params.language
@@ -117,11 +116,6 @@ def package(data: Path, params: Params, variant: Variant, base: Base, out: Path)
         known = read_json(report / "provenance.json")["settings"]
         _write_card(folder, config, classified, scores, ruled, params, known)
     return config
-
-
-def describe_base(folder: Path) -> Base:
-    """A language model by hash."""
-    return Base(folder=folder.as_posix(), files=identify(folder))
 
 
 def export(folder: Path, to: Path, *, with_base: bool = False, base: Path | None = None) -> None:

@@ -7,8 +7,9 @@ import uuid
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError, field_validator
 
+from pipeline.core.errors import first_problem
 from pipeline.use.media import Refused, from_base64
 
 MARK = "{tactile}"
@@ -18,10 +19,6 @@ Json = dict[str, Any]
 Said = tuple[str, tuple[bytes, ...], str]
 """A question, its videos, and the answer."""
 
-# ---- requests ----
-
-Text = Annotated[str, Field(max_length=CHARACTERS)]
-
 
 class _Url(BaseModel):
     url: str
@@ -29,7 +26,7 @@ class _Url(BaseModel):
 
 class _Text(BaseModel):
     type: Literal["text"]
-    text: Text
+    text: str = Field(max_length=CHARACTERS)
 
 
 class _Video(BaseModel):
@@ -42,22 +39,18 @@ class _Image(BaseModel):  # A touch as well, from a client that knows pictures o
     image_url: _Url
 
 
-Part = Annotated[_Text | _Video | _Image, Field(discriminator="type")]
-
-
-def _parts(content: object) -> object:
-    """A text alone is one part."""
-    return [{"type": "text", "text": content}] if isinstance(content, str) else content
-
-
-Content = Annotated[list[Part], Field(min_length=1, max_length=MESSAGES), BeforeValidator(_parts)]
-
-
 class Message(BaseModel):
     """One turn."""
 
     role: Literal["system", "developer", "user", "assistant"]
-    content: Content
+    content: list[Annotated[_Text | _Video | _Image, Field(discriminator="type")]] = Field(
+        min_length=1, max_length=MESSAGES
+    )
+
+    @field_validator("content", mode="before")
+    @classmethod
+    def _text_alone_is_one_part(cls, content: object) -> object:
+        return [{"type": "text", "text": content}] if isinstance(content, str) else content
 
 
 class ChatRequest(BaseModel):
@@ -85,9 +78,8 @@ def read_request(body: bytes) -> ChatRequest:
     try:
         return ChatRequest.model_validate_json(body)
     except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False, include_context=False)[0]
-        place = ".".join(str(part) for part in first["loc"]) or "body"
-        raise Refused(f"{place}: {first['msg'][:300]}") from None
+        # Cut, since a message may quote what was sent.
+        raise Refused(first_problem(error)[:300]) from None
 
 
 def read_conversation(messages: Sequence[Message]) -> list[Said]:
@@ -125,9 +117,6 @@ def _read(message: Message, place: str) -> tuple[str, tuple[bytes, ...]]:
         apart = text and piece and not text[-1].isspace() and not piece[0].isspace()
         text += f" {piece}" if apart else piece
     return text, tuple(videos)
-
-
-# ---- answers ----
 
 
 class Reply:

@@ -10,11 +10,13 @@ import asyncio
 import hmac
 import json
 import math
+import os
 import threading
 import time
 from collections import Counter
-from collections.abc import AsyncGenerator, AsyncIterator, Iterable
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterable
 from contextlib import ExitStack, aclosing, asynccontextmanager, suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fastapi import APIRouter, Depends, FastAPI, Request
@@ -28,7 +30,7 @@ from pipeline.core.errors import UserError
 from pipeline.use.media import PLACE, Gate, Limits, Refused
 from pipeline.use.protocol import ChatRequest, Json, Reply, error_body, model_entry, read_conversation, read_request
 from pipeline.use.results import Exchange
-from pipeline.use.worker import Failed, Worker
+from pipeline.use.server import Failed, Worker, listen, make_server
 
 if TYPE_CHECKING:
     from pipeline.use.model import Octopi
@@ -37,7 +39,42 @@ UPLOAD_SECONDS, DRAIN_SECONDS = 30.0, 5.0
 """How long a client may take for a body, and for the rest of one that is not wanted."""
 MOST_TOKENS = 1024
 """The longest answer that a client may ask for."""
+SHORTEST_TOKEN = 16
 HOME = ("127.0.0.1", "localhost", "::1", "[::1]")
+"""Names that a server without a token answers to."""
+
+
+def serve(load: Callable[[], Octopi], name: str, host: str, port: int, token_file: Path | None, places: int) -> None:
+    """Serve a model until a signal comes; answers in flight are finished then.
+
+    Raises:
+        UserError: where the model, the token or the address cannot be used.
+    """
+    token = read_token(token_file)
+    # First the address, which is known at once; loading takes its time.
+    with listen(host, port, token) as listening:
+        app = make_app(load(), name, token=token, places=places)
+        address, number = listening.getsockname()[:2]
+        place = f"[{address}]" if ":" in address else address
+        print(f"{name} answers at http://{place}:{number}/v1; Ctrl-C ends it", flush=True)
+        with suppress(KeyboardInterrupt):
+            make_server(app).run(sockets=[listening])
+
+
+def read_token(file: Path | None) -> str:
+    """The token that the file holds, or else the environment; UserError for an empty file or a short token."""
+    if file is None:
+        token = os.environ.get("OCTOPI_TOKEN", "").strip()
+    else:
+        try:
+            token = file.read_text(encoding="utf-8").strip()
+        except (OSError, UnicodeDecodeError) as error:
+            raise UserError(f"--token-file {file}: cannot be read ({error}); name a text file") from None
+        if not token:
+            raise UserError(f"--token-file {file}: empty; write the token into it")
+    if token and (len(token) < SHORTEST_TOKEN or not token.isascii() or not token.isprintable()):
+        raise UserError(f"the token needs {SHORTEST_TOKEN} or more ASCII characters; `openssl rand -hex 32` makes one")
+    return token
 
 
 class Service:
@@ -114,20 +151,18 @@ class Service:
 
     def metrics(self) -> str:
         """What happened since the start, in Prometheus' text format."""
-        lines = [
-            "# TYPE octopi_requests_total counter",
-            *(f'octopi_requests_total{{status="{s}"}} {n}' for s, n in sorted(self.requests.items())),
-            "# TYPE octopi_videos_total counter",
-            f"octopi_videos_total {self.videos}",
-            "# TYPE octopi_requests_waiting gauge",
-            f"octopi_requests_waiting {self.taken}",
-            "# TYPE octopi_requests_places gauge",
-            f"octopi_requests_places {self.places}",
-            "# TYPE octopi_answer_seconds summary",
-            f"octopi_answer_seconds_sum {self.worker.seconds:.6f}",
-            f"octopi_answer_seconds_count {self.worker.answers}",
-        ]
-        return "\n".join(lines) + "\n"
+        by_status = "".join(f'octopi_requests_total{{status="{s}"}} {n}\n' for s, n in sorted(self.requests.items()))
+        return f"""# TYPE octopi_requests_total counter
+{by_status}# TYPE octopi_videos_total counter
+octopi_videos_total {self.videos}
+# TYPE octopi_requests_waiting gauge
+octopi_requests_waiting {self.taken}
+# TYPE octopi_requests_places gauge
+octopi_requests_places {self.places}
+# TYPE octopi_answer_seconds summary
+octopi_answer_seconds_sum {self.worker.seconds:.6f}
+octopi_answer_seconds_count {self.worker.answers}
+"""
 
 
 async def _read(request: Request, most: int) -> bytes:
@@ -255,7 +290,7 @@ def make_app(model: Octopi, name: str, *, token: str = "", limits: Limits | None
         return JSONResponse(error_body(message, status), status, getattr(error, "headers", None))
 
     async def fail(_: Request, __: Exception) -> Response:
-        service.requests[500] += 1  # It answers outside of `_Count`.
+        service.requests[500] += 1  # What nothing foresaw is answered outside of `_Count`.
         return JSONResponse(error_body(str(Failed()), 500), 500)
 
     app.include_router(guarded)
@@ -267,7 +302,7 @@ def make_app(model: Octopi, name: str, *, token: str = "", limits: Limits | None
 
 
 class _Count:
-    """Counts answers by status."""
+    """Counts answers by status. No `@app.middleware`, behind which a stream never learns that its client has left."""
 
     def __init__(self, app: Any, counts: Counter[int]) -> None:
         self.app, self.counts = app, counts

@@ -1,15 +1,19 @@
-"""Where `octopi serve` listens, whom it lets in, and how it ends."""
+"""What `octopi serve` and `octopi demo` stand on: the thread that holds the model, and where uvicorn listens."""
 
 from __future__ import annotations
 
 import asyncio
 import ipaddress
-import os
+import itertools
+import logging
+import queue
 import socket
-from collections.abc import Callable
+import threading
+import time
+from collections.abc import AsyncGenerator, Callable, Iterable, Sequence
 from contextlib import suppress
-from pathlib import Path
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import Any
 
 import h11
 import uvicorn
@@ -18,12 +22,147 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from pipeline.core.errors import UserError
 
-if TYPE_CHECKING:
-    from pipeline.use.model import Octopi
+logger = logging.getLogger(__name__)
 
-SHORTEST_TOKEN = 16
 HEADER_SECONDS = 10.0
 """How long a client may take for a request's head."""
+TOGETHER = 32
+"""Most questions that are begun at once; the model divides them by its own batch size."""
+
+
+class Failed(Exception):
+    """The model failed in a way that is nobody's input; the log has it."""
+
+    def __init__(self) -> None:
+        super().__init__("the model failed at this request; the server's log says why")
+
+
+@dataclass(frozen=True)
+class Job:
+    """A question on its way; the arguments of `Worker.answer`, and where its pieces go."""
+
+    ask: Callable[[], Iterable[Any]]
+    done: Callable[[], object]
+    put: Callable[[Any], None]
+    left: threading.Event
+
+    def end(self, error: Exception | None = None) -> None:
+        """Give the place and the files back first, so that who has the answer finds the place free."""
+        if error is not None and not isinstance(error, UserError):
+            logger.error("the model failed", exc_info=error)
+            error = Failed()
+        with suppress(Exception):
+            self.done()
+        self.put(error)
+
+
+class Worker:
+    """The thread that holds the model: it answers what waits in one batch where the model can, else one by one.
+
+    What comes meanwhile waits for the next batch.
+
+    Attributes:
+        answers: How many were given in full.
+        seconds: That the model took for them all.
+    """
+
+    def __init__(self) -> None:
+        self.answers, self.seconds = 0, 0.0
+        self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
+        # A daemon, so that a second Ctrl-C does not wait for the answer.
+        self._thread = threading.Thread(target=self._work, name="octopi-model", daemon=True)
+        self._thread.start()
+
+    def answer(
+        self, ask: Callable[[], Iterable[Any]], done: Callable[[], object] = lambda: None
+    ) -> AsyncGenerator[Any]:
+        """Queue a question, and yield the pieces of its answer as they are made; who closes this gives it up.
+
+        Args:
+            ask: Called in the thread, where its pieces are made, too. Pieces with a method `together`, as `Stream` has
+                it, are made in one batch with those of others.
+            done: Called in the thread behind the last piece, also where the answer failed or was given up.
+
+        Raises:
+            UserError: as `ask` raises it.
+            Failed: where it raises anything else.
+        """
+        loop, left = asyncio.get_running_loop(), threading.Event()
+        pieces: asyncio.Queue[Any] = asyncio.Queue()
+
+        def put(piece: Any) -> None:
+            with suppress(RuntimeError):  # The loop is closed: nobody waits.
+                loop.call_soon_threadsafe(pieces.put_nowait, piece)
+
+        async def made() -> AsyncGenerator[Any]:
+            try:
+                while (piece := await pieces.get()) is not None:
+                    if isinstance(piece, Exception):
+                        raise piece
+                    yield piece
+            finally:
+                left.set()
+
+        # Queued here and not at the first piece: `done` is called even where nobody asks for a piece.
+        self._jobs.put(Job(ask, done, put, left))
+        return made()
+
+    def stop(self) -> None:
+        """Wait until all that is queued is answered."""
+        self._jobs.put(None)
+        self._thread.join()
+
+    def _work(self) -> None:
+        waiting: Job | None
+        while (waiting := self._jobs.get()) is not None:
+            jobs: list[Job | None] = [waiting]
+            while len(jobs) < TOGETHER and jobs[-1] is not None and not self._jobs.empty():
+                jobs.append(self._jobs.get())
+            started = time.monotonic()
+            self._answer([job for job in jobs if job is not None])
+            self.seconds += time.monotonic() - started
+            if jobs[-1] is None:
+                return
+
+    def _answer(self, jobs: Sequence[Job]) -> None:
+        """Answer these: what cannot be in a batch by itself, then the others in one."""
+        batch: list[tuple[Job, Any]] = []
+        for job in jobs:
+            if job.left.is_set():
+                job.end()
+                continue
+            try:
+                pieces = job.ask()
+            except Exception as error:
+                job.end(error)
+                continue
+            if hasattr(pieces, "together"):
+                batch.append((job, pieces))
+            else:
+                self._hand_out([job], ((0, piece) for piece in itertools.chain(pieces, [None])), set())
+        if batch:
+            left: set[int] = set()
+            together = batch[0][1].together([pieces for _, pieces in batch], left)
+            self._hand_out([job for job, _ in batch], together, left)
+
+    def _hand_out(self, jobs: Sequence[Job], pieces: Iterable[tuple[int, Any]], left: set[int]) -> None:
+        """Give jobs their pieces, each by the job's place, None behind the last; `left` gets the places of who left."""
+        waiting = dict(enumerate(jobs))
+        try:
+            for place, piece in pieces:
+                if piece is not None and place in waiting:
+                    waiting[place].put(piece)
+                elif place in waiting:
+                    self.answers += 1
+                    waiting.pop(place).end()
+                for gone in [place for place, job in waiting.items() if job.left.is_set()]:
+                    left.add(gone)
+                    waiting.pop(gone).end()
+                if not waiting:
+                    return
+        except Exception as error:
+            for job in waiting.values():
+                job.end(error)
 
 
 class HeaderTimeout(H11Protocol):
@@ -45,12 +184,6 @@ class HeaderTimeout(H11Protocol):
             self._timer.cancel()
             self._timer = None
 
-    def connection_lost(self, exc: Exception | None) -> None:
-        """Forget it."""
-        if self._timer is not None:
-            self._timer.cancel()
-        super().connection_lost(exc)
-
 
 def make_server(app: FastAPI) -> uvicorn.Server:
     """The server of the application; `run(sockets=[...])` returns when a signal came and all answers are sent."""
@@ -60,7 +193,7 @@ def make_server(app: FastAPI) -> uvicorn.Server:
     return uvicorn.Server(config)
 
 
-def listen(host: str, port: int, token: str) -> socket.socket:
+def listen(host: str, port: int, token: str = "") -> socket.socket:
     """A socket for the server; UserError where others could reach it without a token, or it cannot have the address."""
     try:
         own = host == "localhost" or ipaddress.ip_address(host).is_loopback
@@ -74,38 +207,3 @@ def listen(host: str, port: int, token: str) -> socket.socket:
     except (OSError, OverflowError) as error:
         words = getattr(error, "strerror", None) or error
         raise UserError(f"--host {host} --port {port}: cannot be had ({words}); choose another") from None
-
-
-def serve(load: Callable[[], Octopi], name: str, host: str, port: int, token_file: Path | None, places: int) -> None:
-    """Serve a model until a signal comes; answers in flight are finished then.
-
-    Raises:
-        UserError: where the model, the token or the address cannot be used.
-    """
-    from pipeline.use.serve import make_app
-
-    token = read_token(token_file)
-    # First the address, which is known at once; loading takes its time.
-    with listen(host, port, token) as listening:
-        app = make_app(load(), name, token=token, places=places)
-        address, number = listening.getsockname()[:2]
-        place = f"[{address}]" if ":" in address else address
-        print(f"{name} answers at http://{place}:{number}/v1; Ctrl-C ends it", flush=True)
-        with suppress(KeyboardInterrupt):
-            make_server(app).run(sockets=[listening])
-
-
-def read_token(file: Path | None) -> str:
-    """The token that the file holds, or else the environment; UserError for an empty file or a short token."""
-    if file is None:
-        token = os.environ.get("OCTOPI_TOKEN", "").strip()
-    else:
-        try:
-            token = file.read_text(encoding="utf-8").strip()
-        except (OSError, UnicodeDecodeError) as error:
-            raise UserError(f"--token-file {file}: cannot be read ({error}); name a text file") from None
-        if not token:
-            raise UserError(f"--token-file {file}: empty; write the token into it")
-    if token and (len(token) < SHORTEST_TOKEN or not token.isascii() or not token.isprintable()):
-        raise UserError(f"the token needs {SHORTEST_TOKEN} or more ASCII characters; `openssl rand -hex 32` makes one")
-    return token

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 
@@ -23,17 +22,6 @@ from pipeline.videos.catalogue import Catalogue, load_catalogue
 BATCH = 64
 """Answers at once: a gigabyte of keys and values. A processor reads all weights for each token of a batch, however many
 answers are in it."""
-
-
-class Touches(NamedTuple):
-    """Videos as the model's encoder has them."""
-
-    features: torch.Tensor
-    """Of all frames, one video after another: frames x dim."""
-    rows: dict[str, range]
-    """Where each video's frames are."""
-    classified: list[Classification]
-    """What its heads say."""
 
 
 def answers_about(octopi: Octopi, params: Params, videos: Sequence[Video]) -> list[GradedVision]:
@@ -62,19 +50,19 @@ def answers_about(octopi: Octopi, params: Params, videos: Sequence[Video]) -> li
         distinct=True,
         facts=octopi.config.facts,
     )
-    touches = touched(octopi, catalogue, Path(params.data.dir), videos)
-    ways = {Shown.TOUCH: touches.features}
+    touches, rows, classified = touched(octopi, catalogue, Path(params.data.dir), videos)
+    ways = {Shown.TOUCH: touches}
     if params.data.source == "videos":
-        std, mean = torch.std_mean(touches.features, dim=0)
-        ways[Shown.STANDARDISED] = (touches.features - mean) / torch.where(std > 0, std, 1.0)  # As `adapt` does.
+        std, mean = torch.std_mean(touches, dim=0)
+        ways[Shown.STANDARDISED] = (touches - mean) / torch.where(std > 0, std, 1.0)  # As `adapt` does.
     config = octopi.config
     language = config.language.model_copy(update={"generation_batch_size": BATCH})
     scored = {}
     for shown, features in ways.items():
-        store = EmbeddingStore().with_rows(touches.rows, features)
+        store = EmbeddingStore().with_rows(rows, features)
         said = answer(octopi.llm, store, questions, config.opd, language, config.frames.per_video)
         scored[shown] = grade(questions, said, catalogue)
-    scored[Shown.CLASSES] = conclude(questions, touches.classified, catalogue)
+    scored[Shown.CLASSES] = conclude(questions, classified, catalogue)
     return [
         GradedVision(**score.model_dump(), model=octopi.name, shown=shown, seed=params.ablation.seeds[0])
         for shown, scores in scored.items()
@@ -82,8 +70,15 @@ def answers_about(octopi: Octopi, params: Params, videos: Sequence[Video]) -> li
     ]
 
 
-def touched(octopi: Octopi, catalogue: Catalogue, folder: Path, videos: Sequence[Video]) -> Touches:
-    """Encode and classify videos."""
+def touched(
+    octopi: Octopi, catalogue: Catalogue, folder: Path, videos: Sequence[Video]
+) -> tuple[torch.Tensor, dict[str, range], list[Classification]]:
+    """Encode and classify videos.
+
+    Returns:
+        The features of all frames, one video after another (frames x dim), where each video's frames are in them, and
+        what the heads say.
+    """
     features, rows, classified = [torch.zeros(0, octopi.llm.octopi_config.tactile_dim)], dict[str, range](), []
     for video in track(videos, "touches", "video"):
         before = sum(map(len, features))
@@ -103,4 +98,4 @@ def touched(octopi: Octopi, catalogue: Catalogue, folder: Path, videos: Sequence
             )
             for prop, label, probabilities, level in found
         ]
-    return Touches(torch.cat(features), rows, classified)
+    return torch.cat(features), rows, classified

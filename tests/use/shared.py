@@ -39,8 +39,9 @@ from pipeline.language.training import add_lora
 from pipeline.tasks import TASKS
 from pipeline.tasks.questions import build_questions, pool_of
 from pipeline.training.trainable import save_trainable
+from pipeline.use.folder import Base
 from pipeline.use.model import Octopi
-from pipeline.use.package import describe_base, package
+from pipeline.use.package import package
 from pipeline.use.results import Exchange
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.frames.extract import extract_frames
@@ -138,7 +139,7 @@ def make(where: Path, variant: Variant, *overrides: str) -> Made:
     pd.DataFrame(rows).to_csv(where / "reports" / params.report_name / "scores.csv", index=False)
     write_json(where / "reports" / params.report_name / "provenance.json", {"settings": "Looked at before."})
     out = where / "models" / variant.key
-    package(data, params, variant, describe_base(Path("llama")), out)
+    package(data, params, variant, Base.of(Path("llama")), out)
     return Made(out, videos, questions, predictions, classified, params, variant)
 
 

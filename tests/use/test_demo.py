@@ -27,7 +27,7 @@ from pipeline.scenes.recipe import load_recipes
 from pipeline.use.demo import MOST_TOUCHES, Asked, Session, Turn, make_app, where
 from pipeline.use.model import Octopi
 from pipeline.use.results import Exchange
-from pipeline.use.worker import Failed
+from pipeline.use.server import Failed
 from pipeline.videos.catalogue import Catalogue
 from tests.conftest import HUNG, ROOT
 from tests.use.browser import tab

@@ -15,9 +15,9 @@ import yaml
 
 from pipeline.core.io import load_tensors, read_table, save_tensors, write_table
 from pipeline.core.records import TENSOR, TENSOR_FILE, Classification, Probe
-from pipeline.use.folder import FORMAT, read_folder
+from pipeline.use.folder import FORMAT, Base, read_folder
 from pipeline.use.model import Octopi
-from pipeline.use.package import describe_base, export, package
+from pipeline.use.package import export, package
 from pipeline.videos.frames.store import PROBES_FILE
 from tests.checkpoints import write_llama
 from tests.closure import ROOT
@@ -77,7 +77,7 @@ def test_inputs_that_are_equal_give_equal_bytes(
     place = shutil.copytree(made.folder.parents[1], tmp_path / "again")
     monkeypatch.chdir(place)
     change(Path("data"))
-    package(Path("data"), made.params, made.variant, describe_base(Path("llama")), place / "models" / "new")
+    package(Path("data"), made.params, made.variant, Base.of(Path("llama")), place / "models" / "new")
     assert files_of(place / "models" / "new") == files_of(made.folder)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from pipeline.use.serve import make_app
-from pipeline.use.worker import Failed
+from pipeline.use.server import Failed
 from pipeline.videos.decoding import decode
 from tests.closure import ROOT, imported
 from tests.conftest import deaf_port

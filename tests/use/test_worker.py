@@ -14,14 +14,14 @@ import pytest
 from pipeline.core.errors import UserError
 from pipeline.language.generate import Stream
 from pipeline.use.model import Octopi
-from pipeline.use.worker import Failed, Job, Worker
+from pipeline.use.server import Failed, Worker
 from tests.conftest import HUNG
 
 QUESTIONS = (("Describe this. {tactile}", 1, None), ("Is it soft?", 1, 3), ("Which is softer?", 2, 20), ("Why?", 3, 1))
 
 
 async def everything(pieces: AsyncGenerator[Any]) -> str:
-    return "".join([piece async for piece in pieces])
+    return "".join([piece async for piece in pieces]).strip()
 
 
 @pytest.fixture
@@ -65,14 +65,12 @@ def test_what_waits_is_one_batch_and_each_answer_is_the_one_given_alone(
         await anext(halfway)
         await halfway.aclose()
         failed = await asyncio.gather(everything(refused), everything(broken), return_exceptions=True)
-        found = [await first, failed, [text.strip() for text in await asyncio.gather(*whole)]]
+        found = [await first, *map(type, failed), await asyncio.gather(*whole)]
         await asyncio.to_thread(worker.stop)
         return [*found, worker.answers]
 
-    first, (refused, broken), answered, count = asyncio.run(ask())
-    assert first == "True"
-    assert isinstance(refused, UserError)
-    assert isinstance(broken, Failed)
+    *failed, answered, count = asyncio.run(ask())
+    assert failed == ["True", UserError, Failed]
     assert answered == [text.strip() for text in alone]
     assert batches[-1] == len(QUESTIONS) + 1
     assert count - 1 - len(QUESTIONS) in (0, 1), "the one that is given up may have been at its end"
@@ -89,27 +87,36 @@ def test_a_batch_that_breaks_fails_each_of_its_questions(
         monkeypatch.undo()
         after = await everything(worker.answer(lambda: octopi.stream("Why?", files[:1])))
         await asyncio.to_thread(worker.stop)
-        return [*found, after.strip()]
+        return [*map(type, found), after]
 
     monkeypatch.setattr("pipeline.language.generate.greedy_tokens", lambda *_: iter([1 / 0]))
-    *failed, after = asyncio.run(ask())
-    assert [type(error) for error in failed] == [Failed] * 3
-    assert after == octopi.ask("Why?", files[:1])
+    assert asyncio.run(ask()) == [Failed] * 3 + [octopi.ask("Why?", files[:1]).strip()]
+
+
+class LeavesAtTheLast:
+    """Pieces of two answers; who asked for the first leaves once its last piece has come."""
+
+    def __init__(self, leaves: threading.Event) -> None:
+        self.leaves = leaves
+
+    def together(self, streams: Sequence[Any], left: Collection[int]) -> Iterator[tuple[int, str | None]]:
+        yield 0, "last"
+        assert self.leaves.wait(HUNG)
+        yield from [(0, None), (1, "one"), (1, None)]
 
 
 def test_who_leaves_at_the_last_piece_leaves_the_others_their_answers() -> None:
-    said: dict[int, list[Any]] = {0: [], 1: []}
-    leaves = threading.Event()
+    async def ask() -> tuple[str, int]:
+        worker, leaves, gate = Worker(), threading.Event(), threading.Event()
+        blocker = worker.answer(lambda: [gate.wait(HUNG)])  # Until both wait, so that they are one batch.
+        gone, stays = (worker.answer(lambda: LeavesAtTheLast(leaves)) for _ in range(2))
+        gate.set()
+        assert await anext(blocker)
+        assert await anext(gone) == "last"
+        await gone.aclose()
+        leaves.set()
+        said = await everything(stays)
+        await asyncio.to_thread(worker.stop)
+        return said, worker.answers
 
-    class Pieces:
-        @staticmethod
-        def together(streams: Sequence[Pieces], left: Collection[int]) -> Iterator[tuple[int, str | None]]:
-            leaves.set()
-            yield from [(0, "last"), (0, None), (1, "one"), (1, None)]
-
-    jobs = [Job(Pieces, lambda: None, said[n].append, event) for n, event in enumerate((leaves, threading.Event()))]
-    worker = Worker()
-    worker._answer(jobs)
-    worker.stop()
-    assert said[1] == ["one", None]
-    assert worker.answers == 1
+    assert asyncio.run(ask())[0] == "one"
