@@ -5,16 +5,16 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 from pipeline.cli import app, main
 from pipeline.core import runtime
 from pipeline.use import ask as asking
-from pipeline.use import model as model_code
-from pipeline.use.ask import Chat, describe_folder
+from pipeline.use.ask import Chat, describe_folder, videos_of
 from pipeline.use.model import Octopi
 from tests.conftest import not_utf8, refused
 from tests.report.shared import rows_of
@@ -22,6 +22,20 @@ from tests.use.shared import Made
 
 QUESTION = "Describe {tactile}."
 OWN = "mug: hard, smooth, no bumps; rug: soft, rough, no bumps"
+Command = Callable[..., Result]
+
+
+@pytest.fixture
+def by_command(octopi: Octopi, monkeypatch: pytest.MonkeyPatch) -> Command:
+    """`octopi WORDS...` with the model that is loaded already."""
+    monkeypatch.setattr("pipeline.cli._load", lambda *_: octopi)
+
+    def run(*words: object, typed: str = "", status: int = 0) -> Result:
+        found = CliRunner().invoke(app, [str(word) for word in words], input=typed)
+        assert found.exit_code == status, found.output
+        return found
+
+    return run
 
 
 def test_an_answer_for_machines_however_long_it_takes(
@@ -42,19 +56,16 @@ def test_an_answer_for_machines_however_long_it_takes(
     assert (said.out, said.err) == ("", "work: piece 1 of 1, 0 s left\n")
 
 
-def test_a_question_may_be_longer_than_a_files_name(made: Made, octopi: Octopi, files: list[Path]) -> None:
+def test_a_question_may_be_longer_than_a_files_name(by_command: Command, octopi: Octopi, files: list[Path]) -> None:
     question = "Which is it? " * 20
-    said = CliRunner().invoke(app, ["ask", question, str(files[0]), "--model", str(made.folder), "--device", "cpu"])
-    assert said.exit_code == 0, said.output
+    said = by_command("ask", question, files[0])
     assert said.stdout == octopi.ask(question, files[:1]) + "\n"
     assert "compares, but there is one video" in said.stderr
     assert octopi.doubts_about(question, 2) == octopi.doubts_about("Describe it.", 1) == octopi.doubts
 
 
-def test_a_chat_from_standard_input(made: Made, octopi: Octopi, files: list[Path]) -> None:
-    typed = f"/add {files[0]}\n{QUESTION}\n/quit\n"
-    said = CliRunner().invoke(app, ["ask", "--model", str(made.folder), "--device", "cpu"], input=typed)
-    assert said.exit_code == 0, said.output
+def test_a_chat_from_standard_input(by_command: Command, octopi: Octopi, files: list[Path]) -> None:
+    said = by_command("ask", typed=f"/add {files[0]}\n{QUESTION}\n/quit\n")
     assert octopi.ask(QUESTION, files[:1]) in said.stdout
 
 
@@ -94,14 +105,6 @@ def test_a_stopped_answer_is_forgotten(octopi: Octopi, monkeypatch: pytest.Monke
     assert "stopped" in said[0]
 
 
-def test_a_folder_without_videos_is_refused(octopi: Octopi, tmp_path: Path) -> None:
-    with refused("no such file or folder"):
-        describe_folder(octopi, [tmp_path / "nothing"], tmp_path / "out.csv")
-    (tmp_path / "empty").mkdir()
-    with refused("holds no video"):
-        describe_folder(octopi, [tmp_path / "empty"], tmp_path / "out.csv")
-
-
 @pytest.fixture
 def folder(files: list[Path], tmp_path: Path) -> Path:
     place = tmp_path / "videos" / "a,  b"
@@ -113,6 +116,13 @@ def folder(files: list[Path], tmp_path: Path) -> Path:
     (place / "gone.mov").symlink_to(place / "nowhere.mov")
     (place.parent / "linked").symlink_to(place)
     return place.parent
+
+
+def test_what_holds_no_video_is_refused(tmp_path: Path) -> None:
+    with refused("no such file or folder"):
+        videos_of([tmp_path / "nothing"])
+    with refused("holds no video"):
+        videos_of([tmp_path])
 
 
 def test_a_folder_is_described(
@@ -146,57 +156,43 @@ def test_names_that_are_no_text_are_described_once(
     assert describe_folder(octopi, [folder], out) == (5, 2), "one is broken, one a dead link"
 
 
-def test_a_folder_is_described_and_a_model_copied_by_command(
-    made: Made, octopi: Octopi, folder: Path, files: list[Path], tmp_path: Path
-) -> None:
-    out, model = tmp_path / "out.csv", ["--model", str(made.folder), "--device", "cpu"]
-    said = CliRunner().invoke(app, ["describe", str(folder), "--csv", str(out), *model])
-    assert said.exit_code == 0, said.output
-    assert f"{out}: 5 videos, 2 of them not described" in said.stdout
-    alone = tmp_path / "alone.csv"
-    assert CliRunner().invoke(app, ["describe", str(files[0]), "--csv", str(alone), *model]).exit_code == 0
+def test_described_by_command(by_command: Command, folder: Path, files: list[Path], tmp_path: Path) -> None:
+    out, alone = tmp_path / "out.csv", tmp_path / "alone.csv"
+    assert f"{out}: 5 videos, 2 of them not described" in by_command("describe", folder, "--csv", out).stdout
+    by_command("describe", files[0], "--csv", alone)
     assert [row["file"] for row in rows_of(alone)] == [files[0].name]
-    assert CliRunner().invoke(app, ["export", str(made.folder), str(tmp_path / "copy"), "--with-base"]).exit_code == 0
-    copied = Octopi.from_pretrained(tmp_path / "copy", device="cpu")
-    assert copied.ask(QUESTION, files[:1]) == octopi.ask(QUESTION, files[:1])
     (broken := tmp_path / "broken.avi").touch()
-    for given in ([str(broken)], [str(broken), str(broken), "--csv", str(tmp_path / "broken.csv")]):
-        assert CliRunner().invoke(app, ["describe", *given, *model]).exit_code == 1
+    for given in ([broken], [broken, broken, "--csv", tmp_path / "broken.csv"]):
+        by_command("describe", *given, status=1)
 
 
-def test_videos_described_compared_ranked_and_matched_by_command(
-    made: Made, octopi: Octopi, files: list[Path], monkeypatch: pytest.MonkeyPatch
+def test_described_compared_ranked_and_matched_by_command(
+    by_command: Command, octopi: Octopi, files: list[Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each as the call of the same name, and what makes one doubt it on stderr, once."""
-    monkeypatch.setattr(model_code, "is_tiny", lambda _: True)
+    monkeypatch.setattr(octopi, "doubts", ("no answer means anything",))
 
-    def said(*words: str) -> str:
-        found = CliRunner().invoke(app, [*words, "--model", str(made.folder), "--device", "cpu"])
-        assert found.exit_code == 0, found.output
-        assert found.stderr.count("tiny and random") == 1
+    def said(*words: object) -> str:
+        found = by_command(*words)
+        assert found.stderr.count("no answer means anything") == 1
         return found.stdout
 
     one, two, three = map(str, files)
+    known = octopi.describe(one)
     table = said("describe", one)
-    level, *_ = (known := octopi.describe(one)).levels.values()
-    for word in (files[0].name, *known.levels, level, f"({max(known.probabilities['hardness'].values()):.0%})"):
+    shares = (f"({max(found.values()):.0%})" for found in known.probabilities.values())
+    for word in (files[0].name, *known.levels, *known.levels.values(), *shares, "in words"):
         assert word in table
-    assert "in words" in said("describe", one, two, str(files[2].parent))
     assert said("compare", one, two, "hardness") == octopi.compare(one, two, "hardness").answer + "\n"
     ranked = octopi.rank([three, one, two], "roughness")
     scale, *lines, answer = said("rank", "roughness", three, one, two).rstrip("\n").split("\n")
     assert [line.split("  ")[1] for line in lines] == [[three, one, two][i] for i in ranked.order]
     assert answer == ranked.answer
     assert scale.endswith("0 smooth, 1 slightly rough, 2 rough")
-    folder = said("rank", "roughness", str(files[0].parent)).splitlines()[1:]
+    folder = said("rank", "roughness", files[0].parent).splitlines()[1:]
     assert {Path(line.split("  ")[1]) for line in folder} == set(files[0].parent.iterdir())
-    names = "rug, a fuzzy rug" if "rug" not in octopi.catalogue.objects else "rug, millet"
-    ids = [name.strip() for name in names.split(",")]
     own = {"mug": ["hard", "smooth", "no bumps"], "rug": ["soft", "rough", "no bumps"]}
-    for named, given in (
-        (names, ids),
-        (OWN, own),
-    ):
+    for named, given in (("rug, millet", ["rug", "millet"]), (OWN, own)):
         matched = octopi.match([one, two], given)
         *lines, answer = said("match", one, two, "--names", named).rstrip("\n").split("\n")
         assert answer == matched.answer
@@ -210,7 +206,7 @@ def test_a_killed_description_goes_on(
     whole, out = tmp_path / "whole.csv", tmp_path / "out.csv"
     describe_folder(octopi, [folder], whole)
     text = whole.read_text()
-    for end in (0, 5, len(text) // 2, len(text) - 1, len(text)):
+    for end in (0, 5, len(text) // 2, len(text) - 1):
         out.write_text(text[:end])
         looked: list[object] = []
         real = octopi.describe_all
@@ -224,19 +220,19 @@ def test_a_killed_description_goes_on(
 
 @pytest.mark.parametrize(
     "content",
-    [b"", b"my only notes", b"file,object\n", b"a,b\n1,2\n", "file;größe\n".encode("utf-16")],
-    ids=["another training's", "notes", "begun alike", "a table", "utf-16"],
+    [b"", b"my only notes", b"file,object\n", "file;größe\n".encode("utf-16")],
+    ids=["another training's", "notes", "begun alike", "utf-16"],
 )
 def test_what_another_model_or_somebody_else_wrote_stays(
-    content: bytes, octopi: Octopi, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    content: bytes, octopi: Octopi, files: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "notes.txt"
     if content:
         out.write_bytes(content)
     else:
-        describe_folder(octopi, [folder], out)
+        describe_folder(octopi, files[:1], out)
         content = out.read_bytes()
         monkeypatch.setattr(octopi, "config", octopi.config.model_copy(update={"files": {}}))
     with refused("is no description by finetuned-with-all-0.*name another file with --csv"):
-        describe_folder(octopi, [folder], out)
+        describe_folder(octopi, files[:1], out)
     assert out.read_bytes() == content
