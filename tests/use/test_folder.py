@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import json
+import runpy
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from typer.testing import CliRunner
 
+from pipeline.cli import app
 from pipeline.core.io import load_tensors, read_table, save_tensors, write_table
 from pipeline.core.records import TENSOR, TENSOR_FILE, Classification, Probe
 from pipeline.use.folder import FORMAT, Base, read_folder
@@ -38,11 +39,8 @@ def llama(made: Made) -> Path:
     return made.folder.parents[1] / "llama"
 
 
-def test_holds_safetensors_and_text_alone(made: Made) -> None:
+def test_it_holds_safetensors_and_text_alone_and_a_card(made: Made) -> None:
     assert {Path(name).suffix for name in files_of(made.folder)} <= {".json", ".safetensors", ".md"}
-
-
-def test_the_card_says_what_it_stands_on(made: Made) -> None:
     text = (made.folder / "README.md").read_text()
     assert "| test objects | Looked at before. |" in text, "what the report knows of them"
     front = yaml.safe_load(text.split("---\n")[1])
@@ -81,21 +79,22 @@ def test_inputs_that_are_equal_give_equal_bytes(
     assert files_of(place / "models" / "new") == files_of(made.folder)
 
 
-@pytest.mark.parametrize(("overrides", "made_too"), [([], []), (["packaged=all"], ["finetuned-with-none-0"])])
 def test_the_stage_packages_the_full_system_and_the_others_on_demand(
-    overrides: list[str], made_too: list[str], made: Made, tmp_path: Path
+    made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each folder holds the whole encoder, and the chain trains eight variants."""
     shutil.copytree(made.folder.parents[1], tmp_path, dirs_exist_ok=True, ignore=shutil.ignore_patterns("models"))
     trained = made.folder.parents[1] / "data" / "models" / "with"
     shutil.copytree(trained, tmp_path / "data" / "models" / "with")
     shutil.copytree(trained / "finetuned-all-0", tmp_path / "data" / "models" / "with" / "finetuned-none-0")
-    lists = ["ablation.encoders=[finetuned]", "ablation.lora=[with]", "ablation.opd=[none,all]"]
-    values = fake_params(*lists, *overrides).model_dump(mode="json")
-    values |= {name: made.params.model_dump(mode="json")[name] for name in ("frames", "encoder", "language")}
-    (tmp_path / "params.yaml").write_text(yaml.safe_dump(values))
-    subprocess.run([sys.executable, ROOT / "stages" / "package.py"], cwd=tmp_path, check=True, timeout=300)
-    assert sorted(f.name for f in (tmp_path / "models").iterdir()) == sorted([made.variant.key, *made_too])
+    monkeypatch.chdir(tmp_path)
+    for overrides, made_too in (([], []), (["packaged=all"], ["finetuned-with-none-0"])):
+        lists = ["ablation.encoders=[finetuned]", "ablation.lora=[with]", "ablation.opd=[none,all]"]
+        values = fake_params(*lists, *overrides).model_dump(mode="json")
+        values |= {name: made.params.model_dump(mode="json")[name] for name in ("frames", "encoder", "language")}
+        (tmp_path / "params.yaml").write_text(yaml.safe_dump(values))
+        runpy.run_path(str(ROOT / "stages" / "package.py"), run_name="__main__")
+        assert sorted(f.name for f in (tmp_path / "models").iterdir()) == sorted([made.variant.key, *made_too])
 
 
 def test_export_with_its_base_needs_nothing_else(made: Made, copy: Path, files: list[Path], tmp_path: Path) -> None:
@@ -103,7 +102,8 @@ def test_export_with_its_base_needs_nothing_else(made: Made, copy: Path, files: 
     expected = Octopi.from_pretrained(made.folder).ask(*question)
     with refused(r"language model llama is not there .*--base"):
         Octopi.from_pretrained(copy)
-    export(made.folder, tmp_path / "whole", with_base=True)
+    command = ["export", str(made.folder), str(tmp_path / "whole"), "--with-base"]
+    assert CliRunner().invoke(app, command).exit_code == 0
     assert Octopi.from_pretrained(tmp_path / "whole").ask(*question) == expected
     with refused("is there already"):
         export(made.folder, tmp_path / "whole")
@@ -127,16 +127,12 @@ def test_another_chat_format_is_refused(copy: Path, llama: Path, tmp_path: Path)
         Octopi.from_pretrained(copy, base=other)
 
 
-def change(file: Path, **values: object) -> None:
-    file.write_text(json.dumps(json.loads(file.read_text()) | values))
-
-
 def test_another_version_and_other_frames_are_refused(copy: Path, llama: Path) -> None:
-    frames = json.loads((copy / "config.json").read_text())["frames"]
-    change(copy / "config.json", frames=frames | {"per_video": 4})
+    told = json.loads((copy / "config.json").read_text())
+    (copy / "config.json").write_text(json.dumps({**told, "frames": {**told["frames"], "per_video": 4}}))
     with refused("frame settings are not those of training"):
         Octopi.from_pretrained(copy, base=llama)
-    change(copy / "config.json", format=FORMAT + 1)
+    (copy / "config.json").write_text(json.dumps({**told, "format": FORMAT + 1}))
     with refused(f"of format {FORMAT + 1}, but this version reads {FORMAT}"):
         Octopi.from_pretrained(copy)
 
