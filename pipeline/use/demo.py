@@ -40,7 +40,6 @@ if TYPE_CHECKING:
 PAGE = Path(__file__).with_name("page")
 HOSTS = ["127.0.0.1", "localhost"]
 """Names that the page answers to, so that no other site's name can be pointed at it."""
-POLICY = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'"
 MOST_BYTES, MOST_TOUCHES = 200_000_000, 30
 """Of one video; and touches that are remembered, the last ones."""
 SCENE, SCENE_FRAMES = ScenesConfig(), 60
@@ -175,12 +174,6 @@ def make_app(session: Session) -> FastAPI:
 
     app = FastAPI(lifespan=life, openapi_url=None)  # Its documentation page would load scripts from elsewhere.
     app.add_middleware(TrustedHostMiddleware, allowed_hosts=HOSTS)
-
-    @app.middleware("http")
-    async def guard(request: Request, answer: Callable[[Request], Any]) -> Response:
-        response: Response = await answer(request)
-        response.headers["Content-Security-Policy"] = POLICY
-        return response
 
     @app.exception_handler(UserError)
     async def refuse(_: Request, error: UserError) -> Response:

@@ -1,4 +1,4 @@
-"""`octopi serve` on a real socket: many clients, slow ones, rude ones, and its end."""
+"""`octopi serve` on a real socket: many clients, slow ones, rude ones, and its end; and the demo's command."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from typing import Any
 
 import httpx2
@@ -21,9 +22,11 @@ import pytest
 from pipeline.use import serve, server
 from pipeline.use.media import Limits
 from pipeline.use.serve import make_app
+from pipeline.videos.catalogue import load_catalogue
 from tests.closure import ROOT
 from tests.conftest import HUNG, wait_until_ended
 from tests.use.fake import CHAT, FakeOctopi, body, digest, events, part, running, said, text, user
+from tests.use.shared import Made
 from tests.use.videos import video
 
 
@@ -193,3 +196,26 @@ def test_no_checking_process_outlives_a_killed_server() -> None:
         children = psutil.Process(process.pid).children()
     assert len(children) == 1
     wait_until_ended(children)
+
+
+def test_the_demo_is_shown_until_it_is_interrupted(made: Made) -> None:
+    octopi, catalogue = Path(sys.executable).with_name("octopi"), ROOT / "pipeline" / "physiclear"
+    process = subprocess.Popen(
+        [octopi, "demo", str(made.folder), "--device", "cpu", "--port", "0", "--catalogue", str(catalogue)],
+        cwd=made.folder.parents[1],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        text=True,
+        # What a shell starts in the background ignores it, and so would what is started here.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    try:
+        assert process.stdout is not None
+        address, _, rest = process.stdout.readline().partition(" ")
+        assert rest == "shows the demo; Ctrl-C ends it\n"
+        about = httpx2.get(f"{address}/api/about", timeout=HUNG).json()
+        assert about["model"] == "finetuned-with-all-0"
+        assert len(about["scenes"]) == len(load_catalogue(catalogue).objects)
+    finally:
+        process.send_signal(signal.SIGINT)
+    assert process.wait(HUNG) == 0
