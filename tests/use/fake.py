@@ -103,7 +103,7 @@ class FakeOctopi:
 @contextmanager
 def running(app: Any) -> Iterator[int]:
     """A server of an application in a thread; its port."""
-    with listen("127.0.0.1", 0, "") as listening:
+    with listen("127.0.0.1", 0) as listening:
         there = make_server(app)
         thread = threading.Thread(target=there.run, kwargs={"sockets": [listening]})
         thread.start()

@@ -7,6 +7,8 @@ import runpy
 import shlex
 from pathlib import Path
 
+import nbclient
+import nbformat
 import pandas as pd
 import pytest
 
@@ -64,8 +66,6 @@ def test_the_script_runs(made: Made, monkeypatch: pytest.MonkeyPatch, capsys: py
 
 def test_the_notebook_runs(made: Made) -> None:
     """With the paths of a tiny model in place of its own."""
-    nbformat = pytest.importorskip("nbformat", reason="needs nbclient: pip install -e '.[dev]'")
-    nbclient = pytest.importorskip("nbclient", reason="needs nbclient: pip install -e '.[dev]'")
     notebook = nbformat.read(EXAMPLES / "touch.ipynb", as_version=4)
     nbformat.validate(notebook)
     cells = [cell for cell in notebook.cells if cell.cell_type == "code"]

@@ -13,17 +13,14 @@ from pathlib import Path
 
 import av
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from pipeline.config import FramesConfig
-from pipeline.core.errors import UserError
 from pipeline.use.frames import prepare_video
-from pipeline.use.media import Gate, Limits, Refused, from_base64
+from pipeline.use.media import Gate, Limits, from_base64
 from pipeline.videos.decoding import SUFFIXES, Decoder
 from pipeline.videos.files import video_files
 from tests.closure import ROOT
-from tests.conftest import HUNG
+from tests.conftest import HUNG, refused
 from tests.use.videos import avi_of_giant_jpegs, blank, claims_frames, claims_pixels, video
 
 FRAMES = FramesConfig(pixels=32)
@@ -35,26 +32,19 @@ def gate() -> object:
         yield gate
 
 
-@given(st.binary(min_size=1))
-def test_base64_comes_back_with_and_without_a_head(data: bytes) -> None:
+def test_base64_comes_back_with_and_without_a_head_and_nothing_else_does() -> None:
+    data = bytes(range(256))
     text = base64.b64encode(data).decode()
-    assert from_base64(text) == from_base64(f"data:video/mp4;base64,{text}") == data
-    assert from_base64(f"data:;base64,{text}") == from_base64(f"data:video/mp4;codecs=avc1;base64,{text}") == data
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
+    for head in ("", "data:video/mp4;base64,", "data:;base64,", "data:video/mp4;codecs=avc1;base64,"):
+        assert from_base64(head + text) == data
+    for bad in (
         *("", "data:video/mp4;base64,", "data:video/mp4;base64,AAA", "data:video/mp4;base64,AA AA", "AA\nAA", "ä"),
         *("file:///etc/passwd", "/etc/passwd", "http://127.0.0.1/a.mp4", "C:\\a.mov", "data:video/mp4,AAAA", "-_-_"),
         *("DATA:video/mp4;base64,AAAA", "concat:a|b", "pipe:0"),
-    ],
-)
-def test_paths_addresses_and_broken_base64_are_refused(text: str) -> None:
-    with pytest.raises(Refused) as refused:
-        from_base64(text)
-    assert refused.value.status == 422
-    assert "\n" not in str(refused.value)
+    ):
+        with refused("^video: ") as error:
+            from_base64(bad)
+        assert error.value.status == 422
 
 
 CODECS = {".avi": "mjpeg", ".mjpg": "mjpeg", ".mkv": "ffv1", ".webm": "libvpx"}
@@ -67,7 +57,7 @@ def test_a_video_is_one_for_the_server_for_ask_and_in_a_folder(gate: Gate, suffi
     for path in (named, other):
         path.write_bytes(videos[0])
     assert video_files(tmp_path)[0] == [named]
-    with pytest.raises(UserError, match="no video by its name"):
+    with refused("no video by its name"):
         prepare_video(other, FRAMES, subtracts=False, quiet=0)
     asked = prepare_video(named, FRAMES, subtracts=False, quiet=0)
     with gate.files(videos) as paths:
@@ -94,11 +84,10 @@ def test_a_video_is_one_for_the_server_for_ask_and_in_a_folder(gate: Gate, suffi
     ],
 )
 def test_bombs_and_what_is_no_video(gate: Gate, data: Callable[[], bytes], status: int, words: str) -> None:
-    with pytest.raises(Refused, match=words) as refused, gate.files([data()]):
+    with refused(f"^video 1: .*({words})") as error, gate.files([data()]):
         pass
-    assert refused.value.status == status
-    assert str(refused.value).startswith("video 1: ")
-    assert "/tmp" not in str(refused.value)
+    assert error.value.status == status
+    assert "/tmp" not in str(error.value)
     with gate.files([video()]):
         pass
 
@@ -113,35 +102,28 @@ def test_a_playlist_cannot_read_another_file(gate: Gate, tmp_path: Path) -> None
     other = tmp_path / "secret.mp4"
     hls = f"#EXTM3U\n#EXT-X-TARGETDURATION:10\n#EXTINF:10,\n{other}\n#EXT-X-ENDLIST\n"
     for text in (hls, f"ffconcat version 1.0\nfile {other}\n"):
-        with pytest.raises(Refused, match="no video"), gate.files([text.encode()]):
+        with refused("no video"), gate.files([text.encode()]):
             pass
 
 
 def test_too_many_videos_cost_no_check() -> None:
     gate = Gate(Limits(videos=2))
-    with pytest.raises(Refused, match="3 videos"), gate.files([b"x"] * 3):
+    with refused("3 videos"), gate.files([b"x"] * 3):
         pass
     assert gate._checker is None
 
 
-def test_a_checker_that_dies_is_replaced(gate: Gate) -> None:
-    for _ in range(2):
-        with gate.files([video()]):
-            assert gate._checker is not None
-            gate._checker.kill()
-            gate._checker.wait()
-    with gate.files([video()]):
-        pass
-
-
-def test_time_is_limited(tmp_path: Path) -> None:
+def test_a_checker_that_dies_or_takes_too_long_is_replaced(tmp_path: Path) -> None:
     """A pipe that nobody writes to takes for ever to open, as a decoder may take."""
     os.mkfifo(tmp_path / "endless.mov")
     with closing(Gate(Limits(check_seconds=1))) as gate:
-        with pytest.raises(Refused, match="too long") as refused:
+        with refused("too long") as error:
             gate._check(tmp_path / "endless.mov", "video 1")
-        assert refused.value.status == 413
+        assert error.value.status == 413
         gate.limits = Limits(check_seconds=int(HUNG))  # Of the next process.
+        with gate.files([video()]):
+            gate._checker.kill()
+            gate._checker.wait()
         with gate.files([video()]):
             pass
 

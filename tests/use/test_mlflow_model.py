@@ -68,7 +68,6 @@ def test_what_is_logged_says_what_it_is(logged: Logged, loaded: Any, made: Made)
     needs = Path(mlflow.artifacts.download_artifacts(f"{logged.address}/requirements.txt")).read_text().splitlines()
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
     assert {line.partition("==")[0] for line in needs} == {re.split(r"[^\w.-]", line)[0] for line in declared}
-    assert all("==" in line and "+" not in line and "@" not in line for line in needs)
 
 
 FRESH = """
@@ -114,37 +113,27 @@ def test_over_http_answers_are_those_of_the_library(
     asked = [{"question": q, "videos": [encoded(f) for f in of]} for q, of in used]
     answers = ask(client, *asked)
     assert answers.json() == {"predictions": [{"answer": octopi.ask(q, of)} for q, of in used]}
-    with monkeypatch.context() as patch:
-        patch.setattr(loaded.unwrap_python_model().model, "ask", lambda *_: 1 / 0)
-        broken = ask(client, asked[0])
+    monkeypatch.setattr(loaded.unwrap_python_model().model, "ask", lambda *_: 1 / 0)
+    broken = ask(client, asked[0])
     assert broken.status_code == 500
     assert "row 1: the model broke" in broken.text
     assert "Traceback" not in broken.text
     assert "ZeroDivision" not in broken.text
-    assert ask(client, asked[0]).status_code == 200
 
 
-@pytest.mark.parametrize(
-    ("question", "videos", "words"),
-    [
-        ("{tactile}", ["/etc/passwd"], "row 2: video 1: broken base64"),
-        ("{tactile}", [base64.b64encode(b"no video").decode()], "row 2: video 1: no video"),
-        ("{tactile} and no video", [], "row 2: the question has 1 {tactile} for 0 videos"),
-        (None, [], "row 2: its question is no text of at most 20000 characters"),
-        ("a" * 20_001, [], "row 2: its question is no text of at most 20000 characters"),
-    ],
-)
-def test_bad_rows_are_400(client: TestClient, files: list[Path], question: Any, videos: list[str], words: str) -> None:
+def test_bad_rows_and_tables_are_400(client: TestClient, files: list[Path]) -> None:
     good = {"question": QUESTIONS[0], "videos": [encoded(files[0])]}
-    bad = ask(client, good, {"question": question, "videos": videos})
-    assert bad.status_code == 400
-    assert words in bad.text
-    assert "Traceback" not in bad.text
-    assert "octopi-" not in bad.text, "the folder of the videos"
-
-
-def test_bad_tables_are_400(client: TestClient) -> None:
-    for rows, words in (([{"question": "a", "videos": []}] * 65, "at most 64"), ([{"question": "a"}], "videos")):
+    for rows, words in (
+        ([good, {"question": "{tactile}", "videos": ["/etc/passwd"]}], "row 2: video 1: broken base64"),
+        ([good, {"question": "{tactile}", "videos": ["bm8gdmlkZW8="]}], "row 2: video 1: no video"),
+        ([{"question": "{tactile}?", "videos": []}], "row 1: the question has 1 {tactile} for 0 videos"),
+        ([{"question": None, "videos": []}], "row 1: its question is no text of at most 20000 characters"),
+        ([{"question": "a" * 20_001, "videos": []}], "row 1: its question is no text of at most 20000 characters"),
+        ([{"question": "a", "videos": []}] * 65, "at most 64"),
+        ([{"question": "a"}], "videos"),
+    ):
         bad = ask(client, *rows)
         assert bad.status_code == 400
         assert words in bad.text
+        assert "Traceback" not in bad.text
+        assert "octopi-" not in bad.text, "the folder of the videos"
