@@ -97,7 +97,11 @@ class Session:
         return file
 
     def show(self, name: str, video: Path) -> dict[str, Any]:
-        """Let the model feel a video, which is a UserError where it cannot; everything about it that the page draws."""
+        """Encode and classify a video, and give all that the page draws of it.
+
+        Raises:
+            UserError: for a video that the model cannot use.
+        """
         touch, said = self.model.look(video), self.model.describe(video, sentence=False)
         key = uuid4().hex
         self.videos[key] = video

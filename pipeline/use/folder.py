@@ -113,7 +113,7 @@ def read_folder(folder: Path) -> tuple[ModelConfig, Catalogue]:
     """
     if not (folder / CONFIG).is_file():
         raise UserError(f"{folder}: holds no {CONFIG}, so it is no trained model; `dvc repro package` makes models/")
-    values = _json(folder / CONFIG)
+    values = _read(folder / CONFIG)
     version = values.get("format") if isinstance(values, dict) else None
     if version != FORMAT:
         raise UserError(
@@ -129,7 +129,7 @@ def read_folder(folder: Path) -> tuple[ModelConfig, Catalogue]:
             raise UserError(f"{file}: is missing; copy the whole folder again")
         if sha256(file) != expected:
             raise UserError(f"{file}: differs from what {CONFIG} says; copy the whole folder again")
-    return config, _validate(Catalogue, _json(folder / CATALOGUE), folder / CATALOGUE)
+    return config, _validate(Catalogue, _read(folder / CATALOGUE), folder / CATALOGUE)
 
 
 def find_base(folder: Path, base: Base, given: Path | None = None) -> Path:
@@ -177,10 +177,10 @@ def distance(standardised: npt.NDArray[np.float64]) -> float:
     return float(np.sqrt(np.square(standardised.mean(axis=0)).mean()))
 
 
-def _json(file: Path) -> Any:
+def _read(file: Path) -> Any:
     try:
         return read_json(file)
-    except UserError:
+    except UserError:  # Its mend is the chain's, which a folder that was copied here knows nothing of.
         raise UserError(f"{file}: missing, or not JSON; copy the whole folder again") from None
 
 

@@ -62,11 +62,14 @@ def watch(camera: str) -> Iterator[Shot]:
 def presses(shots: Iterable[Shot], times: float = FOUND) -> Iterator[list[Shot]]:
     """Each press as soon as it ends, with up to `LONGEST` untouched pictures in front, which the model compares it to.
 
-    A press begins where the contact strength is `times` the quiet level, and ends under `RELEASED` of that for as many
-    pictures as it needs at least. It is measured against the mean of pictures that are a little older than the last
-    ones: so the untouched picture follows a slow change of light, and the beginning of a press has no part in it. It
-    follows a press too that takes seconds to deepen; what is then found is the release, which shows by its detail and
-    is left out.
+    A press begins where the contact strength is more than `times` the quiet level (the median of untouched pictures),
+    and ends when it has stayed under `RELEASED` of that for `SHORTEST` pictures. The strength is measured against the
+    mean of pictures a little older than the last ones, so that a slow change of light counts as untouched and the
+    beginning of a press has no part in the mean. A press that deepens over seconds passes as such a change, too; then
+    its release looks like a press. `starts_touching` knows a release by the detail of its pictures; it is left out.
+
+    Raises:
+        UserError: as `shots` raises it, after the press that had begun.
     """
     before = deque[tuple[Shot, np.ndarray]](maxlen=2 * LONGEST)
     quiet = deque[float](maxlen=QUIET)

@@ -8,7 +8,7 @@ import random
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import torch
@@ -47,16 +47,15 @@ logger = logging.getLogger(__name__)
 
 
 class Octopi:
-    """A model that feels: `Octopi.from_pretrained("models/finetuned-with-all-0").ask("...{tactile}...", ["a.mov"])`.
+    """A trained model: `Octopi.from_pretrained("models/finetuned-with-all-0").ask("...{tactile}...", ["a.mov"])`.
 
     It remembers no conversation: the caller hands the earlier exchanges in. One call at a time.
 
     Attributes:
         folder: That it was loaded from.
         name: Of the folder that is shipped, else the variant's.
-        card: What the folder's config.json says.
+        config: What the folder's config.json says.
         properties: The catalogue's properties.
-        names: The names of the catalogue's objects.
         numbered: Whether training called objects "object 1" and the like alone; then it copies no other name.
         doubts: What should make one doubt every answer; empty for a model that was trained from real weights.
     """
@@ -67,10 +66,9 @@ class Octopi:
         self.folder, self.config, self.catalogue = folder, config, catalogue
         self.name = SHIPPED.name if folder == SHIPPED else config.variant
         self.llm = llm.to(device)
-        self.card: Mapping[str, Any] = config.model_dump(mode="json")
         self.properties: tuple[str, ...] = catalogue.property_names
-        self.names: tuple[str, ...] = tuple(o.name for o in catalogue.objects.values())
-        self.numbered = config.names == "number" or all(map(NUMBERED.fullmatch, self.names))
+        names = [o.name for o in catalogue.objects.values()]
+        self.numbered = config.names == "number" or all(map(NUMBERED.fullmatch, names))
         self.encoder = VideoEncoder(folder, config, catalogue, device)
         files = sorted((name, known) for name, known in config.files.items() if name.startswith(ENCODER_DIR))
         self._encoder_name = fingerprint(config.frames, *(part for file in files for part in file))
@@ -171,7 +169,11 @@ class Octopi:
         return self._reply(prompts, max_new_tokens)
 
     def look(self, video: Video) -> Touch:
-        """What the model sees of a video; UserError for what is no video, or is too short."""
+        """The frames of a video that the model is given, and what they show.
+
+        Raises:
+            UserError: for what is no video, or is too short.
+        """
         encoded = self.encoder.encode(video)
         return encoded.prepared.touch.model_copy(update={"notes": encoded.notes})
 
@@ -313,16 +315,18 @@ class Octopi:
         return remember(Path(memory), touch)
 
     def recognise(self, video: Video, memory: Path | str) -> Recognition:
-        """Which remembered objects a touch is like, the most similar first. An object that was never remembered is like
-        one, too: similarities tell apart, and are no probabilities."""
+        """Remembered objects, the most similar to a touch first.
+
+        An object that was never remembered is most similar to one of them, too: a similarity is no probability.
+        """
         encoded = self.touched(video)
         touches = recall(Path(memory), self._encoder_name)
         objects = most_similar(encoded.embedding.double().numpy(), touches)
         return Recognition(objects=objects, touches=len(touches), notes=self.notes(video))
 
     def reminded(self, question: str, videos: Sequence[Video], memory: Path | str) -> str:
-        """The question, behind what is remembered of the object that each video is most like: "soft, rough, no bumps is
-        my rug. ...", as matching tells it."""
+        """The question with facts in front of it: of each video, name and classes of the remembered object that it is
+        most similar to, in the sentence of a matching question: "soft, rough, no bumps is my rug. ..."."""
         nearest = [self.recognise(video, memory).objects[0] for video in videos]
         facts = dict.fromkeys(pom.sentence(known.classes, known.name) for known in nearest)
         return " ".join([*facts, with_marks(question, len(videos))])

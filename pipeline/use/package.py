@@ -64,9 +64,9 @@ def package(data: Path, params: Params, variant: Variant, base: Base, out: Path)
     catalogue = load_catalogue(Path(params.data.catalogue))
     classified = read_table(data / "encoder" / str(variant.seed) / "classifications.parquet", Classification)
     embeddings = data / "embeddings" / f"{variant.encoder}-{variant.seed}"
-    seen = {p.name: [c for c in classified if c.property == p.name] for p in catalogue.properties}
+    by_property = {p.name: [c for c in classified if c.property == p.name] for p in catalogue.properties}
     temperatures = {
-        name: fit_temperature([c for c in rows if c.part == Part.VALIDATION]) for name, rows in seen.items()
+        name: fit_temperature([c for c in rows if c.part == Part.VALIDATION]) for name, rows in by_property.items()
     }
     report, seed = Path("reports") / params.report_name, str(params.split.replicate_of(variant.seed))
     scores = _scores(report / "scores.csv", (variant.encoder, variant.lora, variant.opd, Touch.REAL, seed))

@@ -10,9 +10,9 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, Field, ValidationError, field_validator
 
 from pipeline.core.errors import first_problem
+from pipeline.language.chat import TACTILE
 from pipeline.use.media import Refused, from_base64
 
-MARK = "{tactile}"
 MESSAGES, CHARACTERS = 64, 20_000
 """The longest conversation, and the longest text of one part of it."""
 Json = dict[str, Any]
@@ -104,8 +104,10 @@ def read_conversation(messages: Sequence[Message]) -> list[Said]:
 
 
 def _read(message: Message, place: str) -> tuple[str, tuple[bytes, ...]]:
+    """The text of a message with its marks, and its videos; `place` is what an error calls it."""
     texts = [part.text for part in message.content if isinstance(part, _Text)]
-    placed = sum(bool(text.strip()) for text in texts) == 1 or any(MARK in text for text in texts)
+    # Then videos get no mark by their own place in the message.
+    placed = sum(bool(text.strip()) for text in texts) == 1 or any(TACTILE in text for text in texts)
     text, videos = "", []
     for i, part in enumerate(message.content):
         if isinstance(part, _Text):
@@ -113,7 +115,7 @@ def _read(message: Message, place: str) -> tuple[str, tuple[bytes, ...]]:
         else:
             url = part.video_url if isinstance(part, _Video) else part.image_url
             videos.append(from_base64(url.url, f"{place}.content.{i}"))
-            piece = "" if placed else MARK
+            piece = "" if placed else TACTILE
         apart = text and piece and not text[-1].isspace() and not piece[0].isspace()
         text += f" {piece}" if apart else piece
     return text, tuple(videos)

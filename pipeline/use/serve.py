@@ -94,7 +94,10 @@ class Service:
         return self.places - self._free._value
 
     async def check_token(self, request: Request) -> None:
-        """Raise 401 without the right token; without any, raise 403 where a browser was lured here by another name."""
+        """Raise 401 without the right token, or 403 where the server has none and is called by another machine's name.
+
+        A site may point its own name at 127.0.0.1, so that a visitor's browser asks here for it (DNS rebinding).
+        """
         if not self.token:
             if (request.url.hostname or "") not in HOME:
                 raise HTTPException(403, "this server has no token and answers to 127.0.0.1 and localhost only")
@@ -141,6 +144,7 @@ class Service:
         return wanted, [Exchange(q, tuple(next(files) for _ in videos), a) for q, videos, a in said]
 
     def _ask(self, wanted: ChatRequest, exchanges: list[Exchange], reply: Reply) -> Iterable[str]:
+        """The answer in pieces, made in the model's thread; its notes go into the reply."""
         *history, last = exchanges
         most = wanted.max_completion_tokens or wanted.max_tokens
         most = min(most, MOST_TOKENS) if most else None
