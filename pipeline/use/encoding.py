@@ -22,8 +22,8 @@ from pipeline.encoder.recipes import base_encoder, property_classifier
 from pipeline.evaluation.calibration import rescale
 from pipeline.training.trainable import load_trainable
 from pipeline.use.folder import BACKBONE_DIR, CONFIG, ENCODER_DIR, SCENES, TRAINED, ModelConfig, distance
-from pipeline.use.frames import PreparedVideo, prepare_video
-from pipeline.use.results import Video
+from pipeline.use.frames import name_of, read_touch
+from pipeline.use.results import Touch, Video
 from pipeline.videos.catalogue import Catalogue
 
 REMEMBERED = 2**28
@@ -33,19 +33,21 @@ REMEMBERED = 2**28
 class EncodedVideo(NamedTuple):
     """A video as the language model is given it."""
 
-    prepared: PreparedVideo
+    name: str
+    """What notes and errors call it."""
+    touch: Touch
+    """Its frames, and all notes on them."""
+    touched: bool
+    """Whether anything touches the sensor."""
     features: torch.Tensor
     """float32, frames x dim."""
-    notes: tuple[str, ...]
-    """What should make one doubt an answer."""
     embedding: torch.Tensor
     """float32, dim: the mean over its frames, before property heads and as the encoder has it."""
 
     @property
     def size(self) -> int:
         """Bytes of its pictures."""
-        touch = self.prepared.touch
-        return sum(pictures.nbytes for pictures in (touch.frames, touch.reference, touch.difference))
+        return sum(p.nbytes for p in (self.touch.frames, self.touch.reference, self.touch.difference))
 
 
 class Classified(NamedTuple):
@@ -72,29 +74,27 @@ class VideoEncoder:
     @torch.inference_mode()
     def encode(self, video: Video) -> EncodedVideo:
         """A video's frames and their embeddings; UserError for what is no video, is damaged as a whole or too short."""
-        name, config = _name(video), self.config
-        if name not in self._encoded:
-            prepared = prepare_video(
-                video, config.frames, subtracts=config.encoder.reference == "subtract", quiet=config.quiet
-            )
-            raw = self._encoder(*self._frames(prepared)).float().cpu()
+        key, config = _key(video), self.config
+        if key not in self._encoded:
+            touch, name = read_touch(video, config.frames, config.quiet), name_of(video)
+            raw = self._encoder(*self._pictures(touch)).float().cpu()
             if not raw.isfinite().all():
-                raise UserError(f"{prepared.name}: its embedding is not finite; check the video")
-            standard, notes = standardize(raw, self.statistics), prepared.touch.notes
+                raise UserError(f"{name}: its embedding is not finite; check the video")
+            standard = standardize(raw, self.statistics)
             if (far := distance(standard.double().numpy())) > (usual := config.usual):
                 unlike = f"{far:.1f} deviations from its mean, where its own videos reach {usual:.1f}"
-                notes = (*notes, f"unlike training: {unlike}")
+                touch = touch.model_copy(update={"notes": (*touch.notes, f"unlike training: {unlike}")})
             features = standard if config.encoder.standardize else raw
-            self._encoded[name] = EncodedVideo(prepared, features, notes, raw.mean(0))
-        self._encoded.move_to_end(name)
+            self._encoded[key] = EncodedVideo(name, touch, touch.strength > config.quiet, features, raw.mean(0))
+        self._encoded.move_to_end(key)
         while len(self._encoded) > 1 and sum(encoded.size for encoded in self._encoded.values()) > REMEMBERED:
             self._encoded.popitem(last=False)
-        return self._encoded[name]
+        return self._encoded[key]
 
     @torch.inference_mode()
     def classify(self, video: Video) -> Classified:
         """What the property heads say of a video."""
-        frames, numbers = self._frames(self.encode(video).prepared)
+        frames, numbers = self._pictures(self.encode(video).touch)
         logits = self._classifier(frames[None], numbers[None])["logits"].cpu()
         parts = logits.double().split([len(p.levels) for p in self.catalogue.properties], dim=1)
         probabilities = tuple(
@@ -103,9 +103,10 @@ class VideoEncoder:
         )
         return Classified(probabilities, tuple(self._classifier.decide(logits)[0].tolist()))
 
-    def _frames(self, prepared: PreparedVideo) -> tuple[torch.Tensor, torch.Tensor]:
-        numbers = torch.tensor(prepared.touch.numbers, device=self.device)
-        return torch.from_numpy(prepared.pictures).to(self.device), numbers
+    def _pictures(self, touch: Touch) -> tuple[torch.Tensor, torch.Tensor]:
+        """What the encoder takes: frames, or their differences to the reference, and their places in the video."""
+        pictures = touch.difference if self.config.encoder.reference == "subtract" else touch.frames
+        return torch.from_numpy(pictures).to(self.device), torch.tensor(touch.numbers, device=self.device)
 
     @property
     def _own(self) -> EncoderConfig:
@@ -126,7 +127,7 @@ class VideoEncoder:
         return base_encoder(self._own).to(self.device).eval()
 
 
-def _name(video: Video) -> str:
+def _key(video: Video) -> str:
     """By which a video is known again: its place, size and time of change, or an array's bytes."""
     if isinstance(video, np.ndarray):
         return f"{video.shape} {video.dtype} {sha256(np.ascontiguousarray(video).data).hexdigest()}"

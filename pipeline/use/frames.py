@@ -6,7 +6,6 @@ import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import av
@@ -16,7 +15,7 @@ from pipeline.config import FramesConfig
 from pipeline.core.errors import UserError
 from pipeline.core.records import Finding
 from pipeline.training.sampling import sample_evaluation
-from pipeline.use.results import Pictures, Touch, Video
+from pipeline.use.results import Touch, Video
 from pipeline.videos.audit.files import FOUND, unsteady
 from pipeline.videos.decoding import SUFFIXES
 from pipeline.videos.files import VideoFile, is_video
@@ -30,30 +29,22 @@ TOUCHED = 8
 FPS = 25
 
 
-@dataclass(frozen=True)
-class PreparedVideo:
-    """A video as it is shown to a model."""
-
-    name: str
-    touch: Touch
-    pictures: Pictures
-    """What the encoder takes: the frames, or their differences to the reference."""
-    touched: bool
-    """Whether anything touches the sensor."""
+def name_of(video: Video) -> str:
+    """What notes and errors call a video."""
+    return "the array" if isinstance(video, np.ndarray) else str(Path(video))
 
 
-def prepare_video(video: Video, frames: FramesConfig, *, subtracts: bool, quiet: float) -> PreparedVideo:
+def read_touch(video: Video, frames: FramesConfig, quiet: float) -> Touch:
     """Decode a video, choose its frames and say what they show.
 
     Args:
-        subtracts: Whether the encoder is shown differences.
         quiet: Contact strength that noise alone gives.
 
     Raises:
         UserError: for what is no video, is damaged as a whole or too short.
     """
     with _as_file(video) as path:
-        name = str(path) if not isinstance(video, np.ndarray) else "the array"
+        name = name_of(video)
         found = scan(VideoFile(path, name, object_id="", video_id=path.stem), frames)
     if isinstance(found, Finding):
         raise UserError(f"{name}: {found.measured}")
@@ -64,8 +55,7 @@ def prepare_video(video: Video, frames: FramesConfig, *, subtracts: bool, quiet:
     difference = subtract(pictures, found.reference)
     beyond = np.abs(difference.astype(np.int16) - MIDDLE).max(axis=3) > GAIN * TOUCHED
     notes, probe = [], found.probe
-    touched = probe.contact > quiet
-    if not touched:
+    if probe.contact <= quiet:
         notes.append(f"nothing touches the sensor: strength {probe.contact:.2f}, where noise alone has {quiet:.2f}")
     elif probe.contact <= FOUND * (noise := max(quiet, probe.quiet)):
         notes.append(f"little touches the sensor: strength {probe.contact:.2f}, where noise alone has {noise:.2f}")
@@ -75,7 +65,7 @@ def prepare_video(video: Video, frames: FramesConfig, *, subtracts: bool, quiet:
         notes.append("recorded in HDR, which looks flat beside other videos; record or export it in SDR")
     if probe.header_frames > probe.frames:
         notes.append(f"damaged: only {probe.frames} of its {probe.header_frames} frames decode")
-    touch = Touch(
+    return Touch(
         frames=pictures,
         numbers=tuple(kept.index for kept in chosen),
         reference=found.reference,
@@ -84,7 +74,6 @@ def prepare_video(video: Video, frames: FramesConfig, *, subtracts: bool, quiet:
         strength=probe.contact,
         notes=tuple(notes),
     )
-    return PreparedVideo(name, touch, difference if subtracts else pictures, touched)
 
 
 @contextmanager

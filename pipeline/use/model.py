@@ -174,13 +174,12 @@ class Octopi:
         Raises:
             UserError: for what is no video, or is too short.
         """
-        encoded = self.encoder.encode(video)
-        return encoded.prepared.touch.model_copy(update={"notes": encoded.notes})
+        return self.encoder.encode(video).touch
 
     def notes(self, videos: Video | Sequence[Video] = (), question: str = "") -> tuple[str, ...]:
         """What should make one doubt an answer: of the model itself, of the question, then of each named video."""
         found = [self.encoder.encode(video) for video in _listed(videos)]
-        seen = (f"{encoded.prepared.name}: {note}" for encoded in found for note in encoded.notes)
+        seen = (f"{encoded.name}: {note}" for encoded in found for note in encoded.touch.notes)
         return (*self.doubts_about(question, len(found)), *seen)
 
     def doubts_about(self, question: str, videos: int) -> tuple[str, ...]:
@@ -210,8 +209,8 @@ class Octopi:
                 levels={p.name: p.levels[level] for p, _, level in each},
                 probabilities={p.name: dict(zip(p.levels, found, strict=True)) for p, found, _ in each},
                 sentence="",
-                frames=encoded.prepared.touch.numbers,
-                notes=(*self.doubts, *encoded.notes, *(silent if self.config.opd is Opd.NONE else ())),
+                frames=encoded.touch.numbers,
+                notes=(*self.doubts, *encoded.touch.notes, *(silent if self.config.opd is Opd.NONE else ())),
             )
             described.append(description)
             if sentence and self.config.opd is not Opd.NONE:
@@ -240,7 +239,7 @@ class Octopi:
         notes: list[str] = []
         for video in videos:  # All of a video at once, as not all may be remembered.
             encoded = self.touched(video)
-            notes += [f"{encoded.prepared.name}: {note}" for note in encoded.notes]
+            notes += [f"{encoded.name}: {note}" for note in encoded.touch.notes]
             expected.append(self._classes(video)[place][1])
         answer, most = "", None
         if len(videos) == 3:
@@ -377,8 +376,8 @@ class Octopi:
     def touched(self, video: Video) -> EncodedVideo:
         """A video as the model reads it; UserError where nothing touches the sensor."""
         encoded = self.encoder.encode(video)
-        if not encoded.prepared.touched:
-            raise UserError(f"{encoded.prepared.name}: {encoded.notes[0]}; record the sensor being pressed")
+        if not encoded.touched:
+            raise UserError(f"{encoded.name}: {encoded.touch.notes[0]}; record the sensor being pressed")
         return encoded
 
     def _classes(self, video: Video) -> list[tuple[int, float]]:

@@ -15,7 +15,7 @@ import av
 import pytest
 
 from pipeline.config import FramesConfig
-from pipeline.use.frames import prepare_video
+from pipeline.use.frames import read_touch
 from pipeline.use.media import Gate, Limits, from_base64
 from pipeline.videos.decoding import SUFFIXES, Decoder
 from pipeline.videos.files import video_files
@@ -58,13 +58,13 @@ def test_a_video_is_one_for_the_server_for_ask_and_in_a_folder(gate: Gate, suffi
         path.write_bytes(videos[0])
     assert video_files(tmp_path)[0] == [named]
     with refused("no video by its name"):
-        prepare_video(other, FRAMES, subtracts=False, quiet=0)
-    asked = prepare_video(named, FRAMES, subtracts=False, quiet=0)
+        read_touch(other, FRAMES, quiet=0)
+    asked = read_touch(named, FRAMES, quiet=0)
     with gate.files(videos) as paths:
         assert [p.read_bytes() for p in paths] == videos
-        served = prepare_video(paths[0], FRAMES, subtracts=False, quiet=0)
+        served = read_touch(paths[0], FRAMES, quiet=0)
     assert not any(p.parent.exists() for p in paths)
-    assert (served.pictures == asked.pictures).all()
+    assert (served.frames == asked.frames).all()
 
 
 @pytest.mark.parametrize(

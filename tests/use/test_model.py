@@ -15,7 +15,7 @@ from pipeline.encoder.timm_backbone import STAGES
 from pipeline.use import encoding
 from pipeline.use import model as model_code
 from pipeline.use.encoding import VideoEncoder
-from pipeline.use.frames import prepare_video
+from pipeline.use.frames import read_touch
 from pipeline.use.model import Octopi, with_marks
 from pipeline.use.results import Exchange
 from pipeline.videos.decoding import decode
@@ -89,7 +89,7 @@ def test_each_video_is_decoded_once_a_call(
     """However many there are, and however little of them is remembered; where they are, one call takes all."""
     seen: list[str] = []
     monkeypatch.setattr(
-        encoding, "prepare_video", lambda video, *a, **k: (seen.append(str(video)), prepare_video(video, *a, **k))[1]
+        encoding, "read_touch", lambda video, *a, **k: (seen.append(str(video)), read_touch(video, *a, **k))[1]
     )
     videos = [tmp_path / f"{i}.avi" for i in range(6)]
     for number, video in enumerate(videos):
@@ -293,7 +293,7 @@ def test_a_little_touch_and_a_damaged_video_are_noted(
     strength = octopi.look(files[0]).strength
     quiet = octopi.config.model_copy(update={"quiet": 0.8 * strength})
     weak = VideoEncoder(made.folder, quiet, octopi.catalogue, octopi.encoder.device)
-    assert [n.partition(":")[0] for n in weak.encode(files[0]).notes] == ["little touches the sensor"]
+    assert [n.partition(":")[0] for n in weak.encode(files[0]).touch.notes] == ["little touches the sensor"]
     compared = octopi.compare(files[0], cut, "hardness")
     assert [n.partition(": ")[0] for n in compared.notes] == [str(cut)]
     assert "damaged" in compared.notes[0]
