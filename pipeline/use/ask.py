@@ -151,14 +151,12 @@ def describe_folder(model: Octopi, paths: Sequence[Path], out: Path) -> tuple[in
     failed = sum(bool(error) for error in done.values())
     if not out.is_file() or not done:
         write_text(out, _row(columns))
-    with progress(len(rest), "describe", "video") as advance:
-        for start in range(0, len(rest), BATCH):
-            rows = _describe(model, rest[start : start + BATCH])
-            with out.open("a", encoding="utf-8", newline="") as stream:
-                stream.write("".join(_row([row.get(column, "") for column in columns]) for row in rows))
-            failed += sum(bool(row.get("error")) for row in rows)
-            for _ in rows:
-                advance()
+    with progress(len(rest), "describe", "video") as advance, out.open("a", encoding="utf-8", newline="") as stream:
+        for row in _describe(model, rest):
+            stream.write(_row([row.get(column, "") for column in columns]))
+            stream.flush()
+            failed += bool(row.get("error"))
+            advance()
     return len(done) + len(rest), failed
 
 
@@ -174,13 +172,12 @@ def described(model: Octopi, paths: Sequence[Path]) -> tuple[Table, list[str]]:
     files = videos_of(paths)
     table = Table("video", *model.properties, "in words")
     notes, errors = [*model.doubts], list[str]()
-    for start in range(0, len(files), BATCH):
-        for row in _describe(model, files[start : start + BATCH]):
-            found = [(row.get(p), row.get(f"{p}: {row.get(p)}")) for p in model.properties]
-            cells = [f"{level} ({share:.0%})" if level else "" for level, share in found]
-            table.add_row(*map(escape, (str(row["file"]), *cells, str(row.get("sentence", "")))))
-            notes += [f"{row['file']}: {row['notes']}"] if row.get("notes") else []
-            errors += [str(row["error"])] if row.get("error") else []
+    for row in _describe(model, files):
+        found = [(row.get(p), row.get(f"{p}: {row.get(p)}")) for p in model.properties]
+        cells = [f"{level} ({share:.0%})" if level else "" for level, share in found]
+        table.add_row(*map(escape, (str(row["file"]), *cells, str(row.get("sentence", "")))))
+        notes += [f"{row['file']}: {row['notes']}"] if row.get("notes") else []
+        errors += [str(row["error"])] if row.get("error") else []
     if len(errors) == len(files):
         raise UserError(f"{errors[0]}{f' (nor was any of {len(errors) - 1} more described)' if errors[1:] else ''}")
     return table, [*errors, *notes]
@@ -223,24 +220,26 @@ def _done(out: Path, columns: Sequence[str], name: str) -> dict[str, str]:
     return {row["file"]: row["error"] for row in rows}
 
 
-def _describe(model: Octopi, files: Sequence[tuple[Path, str]]) -> list[dict[str, object]]:
-    rows: list[dict[str, object]] = []
-    good = []
-    for file, name in files:
-        row: dict[str, object] = {"file": name, "model": _whose(model)}
-        rows.append(row)
-        try:
-            model.look(file)
-            good.append((file, row))
-        except UserError as error:
-            row["error"] = " ".join(str(error).split())
-    for (_, row), found in zip(good, model.describe_all([file for file, _ in good]), strict=True):
-        row |= found.levels
-        for name, known in found.probabilities.items():
-            row |= {f"{name}: {level}": round(p, 4) for level, p in known.items()}
-        row |= {"sentence": " ".join(found.sentence.split()), "frames": " ".join(map(str, found.frames))}
-        row["notes"] = "; ".join(note for note in found.notes if note not in model.doubts)
-    return rows
+def _describe(model: Octopi, files: Sequence[tuple[Path, str]]) -> Iterator[dict[str, object]]:
+    """A row for each video: its description, or the error that says why there is none."""
+    for start in range(0, len(files), BATCH):
+        rows: list[dict[str, object]] = []
+        good = []
+        for file, name in files[start : start + BATCH]:
+            row: dict[str, object] = {"file": name, "model": _whose(model)}
+            rows.append(row)
+            try:
+                model.look(file)
+                good.append((file, row))
+            except UserError as error:
+                row["error"] = " ".join(str(error).split())
+        for (_, row), found in zip(good, model.describe_all([file for file, _ in good]), strict=True):
+            row |= found.levels
+            for name, known in found.probabilities.items():
+                row |= {f"{name}: {level}": round(p, 4) for level, p in known.items()}
+            row |= {"sentence": " ".join(found.sentence.split()), "frames": " ".join(map(str, found.frames))}
+            row["notes"] = "; ".join(note for note in found.notes if note not in model.doubts)
+        yield from rows
 
 
 def _row(cells: Iterable[object]) -> str:
