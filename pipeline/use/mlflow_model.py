@@ -18,7 +18,7 @@ from mlflow.protos.databricks_pb2 import INVALID_PARAMETER_VALUE
 from mlflow.pyfunc import PythonModel
 
 from pipeline.core.errors import UserError
-from pipeline.use.media import PLACE, Gate, Limits, Refused, from_base64
+from pipeline.use.media import PLACE, Gate, Refused, from_base64
 
 logger = logging.getLogger(__name__)
 ROWS, CHARACTERS = 64, 20_000
@@ -38,7 +38,7 @@ class TouchModel(PythonModel):
         settings = {**(context.model_config or {})}
         settings["base"] = settings.get("base") or os.environ.get("OCTOPI_BASE") or None
         self.model = Octopi.from_pretrained(context.artifacts["folder"], **settings)
-        self.gate = Gate(Limits())
+        self.gate = Gate()
         self.lock = threading.Lock()  # MLflow serves each request in a thread, and a model takes one at a time.
 
     def predict(self, context: Any, model_input: pd.DataFrame, params: dict[str, Any] | None = None) -> pd.DataFrame:

@@ -52,7 +52,7 @@ LIMITS = (
 )
 
 
-def package(data: Path, params: Params, variant: Variant, base: Base, out: Path) -> ModelConfig:
+def package(data: Path, params: Params, variant: Variant, base: Base, out: Path) -> None:
     """Write one variant's folder.
 
     Args:
@@ -115,7 +115,6 @@ def package(data: Path, params: Params, variant: Variant, base: Base, out: Path)
         write_json(folder / CONFIG, config.model_dump(mode="json"))
         known = read_json(report / "provenance.json")["settings"]
         _write_card(folder, config, classified, scores, ruled, params, known)
-    return config
 
 
 def export(folder: Path, to: Path, *, with_base: bool = False, base: Path | None = None) -> None:

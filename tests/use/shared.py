@@ -57,7 +57,7 @@ PARTS = {
     **dict.fromkeys(("ice_block", "millet", "bath_towel", "toilet_brush_bristles", "hairbrush_bristles"), Part.TEST),
 }
 CPU = torch.device("cpu")
-ASKED = {"OPD": 3, "PC": 8, "PSS": 8, "POM": 8, "PSR": 4}
+ASKED = {"OPD": 8, "PC": 12, "PSS": 12, "POM": 12, "PSR": 8}
 
 
 class Made(NamedTuple):

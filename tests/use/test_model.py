@@ -26,15 +26,15 @@ FULL = Variant(Encoder.FINETUNED, Lora.WITH, Opd.ALL, 0)
 TUNED = ("encoder.recipe=tuned", "encoder.reference=subtract", "encoder.standardize=false")
 
 
-def answers_as_stored(made: Made) -> int:
-    """Ask every stored question; how many were asked."""
+def answers_as_stored(made: Made, every: int = 1) -> int:
+    """Ask the stored questions, or every so many of them; how many were asked."""
     model = Octopi.from_pretrained(made.folder, device="cpu")
     files = {f.stem: f for f in made.videos.iterdir()}
-    return replay(model, made.questions, made.predictions, made.variant.opd, files)
+    return replay(model, made.questions, made.predictions[::every], made.variant.opd, files)
 
 
 def test_its_answers_equal_the_stored_predictions(made: Made) -> None:
-    assert answers_as_stored(made) >= 20
+    assert answers_as_stored(made, every=2) >= 25
 
 
 @pytest.mark.slow
@@ -57,7 +57,7 @@ def test_of_other_recipes_too(
         whole = tensor_shapes(tmp_path / "clip" / "model.safetensors")
         assert kept.items() < whole.items(), "what follows the stage that is read stays behind"
     monkeypatch.chdir("/")
-    assert answers_as_stored(made) >= 15
+    assert answers_as_stored(made) >= 40
 
 
 def test_heads_say_what_the_stage_stored(made: Made, octopi: Octopi) -> None:
