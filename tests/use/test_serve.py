@@ -96,14 +96,11 @@ def test_openai_s_own_client(client: TestClient) -> None:
 def test_the_real_model_answers_as_the_library_does(octopi: Octopi, files: list[Path]) -> None:
     question = "Which is softer, {tactile} or {tactile}?"
     asked = body(user(text(question), *(part(file.read_bytes()) for file in files[:2])))
-    blank = body(user(text("What is it?"), part(video(1, 1))))
     with TestClient(make_app(octopi, "octopi"), base_url="http://localhost") as client:
         whole = said(client.post(CHAT, json=asked).json())
-        streamed = said(client.post(CHAT, json={**asked, "stream": True}).text)
-        refused = error(client.post(CHAT, json=blank), 422)
-    assert whole == streamed
+        assert whole == said(client.post(CHAT, json={**asked, "stream": True}).text)
+        assert error(client.post(CHAT, json=body(user(part(video(1, 1))))), 422).startswith("video 1: ")
     assert whole.strip() == octopi.ask(question, files[:2]).strip()
-    assert refused.startswith("video 1")
 
 
 @pytest.mark.parametrize(
@@ -113,10 +110,7 @@ def test_the_real_model_answers_as_the_library_does(octopi: Octopi, files: list[
         ((part(video(1)), part(video(2)), text("Which is softer?")), "{tactile} {tactile} Which is softer?"),
         ((text("a) {tactile} b) {tactile}?"), part(video(1)), part(video(2))), "a) {tactile} b) {tactile}?"),
         ((text("a)\n"), part(video(1)), text("\nb)\n"), part(video(2))), "a)\n{tactile}\nb)\n{tactile}"),
-        (
-            (text("a)"), part(video(1), "image_url"), text("b)"), part(video(2), "image_url")),
-            "a) {tactile} b) {tactile}",
-        ),
+        ((text("a)"), part(video(1), "image_url"), text("b)"), part(video(2))), "a) {tactile} b) {tactile}"),
     ],
 )
 def test_videos_stand_where_their_parts_or_marks_stand(client: TestClient, content: Any, question: str) -> None:
@@ -166,13 +160,12 @@ def test_who_is_let_in(client: TestClient, fake: FakeOctopi) -> None:
 ASK = user("hello")
 
 
-def url(text: str, kind: str = "video_url") -> dict[str, Any]:
-    return body(user({"type": kind, kind: {"url": text}}))
+def url(text: str) -> dict[str, Any]:
+    return body(user({"type": "video_url", "video_url": {"url": text}}))
 
 
 BAD: list[tuple[bytes | dict[str, Any], int, str]] = [
     (b"", 422, "JSON"),
-    (b"{", 422, "JSON"),
     (b"[" * 100_000, 422, "JSON"),
     (b"[]", 422, "Input should be"),
     (b'{"model": NaN}', 422, "model"),
@@ -188,7 +181,6 @@ BAD: list[tuple[bytes | dict[str, Any], int, str]] = [
     (body(user({"type": "video_url", "video_url": "data:"})), 422, "messages.0.content.0.video_url.video_url"),
     (body({"role": "user", "content": []}), 422, "messages.0.content"),
     (body(ASK, ASK), 422, "take turns"),
-    (body({"role": "assistant", "content": "a"}), 422, "take turns"),
     (body(ASK, {"role": "assistant", "content": "a"}), 422, "take turns"),
     (body({"role": "system", "content": "a"}), 422, "take turns"),
     (body(ASK, {"role": "assistant", "content": [part(video())]}, ASK), 422, "assistant"),
@@ -198,10 +190,9 @@ BAD: list[tuple[bytes | dict[str, Any], int, str]] = [
     (body(ASK, logprobs=True), 422, "logprobs"),
     (body(ASK, response_format={"type": "json_object"}), 422, "response_format"),
     (body(ASK, max_tokens=0), 422, "max_tokens"),
-    (body(ASK, max_tokens="many"), 422, "max_tokens"),
     (url("file:///etc/passwd"), 422, "data URI"),
     (url("/etc/passwd"), 422, "base64"),
-    (url("data:video/mp4;base64,AAA", "image_url"), 422, "messages.0.content.0"),
+    (url("data:video/mp4;base64,AAA"), 422, "messages.0.content.0"),
     (body(user(part(b"no video at all"))), 422, "video 1: no video"),
     (body(user(part(claims_frames(10**6)))), 413, "longer than 200 frames"),
     (body(user(*[part(video())] * 4)), 413, "4 videos"),
