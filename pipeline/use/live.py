@@ -113,7 +113,7 @@ def presses(shots: Iterable[Shot], times: float = FOUND) -> Iterator[list[Shot]]
 
 
 def run(model: Octopi, camera: str, question: str, say: Callable[[str], object], times: float = FOUND) -> int:
-    """Say of each press what is felt, and the true frame rate, until the file ends or Ctrl-C.
+    """Describe each press, or answer the question about it, with the true frame rate, until the file ends or Ctrl-C.
 
     Args:
         question: Asked of each press; empty for a description.

@@ -139,8 +139,8 @@ class Octopi:
             videos: Files, or arrays of uint8, frames x height x width x RGB; one, or several in a list.
             history: Earlier exchanges of the conversation.
             max_new_tokens: Of the answer; by default those of the evaluation.
-            memory: A folder of remembered touches: the question begins with what the object that each video is most
-                like was called, and felt like.
+            memory: A folder of remembered touches: the question begins with name and classes of the object that each
+                video is most similar to.
 
         Raises:
             UserError: for a question that does not fit its videos or is too long, or a video that cannot be used.
@@ -179,8 +179,8 @@ class Octopi:
     def notes(self, videos: Video | Sequence[Video] = (), question: str = "") -> tuple[str, ...]:
         """What should make one doubt an answer: of the model itself, of the question, then of each named video."""
         found = [self.encoder.encode(video) for video in _listed(videos)]
-        seen = (f"{encoded.name}: {note}" for encoded in found for note in encoded.touch.notes)
-        return (*self.doubts_about(question, len(found)), *seen)
+        of_videos = (f"{encoded.name}: {note}" for encoded in found for note in encoded.touch.notes)
+        return (*self.doubts_about(question, len(found)), *of_videos)
 
     def doubts_about(self, question: str, videos: int) -> tuple[str, ...]:
         """`doubts`, and that a question compares where there is only one video."""

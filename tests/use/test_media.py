@@ -1,4 +1,4 @@
-"""Videos from strangers: what is taken, what is refused, and at what cost."""
+"""Videos that clients send: what is taken, what is refused, and at what cost."""
 
 from __future__ import annotations
 
