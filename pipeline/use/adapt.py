@@ -41,7 +41,7 @@ def adapt(model: Octopi, videos: Sequence[Path], to: Path) -> None:
         raise UserError("one frame has no deviation; name more videos")
     std, mean = torch.std_mean(features, dim=0)
     known = model.encoder.statistics
-    # A number that never changes among these frames says nothing of how far others move it.
+    # A dimension that is constant in these frames gives no estimate of its scale, so the old scale stays.
     scale = known.scale * torch.where(std > 0, std, 1.0)
     with atomic_folder(to) as made:
         shutil.copytree(model.folder, made, dirs_exist_ok=True)

@@ -51,12 +51,12 @@ class EncodedVideo(NamedTuple):
 
 
 class Classified(NamedTuple):
-    """What the heads say, each by the catalogue's order of properties."""
+    """Predictions of the property heads, in the catalogue's order of properties."""
 
     probabilities: tuple[tuple[float, ...], ...]
     """Calibrated, of each class."""
     levels: tuple[int, ...]
-    """The classes that they take."""
+    """The predicted classes."""
 
 
 class VideoEncoder:

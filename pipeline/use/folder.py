@@ -85,11 +85,13 @@ class ModelConfig(Record):
     language: LanguageConfig
     base: Base
     chat: str
-    """A conversation as its chat format writes it; another format would be asked what was never trained."""
+    """A sample conversation in the chat format of training. Where a tokenizer writes it otherwise, the model is
+    refused."""
     quiet: Rounded
     """Contact strength that noise alone gives in its data."""
     usual: Rounded
-    """How far its training and validation videos lie from their mean at most, in deviations a dimension."""
+    """Largest distance of a training or validation video from the training mean, in standard deviations
+    (`distance`)."""
     temperatures: dict[str, Rounded]
     """By property, fitted on validation objects."""
     scores: dict[str, tuple[float, float, float]]
@@ -121,7 +123,7 @@ def read_folder(folder: Path) -> tuple[ModelConfig, Catalogue]:
             "or install the version that made it"
         )
     if isinstance(language := values.get("language"), dict):
-        language.pop("touch_noise", None)  # A setting that was always off and is gone.
+        language.pop("touch_noise", None)  # A removed setting; folders that still have it have it off.
     config = _validate(ModelConfig, values, folder / CONFIG)
     for name, expected in config.files.items():
         file = folder / name

@@ -1,4 +1,4 @@
-"""From a video to what a model is given of it: the chain's own decoding, frame selection and embedding."""
+"""Decoding of a video and selection of its frames for a trained model, by the chain's own code."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from pipeline.videos.frames.scan import scan
 from pipeline.videos.frames.subtraction import GAIN, MIDDLE, subtract
 
 FEWEST = 2
-"""Frames of a video at least: touch is a change."""
+"""Minimum number of frames in a video: contact shows as a change between frames."""
 TOUCHED = 8
 """Steps of difference to the untouched sensor, of 255, from which a pixel counts as touched."""
 FPS = 25
@@ -78,7 +78,7 @@ def read_touch(video: Video, frames: FramesConfig, quiet: float) -> Touch:
 
 @contextmanager
 def _as_file(video: Video) -> Iterator[Path]:
-    """The file of a video; an array becomes a lossless one, so that both take the same way."""
+    """The file of a video. An array is first written to a lossless file, so that both are decoded by the same code."""
     if not isinstance(video, np.ndarray | str | os.PathLike):
         raise UserError(f"a {type(video).__name__} is no video; give a file, or an array of uint8")
     if not isinstance(video, np.ndarray):

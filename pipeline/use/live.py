@@ -46,7 +46,7 @@ def watch(camera: str) -> Iterator[Shot]:
         raise UserError(f"{camera}: no camera that opens; name an index (0 is the first), a file or an address")
     missed = 0
     try:
-        while missed < GONE:  # One that drops frames goes on with the next.
+        while missed < GONE:  # A camera may drop a frame and deliver the next one.
             good, picture = capture.read()
             now = time.monotonic_ns()
             missed = 0 if good else missed + 1
@@ -63,10 +63,10 @@ def presses(shots: Iterable[Shot], times: float = FOUND) -> Iterator[list[Shot]]
     """Each press as soon as it ends, with up to `LONGEST` untouched pictures in front, which the model compares it to.
 
     A press begins where the contact strength is more than `times` the quiet level (the median of untouched pictures),
-    and ends when it has stayed under `RELEASED` of that for `SHORTEST` pictures. The strength is measured against the
-    mean of pictures a little older than the last ones, so that a slow change of light counts as untouched and the
-    beginning of a press has no part in the mean. A press that deepens over seconds passes as such a change, too; then
-    its release looks like a press. `starts_touching` knows a release by the detail of its pictures; it is left out.
+    and ends when it has stayed under `RELEASED` of that for `SHORTEST` pictures. The reference is the mean of pictures
+    a little older than the latest ones: it follows slow changes of the light, and does not yet contain a press that
+    begins. A press that deepens over seconds is also taken for a change of the light, and its release then looks like a
+    press. `starts_touching` recognises such a release by its loss of detail, and it is dropped.
 
     Raises:
         UserError: as `shots` raises it, after the press that had begun.
@@ -104,7 +104,7 @@ def presses(shots: Iterable[Shot], times: float = FOUND) -> Iterator[list[Shot]]
                 elif touched >= SHORTEST:
                     yield press
                 press, touched, behind = [], 0, 0
-    except UserError as error:  # What was pressed until the camera was gone is no less a press.
+    except UserError as error:  # A press that the camera's failure cut off is still yielded.
         gone = error
     if touched >= SHORTEST:
         yield press

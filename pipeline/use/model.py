@@ -52,11 +52,11 @@ class Octopi:
     It remembers no conversation: the caller hands the earlier exchanges in. One call at a time.
 
     Attributes:
-        folder: That it was loaded from.
-        name: Of the folder that is shipped, else the variant's.
+        folder: The folder that it was loaded from.
+        name: The folder's name for the shipped model, else the variant's.
         config: What the folder's config.json says.
         properties: The catalogue's properties.
-        numbered: Whether training called objects "object 1" and the like alone; then it copies no other name.
+        numbered: Whether training named objects only "object 1" and so on; such a model cannot repeat other names.
         doubts: What should make one doubt every answer; empty for a model that was trained from real weights.
     """
 
@@ -381,7 +381,7 @@ class Octopi:
         return encoded
 
     def _classes(self, video: Video) -> list[tuple[int, float]]:
-        """What the heads take a video for: a class and a mean class of each property."""
+        """The heads' prediction for a video: the class and the expected class of each property."""
         found = self.encoder.classify(video)
         means = (sum(level * p for level, p in enumerate(each)) for each in found.probabilities)
         return list(zip(found.levels, means, strict=True))
@@ -399,7 +399,7 @@ class Octopi:
         )
 
     def _told(self, name: str, classes: Sequence[str]) -> Object:
-        """An object of the caller's, by its classes in the order of the properties."""
+        """An object that the caller describes by its classes, in the order of the properties."""
         levels = [p.levels for p in self.catalogue.properties]
         if len(classes) != len(levels) or any(c not in known for c, known in zip(classes, levels, strict=True)):
             raise UserError(f"{name} ({', '.join(classes)}): write a class of every property ({self._example()})")

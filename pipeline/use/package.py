@@ -162,7 +162,7 @@ def _scores(file: Path, wanted: tuple[str, ...]) -> dict[str, Score]:
 
 
 def _usual(embeddings: Path, split: Path, params: Params) -> float:
-    """How far a training or validation video's mean embedding lies from that of all, at most; rounded up."""
+    """Largest distance of a training or validation video from the training mean, rounded up."""
     store, known = EmbeddingStore(embeddings), Statistics.load(embeddings / STATISTICS_FILE)
     distances = []
     for assignment in read_table(split, Assignment):
@@ -172,6 +172,7 @@ def _usual(embeddings: Path, split: Path, params: Params) -> float:
             distances.append(
                 distance(found.numpy() if params.encoder.standardize else ((found - known.mean) / known.scale).numpy())
             )
+    # Rounded up to the four digits that config.json keeps: rounding down would flag the farthest video itself.
     return math.ceil(1e4 * max(distances, default=0.0)) / 1e4
 
 

@@ -1,4 +1,4 @@
-"""A trained model's answers about a run's videos, whose objects it has never met: how the shipped model is tried."""
+"""Evaluation of the shipped model on a run's videos, whose objects it was not trained on."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from pipeline.use.model import Octopi
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 
 BATCH = 64
-"""Answers at once: a gigabyte of keys and values. A processor reads all weights for each token of a batch, however many
-answers are in it."""
+"""Answers in a batch; their keys and values take a gigabyte. Each step reads all weights once, however many answers
+share it."""
 
 
 def answers_about(octopi: Octopi, params: Params, videos: Sequence[Video]) -> list[GradedVision]:
@@ -40,7 +40,7 @@ def answers_about(octopi: Octopi, params: Params, videos: Sequence[Video]) -> li
         of_object.setdefault(video.object_id, []).append(video.video_id)
     if met := sorted(octopi.catalogue.objects.keys() & of_object.keys()):
         raise UserError(f"{octopi.name} knows {met[0]}, so it is not asked; set shipped to 0 in params.yaml")
-    # Half of them describe: those answers are short, and the others follow from what they say.
+    # Half of the questions are descriptions: their answers are short, and other answers follow from descriptions.
     asked = {task: count for task, count in counts_by_task(params.questions, "evaluation").items() if count}
     parts = {task: max(1, len(asked) - 1) if task == "OPD" else 1 for task in asked}
     questions = build_questions(

@@ -36,7 +36,7 @@ def reference_indices(frames: int) -> tuple[int, ...]:
 
 
 def unsteady_frames(thumbs: Iterable[Image], frames: int) -> int:
-    """How many of a video's first frames go by before a reference can be taken; all, where the light is never steady.
+    """Number of first frames to skip until the light is steady enough for a reference; all where it never is.
 
     Args:
         thumbs: the video's thumbnails, in order; no more are drawn than it takes.
@@ -55,6 +55,7 @@ def unsteady_frames(thumbs: Iterable[Image], frames: int) -> int:
 def is_steady(thumbs: Sequence[Image]) -> bool:
     """Whether frames have the light of the last one (`UNSTEADY`), by their thumbnails."""
     for thumb in thumbs[:-1]:
+        # Three quarters of a picture are brighter, or darker, by more than a value where a quartile is beyond it.
         low, high = np.quantile(thumb.astype(np.int16) - thumbs[-1], (0.25, 0.75), axis=(0, 1))
         if max(low.max(), -high.min()) > UNSTEADY:
             return False

@@ -1,4 +1,4 @@
-"""Everything about one video: its hash and true length, the frames to keep, its reference, what the audit wants."""
+"""One pass over a video: hash, number of decoded frames, frames to keep, no-contact reference, audit measurements."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from pipeline.videos.frames.selection import RELEASE_FEWEST, BestFrames, Kept
 PROBES = 8
 """Frames of a video that are measured for the audit, besides the reference's and the last."""
 SIGNATURE_FRAMES = 64
-"""Frames of a video that the signature is made from, which tells copies."""
+"""Number of frames that a video's signature is computed from; signatures are compared to find copies."""
 THUMBNAIL_SIZE = (8, 6)
 SIGNATURE_SIZE = (24, 18)
 
@@ -85,10 +85,10 @@ class VideoPass:
 
 
 def scan(file: VideoFile, config: FramesConfig) -> Scan | Finding:
-    """Look at one video; what is wrong with it comes back as a finding, so that one bad file hides no other.
+    """Scan one video. A problem is returned as a finding and not raised, so that one bad file does not hide the others.
 
-    One decode, unless the header lies about the number of frames, the light is not steady at the beginning, or the
-    video starts in contact.
+    The video is decoded once, and again only where the header gives a wrong number of frames, the light is unsteady at
+    the beginning, or the video starts in contact.
     """
     try:
         size = file.path.stat().st_size
@@ -102,7 +102,7 @@ def scan(file: VideoFile, config: FramesConfig) -> Scan | Finding:
         return _wrong(file, "no frame decodes; copy it again, convert it, or remove it")
     if len(found.sizes) > 1:
         return _wrong(file, f"frames of {len(found.sizes)} sizes; convert it to one size, or remove it")
-    # The published rule believes the header; all others go by what really decodes.
+    # The published rule takes the number of frames from the header; the others count the frames that decode.
     count = found.header.frames if config.selection == "release" else found.frames
     if count != found.header.frames:
         found = run_pass(file.path, config, count)
@@ -110,12 +110,13 @@ def scan(file: VideoFile, config: FramesConfig) -> Scan | Finding:
     if not found.steady:
         with Decoder(file.path) as decoder:
             unsteady = unsteady_frames(map(thumbnail, decoder.frames()), found.frames)
-        # Where no frame is as good as another, the first are as good as any.
+        # Where the light is never steady, no later frames are better, so the reference is taken from the first ones.
         begin = unsteady if unsteady < found.frames else 0
         found = run_pass(file.path, config, count, unsteady=begin)
     untouched = tuple(begin + i for i in reference_indices(count) if begin + i < found.frames)
     touching = starts_touching(found.first, found.last)
-    # What comes after unsteady frames need not be untouched any more: then the end is taken unless it has more detail.
+    # After skipped frames the object may touch the sensor already. Then the reference comes from whichever end has
+    # less detail, since contact adds detail.
     if touching or (begin and detail(found.first) > detail(found.last)):
         untouched = tuple(found.frames - 1 - i for i in reference_indices(found.frames))
         with Decoder(file.path) as decoder:
@@ -125,7 +126,7 @@ def scan(file: VideoFile, config: FramesConfig) -> Scan | Finding:
     reference = found.reference.thumb
     shown = found.last if found.strongest is None else found.strongest
     ((height, width),) = found.sizes
-    # The time a frame takes, between probed ones; unknown (0) where time stamps do not rise.
+    # Seconds per frame between probed frames; `irregular` is 0 (unknown) where time stamps do not rise.
     steps = [(b[1] - a[1]) / (b[0] - a[0]) for a, b in itertools.pairwise(found.times)]
     rising = bool(steps) and min(steps) > 0
     probe = Probe(
@@ -166,7 +167,8 @@ def run_pass(
     Args:
         promised: how many frames it has, where the header is not to be trusted.
         given: its no-contact reference; None takes it from the first frames.
-        unsteady: first frames that are not looked at; only the published rule, which knows no light, may choose them.
+        unsteady: number of first frames to skip; only the published rule, which has no check of the light, may keep
+            them.
     """
     with Decoder(path) as decoder:
         found = VideoPass(decoder.header, reference=given)
@@ -184,7 +186,7 @@ def run_pass(
             if len(found.sizes) > 1:
                 return found
             if config.selection == "release" or (index >= unsteady and not by_contact):
-                best.look(index, frame)
+                best.consider(index, frame)
             if index < unsteady:
                 continue
             if index in places:
@@ -230,12 +232,13 @@ def reference_of(frames: Sequence[av.VideoFrame], config: FramesConfig) -> Refer
 
 
 def _signature(pictures: list[Image], reference: Image) -> tuple[float, ...]:
-    """What the contact looks like, for finding copies: the third of the pictures that show most of it less the others.
+    """A signature of the contact, for finding copies: the mean of the third with most contact, less that of the rest.
 
-    Means of many survive a copy that is shortened or encoded anew, which changes each picture and the reference.
+    Such means change little when a copy is shortened or encoded again, though each picture and the reference do.
     """
     untouched = np.ascontiguousarray(reference[:, :, 0])
     ranked = [*sorted(pictures, key=lambda p: contact_strength(p, untouched), reverse=True), untouched]
+    # Rounded up, so that one picture is enough for the part with most contact.
     third = -(-len(ranked) // 3)
     most, rest = (np.mean(part or [untouched], axis=0, dtype=np.float32) for part in (ranked[:third], ranked[third:]))
     change = most - rest

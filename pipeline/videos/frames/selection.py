@@ -1,11 +1,11 @@
-"""Which frames of a video are kept. Frames pass by once; what is kept never outgrows the share that was asked for.
+"""Selection of the frames of a video that are kept. A video is read once; memory holds no more than the kept share.
 
 `salient`: paper, "Data Processing": the 30 % with the largest total intensity difference to the frame before; intensity
 is the brightness that the codec keeps.
-`release`: what the published code does (github.com/clear-nus/octopi, utils/process_dataset.py): it counts changed grey
-pixels, takes its number of frames from the header, saves the frame *before* each that it chose, and leaves out videos
-that would keep fewer than five.
-`contact` is this project's.
+`release`: what the published code does (github.com/clear-nus/octopi, utils/process_dataset.py): it scores a frame by
+the number of changed grey pixels, takes the number of frames from the header, saves the frame *before* each chosen one,
+and leaves out videos that would keep fewer than five.
+`contact`: this project's own rule, the largest contact strength against the no-contact reference.
 """
 
 from __future__ import annotations
@@ -63,11 +63,11 @@ def changed_pixels(grey: Image, before: Image) -> float:
 class BestFrames:
     """The best frames so far: those with the largest scores, equal scores in favour of the earlier frame.
 
-    Frames are held as the codec left them and fitted at the end, since most that come are pushed out again; only where
-    all that may be held would take more than `HELD_BYTES`, they are fitted at once.
+    Frames are held as decoded and resized at the end, since most candidates are displaced by better ones. Only if the
+    held frames could take more than `HELD_BYTES`, each is resized at once.
 
     Args:
-        frames: how many the video has, by what it promises or by a first pass.
+        frames: number of frames in the video, from its header or from a first pass.
     """
 
     def __init__(self, frames: int, config: FramesConfig) -> None:
@@ -77,8 +77,8 @@ class BestFrames:
         self._held: list[av.VideoFrame | Image] = []
         self._before: tuple[av.VideoFrame, Image] | None = None
 
-    def look(self, index: int, frame: av.VideoFrame) -> None:
-        """Score a frame, or by the published rule the one before it, by the change between the two, and offer it."""
+    def consider(self, index: int, frame: av.VideoFrame) -> None:
+        """Score the change from the frame before, and offer this frame, or by the published rule the one before."""
         salient = self.config.selection == "salient"
         now = brightness(frame) if salient else cv2.cvtColor(picture(frame), cv2.COLOR_BGR2GRAY)
         if self._before is not None:
@@ -92,8 +92,10 @@ class BestFrames:
     def offer(self, score: float, index: int, frame: av.VideoFrame) -> None:
         """Keep a frame if it is among the best."""
         full = len(self._heap) >= self.capacity
+        # The heap is empty where the published rule keeps no frame at all (capacity 0).
         if full and (not self._heap or (score, -index) <= self._heap[0][:2]):
             return
+        # 1.5 bytes a pixel: 4:2:0 keeps brightness in full and two colour planes at a quarter of the size.
         heavy = self.capacity * frame.width * frame.height * 1.5 > HELD_BYTES
         held = fit(frame, self.config) if heavy else frame
         if full:
