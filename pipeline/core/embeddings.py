@@ -19,13 +19,13 @@ STATISTICS_FILE = "statistics.safetensors"
 
 
 class Statistics(NamedTuple):
-    """What embeddings are standardised by, and of which frames they are."""
+    """Mean and scale by which embeddings are standardised, and the frame settings that they are valid for."""
 
     mean: torch.Tensor
     scale: torch.Tensor
     """float64, dim each."""
     frames: str = ""
-    """Fingerprint of the settings that the frames were chosen by: those of others are standardised by others."""
+    """Fingerprint of the frame settings: frames that are selected otherwise have other statistics."""
     heads: tuple[torch.Tensor, torch.Tensor] | None = None
     """Where logits stand in place of features (`encoder.embedding=logits`), the heads that give them: weights, classes
     of all properties x features, and biases; float64. Mean and scale are then of the logits."""
@@ -50,7 +50,7 @@ class EmbeddingStore:
     """Embeddings of every salient frame; training videos also in their three mirrored versions.
 
     Args:
-        folder: Where `embed` wrote them; without one there are none, as for questions in words.
+        folder: Where `embed` wrote them; without a folder the store is empty.
 
     Raises:
         UserError: naming the video, where an embedding is not finite: it would spoil all that is trained on it.
@@ -64,7 +64,7 @@ class EmbeddingStore:
             return
         self.folder = folder
         self.tensor = load_tensors(folder / TENSOR_FILE)[TENSOR]
-        # A part at a time, as the answers for all values take a quarter of the room of the values.
+        # In parts: one boolean for every value would take a quarter of the embeddings' own memory.
         finite = [ok for part in self.tensor.split(2**16) for ok in part.isfinite().all(1).tolist()]
         for entry in read_table(folder / INDEX_FILE, Embedding):
             if not finite[entry.row]:

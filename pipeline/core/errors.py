@@ -20,7 +20,8 @@ class UserError(Exception):
 
 
 SECRET = re.compile(
-    # Before an @: in a web address all of it, as tokens stand alone there; elsewhere what has a colon of no port.
+    # What is hidden before an @: in a web address everything, since a token may stand there alone; in other addresses
+    # only what has a colon that does not begin a port.
     r"(?P<web>https?:/{1,2})[^\s/?#]*@"
     r"|(?P<other>\b[a-z][\w+.-]*:/{1,2})[^\s/:@]*:(?!\d*(?:[/?#\s]|$))\S*@"
     r"|(?P<key>[?&;](?:pass(?:word|wd)?|pwd|token|secret|api_?key)=)[^\s&;#'\"]+",

@@ -1,7 +1,7 @@
 """Work on many files at once: in processes of this machine, or on a cluster of Ray's.
 
-joblib reaches both, and loses by each: its own workers outlive a parent that is killed, and cost over a second of
-processor time a call; from Ray it gives nothing before all is done.
+joblib supports both but fits neither: its own workers outlive a killed parent and cost over a second of processor time
+a call, and with Ray it yields nothing before all jobs are done.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ def _in_processes(work: Callable[[J], R], jobs: Sequence[J], label: str) -> Iter
     mask: Any = getattr(signal, "pthread_sigmask", lambda *_: ())  # Windows has none.
     done = 0
     try:
-        # Workers are born deaf to Ctrl-C: it is for this process, which ends them.
+        # Workers inherit the blocked SIGINT, so that on Ctrl-C only this process reacts, and ends them.
         before = mask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             # A few jobs at a time: handing over each alone costs as much as a tenth of decoding it.
@@ -142,12 +142,12 @@ def _in_processes(work: Callable[[J], R], jobs: Sequence[J], label: str) -> Iter
     except BrokenProcessPool:
         raise _died(label, jobs[done]) from None
     except KeyboardInterrupt:
-        # The others wait for what is being worked on; a person who presses Ctrl-C does not.
-        # Not while one hands over a result, of which the pool would wait for the other half.
+        # On other errors the shutdown below waits for running jobs; on Ctrl-C they are terminated. The lock keeps a
+        # worker from being terminated while it writes a result: the pool would wait for the rest of it.
         handing: Any = pool._result_queue._wlock  # type: ignore[attr-defined]
         if handing is not None:
             handing.acquire(timeout=MOST_SECONDS)
-        # The pool's own thread then trips over jobs that are both cancelled and lost.
+        # The pool's own thread then raises errors for jobs that are both cancelled and lost; they are hidden.
         threading.excepthook = lambda _: None
         for worker in multiprocessing.active_children():
             worker.terminate()
@@ -178,7 +178,7 @@ def _on_ray(work: Callable[[J], R], jobs: Sequence[J], label: str, device: bool)
             yield ray.get(waiting.popleft())
     except ray.exceptions.RayTaskError as error:
         raise error.cause from None
-    except ray.exceptions.RayError:  # What it says of a lost worker fills a page.
+    except ray.exceptions.RayError:  # Ray's own message about a lost worker fills a page.
         raise _died(label, jobs[len(jobs) - len(waiting) - 1]) from None
     finally:
         for each in waiting:
@@ -186,7 +186,7 @@ def _on_ray(work: Callable[[J], R], jobs: Sequence[J], label: str, device: bool)
 
 
 def _there(folder: str, work: Callable[[J], R], job: J) -> R:
-    """In a worker: jobs name files from the project's folder on."""
+    """Run a job in a worker, from the project's folder, since jobs name files relative to it."""
     os.chdir(folder)
     check_code(Path())
     return work(job)

@@ -76,9 +76,9 @@ class Shown(StrEnum):
     PHOTOS = "photos"
     """Photos of the question's objects."""
     TOUCH = "touch"
-    """The videos of the run, that the shipped model feels: it alone is shown this."""
+    """The run's tactile videos; only the shipped model is asked this way."""
     CLASSES = "classes"
-    """What the shipped model's property heads take these videos for, by which plain rules answer."""
+    """The classes that the shipped model's property heads predict; rules answer from them, without a language model."""
     STANDARDISED = "touch, standardised"
     """As `TOUCH`, with embeddings standardised over the run's videos (without labels)."""
 
@@ -132,7 +132,7 @@ class Probe(Video):
     rotation: int
     """Degrees against the clock by which the metadata turn the picture; done already in what is kept."""
     irregular: float
-    """Longest over shortest distance of the probed frames' time stamps, a frame; 1 for an even rate, 0 unknown."""
+    """Longest over shortest time per frame between probed frames; 1 for an even rate, 0 where unknown."""
     kept: int
     """Frames that the selection kept."""
     brightness: float
@@ -221,7 +221,7 @@ class Dialogue(Record):
 
 
 class Gold(Record):
-    """What a right answer says, apart from its wording."""
+    """The content of the right answer, independent of its wording."""
 
     choice: str
     """PC yes/no/same; PSS and PSR a letter; POM the option numbers of a), b), c), as in "312"; OPD empty."""
@@ -281,7 +281,7 @@ class Score(Record):
 
 
 class Graded(Score):
-    """A score and whose it is."""
+    """A score, and the variant that it belongs to."""
 
     encoder: Encoder
     lora: Lora
@@ -322,7 +322,7 @@ class VisionModel(Record):
 
 
 class GradedVision(Score):
-    """A score and which model's it is, of those that the chain did not train."""
+    """A score of a model that the chain did not train."""
 
     model: str
     shown: Shown
@@ -331,7 +331,7 @@ class GradedVision(Score):
 
 
 class Classification(Record):
-    """What the encoder's heads say about one video and one property."""
+    """The heads' prediction for one video and one property."""
 
     video_id: str
     object_id: str
@@ -383,9 +383,9 @@ ALL_SEEDS = "all"
 """In place of a seed: the mean over seeds, or over the repeats of a cross-validation."""
 HEADS, VALIDATION_HEADS, RECALL, CROSS_VALIDATION = "heads", "heads_validation", "heads_recall", "cross_validation"
 NEIGHBOURS, ADJECTIVES = "nearest_neighbour", "adjective"
-"""What stands as the task where no language model with touch answered: the fine-tuned encoder's property heads on test
-videos and on validation videos, class by class, encoders on objects that they were not trained on, and the class of
-each test video's nearest neighbour. Or where answers are counted a second time, adjective by adjective."""
+"""Values of the column `task` in rows that are no task's own accuracy. In this order: the fine-tuned encoder's property
+heads on test and on validation videos, their recall by class, encoders in cross-validation, the class of each test
+video's nearest neighbour, and a task's answers counted again by adjective."""
 
 
 class ScoreRow(Record):
@@ -419,7 +419,7 @@ class ScoreRow(Record):
 
 
 class EffectRow(Record):
-    """What changing one part does on the same questions, all else as in the full system; shares from -1 to 1."""
+    """The effect of changing one part of the full system, on the same questions; differences from -1 to 1."""
 
     part: str
     """`encoder`, `lora`, `opd` or `touch`."""
@@ -436,7 +436,7 @@ class EffectRow(Record):
     p_holm: Optional = None
     """Holm's adjustment over all rows of the report."""
     smallest_effect: Optional = None
-    """The smallest true difference that this design finds in four of five repetitions; above 1 there is none."""
+    """Minimum detectable effect: the smallest true difference found with a power of 80 %; above 1 there is none."""
     n: int
     objects: int
     seeds: int

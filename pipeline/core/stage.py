@@ -83,7 +83,7 @@ def launch(launcher: str) -> None:
     """
     command, marked = shlex.split(launcher) or ["python"], os.environ.get("OCTOPI_LAUNCHED")
     if marked or "RANK" in os.environ:
-        if marked != str(os.getpid()):  # Or the launcher has become this process.
+        if marked != str(os.getpid()):  # An equal number means that the launcher replaced itself by this process.
             end_with_parent(os.getppid(), grace=5)
     elif command != ["python"]:
         os.environ["OCTOPI_LAUNCHED"] = str(os.getpid())

@@ -1,7 +1,7 @@
 """The backbone `clip`, and the paper's recipe: CLIP's visual tower with visual prompts, and a linear head a property.
 
 Visual prompt tuning is the deep variant (Jia et al. 2022, arXiv 2203.12119) on an unmodified open_clip tower: at each
-transformer layer P learnable tokens join the sequence; what the layer before made of its own prompts is thrown away.
+transformer layer P learnable tokens join the sequence; the previous layer's outputs at its own prompts are discarded.
 The paper adds "a shared linear layer": each prompt passes through one linear map common to all layers. The published
 code has no such map, draws its prompts from N(0, .02), and puts the first layer's in before the tower's first
 normalisation.
@@ -74,7 +74,8 @@ class VisualPrompts(nn.Module):
     """P prompts for each of L layers, and the hooks that put them there.
 
     Args:
-        layers: L: the transformer's depth, or fewer; then the last prompts go on through the layers behind.
+        layers: L: the transformer's depth, or fewer; then the tokens of the last prompts pass on through the remaining
+            layers.
         count: P, prompts a layer.
         width: Length of a token.
         patch_area: Pixels in a patch, times channels; sets the spread of the initial values as in VPT's code.
@@ -116,7 +117,8 @@ class VisualPrompts(nn.Module):
 
 
 class TactileEncoder(FrameEncoder):
-    """CLIP's frozen visual tower, with visual prompts or (the base encoder) without, read as CLIP reads it.
+    """CLIP's frozen visual tower, with visual prompts or (the base encoder) without; its output is CLIP's own
+    embedding.
 
     Args:
         tower: The tower; it takes frames of its own side or larger ones, which are averaged over areas.

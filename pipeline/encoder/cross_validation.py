@@ -83,7 +83,7 @@ def _videos(data: EncoderData) -> tuple[np.ndarray, Labels]:
 
 
 def _dealt(data: EncoderData, parts: Mapping[str, Part]) -> EncoderData:
-    """The same videos, their objects in these parts; unused where `parts` does not say."""
+    """The same videos with their objects in these parts of a split; objects that `parts` lacks are unused."""
     assignments = [a.model_copy(update={"part": parts.get(a.object_id, Part.UNUSED)}) for a in data.assignments]
     return replace(data, assignments=assignments)
 

@@ -53,7 +53,8 @@ class EncoderSource:
     state: Path | None
     """What fine-tuning trained; None for the base encoder."""
     run: float = 0.0
-    """When the stage began: a worker that outlives a run finds the next one's files at the same place."""
+    """Start time of the stage. It tells runs apart: a worker may outlive one, and the next has its files at the same
+    place."""
 
     def __call__(self) -> Loaded:
         """Load them.
@@ -138,7 +139,7 @@ def union(splits: Iterable[Sequence[Assignment]]) -> list[Assignment]:
 def statistics(embeddings: torch.Tensor, index: Sequence[Embedding], training: Collection[str]) -> Statistics:
     """Mean and deviation of each dimension over the training videos' unmirrored frames alone.
 
-    A dimension that never changes there has the scale 1, and is so only shifted.
+    A dimension that is constant there gets the scale 1, so it is only shifted.
     """
     rows = torch.tensor([e.row for e in index if e.video_id in training and e.flip == "none"])
     # A part at a time, as float64 takes three times the room of all of them.

@@ -78,7 +78,8 @@ def finetune(training: Training, trunks: Trunks | None = None) -> tuple[Property
 def tune(model: JointFrameClassifier, training: Training, trunks: Trunks) -> list[Measurement]:
     """Fit the heads, then tune them and what is unfrozen of the encoder; the best epoch is kept (ties: the first).
 
-    The fitted heads are epoch 0. Without validation videos nothing would show that tuning helps, and they are kept.
+    The fitted heads count as epoch 0. Without validation videos they are kept, since nothing could show that tuning
+    helps.
 
     Args:
         trunks: Of the training and validation videos, with all flips where `encoder.flip_probability` is above 0.
@@ -133,10 +134,11 @@ def train_classifier(model: PropertyClassifier, training: Training, trunks: Trun
         partial(ClipDataset, data.store, per_video=data.per_video) if trunks is None else partial(TrunkDataset, trunks)
     )
     chosen = data.videos(Part.VALIDATION)
-    # By video: a label that was corrected must not go on with what was learnt from the wrong one.
+    # Labels are part of the checkpoints' key, so that after a correction no training resumes from the wrong labels.
     labelled = repr([(a.video_id, a.part, data.catalogue.labels(a.object_id)) for a in data.assignments])
     folder = checkpoint_dir("finetune_encoder", config, training.seed, data.per_video, labelled, *training.inputs)
-    # The published code's cosine is as long as one epoch, so that the rate falls to a hundredth and rises again.
+    # The published code's cosine falls to a hundredth within one epoch and rises again in the next: half a cycle an
+    # epoch.
     waves = {
         "lr_scheduler_type": "cosine_with_min_lr",
         "lr_scheduler_kwargs": {"min_lr_rate": 0.01, "num_cycles": config.epochs / 2},

@@ -24,7 +24,7 @@ from pipeline.encoder.folds import Labels, deal
 from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier, SideBySide
 
 FARTHEST = 5.0
-"""Standardised features are held within: one wild frame must not outweigh all others."""
+"""Standardised features are clipped to this absolute value, so that one outlier frame does not outweigh all others."""
 STRENGTHS = (3e-4, 1e-3, 3e-3, 1e-2)
 """Inverse weights of the penalty (scikit-learn's C) that are tried."""
 FOLDS = 5
@@ -67,7 +67,7 @@ class JointFrameClassifier(PropertyClassifier):
         num_items_in_batch: torch.Tensor | int | None = None,
         outputs: Sequence[torch.Tensor] | None = None,
     ) -> dict[str, torch.Tensor]:
-        """As any classifier's; or, in place of frames, of what the encoder's trunks made of them.
+        """As `PropertyClassifier.forward`, or from precomputed outputs of the encoder's trunks in place of frames.
 
         Args:
             outputs: Of each backbone's trunk: batch x frames x what its stage takes.
@@ -83,7 +83,7 @@ class JointFrameClassifier(PropertyClassifier):
     def standardise(self, features: torch.Tensor) -> torch.Tensor:
         """Features on the training frames' scale, within `FARTHEST`."""
         scaled = (features - self.centre) / self.spread
-        # What is infinite stays so, and is found: a wild frame is held, a broken one is not.
+        # Infinite values are not clipped, so that `check_finite` still finds a broken frame; finite outliers are.
         return torch.where(scaled.isinf(), scaled, scaled.clamp(-FARTHEST, FARTHEST))
 
     def classify(self, features: torch.Tensor) -> list[torch.Tensor]:
@@ -112,7 +112,7 @@ class FittedHeads:
     def linear(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """Weights, classes of all properties x features, and biases that give a frame's logits from its features.
 
-        Without the bound that wild frames are held within (`FARTHEST`).
+        They leave out the clipping of outliers (`FARTHEST`).
         """
         weights = np.concatenate(self.weights) / self.spread
         return weights, np.concatenate(self.biases) - weights @ self.centre
@@ -152,6 +152,7 @@ def fit_frame_heads(
 
     frames = clips.reshape(-1, clips.shape[2])
     centre, spread = frames.mean(axis=0), frames.std(axis=0)
+    # A feature that does not vary is only centred: dividing by its deviation would blow up rounding errors.
     spread = np.where(spread > 1e-6, spread, 1).astype(np.float32)
     scaled = np.clip((frames - centre) / spread, -FARTHEST, FARTHEST)
     weights, biases = [], []
@@ -164,10 +165,12 @@ def fit_frame_heads(
             with threadpool_limits(1):
                 fitted = LogisticRegression(C=strength, max_iter=ROUNDS).fit(scaled, wanted)
             rows, offsets = fitted.coef_, fitted.intercept_
-            if len(present) == 2:  # scikit-learn gives one row for the second class alone.
+            # scikit-learn gives one row, for the second class; halves of opposite sign have the same softmax.
+            if len(present) == 2:
                 rows, offsets = np.concatenate([-rows, rows]) / 2, np.concatenate([-offsets, offsets]) / 2
             weight[present], bias[present] = rows, offsets
         else:
+            # A constant label leaves nothing to fit; a logit of 0 against ABSENT makes its class near certain.
             bias[present] = 0
         weights.append(weight)
         biases.append(bias)
@@ -204,7 +207,8 @@ def choose_strength(
 def log_dependence(labels: Labels, objects: Sequence[str], classes: Sequence[int]) -> Probabilities:
     """log[P(a, b, ...) / (P(a) P(b) ...)] of each combination: an array with one axis a property.
 
-    The joint distribution counts every object once, plus `SMOOTHING` a cell; the single ones are its margins.
+    The joint distribution counts every object once and adds `SMOOTHING` to each cell; P(a), P(b), ... are its
+    marginals.
 
     Raises:
         UserError: for more than `MOST_COMBINATIONS`.
@@ -228,8 +232,8 @@ def log_dependence(labels: Labels, objects: Sequence[str], classes: Sequence[int
 def decode_jointly(evidence: Sequence[Probabilities], dependence: Probabilities) -> Labels:
     """The combination of each video that maximises the sum of log probabilities and the dependence.
 
-    This is Bayes' rule where the properties' evidence is independent given the classes. Of equal combinations the
-    one with the lower classes, read from the first property on, is taken.
+    This is Bayes' rule where the properties' evidence is independent given the classes. Ties go to the combination that
+    comes first in lexicographic order.
 
     Args:
         evidence: Log probabilities, videos x classes for each property.

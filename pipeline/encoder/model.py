@@ -35,14 +35,15 @@ class FrameEncoder(nn.Module):
         raise NotImplementedError
 
     def describe(self, frames: torch.Tensor, frame_indices: torch.Tensor) -> torch.Tensor:
-        """What the classifier is given of each frame: the same as `forward`, unless a recipe says otherwise."""
+        """Features of each frame for the classifier: those of `forward`, unless a recipe says otherwise."""
         described: torch.Tensor = self(frames, frame_indices)
         return described
 
     def trunk(self, frames: torch.Tensor) -> torch.Tensor:
-        """What the frozen layers below all that fine-tuning changes make of frames: batch x anything.
+        """Output of the frozen layers, those below all that fine-tuning changes: batch x anything.
 
-        It is computed once a picture. By default there are no such layers, and the frames are given back.
+        It is computed once for each picture and reused in every epoch. By default there are no such layers, and the
+        frames are returned.
         """
         return frames
 
@@ -162,7 +163,7 @@ def mean_and_deviation(maps: torch.Tensor) -> torch.Tensor:
     mean = values.mean(2)
     variance = (values - mean[..., None]).square().mean(2)
     varies = variance > 0
-    # The root's slope at 0 is infinite, and 0 times that no number.
+    # The root's gradient at 0 is infinite, and 0 times infinity is NaN; so constant channels take the root of 1.
     deviation = torch.where(varies, variance, 1.0).sqrt() * varies
     return torch.cat([mean, deviation], dim=1).to(maps.dtype)
 

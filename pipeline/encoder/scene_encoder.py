@@ -17,7 +17,7 @@ SIDE = 120
 """Pixels of the pictures that it is pretrained on at most: as high as they are drawn. Larger ones are averaged."""
 
 STEPS = 12
-"""8-bit steps of difference that count as 1: about the deviation where something touches."""
+"""Difference in 8-bit steps that is scaled to 1: about the standard deviation in contact."""
 CHANNELS = ((16, 2), (32, 2), (48, 1), (64, 2), (96, 1), (128, 2), (128, 1))
 """Outputs and stride of each convolution; the first is 5 x 5, the others 3 x 3."""
 TUNED = 2

@@ -2,10 +2,10 @@
 
 First a linear probe is fitted (`frame_classifier`), then the probe and what the backbones unfreeze are trained by
 gradients at a small rate: with a fitted head fine-tuning distorts the features less (LP-FT, Kumar et al. 2022, arXiv
-2202.10054). The epoch with the best combined validation accuracy is kept. The probe is epoch 0, and wins where it is as
-good, so that tuning is only taken where it helped.
+2202.10054). The epoch with the best combined validation accuracy is kept. The probe is epoch 0 and wins ties, so tuning
+is used only where it helped.
 
-All that lies below is frozen, and so is what it makes of a picture: it is computed once for each picture and flip.
+The layers below are frozen, so their output is computed only once for each picture and flip.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from pipeline.encoder.model import SideBySide, load_backbones
 from pipeline.training.sampling import EpochDataset
 
 MEMORY = 2**30
-"""Bytes of trunks' outputs up to which they are kept as they are; above, in float16."""
+"""Trunks' outputs of more bytes than this are kept in float16."""
 
 
 def base_encoder(config: EncoderConfig) -> SideBySide:

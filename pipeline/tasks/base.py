@@ -16,9 +16,8 @@ LETTERS = "abc"
 LISTED = ("a)", "b)", "c)")
 """Labels of the videos, in the question's list and in descriptions."""
 Classes = Sequence[Sequence[tuple[int, float]]]
-"""What an encoder takes each video for, property by property: its class, and the mean class by its probabilities.
-
-The pairs sort: of two videos of one class, the one with the higher mean comes later.
+"""The property heads' predictions, by video and property: the class, and the expected class under the probabilities.
+Such pairs can be compared: of two videos of one class, the one with the higher expected class is larger.
 """
 ORDINALS = ("First", "Second")
 MARKER = r"[^\S\n]*(?:[:,]|-\s|is\b|\n|$)"
@@ -29,7 +28,7 @@ LETTER = (
 CHOICE = rf"{LETTER}(?:,?\s*(?:or|nor|and|/)\s*{LETTER})?"
 """How answers name what they choose: "b)", "(b)", "option B", or "b" where nothing follows that "a" could belong to."""
 BEGUN = r"(?:^|[.,;:]\s+|\b(?:so|thus)\s+)"
-"""Where a clause begins that nothing before it can doubt or deny."""
+"""The beginning of a clause, so that no words before the match can negate it or put it in doubt."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,8 @@ class Draft:
     dialogues: tuple[Dialogue, ...]
     gold: Gold
     finding: str = ""
-    """What the classes of the property asked for lead to, before it is put as an answer: "Harder: second object."."""
+    """The result of comparing the classes, in short form, before it is worded as an answer: "Harder: second
+    object."."""
 
     def numbered(self, question_id: str, task: str, part: Part) -> Question:
         """The question as it is written to disk."""
@@ -81,7 +81,7 @@ class TaskDefinition(ABC):
     trained = True
     """Whether its questions may be used for training (PSR's may not)."""
     listed: tuple[str, ...] = ()
-    """What an answer calls the objects where it restates their classes; none where it is about several properties."""
+    """Names of the objects in an answer that restates their classes; empty for a task about several properties."""
     adjectives: tuple[str, ...] = ()
     """Fields of a property with the two adjectives that a question may ask by, the one for high classes first."""
     choices = 2
@@ -89,7 +89,7 @@ class TaskDefinition(ABC):
     measure = "choice"
     """The measure that says that a whole answer is right; `chance` lists all measures."""
     told = ""
-    """What `conclude` knows beside the classes of the videos, as tables say it."""
+    """What `conclude` is given besides the videos' classes, in the words of the tables."""
 
     @abstractmethod
     def strata(self, catalogue: Catalogue) -> int:
@@ -129,26 +129,28 @@ class TaskDefinition(ABC):
         return {"choice": 1 / self.choices}
 
     def with_facts(self, draft: Draft, catalogue: Catalogue, rng: random.Random, inexact: float = 0.0) -> Draft:
-        """The question for a language model that knows nothing of the objects: as it is, unless it names objects.
+        """The question with facts about the objects that it names; unchanged if it names none.
 
         Args:
-            inexact: Chance that a class told is a neighbour of the right one.
+            inexact: Probability that a stated class is a neighbour of the right one.
         """
         return draft
 
     def plainly(self, draft: Draft, catalogue: Catalogue, rng: random.Random) -> Draft:
-        """The question as people ask it, where they ask it otherwise."""
+        """The question in everyday wording; unchanged where the task has none."""
         return draft
 
     def as_choice(self, draft: Draft, catalogue: Catalogue) -> Draft | None:
-        """The question as a choice in the form that scenarios ask for, where it leads to one; no scenario is in it."""
+        """The question as a choice between objects, in the form of scenario questions but without a scenario; None if
+        impossible."""
         return None
 
     def restated(self, draft: Draft, catalogue: Catalogue) -> Draft:
-        """The question whose answer, behind descriptions of everything, first names the classes that it is about.
+        """The question whose answer, in OPD mode `all`, repeats the classes asked for between descriptions and
+        conclusion.
 
-        A small model cannot find the one property among all, recall what was asked and conclude in the same token. It
-        can do so one by one.
+        A small model cannot find that property among all, recall the question and conclude within one token. Written
+        out, these are separate steps.
         """
         if not self.listed:
             return draft
@@ -161,7 +163,7 @@ class TaskDefinition(ABC):
 
 
 def before_concluding(draft: Draft, told: str) -> Draft:
-    """The question whose answer in OPD mode `all` says this between its descriptions and its conclusion."""
+    """Insert a text between the descriptions and the conclusion of the answer in OPD mode `all`."""
     dialogues = []
     for dialogue in draft.dialogues:
         *before, last = dialogue.turns
@@ -193,19 +195,20 @@ def draft_about(
 
 
 def single_turn(user: Mapping[Opd, str], answer: Mapping[Opd, str]) -> dict[Opd, list[Turn]]:
-    """The one turn of each OPD mode; what an answer says before its conclusion describes."""
+    """One turn for each OPD mode; all of an answer before its conclusion counts as description."""
     before = {mode: len(text.rpartition(" Conclusion: ")[0]) for mode, text in answer.items()}
     return {mode: [Turn(user=user[mode], assistant=answer[mode], described=before[mode])] for mode in user}
 
 
 def in_turns(draft: Draft, more: Sequence[Draft], catalogue: Catalogue) -> Draft:
-    """The question whose answer describes everything in a first turn, and concludes in a second.
+    """Split a question into turns: the first asks for descriptions of all videos, the others for conclusions.
 
-    A question about one video, without a description or a mode that has none, or of several turns, stays as it is.
+    Unchanged are questions about one video, without the modes `all` and `none`, without a description, or that have
+    several turns already.
 
     Args:
-        more: Further questions about the same videos, each in a turn of its own: descriptions are long, and so more
-            is concluded from one.
+        more: Further questions about the same videos, each in its own turn. Descriptions are long, so several
+            conclusions share one.
     """
     asked = {d.opd: d.turns for d in draft.dialogues}
     if set(map(len, asked.values())) != {1} or not {Opd.ALL, Opd.NONE} <= asked.keys():
@@ -217,7 +220,8 @@ def in_turns(draft: Draft, more: Sequence[Draft], catalogue: Catalogue) -> Draft
     turns = [Turn(user=described_first(len(draft.videos)), assistant=first, described=len(first))]
     for one in (draft, *more):
         (bare,), (told,) = (d.turns for mode in (Opd.NONE, Opd.ALL) for d in one.dialogues if d.opd is mode)
-        # Felt in the first turn, videos are named by their letters, which a list has before each of them already.
+        # Later turns name the videos of the first turn by letter. A listed question has the letter already, so it is
+        # removed before it is added.
         *texts, end = bare.user.split("{tactile}")
         named = [text.removesuffix(f"{x}) ") + f"{x})" for text, x in zip(texts, LETTERS, strict=False)]
         question = "".join([*named, end])
@@ -231,7 +235,7 @@ def in_turns(draft: Draft, more: Sequence[Draft], catalogue: Catalogue) -> Draft
 
 
 def described_first(count: int, aspects: str = "") -> str:
-    """The first turn of a question in two: `aspects` of two or three videos, or everything about them."""
+    """The request of a first turn: to describe `aspects` of two or three videos, or all their properties."""
     asked = f"the {aspects} of these" if aspects else "these"
     return f"Describe {asked} {('two', 'three')[count - 2]} tactile videos: {lettered(count)}."
 
@@ -273,9 +277,10 @@ def lettered(count: int) -> str:
 
 
 def conclusion(text: str) -> list[str]:
-    """What an answer says after its last "Conclusion:", or all of it where it has none, as a person reads it.
+    """The text after an answer's last "Conclusion:", or the whole answer without one; markup is removed.
 
-    It is cut where it says "Answer:" once more. Parts that choose otherwise contradict each other.
+    It is split at each "Answer:". Graders read every part, so that an answer whose parts choose differently has no
+    choice.
     """
     said = re.split(rf"\bconclusion{MARKER}", unmarked(text), flags=re.IGNORECASE)[-1]
     return [" ".join(part.split()) for part in re.split(rf"\banswer{MARKER}", said, flags=re.IGNORECASE)]
@@ -288,11 +293,11 @@ def find_level(text: str, prop: Property) -> int | None:
 
 
 def chosen_letter(answer: str, letters: str, *sayings: str, concluded: bool = False) -> str | None:
-    """The one of `letters` that an answer chooses, or None: two, another one, or "a) or b)" are no choice.
+    """The single letter that an answer chooses; None if it names two, "a) or b)", or one outside `letters`.
 
     Args:
-        sayings: Patterns in which CHOICE stands for the letter. The first that is found decides. Where none is, a
-            letter that is all of an answer, or that its conclusion begins with, before any reason.
+        sayings: Patterns in which CHOICE stands for the letter; the first that matches decides. If none does, the
+            letter counts that is the whole answer or begins its conclusion, before any reason.
         concluded: Look for sayings in the conclusion alone.
     """
     whole, parts = " ".join(unmarked(answer).split()), conclusion(answer)
@@ -343,7 +348,7 @@ def choice_score(
     """
     strict = None
     if published:
-        # All OPD modes conclude alike, so it does not matter which one was asked.
+        # The conclusion is the same in all OPD modes, so any dialogue serves.
         right = question.dialogues[0].turns[-1].assistant.split("Conclusion: ")[-1]
         strict = prediction.outputs[-1].split("Conclusion: ")[-1].startswith(right)
     return [scored(question, prediction, "choice", question.gold.choice, predicted, strict)]

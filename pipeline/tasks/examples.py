@@ -1,4 +1,4 @@
-"""The paper's figures of rice and of a toothbrush: described first, then reasoned about; shown, and counted nowhere."""
+"""The paper's qualitative examples, rice and a toothbrush. Reports show the answers; no accuracy counts them."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from pipeline.tasks.opd import TEMPLATES
 from pipeline.videos.catalogue import Catalogue
 
 LEAST_KNOWN_FIRST = (Part.TEST, Part.VALIDATION, Part.TRAIN)
-"""The parts of a split, what a model knows least of first."""
+"""The parts of a split, the least familiar to a model first."""
 
 
 class Example(NamedTuple):
-    """A question about one object, of whose two options the first is right, or about two, of which the first is."""
+    """A question with two choices, of which the first is right: two options for one object, or two objects."""
 
     name: str
     objects: tuple[str, ...]

@@ -30,7 +30,7 @@ OPENINGS = ("Given three tactile videos: {videos}.", "You have tactile videos of
 REQUEST = "atch each video to one of the following objects in alphabetical order: {options}."
 ORDERS = tuple("".join(order) for order in itertools.permutations("123"))
 TRIES = 60
-"""Draws of inexact facts before they are told as they are."""
+"""Attempts to draw inexact facts; after these, facts are stated exactly."""
 
 
 def fact(catalogue: Catalogue, object_id: str, labels: Sequence[int] | None = None) -> str:
@@ -79,7 +79,7 @@ def steps(some: Iterable[Sequence[float]], others: Iterable[Sequence[float]]) ->
 
 
 def asked(opening: str, names: Iterable[str]) -> dict[Opd, str]:
-    """The question in every OPD mode; names in the order that it lists them in."""
+    """The question in every OPD mode; `names` in the order of the options."""
     names = list(names)
     opening = opening.format(videos=lettered(len(names)))
     request = REQUEST.format(options=", ".join(f"{i}) {name}" for i, name in enumerate(names, 1)))
@@ -101,7 +101,7 @@ def read(answer: str, names: Sequence[str]) -> dict[str, int] | None:
 
 
 def nearest(classes: Classes, catalogue: Catalogue, objects: Iterable[str] | None = None) -> tuple[str, ...]:
-    """The ids, one a video, whose classes are off by the fewest steps; of those, whose mean classes are nearest.
+    """The object ids, one for each video, whose labels are nearest to its classes; ties go by the expected classes.
 
     Args:
         objects: Ids to match, as many as there are videos; by default all of the catalogue.
@@ -121,7 +121,7 @@ def in_words(catalogue: Catalogue, objects: Sequence[str]) -> str:
 
 
 class PropertyObjectMatching(TaskDefinition):
-    """The three objects differ in at least one property each, or touch could not tell them apart."""
+    """Any two of the three objects differ in at least one property; otherwise touch could not tell them apart."""
 
     name = "POM"
     title = "Property-object Matching"
@@ -146,7 +146,8 @@ class PropertyObjectMatching(TaskDefinition):
         return draft_about(pool, objects, rng, turns=turns, choice=order, properties=catalogue.property_names)
 
     def with_facts(self, draft: Draft, catalogue: Catalogue, rng: random.Random, inexact: float = 0.0) -> Draft:
-        """The same question after the facts about its objects; touch and reasoning remain to be asked for."""
+        """The question after facts about its objects, so that it tests touch and reasoning, not knowledge of
+        objects."""
         told = facts(catalogue, draft.objects, rng, inexact)
 
         def begin(dialogue: Dialogue) -> Dialogue:
@@ -157,7 +158,7 @@ class PropertyObjectMatching(TaskDefinition):
         return replace(draft, dialogues=tuple(map(begin, draft.dialogues)))
 
     def restated(self, draft: Draft, catalogue: Catalogue) -> Draft:
-        """The question whose answer, behind descriptions of everything, says of each video what a fact would."""
+        """The question whose answer states the fact about each video's object, between descriptions and conclusion."""
         told = zip(LETTERS, draft.objects, strict=True)
         return before_concluding(draft, " ".join(f"{x}) {fact(catalogue, o)}" for x, o in told))
 

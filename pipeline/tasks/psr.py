@@ -89,7 +89,7 @@ class PropertyScenarioReasoning(TaskDefinition):
         return draft_about(pool, objects, rng, turns=turns, choice=LETTERS[position], properties=names)
 
     def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str | None:
-        """The video whose classes are the fewest steps from what suits; of those, whose mean classes are nearest."""
+        """The video whose classes are nearest to the suitable ones; ties go by the expected classes."""
         asked = question.dialogues[0].turns[-1].user
         scenario = next((s for s in catalogue.language.scenarios if s.question in asked), None)
         if scenario is None:

@@ -18,7 +18,7 @@ from pipeline.tasks.base import Draft, Pool, TaskDefinition, in_turns
 from pipeline.videos.catalogue import Catalogue
 
 CHOICES = 2
-"""At most so many questions of a dialogue in several turns are also asked in the form of a scenario."""
+"""Maximum number of questions of a multi-turn dialogue that are asked again in the form of a scenario question."""
 ATTEMPTS = 60
 """Draws without a new question after which a stratum is left out; a rare class may need many."""
 
@@ -73,13 +73,13 @@ def build_questions(
         restate: Answers as each task's `restated` has them.
         two_turns: Share of the questions that are asked as `in_turns` does, with all others about the same videos.
         plainly: Share of the others that become what their task's `plainly` makes.
-        fold: Stands in the questions' ids, which are so unique over all folds.
+        fold: Part of the questions' ids, which makes them unique over all folds.
     """
     place = str(pool.part) if fold is None else f"{pool.part}-fold{fold}"
     questions: list[Question] = []
     for task, count in counts.items() if pool.objects else ():
         definition = TASKS[task]
-        # Streams of their own: however they are worded, the same questions are drawn.
+        # Separate random streams, so that options of wording do not change which questions are drawn.
         rng, order, turns = (
             random.Random(derive_seed(seed, pool.part, task, *purpose)) for purpose in ((), ("facts",), ("turns",))
         )
@@ -92,7 +92,8 @@ def build_questions(
                 draft, *more = (definition.restated(d, pool.catalogue) for d in (draft, *more))
             if asked_on:
                 choices = (definition.as_choice(d, pool.catalogue) for d in (draft, *more))
-                # A choice may stand anywhere, also first, where a scenario's stands.
+                # Shuffled among the turns: a choice may then follow the descriptions directly, as a scenario question
+                # does.
                 more += islice(filter(None, choices), CHOICES)
                 draft = in_turns(draft, turns.sample(more, len(more)), pool.catalogue)
             if facts:
@@ -103,7 +104,7 @@ def build_questions(
 
 
 def further(definition: TaskDefinition, pool: Pool, draft: Draft, rng: random.Random) -> list[Draft]:
-    """Other questions of the task about the videos of a question, in the same order; random order."""
+    """The task's other questions about the same videos in the same order of videos, shuffled."""
     few = replace(pool, videos={o: [v] for o, v in zip(draft.objects, draft.videos, strict=True)})
     found = {}
     for stratum in range(definition.strata(pool.catalogue)):
@@ -124,7 +125,8 @@ def _drafts(definition: TaskDefinition, pool: Pool, rng: random.Random, distinct
             for draft in (definition.draft(pool, stratum, rng) for _ in range(ATTEMPTS)):
                 if draft is None:
                     continue
-                # A template or a video more does not make a new question about the same videos and property.
+                # Another template does not make a new question about the same videos and properties; another scenario
+                # does.
                 last = draft.dialogues[-1].turns[-1]
                 situation = last.user if "{tactile}" not in last.user else ""
                 key = (draft.videos, draft.gold.properties, last.assistant, situation)

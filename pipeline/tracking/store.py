@@ -50,7 +50,8 @@ def cause(error: Exception, tracking: TrackingConfig) -> str:
 
 
 def attempt(tracking: TrackingConfig, call: Callable[..., T], *args: object) -> T | None:
-    """Call, unless tracking is out of reach already. A failure is one warning: the training is worth more."""
+    """Call, unless tracking has failed before in this process. A failure is only a warning, so that no training is lost
+    to it."""
     if not out_of_reach.is_set():
         try:
             return call(*args)
@@ -161,6 +162,6 @@ class Store:
             self.client.log_batch(run, *(items[i : i + 100] for items in (points, own, marks)), synchronous=True)
 
     def finish(self, run: str, end: int, tags: Mapping[str, str]) -> None:
-        """Say what a run stands for, last of all, and end it."""
+        """Set a run's final tags, as the last step, and end it."""
         self.log(run, tags=tags)
         self.client.set_terminated(run, "FINISHED", end)

@@ -44,7 +44,7 @@ class TrainableTrainer(Trainer):
     Args:
         callbacks: They come after a `TrainingMonitor`.
         rates: Learning rate of the parameters under each name.
-        constant: Of those names, the ones whose rate stays as it is throughout.
+        constant: Names in `rates` whose learning rate is constant.
         sampler: The order of the training set, where it is not simply random.
     """
 
@@ -80,7 +80,7 @@ class TrainableTrainer(Trainer):
         return cast(torch.Tensor, self.accelerator.gather(total.to(device))).sum()
 
     def create_optimizer(self, model: torch.nn.Module | None = None) -> torch.optim.Optimizer:
-        """AdamW with one group a prefix of `rates`, or the Trainer's own without."""
+        """AdamW with one parameter group for each prefix in `rates`; without `rates`, the Trainer's own optimizer."""
         if self._rates is None:
             return cast(torch.optim.Optimizer, super().create_optimizer(model))
         if self.optimizer is None:
@@ -101,7 +101,7 @@ class TrainableTrainer(Trainer):
         for place, name in enumerate(self._rates or ()):
             if name in self._constant:
                 scheduler.lr_lambdas[place] = lambda _: 1.0
-                # What it begins with was set when the scheduler was made, in a warm-up to nothing.
+                # Making the scheduler has already set the rate of the first step, which is 0 in a warm-up.
                 scheduler.optimizer.param_groups[place]["lr"] = scheduler.base_lrs[place]
         return scheduler
 
@@ -196,7 +196,8 @@ MEANT = {
 
 def check_accelerate() -> None:
     """Raise UserError where accelerate was told to compute otherwise than the parameters say."""
-    # Of FSDP it takes version 1 where none is named, which renames what is trained: that would have no learning rate.
+    # Without a version accelerate takes FSDP 1, which renames the trained parameters: no name in `rates` would match
+    # them.
     unnamed = {"FSDP_VERSION": "1"} if "ACCELERATE_USE_FSDP" in os.environ else {}
     for name, meant in MEANT.items():
         found = os.environ.get(name, unnamed.get(name, meant))
