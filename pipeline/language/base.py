@@ -29,8 +29,8 @@ ADAPTER_WEIGHTS = "adapter_model.safetensors"
 def load_tokenizer(folder: Path) -> PreTrainedTokenizerBase:
     """The tokenizer with the tactile tokens added, and with a padding token.
 
-    Where there is none, the unknown token pads, or else the end token. Padding is known by its place and never by its
-    id, so that an end token which pads is still learnt and still stops an answer.
+    If it has none, the unknown token is used, or else the end token. Padding is identified by position, never by token
+    id, so an end token that is also the padding token is still learnt and still ends an answer.
 
     Raises:
         UserError: for a broken file; where there is no end token, which answers are stopped by; and for no chat

@@ -13,9 +13,9 @@ AHEAD = 64
 
 
 class RoomyLayer(DynamicLayer):
-    """Writes new tokens behind the old ones, where transformers' own layer copies all of them for each new token.
+    """Writes the newest keys and values into reserved room; transformers' own layer copies all earlier ones each time.
 
-    What attention is given has the same values. Shapes: batch x heads x tokens x head size.
+    Attention gets the same values. Shapes: batch x heads x tokens x head size.
     """
 
     keys: torch.Tensor

@@ -1,4 +1,4 @@
-"""The one renderer of a conversation: training and evaluation speak through it.
+"""Rendering of a conversation as text, one for training and evaluation, so that both use the same format.
 
 The chat format is the tokenizer's own template where it has one, else Vicuna v1.5's. A video in a question becomes
 `<tact_start>`, one `<tact_frame>` a frame and `<tact_end>`; the model puts tactile embeddings in the frames' places.
@@ -27,7 +27,7 @@ VICUNA = (
 )
 """Vicuna v1.5's format (FastChat's `vicuna_v1.1`): `SYSTEM USER: question ASSISTANT: answer</s>USER: ...`."""
 PROBE = "Octopi"
-"""Said to a chat template to see what it writes around an answer."""
+"""A placeholder, rendered to find out what a chat template writes around an answer."""
 IGNORE_INDEX = -100
 """Label of a token that the loss leaves out (torch's and transformers' convention)."""
 
@@ -89,8 +89,8 @@ def render(
         if not longer.startswith(before):
             raise UserError(f"{where} writes a prompt otherwise once it is answered; take one that only appends")
         added = longer.removeprefix(before)
-        # Some templates (Qwen3's) write their lead before the last answer alone. Every answer is the last one when it
-        # is asked for, so each of them gets it here.
+        # Some templates (Qwen3's) write a prefix, such as an empty block of thoughts, only before the last answer. At
+        # generation every answer is the last one, so each gets the prefix here.
         text += added if not before or added.startswith(lead) else lead + added
         starts.append(len(text) + len(lead))
     ends, answers = [str(tokenizer.convert_ids_to_tokens(i)) for i in end_ids(tokenizer)], []

@@ -19,7 +19,7 @@ from pipeline.language.chat import IGNORE_INDEX, conclusions, encode, render
 from pipeline.training.sampling import EpochDataset, sample_evaluation, sample_training
 
 FILLER = -1
-"""In place of an index: a conversation of one token, of which nothing is learnt."""
+"""Index of a dummy conversation: one token that is left out of the loss."""
 
 
 class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
@@ -61,7 +61,7 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
         self.flip_probability = flip_probability
         self.seed = seed
         self.written: list[dict[str, torch.Tensor]] = []
-        """Of each question all that is the same in every epoch."""
+        """The tensors of each question that are the same in every epoch."""
         for question, dialogue in asked:
             rendered = render(dialogue.turns, tokenizer, system_prompt=system_prompt, frames=per_video, complete=True)
             encoded = encode(rendered, tokenizer, bos=bos)
@@ -71,7 +71,9 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
                 learnt = encode(conclusions(rendered, dialogue.turns), tokenizer, bos=bos).labels
             weights = (torch.tensor(learnt) != IGNORE_INDEX).float()
             if by_question:
+                # The weights of a conversation then sum to 1, however long its answers are.
                 weights = F.normalize(weights, p=1.0, dim=0)
+            # Given descriptions keep their labels; their weight of 0 leaves them out of the loss.
             ids, labels = torch.tensor(encoded.input_ids), torch.tensor(encoded.labels)
             self.written.append({"input_ids": ids, "labels": labels, "weights": weights})
 
@@ -126,7 +128,7 @@ def collate(samples: Sequence[Mapping[str, torch.Tensor]]) -> dict[str, torch.Te
 
 
 class UpdateSampler(Sampler[int]):
-    """Every index once, in random order; within an update by length, since what is computed at once is padded.
+    """Yields every index once, in random order; within an update sorted by length, so that micro-batches pad little.
 
     Which items an update has follows from seed and epoch. It does not depend on how many are computed at once, nor on
     how many devices share them. A last update that devices cannot share evenly is filled up with `FILLER`, where

@@ -1,6 +1,6 @@
-"""Greedy decoding: what all prompts begin with is read once, and what has ended is computed no further.
+"""Greedy decoding that computes the prompts' common prefix once, and drops rows whose answers have ended.
 
-transformers' `generate` goes on with all rows until the longest answer ends, and reads what all begin with for each.
+transformers' `generate` computes the prefix for every row, and every row until the longest answer ends.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pipeline.language.cache import extendable, roomy_cache
 from pipeline.language.octopi import OctopiForCausalLM
 
 READ = 1024
-"""Tokens of prompts that are read at once: enough for a processor, and neighbours of like length pad little."""
+"""Prompt tokens that are computed at once, with padding: enough to keep a processor busy."""
 STAYING = 7 / 8
 """Rows that ended are dropped once no more than this share goes on. Dropping copies the keys and values of all others,
 so it is not done for each row by itself."""
@@ -30,7 +30,7 @@ def greedy(
     ends: Collection[int],
     limits: Sequence[int],
 ) -> list[list[int]]:
-    """All that `greedy_tokens` says: the new tokens of each prompt."""
+    """All tokens that `greedy_tokens` yields, by prompt."""
     said: list[list[int]] = [[] for _ in prompts]
     for row, token in greedy_tokens(model, prompts, features, ends, limits):
         said[row].append(token)
@@ -45,7 +45,7 @@ def greedy_tokens(
     ends: Collection[int],
     limits: Sequence[int],
 ) -> Iterator[tuple[int, int]]:
-    """The likeliest next token after each prompt, until one that ends an answer (kept) or the limit.
+    """Yield the most likely next token of each prompt, up to and including an end token, or up to the limit.
 
     Args:
         prompts: Token ids, of like length where little is to be spent on padding.
@@ -82,7 +82,8 @@ def greedy_tokens(
 
 
 def _step(model: OctopiForCausalLM, embeddings: torch.Tensor, mask: torch.Tensor, cache: Cache) -> torch.Tensor:
-    """Logits behind the last column, rows x vocabulary, of embeddings at the end of what the mask covers."""
+    """Logits of the next token, rows x vocabulary, after these embeddings: the last columns that the mask covers."""
+    # Padding on the left takes no position, so positions count a row's real tokens; the clamp keeps padding at 0.
     positions = (mask.cumsum(1) - 1).clamp(min=0)[:, -embeddings.shape[1] :]
     call = {"attention_mask": mask, "position_ids": positions, "past_key_values": cache, "use_cache": True}
     logits: torch.Tensor = model.llm(inputs_embeds=embeddings, **call, logits_to_keep=1).logits
@@ -95,7 +96,7 @@ def _read(
     """Logits behind each prompt, the cache, and which of its columns a row sees; prompts are padded on the left."""
     device, config = model.connector.delimiters.device, model.llm.config
     shared, parts = 0, [list(range(len(prompts)))]
-    # Layers that forget what lies behind their window can neither share a beginning nor be joined.
+    # Caches of sliding-window layers have dropped tokens, so they can neither share a prefix nor be joined.
     if extendable(config):
         shared = _shared(prompts, model.start_id)
         parts = _parts([len(p) - shared for p in prompts])
@@ -123,14 +124,14 @@ def _read(
     width = max(mask.shape[1] for mask in masks)
     whole = roomy_cache(config)
     for layer in whole.layers:
-        own = [cache.layers.pop(0) for cache in caches]  # Or all would be held twice.
+        own = [cache.layers.pop(0) for cache in caches]  # Popped, so that no keys and values are held twice.
         keys, values = ([getattr(each, kind) for each in own] for kind in ("keys", "values"))
         layer.update(*(torch.cat([F.pad(s, (0, 0, width - s.shape[-2], 0)) for s in x]) for x in (keys, values)))
     return torch.cat(logits), whole, torch.cat([F.pad(mask, (width - mask.shape[1], 0)) for mask in masks])
 
 
 def _shared(prompts: Sequence[Sequence[int]], stop: int) -> int:
-    """How many tokens all prompts begin with alike, before the first video, and not all of any."""
+    """Length of the prompts' common prefix; it ends before the first video and leaves each prompt a token at least."""
     count, most = 0, min(map(len, prompts)) - 1
     while count < most and prompts[0][count] != stop and len({p[count] for p in prompts}) == 1:
         count += 1
@@ -138,7 +139,7 @@ def _shared(prompts: Sequence[Sequence[int]], stop: int) -> int:
 
 
 def _parts(lengths: Sequence[int]) -> list[list[int]]:
-    """Neighbours, of at most `READ` tokens together with their padding, at least one."""
+    """Split rows, in order, into parts of at most `READ` tokens with their padding; a part has one row at least."""
     parts: list[list[int]] = [[]]
     for row in range(len(lengths)):
         longer = [*parts[-1], row]

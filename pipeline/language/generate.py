@@ -32,8 +32,8 @@ class ModelSource:
     quantization: Quantization
     device: DeviceName
     run: float = 0.0
-    """When the stage began. A worker may outlive a run; by this it knows the next run's model in the same folder as
-    another one."""
+    """Start time of the stage. It tells runs apart: a worker may outlive one, and the next has its model in the same
+    folder."""
 
     def __call__(self) -> OctopiForCausalLM:
         """Load it, as `OctopiForCausalLM.from_pretrained` does."""
@@ -53,7 +53,7 @@ class Batch(NamedTuple):
 
 @dataclass(frozen=True)
 class Generated:
-    """What was said to one prompt."""
+    """The answer to one prompt."""
 
     text: str
     tokens: int
@@ -153,12 +153,12 @@ def reply(
 def _reply_batch(model: OctopiForCausalLM, batch: Batch) -> list[Generated]:
     ends = end_ids(model.tokenizer)
     rows = greedy(model, batch.prompts, batch.features, ends, batch.limits)
-    return [_said(row, ends, model.tokenizer) for row in rows]
+    return [_answer_of(row, ends, model.tokenizer) for row in rows]
 
 
 @dataclass(frozen=True)
 class Stream:
-    """What `reply` says to one prompt, in pieces as they come; together they are the same text."""
+    """The answer to one prompt in pieces, as they are generated; joined, they are the text of `reply`."""
 
     model: OctopiForCausalLM
     prompt: Sequence[int]
@@ -174,7 +174,7 @@ class Stream:
 
         Args:
             streams: Of one model, whose first says how many a batch has (`language.generation_batch_size`).
-            left: Places of those that nobody listens to any more; they may be added meanwhile.
+            left: Places of streams whose client has left; the caller may add to it during generation.
         """
         model, size = streams[0].model, streams[0].language.generation_batch_size
         ends, tokenizer = end_ids(model.tokenizer), model.tokenizer
@@ -195,7 +195,7 @@ class Stream:
                     room[row] = 0
                     continue
                 own.append(token)
-                text, over = _said(own, ends, tokenizer).text, token in ends or len(own) == room[row]
+                text, over = _answer_of(own, ends, tokenizer).text, token in ends or len(own) == room[row]
                 # A character may be spread over tokens; until it is whole it is shown as the replacement character.
                 whole = over or not text.endswith("\N{REPLACEMENT CHARACTER}")
                 if text.startswith(given[row]) and len(text) > len(given[row]) and whole:
@@ -206,13 +206,13 @@ class Stream:
 
 
 def _room(model: OctopiForCausalLM, prompt: Sequence[int], language: LanguageConfig) -> int:
-    """Most tokens that an answer may have."""
+    """Maximum number of new tokens for an answer."""
     most = language.max_new_tokens
     return most if model.positions is None else min(most, model.positions - len(prompt))
 
 
-def _said(tokens: list[int], ends: Collection[int], tokenizer: PreTrainedTokenizerBase) -> Generated:
-    """What one row says, without its end token."""
+def _answer_of(tokens: list[int], ends: Collection[int], tokenizer: PreTrainedTokenizerBase) -> Generated:
+    """The text of one row's tokens, without its end token."""
     truncated = tokens[-1] not in ends
     text = tokenizer.decode(tokens if truncated else tokens[:-1], skip_special_tokens=True).strip()
     return Generated(text=text, tokens=len(tokens), truncated=truncated)

@@ -1,4 +1,4 @@
-"""Is touch used at all? Stores that hand out something else than what the sensor felt."""
+"""Input ablations: stores that return other embeddings than the videos' own, to test whether answers use touch."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from pipeline.core.runtime import derive_seed
 
 
 def ablate_input(store: EmbeddingStore, touch: Touch, questions: Sequence[Question], seed: int) -> EmbeddingStore:
-    """What a variant is given of the questions' videos.
+    """The store that a variant reads the questions' videos from.
 
-    - `swapped`: the objects of the questions are put in a random ring and each is given the touch of the next, so no
-      object keeps its own. It may have the same classes all the same.
+    - `swapped`: the objects of the questions are put in a random ring and each gets the embeddings of the next, so no
+      object keeps its own. The next one may still have the same classes.
     - `noise`: normal noise with the mean and deviation of each dimension over all embeddings, the same at each call.
-    - `removed` leaves the embeddings as they are: it is the prompt that has no frames then.
+    - `removed` returns the store unchanged: the prompt leaves the frames out.
 
     Raises:
         UserError: where touch is to be swapped, and the questions are about one object alone.

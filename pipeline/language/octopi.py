@@ -30,7 +30,7 @@ ADAPTER_DIR = "adapter"
 
 
 class OctopiConfig(Record):
-    """config.json of a saved model: what it stands on, and its shapes."""
+    """config.json of a saved model: its base model and its shapes."""
 
     model_type: str = "octopi"
     architectures: tuple[str, ...] = ("OctopiForCausalLM",)
@@ -104,7 +104,7 @@ class OctopiForCausalLM(nn.Module):
         self.llm = llm
         matrix = llm.get_input_embeddings().weight
         self.connector = Connector(tactile_dim, matrix.shape[1])
-        # Not named `config`: what has that name is transformers' own to Trainer, which writes into it.
+        # Not named `config`: Trainer takes an attribute of that name for transformers' own and writes into it.
         self.octopi_config = OctopiConfig(
             base_model=base, tactile_dim=tactile_dim, hidden_size=matrix.shape[1], normalized=normalize
         )
@@ -288,12 +288,13 @@ class OctopiForCausalLM(nn.Module):
         call: dict[str, Any] = {"use_cache": False}
         shared = self._shared(input_ids, labels)
         if shared:
-            # What all rows begin with is read for one of them; only trained words have a gradient there.
+            # The common prefix is computed for one row. Its embeddings need a gradient only where words are trained.
             first = embeddings[:1, :shared] if self.words is not None else embeddings[:1, :shared].detach()
             cache = DynamicCache(config=self.llm.config)
             self.llm(inputs_embeds=first, past_key_values=cache, use_cache=True, logits_to_keep=1)
             cache.batch_repeat_interleave(len(embeddings))
             call = {"past_key_values": cache, "use_cache": True}
+        # Each column predicts the next token.
         targets = labels[:, shared + 1 :]
         learned = targets != IGNORE_INDEX
         columns = learned.any(0).nonzero().flatten()
@@ -306,13 +307,15 @@ class OctopiForCausalLM(nn.Module):
         return CausalLMOutput(loss=each @ counted / torch.where(total > 0, total, 1))
 
     def _shared(self, input_ids: torch.Tensor, labels: torch.Tensor) -> int:
-        """Columns that all rows begin with alike, before any frame and before what foretells a label.
+        """Number of first columns that are equal in all rows, before any frame and any token that predicts a label.
 
-        None in a sharded model: its layers are gathered once a pass, and processes with other batches would wait.
+        0 in a sharded model: the prefix is another pass, for which layers are gathered again, and processes without one
+        would wait.
         """
         if not extendable(self.llm.config) or (self.training and self.llm.is_gradient_checkpointing):
             return 0
         if any(isinstance(module, FSDPModule) for module in self.modules()):
             return 0
         alike = (input_ids == input_ids[:1]) & (input_ids != self.start_id) & (labels == IGNORE_INDEX)
+        # One less: the last of these columns may predict a label.
         return max(0, int(alike.all(0).long().cumprod(0).sum()) - 1)

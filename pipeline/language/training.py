@@ -41,7 +41,7 @@ logger = logging.getLogger(__name__)
 
 
 def add_lora(model: OctopiForCausalLM, config: LoraTrainConfig) -> None:
-    """Put fresh low-rank adapters (float32) on the language model's linear layers, or train on those that it has.
+    """Add new LoRA adapters (float32) to the language model's linear layers, or train those that it has already.
 
     Raises:
         UserError: for layers that it lacks, or an adapter of another shape.
@@ -87,7 +87,7 @@ class Material:
     source: str = "videos"
     """`data.source`: whether the videos are synthetic."""
     files: tuple[Path, ...] = ()
-    """Of the questions, the embeddings, and what is begun with."""
+    """Input files: questions, embeddings, and the model that training starts from."""
     adapter: Path | None = None
     """Folder of the adapter of `language.start`, which alignment leaves as it is."""
 
@@ -185,10 +185,10 @@ def assemble(
 
 
 def with_given(questions: Sequence[Question], opd: Opd, share: float, seed: int) -> tuple[list[Question], set[str]]:
-    """Exchange the touches of a share of the questions that describe several videos, among those with as many.
+    """Exchange the videos of a share of the questions with descriptions, among questions with equally many videos.
 
-    Their descriptions, which are not learnt, then no longer fit what is touched: the model learns to conclude from the
-    description in front of it, and not to take the answer from touch.
+    Their descriptions no longer fit the videos, and are left out of the loss. So the model learns to conclude from the
+    description in the text, and not directly from touch.
 
     Returns:
         All questions in their order, and the ids of those whose touches were exchanged.
@@ -226,6 +226,7 @@ def fit(
     if runtime.gradient_checkpointing:
         model.llm.gradient_checkpointing_enable(gradient_checkpointing_kwargs={"use_reentrant": False})
     seed_everything(job.seed)
+    # Rounded up, since the last update of an epoch may be smaller.
     steps = config.epochs * -(-len(data) // config.batch_size)
     arguments = training_arguments(
         checkpoint_dir(job.stage, job.fingerprint),
@@ -237,7 +238,7 @@ def fit(
         warmup_steps=round(config.warmup_ratio * steps),
         logging_steps=max(1, steps // 50),
     )
-    # Devices compute so many questions at once, and each must have as many, or one would wait for the others.
+    # Number of questions that all devices compute at once. Each needs equally many, or the others would wait for it.
     shared = config.micro_batch_size * arguments.world_size if arguments.world_size > 1 else 1
     trainer = TrainableTrainer(
         model=model,

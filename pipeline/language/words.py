@@ -1,4 +1,4 @@
-"""A start of the projection: frames that read like the words of their object's classes."""
+"""Initialisation of the projection: frames map near the word embeddings of their object's classes."""
 
 from __future__ import annotations
 
@@ -18,13 +18,12 @@ NOISE = 0.3
 def begin_with_words(model: OctopiForCausalLM, data: ConversationDataset, catalogue: Catalogue, seed: int) -> None:
     """Fit the projection so that each frame maps to the mean word embedding of its object's class names.
 
-    Frames of a random projection mean nothing to the language model: it first memorises them object by object, and
-    does not learn which video of a question they belong to. Word-like frames it can find by the label before them,
-    as in a list.
+    With a random projection the language model first memorises frames object by object, and does not learn which video
+    of a question they belong to. Frames that resemble words it finds by the label before them, as in a list.
 
     Args:
-        data: Whose frames, mirrored ones left out, and labels are fitted. Frames get noise, or the few objects would be
-            learnt by heart here.
+        data: Its unmirrored frames and labels are fitted. Noise is added to the frames, or the projection would
+            memorise the few objects.
     """
     tokenizer, matrix = model.tokenizer, model.llm.get_input_embeddings().weight.detach().float()
     classes = [
@@ -40,7 +39,8 @@ def begin_with_words(model: OctopiForCausalLM, data: ConversationDataset, catalo
         wanted.append(mean.expand(len(found), -1))
     device = model.connector.delimiters.device
     x, y = torch.cat(frames).to(device), torch.cat(wanted).to(device)
-    # Word embeddings are far smaller than the optimizer's steps: those of length 1 are fitted, and scaled at the end.
+    # Word embeddings are far smaller than the optimizer's steps. So the targets are divided by their root mean square,
+    # and the projection is multiplied by it at the end.
     length = y.square().mean().sqrt()
     projection, drawn = model.connector.projection, torch.Generator().manual_seed(seed)
     optimizer = torch.optim.AdamW(projection.parameters(), lr=RATE)
@@ -54,6 +54,7 @@ def begin_with_words(model: OctopiForCausalLM, data: ConversationDataset, catalo
         optimizer.step()
         schedule.step()
     optimizer.zero_grad()
+    # A normalised projection has the words' length whatever its weights are.
     if model.word_rms is None:
         with torch.no_grad():
             for parameter in projection[-1].parameters():

@@ -87,6 +87,7 @@ class TrainableTrainer(Trainer):
             # By name, not by identity: distributed wrappers replace the parameters and prefix their names.
             trained = [(n, p) for n, p in (model or self.model).named_parameters() if p.requires_grad]
             groups = [
+                # Dots on both sides, so that a prefix matches whole parts of a name only.
                 {"params": [p for n, p in trained if f".{prefix}." in f".{n}."], "lr": rate}
                 for prefix, rate in self._rates.items()
             ]
