@@ -146,7 +146,7 @@ def ask_all(
             if done:
                 for seed, predictions in answered.items():
                     write_jsonl(place / f"{seed}.jsonl", predictions)
-                # Last: it says of what stands beside it that it belongs to these questions.
+                # Written last, since this file vouches that the answers beside it belong to these questions.
                 days = sorted(reply.day for reply in asker.used.values())
                 source = VisionModel(
                     model=f"{endpoint.model}, published prompts" if published else endpoint.model,

@@ -24,7 +24,7 @@ RANGE = (0.05, 20.0)
 PRIOR = 2.0
 """Standard deviation of the prior on the temperature, as a factor."""
 SMALLEST = 1e-12
-"""Probabilities are lifted to it before a logarithm."""
+"""Lower bound of a probability before its logarithm is taken."""
 DRAWS = 1000
 """Bootstrap samples."""
 
@@ -59,8 +59,8 @@ def rescale(probabilities: npt.ArrayLike, temperature: float) -> Floats:
 def fit_temperature(classified: Sequence[Classification]) -> float:
     """The temperature that makes the expected classes likeliest; 1 where there is nothing to fit it on.
 
-    Videos of one object are alike, so each object counts once, by its videos' mean. Few objects say little: a normal
-    prior holds the temperature's logarithm at 0, with a factor of `PRIOR` as its deviation.
+    Videos of one object are alike, so each object counts once, by its videos' mean. With few objects the data say
+    little, so the temperature's logarithm has a normal prior of mean 0 and deviation log(`PRIOR`).
 
     Args:
         classified: Of one property, on videos that nothing was trained on.
@@ -79,6 +79,7 @@ def fit_temperature(classified: Sequence[Classification]) -> float:
         missed = -np.log(np.maximum(scaled[np.arange(len(expected)), expected], SMALLEST))
         return float(weights @ missed) + (log_temperature / math.log(PRIOR)) ** 2 / 2
 
+    # Over the logarithm, in which halving and doubling a temperature are equally far.
     found = minimize_scalar(loss, bounds=np.log(RANGE), method="bounded", options={"xatol": 1e-5})
     return float(np.exp(found.x))
 

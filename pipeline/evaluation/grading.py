@@ -63,7 +63,7 @@ def conclude(questions: Sequence[Question], classified: Iterable[Classification]
 
 
 def vision_models(folder: Path) -> dict[Path, VisionModel]:
-    """Who answered in the folder of a report in `EXTERNAL`, by the folder of each; empty where there is none.
+    """The models with answers in a report's folder in `EXTERNAL`, by their own folders; empty where there are none.
 
     Raises:
         UserError: for a source.json that is none.

@@ -31,7 +31,8 @@ LEVEL = 0.95
 TINY = 1e-12
 """Variances up to it are rounding."""
 DISTINCT = 1e-3
-"""A factor is estimated beside the others where the smallest eigenvalue of all moments, scaled to 1, is larger."""
+"""A variance component is estimated only where the smallest eigenvalue of the scaled moments exceeds this; below it,
+the component cannot be told apart from the others."""
 
 
 class Interval(NamedTuple):
@@ -66,7 +67,8 @@ class Design:
 
     @property
     def estimable(self) -> bool:
-        """Whether objects can be seen to differ: not with one object, nor if every question is about all of them."""
+        """Whether a variance over objects can be estimated: not with one object, nor if all questions are about all
+        objects."""
         return self.objects > 1 and bool(self.moments[0, 0] > TINY)
 
     @property
@@ -166,7 +168,7 @@ def wilson(values: Values, design: Design) -> tuple[Values, Values]:
 
 
 def effective(single: Values, mean: Values, design: Design) -> Values:
-    """How many independent questions with the variance `single` have a mean with the variance `mean`; shapes alike."""
+    """Effective sample size: how many independent questions of variance `single` have a mean of variance `mean`."""
     estimated = (single > TINY) & (mean > TINY)
     few = min(design.objects, design.questions)
     return np.clip(np.where(estimated, single / np.where(estimated, mean, 1.0), few), 1, design.questions)

@@ -21,11 +21,11 @@ from scipy.sparse.csgraph import connected_components
 from pipeline.evaluation.intervals import LEVEL, Design, Objects, Values, design_of, effective, variance
 
 MOST_FLIPPED = 15
-"""Up to so many units all signs are gone through; beyond, some are drawn."""
+"""Up to so many units all combinations of signs are enumerated; beyond, some are drawn."""
 DRAWS = 10_000
 ROUNDING = 1e-9
 POWER, SIZE = 0.8, 0.05
-"""How often a true difference is to be found, and how often one where there is none."""
+"""Power and significance level of the minimum detectable effect."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Difference:
     high: float | None = None
     p: float | None = None
     """Two-sided, of sign flips over objects. It takes few values (with seven objects none below 2/128) and is about
-    these runs alone, so that it may doubt what the interval excludes, or the other way round."""
+    these runs alone, so it and the interval may disagree."""
     smallest_effect: float | None = None
     """Minimum detectable effect: the smallest true difference that such a comparison finds in four of five repetitions;
     above 1 there is none."""
@@ -102,6 +102,7 @@ def standard_error(values: Values, design: Design) -> tuple[Values, Values, Valu
         freedom = np.where(total > 0, 1 / np.where(inverse > 0, inverse, 1.0), freedom)
     spread = np.maximum(0.0, square - mean**2) * design.questions / max(1, design.questions - 1)
     n = effective(spread, total, design)
+    # One difference of 1 and one of -1 are added: 2 to the number and to the sum of squares, 0 to the sum.
     centre = n * mean / (n + 2)
     return np.sqrt(np.maximum(0.0, (n * square + 2) / (n + 2) - centre**2) / (n + 2)), centre, freedom
 
@@ -110,21 +111,23 @@ def sign_flip(values: Values, design: Design) -> Values:
     """Two-sided p (...) of the mean of differences (..., questions): could they as well have gone the other way?
 
     If both settings are equally good, what an object adds to the difference is as likely to be d as -d. Up to 15
-    objects all signs are gone through, beyond that 10 000 are drawn (Phipson and Smyth 2010 for their p).
+    objects all combinations of signs are enumerated, beyond that 10 000 are drawn (Phipson and Smyth 2010 for their p).
 
-    Simulated at 5 %, two equally good settings are told apart in at most 3 %. Where a difference were fixed by three
-    objects at once and by nothing else, it would be 13 %: objects are taken to add up.
+    In simulations at the 5 % level, at most 3 % of comparisons of equally good settings were significant. If
+    differences came only from triples of objects as wholes, it would be 13 %: the test assumes that objects' effects
+    add up.
     """
     units = flip_units(design)
     parts = values @ units.T
     if len(units) <= MOST_FLIPPED:
-        # The first keeps its sign, as only sizes matter.
+        # The first sign is fixed: flipping all signs leaves the absolute value of the sum unchanged.
         signs = np.array([(1.0, *way) for way in itertools.product((1.0, -1.0), repeat=len(units) - 1)])
         extra = 0
     else:
         signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(DRAWS, len(units)))
         # The measured signs count as a draw too, so that p is never 0.
         extra = 1
+    # Sums that are equal but for rounding must count as equally far.
     measured = np.abs(parts.sum(axis=-1, keepdims=True)) - ROUNDING * np.abs(values).sum(axis=-1, keepdims=True)
     as_far = (np.abs(parts @ signs.T) >= measured).sum(axis=-1)
     return np.asarray((as_far + extra) / (len(signs) + extra), dtype=np.float64)
@@ -132,7 +135,7 @@ def sign_flip(values: Values, design: Design) -> Values:
 
 @lru_cache(maxsize=32)
 def flip_units(design: Design) -> Values:
-    """Units x questions: what each unit that is flipped takes of each question's difference; columns sum to 1 in total.
+    """Units x questions: the weight of each question's difference in each unit that is flipped; columns sum to 1.
 
     For questions about one object a unit is the object's sum. With several objects a question, the objects' sums
     overlap, and flipping them as if independent gives false positives. So each difference is modelled as the mean of

@@ -159,8 +159,8 @@ def effect_rows(
 ) -> list[EffectRow]:
     """The rows of effects.csv: what each part of the full system brings, task by task, pooled over seeds.
 
-    Only each task's measure of a whole answer, on questions and seeds that both settings have. Holm's family is all
-    rows. Arguments are as `score_rows` takes them.
+    Only each task's measure of a whole answer, on questions and seeds that both settings have. Holm's adjustment is
+    over all rows. Arguments are as `score_rows` takes them.
     """
     rows = []
     table = _table(graded, catalogue, concluded or {})
@@ -180,9 +180,10 @@ def candidate_rows(
     task: str = CROSS_VALIDATION,
     properties: Sequence[str] = (),
 ) -> list[EffectRow]:
-    """Each other encoder less the reference, every property of a video right at once, then each of these properties.
+    """Each other encoder less the reference: all properties of a video right, then each of these properties alone.
 
-    As effects, with the repeats in place of seeds; a family of its own. Empty where the reference was not run.
+    Computed as effects are, with repeats in place of seeds and a Holm adjustment of its own. Empty where the reference
+    was not run.
     """
     rows = []
     for place, measure in [(None, "combined"), *enumerate(properties)]:
@@ -195,7 +196,7 @@ def candidate_rows(
 
 
 def with_holm(rows: Sequence[EffectRow]) -> list[EffectRow]:
-    """The rows as one family: what each p is worth, as all of them were looked at (Holm 1979); none has none."""
+    """The rows with Holm's adjusted p (Holm 1979), all of them as one family; a row without p gets none."""
     tested = [row.p for row in rows if row.p is not None]
     adjusted = iter(multipletests(tested, method="holm")[1].tolist() if tested else [])
     return [row if row.p is None else row.model_copy(update={"p_holm": next(adjusted)}) for row in rows]

@@ -76,7 +76,7 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     splits = list(read_splits(data, params.split, params.ablation.seeds).values())
     graded = read_table(data / "graded.parquet", Graded)
     vision = [*_read(data / "graded_vision.parquet", GradedVision), *_read(data / "shipped.parquet", GradedVision)]
-    # By the lists in params.yaml and not by what lies there: a narrowed ablation leaves the others' files behind.
+    # By the lists in params.yaml, not by the files: after an ablation is narrowed, files of removed variants remain.
     models = params.cross_validation.models
     found = {name: _read(data / "cross_validation" / name / "out_of_fold.parquet", OutOfFold) for name in models}
     out_of_fold: dict[str, list[OutOfFold]] = {name: records for name, records in found.items() if records}

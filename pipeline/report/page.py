@@ -159,7 +159,7 @@ def _chapter(report: Report, gaps: list[Gap]) -> dict[str, Any]:
 
 
 def left_to_users(reports: Iterable[Report]) -> list[Gap]:
-    """What of `BY_USER` no report has."""
+    """The entries of `BY_USER` that no report covers."""
     filmed = [r for r in reports if r.provenance["source"] == "videos"]
     known = {name for r in filmed for name in (r.name, *r.scores["task"])}
     known |= {f"{r.provenance['dataset']} {touch}" for r in filmed for touch in r.scores["touch"]}
@@ -249,7 +249,7 @@ def _speed(folder: Path, gaps: list[Gap]) -> Iterator[dict[str, Any]]:
             "costs": "; ".join(group["unit"].dropna().unique()),
             "errors": "; ".join(group["error_of"].dropna().unique()),
             "figure": figure if (folder / figure).is_file() else "",
-            "front": group[group["front"]].sort_values("cost_ratio").map(_said).to_dict("records"),
+            "front": group[group["front"]].sort_values("cost_ratio").map(_cell_text).to_dict("records"),
             "html": draw_table(_shown(shown), str(question), "speed_error.csv"),
         }
 
@@ -284,11 +284,11 @@ def _measured(file: Path, columns: tuple[str, ...], command: str, gaps: list[Gap
 
 def _shown(rows: pd.DataFrame) -> pd.DataFrame:
     """Rows of a CSV as text, without empty columns."""
-    rows = rows.dropna(axis="columns", how="all").map(_said)
+    rows = rows.dropna(axis="columns", how="all").map(_cell_text)
     return rows.rename(columns=lambda name: name.replace("_", " ").capitalize())
 
 
-def _said(value: Any) -> str:
+def _cell_text(value: Any) -> str:
     """A cell of a CSV in words: four digits of a fraction, nothing for what is missing."""
     if isinstance(value, bool):
         return "yes" if value else "no"

@@ -124,9 +124,9 @@ def _against_chance(rows: pd.DataFrame, whose: str = "The full system's") -> str
 
 
 def _touch(effects: pd.DataFrame, solved: Collection[str]) -> str:
-    """Whether answers use touch. Where a task is not `solved`, no better than chance, a difference cannot show it.
+    """Whether answers use touch. In a task no better than chance (not in `solved`) a difference cannot show it.
 
-    An answer that is no choice at all counts as wrong, and without touch answers may lose their form.
+    Without touch, answers may lose their form; unreadable ones count as wrong, which makes a difference of its own.
     """
     rows = effects[effects["part"] == "touch"]
     if not len(rows):
@@ -152,8 +152,9 @@ def _span(rows: pd.DataFrame) -> str:
 
 
 def _impossible(effects: pd.DataFrame) -> str:
-    """Whether so few objects could show anything at all: a sign flip's p is at least 2 / 2**objects."""
+    """A note where too few objects rule out significance: the p of a sign-flip test is at least 2 / 2**objects."""
     objects = int(effects["objects"].max())
+    # Holm's adjustment multiplies the smallest p by the number of tests.
     return f" ({objects} objects are too few for that)" if effects["p"].count() * 2.0 ** (1 - objects) >= ALPHA else ""
 
 

@@ -1,4 +1,5 @@
-"""Sample answers of the full system: a rule decides which, never a person. Text only: frames belong to who filmed."""
+"""Sample answers of the full system: a rule decides which, never a person. Text only, since frames belong to those who
+filmed them."""
 
 from __future__ import annotations
 
