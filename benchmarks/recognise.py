@@ -1,4 +1,4 @@
-"""Which of k objects, each touched once, is touched again? Without training, by how alike two touches are."""
+"""Recognition without training: which of k objects, each remembered by one touch, is most similar to another touch?"""
 
 from __future__ import annotations
 
@@ -23,9 +23,8 @@ COUNTS = (2, 5)
 def measure(root: Path) -> list[Row]:
     """Errors of the shipped model's encoder, which was trained on none of these objects, on the videos of the chain.
 
-    A sensor drifts while it records, and one object's videos are mostly recorded together: the untouched sensor, which
-    has felt nothing, recognises them, too. So it stands beside the touch, and candidates are also drawn from one
-    recording session alone.
+    A sensor drifts while it records, and one object's videos are mostly recorded together: even the no-contact picture
+    recognises them. So it is measured as a baseline, and candidates are also drawn from one recording session alone.
     """
     from pipeline.use.model import Octopi
     from pipeline.videos.audit.leakage import sessions

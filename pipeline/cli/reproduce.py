@@ -50,7 +50,7 @@ def reproduce(root: Path, arguments: list[str]) -> int:
 
     stopped: list[BaseException] = []
 
-    def heard(record: logging.LogRecord) -> bool:
+    def shown(record: logging.LogRecord) -> bool:
         """Whether DVC's words are shown: a stage that Ctrl-C ended has said so itself."""
         error = record.exc_info[1] if record.exc_info else None
         if error and (isinstance(error, KeyboardInterrupt) or str(error.__cause__).endswith(INTERRUPTED)):
@@ -64,7 +64,7 @@ def reproduce(root: Path, arguments: list[str]) -> int:
         print(f"{name}: up to {waiting} of {total} stages will run", flush=True)
     if waiting or arguments:
         for handler in logging.getLogger("dvc").handlers:
-            handler.addFilter(heard)
+            handler.addFilter(shown)
         status = int(dvc(["repro", *arguments]))
         if stopped and isinstance(stopped[0], KeyboardInterrupt):
             raise KeyboardInterrupt

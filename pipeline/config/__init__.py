@@ -140,7 +140,8 @@ class SplitConfig(Section):
         return seed % self.folds if self.name == "kfold" else None
 
     def replicate_of(self, seed: int) -> int:
-        """Seeds of one replicate test each object once together, so their answers are pooled as those of one seed."""
+        """The replicate of a seed. The seeds of one test each object once together, so their answers are pooled as one
+        seed's."""
         return seed // self.folds if self.name == "kfold" else seed
 
 
@@ -162,11 +163,12 @@ class QuestionsConfig(Section):
     """Begin matching questions with what the named objects are like, for a language model that has never heard of
     them: then touch and reasoning are asked for and no knowledge of the world. Tables say so."""
     names: Literal["catalogue", "number"] = "catalogue"
-    """What objects are called. `number`: "object 7", as the objects are that the shipped model has learnt from; it
-    copies no other name. With `facts`, a name says nothing about its object."""
+    """What objects are called. `number`: "object 7", as in the training of the shipped model, which cannot repeat other
+    names. Such a name says nothing about its object; `facts` do."""
     inexact: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """`facts` in training: chance that a class told is a neighbour of the right one, the right matching staying the
-    nearest. An encoder's errors are of this kind, and exact facts teach to look for equal classes alone."""
+    """`facts` in training: probability that a stated class is a neighbour of the right one; the right matching stays
+    the nearest. An encoder errs in this way, and from exact facts the model would learn to look for equal classes
+    alone."""
     restate: bool = False
     """Where everything is described (OPD `all`), have answers to PC and PSS name the classes of the one property that
     is asked for, and which object has more or less of it, before they conclude: for a language model too small to find
@@ -304,9 +306,9 @@ class LanguageConfig(Section):
     """Begin each conversation about touch with the begin token, where the tokenizer writes one (the published code
     takes it away). A chat template's own stays."""
     normalize_touch: bool = False
-    """Scale each projected tactile embedding to the root mean square of the word embeddings. Without, alignment at a
-    high rate makes them a hundred times as long as words, and what attention adds to them, as which video they are of,
-    is lost in them."""
+    """Scale each projected tactile embedding to the root mean square of the word embeddings. Otherwise alignment at a
+    high rate makes them a hundred times as long as words, which drowns what attention adds to them, such as the video
+    that they belong to."""
     max_new_tokens: Annotated[int, Field(ge=1, le=4096)] = 256
     """Of an answer; fewer where the language model has no more positions. Longer answers are cut and marked."""
     generation_batch_size: Positive = 32
@@ -353,8 +355,8 @@ class AlignConfig(TrainConfig):
     """Word embeddings that are trained, here and in the end-to-end training that follows: `all`, the whole layer
     (paper), or only those of the two `new` tokens. All take another 16 bytes a value, 2 GiB for Vicuna-7b."""
     begin_with_words: bool = False
-    """First fit the projection to the word embeddings of each object's classes: for a small model, which would take
-    many more questions to read frames of one video apart from those of the next."""
+    """First fit the projection to the word embeddings of each object's classes: for a small model, which would need
+    many more questions to tell the frames of one video from those of the next."""
 
 
 class LoraTrainConfig(TrainConfig):
@@ -369,8 +371,8 @@ class LoraTrainConfig(TrainConfig):
     """Linear layers that get an adapter (the paper does not say; the published code: q_proj and k_proj); `all-linear`:
     all but the one that gives the logits."""
     given: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Share of the questions about several videos whose descriptions are left out of the loss, with another question's
-    videos: the model must then conclude from the description and not from touch."""
+    """Share of the questions about several videos that get another question's videos, with their descriptions left out
+    of the loss: the model must then conclude from the description and not from touch."""
 
 
 class AblationConfig(Section):
@@ -389,7 +391,7 @@ class AblationConfig(Section):
     seeds: tuple[Seed, ...] = Field(default=(0,), min_length=1)
     """With split.name=kfold seeds are folds: [0, 1, 2] of three folds tests each object once, [0, ..., 5] twice."""
     touch: tuple[Literal[Touch.REMOVED, Touch.SWAPPED, Touch.NOISE], ...] = ()
-    """Input ablations: what the full system is also given in place of its videos, to see whether it feels them."""
+    """Input ablations: what the full system is also given in place of its videos, to test whether it uses touch."""
 
     @model_validator(mode="after")
     def _lists_make_sense(self) -> Self:

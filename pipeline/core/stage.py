@@ -29,7 +29,7 @@ from pipeline.core.runtime import CHECKPOINTS, cores, limit_threads, processor, 
 
 DATA = Path("data")
 RUNS = Path("runs")
-NUMBERS = ("NVIDIA_TF32_OVERRIDE", "TORCH_ALLOW_TF32_CUBLAS_OVERRIDE")
+TF32_VARIABLES = ("NVIDIA_TF32_OVERRIDE", "TORCH_ALLOW_TF32_CUBLAS_OVERRIDE")
 """Variables that turn TF32, which has float16's precision, on or off. They change results; some containers set them."""
 
 
@@ -83,7 +83,7 @@ def launch(launcher: str) -> None:
     """
     command, marked = shlex.split(launcher) or ["python"], os.environ.get("OCTOPI_LAUNCHED")
     if marked or "RANK" in os.environ:
-        if marked != str(os.getpid()):  # An equal number means that the launcher replaced itself by this process.
+        if marked != str(os.getpid()):  # Equal where the launcher runs this script in its own process.
             end_with_parent(os.getppid(), grace=5)
     elif command != ["python"]:
         os.environ["OCTOPI_LAUNCHED"] = str(os.getpid())
@@ -110,7 +110,7 @@ def stage(name: str, key: str | None = None, *, launched: bool = False) -> Itera
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     quiet_libraries()
     try:
-        if number := next((name for name in NUMBERS if name in os.environ), None):
+        if number := next((name for name in TF32_VARIABLES if name in os.environ), None):
             raise UserError(f"{number} is set, which changes the format that numbers are computed in; unset it")
         params = load_params()
         if launched:
@@ -146,7 +146,7 @@ def stage(name: str, key: str | None = None, *, launched: bool = False) -> Itera
 
 NO_MEMORY = ("out of memory", "can't allocate memory", "CUBLAS_STATUS_ALLOC_FAILED")
 """How torch says it, on a GPU and on a processor: by a RuntimeError."""
-LITTLE = 64 * 2**20
+FULL_BELOW = 64 * 2**20
 """Free bytes below which a disk counts as full where a library does not say why it could not write."""
 
 
@@ -158,7 +158,7 @@ def disk_error(error: Exception) -> str | None:
         number = int(found[1])
     # Torch says that it could not write a file, and not why.
     elif number is None and ("iostream error" in said or "PytorchStreamWriter failed" in said):
-        number = errno.ENOSPC if shutil.disk_usage(".").free < LITTLE else errno.EIO
+        number = errno.ENOSPC if shutil.disk_usage(".").free < FULL_BELOW else errno.EIO
     if number is None:
         return None
     where = getattr(error, "filename", None) or f"{DATA}/ or {CHECKPOINTS}/"

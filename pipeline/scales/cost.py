@@ -40,7 +40,7 @@ CARDS = {
     "h100": Card(989e12, 3350e9, 80),
 }
 """From NVIDIA's data sheets: RTX 3090 and 4090 (Ada white paper), RTX A6000, A100 80 GB SXM, H100 SXM."""
-REACHED = 0.35
+UTILISATION = 0.35
 """Share of a card's peak that training reaches: an assumption. Large trainings report .21 to .46 (Chowdhery et al.
 2022, table 3); small batches reach less."""
 REST = ("pretrain", "cross_validate", "finetune_encoder", "embed")
@@ -159,8 +159,8 @@ def describe(hours: list[Hours], params: Params, card: str) -> Iterator[str]:
     devices, _ = launched(params.runtime.launcher)
     if card:
         known = CARDS[card]
-        flops, bandwidth = REACHED * known.flops, known.bandwidth
-        how = f"on {card}, if training reaches {REACHED:.0%} of its {known.flops / 1e12:.0f} TFLOP/s"
+        flops, bandwidth = UTILISATION * known.flops, known.bandwidth
+        how = f"on {card}, if training reaches {UTILISATION:.0%} of its {known.flops / 1e12:.0f} TFLOP/s"
     else:
         flops, bandwidth = measured_rate(), None
         how = f"on this processor, at the {flops / 1e9:.0f} GFLOP/s that it reaches now (name a GPU with --card)"

@@ -1,8 +1,8 @@
 """The memory that each stage of a scale takes on a device, counted from shapes before anything runs.
 
 Counted are weights, what training adds to them, the values that a backward pass reads again, the widest passing values,
-and the keys and values of an answer in the making. Not counted are the CUDA context, fragments, and the kernels' own
-rooms: a GiB or two on a card. Tests hold what is kept to what autograd keeps.
+and the keys and values of an answer in the making. Not counted are the CUDA context, fragmentation and kernels'
+workspaces: one or two GiB on a card. Tests compare the counted activations with what autograd keeps.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ GATHERED = 2
 READ_TOGETHER = ({"q_proj", "k_proj", "v_proj"}, {"gate_proj", "up_proj"}, {"down_proj"})
 """Linear maps that read one tensor, which a frozen layer does not keep; what `o_proj` reads, attention keeps anyway."""
 ASKED = 30
-"""Questions of each task that the longest is looked for among."""
+"""Questions of each task among which the longest conversation is looked for."""
 LETTERS = 4
 """Letters a token of English text, where the tokenizer is not there to ask."""
 

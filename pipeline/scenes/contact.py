@@ -6,8 +6,8 @@ the patch carries the body and its larger bumps; what is too fine for it is pres
 pressure flattens it, by the contact share of a rough surface, erf(sqrt(2) p / (E* h')), with the root mean square
 slope h' of the fine part (Persson 2001, J. Chem. Phys. 115).
 
-A gel is alike everywhere, so that a contact depends on the force alone, not on where and how turned it is: a body is
-pressed at a few forces once a video, and frames are cut out of what lies between.
+The gel is uniform, so a contact depends on the force and not on its place or rotation. A body is therefore pressed at a
+few forces once a video, and frames are interpolated between these.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def choose(
     # A layer's influence is smooth on cells of half its thickness only.
     ladder = [m for m in LADDER if side * pitch <= m.cells * GEL.thickness / 2]
     rungs = [m for m in ladder if m.cells < side]
-    if len(rungs) < max(2, len(ladder)):  # One alone would be held against nothing.
+    if len(rungs) < max(2, len(ladder)):  # A single rung has no finer one to estimate its error.
         rungs.append(Method("layer"))
     springs, coarse = (press_by(method, heights, top, modulus, pitch) for method in (winkler, rungs[0]))
     error = 0.0
@@ -219,7 +219,7 @@ def _compliances(cells: int, pitch: float, tier: Tier) -> tuple[Kernel, Kernel]:
 
 
 def _enlarge(field: Heights, side: int) -> Heights:
-    """By cubic splines: light shows slopes, those of linear pieces jump, and OpenCV's cubic ripples on a slope."""
+    """By cubic splines, since light shows slopes: linear interpolation makes them jump, OpenCV's cubic one ripples."""
     spline = _spline(field.shape[0], side)
     return np.asarray(spline @ field @ spline.T)
 

@@ -29,7 +29,7 @@ from pipeline.videos.catalogue.wording import unmarked
 OPENINGS = ("Given three tactile videos: {videos}.", "You have tactile videos of one object each: {videos}.")
 REQUEST = "atch each video to one of the following objects in alphabetical order: {options}."
 ORDERS = tuple("".join(order) for order in itertools.permutations("123"))
-TRIES = 60
+FACT_DRAWS = 60
 """Attempts to draw inexact facts; after these, facts are stated exactly."""
 
 
@@ -54,7 +54,7 @@ def facts(catalogue: Catalogue, objects: Sequence[str], rng: random.Random, inex
     """
     right = [catalogue.labels(o) for o in objects]
     told = right
-    for _ in range(TRIES if inexact else 0):
+    for _ in range(FACT_DRAWS if inexact else 0):
         told = [
             tuple(
                 rng.choice([n for n in (level - 1, level + 1) if 0 <= n < len(p.levels)] or [level])
@@ -65,6 +65,7 @@ def facts(catalogue: Catalogue, objects: Sequence[str], rng: random.Random, inex
             for labels in right
         ]
         others = (steps(told, order) for order in itertools.permutations(right) if list(order) != right)
+        # Otherwise another matching would fit the facts as well as the right one.
         if steps(told, right) < min(others):
             break
         told = right

@@ -46,6 +46,7 @@ def adapt(model: Octopi, videos: Sequence[Path], to: Path) -> None:
     with atomic_folder(to) as made:
         shutil.copytree(model.folder, made, dirs_exist_ok=True)
         statistics = made / ENCODER_DIR / STATISTICS_FILE
+        # The features are standardised already, so the new mean and deviation come on top of the old ones.
         known._replace(mean=known.mean + mean * known.scale, scale=scale).save(statistics)
         write_text(made / CARD_FILE, CARD.format(name=model.name, count=len(features)))
         own = {f.relative_to(made).as_posix(): sha256(f) for f in (statistics, made / CARD_FILE)}

@@ -146,7 +146,7 @@ def describe_folder(model: Octopi, paths: Sequence[Path], out: Path) -> tuple[in
     files, known = videos_of(paths), model.catalogue.properties
     probabilities = [f"{p.name}: {level}" for p in known for level in p.levels]
     columns = ["file", *model.properties, *probabilities, "sentence", "frames", "notes", "error", "model"]
-    done = _done(out, columns, _whose(model))
+    done = _done(out, columns, _label_of(model))
     rest = [(file, name) for file, name in files if name not in done]
     failed = sum(bool(error) for error in done.values())
     if not out.is_file() or not done:
@@ -200,7 +200,7 @@ def videos_of(paths: Sequence[Path]) -> list[tuple[Path, str]]:
     return found
 
 
-def _whose(model: Octopi) -> str:
+def _label_of(model: Octopi) -> str:
     """What a CSV calls a model, by which rows of another one are told apart."""
     return f"{model.name} {model.config.digest}"
 
@@ -226,7 +226,7 @@ def _describe(model: Octopi, files: Sequence[tuple[Path, str]]) -> Iterator[dict
         rows: list[dict[str, object]] = []
         good = []
         for file, name in files[start : start + BATCH]:
-            row: dict[str, object] = {"file": name, "model": _whose(model)}
+            row: dict[str, object] = {"file": name, "model": _label_of(model)}
             rows.append(row)
             try:
                 model.look(file)

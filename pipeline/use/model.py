@@ -275,7 +275,7 @@ class Octopi:
             given = f"{counted(len(videos), 'video')} and {counted(len(names), 'name')} ({'; '.join(names)})"
             raise UserError(f"{given}: two or three of each can be matched; write {self._example()}; ...")
         if isinstance(names, Mapping):
-            objects = [self._told(name, classes) for name, classes in names.items()]
+            objects = [self._described_object(name, classes) for name, classes in names.items()]
         else:
             objects = [self._object(name) for name in names]
         if len({o.object_id for o in objects}) < len(names):
@@ -398,7 +398,7 @@ class Octopi:
             f"{name}: the model's catalogue has no such object; {hint}tell what it is like ({self._example()})"
         )
 
-    def _told(self, name: str, classes: Sequence[str]) -> Object:
+    def _described_object(self, name: str, classes: Sequence[str]) -> Object:
         """An object that the caller describes by its classes, in the order of the properties."""
         levels = [p.levels for p in self.catalogue.properties]
         if len(classes) != len(levels) or any(c not in known for c, known in zip(classes, levels, strict=True)):

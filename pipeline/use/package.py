@@ -106,7 +106,7 @@ def package(data: Path, params: Params, variant: Variant, base: Base, out: Path)
             base=base,
             chat=chat_sample(load_tokenizer(Path(language.weights)), language),
             quiet=quiet_level(read_table(data / "frames" / PROBES_FILE, Probe)),
-            usual=_usual(embeddings, data / "splits" / f"{variant.seed}.parquet", params),
+            usual=_largest_distance(embeddings, data / "splits" / f"{variant.seed}.parquet", params),
             temperatures=temperatures,
             scores={task: score[1:4] for task, score in scores.items()},
             files={f.relative_to(folder).as_posix(): sha256(f) for f in sorted(folder.rglob("*")) if f.is_file()},
@@ -161,7 +161,7 @@ def _scores(file: Path, wanted: tuple[str, ...]) -> dict[str, Score]:
     }
 
 
-def _usual(embeddings: Path, split: Path, params: Params) -> float:
+def _largest_distance(embeddings: Path, split: Path, params: Params) -> float:
     """Largest distance of a training or validation video from the training mean, rounded up."""
     store, known = EmbeddingStore(embeddings), Statistics.load(embeddings / STATISTICS_FILE)
     distances = []

@@ -40,7 +40,7 @@ UPLOAD_SECONDS, DRAIN_SECONDS = 30.0, 5.0
 MOST_TOKENS = 1024
 """The longest answer that a client may ask for."""
 SHORTEST_TOKEN = 16
-HOME = ("127.0.0.1", "localhost", "::1", "[::1]")
+LOCAL_NAMES = ("127.0.0.1", "localhost", "::1", "[::1]")
 """Names that a server without a token answers to."""
 
 
@@ -99,7 +99,7 @@ class Service:
         A site may point its own name at 127.0.0.1, so that a visitor's browser asks here for it (DNS rebinding).
         """
         if not self.token:
-            if (request.url.hostname or "") not in HOME:
+            if (request.url.hostname or "") not in LOCAL_NAMES:
                 raise HTTPException(403, "this server has no token and answers to 127.0.0.1 and localhost only")
             return
         given = request.headers.get("authorization", "").removeprefix("Bearer ").strip()
@@ -234,10 +234,10 @@ async def _events(reply: Reply, first: str, pieces: AsyncGenerator[str]) -> Asyn
             yield event(reply.chunk({}, "stop"))
             yield "data: [DONE]\n\n"
         except (UserError, Failed) as error:
-            yield event(error_body(*_said(error)))
+            yield event(error_body(*_client_message(error)))
 
 
-def _said(error: Exception) -> tuple[str, int]:
+def _client_message(error: Exception) -> tuple[str, int]:
     """What a client is told of an error, and the status."""
     if isinstance(error, AnyHTTPException):
         return str(error.detail), error.status_code
@@ -288,7 +288,7 @@ def make_app(model: Octopi, name: str, *, token: str = "", limits: Limits | None
         return {"status": "ok", "model": name, "waiting": service.taken, "places": places}
 
     async def refuse(request: Request, error: Exception) -> Response:
-        message, status = _said(error)
+        message, status = _client_message(error)
         if status != 408:
             await _drain(request, 4 * service.limits.body_bytes)
         return JSONResponse(error_body(message, status), status, getattr(error, "headers", None))

@@ -16,7 +16,7 @@ from pipeline.core.runtime import derive_seed
 from pipeline.videos.catalogue import RULED_SPLITS, Catalogue
 
 CANDIDATES = 2000
-"""Random sets of test objects that the development split chooses the best balanced one from."""
+"""Number of random sets of test objects; the development split takes the most balanced one."""
 FEWEST_TRAINING_OBJECTS = 3
 """A superlative or a matching question needs three objects."""
 VALIDATION = 8

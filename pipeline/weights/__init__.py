@@ -293,7 +293,7 @@ class Backbone(NamedTuple):
     get: str = ""
     """How the files are got."""
     settings: tuple[str, ...] = ()
-    """Keys of the section `encoder` that it has a use for and not every backbone has."""
+    """Keys of the section `encoder` that this backbone uses and not every other does."""
 
     def place(self, config: EncoderConfig) -> Path:
         """The folder or file of its weights."""
@@ -313,7 +313,8 @@ BACKBONES = {
         "pipeline.encoder.timm_backbone",
         "the network of encoder.weights",
         lambda folder: [folder / TIMM_CONFIG, folder / TIMM_WEIGHTS],
-        side=lambda told: len(told["architecture"]) and 0,  # Any will do, of a network that has a name.
+        # Frames of any size; the key `architecture` only shows that the file is timm's.
+        side=lambda told: len(told["architecture"]) and 0,
         get=GET_TIMM,
         settings=("feature_stage",),
     ),

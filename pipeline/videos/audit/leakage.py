@@ -1,4 +1,4 @@
-"""What a model could know without feeling anything: the same video, object or recording session in two parts."""
+"""Data leakage: the same video, object or recording session in two parts, and what predicts labels without touch."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from pipeline.videos.audit.files import by_rate, quiet_level, touches
 from pipeline.videos.catalogue import Catalogue
 
 DUPLICATE = 0.91
-"""Two videos are no near-duplicates while their contacts are alike by less, however few videos there are. Among 354
-real videos, pairs of different objects reach .905."""
+"""Smallest similarity of near-duplicates, however few videos there are. Among 354 real videos, pairs of different
+objects reach .905."""
 CHANCE = 0.01
 """The probability that any pair of different objects in a data set is called a near-duplicate by chance."""
 SPREAD = 2.0
@@ -186,7 +186,7 @@ def near_copies(probes: Sequence[Probe], parts: Parts) -> Iterator[Finding]:
         largest = np.sort(np.concatenate([largest, chance]))[-math.isqrt(pairs) - 1 :]
     bound = likeness_bound(largest[::-1], pairs)
     for one, other, likeness in close:
-        # What has equal bytes `_copies` names.
+        # `_copies` reports files with equal bytes.
         if likeness > bound and one.sha256 != other.sha256:
             measured, crosses = f"contact is alike by {likeness:.3f}", _crosses(parts, one, other)
             if one.object_id == other.object_id and not crosses:
@@ -202,9 +202,9 @@ def near_copies(probes: Sequence[Probe], parts: Parts) -> Iterator[Finding]:
 def likeness_vectors(signatures: np.ndarray) -> np.ndarray:
     """Vectors whose products are the likenesses of contacts: correlations after what many videos share is divided out.
 
-    A smooth blob looks like many others and says little; what only two videos have says that one is the other's copy.
-    This is whitening by the videos' own covariance. One is added to each direction, so that what two copies have in
-    common is not itself taken for something that many share.
+    A pattern that many videos share, such as a smooth blob, is weak evidence of a copy; one that only two share is
+    strong evidence. So signatures are whitened by their own covariance. The identity is added to it, or the common
+    pattern of two copies would itself be divided out.
 
     Args:
         signatures: videos x values, each of mean 0 and norm 1.
@@ -272,7 +272,7 @@ def _sessions(probes: Sequence[Probe], parts: Parts, names: Sequence[str], catal
 
 
 def _untouched_predictions(probes: Sequence[Probe], names: Sequence[str], catalogue: Catalogue) -> Iterator[Finding]:
-    """Whether the untouched sensor, or the session alone, tells the property of an object never seen."""
+    """Whether the no-contact picture, or the session alone, predicts the property of an unseen object."""
     chosen = _sampled(len(probes)).tolist()
     objects = [probes[i].object_id for i in chosen]
     distinct = sorted({names[i] for i in chosen})

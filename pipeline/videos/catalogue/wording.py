@@ -30,7 +30,7 @@ MARKUP = (
     (r"(?m)^[\s>#+•-]*(?:\d+[.)]\s)?\s*", ""),  # Headings, lists, quoted lines.
     (r"(?<!\w)[_']+|[_']+(?!\w)", ""),
 )
-"""Patterns of what sets a text and is not read, and what takes its place."""
+"""Patterns of markup and thoughts, which are not part of the answer, and their replacements."""
 
 
 def unmarked(text: str) -> str:
