@@ -77,7 +77,7 @@ def spoilt(write: Callable[[Path], Path], file: str, length: int | None) -> None
 
 NOT_THERE = "(no such file|does not exist).*dvc repro"
 SCALES = {
-    "huge": "paper-7b, small, smoke",
+    "huge": "paper-7b, rehearsal, small, smoke",
     "smoke frames.per_vido=1": "frames.per_vido.*did you mean per_video",
     "smoke frames.fraction=1.5": "frames.fraction.*less than or equal to 1",
     "smoke align.batch_size=10": "align.*does not divide",

@@ -20,7 +20,7 @@ from tests.conftest import refused
 CONF = ROOT / "conf"
 
 
-@pytest.mark.parametrize("scale", ["smoke", "small", "invented", "paper-7b", "paper-13b"])
+@pytest.mark.parametrize("scale", ["smoke", "small", "invented", "paper-7b", "paper-13b", "rehearsal"])
 def test_shipped_scale_is_valid_and_survives_writing(scale: str, tmp_path: Path) -> None:
     params = compose(scale, conf=CONF)
     assert write_params(params, tmp_path / "params.yaml")
@@ -31,7 +31,16 @@ def test_shipped_scale_is_valid_and_survives_writing(scale: str, tmp_path: Path)
 def test_a_new_scale_is_a_file(tmp_path: Path) -> None:
     conf = shutil.copytree(CONF, tmp_path / "conf")
     (conf / "lab.yaml").write_text("defaults: [small, _self_]\nscale: lab\nlora: {rank: 4}\n")
-    assert shipped_scales(conf) == ["finetune", "invented", "lab", "paper-13b", "paper-7b", "small", "smoke"]
+    assert shipped_scales(conf) == [
+        "finetune",
+        "invented",
+        "lab",
+        "paper-13b",
+        "paper-7b",
+        "rehearsal",
+        "small",
+        "smoke",
+    ]
     params = compose("lab", conf=conf)
     assert (params.scale, params.lora.rank, params.report_name) == ("lab", 4, "lab-scenes")
     write_params(params, tmp_path / "params.yaml")

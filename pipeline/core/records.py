@@ -374,6 +374,9 @@ class Embedding(Record):
     row: int = Field(ge=0)
 
 
+MIDDLE, GAIN = 128, 2
+"""Pictures of `encoder.reference=subtract` show the difference to the untouched sensor doubled, and 128 where there is
+none: 99.9 % of the real data's differences lie within 50 of 255 steps."""
 TENSOR = "embeddings"
 """The embedding tensor's name in its file: float32, rows x dim."""
 TENSOR_FILE, INDEX_FILE = "embeddings.safetensors", "index.parquet"

@@ -14,13 +14,12 @@ from torch.nn import functional as F
 from transformers import TrainerCallback
 
 from pipeline.config import FramesConfig, PretrainConfig, RuntimeConfig
-from pipeline.core.records import Measurement
+from pipeline.core.records import MIDDLE, Measurement
 from pipeline.core.runtime import derive_seed, seed_everything
 from pipeline.encoder.scene_encoder import SIDE, SceneEncoder
 from pipeline.encoder.synthetic import SyntheticPictures, draw_pictures
 from pipeline.training.sampling import EpochDataset
 from pipeline.training.trainer import TrainableTrainer, checkpoint_dir, train, training_arguments
-from pipeline.videos.frames.subtraction import MIDDLE
 
 HIDDEN = 192
 WEIGHTS = {"quantities": 2.0, "kinds": 0.6}

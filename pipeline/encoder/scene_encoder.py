@@ -9,9 +9,9 @@ from torch import nn
 from torch.nn import functional as F
 
 from pipeline.config import EncoderConfig
+from pipeline.core.records import GAIN, MIDDLE
 from pipeline.encoder.model import FrameEncoder
 from pipeline.training.trainable import load_trainable
-from pipeline.videos.frames.subtraction import GAIN, MIDDLE
 
 SIDE = 120
 """Pixels of the pictures that it is pretrained on at most: as high as they are drawn. Larger ones are averaged."""

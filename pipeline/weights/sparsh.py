@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.core.errors import UserError
-from pipeline.videos.frames.subtraction import GAIN, MIDDLE
+from pipeline.core.records import GAIN, MIDDLE
 
 if TYPE_CHECKING:
     import torch

@@ -9,9 +9,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipeline.core.records import GAIN, MIDDLE
 from pipeline.videos.frames.reference import contact_strength
 from pipeline.videos.frames.selection import difference
-from pipeline.videos.frames.subtraction import GAIN, MIDDLE, RING, subtract
+from pipeline.videos.frames.subtraction import RING, subtract
 from tests.numerics.bounds import summing
 from tests.numerics.harness import FLOAT64, UINT8, Check, Floats
 

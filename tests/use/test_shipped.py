@@ -144,6 +144,8 @@ def test_a_runs_videos_are_asked_about_as_they_are_and_standardised(
     few = ["shipped=4", "questions.evaluation={opd:9,pc:9,pss:0,pom:9,psr:0}"]
     write_params(compose("smoke", [*changed, *few], ROOT / "conf"), tmp_path / "params.yaml")
     monkeypatch.chdir(tmp_path)
+    # Two threads of each of two test processes would wait for each other on two cores.
+    monkeypatch.setattr("pipeline.core.runtime.limit_threads", lambda _: None)
 
     def run(objects: dict[str, str]) -> list[GradedVision]:
         videos = [

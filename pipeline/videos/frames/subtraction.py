@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.core.records import GAIN, MIDDLE
+
 Pictures = npt.NDArray[np.uint8]
 
-GAIN = 2
-"""Pictures of a difference show it doubled: 99.9 % of the real data's differences lie within 50 of 255 steps."""
-MIDDLE = 128
 RING = 8
 """The outer 1/8 of a picture on each side: where contact is least likely."""
 
