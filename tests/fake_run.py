@@ -36,7 +36,7 @@ from pipeline.tasks.examples import build_examples
 from pipeline.tasks.questions import build_questions, counts_by_task, pool_of
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.split import assign
-from pipeline.weights import is_tiny
+from pipeline.weights import is_random
 from tests.closure import ROOT
 from tests.models import model_folder
 
@@ -61,7 +61,7 @@ def write_run(root: Path, params: Params, *, objects: Sequence[str] = (), skill:
     root.mkdir(parents=True, exist_ok=True)
     (root / "params.yaml").write_text(yaml.safe_dump(params.model_dump(mode="json"), sort_keys=False))
     for folder in (params.encoder.weights, params.language.weights):
-        if is_tiny(folder):
+        if is_random(folder):
             (root / folder).parent.mkdir(parents=True, exist_ok=True)
             (root / folder).symlink_to(model_folder(Path(folder).name))
     data, parts = root / "data", {o.object_id: o.splits["paper"] for o in catalogue.objects.values()}

@@ -14,7 +14,7 @@ from pipeline.core.records import Shown
 from pipeline.report.load import Report
 from pipeline.report.render import count, markdown, render, size
 from pipeline.report.tables import FIVE_TASKS, PARTS, SHIPPED_TABLE, SHOWN_WORDS, TABLES, headline, measured, number
-from pipeline.weights import is_tiny
+from pipeline.weights import is_random
 
 MOST_LINES = 150
 CHANCE = (
@@ -101,7 +101,7 @@ def finding(report: Report) -> list[str]:
 
 def at_random(said: dict[str, Any]) -> bool:
     """Whether a base model is a random one, so that figures are chance."""
-    return any(is_tiny(model["folder"]) for model in said["base_models"].values())
+    return any(is_random(model["folder"]) for model in said["base_models"].values())
 
 
 def _against_chance(rows: pd.DataFrame, whose: str = "The full system's") -> str:

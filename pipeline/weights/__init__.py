@@ -119,7 +119,7 @@ def made(folder: Path) -> str | None:
     return folder.name if folder.parent == MADE_DIR else None
 
 
-def is_tiny(folder: str | Path) -> bool:
+def is_random(folder: str | Path) -> bool:
     """Whether `folder` is of a model with random weights that the chain makes."""
     own = MADE.get(made(Path(folder)) or "")
     return own is not None and own.origin is None
