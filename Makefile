@@ -38,7 +38,7 @@ repro: install  ## run the whole chain of params.yaml, and write reports/
 test: install  ## run all tests
 	python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
-test-fast: install  ## four minutes: no chain, nothing that starts processes
+test-fast: install  ## a minute: no chain, nothing that starts processes or trains for seconds
 	python -m pytest --numprocesses 2 --dist loadfile -m "not slow"
 
 stability: install  ## hard cases in every number format, into reports/stability.csv
