@@ -397,8 +397,7 @@ class ScoreRow(Record):
     task: str
     measure: str
     encoder: str
-    """Of a cross-validation, the candidate's name; of described objects, the base model's; of vision alone, the
-    model's."""
+    """Of a cross-validation, the candidate's name; of vision alone, the model's."""
     lora: str = ""
     opd: str = ""
     touch: str = ""
@@ -416,7 +415,7 @@ class ScoreRow(Record):
     """Of the 95 % interval over objects; None where the questions cannot show that objects differ."""
     high: Optional = None
     chance: Optional
-    """None of described objects, where the task is not registered."""
+    """None where there is nothing to guess among."""
     strict: Optional = None
     """Accuracy by the published code's comparison of texts; None where that code has none, or nobody wrote a text."""
 

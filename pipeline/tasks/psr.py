@@ -91,7 +91,9 @@ class PropertyScenarioReasoning(TaskDefinition):
     def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str | None:
         """The video whose classes are nearest to the suitable ones; ties go by the expected classes."""
         asked = question.dialogues[0].turns[-1].user
-        scenario = next((s for s in catalogue.language.scenarios if s.question in asked), None)
+        # The longest, as one scenario's question may stand in another's.
+        found = [s for s in catalogue.language.scenarios if s.question in asked]
+        scenario = max(found, key=lambda s: len(s.question), default=None)
         if scenario is None:
             return None
 

@@ -86,11 +86,13 @@ class TrainableTrainer(Trainer):
         if self.optimizer is None:
             # By name, not by identity: distributed wrappers replace the parameters and prefix their names.
             trained = [(n, p) for n, p in (model or self.model).named_parameters() if p.requires_grad]
-            groups = [
+            groups: list[dict[str, Any]] = [
                 # Dots on both sides, so that a prefix matches whole parts of a name only.
                 {"params": [p for n, p in trained if f".{prefix}." in f".{n}."], "lr": rate}
                 for prefix, rate in self._rates.items()
             ]
+            # A parameter without a group would stay as it was drawn, and nothing would show.
+            assert sum(len(group["params"]) for group in groups) == len(trained), f"rates for {list(self._rates)} alone"
             self.optimizer = torch.optim.AdamW(groups, weight_decay=self.args.weight_decay)
         return self.optimizer
 

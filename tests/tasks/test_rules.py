@@ -140,6 +140,18 @@ def test_among_equal_classes_the_mean_class_decides(task: str) -> None:
     assert all(s.correct for s in scores)
 
 
+def test_a_scenario_whose_question_begins_like_anothers_does_not_answer_for_it() -> None:
+    language = CATALOGUE.language
+    decoys = [
+        s.model_copy(update={"name": f"{s.name} 2", "question": s.question[:-4], "target": s.other, "other": s.target})
+        for s in language.scenarios
+    ]
+    longer = language.model_copy(update={"scenarios": (*decoys, *language.scenarios)})
+    catalogue = CATALOGUE.model_copy(update={"language": longer})
+    asked = [q for q in QUESTIONS if q.task == "PSR"]
+    assert conclude(asked, heads(TRUE), catalogue) == conclude(asked, heads(TRUE), CATALOGUE)
+
+
 def test_a_video_that_the_heads_said_nothing_of_and_a_task_without_a_rule_have_no_score() -> None:
     some = dict(list(TRUE.items())[:40])
     scored = {s.question_id for s in conclude(QUESTIONS, heads(some), CATALOGUE)}
