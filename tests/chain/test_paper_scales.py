@@ -157,7 +157,7 @@ def test_paper_7b_to_the_report(project: Project) -> None:
     assert "Running stage 'finetune_encoder" not in output
     assert list(launches(project).values()) == [{"processes": 2}] * 4
     check_trained(project, "paper-7b")
-    project.run("octopi", "repro")
+    project.run("dvc", "repro", "report")
     report = project.folder / "reports" / "paper-7b-videos" / "README.md"
     assert "weights/vicuna-7b-v1.5" in report.read_text()
     assert "Published 7b" in report.read_text()
