@@ -2,11 +2,12 @@
 
 from pathlib import Path
 
+from pipeline.config.params import load_params
 from pipeline.core.io import read_table, write_table
 from pipeline.core.records import Assignment, OutOfFold, Part, Video
 from pipeline.core.stage import DATA, matrix_key, stage
 from pipeline.encoder.clips import EncoderData
-from pipeline.encoder.cross_validation import MODELS, cross_validate_model
+from pipeline.encoder.cross_validation import cross_validate_model
 from pipeline.encoder.finetune import Training
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.frames.store import REFERENCES_FILE, TABLE_FILE, FrameStore
@@ -14,7 +15,7 @@ from pipeline.weights import backbone_files, check_encoder
 
 
 def main() -> None:
-    (name,) = matrix_key(model=MODELS)
+    (name,) = matrix_key(model=load_params().cross_validation.models)
     with stage("cross_validate", name) as run:
         params = run.params
         check_encoder(Path(params.encoder.weights), params.frames.pixels, params.encoder.backbone)

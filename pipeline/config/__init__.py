@@ -30,7 +30,7 @@ CLIP_RECIPES = ("paper", "release")
 """Recipes that are for `encoder.backbone=[clip]` alone."""
 TrainedEmbeddings = Literal["all", "new"]
 Selection = Literal["salient", "release", "contact"]
-Compared = Literal["constant", "backbone", "backbone-tuned"]
+Compared = Annotated[str, Field(pattern=r"^(constant|backbone|backbone-tuned)(-[1-9][0-9]*)?$")]
 
 INVENTED = Path("data/invented")
 """Where the chain puts the catalogue of invented objects; `data.catalogue` names it to have them."""
@@ -277,8 +277,8 @@ class CrossValidationConfig(Section):
 
     models: tuple[Compared, ...] = Field(default=("constant",), min_length=1)
     """`constant`: the training objects' most frequent combination of classes. `backbone`: a frame classifier on the
-    frozen `encoder.backbone`, decided jointly. `backbone-tuned`: the same, fine-tuned by `encoder.recipe`. Each is a
-    stage."""
+    frozen `encoder.backbone`, decided jointly. `backbone-tuned`: the same, fine-tuned by `encoder.recipe`. A number
+    behind a name, as in `backbone-10`: learnt from so many objects. Each is a stage."""
     folds: Annotated[int, Field(ge=2, le=50)] = 5
     """Parts that objects are dealt into; all videos of an object are in one."""
     repeats: Positive = 3

@@ -1,6 +1,7 @@
 """Grouped cross-validation of the chain's encoder over all videos: no model is tested on an object that it learnt from.
 
-Compared are the backbones of `encoder.backbone` frozen, the same fine-tuned by `encoder.recipe`, and a constant.
+Compared are the backbones of `encoder.backbone` frozen, the same fine-tuned by `encoder.recipe`, and a constant; each
+also with few training objects, which says what a new sensor needs.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from functools import cache
 
 import numpy as np
 
-from pipeline.config import Compared, CrossValidationConfig
+from pipeline.config import CrossValidationConfig
 from pipeline.core.errors import UserError
 from pipeline.core.io import code_of, fingerprint, read_json, write_json
 from pipeline.core.records import OutOfFold, Part
@@ -28,12 +29,13 @@ VALIDATION = 8
 """One in so many training objects is set aside where a training chooses its best epoch."""
 
 
-def cross_validate_model(name: Compared, training: Training, config: CrossValidationConfig) -> list[OutOfFold]:
+def cross_validate_model(name: str, training: Training, config: CrossValidationConfig) -> list[OutOfFold]:
     """Out-of-fold predictions of one model; finished folds survive a kill.
 
     Folds depend on the objects and `config` alone, so all models share them.
 
     Args:
+        name: Of `MODELS`, or with a number behind it as `cross_validation.models` has it.
         training: Of all videos with labels, in the order of the results; parts and seeds are those of the folds.
 
     Raises:
@@ -49,13 +51,19 @@ def cross_validate_model(name: Compared, training: Training, config: CrossValida
     labelled = repr([(a.video_id, data.catalogue.labels(a.object_id)) for a in data.assignments])
     settings = (name, config.model_copy(update={"models": ()}), training.config, data.per_video, labelled)
     work = CHECKPOINTS / "cross_validation" / fingerprint(*settings, *training.inputs, *code_of("cross_validate"))
-    predict = MODELS[name](training)
+    kind, _, count = name.rpartition("-")
+    fewer = int(count) if count.isdecimal() else objects
+    predict = MODELS[kind if count.isdecimal() else name](training)
     with progress(config.folds * config.repeats, "cross-validation", "fold") as advance:
 
         def resumed(fold: Fold) -> Labels:
             file = work / f"{fold.repeat}-{fold.number}.json"
             if not file.is_file():
-                write_json(file, predict(fold).tolist())
+                # The first of a shuffled order: of two numbers, the larger has all objects of the smaller.
+                order = np.random.default_rng(derive_seed(config.seed, "fewer", fold.repeat, fold.number))
+                kept = order.permutation(np.unique(owners[fold.trained]))[:fewer]
+                few = replace(fold, trained=fold.trained & np.isin(owners, kept))
+                write_json(file, predict(few).tolist())
             advance()
             return np.array(read_json(file), dtype=np.int64)
 
@@ -141,7 +149,7 @@ def _tuned(training: Training) -> Predict:
     return predict
 
 
-MODELS: dict[Compared, Callable[[Training], Predict]] = {
+MODELS: dict[str, Callable[[Training], Predict]] = {
     "constant": _constant,
     "backbone": _frozen,
     "backbone-tuned": _tuned,

@@ -14,7 +14,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.config import Compared, CrossValidationConfig, EncoderConfig, Recipe
+from pipeline.config import CrossValidationConfig, EncoderConfig, Recipe
 from pipeline.core.errors import UserError
 from pipeline.core.records import Assignment, Measurement, Part
 from pipeline.core.runtime import derive_seed
@@ -182,6 +182,40 @@ def test_constant_by_hand(training: Training) -> None:
     assert len({r.predicted for r in found}) > 1, "folds differ here"
 
 
+def test_with_fewer_objects_more_contain_fewer(training: Training, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A number behind a model's name is how many objects it learns from, and nothing else changes."""
+    owners = np.array([a.object_id for a in training.data.assignments])
+    learnt: list[set[str]] = []
+
+    def noting(own: Training) -> Predict:
+        def predict(fold: Fold) -> np.ndarray:
+            assert fold.trained[np.isin(owners, owners[fold.trained])].all(), "all videos of an object"
+            learnt.append(set(owners[fold.trained].tolist()))
+            return CONSTANT(own)(fold)
+
+        return predict
+
+    whole = cross_validate_model("constant", training, CONFIG)
+    assert cross_validate_model("constant-9", training, CONFIG) == whole, "a fold has fewer"
+    monkeypatch.setitem(module.MODELS, "constant", noting)
+    for name in ("constant-1", "constant-3", "constant"):
+        cross_validate_model(name, training, CONFIG)
+    one, three, every = learnt[:6], learnt[6:12], learnt[12:]
+    assert [len(objects) for objects in one + three] == [1] * 6 + [3] * 6
+    assert all(a < b < c for a, b, c in zip(one, three, every, strict=True))
+    assert len(set(map(frozenset, one))) > 1, "drawn anew for each fold"
+
+
+def test_heads_learn_from_a_single_object(training: Training) -> None:
+    write_pretrained()
+    few = encoded(training, config(Path("none"), "tuned"))
+    found = cross_validate_model("backbone-1", few, SMALL)
+    for held in deal(OBJECTS, 2, derive_seed(4, "folds", 0)):
+        said = {r.predicted for r in found if r.object_id in held}
+        assert len(said) == 1, "all that it knows"
+        assert said <= {training.data.catalogue.labels(o) for o in OBJECTS if o not in held}
+
+
 def test_what_the_pictures_show_is_found(training: Training, monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures that show the class itself."""
     hardness = {o: training.data.catalogue.labels(o)[0] for o in OBJECTS}
@@ -229,7 +263,7 @@ def kill_after(count: int, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, i
     return begun
 
 
-def killed(count: int, name: Compared, training: Training, monkeypatch: pytest.MonkeyPatch) -> None:
+def killed(count: int, name: str, training: Training, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         kill_after(count, patch)
         with pytest.raises(KeyboardInterrupt):
@@ -253,7 +287,7 @@ def test_finished_folds_survive_a_kill(
 def test_folds_of_other_inputs_settings_or_code_are_not_taken_for_these(
     other: str, training: Training, versions: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    name: Compared = "backbone"
+    name = "backbone"
     setting = CONFIG
     write_pretrained()
     training = encoded(training, config(Path("none"), "tuned"))
