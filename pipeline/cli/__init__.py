@@ -279,7 +279,7 @@ def diff(
     new: Annotated[str, typer.Argument(help="Another one; without it, what lies on disk now.")] = "",
     json: Annotated[Path | None, typer.Option(help="Also write everything to this file, for machines.")] = None,
 ) -> None:
-    """Say what differs between two revisions: parameters, stages, figures, and whether accuracies really changed."""
+    """Say what differs between two revisions: parameters, metrics, and whether answers really got better."""
     from pipeline.cli.diff import compare, describe
     from pipeline.config.params import in_project
     from pipeline.core.io import write_json

@@ -1,5 +1,6 @@
 """What differs between two commits, or a commit and what lies on disk: `octopi diff`.
 
+Parameters and metrics are DVC's own comparison. What DVC lacks is the paired test of the answers to the same questions.
 DVC reads both states: Git's files and, by the hashes in dvc.lock, what its cache holds. Nothing is checked out or run.
 """
 
@@ -13,7 +14,6 @@ from typing import Any
 
 import pandas as pd
 import pyarrow.parquet as pq
-import yaml
 from dvc.api import DVCFileSystem
 from dvc.exceptions import DvcException
 from dvc.repo import Repo
@@ -26,7 +26,6 @@ from pipeline.evaluation.scores import difference, grouped, with_holm
 from pipeline.tasks import TASKS
 
 GRADED, QUESTIONS = "data/graded.parquet", "data/questions"
-KEY = ("task", "measure", "encoder", "lora", "opd", "touch", "seed")
 SHOWN = 40
 Rows = list[dict[str, Any]]
 
@@ -59,46 +58,6 @@ class State:
         except (OSError, DvcException):
             return None
 
-    def mapping(self, path: str) -> dict[str, Any]:
-        """A file in YAML or JSON; empty where it is absent, a UserError where it is something else."""
-        try:
-            found = yaml.load(self.read(path) or b"{}", Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-        except yaml.YAMLError:
-            found = None
-        if not isinstance(found, dict):
-            raise UserError(f"{path} of {self.name}: not a mapping; restore it from Git")
-        return found
-
-    def rows(self, path: str) -> Rows:
-        """A CSV file; none where it is absent."""
-        table = pd.read_csv(io.BytesIO(self.read(path) or b"nothing"), dtype=str)
-        rows: Rows = table.fillna("").to_dict("records")
-        return rows
-
-    def stages(self) -> dict[str, Any]:
-        """Entries of dvc.lock."""
-        stages = self.mapping("dvc.lock").get("stages") or {}
-        if not isinstance(stages, dict) or not all(isinstance(entry, dict) for entry in stages.values()):
-            raise UserError(f"dvc.lock of {self.name}: its stages are no mapping; restore it from Git")
-        return stages
-
-    def figures(self) -> dict[str, dict[str, str]]:
-        """Parameters and what the reports say, by name: metrics, the last loss of each training, scores."""
-        parameters = _flat(self.mapping("params.yaml"))
-        metrics: dict[str, Any] = {}
-        losses: dict[str, str] = {}
-        scores: dict[str, str] = {}
-        folders = sorted(self.files.ls("reports", detail=False)) if self.files.isdir("reports") else []
-        for folder in folders:
-            report = Path(folder).name
-            metrics[report] = self.mapping(f"{folder}/metrics.json")
-            curves = [row for row in self.rows(f"{folder}/curves.csv") if row["name"] == "loss"]
-            losses |= {f"{report} {row['stage']}": row["value"] for row in curves}  # By rising step.
-            for row in self.rows(f"{folder}/scores.csv"):
-                name = " ".join([report, *filter(None, map(row.get, KEY))])
-                scores[name] = f"{row.get('accuracy')} [{row.get('low')}, {row.get('high')}]"
-        return {"parameters": parameters, "metrics": _flat(metrics), "losses": losses, "scores": scores}
-
     def answers(self) -> list[Graded] | None:
         """Graded answers; None where they are not at hand."""
         content = self.read(GRADED)
@@ -107,9 +66,8 @@ class State:
 
     def questions(self) -> dict[str, object]:
         """By id, over all seeds, what makes a question this one: its videos and its right answer."""
-        seeds = (self.mapping("params.yaml").get("ablation") or {}).get("seeds", [0])
-        files = [self.read(f"{QUESTIONS}/{seed}/evaluation.jsonl") or b"" for seed in seeds]
-        rows = (json.loads(line) for file in files for line in file.splitlines())
+        files = self.files.glob(f"{QUESTIONS}/*/evaluation.jsonl")
+        rows = (json.loads(line) for file in files for line in (self.read(file) or b"").splitlines())
         return {row["question_id"]: (row["videos"], row["gold"]) for row in rows}
 
 
@@ -117,20 +75,32 @@ def compare(root: Path, old: str, new: str = "") -> dict[str, Any]:
     """Compare two Git revisions of the project in `root`; an empty `new` is the working tree.
 
     Returns:
-        `old` and `new`, the names of both; `differs`; rows of what differs in `parameters`, `stages` (by dvc.lock),
-        `metrics`, `losses` and `scores`; `tested`, as in effects.csv; `notes`, why something could not be compared.
+        `old` and `new`, the names of both; `differs`; rows of what differs in `parameters` and `metrics`; `tested`, as
+        in effects.csv; `notes`, why something could not be compared.
 
     Raises:
         UserError: for an unknown revision, a folder outside Git and DVC, or a broken file.
     """
     one, two = State.of(root, old or "HEAD"), State.of(root, new)
-    stages = _stages(one, two)  # First, since DVC lists nothing of a state whose dvc.lock is broken.
-    before, after = one.figures(), two.figures()
-    tested, notes = _tested(one, two)
-    found: dict[str, Rows] = {name: _changes(before[name], after[name]) for name in after}
-    found = {"parameters": found.pop("parameters"), "stages": stages, **found, "tested": tested}
-    if found["stages"] and before["scores"] and not (found["scores"] or notes or tested):
-        notes.append("No accuracy changed.")
+    found: dict[str, Rows] = {}
+    with Repo(str(root)) as repo:
+        for kind, differences in (("parameters", repo.params.diff), ("metrics", repo.metrics.diff)):
+            # Of metrics, those of the report that both dvc.yaml name.
+            said = differences(old or "HEAD", new or "workspace")
+            for revision, error in said.get("errors", {}).items():
+                # An error, or one by file.
+                each = error if isinstance(error, dict) else {"": error}
+                if broken := [e for e in each.values() if not isinstance(e, FileNotFoundError)]:
+                    raise UserError(f"{revision}: {' '.join(str(broken[0]).split())}; restore it from Git")
+            found[kind] = [
+                {
+                    "name": name,
+                    **{side: without_secrets(str(change[side])) for side in ("old", "new") if side in change},
+                }
+                for file in said.get("diff", {}).values()
+                for name, change in file.items()
+            ]
+    found["tested"], notes = _tested(one, two)
     return {"old": one.name, "new": two.name, "differs": any(found.values()), **found, "notes": notes}
 
 
@@ -143,20 +113,6 @@ def describe(found: dict[str, Any]) -> str:
             rest = f"\n... and {len(rows) - SHOWN} more; --json FILE has them all" if len(rows) > SHOWN else ""
             parts.append(f"{title.capitalize()}\n{table}{rest}")
     return "\n\n".join([*parts, *found["notes"]])
-
-
-def _stages(one: State, two: State) -> Rows:
-    rows: Rows = []
-    for change in _changes(one.stages(), two.stages()):
-        old, new = change["old"] or {}, change["new"] or {}
-        deps, outs = (
-            [c["name"] for c in _changes(*({d["path"]: d.get("md5") for d in e.get(kind, ())} for e in (old, new)))]
-            for kind in ("deps", "outs")
-        )
-        why = [*deps, *(kind for kind in ("params", "cmd") if old.get(kind) != new.get(kind))]
-        because = ", ".join(why) if old and new else f"only in the {'new' if new else 'old'}"
-        rows.append({"stage": change["name"], "because of": because, "made": ", ".join(outs)})
-    return rows
 
 
 def _tested(one: State, two: State) -> tuple[Rows, list[str]]:
@@ -188,14 +144,3 @@ def _tested(one: State, two: State) -> tuple[Rows, list[str]]:
     other = len(meant[0].keys() | meant[1].keys()) - len(same)
     notes = [f"{len(same)} questions are compared; {other} were asked by one side only, or differ."] if other else []
     return [row.model_dump(mode="json") for row in with_holm(rows)], notes
-
-
-def _changes(old: dict[str, Any], new: dict[str, Any]) -> Rows:
-    names = [name for name in dict.fromkeys([*new, *old]) if old.get(name) != new.get(name)]
-    return [{"name": name, "old": old.get(name), "new": new.get(name)} for name in names]
-
-
-def _flat(nested: dict[str, Any]) -> dict[str, str]:
-    """Dotted key to value, as text."""
-    rows = pd.json_normalize(nested).to_dict("records")
-    return {str(k): without_secrets(str(v)) for row in rows for k, v in row.items()}

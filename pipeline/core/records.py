@@ -406,6 +406,8 @@ class ScoreRow(Record):
     """A number or `all`."""
     n: int
     """Questions, or videos; not multiplied by seeds."""
+    sets: int
+    """Distinct sets of objects that these are about: many questions about one pair say little about others."""
     right: Share
     """Right answers; over seeds their mean, which need not be whole."""
     unread: Share

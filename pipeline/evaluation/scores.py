@@ -272,11 +272,13 @@ def _row(questions: Sequence[Sequence[Answer]], **named: object) -> ScoreRow:
     """One accuracy from the answers to each question, one a seed."""
     right = [fmean(a.correct for a in answers) for answers in questions]
     compared = [a.strict for answers in questions for a in answers]
-    interval = accuracy_interval(np.array(right), [answers[0].objects for answers in questions])
+    about = [answers[0].objects for answers in questions]
+    interval = accuracy_interval(np.array(right), about)
     return ScoreRow.model_validate(
         {
             **{name: str(value) if name != "chance" else value for name, value in named.items()},
             "n": len(right),
+            "sets": len(set(map(frozenset, about))),
             "right": sum(right),
             "unread": sum(fmean(not a.parsed for a in answers) for answers in questions),
             "accuracy": fmean(right),

@@ -122,7 +122,17 @@ def test_errors_have_intervals_over_objects() -> None:
     assert mean_of([1.0], ["a"]) == Error(1.0, n=1)
     share = share_of([1, 0, 0, 1], [(o,) for o in "abcd"])
     assert share.low < share.value == 0.5 < share.high
-    row = {"task": "t", "measure": "m", "encoder": "e", "seed": "all", "right": 4, "unread": 0, "chance": 0.1, "n": 9}
+    row = {
+        "task": "t",
+        "measure": "m",
+        "encoder": "e",
+        "seed": "all",
+        "right": 4,
+        "unread": 0,
+        "chance": 0.1,
+        "n": 9,
+        "sets": 4,
+    }
     score = ScoreRow.model_validate({**row, "accuracy": 0.5, "low": 0.4, "high": 0.7})
     assert error_of(score).columns == pytest.approx({"error": 0.5, "low": 0.3, "high": 0.6, "n": 9})
     assert error_of(score.model_copy(update={"low": None, "high": None})).columns == {"error": 0.5, "n": 9}

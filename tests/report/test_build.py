@@ -89,6 +89,7 @@ def test_accuracies_are_those_of_the_graded_answers(written: Path) -> None:
         assert row["accuracy"] == pytest.approx(np.mean([g.correct for g in mine]))
         assert row["unread"] / row["n"] == pytest.approx(np.mean([not g.parsed for g in mine]))
         assert row["n"] == len({g.question_id for g in mine})
+        assert row["sets"] == len({frozenset(g.objects) for g in mine})
 
 
 def test_confusion_and_metrics_are_the_heads_on_test_videos(written: Path) -> None:

@@ -30,7 +30,7 @@ def test_a_row_is_written_as_by_hand_with_published_figures_in_their_own_columns
         "Task": "Property Comparison (PC)",
         "System": "Octopi (full system)",
         "Measured % [95 %]": "50.0 [35.0, 65.0]",
-        "n": "40",
+        "n (sets of objects)": "40 (9)",
         "Chance %": "33.3",
         "Unread %": "10.0",
         "Published 7b % (n)": "48.10 (158)",

@@ -131,7 +131,7 @@ def make(where: Path, variant: Variant, *overrides: str) -> Made:
     predictions = answer(model.eval(), embeddings, questions, variant.opd, params.language, params.frames.per_video)
     write_jsonl(data / "answers" / variant.key / "real.jsonl", predictions)
     rows = [
-        {"task": t, "measure": TASKS[t].measure, **variant._asdict(), "touch": "real", "n": 8, "chance": 0.5}
+        {"task": t, "measure": TASKS[t].measure, **variant._asdict(), "touch": "real", "n": 8, "sets": 4, "chance": 0.5}
         | {"right": 5, "unread": 0, "accuracy": 0.625, "low": 0.25, "high": 0.875}
         for t in ASKED
     ]
