@@ -217,7 +217,11 @@ def _write_card(
             **({"test objects": " ".join(known.split())} if known else {}),
         },
         settings={
-            **{f"{s}.{name}": v for s in ("frames", "encoder") for name, v in getattr(config, s).model_dump().items()},
+            **{
+                f"{s}.{name}": value
+                for s in ("frames", "encoder", "questions", "language", "align", "lora")
+                for name, value in getattr(params, s).model_dump().items()
+            },
             **config.versions,
         },
         limits=LIMITS,
