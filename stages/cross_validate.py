@@ -1,13 +1,13 @@
 """Cross-validate the encoder, frozen or tuned, or a constant over all objects with videos."""
 
+import sys
 from pathlib import Path
 
-from pipeline.config.params import load_params
 from pipeline.core.io import read_table, write_table
 from pipeline.core.records import Assignment, OutOfFold, Part, Video
 from pipeline.core.stage import DATA, matrix_key, stage
 from pipeline.encoder.clips import EncoderData
-from pipeline.encoder.cross_validation import cross_validate_model
+from pipeline.encoder.cross_validation import MODELS, cross_validate_model, kind_of
 from pipeline.encoder.finetune import Training
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.frames.store import REFERENCES_FILE, TABLE_FILE, FrameStore
@@ -15,7 +15,8 @@ from pipeline.weights import backbone_files, check_encoder
 
 
 def main() -> None:
-    (name,) = matrix_key(model=load_params().cross_validation.models)
+    numbered = [word for word in sys.argv[1:] if kind_of(word)[0] in MODELS and kind_of(word)[1] != 0]
+    (name,) = matrix_key(model=(*MODELS, *numbered))
     with stage("cross_validate", name) as run:
         params = run.params
         check_encoder(Path(params.encoder.weights), params.frames.pixels, params.encoder.backbone)

@@ -85,7 +85,6 @@ def compare(root: Path, old: str, new: str = "") -> dict[str, Any]:
     found: dict[str, Rows] = {}
     with Repo(str(root)) as repo:
         for kind, differences in (("parameters", repo.params.diff), ("metrics", repo.metrics.diff)):
-            # Of metrics, those of the report that both dvc.yaml name.
             said = differences(old or "HEAD", new or "workspace")
             for revision, error in said.get("errors", {}).items():
                 # An error, or one by file.
@@ -94,11 +93,12 @@ def compare(root: Path, old: str, new: str = "") -> dict[str, Any]:
                     raise UserError(f"{revision}: {' '.join(str(broken[0]).split())}; restore it from Git")
             found[kind] = [
                 {
-                    "name": name,
+                    # Two scales have a report each, with metrics of the same names.
+                    "name": f"{Path(file).parent.name}.{name}".lstrip("."),
                     **{side: without_secrets(str(change[side])) for side in ("old", "new") if side in change},
                 }
-                for file in said.get("diff", {}).values()
-                for name, change in file.items()
+                for file, changes in said.get("diff", {}).items()
+                for name, change in changes.items()
             ]
     found["tested"], notes = _tested(one, two)
     return {"old": one.name, "new": two.name, "differs": any(found.values()), **found, "notes": notes}
@@ -106,7 +106,7 @@ def compare(root: Path, old: str, new: str = "") -> dict[str, Any]:
 
 def describe(found: dict[str, Any]) -> str:
     """A comparison for a terminal; long lists are cut."""
-    parts = [f"{found['old']} -> {found['new']}" if found["differs"] else "Nothing differs"]
+    parts = [f"{found['old']} -> {found['new']}" if found["differs"] else "No parameter, metric or answer differs"]
     for title, rows in found.items():
         if isinstance(rows, list) and rows and title != "notes":
             table = pd.DataFrame(rows[:SHOWN]).fillna("").to_string(index=False, max_colwidth=72)

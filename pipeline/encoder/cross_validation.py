@@ -51,9 +51,8 @@ def cross_validate_model(name: str, training: Training, config: CrossValidationC
     labelled = repr([(a.video_id, data.catalogue.labels(a.object_id)) for a in data.assignments])
     settings = (name, config.model_copy(update={"models": ()}), training.config, data.per_video, labelled)
     work = CHECKPOINTS / "cross_validation" / fingerprint(*settings, *training.inputs, *code_of("cross_validate"))
-    kind, _, count = name.rpartition("-")
-    fewer = int(count) if count.isdecimal() else objects
-    predict = MODELS[kind if count.isdecimal() else name](training)
+    kind, fewer = kind_of(name)
+    predict = MODELS[kind](training)
     with progress(config.folds * config.repeats, "cross-validation", "fold") as advance:
 
         def resumed(fold: Fold) -> Labels:
@@ -82,6 +81,12 @@ def cross_validate_model(name: str, training: Training, config: CrossValidationC
         for video, expected, repeats in zip(data.assignments, labels.tolist(), predicted.tolist(), strict=True)
         for repeat, classes in enumerate(repeats)
     ]
+
+
+def kind_of(name: str) -> tuple[str, int | None]:
+    """A name in `MODELS`, and how many objects it learns from: 10 of `backbone-10`, None for all."""
+    kind, _, count = name.rpartition("-")
+    return (kind, int(count)) if count.isdecimal() else (name, None)
 
 
 def _videos(data: EncoderData) -> tuple[np.ndarray, Labels]:

@@ -123,7 +123,7 @@ def test_a_reproduction_done_twice_differs_in_nothing(history: History) -> None:
 def test_what_changed_is_named_with_what_it_moved(history: History) -> None:
     found = compare(history.folder, "again", "longer")
     assert found["parameters"] == [{"name": "epochs", "old": "4", "new": "5"}]
-    assert found["metrics"] == [{"name": "OPD", "old": "0.25", "new": "0.75"}]
+    assert found["metrics"] == [{"name": "smoke-scenes.OPD", "old": "0.25", "new": "0.75"}]
     back = compare(history.folder, "longer", "again")
     assert [row["difference"] for row in back["tested"]] == [-row["difference"] for row in found["tested"]]
 
@@ -162,7 +162,7 @@ def test_the_working_tree_is_what_lies_on_disk(copy: History) -> None:
     found = compare(copy.folder, "HEAD")
     assert found["new"] == "working tree"
     assert found["parameters"] == [{"name": "epochs", "old": "5", "new": "6"}]
-    assert found["metrics"] == [{"name": "PC", "old": "None", "new": "1.0"}]
+    assert found["metrics"] == [{"name": "smoke-scenes.PC", "old": "None", "new": "1.0"}]
     assert found["tested"] == []
 
 
@@ -205,13 +205,13 @@ def test_outside_of_a_project_is_refused(tmp_path: Path, monkeypatch: pytest.Mon
 def test_what_a_person_sees(history: History, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(history.folder)
     same = CliRunner().invoke(app, ["diff", "first", "again"])
-    assert (same.exit_code, same.output.strip()) == (0, "Nothing differs")
+    assert (same.exit_code, same.output.strip()) == (0, "No parameter, metric or answer differs")
     file = tmp_path / "out" / "compared.json"
     other = CliRunner().invoke(app, ["diff", "again", "longer", "--json", str(file)])
     assert other.exit_code == 0, other.output
     for words in (
         r"epochs +4 +5",
-        r"OPD +0\.25 +0\.75",
+        r"smoke-scenes\.OPD +0\.25 +0\.75",
         r"finetuned with all real +new - old +OPD",
     ):
         assert re.search(words, other.output), words
