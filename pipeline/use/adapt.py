@@ -39,7 +39,7 @@ def adapt(model: Octopi, videos: Sequence[Path], to: Path) -> None:
     features = torch.cat([model.touched(video).features for video in videos]).double()
     if len(features) < 2:
         raise UserError("one frame has no deviation; name more videos")
-    std, mean = torch.std_mean(features, dim=0)
+    std, mean = torch.std_mean(features, dim=0, correction=0)
     known = model.encoder.statistics
     # A dimension that is constant in these frames gives no estimate of its scale, so the old scale stays.
     scale = known.scale * torch.where(std > 0, std, 1.0)

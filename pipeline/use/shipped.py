@@ -53,7 +53,7 @@ def answers_about(octopi: Octopi, params: Params, videos: Sequence[Video]) -> li
     touches, rows, classified = touched(octopi, catalogue, Path(params.data.dir), videos)
     ways = {Shown.TOUCH: touches}
     if params.data.source == "videos":
-        std, mean = torch.std_mean(touches, dim=0)
+        std, mean = torch.std_mean(touches, dim=0, correction=0)
         ways[Shown.STANDARDISED] = (touches - mean) / torch.where(std > 0, std, 1.0)  # As `adapt` does.
     config = octopi.config
     language = config.language.model_copy(update={"generation_batch_size": BATCH})
