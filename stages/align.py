@@ -1,13 +1,11 @@
 """Align the projection to the language model."""
 
 import shutil
-from pathlib import Path
 
 from pipeline.core.io import write_table
 from pipeline.core.records import Encoder, Measurement, Opd
 from pipeline.core.stage import DATA, matrix_key, stage
 from pipeline.tracking.live import live
-from pipeline.videos.catalogue import load_catalogue
 
 
 def main() -> None:
@@ -22,7 +20,7 @@ def main() -> None:
         material = Material.load(DATA, run.params, encoder, opd, seed)
         model, data = assemble(material, config, "align")
         if config.begin_with_words and not run.params.language.start:
-            begin_with_words(model, data, load_catalogue(Path(run.params.data.catalogue)), material.seed)
+            begin_with_words(model, data, material.catalogue, material.seed)
         if config.train_embeddings == "all" and model.words is None:
             model.train_words()
         with live(run) as callbacks:

@@ -373,6 +373,8 @@ class LoraTrainConfig(TrainConfig):
     given: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Share of the questions about several videos that get another question's videos, with their descriptions left out
     of the loss: the model must then conclude from the description and not from touch."""
+    skip_contradicted: bool = False
+    """Leave out comparisons whose right answer contradicts the property heads (with `encoder.embedding=logits`)."""
 
 
 class AblationConfig(Section):
@@ -496,6 +498,14 @@ class Params(Section):
                 f"ablation.seeds {list(self.ablation.seeds)} test on some of the {self.split.folds} folds more often "
                 "than on others; take as many seeds for each fold"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _heads_can_contradict(self) -> Self:
+        if self.lora.skip_contradicted and self.encoder.embedding != "logits":
+            raise ValueError("lora.skip_contradicted reads the heads' logits; set encoder.embedding=logits")
+        if self.lora.skip_contradicted and self.questions.two_turns:
+            raise ValueError("lora.skip_contradicted looks at one conclusion a question; set questions.two_turns=0")
         return self
 
     @property

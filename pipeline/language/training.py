@@ -7,9 +7,11 @@ import random
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Self
 
+import torch
 from transformers import TrainerCallback
 
 from pipeline.config import (
@@ -21,7 +23,7 @@ from pipeline.config import (
     TrainConfig,
 )
 from pipeline.core.card import write_card
-from pipeline.core.embeddings import EmbeddingStore
+from pipeline.core.embeddings import STATISTICS_FILE, EmbeddingStore, Statistics
 from pipeline.core.errors import UserError
 from pipeline.core.io import fingerprint, read_jsonl
 from pipeline.core.records import TENSOR_FILE, Encoder, Opd, Question
@@ -29,6 +31,7 @@ from pipeline.core.runtime import derive_seed, name_dtype, seed_everything
 from pipeline.language.base import ADAPTER_WEIGHTS
 from pipeline.language.conversations import ConversationDataset, UpdateSampler, collate
 from pipeline.language.octopi import ADAPTER_DIR, CONFIG_FILE, OctopiForCausalLM, read_config
+from pipeline.tasks import TASKS
 from pipeline.training.trainer import (
     TrainableTrainer,
     Trained,
@@ -36,6 +39,7 @@ from pipeline.training.trainer import (
     train,
     training_arguments,
 )
+from pipeline.videos.catalogue import Catalogue, load_catalogue
 
 logger = logging.getLogger(__name__)
 
@@ -79,6 +83,8 @@ class Material:
 
     questions: Sequence[Question]
     store: EmbeddingStore
+    catalogue: Catalogue
+    """With the objects named as in the questions."""
     opd: Opd
     language: LanguageConfig
     per_video: int
@@ -97,11 +103,13 @@ class Material:
         dtype, start = name_dtype(params.language.dtype, params.runtime.device), params.language.start
         asked = folder / "questions" / str(seed) / "train.jsonl"
         embedded = folder / "embeddings" / f"{encoder}-{seed}"
+        catalogue = load_catalogue(Path(params.data.catalogue))
         begun = Path(start) / LANGUAGE_DIR / ADAPTER_DIR
         adapter = begun if start and begun.is_dir() else None
         return cls(
             questions=read_jsonl(asked, Question),
             store=EmbeddingStore(embedded),
+            catalogue=catalogue.called(params.questions.names),
             opd=opd,
             language=params.language.model_copy(update={"dtype": dtype}),
             per_video=params.frames.per_video,
@@ -159,6 +167,8 @@ def assemble(
             aligned, base=language.weights, dtype=language.dtype, quantization=language.quantization
         )
     usable = [q for q in material.questions if q.dialogue(material.opd)]
+    if isinstance(config, LoraTrainConfig) and config.skip_contradicted:
+        usable = uncontradicted(usable, material.store, material.catalogue)
     random.Random(derive_seed(material.seed, purpose)).shuffle(usable)
     if not usable:
         raise UserError(f"no training question has OPD mode {material.opd}; raise questions.train in params.yaml")
@@ -182,6 +192,34 @@ def assemble(
         given=given,
     )
     return model, data
+
+
+def uncontradicted(questions: Sequence[Question], store: EmbeddingStore, catalogue: Catalogue) -> list[Question]:
+    """Leave out comparisons whose right answer does not follow, by their task's rule, from the heads' logits.
+
+    What touch contradicts cannot be learnt from touch: such questions teach to guess. Descriptions, which are about one
+    video each, stay.
+
+    Args:
+        store: Of logits. Those of training objects are from heads that did not see the object, so that as many are
+            wrong as of new objects.
+        catalogue: With the objects named as in the questions.
+    """
+    scaled = Statistics.load(store.folder / STATISTICS_FILE)
+    sizes = [len(p.levels) for p in catalogue.properties]
+
+    @cache
+    def classes(video: str) -> list[tuple[int, float]]:
+        logits = store.tensor[store.rows(video)].double() * scaled.scale + scaled.mean
+        found = [part.softmax(1).mean(0) for part in logits.split(sizes, dim=1)]
+        return [(int(p.argmax()), float(p @ torch.arange(len(p)).double())) for p in found]
+
+    return [
+        q
+        for q in questions
+        if len(q.videos) == 1
+        or all(score.correct for score in TASKS[q.task].follow(q, [classes(v) for v in q.videos], catalogue))
+    ]
 
 
 def with_given(questions: Sequence[Question], opd: Opd, share: float, seed: int) -> tuple[list[Question], set[str]]:

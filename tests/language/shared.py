@@ -18,8 +18,11 @@ from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import Job, Material, add_lora, assemble, fit
 from pipeline.training import trainer
 from pipeline.training.trainer import Trained
+from pipeline.videos.catalogue import load_catalogue
+from tests.conftest import ROOT
 
 FRAMES, DIM = 2, 6
+CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")
 
 
 def write_store(folder: Path, frames: Sequence[tuple[str, int, str]], tensor: torch.Tensor) -> EmbeddingStore:
@@ -35,7 +38,7 @@ def write_store(folder: Path, frames: Sequence[tuple[str, int, str]], tensor: to
 
 def material(language: LanguageConfig, questions: list[Question], store: EmbeddingStore) -> Material:
     trained = [q for q in questions if q.task != "PSR"]
-    return Material(trained, store, Opd.ALL, language, per_video=FRAMES, flip_probability=0.5, seed=3)
+    return Material(trained, store, CATALOGUE, Opd.ALL, language, per_video=FRAMES, flip_probability=0.5, seed=3)
 
 
 def generation(batch_size: int, tokens: int = 12) -> LanguageConfig:
