@@ -1,4 +1,4 @@
-"""The language model: how many questions at a time, which number format, and how much to describe.
+"""The language model: how many questions at a time, and which number format.
 
 The model of params.yaml is aligned briefly, so that answers have realistic lengths. It is asked the pipeline's own
 questions about noise pictures, as no cost depends on what they show.
@@ -6,7 +6,6 @@ questions about noise pictures, as no cost depends on what they show.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -17,7 +16,6 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 
-from benchmarks.describing import describing
 from benchmarks.errors import share_of
 from benchmarks.table import Row, make_rows
 from benchmarks.timing import interleaved, machine
@@ -56,8 +54,7 @@ class Size:
 
 
 def measure(root: Path, size: Size | None = None) -> list[Row]:
-    """All questions; how much to describe only where answers were graded and their report written."""
-    described = describing(root)  # First, as it may be refused.
+    """Both questions."""
     size = size or Size()
     torch.set_num_threads(1)
     with TemporaryDirectory() as folder:
@@ -72,11 +69,11 @@ def measure(root: Path, size: Size | None = None) -> list[Row]:
             other = OctopiForCausalLM.from_base(base.base_model, base.tactile_dim, dtype=name)
             other.connector.load_state_dict(model.connector.state_dict())
             formats[name] = partial(ask, other, size.batches[-1])
-        found = [
-            _question(question, ways, asked, model, size.repeats)
+        return [
+            row
             for question, ways in (("answering", batches), ("number format, language model", formats))
+            for row in _question(question, ways, asked, model, size.repeats)
         ]
-    return [*itertools.chain(*found), *described]
 
 
 def prepare(root: Path, size: Size, folder: Path) -> tuple[OctopiForCausalLM, EmbeddingStore, list[Question]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -11,10 +12,10 @@ import pytest
 import torch
 import yaml
 
-from benchmarks import contact, describing, encoder, frames, language, serving, training
+from benchmarks import contact, encoder, frames, language, serving, systems, training
 from benchmarks.table import Row, merge, read_rows
-from pipeline.core.io import write_csv, write_json, write_table
-from pipeline.core.records import Encoder, Graded, Lora, Opd, ScoreRow, Variant
+from pipeline.core.io import write_csv, write_json
+from pipeline.core.records import Encoder, Lora, Opd, ScoreRow, Variant
 from pipeline.encoder import frame_classifier
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.scales import compose, write_params
@@ -105,34 +106,46 @@ def test_encoder(project: Path, tmp_path: Path) -> None:
 
 def test_language(project: Path, tmp_path: Path) -> None:
     found = by_question(language.measure(project, TINY), tmp_path)
-    assert list(found) == ["answering", "number format, language model"], "nothing was described yet"
+    assert list(found) == ["answering", "number format, language model"]
     assert [row.error for row in found["answering"].values()] == [0, 0], "one at a time and three say the same"
     assert found["number format, language model"]["float32"].error == 0
 
 
-def test_describing_takes_tokens_from_answers_and_errors_from_the_report(project: Path, tmp_path: Path) -> None:
-    root = tmp_path / "root"
-    (root / "reports" / "smoke-videos").mkdir(parents=True)
-    (root / "params.yaml").symlink_to(project / "params.yaml")
-    assert describing.describing(root) == []
-    scores, graded = [], []
-    for opd, tokens, accuracy in ((Opd.ALL, 100, 0.5), (Opd.NONE, 10, 0.25)):
-        for task in describing.DESCRIBED:
-            kind = {"task": task, "measure": "choice", "encoder": "finetuned", "lora": "with", "touch": "real"}
-            kind["opd"] = opd
-            scores.append(score(**kind, accuracy=accuracy, low=accuracy - 0.1, high=accuracy + 0.2, n=8))
-            said = {"question_id": task, "correct": True, "parsed": True, "truncated": False, "expected": "A"}
-            said |= {"predicted": "A", "objects": ("rug",), "tokens": tokens, "seed": 0, "trained": 0}
-            graded.append(Graded.model_validate({**kind, **said}))
-    rules = {"measure": "choice", "encoder": "finetuned", "lora": "", "opd": "", "touch": "real", "n": 8}
-    scores += [score(**rules, task=task, accuracy=0.75, low=0.5, high=0.9) for task in describing.DESCRIBED]
-    write_csv(root / "reports" / "smoke-videos" / "scores.csv", ScoreRow, scores)
-    write_table(root / "data" / "graded.parquet", Graded, graded)
-    whole, concluded, free = describing.describing(root)
-    assert (free.cost, free.error, free.low, free.high, free.front) == (0, 0.25, 0.1, 0.5, True)
-    assert (whole.setting, whole.cost, whole.error, whole.n) == ("all", 100, 0.5, 24)
-    assert (concluded.cost_ratio, concluded.error, concluded.low, concluded.high) == (0.1, 0.75, 0.55, 0.85)
-    assert (whole.front, concluded.front) == (False, False)
+def test_systems_take_errors_from_the_report_and_times_from_the_shipped_model(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    made = make(tmp_path, Variant(Encoder.FINETUNED, Lora.WITH, Opd.ALL, 0))
+    monkeypatch.setattr(systems, "SHIPPED", made.folder)
+    values = yaml.safe_load((ROOT / "params.yaml").read_text())
+    values["data"] |= {"source": "videos", "dir": "videos"}
+    (tmp_path / "params.yaml").write_text(yaml.safe_dump(values))
+    with refused("scores.csv: has no answers of the shipped model; run `make repro` first"):
+        systems.measure(tmp_path)
+    scores = [
+        score(
+            measure="choice",
+            encoder=made.folder.name,
+            lora="",
+            opd="all",
+            n=8,
+            task=task,
+            touch=touch,
+            accuracy=right,
+            low=right - 0.1,
+            high=right + 0.2,
+        )
+        for touch, right in (("touch", 0.5), ("classes", 0.75))
+        for task in systems.COMPARING
+    ]
+    (tmp_path / "reports" / "smoke-videos").mkdir(parents=True)
+    write_csv(tmp_path / "reports" / "smoke-videos" / "scores.csv", ScoreRow, scores)
+    rules, model, *tokens = systems.measure(tmp_path, triples=1, batch=2)
+    assert (rules.error, rules.low, rules.high, rules.n) == (0.25, 0.05, 0.35, 32)
+    assert (model.error, model.cost_ratio) == (0.5, 1)
+    assert [row.setting for row in tokens] == ["1 at a time", "2 at a time"]
+    for row in tokens:
+        assert re.search(r"memory read at \d+ GB/s; \d+% of what (memory|arithmetic) allows", row.machine)
 
 
 def test_contact(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,103 @@
+"""The shipped model against its own heads and rules, and its tokens a second against the machine's limits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from statistics import fmean
+
+import torch
+
+from benchmarks.errors import Error, error_of
+from benchmarks.table import Row, make_rows
+from benchmarks.timing import machine, timed
+from pipeline.config.params import load_params
+from pipeline.core.errors import UserError
+from pipeline.core.io import read_csv
+from pipeline.core.records import ScoreRow, Shown
+from pipeline.scales.cost import measured_rate
+from pipeline.use.folder import SHIPPED
+from pipeline.use.model import Octopi
+from pipeline.videos.files import video_files
+
+COMPARING = ("PC", "PSS", "POM", "PSR")
+QUESTION = "Which is the softest? a) {tactile}, b) {tactile}, c) {tactile}. Describe each object before answering."
+DESCRIBE = "Describe the touch. {tactile}"
+MODEL = "the shipped model"
+RULES = "heads and rules, no language model (told the classes of POM's objects and PSR's scenario)"
+SHOWN = {MODEL: Shown.TOUCH, RULES: Shown.CLASSES}
+
+
+def measure(root: Path, triples: int = 12, batch: int = 32) -> list[Row]:
+    """Milliseconds to compare three videos, from the files on; milliseconds of a token, alone and in a batch.
+
+    Raises:
+        UserError: where the chain has not asked the shipped model.
+    """
+    params = load_params(root / "params.yaml")
+    file = root / "reports" / params.report_name / "scores.csv"
+    scores = read_csv(file, ScoreRow) if file.is_file() else []
+    rows = [r for r in scores if r.encoder == SHIPPED.name and r.task in COMPARING and r.measure == "choice"]
+    own = {name: [error_of(r) for r in rows if r.touch == shown] for name, shown in SHOWN.items()}
+    if not all(own.values()):
+        raise UserError(f"{file}: has no answers of the shipped model; run `make repro` first")
+    videos = video_files(root / params.data.dir)[0]
+    octopi = Octopi.from_pretrained(SHIPPED, device="cpu", dtype="float32")
+    groups = [videos[i : i + 3] for i in range(0, len(videos) - 2, 3)][: triples + 1]
+    costs: dict[str, list[float]] = {RULES: [], MODEL: []}
+    for group in groups:
+        seen = timed(partial(each, octopi.encoder.encode, group))[1]
+        costs[RULES].append(seen + timed(partial(each, octopi.encoder.classify, group))[1])
+        costs[MODEL].append(seen + timed(partial(octopi.ask, QUESTION, group))[1])
+    compared = make_rows(
+        "comparing three touches",
+        {name: times[1:] for name, times in costs.items()},  # The first one loads and warms up.
+        unit="ms a question, from the video files on",
+        baseline=MODEL,
+        errors={
+            name: Error(
+                fmean(e.value for e in es),
+                fmean(e.low or 0.0 for e in es),
+                fmean(1.0 if e.high is None else e.high for e in es),
+                sum(e.n or 0 for e in es),
+            )
+            for name, es in own.items()
+        },
+        error_of=f"mean error over {', '.join(COMPARING)}; the interval's ends are means of the tasks' ends",
+        machine=machine(f"{torch.get_num_threads()} threads"),
+    )
+    return [*compared, *tokens(octopi, videos, batch)]
+
+
+def each(do: Callable[[Path], object], videos: Sequence[Path]) -> None:
+    """Do it with each video."""
+    for video in videos:
+        do(video)
+
+
+def tokens(octopi: Octopi, videos: list[Path], batch: int) -> list[Row]:
+    """Milliseconds of a token, its share of the question included, beside the least that the machine allows.
+
+    A token cannot come sooner than all weights are read from memory (shared by the answers of a batch) or multiplied.
+    """
+    asked = [(DESCRIBE, videos[i % len(videos)]) for i in range(batch)]
+    octopi.ask_all(asked)  # So that all videos are encoded.
+    block = torch.ones(2**27)
+    read = min(timed(block.sum)[1] for _ in range(5)) / (4 * block.numel())
+    parameters = sum(p.numel() for p in octopi.llm.parameters())
+    multiplied = 2e3 * parameters / measured_rate()
+    costs, notes = {}, {}
+    for count in (1, batch):
+        taken = []
+        for start in range(0, batch, count):
+            said, ms = timed(partial(octopi.ask_all, asked[start : start + count]))
+            taken.append(ms / sum(len(octopi.llm.tokenizer(text).input_ids) + 1 for text in said))
+        least = max(4 * parameters * read / count, multiplied)
+        name = f"{count} at a time"
+        costs[name] = taken if count == 1 else taken * batch
+        limit = "arithmetic" if least == multiplied else "memory"
+        notes[name] = f"{least / fmean(taken):.0%} of what {limit} allows"
+    rows = make_rows("a token of the shipped model", costs, unit="ms a token", baseline="1 at a time")
+    place = f"{machine(f'{torch.get_num_threads()} threads')}, memory read at {1e-6 / read:.0f} GB/s"
+    return [row.model_copy(update={"machine": f"{place}; {notes[row.setting]}"}) for row in rows]
