@@ -25,11 +25,9 @@ from tests.models import model_folder
 
 LITE, SMOLLM2 = (MADE[name].origin for name in ("efficientnet-lite0", "smollm2"))
 
-# ---- SmolLM2 ----
-
 
 @pytest.fixture(scope="module")
-def smollm2_tokenizer(smollm2_folder: Path) -> PreTrainedTokenizerBase:
+def tokenizer(smollm2_folder: Path) -> PreTrainedTokenizerBase:
     return AutoTokenizer.from_pretrained(smollm2_folder, local_files_only=True)
 
 
@@ -62,31 +60,21 @@ def test_smollm2_has_the_weights_of_the_file_as_gguf_reads_them(smollm2_folder: 
     assert numbers == sum(int(np.prod(t.shape)) for t in stored.values())
 
 
-def test_smollm2_answers_in_its_own_chat_format(
-    smollm2_folder: Path, smollm2_tokenizer: PreTrainedTokenizerBase
-) -> None:
+def test_smollm2_answers_in_its_own_chat_format(smollm2_folder: Path, tokenizer: PreTrainedTokenizerBase) -> None:
     model = AutoModelForCausalLM.from_pretrained(smollm2_folder, local_files_only=True, dtype=torch.float32)
-    assert not getattr(model, "is_quantized", False)
     asked = [{"role": "user", "content": "What is the capital of France?"}]
-    ids = smollm2_tokenizer.apply_chat_template(
-        asked, add_generation_prompt=True, return_tensors="pt", return_dict=True
-    )
-    with torch.inference_mode():
-        said = model.generate(**ids, max_new_tokens=12, do_sample=False)
-    text = smollm2_tokenizer.decode(said[0, ids["input_ids"].shape[1] :])
-    assert "Paris" in text
+    form = {"add_generation_prompt": True, "return_tensors": "pt", "return_dict": True}
+    ids = tokenizer.apply_chat_template(asked, **form)
+    said = model.generate(**ids, max_new_tokens=12, do_sample=False)
+    assert "Paris" in tokenizer.decode(said[0, ids["input_ids"].shape[1] :])
 
 
-def test_smollm2s_tokenizer_gives_texts_back(smollm2_tokenizer: PreTrainedTokenizerBase) -> None:
+def test_smollm2s_tokenizer_gives_texts_back(tokenizer: PreTrainedTokenizerBase) -> None:
     """Of the catalogue. Bytes of scripts that its makers never met are not in its vocabulary."""
-    for file in CATALOGUE.iterdir():
-        text = file.read_text(encoding="utf-8")
-        ids = smollm2_tokenizer(text, add_special_tokens=False).input_ids
+    for text in (file.read_text(encoding="utf-8") for file in CATALOGUE.iterdir()):
+        ids = tokenizer(text, add_special_tokens=False).input_ids
         assert len(ids) < len(text) / 1.5
-        assert smollm2_tokenizer.decode(ids, clean_up_tokenization_spaces=False) == text
-
-
-# ---- EfficientNet-Lite0 ----
+        assert tokenizer.decode(ids, clean_up_tokenization_spaces=False) == text
 
 
 @pytest.mark.parametrize("side", [224, 67])
@@ -125,9 +113,6 @@ def test_pixels_are_normalised_as_in_its_training() -> None:
         assert own < 0.8 * distance((0.0,) * 3, (1.0,) * 3)
 
 
-# ---- tiny ones ----
-
-
 @pytest.mark.parametrize("name", ["tiny-clip", "tiny-llama"])
 def test_tiny_models_follow_from_the_seed(name: str, tmp_path: Path) -> None:
     state = torch.get_rng_state()
@@ -151,8 +136,8 @@ def test_tiny_models_are_what_the_checks_and_loaders_want() -> None:
 def test_tiny_llamas_tokenizer() -> None:
     tokenizer = AutoTokenizer.from_pretrained(model_folder("tiny-llama"), local_files_only=True)
     assert tokenizer.chat_template is None, "so that Vicuna's format is used"
-    assert (tokenizer.pad_token, tokenizer.bos_token, tokenizer.eos_token) == ("<pad>", "<s>", "</s>")
-    assert tokenizer.unk_token == "<unk>"
+    named = (tokenizer.pad_token, tokenizer.bos_token, tokenizer.eos_token, tokenizer.unk_token)
+    assert named == ("<pad>", "<s>", "</s>", "<unk>")
     for text in ("Überraschung! 東京 \n\t 1.5", "a hard and smooth surface with no bumps", ""):
         ids = tokenizer(text).input_ids
         assert tokenizer.unk_token_id not in ids
@@ -171,9 +156,6 @@ def test_random_models_have_the_published_shapes() -> None:
     assert {k: v.shape for k, v in own.items()} == {k: v.shape for k, v in published.items()}
     # Touvron et al. 2023, of Llama 2 with 7B.
     assert sum(p.numel() for p in llama.parameters()) == 6_738_415_616
-
-
-# ---- all of them ----
 
 
 # Those of the paper's shapes are not made here: one of them takes 13 GB.

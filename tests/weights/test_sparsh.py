@@ -15,6 +15,8 @@ from pipeline.weights.published import adopt
 from pipeline.weights.sparsh import write
 from tests.conftest import refused
 
+pytestmark = pytest.mark.usefixtures("elsewhere")
+
 WIDTH, HEADS, REGISTERS, DEPTH, PATCH, SIDE = 128, 2, 2, 3, 16, 224
 State = dict[str, torch.Tensor]
 
@@ -36,16 +38,13 @@ def checkpoint() -> State:
         "norm.bias": some(WIDTH),
     }
     for block in range(DEPTH):
-        for name, out, into in (
-            ("attn.qkv", 3 * WIDTH, WIDTH),
-            ("attn.proj", WIDTH, WIDTH),
-            ("mlp.fc1", 4 * WIDTH, WIDTH),
-            ("mlp.fc2", WIDTH, 4 * WIDTH),
-        ):
-            state |= {f"blocks.{block}.{name}.weight": some(out, into), f"blocks.{block}.{name}.bias": some(out)}
-        for name in ("norm1", "norm2"):
-            state |= {f"blocks.{block}.{name}.weight": 1 + some(WIDTH), f"blocks.{block}.{name}.bias": some(WIDTH)}
-        state |= {f"blocks.{block}.ls1.gamma": some(WIDTH), f"blocks.{block}.ls2.gamma": some(WIDTH)}
+        b = f"blocks.{block}"
+        for name, out, into in (("attn.qkv", 3, 1), ("attn.proj", 1, 1), ("mlp.fc1", 4, 1), ("mlp.fc2", 1, 4)):
+            state[f"{b}.{name}.weight"] = some(out * WIDTH, into * WIDTH)
+            state[f"{b}.{name}.bias"] = some(out * WIDTH)
+        for part in ("1", "2"):
+            state |= {f"{b}.norm{part}.weight": 1 + some(WIDTH), f"{b}.norm{part}.bias": some(WIDTH)}
+            state[f"{b}.ls{part}.gamma"] = some(WIDTH)
     return state
 
 
@@ -72,12 +71,17 @@ def patches_of(state: State, pairs: torch.Tensor) -> torch.Tensor:
     return tokens[:, REGISTERS:]
 
 
-def test_features_are_those_of_an_independent_forward_pass_of_the_same_picture_twice(tmp_path: Path) -> None:
-    state, source = checkpoint(), tmp_path / "download"
-    source.mkdir()
-    save_file(state, source / "dino_vitbase.safetensors")
-    (source / "README.md").write_text("a card with its licence")
-    folder = adopt("sparsh", source, tmp_path / "sparsh")
+def adopted(*files: str) -> Path:
+    """What is made of a download with the checkpoint in these files."""
+    Path("download").mkdir()
+    for name in files:
+        save_file(checkpoint(), f"download/{name}.safetensors")
+    Path("download/README.md").write_text("a card with its licence")
+    return adopt("sparsh", Path("download"), Path("sparsh"))
+
+
+def test_features_are_those_of_an_independent_forward_pass_of_the_same_picture_twice() -> None:
+    folder = adopted("dino_vitbase")
     assert {f.name for f in folder.iterdir()} == {"config.json", "model.safetensors", "README.md", "SHA256SUMS"}
     settings = {"recipe": "tuned", "backbone": ("timm",), "reference": "subtract", "feature_stage": DEPTH - 1}
     backbone = load_backbone(EncoderConfig.model_validate(settings | {"weights": str(folder)}), tuned=False)
@@ -85,7 +89,7 @@ def test_features_are_those_of_an_independent_forward_pass_of_the_same_picture_t
     differences = torch.randint(-60, 60, (2, SIDE, SIDE, 3), generator=torch.Generator().manual_seed(1))
     features = backbone((128 + 2 * differences).to(torch.uint8), torch.zeros(2))
     picture = (differences / 255 + 0.5).permute(0, 3, 1, 2).double()
-    patches = patches_of(state, torch.cat([picture, picture], dim=1))
+    patches = patches_of(checkpoint(), torch.cat([picture, picture], dim=1))
     expected = torch.cat([patches.mean(1), patches.std(1, correction=0)], dim=1)
     torch.testing.assert_close(features.double(), expected, rtol=1e-4, atol=1e-4)
 
@@ -108,12 +112,8 @@ def test_another_layout_is_refused_in_a_line_that_names_what_is_wrong(
         write(tmp_path, stored, "sparsh")
 
 
-@pytest.mark.parametrize("count", [0, 2])
-def test_a_folder_without_the_one_file_is_refused(tmp_path: Path, count: int) -> None:
-    source = tmp_path / "download"
-    source.mkdir()
-    for number in range(count):
-        save_file(checkpoint(), source / f"{number}.safetensors")
-    with refused(f"{count} files \\*.safetensors"):
-        adopt("sparsh", source, tmp_path / "sparsh")
-    assert not (tmp_path / "sparsh").exists()
+@pytest.mark.parametrize("files", [(), ("one", "two")])
+def test_a_folder_without_the_one_file_is_refused(files: tuple[str, ...]) -> None:
+    with refused(f"{len(files)} files \\*.safetensors"):
+        adopted(*files)
+    assert not Path("sparsh").exists()

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from shutil import copytree
 from typing import Any
 
 import pytest
@@ -17,8 +16,7 @@ from typer.testing import CliRunner
 
 from pipeline.cli import app
 from pipeline.core.errors import UserError
-from pipeline.encoder.clip import load_visual_tower
-from pipeline.encoder.timm_backbone import load_backbone
+from pipeline.encoder.recipes import base_encoder
 from pipeline.language.base import load_llm, load_tokenizer
 from pipeline.weights import check_encoder, check_finite, check_language
 from pipeline.weights.check import check_encoder_files, check_language_files
@@ -27,14 +25,20 @@ from tests.closure import ROOT
 from tests.conftest import refused
 from tests.encoders import config, write_timm
 
-
-def renamed(file: Path, old: str, new: str) -> None:
-    tensors = load_file(file)
-    save_file({new if name == old else name: value for name, value in tensors.items()}, file)
-
-
 ONE = "model.safetensors"
 INDEX = "model.safetensors.index.json"
+CLIP_FILE, CLIP_FORM = "open_clip_model.safetensors", "open_clip_config.json"
+WRITE: dict[str, Callable[[Path], Path]] = {
+    "llama": write_llama,
+    "shards": partial(write_llama, shard="20KB"),
+    "clip": write_clip,
+    "timm": write_timm,
+}
+Damage = tuple[Callable[[Path], object], str]
+
+
+def without(file: Path, name: str) -> None:
+    save_file({other: value for other, value in load_file(file).items() if other != name}, file)
 
 
 def other_vocabulary(folder: Path) -> None:
@@ -43,18 +47,23 @@ def other_vocabulary(folder: Path) -> None:
         replace(folder / ONE, name, torch.zeros(259, 32))
 
 
-Damage = tuple[Callable[[Path], object], str]
-EMPTY_TOKENIZER: Damage = (lambda f: (f / "tokenizer.json").write_text(""), "tokenizer.json is no fast tokenizer")
-NO_WIDTH: Damage = (
-    lambda f: edit(f / "config.json", hidden_size=None),
-    r"lm_head.weight is \[260, 32\], not \[260, 40",
-)
-LANGUAGE: list[Damage] = [
-    EMPTY_TOKENIZER,
+def form_of_clip(folder: Path, part: str, **changes: Any) -> None:
+    """Set keys of a tower's configuration; None takes a key away."""
+    form = json.loads((folder / CLIP_FORM).read_text())["model_cfg"]
+    own = {k: v for k, v in (form[part] | changes).items() if v is not None}
+    edit(folder / CLIP_FORM, model_cfg=form | {part: own})
+
+
+vision = partial(form_of_clip, part="vision_cfg")
+NO_WIDTH: Damage = (lambda f: edit(f / "config.json", hidden_size=None), r"weight is \[260, 32\], not \[260, 40")
+NO_NUMBER: Damage = (lambda f: vision(f, width="x"), "open_clip_config.json is no configuration of open_clip's")
+LLAMA: list[Damage] = [
+    (lambda f: (f / "tokenizer.json").write_text(""), "tokenizer.json is no fast tokenizer"),
     NO_WIDTH,
     (lambda f: cut(f / ONE), "model.safetensors is cut off or not a safetensors file .*; download it"),
     (lambda f: (f / ONE).write_bytes((f / ONE).read_bytes() + b"x"), "model.safetensors is cut off"),
     (lambda f: (f / ONE).write_text("version https://git-lfs"), "model.safetensors is cut off"),
+    (lambda f: (f / ONE).rename(f / "pytorch_model.bin"), "only pickles"),
     (lambda f: (f / "tokenizer.json").unlink(), "tokenizer.json does not exist"),
     (lambda f: (f / "tokenizer_config.json").write_text("{"), "_config.json is not a JSON object"),
     (lambda f: (f / "config.json").write_bytes("{}".encode("utf-16")), "is not a JSON object"),
@@ -62,7 +71,7 @@ LANGUAGE: list[Damage] = [
     (lambda f: edit(f / "config.json", model_type=None), "cannot be loaded .*model_type"),
     (lambda f: edit(f / "config.json", num_attention_heads=0), "cannot be loaded .*zero"),
     (lambda f: edit(f / "config.json", intermediate_size=65), r"mlp.down_proj.weight is \[32, 64\], not .*; take"),
-    (lambda f: renamed(f / ONE, "lm_head.weight", "x"), "lm_head.weight is missing"),
+    (lambda f: without(f / ONE, "lm_head.weight"), "lm_head.weight is missing"),
     (other_vocabulary, "tokenizer.json has words up to number 259, but vocab_size of .*/config.json is 259"),
 ]
 SHARDS: list[Damage] = [
@@ -70,20 +79,8 @@ SHARDS: list[Damage] = [
     (lambda f: cut(f / "model-00003-of-00007.safetensors"), "model-00003-of-00007.* is cut"),
     (lambda f: edit(f / INDEX, weight_map={}), "shards cannot be loaded"),
 ]
-CLIP_FILE, CLIP_FORM = "open_clip_model.safetensors", "open_clip_config.json"
-
-
-def vision(folder: Path, **changes: Any) -> None:
-    form = json.loads((folder / CLIP_FORM).read_text())
-    form["model_cfg"]["vision_cfg"] |= changes
-    vision = {k: v for k, v in form["model_cfg"]["vision_cfg"].items() if v is not None}
-    (folder / CLIP_FORM).write_text(json.dumps(form | {"model_cfg": form["model_cfg"] | {"vision_cfg": vision}}))
-
-
-CUT_TOWER: Damage = (lambda f: cut(f / CLIP_FILE), "open_clip_model.safetensors is cut off")
-NO_NUMBER: Damage = (lambda f: vision(f, width="x"), "open_clip_config.json is no configuration of open_clip's")
 CLIP: list[Damage] = [
-    CUT_TOWER,
+    (lambda f: cut(f / CLIP_FILE), "open_clip_model.safetensors is cut off"),
     NO_NUMBER,
     (lambda f: vision(f, layers=3), 'Missing key.* "transformer.resblocks.2'),
     (lambda f: vision(f, width=48), "does not fit its open_clip_config.json .*mismatch for class_embedding"),
@@ -91,6 +88,7 @@ CLIP: list[Damage] = [
     (lambda f: vision(f, timm_model_name="test_vit"), "is no vision transformer"),
     (lambda f: (f / CLIP_FORM).write_text("{}"), "open_clip_config.json"),
 ]
+TIMM: list[Damage] = [(lambda f: cut(f / ONE), "^encoder.weights: timm/model.safetensors is cut off")]
 
 
 @pytest.fixture(autouse=True)
@@ -101,35 +99,22 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
-def scale(*overrides: str) -> str | None:
-    """The line that `octopi scale` ends with; None where it is content."""
-    result = CliRunner().invoke(app, ["scale", "smoke", *overrides])
-    assert (result.exception is None) == Path("params.yaml").exists()
-    if result.exception is None:
-        return None
-    assert isinstance(result.exception, UserError), repr(result.exception)
-    return str(result.exception)
-
-
 def check(folder: Path) -> None:
     """What `octopi scale` asks of a folder."""
-    if folder.name == "clip":
-        check_encoder(folder, 32, ("clip",))
-        check_encoder_files(folder, ("clip",))
+    if folder.name in ("clip", "timm"):
+        check_encoder(folder, 32, (folder.name,))
+        check_encoder_files(folder, (folder.name,))
     else:
         check_language(folder)
         check_language_files(folder)
 
 
-@pytest.mark.parametrize(
-    ("kind", "damage", "words"),
-    [(kind, *each) for kind, table in (("llama", LANGUAGE), ("shards", SHARDS), ("clip", CLIP)) for each in table],
-)
+TABLES = {"llama": LLAMA, "shards": SHARDS, "clip": CLIP, "timm": TIMM}
+
+
+@pytest.mark.parametrize(("kind", "damage", "words"), [(kind, *each) for kind, rows in TABLES.items() for each in rows])
 def test_a_broken_folder_is_one_line(kind: str, damage: Callable[[Path], object], words: str) -> None:
-    if kind == "clip":
-        folder = write_clip(Path(kind))
-    else:
-        folder = write_llama(Path(kind), shard="20KB" if kind == "shards" else "5GB")
+    folder = WRITE[kind](Path(kind))
     check(folder)
     damage(folder)
     with refused(words) as caught:
@@ -137,28 +122,13 @@ def test_a_broken_folder_is_one_line(kind: str, damage: Callable[[Path], object]
     assert str(folder) in str(caught.value)
 
 
-def test_the_command_names_what_is_broken_before_it_writes() -> None:
-    """Also where counting memory reads the same file before."""
-    whole = {"language": write_llama(Path("llama")), "encoder": write_clip(Path("clip"))}
-    spoiled = {"language": (EMPTY_TOKENIZER, NO_WIDTH), "encoder": (CUT_TOWER, NO_NUMBER)}
-    for number, (part, (damage, words)) in enumerate((part, each) for part, both in spoiled.items() for each in both):
-        broken = Path(str(number)) / whole[part].name
-        copytree(whole[part], broken)
-        damage(broken)
-        assert re.search(words, scale(f"{part}.weights={broken}") or "")
-    assert scale(*(f"{part}.weights={folder}" for part, folder in whole.items())) is None
-
-
-def test_a_timm_file_that_is_cut_off_is_named_when_the_scale_is_chosen() -> None:
-    folder = write_timm(Path("timm"))
-    check_encoder_files(folder, ("timm", "scenes"))
-    cut(folder / ONE)
-    check_encoder_files(folder, ("scenes",))
-    with refused("^encoder.weights: timm/model.safetensors is cut off"):
-        check_encoder_files(folder, ("timm", "scenes"))
-
-
-# What is right is not refused.
+@pytest.mark.parametrize(("part", "kind", "case"), [("language", "llama", NO_WIDTH), ("encoder", "clip", NO_NUMBER)])
+def test_what_is_broken_is_named_where_counting_memory_reads_it_first(part: str, kind: str, case: Damage) -> None:
+    damage, words = case
+    damage(WRITE[kind](Path(kind)))
+    with refused(words):
+        CliRunner().invoke(app, ["scale", "smoke", f"{part}.weights={kind}"], catch_exceptions=False)
+    assert not Path("params.yaml").exists()
 
 
 @pytest.mark.parametrize("tied", [True, False])
@@ -181,29 +151,6 @@ def test_a_padding_token_beyond_the_words_passes() -> None:
     check_language_files(folder)
 
 
-# At loading
-
-
-def test_a_broken_tokenizer_is_one_line_at_loading_too() -> None:
-    folder = write_llama(Path("llama"))
-    for content in ("", "{}"):
-        (folder / "tokenizer.json").write_text(content)
-        with refused("^language.weights: .*llama"):
-            load_tokenizer(folder)
-
-
-def test_values_that_are_not_finite_are_named_at_loading() -> None:
-    folder = write_llama(Path("llama"), shard="20KB")
-    name = "model.layers.1.mlp.down_proj.weight"
-    file = folder / json.loads((folder / INDEX).read_text())["weight_map"][name]
-    value = load_file(file)[name]
-    value[3, 5] = torch.nan
-    replace(file, name, value)
-    check_language_files(folder)
-    with pytest.raises(UserError, match=rf"\Alanguage.weights: {name} in {file} holds values that are not finite; d"):
-        load_llm(folder, torch.float32)
-
-
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32])
 @pytest.mark.parametrize("bad", [float("nan"), -float("inf")])
 def test_one_value_that_is_not_finite_is_found_wherever_it_stands(bad: float, dtype: torch.dtype) -> None:
@@ -220,26 +167,59 @@ def test_one_value_that_is_not_finite_is_found_wherever_it_stands(bad: float, dt
                 check_finite(Path(), "key", [("a", value), ("w", worse)])
 
 
-def test_a_tower_with_a_nan_is_named_at_loading() -> None:
-    folder = write_clip(Path("clip"))
-    name = "visual.transformer.resblocks.1.mlp.c_fc.bias"
-    replace(folder / CLIP_FILE, name, torch.full((128,), float("nan")))
-    check_encoder_files(folder, ("clip",))
-    with pytest.raises(UserError, match=rf"{name.removeprefix('visual.')} in clip/{CLIP_FILE} holds .* not finite"):
-        load_visual_tower(folder)
+# At loading
 
 
-def test_a_tower_in_a_pickle_is_not_loaded() -> None:
-    folder = write_clip(Path("clip"))
+def spoil(folder: Path, file: str, name: str) -> None:
+    value = load_file(folder / file)[name]
+    value.view(-1)[-3] = torch.nan
+    replace(folder / file, name, value)
+
+
+def spoil_a_shard(folder: Path) -> None:
+    spoil(folder, json.loads((folder / INDEX).read_text())["weight_map"][DOWN], DOWN)
+
+
+def pickled(folder: Path) -> None:
     torch.save(load_file(folder / CLIP_FILE), folder / "open_clip_pytorch_model.bin")
     (folder / CLIP_FILE).unlink()
-    with pytest.raises(UserError, match=rf"\Aencoder.weights: clip/{CLIP_FILE} does not exist; [^\n]*\Z"):
-        load_visual_tower(folder)
 
 
-def test_a_timm_network_with_a_nan_in_its_statistics_is_named_at_loading() -> None:
-    folder = write_timm(Path("timm"))
-    name = next(n for n in load_file(folder / ONE) if n.endswith("running_var"))
-    replace(folder / ONE, name, torch.full_like(load_file(folder / ONE)[name], float("nan")))
-    with pytest.raises(UserError, match=rf"{name} in timm/{ONE} holds values that are not finite"):
-        load_backbone(config(folder, "tuned", backbone=("timm",)), tuned=False)
+def disguised(file: Path) -> None:
+    """A pickle under the name of a file of safetensors."""
+    torch.save({"a": torch.zeros(1)}, file)
+
+
+DOWN = "model.layers.1.mlp.down_proj.weight"
+MLP, RUNNING = "transformer.resblocks.1.mlp.c_fc.bias", "blocks.0.0.bn1.running_var"
+NAN = "holds values that are not finite; d"
+NO_FIT = r"^encoder.weights: \w+ does not fit its (open_clip_)?config.json"
+
+
+@pytest.mark.parametrize(
+    ("kind", "damage", "words"),
+    [
+        ("llama", lambda f: (f / "tokenizer.json").write_text(""), "^language.weights: .*llama"),
+        ("llama", lambda f: (f / "tokenizer.json").write_text("{}"), "^language.weights: .*llama"),
+        ("shards", spoil_a_shard, rf"^language.weights: {DOWN} in shards/model-0000\d-of-00007.safetensors {NAN}"),
+        ("clip", lambda f: spoil(f, CLIP_FILE, f"visual.{MLP}"), f"{MLP} in clip/{CLIP_FILE} {NAN}"),
+        ("clip", pickled, f"^encoder.weights: clip/{CLIP_FILE} does not exist; "),
+        ("clip", lambda f: disguised(f / CLIP_FILE), NO_FIT),
+        ("clip", lambda f: vision(f, layers=3), NO_FIT),
+        ("clip", lambda f: vision(f, unheard_of=1), NO_FIT),
+        ("clip", lambda f: form_of_clip(f, "text_cfg", hf_model_name="roberta"), "open_clip would ask a hub"),
+        ("timm", lambda f: spoil(f, ONE, RUNNING), f"{RUNNING} in timm/{ONE} {NAN}"),
+        ("timm", lambda f: disguised(f / ONE), NO_FIT),
+        ("timm", lambda f: edit(f / "config.json", architecture="test_resnet"), NO_FIT),
+    ],
+)
+def test_a_broken_folder_is_one_line_at_loading_too(kind: str, damage: Callable[[Path], object], words: str) -> None:
+    folder = WRITE[kind](Path(kind))
+    damage(folder)
+    with refused(words):
+        if kind == "llama":
+            load_tokenizer(folder)
+        elif kind == "shards":
+            load_llm(folder, torch.float32)
+        else:
+            base_encoder(config(folder, "tuned", backbone=(kind,)))
