@@ -9,9 +9,10 @@ import pytest
 import torch
 from torch.optim.optimizer import register_optimizer_step_pre_hook
 
+from pipeline.config import EncoderConfig, Recipe
 from pipeline.encoder.clips import EncoderData
 from pipeline.videos.catalogue import Catalogue
-from tests.encoders import PARTS, encoder_data
+from tests.encoders import PARTS, config, encoder_data, write_timm
 
 Hook = Callable[[Callable[[int, torch.optim.Optimizer], None]], None]
 
@@ -28,6 +29,18 @@ def before_updates() -> Iterator[Hook]:
     yield register
     for handle in handles:
         handle.remove()
+
+
+def gradient(optimizer: torch.optim.Optimizer) -> torch.Tensor:
+    """Of all that it changes, in one row."""
+    return torch.cat([p.grad.flatten() for group in optimizer.param_groups for p in group["params"]])
+
+
+def setting_of(recipe: Recipe, weights: Path, **changes: object) -> EncoderConfig:
+    """Of a recipe; `tuned` stands on a tiny network of timm's."""
+    if recipe != "tuned":
+        return config(weights, recipe, **changes)
+    return config(write_timm(Path("timm")), recipe, backbone=("timm",), feature_stage=2, **changes)
 
 
 def killed_at(updates: Collection[int], begun: list[int]) -> Callable[[int, torch.optim.Optimizer], None]:

