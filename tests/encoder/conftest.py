@@ -10,6 +10,7 @@ import torch
 from torch.optim.optimizer import register_optimizer_step_pre_hook
 
 from pipeline.config import EncoderConfig, Recipe
+from pipeline.encoder import frame_classifier
 from pipeline.encoder.clips import EncoderData
 from pipeline.videos.catalogue import Catalogue
 from tests.encoders import PARTS, config, encoder_data, write_timm
@@ -58,3 +59,10 @@ def killed_at(updates: Collection[int], begun: list[int]) -> Callable[[int, torc
 def data(catalogue: Catalogue, tmp_path: Path) -> EncoderData:
     """Five videos to train on, two to choose by."""
     return encoder_data(tmp_path, catalogue, PARTS)
+
+
+@pytest.fixture
+def few_fits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few heads are fitted to choose among, where they are not what is tested."""
+    monkeypatch.setattr(frame_classifier, "STRENGTHS", (1e-3, 1e-2))
+    monkeypatch.setattr(frame_classifier, "FOLDS", 2)

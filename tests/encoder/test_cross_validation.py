@@ -15,7 +15,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.config import CrossValidationConfig, EncoderConfig, Recipe
-from pipeline.core.errors import UserError
 from pipeline.core.records import Assignment, Measurement, Part
 from pipeline.core.runtime import derive_seed
 from pipeline.encoder import cross_validation as module
@@ -29,6 +28,7 @@ from pipeline.encoder.tuned import Trunks
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
 from pipeline.weights import backbone_files
+from tests.conftest import refused
 from tests.encoders import CPU, config, write_frames, write_pretrained, write_timm
 
 OBJECTS = ("baseball", "controller_base", "cotton_ball", "ice_block", "millet", "pillow", "rug")
@@ -37,12 +37,7 @@ SMALL = CrossValidationConfig(folds=2, repeats=1, seed=4)
 CONSTANT = module.MODELS["constant"]
 
 
-@pytest.fixture(autouse=True)
-def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Checkpoints go to a folder of the working directory; fewer fits, since they are not what is tested."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(frame_classifier, "STRENGTHS", (1e-3, 1e-2))
-    monkeypatch.setattr(frame_classifier, "FOLDS", 2)
+pytestmark = pytest.mark.usefixtures("elsewhere", "few_fits")
 
 
 @pytest.fixture
@@ -93,9 +88,6 @@ def relabelled(training: Training, object_id: str) -> Training:
     return replace(training, data=replace(training.data, catalogue=corrected))
 
 
-# Folds
-
-
 @given(st.lists(st.integers(0, 30), min_size=2, max_size=80), st.integers(2, 7), st.integers(0, 99))
 def test_folds_hold_whole_objects_and_are_even(numbers: list[int], folds: int, seed: int) -> None:
     objects = [f"o{n}" for n in numbers]
@@ -104,9 +96,6 @@ def test_folds_hold_whole_objects_and_are_even(numbers: list[int], folds: int, s
     assert sorted(itertools.chain.from_iterable(dealt)) == sorted(set(objects))
     assert max(map(len, dealt)) - min(map(len, dealt)) <= 1
     assert dealt == deal(objects[::-1], folds, seed)
-
-
-# Who learns from what
 
 
 def test_a_tested_objects_own_label_changes_nothing_that_is_said_of_it(
@@ -156,24 +145,18 @@ def test_what_is_tuned_learns_from_no_object_that_it_is_tested_on(
     found = cross_validate_model("backbone-tuned", training, SMALL)
     assert [p[Part.TEST] for p in parts] == [set(part) for part in deal(OBJECTS, 2, derive_seed(4, "folds", 0))]
     for own in parts:
-        train, validation, test, unused = (own[p] for p in (Part.TRAIN, Part.VALIDATION, Part.TEST, Part.UNUSED))
-        assert validation
-        assert not unused
-        assert sorted([*train, *validation, *test]) == sorted(OBJECTS), "each in one part"
-    assert [(r.video_id, r.predicted) for r in found] == [
-        (v.video_id, said[v.video_id]) for v in training.data.assignments
-    ]
-
-
-# What they say
+        assert own[Part.VALIDATION]
+        assert not own[Part.UNUSED]
+        assert sorted(itertools.chain(*own.values())) == sorted(OBJECTS), "each in one part"
+    videos = [v.video_id for v in training.data.assignments]
+    assert [(r.video_id, r.predicted) for r in found] == [(v, said[v]) for v in videos]
 
 
 def test_constant_by_hand(training: Training) -> None:
     """Each object counts once, however many videos it has; of equals the lowest classes."""
     found = cross_validate_model("constant", training, CONFIG)
-    assert [(r.video_id, r.repeat) for r in found] == [
-        (v.video_id, n) for v in training.data.assignments for n in (0, 1)
-    ]
+    videos = [v.video_id for v in training.data.assignments]
+    assert [(r.video_id, r.repeat) for r in found] == list(itertools.product(videos, (0, 1)))
     for repeat in range(2):
         for held in deal(OBJECTS, 3, derive_seed(4, "folds", repeat)):
             counts = Counter(training.data.catalogue.labels(o) for o in OBJECTS if o not in held)
@@ -242,9 +225,6 @@ def test_results_are_repeatable_and_independent_of_the_order(training: Training)
     assert sorted(turned, key=lambda r: r.video_id) == sorted(first, key=lambda r: r.video_id)
 
 
-# Kills
-
-
 def kill_after(count: int, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
     """Make all models constant and interrupt them when asked for one more fold; returns the folds begun."""
     begun: list[tuple[int, int]] = []
@@ -258,8 +238,7 @@ def kill_after(count: int, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, i
 
         return counting
 
-    for name in module.MODELS:
-        monkeypatch.setitem(module.MODELS, name, until)
+    monkeypatch.setattr(module, "MODELS", dict.fromkeys(module.MODELS, until))
     return begun
 
 
@@ -287,8 +266,7 @@ def test_finished_folds_survive_a_kill(
 def test_folds_of_other_inputs_settings_or_code_are_not_taken_for_these(
     other: str, training: Training, versions: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    name = "backbone"
-    setting = CONFIG
+    name, setting = "backbone", CONFIG
     write_pretrained()
     training = encoded(training, config(Path("none"), "tuned"))
     killed(2, name, training, monkeypatch)
@@ -314,7 +292,6 @@ def test_folds_of_other_inputs_settings_or_code_are_not_taken_for_these(
 def test_folds_need_as_many_objects_and_no_more(training: Training) -> None:
     """With one object to train on none is left to validate by."""
     data = replace(training.data, assignments=[a for a in training.data.assignments if a.object_id in OBJECTS[1:3]])
-    few = replace(training, data=data)
-    assert len(cross_validate_model("backbone-tuned", few, SMALL)) == 4
-    with pytest.raises(UserError, match=r"cross_validation.folds is 8 but only 7 objects have videos"):
+    assert len(cross_validate_model("backbone-tuned", replace(training, data=data), SMALL)) == 4
+    with refused("cross_validation.folds is 8 but only 7 objects have videos"):
         cross_validate_model("constant", training, CrossValidationConfig(folds=8))

@@ -30,12 +30,7 @@ class Tower:
     def __init__(self, folder: Path) -> None:
         tensors = load_file(folder / "open_clip_model.safetensors")
         self.state = {k[7:]: v.double().numpy() for k, v in tensors.items() if k.startswith("visual.")}
-        preprocess = CLIP_CONFIG["preprocess_cfg"]
-        self.mean, self.std = np.array(preprocess["mean"]), np.array(preprocess["std"])
-
-    def token(self, pictures: Floats, prompts: Sequence[Floats] = (), *, normed: bool = False) -> Floats:
-        """The class token after the last block."""
-        return self.tokens(pictures, prompts, normed=normed)[:, 0]
+        self.mean, self.std = (np.array(CLIP_CONFIG["preprocess_cfg"][name]) for name in ("mean", "std"))
 
     def tokens(self, pictures: Floats, prompts: Sequence[Floats] = (), *, normed: bool = False) -> Floats:
         """Class token and patches after the last block, of pictures (0 to 255), batch x side x side x RGB.
@@ -87,12 +82,12 @@ class Tower:
 
 def waves(frame_indices: Floats, dim: int) -> Floats:
     """Vaswani et al. 2017, section 3.5, one number at a time."""
-    table = np.empty((len(frame_indices), dim))
-    for row, frame_index in enumerate(frame_indices.tolist()):
-        for k in range(dim):
-            angle = frame_index / 10_000 ** (2 * (k // 2) / dim)
-            table[row, k] = math.cos(angle) if k % 2 else math.sin(angle)
-    return table
+
+    def wave(frame_index: float, k: int) -> float:
+        angle = frame_index / 10_000 ** (2 * (k // 2) / dim)
+        return math.cos(angle) if k % 2 else math.sin(angle)
+
+    return np.array([[wave(frame_index, k) for k in range(dim)] for frame_index in frame_indices.tolist()])
 
 
 def tuned_encoder(weights: Path, recipe: str, **changes: object) -> TactileEncoder:
@@ -109,21 +104,6 @@ def own_prompts(encoder: TactileEncoder) -> list[Floats]:
     if prompts.shared is not None:
         mapped = mapped @ float64(prompts.shared.weight).T + float64(prompts.shared.bias)
     return list(mapped)
-
-
-# What encoders compute
-
-
-def test_base_encoder_is_open_clips_own_embedding(weights: Path, frames: torch.Tensor) -> None:
-    import open_clip
-    from PIL import Image
-
-    model = open_clip.create_model(f"local-dir:{weights}").eval()
-    form = open_clip.transform.PreprocessCfg(**model.visual.preprocess_cfg)
-    transform = open_clip.transform.image_transform_v2(form, is_train=False)
-    pictures = torch.stack([transform(Image.fromarray(f.numpy())) for f in frames[:, 0]])
-    found = base_encoder(config(weights, "paper"))(frames[:, 0], FRAME_INDICES[:, 0])
-    torch.testing.assert_close(found, model.encode_image(pictures), atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize(("layers", "prompted"), [(None, 0), (0, 2), (1, 1), (9, 2)])
@@ -166,7 +146,7 @@ def test_the_class_token_is_read_where_it_is_named(frames: torch.Tensor, tmp_pat
     weights, pictures, indices = write_tower(tmp_path), frames[:, 0], FRAME_INDICES[:, 0]
     tower, encoder = Tower(weights), base_encoder(config(weights, "paper", embedding="class_token"))
     assert encoder.dim == 32
-    close(encoder(pictures, indices), tower.norm(tower.token(pictures.numpy()), "ln_post"))
+    close(encoder(pictures, indices), tower.norm(tower.tokens(pictures.numpy())[:, 0], "ln_post"))
     names = ("projected", "class_token")
     one, other = (base_encoder(config(weights, "release", embedding=name))(pictures, indices) for name in names)
     assert torch.equal(one, other)
@@ -181,7 +161,7 @@ def test_larger_frames_are_means_over_areas(side: int, recipe: str, weights: Pat
     borders = [(i * side // 32, -(-(i + 1) * side // 32)) for i in range(32)]
     means = np.array([[frames[:, a:b, c:d].astype(float).mean((1, 2)) for c, d in borders] for a, b in borders])
     tower, indices = Tower(weights), torch.tensor([3, 8])
-    token = tower.token(means.transpose(2, 0, 1, 3), own_prompts(encoder), normed=recipe == "release")
+    token = tower.tokens(means.transpose(2, 0, 1, 3), own_prompts(encoder), normed=recipe == "release")[:, 0]
     expected = token + waves(indices.numpy(), 32) if recipe == "release" else tower.embedding(token)
     close(encoder(torch.from_numpy(frames), indices), expected)
 
@@ -190,7 +170,7 @@ def test_larger_frames_are_means_over_areas(side: int, recipe: str, weights: Pat
 def test_classifiers_sum_cross_entropies_of_heads_on_the_mean_frame(
     recipe: str, weights: Path, frames: torch.Tensor
 ) -> None:
-    """Those of `release` stand on the mean's direction, behind a hidden layer. Batches change nothing."""
+    """Those of `release` stand on the mean's direction, behind a hidden layer."""
     model = property_classifier(config(weights, recipe), [3, 3, 2]).eval()
     described = model.encoder.describe(frames.flatten(0, 1), FRAME_INDICES.flatten())
     features, heads = float64(described).reshape(4, 3, -1).mean(axis=1), model.heads
@@ -206,11 +186,6 @@ def test_classifiers_sum_cross_entropies_of_heads_on_the_mean_frame(
     loss = sum(-log_softmax(z, axis=1)[range(4), y].mean() for z, y in zip(expected, labels.T.numpy(), strict=True))
     assert found["loss"].item() == pytest.approx(loss, rel=1e-5)
     assert (model.decide(found["logits"]).numpy() == np.stack([z.argmax(1) for z in expected], axis=1)).all()
-    single = torch.cat([model(f[None], i[None])["logits"] for f, i in zip(frames, FRAME_INDICES, strict=True)])
-    torch.testing.assert_close(found["logits"], single, atol=1e-6, rtol=0)
-    for value in (0, 255):
-        constant = torch.full((1, 5, 32, 32, 3), value, dtype=torch.uint8)
-        assert model(constant, torch.zeros(1, 5, dtype=torch.int64))["logits"].isfinite().all()
 
 
 @pytest.mark.parametrize("shared", [False, True])

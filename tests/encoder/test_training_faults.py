@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -31,6 +31,7 @@ from tests.conftest import Begun, refused
 from tests.encoder.conftest import Hook, gradient, killed_at, setting_of
 from tests.encoders import PARTS, encoder_data, training
 
+State = dict[str, torch.Tensor]
 CLASSES = [3, 3, 3]
 DEVICE = torch.device("cpu")
 pytestmark = pytest.mark.usefixtures("elsewhere")
@@ -38,7 +39,7 @@ pytestmark = pytest.mark.usefixtures("elsewhere")
 
 def trained(
     kind: Recipe, weights: Path, data: EncoderData, *, factor: float = 1.0, **changes: object
-) -> tuple[list[Measurement], dict[str, torch.Tensor]]:
+) -> tuple[list[Measurement], State]:
     """The history and end state of a training, with the learning rate times `factor`."""
     setting = setting_of(kind, weights, **changes)
     setting = setting.model_copy(update={"learning_rate": factor * setting.learning_rate})
@@ -46,7 +47,7 @@ def trained(
     return history, trainable_state(model)
 
 
-def same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> None:
+def same(one: State, other: State) -> None:
     torch.testing.assert_close(one, other, rtol=0, atol=0)
 
 
@@ -117,7 +118,26 @@ def in_order(history: list[Measurement]) -> list[tuple[int, str, float]]:
     return sorted((m.step, m.name, m.value) for m in history)
 
 
+def updates_of_killed(
+    run: Callable[[], tuple[list[Measurement], State]], kills: Sequence[int], left: Sequence[int], before_updates: Hook
+) -> int:
+    """Updates that a run begins which is killed at some, leaving these checkpoints, and ends as one that is not."""
+    history, state = run()
+    shutil.rmtree("checkpoints")
+    begun: list[int] = []
+    before_updates(killed_at(kills, begun))
+    for number in left:
+        with pytest.raises(KeyboardInterrupt):
+            run()
+        assert f"checkpoint-{number}" in {f.name for f in Path("checkpoints").glob("*/*/*")}
+    resumed, end = run()
+    assert in_order(resumed) == in_order(history)
+    same(state, end)
+    return len(begun)
+
+
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_fits")
 @pytest.mark.parametrize(("kind", "validated"), [("paper", False), ("release", True), ("tuned", True)])
 def test_a_killed_training_ends_as_if_it_had_not_been(
     kind: Recipe, validated: bool, weights: Path, catalogue: Catalogue, tmp_path: Path, before_updates: Hook
@@ -126,26 +146,16 @@ def test_a_killed_training_ends_as_if_it_had_not_been(
 
     `release` drops units at random, `tuned` trains above what its trunk makes of mirrored frames.
     """
-    parts = PARTS if validated else dict.fromkeys(PARTS, Part.TRAIN)
-    data = encoder_data(tmp_path, catalogue, parts)
+    data = encoder_data(tmp_path, catalogue, PARTS if validated else dict.fromkeys(PARTS, Part.TRAIN))
     run = partial(trained, kind, weights, data, epochs=3, batch_size=2)
     epoch = 3 if validated else 4
-    history, state = run()
-    begun: list[int] = []
-    before_updates(killed_at([epoch + 1, 2 * epoch + 2], begun))
-    for number in (1, 2):
-        with pytest.raises(KeyboardInterrupt):
-            run()
-        assert f"checkpoint-{number * epoch}" in {f.name for f in tmp_path.glob("checkpoints/*/*/*")}
-    resumed, end = run()
-    assert len(begun) == (epoch + 2) + (epoch + 1) + epoch, "only what the last checkpoint lacked was done again"
-    assert in_order(resumed) == in_order(history)
-    same(state, end)
+    begun = updates_of_killed(run, [epoch + 1, 2 * epoch + 2], [epoch, 2 * epoch], before_updates)
+    assert begun == (epoch + 2) + (epoch + 1) + epoch, "only what the last checkpoint lacked was done again"
     assert not any(tmp_path.glob("checkpoints/*/*"))
 
 
 def unwritten(file: Path) -> None:
-    """Leave the checkpoint as it is while this file is being written; the Trainer writes its state last."""
+    """Leave the checkpoint as while this file is written; the Trainer writes its state last."""
     file.with_name("trainer_state.json").unlink()
     file.write_bytes(b"")
 
@@ -185,40 +195,32 @@ def test_a_damaged_checkpoint_is_passed_over(
 
 
 @pytest.fixture
-def noise(monkeypatch: pytest.MonkeyPatch) -> SyntheticPictures:
+def noise(monkeypatch: pytest.MonkeyPatch) -> None:
     """Noise in place of scenes, with something to tell of it."""
     rng = np.random.default_rng(0)
-    made = SyntheticPictures(
-        pictures=rng.integers(0, 256, (16, 2, 16, 16, 3), dtype=np.uint8),
-        quantities=rng.normal(size=(16, 2, 5)).astype(np.float32),
-        kinds=rng.integers(0, 2, (16, 4)).astype(np.uint8),
-    )
+    pictures = rng.integers(0, 256, (16, 2, 16, 16, 3), dtype=np.uint8)
+    quantities, kinds = rng.normal(size=(16, 2, 5)), rng.integers(0, 2, (16, 4))
+    made = SyntheticPictures(pictures, quantities.astype(np.float32), kinds.astype(np.uint8))
     monkeypatch.setattr(pretraining, "draw_pictures", lambda *_: made)
-    return made
 
 
-def pretrained(steps: int, saved: int, objects: int = 16, side: int = 16) -> tuple[SceneEncoder, list[Measurement]]:
+def pretrained(steps: int, saved: int, objects: int = 16, side: int = 16) -> tuple[list[Measurement], SceneEncoder]:
     setting = PretrainConfig(objects=objects, presses=2, steps=steps, batch_size=4)
-    return pretrain(setting, FramesConfig(pixels=side), RuntimeConfig(device="cpu", save_steps=saved))
+    encoder, history = pretrain(setting, FramesConfig(pixels=side), RuntimeConfig(device="cpu", save_steps=saved))
+    return history, encoder
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("noise")
-def test_a_killed_pretraining_ends_as_if_it_had_not_been(tmp_path: Path, before_updates: Hook) -> None:
+def test_a_killed_pretraining_ends_as_if_it_had_not_been(before_updates: Hook) -> None:
     """15 objects make four updates an epoch: it is killed in the first (after a checkpoint at 2), and in the second."""
-    encoder, history = pretrained(8, 2)
-    shutil.rmtree("checkpoints")
-    begun: list[int] = []
+
+    def run() -> tuple[list[Measurement], State]:
+        history, encoder = pretrained(8, 2)
+        return history, trainable_state(encoder)
+
     # Four updates are begun before the first kill, and five more (from the third on) before the second.
-    before_updates(killed_at([3, 8], begun))
-    for checkpoint in (2, 6):
-        with pytest.raises(KeyboardInterrupt):
-            pretrained(8, 2)
-        assert [f.name for f in tmp_path.glob("checkpoints/pretrain/*/*")] == [f"checkpoint-{checkpoint}"]
-    again, resumed = pretrained(8, 2)
-    assert len(begun) == 4 + 5 + 2
-    same(trainable_state(encoder), trainable_state(again))
-    assert in_order(resumed) == in_order(history)
+    assert updates_of_killed(run, [3, 8], [2, 6], before_updates) == 4 + 5 + 2
 
 
 @pytest.mark.slow
@@ -239,8 +241,8 @@ def test_what_diverges_between_two_reports_replaces_no_good_checkpoint(tmp_path:
 
 
 @pytest.mark.slow
-def test_a_tiny_pretraining_draws_trains_and_tells_what_it_left_aside(tmp_path: Path) -> None:
-    encoder, history = pretrained(4, 2, objects=8, side=32)
+def test_a_tiny_pretraining_draws_trains_and_tells_what_it_left_aside() -> None:
+    history, encoder = pretrained(4, 2, objects=8, side=32)
     assert all(np.isfinite(m.value) for m in history)
     last = {m.name: m.value for m in history if m.step == 4}
     parts = {name: last[f"held_out_{name}"] for name in WEIGHTS}
