@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -42,6 +43,15 @@ def setting_of(recipe: Recipe, weights: Path, **changes: object) -> EncoderConfi
     if recipe != "tuned":
         return config(weights, recipe, **changes)
     return config(write_timm(Path("timm")), recipe, backbone=("timm",), feature_stage=2, **changes)
+
+
+def relabelled(data: EncoderData, object_id: str) -> EncoderData:
+    """Another rating of one object, as a corrected objects.csv has it."""
+    own = data.catalogue.objects[object_id]
+    other = own.model_copy(update={"ratings": tuple((0 if level else 2,) * 3 for level in own.labels)})
+    assert other.labels != own.labels
+    objects = {**data.catalogue.objects, object_id: other}
+    return replace(data, catalogue=data.catalogue.model_copy(update={"objects": objects}))
 
 
 def killed_at(updates: Collection[int], begun: list[int]) -> Callable[[int, torch.optim.Optimizer], None]:

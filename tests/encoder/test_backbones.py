@@ -178,9 +178,7 @@ def test_a_clip_among_several_backbones_gets_prompts(weights: Path, data: Encode
 
 
 @pytest.mark.slow
-def test_training_above_trunks_is_training_through_the_whole_network(
-    timm_folder: Path, data: EncoderData, tmp_path: Path
-) -> None:
+def test_training_above_trunks_trains_as_on_frames(timm_folder: Path, data: EncoderData, tmp_path: Path) -> None:
     """Two epochs, against the classifier on the frames themselves; each video has just the frames of a clip.
 
     Statistics of batch normalisation stay those of the pretraining.
@@ -225,9 +223,7 @@ def test_flips_are_drawn_by_seed_epoch_and_video(timm_folder: Path, data: Encode
     assert not any(drawn(TrunkDataset(trunks, videos)))
 
 
-def test_trunks_too_large_for_memory_are_kept_in_float16(
-    timm_folder: Path, data: EncoderData, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_large_trunks_are_float16(timm_folder: Path, data: EncoderData, monkeypatch: pytest.MonkeyPatch) -> None:
     encoder, videos = side_by_side(timm_folder), data.videos(Part.TRAIN)
     exact = run_trunks(encoder, data, videos, DEVICE, mirrored=False)
     monkeypatch.setattr(tuned, "MEMORY", 0)
@@ -269,9 +265,7 @@ def test_a_stage_that_cannot_be_read_is_one_line(timm_folder: Path, tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_the_backbone_of_the_documentation_works(
-    data: EncoderData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_documented_backbone_works(data: EncoderData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As it stands in docs/encoders.md, module and entry: it embeds, and trains beside another."""
     from transformers import Dinov2Config, Dinov2Model
 

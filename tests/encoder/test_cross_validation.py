@@ -29,14 +29,13 @@ from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.frames.store import FrameStore
 from pipeline.weights import backbone_files
 from tests.conftest import refused
+from tests.encoder.conftest import relabelled
 from tests.encoders import CPU, config, write_frames, write_pretrained, write_timm
 
 OBJECTS = ("baseball", "controller_base", "cotton_ball", "ice_block", "millet", "pillow", "rug")
 CONFIG = CrossValidationConfig(folds=3, repeats=2, seed=4)
 SMALL = CrossValidationConfig(folds=2, repeats=1, seed=4)
 CONSTANT = module.MODELS["constant"]
-
-
 pytestmark = pytest.mark.usefixtures("elsewhere", "few_fits")
 
 
@@ -76,18 +75,6 @@ class Telling(FrameEncoder):
         return torch.stack([frames[:, 0, 0, 0].float(), numbers, numbers**2], dim=1)
 
 
-def relabelled(training: Training, object_id: str) -> Training:
-    """Another rating of one object, as a corrected objects.csv has it."""
-    catalogue = training.data.catalogue
-    own = catalogue.objects[object_id]
-    other = tuple(0 if level else 2 for level in own.labels)
-    ratings = tuple((level,) * 3 for level in other)
-    objects = {**catalogue.objects, object_id: own.model_copy(update={"ratings": ratings})}
-    assert objects[object_id].labels == other
-    corrected = Catalogue(language=catalogue.language, objects=objects)
-    return replace(training, data=replace(training.data, catalogue=corrected))
-
-
 @given(st.lists(st.integers(0, 30), min_size=2, max_size=80), st.integers(2, 7), st.integers(0, 99))
 def test_folds_hold_whole_objects_and_are_even(numbers: list[int], folds: int, seed: int) -> None:
     objects = [f"o{n}" for n in numbers]
@@ -98,9 +85,7 @@ def test_folds_hold_whole_objects_and_are_even(numbers: list[int], folds: int, s
     assert dealt == deal(objects[::-1], folds, seed)
 
 
-def test_a_tested_objects_own_label_changes_nothing_that_is_said_of_it(
-    training: Training, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_tested_objects_own_label_changes_nothing(training: Training, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each object has a grey of its own, so that heads that had learnt from one would know it again."""
     monkeypatch.setattr(module, "SideBySide", Telling)
     monkeypatch.setattr(frame_classifier, "STRENGTHS", (100.0,))
@@ -110,7 +95,7 @@ def test_a_tested_objects_own_label_changes_nothing_that_is_said_of_it(
     assert all(r.expected == training.data.catalogue.labels(r.object_id) for r in whole)
     changed = False
     for name in OBJECTS[:4]:
-        other = cross_validate_model("backbone", relabelled(training, name), once)
+        other = cross_validate_model("backbone", replace(training, data=relabelled(training.data, name)), once)
         said, found = ({r.video_id: r.predicted for r in records} for records in (whole, other))
         assert all(said[video] == found[video] for video in said if video.startswith(name))
         changed = changed or said != found
@@ -250,9 +235,7 @@ def killed(count: int, name: str, training: Training, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("count", [0, 4])
-def test_finished_folds_survive_a_kill(
-    count: int, training: Training, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_folds_survive(count: int, training: Training, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = cross_validate_model("constant", training, CONFIG)
     killed(count, "constant", training, monkeypatch)
     begun = kill_after(99, monkeypatch)
@@ -274,7 +257,7 @@ def test_folds_of_other_inputs_settings_or_code_are_not_taken_for_these(
         case "model":
             name = "backbone-tuned"
         case "labels":
-            training = relabelled(training, "rug")
+            training = replace(training, data=relabelled(training.data, "rug"))
         case "pretraining":
             write_pretrained(1)
         case "frames":

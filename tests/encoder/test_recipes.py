@@ -167,9 +167,7 @@ def test_larger_frames_are_means_over_areas(side: int, recipe: str, weights: Pat
 
 
 @pytest.mark.parametrize("recipe", ["paper", "release"])
-def test_classifiers_sum_cross_entropies_of_heads_on_the_mean_frame(
-    recipe: str, weights: Path, frames: torch.Tensor
-) -> None:
+def test_classifiers_stand_on_the_mean_frame(recipe: str, weights: Path, frames: torch.Tensor) -> None:
     """Those of `release` stand on the mean's direction, behind a hidden layer."""
     model = property_classifier(config(weights, recipe), [3, 3, 2]).eval()
     described = model.encoder.describe(frames.flatten(0, 1), FRAME_INDICES.flatten())

@@ -23,22 +23,10 @@ from pipeline.core.runtime import seed_everything
 from pipeline.encoder import synthetic as module
 from pipeline.encoder.pretrain import STRENGTH, PretrainingDataset, PretrainingModel, vary
 from pipeline.encoder.scene_encoder import SceneEncoder
-from pipeline.encoder.synthetic import (
-    BODIES,
-    FORCES,
-    HEIGHT,
-    KINDS,
-    PITCH,
-    QUANTITIES,
-    SIDE,
-    WIDTH,
-    SyntheticPictures,
-    draw_object,
-    draw_pictures,
-    sensors,
-)
+from pipeline.encoder.synthetic import HEIGHT, KINDS, PITCH, SIDE, WIDTH, SyntheticPictures, draw_object, draw_pictures
 from pipeline.scenes.geometry import heights
 from pipeline.scenes.invent import MODULUS_MPA, invent
+from pipeline.scenes.measure import bump_share, texture
 from pipeline.scenes.recipe import Recipe
 from pipeline.videos.frames.subtraction import subtract
 from tests.frame_rules import pillow
@@ -56,9 +44,9 @@ def few_sensors() -> Iterator[None]:
     """Making all of them takes each process seconds."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "SENSORS", 3)
-        sensors.cache_clear()
+        module.sensors.cache_clear()
         yield
-    sensors.cache_clear()
+    module.sensors.cache_clear()
 
 
 @pytest.fixture(scope="module")
@@ -69,67 +57,53 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> SyntheticPictures:
         return draw_pictures(CONFIG, FRAMES, tmp_path_factory.mktemp("pictures"))
 
 
-# Drawing
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [0, 8])
-def test_an_object_alone_is_the_same_as_among_others(number: int, drawn: SyntheticPictures) -> None:
-    """Whatever else the settings say, and whatever was drawn before."""
-    np.random.seed(number)
+def test_an_object_follows_from_seed_and_number_alone(drawn: SyntheticPictures) -> None:
+    """Whatever else the settings say, whatever was drawn before, and whether others are."""
     other = PretrainConfig(objects=5000, presses=2, seed=5, steps=7, batch_size=1, augment=False)
-    assert equal(draw_object(number, other, FRAMES), [array[[number]] for array in drawn])
-
-
-def test_pictures_differ_by_number_and_by_seed(drawn: SyntheticPictures) -> None:
-    assert len({drawn.pictures[i].tobytes() for i in range(9)}) == 9
+    for number in (8, 0):
+        np.random.seed(number)
+        assert equal(draw_object(number, other, FRAMES), [array[[number]] for array in drawn])
+    assert len({pictures.tobytes() for pictures in drawn.pictures}) == 9
     elsewhere = draw_object(0, CONFIG.model_copy(update={"seed": 6}), FRAMES)
     assert not any(np.array_equal(elsewhere.pictures[0], p) for p in drawn.pictures)
     assert (elsewhere.quantities[0, 0, 0] != drawn.quantities[:, 0, 0]).all()
 
 
 @pytest.mark.slow
-def test_a_killed_drawing_keeps_what_is_finished_and_ends_the_same(
-    drawn: SyntheticPictures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_killed_drawing_goes_on(drawn: SyntheticPictures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pipeline.core.parallel, "cores", lambda: 1)
     monkeypatch.setattr(module, "CHUNK", 4)
 
-    def until(number: int, config: PretrainConfig, frames: FramesConfig) -> SyntheticPictures:
+    def dying(number: int, config: PretrainConfig, frames: FramesConfig) -> SyntheticPictures:
         if number == 5:
             os._exit(9)
         return draw_object(number, config, frames)
 
     with monkeypatch.context() as patch:
-        patch.setattr(module, "draw_object", until)
+        patch.setattr(module, "draw_object", dying)
         with pytest.raises(UserError):
             draw_pictures(CONFIG, FRAMES, tmp_path)
-    assert [f.name for f in tmp_path.glob("[0-9]*.npz")] == ["000000.npz"]
-
-    def only_others(number: int, config: PretrainConfig, frames: FramesConfig) -> SyntheticPictures:
-        assert number >= 4, "drawn again"
-        return draw_object(number, config, frames)
-
-    monkeypatch.setattr(module, "draw_object", only_others)
+    (finished,) = tmp_path.glob("[0-9]*.npz")
+    assert finished.name == "000000.npz"
+    before = finished.stat().st_mtime_ns
     assert equal(draw_pictures(CONFIG, FRAMES, tmp_path), drawn)
-
-
-# What is told
+    assert finished.stat().st_mtime_ns == before, "not drawn again"
 
 
 def test_pictures_have_their_shapes_and_ranges(drawn: SyntheticPictures) -> None:
     assert (drawn.pictures.shape, drawn.pictures.dtype) == ((9, 2, 32, 32, 3), np.uint8)
-    assert (drawn.quantities.shape, drawn.quantities.dtype) == ((9, 2, len(QUANTITIES)), np.float32)
+    assert (drawn.quantities.shape, drawn.quantities.dtype) == ((9, 2, len(module.QUANTITIES)), np.float32)
     assert (drawn.kinds.shape, drawn.kinds.dtype) == ((9, len(KINDS)), np.uint8)
     assert np.isfinite(drawn.quantities).all()
     assert set(np.unique(drawn.kinds)) == {0, 1}
-    assert (drawn.kinds[:, -len(BODIES) :].sum(axis=1) == 1).all(), "one body each"
-    assert (drawn.kinds[:, : -len(BODIES)].sum(axis=1) <= 3).all(), "three layers at most"
-    told = {name: drawn.quantities[..., i] for i, name in enumerate(QUANTITIES)}
+    assert (drawn.kinds[:, -len(module.BODIES) :].sum(axis=1) == 1).all(), "one body each"
+    assert (drawn.kinds[:, : -len(module.BODIES)].sum(axis=1) <= 3).all(), "three layers at most"
+    told = {name: drawn.quantities[..., i] for i, name in enumerate(module.QUANTITIES)}
     modulus, force, radius = (told[f"log10 {name}"] for name in ("modulus", "force", "contact radius"))
     assert (modulus == modulus[:, :1]).all(), "the object's, whatever the press"
     assert ((modulus >= np.log10(MODULUS_MPA[0])) & (modulus <= np.log10(MODULUS_MPA[1]))).all()
-    assert ((force >= np.log10(FORCES[0])) & (force <= np.log10(FORCES[1]))).all()
+    assert ((force >= np.log10(module.FORCES[0])) & (force <= np.log10(module.FORCES[1]))).all()
     assert (np.diff(force, axis=1) > 0).all()
     assert (np.diff(radius, axis=1) > -1e-6).all(), "pressed harder, nothing loses contact"
     assert ((told["bump share"] >= 0) & (told["bump share"] <= 1)).all()
@@ -139,18 +113,16 @@ def test_pictures_have_their_shapes_and_ranges(drawn: SyntheticPictures) -> None
 def test_quantities_are_measured_where_they_are_shown(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Texture of the whole surface; bumps and depth of the skin in view, under each force."""
     fields: dict[str, list[np.ndarray]] = {"texture": [], "bump_share": []}
-    originals = {name: getattr(module, name) for name in fields}
     for name, seen in fields.items():
-        original = originals[name]
-        monkeypatch.setattr(module, name, lambda f, p, own=original, seen=seen: (seen.append(f), own(f, p))[1])
+        own = getattr(module, name)
+        monkeypatch.setattr(module, name, lambda f, p, own=own, seen=seen: (seen.append(f), own(f, p))[1])
     told = draw_object(number, CONFIG, FRAMES).quantities[0].astype(np.float64)
-    (surface,) = fields["texture"]
+    (surface,), skins = fields["texture"], fields["bump_share"]
     assert surface.shape == (SIDE, SIDE)
-    assert {skin.shape for skin in fields["bump_share"]} == {(HEIGHT, WIDTH)}
-    for press, skin in zip(told, fields["bump_share"], strict=True):
-        assert 10 ** press[3] - 5e-4 == pytest.approx(originals["texture"](surface, PITCH), rel=1e-4, abs=1e-8)
-        assert press[4] == pytest.approx(originals["bump_share"](skin, PITCH), abs=1e-6)
-        assert press[5] == pytest.approx(math.log10(skin.max() + 1e-3), abs=1e-5)
+    assert {skin.shape for skin in skins} == {(HEIGHT, WIDTH)}
+    np.testing.assert_allclose(10 ** told[:, 3] - 5e-4, texture(surface, PITCH), rtol=1e-4, atol=1e-8)
+    np.testing.assert_allclose(told[:, 4], [bump_share(skin, PITCH) for skin in skins], atol=1e-6)
+    np.testing.assert_allclose(told[:, 5], [math.log10(skin.max() + 1e-3) for skin in skins], atol=1e-5)
 
 
 @pytest.mark.parametrize("length", [0.6, 2.4, 7.0])
@@ -170,9 +142,6 @@ def test_bands_tell_a_wave_as_the_filters_transfer_says(length: float) -> None:
     assert module._bands(wave, ~(inner | ~inner)) == [-3.0] * 5, "nothing touches, nothing to tell"
 
 
-# Pictures
-
-
 def test_a_press_that_touches_nothing_shows_128(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the sensor; what is left is noise, doubled, and what coding makes of it."""
     shade = module.shade
@@ -187,7 +156,7 @@ def test_a_press_that_touches_nothing_shows_128(monkeypatch: pytest.MonkeyPatch)
 @pytest.mark.parametrize(("fit", "size"), [("crop", 16), ("squash", 150)])
 def test_pictures_are_fitted_as_frames_of_videos(fit: str, size: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Against PIL, and in RGB: the difference of what is lit to the same sensor's background."""
-    sensor = sensors()[0]
+    sensor = module.sensors()[0]
     background = cv2.convertScaleAbs(sensor.background)
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH] / 12
     waves = np.stack([30 * np.sin(x + c) * np.cos(y) + 10 * np.sin(y) for c in range(3)], axis=2)
@@ -201,9 +170,6 @@ def test_pictures_are_fitted_as_frames_of_videos(fit: str, size: int, monkeypatc
     assert np.abs(found - expected[..., ::-1]).mean() > 4 * 2.5
 
 
-# Varying
-
-
 ramp = np.arange(256, dtype=np.uint8).reshape(16, 16)
 RAMPS = np.repeat(np.stack([ramp, ramp, ramp])[..., None], 3, axis=3)
 """Three presses that show every value once in every channel."""
@@ -211,7 +177,7 @@ RAMPS = np.repeat(np.stack([ramp, ramp, ramp])[..., None], 3, axis=3)
 
 def test_presses_are_mirrored_alike_and_strengths_turn_about_the_middle() -> None:
     """128 + g (v - 128), rounded and cut at the ends: one factor a press, one of four ways for all."""
-    before, ways = RAMPS.copy(), []
+    before, ways, steps = RAMPS.copy(), [], np.arange(256) - 128.0
     for seed in range(40):
         found = vary(RAMPS, np.random.default_rng(seed))
         assert np.array_equal(found, vary(RAMPS, np.random.default_rng(seed))), "repeatable"
@@ -224,7 +190,6 @@ def test_presses_are_mirrored_alike_and_strengths_turn_about_the_middle() -> Non
             assert (press == press[..., :1]).all(), "all channels alike"
             values = press[..., 0].ravel()
             inside = (values > 0) & (values < 255)
-            steps = np.arange(256) - 128.0
             gains.append(float(steps[inside] @ (values[inside] - 128.0) / (steps[inside] @ steps[inside])))
             assert np.abs(values - np.clip(128 + gains[-1] * steps, 0, 255)).max() < 1.6
             assert values[128] == 128
@@ -235,21 +200,19 @@ def test_presses_are_mirrored_alike_and_strengths_turn_about_the_middle() -> Non
 
 
 def test_an_item_of_a_training_depends_on_seed_epoch_and_number_alone(drawn: SyntheticPictures) -> None:
-    data = PretrainingDataset(drawn, augment=True, seed=1)
-    first = data[3]["frames"]
-    assert torch.equal(first, PretrainingDataset(drawn, augment=True, seed=1)[3]["frames"])
-    assert not torch.equal(first, PretrainingDataset(drawn, augment=True, seed=2)[3]["frames"])
-    data.follow(lambda: 1)
-    assert not torch.equal(first, data[3]["frames"])
+    def shown(seed: int, epoch: int) -> bytes:
+        data = PretrainingDataset(drawn, augment=True, seed=seed)
+        data.follow(lambda: epoch)
+        return data[3]["frames"].numpy().tobytes()
+
+    assert shown(1, 0) == shown(1, 0)
+    assert len({shown(1, 0), shown(2, 0), shown(1, 1)}) == 3
     plain = PretrainingDataset(drawn, augment=False, seed=1)
     assert len(plain) == 9
-    for name, kind in (("frames", torch.uint8), ("quantities", torch.float32), ("kinds", torch.float32)):
-        assert plain[3][name].dtype == kind
-        source = drawn.pictures if name == "frames" else getattr(drawn, name)
+    sources = {"frames": drawn.pictures, "quantities": drawn.quantities, "kinds": drawn.kinds.astype(np.float32)}
+    for name, source in sources.items():
+        assert plain[3][name].numpy().dtype == source.dtype
         np.testing.assert_array_equal(plain[3][name].numpy(), source[3])
-
-
-# Inventing
 
 
 @given(st.integers(0, 2**62))
@@ -268,17 +231,12 @@ def test_what_is_invented_can_be_made(seed: int) -> None:
     assert surface.max() < 20, "in mm: nothing stands out farther than the sensor is wide"
 
 
-# The model
-
-
 def test_the_loss_weighs_standardised_quantities_and_kinds() -> None:
     """From what the head says, by hand in float64; the first quantity never changes, and its deviation is 0."""
     rng = np.random.default_rng(1)
-    pictures = SyntheticPictures(
-        pictures=rng.integers(0, 256, (6, 2, 32, 32, 3), dtype=np.uint8),
-        quantities=rng.normal(3, 5, size=(6, 2, 4)).astype(np.float32),
-        kinds=rng.integers(0, 2, (6, 3)).astype(np.uint8),
-    )
+    frames = rng.integers(0, 256, (6, 2, 32, 32, 3), dtype=np.uint8)
+    quantities = rng.normal(3, 5, size=(6, 2, 4)).astype(np.float32)
+    pictures = SyntheticPictures(frames, quantities, rng.integers(0, 2, (6, 3)).astype(np.uint8))
     pictures.quantities[..., 0] = 7
     seed_everything(0)
     model = PretrainingModel(SceneEncoder(), pictures).eval()
@@ -289,9 +247,9 @@ def test_the_loss_weighs_standardised_quantities_and_kinds() -> None:
         told = model.head(features).double().numpy().reshape(6, 2, 7)
     exact = pictures.quantities.astype(np.float64)
     off = np.abs(told[..., :4] - (exact - exact.mean(axis=(0, 1))) / (exact.std(axis=(0, 1)) + 1e-6))
-    quantities = np.where(off < 1, off**2 / 2, off - 0.5).mean()
+    huber = np.where(off < 1, off**2 / 2, off - 0.5).mean()
     chances, present = expit(told[..., 4:]), pictures.kinds[:, None].astype(float)
     flags = -(present * np.log(chances) + (1 - present) * np.log(1 - chances)).mean()
-    assert found["quantities"] == pytest.approx(quantities, rel=1e-5)
+    assert found["quantities"] == pytest.approx(huber, rel=1e-5)
     assert found["kinds"] == pytest.approx(flags, rel=1e-5)
-    assert found["loss"] == pytest.approx(2 * quantities + 0.6 * flags, rel=1e-5)
+    assert found["loss"] == pytest.approx(2 * huber + 0.6 * flags, rel=1e-5)

@@ -1,19 +1,23 @@
-"""Training of encoders, what is saved of them, and the registry of recipes."""
+"""Training of encoders, the clips that they are shown, what is saved of them, and the registry of recipes."""
 
 from __future__ import annotations
 
 import hashlib
+import itertools
+import random
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
 import torch
 import yaml
+from hypothesis import given
+from hypothesis import strategies as st
 from pydantic import ValidationError
 from sklearn.linear_model import LogisticRegression
 from sklearn.preprocessing import StandardScaler
@@ -32,9 +36,13 @@ from pipeline.encoder.frame_classifier import STRENGTHS, JointFrameClassifier
 from pipeline.encoder.model import Heads, PropertyClassifier
 from pipeline.encoder.recipes import RECIPES, base_encoder, property_classifier
 from pipeline.encoder.scene_encoder import SceneEncoder
+from pipeline.training.sampling import sample_evaluation, sample_training
 from pipeline.training.trainable import load_trainable, save_trainable, trainable_state
 from pipeline.videos.catalogue import Catalogue
+from pipeline.videos.frames.extract import extract_frames
 from pipeline.videos.frames.store import FrameStore
+from pipeline.videos.frames.subtraction import subtract
+from tests import frame_rules
 from tests.conftest import refused
 from tests.encoder.conftest import Hook, gradient, setting_of
 from tests.encoders import FRAME_INDICES, PARTS, config, float64, random_heads, training, write_frames, write_pretrained
@@ -157,6 +165,47 @@ def test_the_first_of_the_best_epochs_is_kept(
     assert not any(Path("checkpoints").glob("*/*")), "a finished training leaves no checkpoint"
 
 
+@given(st.integers(1, 400), st.integers(1, 64), st.integers(0, 2**32))
+def test_training_samples(count: int, k: int, seed: int) -> None:
+    drawn = sample_training(count, k, random.Random(seed))
+    assert len(drawn) == k
+    assert list(drawn) == sorted(drawn)
+    assert set(drawn) <= set(range(count))
+    assert len(set(drawn)) == k or count < k
+    assert drawn == sample_training(count, k, random.Random(seed))
+
+
+@given(st.integers(1, 400), st.integers(1, 64))
+def test_evaluation_samples_are_uniform_from_the_first(count: int, k: int) -> None:
+    drawn = sample_evaluation(count, k)
+    assert len(drawn) == k
+    assert drawn[0] == 0
+    assert drawn[-1] < count
+    gaps = [b - a for a, b in itertools.pairwise(drawn)]
+    assert all(between in (count // k, -(-count // k)) for between in gaps)
+
+
+def test_the_store_gives_pictures(tiny_videos: Path, tmp_path: Path, catalogue: Catalogue) -> None:
+    found = extract_frames(tiny_videos, catalogue, frame_rules.CONFIG, tmp_path, tmp_path / "partial")
+    plain, subtracted = FrameStore(tmp_path), FrameStore(tmp_path, "subtract")
+    for name, reference in zip((v.video_id for v in found.videos), np.load(tmp_path / "references.npy"), strict=True):
+        rows = [f.row for f in found.frames if f.video_id == name]
+        assert plain.rows(name) == rows
+        np.testing.assert_array_equal(plain.pictures(name), plain.pixels[rows])
+        differences = subtract(np.asarray(plain.pixels[rows]), reference)
+        np.testing.assert_array_equal(subtracted.pictures(name), differences)
+        drawn = sample_evaluation(len(rows), 5)
+        np.testing.assert_array_equal(subtracted.pictures(name, drawn), differences[list(drawn)])
+
+
+@pytest.mark.parametrize(("file", "reference"), [("frames.npy", "none"), ("references.npy", "subtract")])
+def test_a_row_too_few_is_an_error(tmp_path: Path, file: str, reference: Literal["none", "subtract"]) -> None:
+    write_frames(tmp_path, {"a_0": 4, "b_0": 1})
+    np.save(tmp_path / file, np.load(tmp_path / file)[:-1])
+    with refused("differ in length; run"):
+        FrameStore(tmp_path, reference)
+
+
 def test_a_clip_depends_on_seed_epoch_and_video_alone(tmp_path: Path) -> None:
     store = FrameStore(write_frames(tmp_path, {"a_0": 9, "b_0": 9}))
     videos = [LabelledVideo("a_0", (0,)), LabelledVideo("b_0", (1,))]
@@ -181,7 +230,7 @@ def test_validation_counts_videos_that_are_right_in_everything(catalogue: Catalo
 
 
 @pytest.mark.slow
-def test_a_new_recipe_is_a_module_and_a_line(
+def test_a_recipe_is_a_module_and_a_line(
     weights: Path, data: EncoderData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It trains, is saved and loaded, and embeds, without another change."""
@@ -249,9 +298,7 @@ OWN = {
 
 
 @pytest.mark.parametrize("recipe", OWN)
-def test_each_recipe_saves_what_is_its_own_and_reloads_exactly(
-    recipe: str, weights: Path, frames: torch.Tensor, tmp_path: Path
-) -> None:
+def test_each_recipe_reloads_what_is_its_own(recipe: str, weights: Path, frames: torch.Tensor, tmp_path: Path) -> None:
     write_pretrained()
     model, other = (property_classifier(config(weights, recipe), [3, 2]).eval() for _ in range(2))
     if isinstance(model, JointFrameClassifier):

@@ -1,49 +1,129 @@
-"""Whether a folder holds weights: what is there, what the chain can make, and the line that says what is missing."""
+"""What base weights lack, or what is wrong with them, is said in a line: when a scale is chosen, and at loading."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
+from functools import partial
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from transformers import AutoConfig, AutoModelForCausalLM
+from typer.testing import CliRunner
 
-from pipeline.encoder.recipes import check_recipe
+from pipeline.cli import app
+from pipeline.core.errors import UserError
+from pipeline.encoder.recipes import base_encoder, check_recipe
 from pipeline.language.base import load_llm, load_tokenizer
-from pipeline.weights import MADE_DIR, check_encoder, check_language
-from pipeline.weights.check import check_encoder_files
-from tests.checkpoints import write_clip, write_llama
+from pipeline.weights import MADE_DIR, check_encoder, check_finite, check_language
+from pipeline.weights.check import check_encoder_files, check_language_files
+from tests.checkpoints import cut, edit, replace, write_clip, write_llama
+from tests.closure import ROOT
 from tests.conftest import refused
+from tests.encoders import config, write_timm
 
-pytestmark = pytest.mark.usefixtures("elsewhere")
+ONE = "model.safetensors"
+INDEX = "model.safetensors.index.json"
+CLIP_FILE, CLIP_FORM = "open_clip_model.safetensors", "open_clip_config.json"
+WRITE: dict[str, Callable[[Path], Path]] = {
+    "llama": write_llama,
+    "shards": partial(write_llama, shard="20KB"),
+    "clip": write_clip,
+    "timm": write_timm,
+}
+Damage = tuple[Callable[[Path], object], str]
 
 
-def timm_folder(config: str = '{"architecture": "x"}', file: str = "model.safetensors") -> Path:
-    folder = Path("timm")
-    folder.mkdir()
-    (folder / "config.json").write_text(config)
-    (folder / file).write_bytes(b"")
-    return folder
+def without(file: Path, name: str) -> None:
+    save_file({other: value for other, value in load_file(file).items() if other != name}, file)
 
 
-def test_what_is_there_or_can_be_made_passes() -> None:
+def other_vocabulary(folder: Path) -> None:
+    edit(folder / "config.json", vocab_size=259)
+    for name in ("lm_head.weight", "model.embed_tokens.weight"):
+        replace(folder / ONE, name, torch.zeros(259, 32))
+
+
+def form_of_clip(folder: Path, part: str, **changes: Any) -> None:
+    """Set keys of a tower's configuration; None takes a key away."""
+    form = json.loads((folder / CLIP_FORM).read_text())["model_cfg"]
+    own = {k: v for k, v in (form[part] | changes).items() if v is not None}
+    edit(folder / CLIP_FORM, model_cfg=form | {part: own})
+
+
+vision = partial(form_of_clip, part="vision_cfg")
+NO_WIDTH: Damage = (lambda f: edit(f / "config.json", hidden_size=None), r"weight is \[260, 32\], not \[260, 40")
+NO_NUMBER: Damage = (lambda f: vision(f, width="x"), "open_clip_config.json is no configuration of open_clip's")
+LLAMA: list[Damage] = [
+    (lambda f: (f / "tokenizer.json").write_text(""), "tokenizer.json is no fast tokenizer"),
+    NO_WIDTH,
+    (lambda f: cut(f / ONE), "model.safetensors is cut off or not a safetensors file .*; download it"),
+    (lambda f: (f / ONE).write_bytes((f / ONE).read_bytes() + b"x"), "model.safetensors is cut off"),
+    (lambda f: (f / ONE).write_text("version https://git-lfs"), "model.safetensors is cut off"),
+    (lambda f: (f / ONE).rename(f / "pytorch_model.bin"), "only pickles"),
+    (lambda f: (f / "tokenizer.json").unlink(), "tokenizer.json does not exist"),
+    (lambda f: (f / "tokenizer_config.json").write_text("{"), "_config.json is not a JSON object"),
+    (lambda f: (f / "config.json").write_bytes("{}".encode("utf-16")), "is not a JSON object"),
+    (lambda f: (f / "config.json").write_text("[]"), "/config.json is not a JSON object"),
+    (lambda f: edit(f / "config.json", model_type=None), "cannot be loaded .*model_type"),
+    (lambda f: edit(f / "config.json", num_attention_heads=0), "cannot be loaded .*zero"),
+    (lambda f: edit(f / "config.json", intermediate_size=65), r"mlp.down_proj.weight is \[32, 64\], not .*; take"),
+    (lambda f: without(f / ONE, "lm_head.weight"), "lm_head.weight is missing"),
+    (other_vocabulary, "tokenizer.json has words up to number 259, but vocab_size of .*/config.json is 259"),
+]
+SHARDS: list[Damage] = [
+    (lambda f: (f / "model-00002-of-00007.safetensors").unlink(), "No such file.*model-00002-of-00007"),
+    (lambda f: cut(f / "model-00003-of-00007.safetensors"), "model-00003-of-00007.* is cut"),
+    (lambda f: edit(f / INDEX, weight_map={}), "shards cannot be loaded"),
+]
+CLIP: list[Damage] = [
+    (lambda f: cut(f / CLIP_FILE), "open_clip_model.safetensors is cut off"),
+    NO_NUMBER,
+    (lambda f: vision(f, layers=3), 'Missing key.* "transformer.resblocks.2'),
+    (lambda f: vision(f, width=48), "does not fit its open_clip_config.json .*mismatch for class_embedding"),
+    (lambda f: vision(f, layers=[3, 4, 6, 3]), "is no vision transformer"),
+    (lambda f: vision(f, timm_model_name="test_vit"), "is no vision transformer"),
+    (lambda f: (f / CLIP_FORM).write_text("{}"), "open_clip_config.json"),
+]
+NO_TIMM = "is no configuration of a timm backbone"
+TIMM: list[Damage] = [
+    (lambda f: cut(f / ONE), "^encoder.weights: timm/model.safetensors is cut off"),
+    (lambda f: (f / ONE).rename(f / "pytorch_model.bin"), "pickles are refused"),
+    (lambda f: (f / "config.json").unlink(), "config.json does not exist; set encoder.weights=data/weights/"),
+    (lambda f: (f / "config.json").write_text("{}"), NO_TIMM),
+    (lambda f: (f / "config.json").write_text("no JSON"), NO_TIMM),
+    (lambda f: (f / "config.json").write_text("[]"), NO_TIMM),
+]
+
+
+@pytest.fixture(autouse=True)
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder that sees the project's inputs, but has params.yaml and data/ of its own."""
+    for name in ("conf", "pipeline"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    monkeypatch.chdir(tmp_path)
+
+
+def test_what_can_be_made_or_is_not_read_need_not_be_there() -> None:
     check_encoder(MADE_DIR / "tiny-clip", 64, ("clip",))
     check_encoder(MADE_DIR / "efficientnet-lite0", 32, ("timm", "scenes"))
     check_language(MADE_DIR / "smollm2")
     check_language(MADE_DIR / "tiny-llama", "language.weights")
-    check_encoder(timm_folder(), 8, ("timm",))
-    check_encoder_files(Path("timm"), ("scenes",))
-    check_encoder(write_clip(Path("clip")), 32, ("clip",))
     check_encoder(Path("nowhere"), 8, ("scenes",))
+    cut(write_timm(Path("timm")) / ONE)
+    check_encoder_files(Path("timm"), ("scenes",))
 
 
 NOT_MADE = "encoder.weights: data/weights/{} is none .* allowed below data/weights: {}"
 MAKE = "data/weights/tiny-llama/config.json does not exist; `dvc repro weights` makes it"
-NO_TIMM = "is no configuration of a timm backbone"
 
 
 @pytest.mark.parametrize(
-    ("check", "words"),
+    ("ask", "words"),
     [
         (lambda: check_recipe("papr"), r"^encoder.recipe: papr is no recipe; did you mean paper\? known: paper, "),
         (lambda: check_encoder(Path(), 32, ("tim",)), r"^encoder.backbone: tim .*; did you mean timm\? known: clip, "),
@@ -53,18 +133,14 @@ NO_TIMM = "is no configuration of a timm backbone"
         (lambda: check_encoder(MADE_DIR / "tiny-clip", 63, ("clip",)), "set frames.pixels=64"),
         (lambda: check_encoder(write_clip(Path("c")), 24, ("clip",)), r"frames\.pixels is 24 .* frames\.pixels=32$"),
         (lambda: check_encoder(write_clip(Path("c")), 32, ("clip", "timm")), "config.json does not exist"),
-        (lambda: check_encoder(Path("nowhere"), 8, ("timm",)), "config.json does not exist; set encoder.weights=data"),
-        (lambda: check_encoder(timm_folder("{}"), 8, ("timm",)), NO_TIMM),
-        (lambda: check_encoder(timm_folder("no JSON"), 8, ("timm",)), NO_TIMM),
-        (lambda: check_encoder(timm_folder("[]"), 8, ("timm",)), NO_TIMM),
-        (lambda: check_encoder(timm_folder(file="pytorch_model.bin"), 8, ("timm",)), "pickles are refused"),
+        (lambda: check_encoder(Path("nowhere"), 8, ("timm",)), "nowhere/config.json does not exist; set encoder.weigh"),
         (lambda: load_tokenizer(MADE_DIR / "tiny-llama"), MAKE),
         (lambda: load_llm(MADE_DIR / "tiny-llama", dtype=None), MAKE),
     ],
 )
-def test_what_is_wrong_is_one_line(check: Callable[[], object], words: str) -> None:
+def test_what_is_not_there_or_not_known_is_one_line(ask: Callable[[], object], words: str) -> None:
     with refused(words):
-        check()
+        ask()
 
 
 def test_a_missing_package_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -80,3 +156,129 @@ def test_a_missing_package_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     (MADE_DIR / "smollm2").parent.mkdir(parents=True)
     write_llama(MADE_DIR / "smollm2")
     check_language(MADE_DIR / "smollm2")
+
+
+def check(folder: Path) -> None:
+    """What `octopi scale` asks of a folder."""
+    if folder.name in ("clip", "timm"):
+        check_encoder(folder, 32, (folder.name,))
+        check_encoder_files(folder, (folder.name,))
+    else:
+        check_language(folder)
+        check_language_files(folder)
+
+
+TABLES = {"llama": LLAMA, "shards": SHARDS, "clip": CLIP, "timm": TIMM}
+
+
+@pytest.mark.parametrize(("kind", "damage", "words"), [(kind, *each) for kind, rows in TABLES.items() for each in rows])
+def test_a_broken_folder_is_one_line(kind: str, damage: Callable[[Path], object], words: str) -> None:
+    folder = WRITE[kind](Path(kind))
+    check(folder)
+    damage(folder)
+    with refused(words) as caught:
+        check(folder)
+    assert str(folder) in str(caught.value)
+
+
+@pytest.mark.parametrize(("part", "kind", "case"), [("language", "llama", NO_WIDTH), ("encoder", "clip", NO_NUMBER)])
+def test_what_is_broken_is_named_where_counting_memory_reads_it_first(part: str, kind: str, case: Damage) -> None:
+    damage, words = case
+    damage(WRITE[kind](Path(kind)))
+    with refused(words):
+        CliRunner().invoke(app, ["scale", "smoke", f"{part}.weights={kind}"], catch_exceptions=False)
+    assert not Path("params.yaml").exists()
+
+
+@pytest.mark.parametrize("tied", [True, False])
+@pytest.mark.parametrize("kind", ["llama", "gpt_neox"])
+def test_whole_models_of_several_kinds_pass(kind: str, tied: bool) -> None:
+    folder = write_llama(Path("llama"))
+    sizes = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 4}
+    form = AutoConfig.for_model(kind, **sizes, vocab_size=260, tie_word_embeddings=tied)
+    AutoModelForCausalLM.from_config(form).save_pretrained(folder)
+    check_language_files(folder)
+
+
+def test_a_padding_token_beyond_the_words_passes() -> None:
+    """As LLaMA's checkpoints often have one; the chain gives it a row when it adds its own tokens."""
+    folder = write_llama(Path("llama"))
+    file = folder / "tokenizer.json"
+    form = json.loads(file.read_text())
+    form["added_tokens"].append(form["added_tokens"][0] | {"id": 260, "content": "[PAD]"})
+    file.write_text(json.dumps(form))
+    check_language_files(folder)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32])
+@pytest.mark.parametrize("bad", [float("nan"), -float("inf")])
+def test_one_value_that_is_not_finite_is_found_wherever_it_stands(bad: float, dtype: torch.dtype) -> None:
+    draw = torch.Generator().manual_seed(0)
+    largest = torch.finfo(dtype).max
+    for rows, columns in ((1, 1), (3, 7), (129, 65)):
+        value = torch.randn(rows, columns, generator=draw).to(dtype)
+        value[0, 0] = largest
+        check_finite(Path(), "key", [("a", value), ("empty", value[:0]), ("turned", value.T), ("bytes", value.byte())])
+        for place in torch.randint(rows * columns, (40,), generator=draw).tolist():
+            worse = value.clone()
+            worse.view(-1)[place] = bad
+            with pytest.raises(UserError, match="key: w in . holds values that are not finite; download it again"):
+                check_finite(Path(), "key", [("a", value), ("w", worse)])
+
+
+# At loading
+
+
+def spoil(folder: Path, file: str, name: str) -> None:
+    value = load_file(folder / file)[name]
+    value.view(-1)[-3] = torch.nan
+    replace(folder / file, name, value)
+
+
+def spoil_a_shard(folder: Path) -> None:
+    spoil(folder, json.loads((folder / INDEX).read_text())["weight_map"][DOWN], DOWN)
+
+
+def pickled(folder: Path) -> None:
+    torch.save(load_file(folder / CLIP_FILE), folder / "open_clip_pytorch_model.bin")
+    (folder / CLIP_FILE).unlink()
+
+
+def disguised(file: Path) -> None:
+    """A pickle under the name of a file of safetensors."""
+    torch.save({"a": torch.zeros(1)}, file)
+
+
+DOWN = "model.layers.1.mlp.down_proj.weight"
+MLP, RUNNING = "transformer.resblocks.1.mlp.c_fc.bias", "blocks.0.0.bn1.running_var"
+NAN = "holds values that are not finite; d"
+NO_FIT = r"^encoder.weights: \w+ does not fit its (open_clip_)?config.json"
+
+
+@pytest.mark.parametrize(
+    ("kind", "damage", "words"),
+    [
+        ("llama", lambda f: (f / "tokenizer.json").write_text(""), "^language.weights: .*llama"),
+        ("llama", lambda f: (f / "tokenizer.json").write_text("{}"), "^language.weights: .*llama"),
+        ("shards", spoil_a_shard, rf"^language.weights: {DOWN} in shards/model-0000\d-of-00007.safetensors {NAN}"),
+        ("clip", lambda f: spoil(f, CLIP_FILE, f"visual.{MLP}"), f"{MLP} in clip/{CLIP_FILE} {NAN}"),
+        ("clip", pickled, f"^encoder.weights: clip/{CLIP_FILE} does not exist; "),
+        ("clip", lambda f: disguised(f / CLIP_FILE), NO_FIT),
+        ("clip", lambda f: vision(f, layers=3), NO_FIT),
+        ("clip", lambda f: vision(f, unheard_of=1), NO_FIT),
+        ("clip", lambda f: form_of_clip(f, "text_cfg", hf_model_name="roberta"), "open_clip would ask a hub"),
+        ("timm", lambda f: spoil(f, ONE, RUNNING), f"{RUNNING} in timm/{ONE} {NAN}"),
+        ("timm", lambda f: disguised(f / ONE), NO_FIT),
+        ("timm", lambda f: edit(f / "config.json", architecture="test_resnet"), NO_FIT),
+    ],
+)
+def test_a_broken_folder_is_one_line_at_loading_too(kind: str, damage: Callable[[Path], object], words: str) -> None:
+    folder = WRITE[kind](Path(kind))
+    damage(folder)
+    with refused(words):
+        if kind == "llama":
+            load_tokenizer(folder)
+        elif kind == "shards":
+            load_llm(folder, torch.float32)
+        else:
+            base_encoder(config(folder, "tuned", backbone=(kind,)))
