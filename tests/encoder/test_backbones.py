@@ -109,12 +109,14 @@ def test_a_transformer_of_one_side_is_shown_means_over_areas(own: tuple[int, int
         (folder / "config.json").write_text(json.dumps(form))
     backbone = loaded(folder, 2)
 
-    # Two by two fields have the same means at every size.
+    # Two by two fields have the same means at every size, also where rows of pixels differ within an area.
     with torch.no_grad():
-        expected = backbone(enlarged(noise(2), own[0] // 2, own[1] // 2), torch.zeros(3))
-        for times in (np.lcm(*own), 16, 50):
-            found = backbone(enlarged(noise(2), times, times), torch.zeros(3))
-            torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
+        expected = backbone(enlarged(noise(2) // 2 + 64, own[0] // 2, own[1] // 2), torch.zeros(3))
+        for times, contrast in ((np.lcm(*own), 60), (16, 0), (50, 0)):
+            frames = enlarged(noise(2) // 2 + 64, times, times)
+            frames[:, ::2] += contrast
+            frames[:, 1::2] -= contrast
+            torch.testing.assert_close(backbone(frames, torch.zeros(3)), expected, rtol=1e-4, atol=1e-4)
 
 
 def test_a_transformer_of_any_side_is_shown_whole_patches(tmp_path: Path) -> None:

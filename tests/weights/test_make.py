@@ -62,6 +62,7 @@ def test_smollm2_has_the_weights_of_the_file_as_gguf_reads_them(smollm2_folder: 
 
 def test_smollm2_answers_in_its_own_chat_format(smollm2_folder: Path, tokenizer: PreTrainedTokenizerBase) -> None:
     model = AutoModelForCausalLM.from_pretrained(smollm2_folder, local_files_only=True, dtype=torch.float32)
+    assert not getattr(model, "is_quantized", False)
     asked = [{"role": "user", "content": "What is the capital of France?"}]
     form = {"add_generation_prompt": True, "return_tensors": "pt", "return_dict": True}
     ids = tokenizer.apply_chat_template(asked, **form)
