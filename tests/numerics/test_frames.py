@@ -9,10 +9,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.core.records import GAIN, MIDDLE
 from pipeline.videos.frames.reference import contact_strength
 from pipeline.videos.frames.selection import difference
-from pipeline.videos.frames.subtraction import RING, subtract
+from pipeline.videos.frames.subtraction import subtract
 from tests.numerics.bounds import summing
 from tests.numerics.harness import FLOAT64, UINT8, Check, Floats
 
@@ -64,12 +63,12 @@ def test_pictures_are_compared_without_wrapping_around(check: Check, name: str) 
 
 
 def subtracted(change: Floats) -> Floats:
-    """128 and twice the difference, less the outer ring's median; halves of it go up."""
+    """128 and twice the difference, less its median over the outer eighth; halves of it go up."""
     rows, columns = (np.arange(n) for n in change.shape[:2])
-    top, left = (max(1, n // RING) for n in change.shape[:2])
+    top, left = (max(1, n // 8) for n in change.shape[:2])
     outer = (np.minimum(rows, rows[::-1]) < top)[:, None] | (np.minimum(columns, columns[::-1]) < left)[None, :]
     light = np.floor(np.median(change[outer], axis=0) + 0.5)
-    return np.clip(MIDDLE + GAIN * (change - light), 0, 255)
+    return np.clip(128 + 2 * (change - light), 0, 255)
 
 
 def test_a_difference_beyond_32_bits_is_exact(check: Check) -> None:

@@ -11,13 +11,7 @@ from hypothesis import strategies as st
 from scipy.integrate import dblquad, quad
 from scipy.special import j0
 
-from pipeline.scenes.elastic.kernels import (
-    Gel,
-    half_space_table,
-    layer_response,
-    layer_table,
-    make_kernel,
-)
+from pipeline.scenes.elastic.kernels import Gel, half_space_table, layer_response, layer_table, make_kernel
 
 
 def test_a_pixel_sinks_by_the_integral_of_boussinesq() -> None:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -18,22 +16,8 @@ from sklearn.preprocessing import StandardScaler
 from pipeline.core.records import Part, Probe, Severity
 from pipeline.videos.audit import leakage
 from pipeline.videos.audit.leakage import predictability, sessions
-from pipeline.videos.catalogue import Catalogue
 from tests import audit_records as made
-from tests.audit_records import (
-    ERROR,
-    GOOD_SPLIT,
-    INFO,
-    OBJECTS,
-    OTHER,
-    WARNING,
-    leaks,
-    look_at,
-    of,
-    probe,
-    probes,
-    relabelled,
-)
+from tests.audit_records import ERROR, GOOD_SPLIT, INFO, OBJECTS, OTHER, WARNING, leaks, look_at, of, probe, probes
 from tests.conftest import encode, write_video
 
 pytestmark = pytest.mark.usefixtures("few_permutations")
@@ -66,9 +50,9 @@ def test_equal_bytes(twin: str, severity: Severity) -> None:
 def test_an_unused_copy_does_not_hide_a_copy_in_two_parts() -> None:
     parts = {"baseball": Part.UNUSED, "cotton_ball": Part.TRAIN, "pillow": Part.TEST}
     found = leaks(probes(), parts, OTHER, baseball_0="x", cotton_ball_0="x", pillow_0="x")
-    errors = [f for f in found if f.severity is ERROR]
-    assert [(f.check, f.item) for f in errors] == [("same content", "pillow_0.mov")]
-    assert "cotton_ball_0.mov" in errors[0].measured
+    (error,) = (f for f in found if f.severity is ERROR)
+    assert (error.check, error.item) == ("same content", "pillow_0.mov")
+    assert "cotton_ball_0.mov" in error.measured
 
 
 def test_videos_without_any_contact_are_not_compared() -> None:
@@ -80,11 +64,9 @@ def test_videos_without_any_contact_are_not_compared() -> None:
 @pytest.fixture(scope="module")
 def presses(tmp_path_factory: pytest.TempPathFactory) -> list[Probe]:
     """Synthetic presses of four objects."""
-    folder = tmp_path_factory.mktemp("presses")
-    names = [f"{o}_0" for o in sorted(made.PHYSICLEAR.objects)[::20]]
+    folder, objects = tmp_path_factory.mktemp("presses"), sorted(made.PHYSICLEAR.objects)[::20]
     return [
-        look_at(write_video(folder / f"{name}.avi", made.recorded(name[:-2], seed)), name)
-        for seed, name in enumerate(names)
+        look_at(write_video(folder / f"{o}.avi", made.recorded(o, seed)), f"{o}_0") for seed, o in enumerate(objects)
     ]
 
 
@@ -172,25 +154,17 @@ def test_likeness_divides_out_what_is_shared() -> None:
     assert own[0] @ own[30] == pytest.approx(1)
 
 
-def three_sensors(videos: int) -> tuple[list[Probe], list[int]]:
-    rng = np.random.default_rng(5)
-    looks = rng.normal(90, 8, (3, 144))
-    found_videos, truth = [], []
-    for number in range(videos):
-        own = number % 3 if number < videos - 1 else 0
-        drift = rng.normal(0, 6)
-        picture = looks[own] + rng.normal(0, 1, 144) + drift
-        found_videos.append(probe(f"{OBJECTS[number % 8]}_{number}", thumbnail=tuple(picture), brightness=90 + drift))
-        truth.append(own)
-    return found_videos, truth
-
-
 def test_sessions_are_told_apart_by_the_untouched_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     """In whatever order the videos come, and where most of them only go with the nearest of a sample."""
-    found, truth = three_sensors(videos=60)
+    rng = np.random.default_rng(5)
+    looks, truth = rng.normal(90, 8, (3, 144)), [number % 3 for number in range(59)] + [0]
+    found = []
+    for number, own in enumerate(truth):
+        picture = looks[own] + rng.normal(0, 1, 144) + (drift := rng.normal(0, 6))
+        found.append(probe(f"{OBJECTS[number % 8]}_{number}", thumbnail=tuple(picture), brightness=90 + drift))
     names = sessions(found)
     assert len(set(names)) == len(set(zip(truth, names, strict=True))) == 3
-    order = np.random.default_rng(0).permutation(60)
+    order = rng.permutation(60)
     assert sessions([found[i] for i in order]) == [names[i] for i in order]
     monkeypatch.setattr(leakage, "SAMPLE", 20)
     assert sessions(found) == names
@@ -221,78 +195,59 @@ def test_a_session_in_training_and_test_is_a_warning() -> None:
 
 
 def test_what_a_session_holds() -> None:
-    found_videos = [probe(p.video_id, session="a" if p.object_id == "rug" else "b", brightness=80.0) for p in probes()]
-    first, second = of(leaks(found_videos, {}, OTHER), "session")
-    assert (first.item, second.item) == ("a", "b")
+    found = [probe(p.video_id, session="a" if p.object_id == "rug" else "b", brightness=80.0) for p in probes()]
+    first, second = of(leaks(found, {}, OTHER), "session")
+    assert (first.item, second.item, first.expected) == ("a", "b", second.expected)
     assert first.measured.startswith("3 videos of 1 objects, brightness 80.0; hardness ")
-    assert sum(map(int, re.search(r"hardness ([\d/]+) %", first.measured)[1].split("/"))) == 100  # type: ignore[index]
-    assert first.expected == second.expected
+    (shares,) = re.findall(r"hardness ([\d/]+) %", first.measured)
+    assert sum(map(int, shares.split("/"))) == 100
 
 
 # Whether the untouched sensor tells the label: against scikit-learn, planted leaks and pure noise
 
 
-class Planted(NamedTuple):
-    features: np.ndarray
-    labels: list[int]
-    objects: list[str]
-
-
-def planted(seed: int, *, leak: float, objects: int = 24, dims: int = 6, own: float = 0.0) -> Planted:
-    """Unequal numbers of videos; `leak` moves features with the label, `own` with the object."""
+def planted(
+    seed: int, *, leak: float, objects: int = 24, dims: int = 6, own: float = 0.0
+) -> tuple[np.ndarray, list[int], list[str]]:
+    """Features, labels and objects of unequal numbers of videos; `leak` moves features with the label, `own` with the
+    object."""
     rng = np.random.default_rng(seed)
     label = rng.integers(0, 3, objects)
-    member = np.repeat(np.arange(objects), rng.integers(1, 6, objects))
+    member = rng.permutation(np.repeat(np.arange(objects), rng.integers(1, 6, objects)))
     centres, looks = rng.normal(size=(3, dims)), rng.normal(size=(objects, dims))
     features = leak * centres[label[member]] + own * looks[member] + rng.normal(size=(len(member), dims))
-    order = rng.permutation(len(member))
-    member = member[order]
-    return Planted(features[order], label[member].tolist(), [f"object {m:02}" for m in member])
-
-
-def p_value(share: float, null: Sequence[float]) -> float:
-    return (1 + sum(n >= share - 1e-12 for n in null)) / (1 + len(null))
-
-
-def slow_shares(data: Planted, seed: int, permutations: int) -> list[float]:
-    """One ridge regression a fold and an order, by scikit-learn."""
-    names = sorted(set(data.objects))
-    rng = np.random.default_rng(seed)
-    fold_of = dict(zip(names, rng.permutation(len(names)) % min(leakage.FOLDS, len(names)), strict=True))
-    label_of = dict(zip(data.objects, data.labels, strict=True))
-    own = np.array([label_of[n] for n in names])
-    features = StandardScaler().fit_transform(data.features) / np.sqrt(data.features.shape[1])
-    shares = []
-    for order in [own, *(rng.permutation(own) for _ in range(permutations))]:
-        now = dict(zip(names, order, strict=True))
-        truth = np.array([now[o] for o in data.objects])
-        fold = np.array([fold_of[o] for o in data.objects])
-        right = 0
-        for number in set(fold.tolist()):
-            model = Ridge(alpha=leakage.RIDGE).fit(features[fold != number], np.eye(3)[truth[fold != number]])
-            right += int((model.predict(features[fold == number]).argmax(1) == truth[fold == number]).sum())
-        shares.append(right / len(truth))
-    return shares
+    return features, label[member].tolist(), [f"object {m:02}" for m in member]
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_predictability_is_ridge_regression_fold_by_fold(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
+    """One a fold and an order, by scikit-learn."""
     monkeypatch.setattr(leakage, "PERMUTATIONS", 5)
-    data = planted(seed, leak=0.7, dims=(4, 40, 144)[seed])
-    share, null = predictability(*data, seed)
-    assert [share, *null] == pytest.approx(slow_shares(data, seed, 5), abs=1e-12)
+    features, labels, objects = planted(seed, leak=0.7, dims=(4, 40, 144)[seed])
+    found, null = predictability(features, labels, objects, seed)
+    rng = np.random.default_rng(seed)
+    names, place = np.unique(objects, return_inverse=True)
+    fold = (rng.permutation(len(names)) % min(leakage.FOLDS, len(names)))[place]
+    own = np.array([labels[objects.index(name)] for name in names])
+    scaled = StandardScaler().fit_transform(features) / np.sqrt(features.shape[1])
+    shares = []
+    for order in [own, *(rng.permutation(own) for _ in range(5))]:
+        truth, said = order[place], np.empty(len(place), int)
+        for test in (fold == number for number in set(fold.tolist())):
+            model = Ridge(alpha=leakage.RIDGE).fit(scaled[~test], np.eye(3)[truth[~test]])
+            said[test] = model.predict(scaled[test]).argmax(1)
+        shares.append(np.mean(said == truth))
+    assert [found, *null] == pytest.approx(shares, abs=1e-12)
 
 
 @pytest.mark.parametrize("own", [0.0, 3.0])
 def test_noise_gives_uniform_p_values(monkeypatch: pytest.MonkeyPatch, own: float) -> None:
     """Also where videos of one object look alike: labels are permuted among objects, not among videos."""
     monkeypatch.setattr(leakage, "PERMUTATIONS", 79)
-    values = []
-    for seed in range(40):
-        data = planted(seed, leak=0.0, own=own)
-        values.append(p_value(*predictability(*data, seed)))
-    assert np.mean(np.array(values) <= 0.05) <= 0.15
-    assert 0.35 <= np.mean(np.array(values) <= 0.5) <= 0.65
+    found = [predictability(*planted(seed, leak=0.0, own=own), seed) for seed in range(40)]
+    values = np.array([(1 + sum(n >= share - 1e-12 for n in null)) / 80 for share, null in found])
+    assert np.mean(values <= 0.05) <= 0.15
+    assert 0.35 <= np.mean(values <= 0.5) <= 0.65
     assert 0.4 < np.mean(values) < 0.6
 
 
@@ -300,59 +255,50 @@ def test_noise_gives_uniform_p_values(monkeypatch: pytest.MonkeyPatch, own: floa
 def test_classes_that_are_equally_likely_are_not_told_apart_by_rounding(seed: int) -> None:
     """Sessions with as many objects of each class: every score is a tie, and each processor rounds in its own way."""
     rng = np.random.default_rng(seed)
-    objects = [f"object_{i:02d}" for i in range(36)]
-    labels = [i % 3 for i in range(36)]
-    session = np.eye(4)[[i // 9 for i in range(36)]]
-    exact = predictability(session, labels, objects, seed)
+    rest = [i % 3 for i in range(36)], [f"object_{i:02d}" for i in range(36)], seed
+    session = np.repeat(np.eye(4), 9, axis=0)
+    exact = predictability(session, *rest)
     for _ in range(5):
-        assert predictability(session + rng.normal(scale=1e-14, size=session.shape), labels, objects, seed) == exact
+        assert predictability(session + rng.normal(scale=1e-14, size=session.shape), *rest) == exact
 
 
 def test_fewer_objects_than_folds_and_constant_features() -> None:
-    few = planted(0, leak=1.0, objects=3)
-    share, null = predictability(*few, 0)
+    share, null = predictability(*planted(0, leak=1.0, objects=3), 0)
     assert 0 <= share <= 1
     assert len(null) == leakage.PERMUTATIONS
-    data = planted(0, leak=0.0)
-    share, null = predictability(np.ones_like(data.features), data.labels, data.objects, 0)
+    features, labels, objects = planted(0, leak=0.0)
+    share, null = predictability(np.ones_like(features), labels, objects, 0)
     assert np.isfinite([share, *null]).all(), "what does not vary is no division by zero"
 
 
-def coloured(catalogue: Catalogue, leak: float) -> list[Probe]:
-    """Videos whose untouched picture depends on the object's hardness."""
-    rng = np.random.default_rng(0)
-    shades = rng.normal(size=(3, 144))
-    made = []
-    for number, o in enumerate(sorted(catalogue.objects)[:45]):
-        for i in range(1 + number % 4):
-            picture = 90 + leak * shades[catalogue.labels(o)[0]] + rng.normal(size=144)
-            made.append(probe(f"{o}_{i}", thumbnail=tuple(picture)))
-    return made
-
-
-@pytest.mark.parametrize("sample", [leakage.SAMPLE, 50])
-def test_a_picture_that_tells_the_label_is_a_warning(
-    catalogue: Catalogue, sample: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Also where a sample of the videos is predicted, as of very many."""
+@pytest.mark.parametrize(("sample", "leak"), [(leakage.SAMPLE, 1.0), (leakage.SAMPLE, 0.0), (50, 1.0)])
+def test_a_picture_that_tells_the_label_is_a_warning(monkeypatch: pytest.MonkeyPatch, sample: int, leak: float) -> None:
+    """Where untouched pictures depend on the object's hardness; also where few of very many videos are predicted."""
     monkeypatch.setattr(leakage, "PERMUTATIONS", 200)
     monkeypatch.setattr(leakage, "SAMPLE", sample)
-    check = "predicted from the no-contact reference alone"
-    hardness, *others = of(leaks(coloured(catalogue, 1.0), {}, catalogue), check)
-    assert (hardness.item, hardness.severity) == ("hardness", WARNING)
-    assert [f.item for f in others] == ["roughness", "bumpiness"]
-    if sample == leakage.SAMPLE:
-        assert float(hardness.measured.rpartition("p = ")[2]) < 0.01
-        assert [f.severity for f in of(leaks(coloured(catalogue, 0.0), {}, catalogue), check)] == [INFO] * 3
+    rng = np.random.default_rng(0)
+    shades = rng.normal(size=(3, 144))
+    found = []
+    for number, o in enumerate(sorted(made.PHYSICLEAR.objects)[:45]):
+        for i in range(1 + number % 4):
+            picture = 90 + leak * shades[made.PHYSICLEAR.labels(o)[0]] + rng.normal(size=144)
+            found.append(probe(f"{o}_{i}", thumbnail=tuple(picture)))
+    said = of(leaks(found, {}, made.PHYSICLEAR), "predicted from the no-contact reference alone")
+    assert [f.item for f in said] == ["hardness", "roughness", "bumpiness"]
+    if leak == 0:
+        assert [f.severity for f in said] == [INFO] * 3
     else:
-        right = float(hardness.measured.partition(" ")[0]) / 100 * sample
+        assert said[0].severity == WARNING
+        assert float(said[0].measured.rpartition("p = ")[2]) < 0.01
+    if sample == 50:
+        right = float(said[0].measured.partition(" ")[0]) / 100 * sample
         assert right == pytest.approx(round(right), abs=0.05), "a share of fifty"
 
 
 def test_what_cannot_be_predicted_is_undefined() -> None:
     """Of too few objects, and where all have one class."""
     few = leaks(probes(2, OBJECTS[:4]), {}, OTHER)
-    same = leaks(probes(), {}, relabelled(OTHER, ratings=((0, 0), (1, 1), (2, 2))))
+    same = leaks(probes(), {}, made.relabelled(OTHER, ratings=((0, 0), (1, 1), (2, 2))))
     for findings in (few, same):
-        found = [f for f in findings if f.check.startswith("predicted")]
-        assert [(f.measured.partition(":")[0], f.severity) for f in found] == [("undefined", INFO)] * 6
+        found = [(f.measured.partition(":")[0], f.severity) for f in findings if f.check.startswith("predicted")]
+        assert found == [("undefined", INFO)] * 6

@@ -33,16 +33,15 @@ def test_a_fork_decodes_after_its_parent_has(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("signal_number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
 def test_no_worker_outlives_its_parent(tmp_path: Path, signal_number: int) -> None:
-    script = tmp_path / "work.py"
-    script.write_text(
-        "import os, sys, time\nfrom pathlib import Path\nfrom pipeline.core.parallel import run_parallel\n"
-        "def work(i):\n    (Path(sys.argv[1]) / f'{os.getpid()}.pid').touch()\n    time.sleep(10**6)\n"
+    (tmp_path / "work.py").write_text(
+        "import os, time\nfrom pathlib import Path\nfrom pipeline.core.parallel import run_parallel\n"
+        "def work(i):\n    Path(f'{os.getpid()}.pid').touch()\n    time.sleep(10**6)\n"
         "if __name__ == '__main__':\n    list(run_parallel(work, range(4), 'x', 'y'))\n"
     )
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     process = subprocess.Popen(
-        [sys.executable, str(script), str(tmp_path)],
-        env=environment,
+        [sys.executable, "work.py"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
         stderr=subprocess.DEVNULL,
         # What a shell starts in the background ignores it, and so would what is started here.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-import math
-import statistics
 from pathlib import Path
 
 import numpy as np
@@ -17,16 +14,12 @@ from pipeline.use.frames import read_touch
 from pipeline.videos.decoding import brightness, decode
 from pipeline.videos.files import VideoFile
 from pipeline.videos.frames.fit import fit
-from pipeline.videos.frames.reference import (
-    LONGEST,
-    MOST_FRAMES,
-    reference_indices,
-    thumbnail,
-)
+from pipeline.videos.frames.reference import LONGEST, MOST_FRAMES, reference_indices, thumbnail
 from pipeline.videos.frames.scan import Scan, scan
 from pipeline.videos.frames.subtraction import subtract
 from tests.conftest import encode, write_video
 from tests.frame_rules import frames_of
+from tests.numerics.test_frames import subtracted
 
 WIDTH, HEIGHT = 120, 90
 
@@ -68,10 +61,9 @@ def test_the_reference_spans_a_tenth_at_most(frames: int) -> None:
 def test_the_reference_of_usual_lengths(tmp_path: Path, count: int, expected: tuple[int, ...]) -> None:
     """50 and 126 frames: five seconds at 10 and 25 frames a second."""
     assert reference_indices(count) == expected
-    path = tmp_path / "v.avi"
-    found = scanned(path, film(rise(count)))
-    fitted = [fit(frame, FramesConfig(pixels=32)).astype(np.float64) for frame in frames_of(path)]
-    np.testing.assert_array_equal(found.reference, np.rint(np.mean([fitted[i] for i in expected], axis=0)))
+    found = scanned(path := tmp_path / "v.avi", film(rise(count)))
+    fitted = np.array([fit(frame, FramesConfig(pixels=32)) for frame in frames_of(path)], np.float64)
+    np.testing.assert_array_equal(found.reference, np.rint(fitted[list(expected)].mean(axis=0)))
     assert not found.probe.starts_touching
     if count > 3:
         assert found.probe.contact_end > 2
@@ -94,22 +86,22 @@ def test_a_video_that_starts_in_contact_takes_its_reference_from_the_end(tmp_pat
 
 
 def test_contact_throughout_is_not_taken_for_a_start_in_contact(tmp_path: Path) -> None:
-    found = scanned(tmp_path / "v.avi", film([80.0] * 40))
-    assert not found.probe.starts_touching
-    assert found.probe.contact < 1
+    found = scanned(tmp_path / "v.avi", film([80.0] * 40)).probe
+    assert not found.starts_touching
+    assert found.contact < 1
 
 
 def test_a_step_of_the_light_is_no_contact(tmp_path: Path) -> None:
-    light = [0.0] * 25 + [12.0] * 25
-    found = scanned(tmp_path / "light.avi", film([0.0] * 50, light=light))
-    without = scanned(tmp_path / "dark.avi", film([0.0] * 50))
-    touched = scanned(tmp_path / "touched.avi", film(rise(50)))
-    assert found.probe.brightness_step == pytest.approx(12, abs=1)
-    assert without.probe.brightness_step < 0.5
-    assert found.probe.contact < without.probe.contact + 0.5 < touched.probe.contact / 3
+    stepped = scanned(tmp_path / "light.avi", film([0.0] * 50, light=[0.0] * 25 + [12.0] * 25)).probe
+    without = scanned(tmp_path / "dark.avi", film([0.0] * 50)).probe
+    touched = scanned(tmp_path / "touched.avi", film(rise(50))).probe
+    assert stepped.brightness_step == pytest.approx(12, abs=1)
+    assert without.brightness_step < 0.5
+    assert stepped.contact < without.contact + 0.5 < touched.contact / 3
 
 
 WARM_UP = [0.25 + 0.75 * i / 8 for i in range(8)]
+SLOWLY = [1 - 0.6 * 0.8**i for i in range(18)]
 
 
 def warmed(frames: list[np.ndarray], gains: list[float]) -> list[np.ndarray]:
@@ -121,11 +113,8 @@ def warmed(frames: list[np.ndarray], gains: list[float]) -> list[np.ndarray]:
 @pytest.mark.parametrize(
     ("name", "gains", "shape"),
     [
-        ("salient", WARM_UP, "press"),
-        ("contact", WARM_UP, "start"),
-        ("contact", [1 - 0.6 * 0.8**i for i in range(18)], "throughout"),
-        ("contact", [1 - 0.6 * 0.8**i for i in range(18)], "press"),
-        ("salient", [0.0], "start"),
+        *(("salient", WARM_UP, "press"), ("contact", WARM_UP, "start"), ("contact", SLOWLY, "throughout")),
+        *(("contact", SLOWLY, "press"), ("salient", [0.0], "start")),
         ("release", [1.3, 1.3, 1.2, 1.2, 1.1], "press"),
     ],
 )
@@ -170,18 +159,13 @@ def test_a_warm_up_is_noted_and_hides_no_lack_of_contact(tmp_path: Path) -> None
 
 
 def test_a_steady_press_has_the_reference_that_it_had(tmp_path: Path) -> None:
-    """Also where contact begins at once, and under a light that only ever changes later."""
-    late = [0.0] * 30 + [20.0] * 70
-    for number, frames in enumerate((film([4.0 * i for i in range(60)]), film(rise(100)), film(rise(100), light=late))):
-        found = scanned(tmp_path / f"{number}.avi", frames, "salient", lossless=True)
-        assert found.probe.unsteady == 0
-        assert found.probe.untouched == reference_indices(len(frames))
-
-
-def test_a_light_that_never_settles_is_named_and_measured_as_before(tmp_path: Path) -> None:
-    flicker = [15.0 * (i % 2) for i in range(60)]
-    found = scanned(tmp_path / "v.avi", film(rise(60), light=flicker), "salient", lossless=True)
-    assert (found.probe.unsteady, found.probe.untouched) == (60, reference_indices(60))
+    """Also where contact begins at once, under a light that only ever changes later, and one that never settles."""
+    late, flicker = [0.0] * 30 + [20.0] * 70, [15.0 * (i % 2) for i in range(60)]
+    for number, (depths, light, unsteady) in enumerate(
+        (([4.0 * i for i in range(60)], None, 0), (rise(100), None, 0), (rise(100), late, 0), (rise(60), flicker, 60))
+    ):
+        found = scanned(tmp_path / f"{number}.avi", film(depths, light=light), "salient", lossless=True).probe
+        assert (found.unsteady, found.untouched) == (unsteady, reference_indices(len(depths)))
 
 
 @pytest.mark.parametrize(("height", "width"), [(240, 320), (17, 97), (1, 1), (600, 4)])
@@ -193,31 +177,11 @@ def test_thumbnails_keep_the_shape(tmp_path: Path, height: int, width: int) -> N
     assert (thumb[..., 0] == brightness(frame)[0, 0]).all()
 
 
-def slow(frame: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Pixel by pixel in floats: twice the difference less its median over the outer eighth, about 128."""
-    height, width, channels = frame.shape
-    shown = np.zeros(frame.shape)
-    down, across = max(1, height // 8), max(1, width // 8)
-    for c in range(channels):
-        places = list(itertools.product(range(height), range(width)))
-        change = {(y, x): float(frame[y, x, c]) - float(reference[y, x, c]) for y, x in places}
-        outer = [(y, x) for y, x in places if min(y, height - 1 - y) < down or min(x, width - 1 - x) < across]
-        middle = statistics.median(change[place] for place in outer)
-        for y, x in places:
-            shown[y, x, c] = min(255.0, max(0.0, 128 + 2 * (change[y, x] - math.floor(middle + 0.5))))
-    return shown
-
-
-sides = st.tuples(st.integers(1, 20), st.integers(1, 20), st.integers(0, 2**32), st.sampled_from([3, 40, 256]))
-pairs = sides.map(
-    lambda case: np.random.default_rng(case[2]).integers(0, case[3], (3, case[0], case[1], 3)).astype(np.uint8)
-)
-
-
-@given(pairs)
-def test_subtraction_equals_the_slow_one(pictures: np.ndarray) -> None:
+@given(st.tuples(*[st.integers(1, 20)] * 2), st.integers(0, 2**32), st.sampled_from([3, 40, 256]))
+def test_subtraction_equals_the_float64_one(size: tuple[int, int], seed: int, values: int) -> None:
+    pictures = np.random.default_rng(seed).integers(0, values, (3, *size, 3), np.uint16).astype(np.uint8)
     found = subtract(pictures[:2], pictures[2])
     assert (found.dtype, found.shape) == (np.uint8, pictures[:2].shape)
     for frame, shown in zip(pictures[:2], found, strict=True):
-        np.testing.assert_array_equal(shown, slow(frame, pictures[2]))
+        np.testing.assert_array_equal(shown, subtracted(frame - pictures[2].astype(np.float64)))
     assert subtract(pictures[:0], pictures[2]).shape == pictures[:0].shape
