@@ -1,6 +1,4 @@
-"""Bounds that more than one part uses.
-
-No bound is fitted to an error that was measured. Each is one of three kinds, and its test says which:
+"""Bounds that more than one part uses. None is fitted to an error that was measured; its test says which kind it is.
 
 - roundings: an operation count times the format's unit roundoff (Higham 2002, Accuracy and Stability of Numerical
   Algorithms, chapters 2 to 4), where a sum of n terms in any order is off by at most n u times the sum of their sizes;
@@ -43,11 +41,7 @@ def magnification(module: nn.Module, compute: Callable[[], torch.Tensor]) -> flo
     """How many times as large as a random relative change of all weights the output's is, at most of some draws.
 
     Each weight w becomes w (1 + d) with d normal of deviation `CHANGE`. A change of every weight enters every layer and
-    travels through all behind it, as roundings do. In the end all weights are what they were.
-
-    Args:
-        module: In float64.
-        compute: Its output.
+    travels through all behind it, as roundings do. The module is in float64; in the end all weights are what they were.
     """
     draw = torch.Generator().manual_seed(0)
     kept = [(p, p.detach().clone()) for p in module.parameters()]
@@ -68,12 +62,7 @@ def rounded(magnified: float, terms: int, fmt: Format) -> float:
     """The bound of a network's relative error: magnification x root of the roundings a layer x their deviation.
 
     Roundings are taken as random, evenly spread from -u to u, which has a deviation of u / sqrt 3. Products of 16 bits
-    are added in float32, others in the format itself, so that their sum's roundings count.
-
-    Args:
-        magnified: From `magnification`.
-        terms: Of the longest sum in the network (`longest_sum`).
-        fmt: The network's.
+    are added in float32, others in the format itself, so that the roundings of the longest sum (`longest_sum`) count.
     """
     return SURE * magnified * math.sqrt((STEPS if fmt.short else STEPS + terms) / 3) * fmt.roundoff
 

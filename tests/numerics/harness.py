@@ -88,13 +88,9 @@ class Check:
         bound: float | Callable[[Format], float] | None = None,
         exact: npt.ArrayLike | None = None,
     ) -> None:
-        """Hold a result against `exact`, or without it against float64, whose own row is then judged by finiteness.
+        """Hold the result in a format against `exact`, of its shape or a single number, within `bound` (see `Row`).
 
-        Args:
-            case: Its name, different from all others of the part.
-            compute: The result in a format, of any shape.
-            bound: How far the result may be off; see `Row`.
-            exact: The result from another computation, in float64 or better, of the same shape or a single number.
+        Without `exact` it is held against float64, whose own row is then judged by finiteness.
         """
         found, wanted = _floats(compute, fmt), None
         if exact is not None:
@@ -107,12 +103,12 @@ class Check:
                 self.float64[case] = _floats(compute, FLOAT64)
             wanted = self.float64[case]
         limit = error = None
+        finite = bool(np.isfinite(found).all())
         if wanted is not None:
             assert found.shape == wanted.shape, case
             limit = bound(fmt) if callable(bound) else bound
-            if np.isfinite(found).all():
+            if finite:
                 error = float(np.abs(found - wanted).max(initial=0)) / (float(np.abs(wanted).max(initial=0)) or 1)
-        finite = bool(np.isfinite(found).all())
         right = finite and (error is None or limit is None or error <= limit)
         digits = ["" if x is None else f"{x:.1e}" if x else "0" for x in (error, limit)]
         self.rows.append(Row(self.part, case, fmt.value, finite, *digits, "pass" if right else "fail"))

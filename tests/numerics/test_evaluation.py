@@ -1,7 +1,6 @@
 """Figures at their edges: none or all right, p at its smallest, differences next to nothing, far-off ratings.
 
-All of it is float64, held against the closed form of the special case, in whole numbers or fractions. Where a special
-function of scipy's takes part, the bound is the agreement asked of it, 1e-12.
+All of it is float64, held against the closed form of the special case, in whole numbers or fractions.
 """
 
 from __future__ import annotations
@@ -34,13 +33,9 @@ def test_answers_that_are_all_alike_have_wilsons_interval_of_objects(check: Chec
     """With as many questions as objects and Student's t: 0 to t^2 / (n + t^2), or the mirror image of it."""
     square = float(stats.t.ppf(0.975, 6)) ** 2
     exact = np.array([0, square / (7 + square)])
-    check(
-        f"seven objects, all answers {value:g}: interval",
-        FLOAT64,
-        lambda _: accuracy_interval(np.full(21, value), by_turns(21, 7)),
-        AGREED,
-        1 - exact[::-1] if value else exact,
-    )
+    name = f"seven objects, all answers {value:g}: interval"
+    found = accuracy_interval(np.full(21, value), by_turns(21, 7))
+    check(name, FLOAT64, lambda _: found, AGREED, 1 - exact[::-1] if value else exact)
 
 
 @pytest.mark.parametrize(

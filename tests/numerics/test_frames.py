@@ -17,17 +17,11 @@ from tests.numerics.harness import FLOAT64, UINT8, Check, Floats
 
 PART = "frames"
 HEIGHT, WIDTH = 30, 40
-Image = np.ndarray
 
 
-def even(value: int, *shape: int) -> Image:
+def even(value: int, *shape: int) -> np.ndarray:
     """A picture of one value."""
     return np.full(shape or (HEIGHT, WIDTH, 3), value, np.uint8)
-
-
-def noise(seed: int) -> Image:
-    """A picture of values from 0 to 255."""
-    return np.random.default_rng(seed).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
 
 
 PAIRS = {
@@ -36,7 +30,7 @@ PAIRS = {
     "white and black": (even(255), even(0)),
     "black and white": (even(0), even(255)),
     "saturated by halves": (np.repeat([even(0, WIDTH, 3), even(255, WIDTH, 3)], 15, axis=0), even(128)),
-    "noise and noise": (noise(0), noise(1)),
+    "noise and noise": tuple(np.random.default_rng(0).integers(0, 256, (2, HEIGHT, WIDTH, 3), np.uint8)),
     "one pixel": (even(255, 1, 1, 3), even(0, 1, 1, 3)),
 }
 """Two pictures each that are hard to compare: bytes that wrap around, saturate, or do not differ at all."""
@@ -52,13 +46,8 @@ def test_pictures_are_compared_without_wrapping_around(check: Check, name: str) 
     one, other = PAIRS[name]
     change = one.astype(np.float64) - other
     check(f"salience: {name}", UINT8, lambda _: difference(one[..., 0], other[..., 0]), 0, abs(change[..., 0]).sum())
-    check(
-        f"contact strength: {name}",
-        UINT8,
-        lambda _: contact_strength(one, other),
-        255 * summing(HEIGHT * WIDTH * 3, FLOAT64),
-        abs(change).mean() - abs(change.mean(axis=(0, 1))).mean(),
-    )
+    strength, bound = abs(change).mean() - abs(change.mean(axis=(0, 1))).mean(), 255 * summing(one.size, FLOAT64)
+    check(f"contact strength: {name}", UINT8, lambda _: contact_strength(one, other), bound, strength)
     check(f"subtraction: {name}", UINT8, lambda _: subtract(one[None], other)[0], 0, subtracted(change))
 
 
@@ -72,8 +61,5 @@ def subtracted(change: Floats) -> Floats:
 
 
 def test_a_difference_beyond_32_bits_is_exact(check: Check) -> None:
-    shape = 4320, 7680
-    check(
-        "salience: a sum beyond 32 bits", UINT8, lambda _: difference(even(255, *shape), even(0, *shape)), 0,
-        255.0 * shape[0] * shape[1],
-    )  # fmt: skip
+    white, black = (even(value, 4320, 7680) for value in (255, 0))
+    check("salience: a sum beyond 32 bits", UINT8, lambda _: difference(white, black), 0, 255.0 * white.size)

@@ -32,23 +32,22 @@ CLASSES = (3, 3, 3)
 # Features of no length
 
 
-def published_heads(dtype: torch.dtype) -> PublishedHeads:
-    seed_everything(0)
-    return PublishedHeads(16, [3, 2]).to(dtype).eval()
-
-
 @formats(*NETWORKS)
 def test_features_of_length_0_are_classified(check: Check, fmt: Format) -> None:
     """And learnt from. roundings: the sum over the hidden layer, by the sizes of its terms."""
-    heads = published_heads(torch.float64)
+
+    def published_heads(f: Format) -> PublishedHeads:
+        seed_everything(0)
+        return PublishedHeads(16, [3, 2]).to(f.torch).eval()
+
+    heads = published_heads(FLOAT64)
     hidden = F.relu(heads.shared.bias)
     with torch.no_grad():
         exact = torch.cat(heads.properties(hidden[None]), dim=1)
-        layers = list(heads.properties)
-        sizes = torch.cat([layer.weight.abs() @ hidden + layer.bias.abs() for layer in layers])
+        sizes = torch.cat([layer.weight.abs() @ hidden + layer.bias.abs() for layer in heads.properties])
 
     def classified(f: Format) -> torch.Tensor:
-        model = PropertyClassifier(FrameEncoder(16), published_heads(f.torch), [3, 2]).to(f.device)
+        model = PropertyClassifier(FrameEncoder(16), published_heads(f), [3, 2]).to(f.device)
         frame = torch.randn(1, 1, 16, generator=torch.Generator().manual_seed(0)).to(f.device, f.torch)
         features = torch.cat([frame, -frame], dim=1).requires_grad_()  # Their mean is exactly 0.
         logits = torch.cat(model.classify(features), dim=1)
@@ -115,9 +114,7 @@ def test_huge_logits_are_finite_and_decided_on(
 
 # Joint decisions
 
-Table = Sequence[Sequence[float]]
-"""One video's probabilities of each class, by property."""
-TABLES: dict[str, Table] = {
+TABLES: dict[str, Sequence[Sequence[float]]] = {
     "all classes alike": ((0.5, 0.5), (0.5, 0.5)),
     "certain": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
     "tie of two combinations": ((0.25, 0.5, 0.25), (0.5, 0.5, 0.0)),
@@ -127,6 +124,7 @@ TABLES: dict[str, Table] = {
     "a single class": ((1.0,), (1.0,)),
     "a rounding apart": ((0.5, 0.5 + 2**-40), (0.5 + 2**-39, 0.5)),
 }
+"""One video's probabilities of each class, by property."""
 
 
 @pytest.mark.parametrize("name", TABLES)

@@ -24,17 +24,16 @@ from tests.closure import ROOT
 
 def test_each_combination_comes_as_often() -> None:
     catalogue = invented_catalogue(InventConfig(objects=270))
-    assert set(Counter(map(catalogue.labels, catalogue.objects)).values()) == {10}
-    assert len(catalogue.objects) == 270
-    assert [catalogue.labels(o) for o in catalogue.objects] == [classes_of(n) for n in range(270)]
+    labels = [catalogue.labels(o) for o in catalogue.objects]
+    assert labels == [classes_of(number) for number in range(270)]
+    assert set(Counter(labels).values()) == {10}
 
 
 @pytest.mark.slow
 def test_an_object_measures_as_its_classes_in_videos_of_it() -> None:
     """By the scene that a video is made of: a patch, a force and a resolution that the drawing has not seen."""
-    numbers, right = (0, 5, 13, 21, 26), 0
-    config = ScenesConfig(tier="layer", cells=96, width=240, height=180)
-    for number in numbers:
+    config, right = ScenesConfig(tier="layer", cells=96, width=240, height=180), 0
+    for number in (0, 5, 13, 21, 26):
         recipe = draw(classes_of(number), np.random.default_rng(number))
         for seed in range(3):
             measured = measure_scene(make_scene(recipe, config, 2, 100 + seed), recipe, config)
@@ -58,21 +57,18 @@ def test_it_is_written_as_a_catalogue_whose_objects_depend_on_seed_and_number(
     here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(invented, "draw", drawn)
-    recipes = {}
-    for name, config in (
-        ("few", InventConfig(objects=27)),
-        ("more", InventConfig(objects=54)),
-        ("other", InventConfig(objects=27, seed=1)),
-    ):
-        write_catalogue(config, here / name)
-        catalogue = load_catalogue(here / name)
+    recipes = []
+    for objects, seed in ((27, 0), (54, 0), (27, 1)):
+        config = InventConfig(objects=objects, seed=seed)
+        write_catalogue(config, here / f"{objects} {seed}")
+        catalogue = load_catalogue(here / f"{objects} {seed}")
         assert catalogue == invented_catalogue(config), "known before it is written"
-        recipes[name] = load_recipes(here / name, catalogue, seed=0)
-    assert recipes["few"].items() <= recipes["more"].items()
-    assert not recipes["few"].items() & recipes["other"].items()
+        recipes.append(load_recipes(here / f"{objects} {seed}", catalogue, seed=0).items())
+    few, more, other = recipes
+    assert few <= more
+    assert not few & other
     assert catalogue.language.dataset != "PhysiCLeAR", "its published figures are not about these"
-    public = load_catalogue(ROOT / "pipeline" / "physiclear")
-    assert not public.objects.keys() & catalogue.objects.keys()
+    assert not load_catalogue(ROOT / "pipeline" / "physiclear").objects.keys() & catalogue.objects.keys()
 
 
 def test_a_killed_drawing_goes_on_from_what_is_finished(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -95,13 +91,11 @@ def test_a_killed_drawing_goes_on_from_what_is_finished(here: Path, monkeypatch:
     assert work.name == fingerprint(0, *code_of("invent")), "another version of the code draws all anew"
     assert Path(solver.__file__) in code_of("invent")
     monkeypatch.setattr(invented, "CHECKPOINTS", here / "fresh")
-    monkeypatch.setattr(invented, "draw", drawn)
     write_catalogue(config, here / "whole")
-    files = [{f.name: f.read_bytes() for f in (here / name).iterdir()} for name in ("resumed", "whole")]
-    assert files[0] == files[1]
+    resumed, whole = ({f.name: f.read_bytes() for f in (here / name).iterdir()} for name in ("resumed", "whole"))
+    assert resumed == whole
 
 
 def test_its_scale_is_checked_before_the_catalogue_is_written(here: Path) -> None:
-    params = compose("invented", ["invent.objects=54"], conf=ROOT / "conf")
-    check_inputs(params)
+    check_inputs(compose("invented", ["invent.objects=54"], conf=ROOT / "conf"))
     assert not (here / "data").exists()

@@ -15,40 +15,31 @@ from pipeline.scenes.elastic.kernels import Gel, half_space_table, layer_respons
 
 
 def test_a_pixel_sinks_by_the_integral_of_boussinesq() -> None:
-    """u = 1 / (pi E*) times the integral of dA / r (Johnson, 3.2)."""
+    """u = 1 / (pi E*) times the integral of dA / r (Johnson, 3.2); far away u = F / (pi E* r)."""
     table = half_space_table((6, 6), pitch=1.0, modulus=1.0)
     assert table[0, 0] == pytest.approx(4 * math.log(1 + math.sqrt(2)) / math.pi, rel=1e-12)
     for row, column in ((0, 1), (2, 0), (3, 4)):
-        direct, _ = dblquad(
-            lambda y, x: 1 / (math.pi * math.hypot(x, y)), column - 0.5, column + 0.5, row - 0.5, row + 0.5
-        )
+        sides = column - 0.5, column + 0.5, row - 0.5, row + 0.5
+        direct, _ = dblquad(lambda y, x: 1 / (math.pi * math.hypot(x, y)), *sides)
         assert table[row, column] == pytest.approx(direct, rel=1e-9)
-
-
-def test_far_away_a_pixel_is_a_point_force() -> None:
-    """Boussinesq: u = F / (pi E* r)."""
-    table = half_space_table((901, 4), pitch=0.1, modulus=2.0)
+    far = half_space_table((901, 4), pitch=0.1, modulus=2.0)
     for offset, bound in ((10, 1e-3), (100, 1e-5), (900, 1e-6)):
-        point = 0.1**2 / (math.pi * 2.0 * 0.1 * offset)
-        assert table[offset, 0] == pytest.approx(point, rel=bound)
+        assert far[offset, 0] == pytest.approx(0.1**2 / (math.pi * 2.0 * 0.1 * offset), rel=bound)
 
 
 @given(st.floats(0, 1e4), st.floats(0, 0.5))
 def test_a_layers_response_is_between_springs_and_half_space(wave: float, poisson: float) -> None:
+    """It may overshoot a half-space by little where its sides bulge."""
     response = float(layer_response(wave, poisson))
-    assert math.isfinite(response)
-    assert response >= 0
-    # A layer may overshoot a half-space by little where its sides bulge.
-    assert response <= 1.1
+    assert 0 <= response <= 1.1
     if wave > 25:
         assert response == pytest.approx(1, abs=1e-12)
 
 
 @pytest.mark.parametrize("poisson", [0.0, 0.3, 0.48])
 def test_to_long_waves_a_layer_is_springs(poisson: float) -> None:
-    """p = M c / t with the modulus M = E (1 - nu) / ((1 + nu)(1 - 2 nu)) of a layer that cannot widen."""
-    k = 1e-4
-    young = 1 - poisson**2  # E* = 1
+    """p = M c / t with the modulus M = E (1 - nu) / ((1 + nu)(1 - 2 nu)) of a layer that cannot widen; E* = 1."""
+    k, young = 1e-4, 1 - poisson**2
     oedometric = young * (1 - poisson) / ((1 + poisson) * (1 - 2 * poisson))
     assert 2 * float(layer_response(k, poisson)) / k == pytest.approx(1 / oedometric, rel=1e-6)
 
@@ -62,11 +53,9 @@ def test_the_series_meets_the_formula() -> None:
 
 
 def test_a_thick_layer_is_a_half_space() -> None:
-    shape, pitch = (24, 24), 0.1
-    half = half_space_table(shape, pitch, 1.0)
-    last = math.inf
+    half, last = half_space_table((24, 24), 0.1, 1.0), math.inf
     for thickness in (10.0, 100.0, 1000.0):
-        layer = layer_table(shape, pitch, Gel(modulus=1.0, poisson=0.4, thickness=thickness))
+        layer = layer_table((24, 24), 0.1, Gel(modulus=1.0, poisson=0.4, thickness=thickness))
         off = float(np.abs(layer - half).max() / half.max())
         assert off < last / 5
         last = off
@@ -93,11 +82,12 @@ def test_a_layers_table_is_its_hankel_transform() -> None:
     table = layer_table((40, 40), pitch, gel)
     for offset in (12, 20, 30):
         r = offset * pitch
-        # The tail of S = 1 is 1/r (half-space); what is left converges fast.
-        rest, _ = quad(
-            lambda k, r=r: (float(layer_response(k, gel.poisson)) - 1) * j0(k * r / gel.thickness), 0, 30, limit=400
-        )
-        direct = pitch**2 / (math.pi * gel.modulus) * (1 / r + rest / gel.thickness)
+
+        def rest(k: float, r: float = r) -> float:
+            """The tail of S = 1 is 1/r (half-space); what is left converges fast."""
+            return (float(layer_response(k, gel.poisson)) - 1) * j0(k * r / gel.thickness)
+
+        direct = pitch**2 / (math.pi * gel.modulus) * (1 / r + quad(rest, 0, 30, limit=400)[0] / gel.thickness)
         assert table[0, offset] == pytest.approx(direct, rel=2e-2, abs=2e-5 * table[0, 0])
 
 
@@ -107,11 +97,10 @@ def test_convolution_is_the_direct_sum() -> None:
     rows, columns = (np.abs(np.subtract.outer(np.arange(n), np.arange(n))) for n in table.shape)
     # Of pixels (i, j) and (k, m) the offsets are |i - k| and |j - m|.
     direct = np.einsum("ikjm,nkm->nij", table[rows[:, :, None, None], columns], pressure)
-    np.testing.assert_allclose(make_kernel(table).sink(pressure), direct, rtol=1e-12)
-    single = pressure.astype(np.float32)
-    found = make_kernel(table, np.float32).sink(single)
-    assert found.dtype == np.float32
-    np.testing.assert_allclose(found, direct, rtol=2e-6)
+    for dtype, bound in ((np.float64, 1e-12), (np.float32, 2e-6)):
+        found = make_kernel(table, dtype).sink(pressure.astype(dtype))
+        assert found.dtype == dtype
+        np.testing.assert_allclose(found, direct, rtol=bound)
 
 
 def test_a_gel_thinner_than_its_pixels_is_refused() -> None:

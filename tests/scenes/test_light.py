@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.scenes.light import NOISE, Drift, Sensor, make_sensor, shade, surface
+from pipeline.scenes.light import NOISE, Sensor, make_sensor, shade, surface
 
 WIDTH, HEIGHT, PITCH = 96, 72, 0.2
 FLAT = np.zeros((HEIGHT, WIDTH), np.float32)
@@ -33,8 +33,7 @@ def test_flat_skin_is_the_background_within_the_noise(seed: int) -> None:
     error = frame - sensor.background
     assert np.abs(error).max() < 6 * NOISE
     assert error.std() == pytest.approx(NOISE, rel=0.1)
-    exact = shade(FLAT, quiet(sensor), PITCH, 7)
-    np.testing.assert_array_equal(exact, cv2.convertScaleAbs(sensor.glow))
+    np.testing.assert_array_equal(shade(FLAT, quiet(sensor), PITCH, 7), cv2.convertScaleAbs(sensor.glow))
 
 
 @pytest.mark.parametrize("curvature", [0.01, 0.05, 0.2])
@@ -46,48 +45,42 @@ def test_lambert_on_a_paraboloid(curvature: float) -> None:
     skin = 3 - curvature * (x * x + 0.5 * x * y + 2 * y * y)
     normals = np.stack([curvature * (2 * x + 0.5 * y), curvature * (0.5 * x + 4 * y), np.ones_like(x)], axis=-1)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    expected = []
-    for channel in range(3):
-        across, along = sensor.gains[channel]
+    expected = sensor.glow.astype(np.float64) - np.stack(sensor.direct, axis=-1)
+    for channel, (across, along) in enumerate(sensor.gains):
         vector = np.stack([-across, -along, sensor.direct[channel]], axis=-1).astype(np.float64)
-        lit = np.maximum((vector * normals).sum(axis=-1), 0)
-        expected.append(sensor.glow[..., channel] - sensor.direct[channel] + lit)
+        expected[..., channel] += np.maximum((vector * normals).sum(axis=-1), 0)
     frame = shade(skin.astype(np.float32), sensor, PITCH, 0)
     inner = (slice(1, -1), slice(1, -1))  # Differences at the border are one-sided.
-    error = frame[inner] - np.clip(np.stack(expected, axis=-1), 0, 255)[inner]
-    assert np.abs(error).max() < 0.51, "rounding to 8 bits"
+    assert np.abs(frame[inner] - np.clip(expected, 0, 255)[inner]).max() < 0.51, "rounding to 8 bits"
 
 
 def test_red_comes_from_above_green_from_the_right_blue_from_below() -> None:
     """As in the real videos: a bulge's upper flank is redder than flat skin, its lower flank bluer."""
     sensor = quiet(make_sensor(WIDTH, HEIGHT, 0))
     change = shade(bump(1.0, 1.5), sensor, PITCH, 0).astype(int) - shade(FLAT, sensor, PITCH, 0)
-    middle, offset = (HEIGHT // 2, WIDTH // 2), 7
-    upper, lower = change[middle[0] - offset, middle[1]], change[middle[0] + offset, middle[1]]
-    left, right = change[middle[0], middle[1] - offset], change[middle[0], middle[1] + offset]
+    row, column = HEIGHT // 2, WIDTH // 2
+    upper, lower, left, right = change[[row - 7, row + 7, row, row], [column, column, column - 7, column + 7]]
     assert upper[2] > 10 > -10 > lower[2]
     assert lower[0] > 10 > -10 > upper[0]
     assert right[1] > 10 > -10 > left[1]
 
 
-def drift(x: float, y: float) -> Drift:
-    return np.full_like(FLAT, x), np.full_like(FLAT, y)
-
-
 def test_drift_carries_the_marks_and_nothing_else() -> None:
     sensor = make_sensor(WIDTH, HEIGHT, 1)
-    sensor = dataclasses.replace(quiet(sensor), dust=sensor.dust)
+    bare, marked = quiet(sensor), dataclasses.replace(quiet(sensor), dust=sensor.dust)
     assert (sensor.dust < 0.9).any()
-    skin = bump(0.5, 2.0)
-    still = shade(skin, sensor, PITCH, 0)
-    np.testing.assert_array_equal(shade(skin, sensor, PITCH, 0, drift(0, 0)), still)
-    moved = shade(skin, sensor, PITCH, 0, drift(4 * PITCH, -3 * PITCH))
+
+    def shown(sensor: Sensor, x: float, y: float) -> np.ndarray:
+        return shade(bump(0.5, 2.0), sensor, PITCH, 0, (np.full_like(FLAT, x), np.full_like(FLAT, y)))
+
+    still, plain = (shade(bump(0.5, 2.0), each, PITCH, 0) for each in (marked, bare))
+    np.testing.assert_array_equal(shown(marked, 0, 0), still)
+    moved = shown(marked, 4 * PITCH, -3 * PITCH)
     assert (moved != still).any()
-    bare = shade(skin, quiet(sensor), PITCH, 0)
     shifted = np.ones_like(sensor.dust)
     shifted[:-3, 4:] = sensor.dust[3:, :-4]
-    assert np.abs(moved - bare * shifted).max() <= 1.01, "right and up"
-    np.testing.assert_array_equal(shade(skin, quiet(sensor), PITCH, 0, drift(1, 1)), bare)
+    assert np.abs(moved - plain * shifted).max() <= 1.01, "right and up"
+    np.testing.assert_array_equal(shown(bare, 1, 1), plain)
 
 
 def test_a_curve_is_its_polynomial() -> None:

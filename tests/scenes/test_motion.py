@@ -7,20 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.scenes.motion import (
-    BEGUN,
-    CENTRE_MM,
-    FORCE_N,
-    LINGER,
-    REACH_MM,
-    RECORDED,
-    RELEASED,
-    SLOW_SHARE,
-    TRAVEL_MM,
-    TWIST_DEGREES,
-    draw_length,
-    make_motion,
-)
+from pipeline.scenes import motion
+from pipeline.scenes.motion import FORCE_N, RECORDED, SLOW_SHARE, TWIST_DEGREES, draw_length, make_motion
 
 MEDIAN = 3
 
@@ -28,15 +16,17 @@ MEDIAN = 3
 @given(st.integers(2, 300), st.integers(0, 2**32))
 def test_a_hand_rests_presses_and_twists(frames: int, seed: int) -> None:
     hand = make_motion(frames, np.random.default_rng(seed))
-    assert len(hand.force) == len(hand.angle) == len(hand.x) == len(hand.y) == frames
+    tracks = np.array([hand.force, hand.angle, hand.x, hand.y])
+    assert tracks.shape == (4, frames)
+    assert np.isfinite(tracks).all()
     assert hand.force[0] == 0, "the first frame shows the gel untouched"
     assert (hand.force >= 0).all()
     assert 0 < hand.force.max() <= FORCE_N[1], "even the shortest video shows contact"
-    assert np.abs([hand.x, hand.y]).max() <= REACH_MM
+    assert np.abs([hand.x, hand.y]).max() <= motion.REACH_MM
     turned = np.flatnonzero(np.diff(hand.angle))
-    assert (hand.force[turned + 1] > 0).all(), "what turns is held"
+    # Between two frames of a short video the hand may turn and then let go.
+    assert (np.maximum(hand.force[turned], hand.force[turned + 1]) > 0).all(), "what turns is held"
     assert np.ptp(hand.angle) <= max(TWIST_DEGREES) + 1e-9
-    assert all(np.isfinite(track).all() for track in (hand.angle, hand.x, hand.y))
 
 
 @given(st.integers(1, 60), st.integers(0, 1000))
@@ -49,17 +39,17 @@ def test_the_rate_changes_nothing_but_the_sampling(half: int, seed: int) -> None
 def test_times_and_places_are_those_that_were_measured() -> None:
     hands = [make_motion(500, np.random.default_rng(seed)) for seed in range(400)]
     force = np.stack([h.force / h.force.max() for h in hands])
+    let_go = force[:, -1] < 0.05
     first = (force >= 0.1).argmax(axis=1) / 500
-    gone = hands_that_let_go = force[:, -1] < 0.05
-    last = 1 - (force[hands_that_let_go, ::-1] >= 0.3).argmax(axis=1) / 500
-    assert np.median(first) == pytest.approx(BEGUN[MEDIAN], abs=0.01)
-    assert np.median(last) == pytest.approx(RELEASED[MEDIAN], abs=0.02)
-    assert 1 - gone.mean() == pytest.approx(LINGER, abs=0.03)
+    last = 1 - (force[let_go, ::-1] >= 0.3).argmax(axis=1) / 500
+    assert np.median(first) == pytest.approx(motion.BEGUN[MEDIAN], abs=0.01)
+    assert np.median(last) == pytest.approx(motion.RELEASED[MEDIAN], abs=0.02)
+    assert 1 - let_go.mean() == pytest.approx(motion.LINGER, abs=0.03)
     assert np.median([np.ptp(h.angle) for h in hands]) == pytest.approx(TWIST_DEGREES[MEDIAN], rel=0.15)
-    for axis, (mean, _) in zip("xy", CENTRE_MM, strict=True):
+    for axis, (mean, _) in zip("xy", motion.CENTRE_MM, strict=True):
         assert np.mean([getattr(h, axis).mean() for h in hands]) == pytest.approx(mean, abs=0.25)
     travel = [np.hypot(h.x[-1] - h.x[0], h.y[-1] - h.y[0]) for h in hands]
-    assert np.median(travel) == pytest.approx(TRAVEL_MM[MEDIAN], abs=0.25)
+    assert np.median(travel) == pytest.approx(motion.TRAVEL_MM[MEDIAN], abs=0.25)
 
 
 def test_the_force_falls_while_the_hand_twists() -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.core.errors import UserError
 from pipeline.scenes.bumps import Domes, Ridges
 from pipeline.scenes.geometry import IMAGE_MM
 from pipeline.scenes.recipe import BUMP_SHARE, MODULUS_MPA, ROUGH_RMS_MM, load_recipes, recipe_of
@@ -22,7 +21,7 @@ PHYSICLEAR = ROOT / "pipeline" / "physiclear"
 def test_every_object_has_a_recipe_of_its_own(catalogue: Catalogue) -> None:
     recipes = load_recipes(PHYSICLEAR, catalogue, 0)
     assert list(recipes) == list(catalogue.objects)
-    assert len({r.model_dump_json() for r in recipes.values()}) == len(recipes) == 74
+    assert len(set(recipes.values())) == len(recipes) == 74
     assert recipes == load_recipes(PHYSICLEAR, catalogue, 1), "listed, not drawn"
 
 
@@ -40,25 +39,26 @@ def test_drawn_recipes_follow_the_labels(catalogue: Catalogue) -> None:
     assert len(set(recipes.values())) == len(recipes), "objects of one class differ"
     for object_id, recipe in recipes.items():
         hardness, roughness, bumpiness = catalogue.labels(object_id)
-        assert MODULUS_MPA[hardness][0] <= recipe.modulus <= MODULUS_MPA[hardness][1]
         (rough,) = (r for r in recipe.relief if isinstance(r, Rough))
-        assert ROUGH_RMS_MM[roughness][0] <= rough.rms <= ROUGH_RMS_MM[roughness][1]
         bumps = [r for r in recipe.relief if isinstance(r, Domes | Ridges)]
         assert len(bumps) == (bumpiness > 0)
-        for bump in bumps:
-            assert BUMP_SHARE[bumpiness][0] <= bump.width / IMAGE_MM[1] <= BUMP_SHARE[bumpiness][1]
-    assert recipe_of("rug", catalogue, 0) == recipes["rug"]
-    assert recipe_of("rug", catalogue, 1) != recipes["rug"]
+        for value, (least, most) in (
+            (recipe.modulus, MODULUS_MPA[hardness]),
+            (rough.rms, ROUGH_RMS_MM[roughness]),
+            *((bump.width / IMAGE_MM[1], BUMP_SHARE[bumpiness]) for bump in bumps),
+        ):
+            assert least <= value <= most
+    assert recipe_of("rug", catalogue, 0) == recipes["rug"] != recipe_of("rug", catalogue, 1)
 
 
 def test_scenes_need_their_properties(catalogue: Catalogue, tmp_path: Path) -> None:
     language = catalogue.language.model_copy(update={"properties": catalogue.properties[1:]})
     objects = {"rug": catalogue.objects["rug"].model_copy(update={"ratings": catalogue.objects["rug"].ratings[1:]})}
     fewer = Catalogue.model_construct(language=language, objects=objects)
-    with pytest.raises(UserError, match=r"hardness.*three classes each.*data\.source=videos"):
+    with refused(r"hardness.*three classes each.*data\.source=videos"):
         load_recipes(tmp_path, fewer, 0)
     shutil.copy(PHYSICLEAR / "scenes.yaml", tmp_path)
-    with pytest.raises(UserError, match=r"is not in objects\.csv; correct or remove"):
+    with refused(r"is not in objects\.csv; correct or remove"):
         load_recipes(tmp_path, fewer, 0)
     (tmp_path / "scenes.yaml").write_text("rug: {modulus: 0.3}")
     assert load_recipes(tmp_path, fewer, 0)["rug"].modulus == 0.3, "a listed object needs no labels"
@@ -72,8 +72,6 @@ def test_scenes_need_their_properties(catalogue: Catalogue, tmp_path: Path) -> N
         ("rug:", r"rug: Input should be .*; docs/scenes\.md"),
         ("rug: {modulus: -1}", r"rug: modulus: .*greater than"),
         ("rug: {modulus: .nan}", r"rug: modulus: "),
-        ("rug: {modulus: soft}", r"rug: modulus: .*number"),
-        ("rug: {modulus: 1, colour: red}", r"rug: colour: .*not permitted; docs/scenes\.md"),
         ("rug: {modulus: 1, body: {kind: cube}}", r"rug: body: .*cube.*'flat'"),
         ("rug: {modulus: 1, body: {kind: round, radii: [3, 0]}}", r"rug: body\.round\.radii\.1: "),
         ("rug: {modulus: 1, body: {kind: round, radii: [.inf, 3]}}", r"rug: body\.round\.radii\.0: "),
@@ -81,13 +79,10 @@ def test_scenes_need_their_properties(catalogue: Catalogue, tmp_path: Path) -> N
         ("rug: {modulus: 1, relief: [{kind: rough, rms: 1}]}", r"rug: relief\.0\.rough\.longest: Field required"),
         ("- rug", r"must map object ids to recipes"),
         ("rug: {modulus: 1", r"correct it, or remove it"),
-        (b"rug: \xff\xfe", r"correct it, or remove it"),
     ],
 )
-def test_bad_entries_are_refused_in_one_line(
-    text: str | bytes, message: str, catalogue: Catalogue, tmp_path: Path
-) -> None:
+def test_bad_entries_are_refused_in_one_line(text: str, message: str, catalogue: Catalogue, tmp_path: Path) -> None:
     file = tmp_path / "scenes.yaml"
-    file.write_bytes(text.encode() if isinstance(text, str) else text)
+    file.write_text(text)
     with refused(f"^{re.escape(str(file))}: .*{message}"):
         load_recipes(tmp_path, catalogue, 0)

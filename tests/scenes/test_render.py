@@ -14,7 +14,7 @@ from pipeline.scenes.geometry import IMAGE_MM, Round
 from pipeline.scenes.light import make_sensor
 from pipeline.scenes.motion import RECORDED
 from pipeline.scenes.recipe import Recipe, load_recipes
-from pipeline.scenes.render import Scene, make_scene, render
+from pipeline.scenes.render import make_scene, render
 from pipeline.scenes.video import share_as_labelled, synthesize
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.decoding import decode
@@ -32,36 +32,31 @@ def recipes(catalogue: Catalogue) -> dict[str, Recipe]:
     return load_recipes(PHYSICLEAR, catalogue, 0)
 
 
-def film(recipe: Recipe, config: ScenesConfig, seed: int) -> tuple[Scene, np.ndarray]:
-    scene = make_scene(recipe, config, int(config.frames), seed)
-    sensor = make_sensor(config.width, config.height, 1)
-    return scene, np.stack(list(render(scene, config, sensor, seed)))
-
-
 @pytest.mark.parametrize(
     ("tier", "width", "height"),
     [("auto", 64, 48), ("auto", 48, 64), ("winkler", 64, 48), ("layer", 48, 64), ("half_space", 64, 48)],
 )
 def test_every_tier_shows_a_contact_on_pictures_of_either_shape(tier: str, width: int, height: int) -> None:
     config = SMALL.model_copy(update={"tier": tier, "cells": 64, "frames": 20, "width": width, "height": height})
-    scene, frames = film(PLAIN, config, 3)
-    assert frames.shape == (20, height, width, 3)
+    scene = make_scene(PLAIN, config, 20, 3)
     assert tier == "auto" or scene.imprint.method.tier == tier
     assert (scene.imprint.error is not None) == (tier == "auto")
-    strongest = int(scene.motion.force.argmax())
+    frames = np.stack(list(render(scene, config, make_sensor(width, height, 1), 3)))
+    assert frames.shape == (20, height, width, 3)
     change = np.abs(frames.astype(int) - frames[0]).mean((1, 2, 3))
-    assert change[strongest] > 1.5 * np.median(change[scene.motion.force == 0])
+    force = scene.motion.force
+    assert change[force.argmax()] > 1.5 * np.median(change[force == 0])
 
 
-def test_a_scene_is_the_same_at_other_resolutions(recipes: dict[str, Recipe]) -> None:
+def test_a_scene_is_the_same_at_other_resolutions() -> None:
     """Lengths are in mm: the depth of a plain body's imprint does not depend on the pixels."""
     depths = []
     for width in (64, 128):
         config = ScenesConfig(frames=10, width=width, height=width * 3 // 4, tier="layer", cells=64)
         scene = make_scene(PLAIN, config, 10, 5)
         assert scene.pitch == pytest.approx(IMAGE_MM[0] / width)
-        depths.append(float(scene.imprint.skins[-1].max()))
-    np.testing.assert_allclose(depths, depths[-1], rtol=0.02)
+        depths.append(scene.imprint.skins[-1].max())
+    assert depths[0] == pytest.approx(depths[1], rel=0.02)
 
 
 @pytest.mark.parametrize(("tier", "width", "height"), [("auto", 32, 960), ("layer", 32, 960), ("layer", 120, 160)])
@@ -88,11 +83,10 @@ def test_files_are_equal_for_equal_seeds_and_as_their_rows_say(
     config = SMALL.model_copy(update={"frames": frames})
     rows, again = (synthesize(recipes, config, folder) for folder in folders)
     assert rows == again
-    names = [row.video for row in rows]
-    assert names == sorted(f.name for f in folders[0].iterdir()) == ["rug_0.mp4", "rug_1.mp4"]
-    first, second = ([(folder / name).read_bytes() for name in names] for folder in folders)
+    first, second = ({f.name: f.read_bytes() for f in folder.iterdir()} for folder in folders)
     assert first == second
-    assert first[0] != first[1], "each video has its own patch, motion and noise"
+    assert [row.video for row in rows] == sorted(first) == ["rug_0.mp4", "rug_1.mp4"]
+    assert first["rug_0.mp4"] != first["rug_1.mp4"], "each video has its own patch, motion and noise"
     for row, file in zip(rows, list_videos(folders[0], catalogue).files, strict=True):
         found = scan(file, FramesConfig(pixels=16))
         assert isinstance(found, Scan)
