@@ -1,7 +1,4 @@
-"""Encoders at their edges: frames without signal and with too much of it, late frames, batches of one.
-
-All networks are tiny and random, and run in float64, float32 and bfloat16, and in float16 where a CUDA device is.
-"""
+"""Encoders at their edges, tiny and random: frames without signal and with too much, late frames, batches of one."""
 
 from __future__ import annotations
 
@@ -104,17 +101,12 @@ def test_hard_frames_are_embedded(check: Check, kind: str, name: str, fmt: Forma
 @pytest.mark.parametrize("value", [0.0, 0.1, 6.0, 1e4])
 def test_a_channel_that_is_the_same_everywhere_has_no_deviation(check: Check, value: float, fmt: Format) -> None:
     """roundings: of the value, and of a mean of 196 equal ones in float32. Its gradient is finite, also of 0."""
-    maps = torch.full((1, 2, 196), value, dtype=torch.float64)
-
-    def pooled(f: Format) -> torch.Tensor:
-        return mean_and_deviation(maps.to(f.device, f.torch))
-
-    bound = fmt.roundoff + summing(196, FLOAT32)
-    exact = np.array([[value, value, 0.0, 0.0]])
-    check(f"mean and deviation: {value} everywhere", fmt, pooled, bound, exact)
-    learnt = maps.to(fmt.device, fmt.torch).requires_grad_()
-    mean_and_deviation(learnt).sum().backward()
-    assert learnt.grad.isfinite().all()
+    maps = torch.full((1, 2, 196), value, dtype=torch.float64).to(fmt.device, fmt.torch).requires_grad_()
+    found = mean_and_deviation(maps)
+    bound, exact = fmt.roundoff + summing(196, FLOAT32), np.array([[value, value, 0.0, 0.0]])
+    check(f"mean and deviation: {value} everywhere", fmt, lambda _: found, bound, exact)
+    found.sum().backward()
+    assert maps.grad.isfinite().all()
 
 
 def test_positions_of_late_frames_are_told_apart(check: Check) -> None:
@@ -130,15 +122,13 @@ def test_positions_of_late_frames_are_told_apart(check: Check) -> None:
 @pytest.mark.parametrize("kind", [*BASES, *CLASSIFIERS])
 def test_a_batch_of_one_equals_a_batch_of_many(check: Check, kind: str) -> None:
     """condition: twice that of the network, as two ways are compared."""
-
-    @torch.no_grad()
-    def alone(f: Format) -> torch.Tensor:
-        whole = both(encoder(kind, f), FRAMES["noise"])
-        single = [both(encoder(kind, f), x[None], n[None]) for x, n in zip(FRAMES["noise"], TIMES, strict=True)]
-        assert not torch.allclose(whole[0], whole[1]), "the frames differ"
-        return (torch.cat(single) - whole) / whole.abs().max()
-
-    check(f"{kind}: frames one by one, against a batch", FLOAT32, alone, 2 * network(kind, "noise", FLOAT32), 0.0)
+    model = encoder(kind, FLOAT32)
+    with torch.no_grad():
+        whole = both(model, FRAMES["noise"])
+        alone = torch.cat([both(model, x[None], n[None]) for x, n in zip(FRAMES["noise"], TIMES, strict=True)])
+    assert not torch.allclose(whole[0], whole[1]), "the frames differ"
+    found, bound = (alone - whole) / whole.abs().max(), 2 * network(kind, "noise", FLOAT32)
+    check(f"{kind}: frames one by one, against a batch", FLOAT32, lambda _: found, bound, 0.0)
 
 
 @pytest.mark.parametrize("name", FRAMES)
@@ -147,13 +137,10 @@ def test_hard_frames_train_and_are_decided_on(check: Check, kind: str, name: str
     frames = torch.stack([FRAMES[name][:3], FRAMES[name][1:]])
     numbers = torch.tensor([[0, 1, 2], [10**6, 10**6, 10**6]])
     model = classifier(kind).train()
-
-    def trained(_: Format) -> torch.Tensor:
-        loss = model(frames, numbers, torch.tensor([[0, 1, 2], [2, 1, 0]]))["loss"]
-        loss.backward()
-        return torch.cat([loss[None], *(p.grad.flatten() for p in model.parameters() if p.grad is not None)])
-
-    check(f"{kind}: {name}: loss and gradients", FLOAT32, trained)
+    loss = model(frames, numbers, torch.tensor([[0, 1, 2], [2, 1, 0]]))["loss"]
+    loss.backward()
+    found = torch.cat([loss[None], *(p.grad.flatten() for p in model.parameters() if p.grad is not None)])
+    check(f"{kind}: {name}: loss and gradients", FLOAT32, lambda _: found)
     with torch.no_grad():
         logits = model.eval()(frames, numbers)["logits"]
     assert logits.isfinite().all()
@@ -165,8 +152,7 @@ def test_the_network_is_seven_convolutions_of_what_differs_from_128(check: Check
 
     condition: twice that of the network, as two ways are compared.
     """
-    model = encoder("tuned", FLOAT64)
-    state = model.get_submodule("backbones.0").state_dict()
+    state = encoder("tuned", FLOAT64).get_submodule("backbones.0").state_dict()
     shown = FRAMES["noise"].clone()
     shown[0] = 128
     maps = (shown.double().permute(0, 3, 1, 2) - 128) / 24
@@ -176,10 +162,7 @@ def test_the_network_is_seven_convolutions_of_what_differs_from_128(check: Check
         shift = state[f"{norm}.bias"] - state[f"{norm}.running_mean"] * scale
         maps = F.conv2d(maps, kernel * scale[:, None, None, None], shift, stride, kernel.shape[-1] // 2).relu()
     assert maps.shape[1:] == (128, 4, 4)
-    exact = torch.cat([maps.mean((2, 3)), maps.amax((2, 3))], dim=1).detach()
-
-    @torch.no_grad()
-    def found(f: Format) -> torch.Tensor:
-        return encoder("tuned", f)(shown, TIMES)
-
-    check("scenes: against folded convolutions", FLOAT32, found, 2 * network("tuned", "noise", FLOAT32), exact.numpy())
+    exact = torch.cat([maps.mean((2, 3)), maps.amax((2, 3))], dim=1)
+    bound = 2 * network("tuned", "noise", FLOAT32)
+    with torch.no_grad():
+        check("scenes: against folded convolutions", FLOAT32, lambda f: encoder("tuned", f)(shown, TIMES), bound, exact)

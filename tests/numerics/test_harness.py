@@ -1,4 +1,4 @@
-"""The check itself on cases whose verdict is known, and the condition number of networks."""
+"""The check itself on cases whose verdict is known."""
 
 from __future__ import annotations
 
@@ -7,10 +7,7 @@ from contextlib import nullcontext
 
 import numpy as np
 import pytest
-import torch
-from torch import nn
 
-from tests.numerics.bounds import CHANGE, magnification
 from tests.numerics.harness import FLOAT32, FLOAT64, UINT8, Check
 
 
@@ -41,13 +38,3 @@ def test_without_an_exact_result_formats_are_held_against_float64_of_the_same_sh
     assert [row.error for row in check.rows] == ["", "2.5e-01", "2.5e-01"]
     with pytest.raises(AssertionError):
         check("another shape", UINT8, lambda _: [1.0, 1.0], 0.5, [1.0])
-
-
-def test_magnification_is_the_condition_number_of_a_single_weight() -> None:
-    """w^8 changes eight times as much as w; and the weight is what it was."""
-    layer = nn.Linear(1, 1, bias=False).double()
-    nn.init.constant_(layer.weight, 1.25)
-    draw = torch.Generator().manual_seed(0)
-    largest = max(abs(torch.randn(1, 1, generator=draw, dtype=torch.float64).item()) for _ in range(3))
-    assert magnification(layer, lambda: layer.weight**8) == pytest.approx(8 * largest, rel=10 * CHANGE)
-    assert layer.weight.item() == 1.25

@@ -29,9 +29,6 @@ PART = "heads"
 CLASSES = (3, 3, 3)
 
 
-# Features of no length
-
-
 @formats(*NETWORKS)
 def test_features_of_length_0_are_classified(check: Check, fmt: Format) -> None:
     """And learnt from. roundings: the sum over the hidden layer, by the sizes of its terms."""
@@ -61,31 +58,23 @@ def test_features_of_length_0_are_classified(check: Check, fmt: Format) -> None:
     check("heads of release: mean of length 0", fmt, classified, bound, exact.numpy())
 
 
-# Huge logits
-
-
 @formats(*SOLVED)
 @pytest.mark.parametrize("weight", [1.0, 1e4])
 @pytest.mark.parametrize("size", [1e4, 1e30])
-@pytest.mark.parametrize("name", ["heads", "frame heads"])
-def test_huge_logits_are_finite_and_decided_on(
-    check: Check, name: str, size: float, weight: float, fmt: Format
-) -> None:
-    """roundings: the mean over frames and the sum over features, by the sizes of its terms.
+@pytest.mark.parametrize("joint", [False, True])
+def test_huge_logits_are_decided_on(check: Check, joint: bool, size: float, weight: float, fmt: Format) -> None:
+    """Of heads whose weights are `weight` times as large as fresh ones, of whole videos or (joint) of single frames.
 
-    Heads of single frames clip features, so that there it is the weights that count; they take a softmax's logarithm
-    besides, which is off by no more than twice its logits.
+    roundings: the mean over frames and the sum over features, by the sizes of its terms. Heads of single frames clip
+    features, so that there it is the weights that count; they take a softmax's logarithm besides, which is off by no
+    more than twice its logits.
     """
 
     def classifier(f: Format) -> PropertyClassifier:
-        """With heads whose weights are `weight` times as large as fresh ones."""
         seed_everything(0)
         network = SceneEncoder()
-        model = (
-            JointFrameClassifier(network, CLASSES)
-            if name == "frame heads"
-            else PropertyClassifier(network, Heads(256, CLASSES), CLASSES)
-        )
+        heads = JointFrameClassifier(network, CLASSES) if joint else Heads(256, CLASSES)
+        model = heads if joint else PropertyClassifier(network, heads, CLASSES)
         with torch.no_grad():
             for parameter in model.heads.parameters():
                 parameter.mul_(weight)
@@ -97,10 +86,10 @@ def test_huge_logits_are_finite_and_decided_on(
         return torch.cat(classifier(f).classify(features.to(f.torch)), dim=1).detach()
 
     exact, double, wild = said(FLOAT64), classifier(FLOAT64), features.double()
-    joint = isinstance(double, JointFrameClassifier)
     terms = double.standardise(wild).abs().flatten(0, 1) if joint else wild.abs().mean(1)
     sizes = max((terms @ head.weight.abs().T + head.bias.abs()).max().item() for head in double.heads.children())
     bound = (2 if joint else 1) * summing(256 + 4, fmt) * sizes / float(exact.abs().max())
+    name = "frame heads" if joint else "heads"
     check(f"{name}: features of {size:g}, weights times {weight:g}", fmt, said, bound)
 
     model, given = classifier(fmt), features.to(fmt.torch).requires_grad_()
@@ -111,8 +100,6 @@ def test_huge_logits_are_finite_and_decided_on(
     decided = model.decide(torch.cat(found, dim=1).detach())
     assert torch.equal(decided, torch.stack([z.argmax(1) for z in exact.split(CLASSES, dim=1)], dim=1))
 
-
-# Joint decisions
 
 TABLES: dict[str, Sequence[Sequence[float]]] = {
     "all classes alike": ((0.5, 0.5), (0.5, 0.5)),

@@ -17,6 +17,7 @@ import torch
 from scipy.special import logsumexp
 from torch import nn
 from torch.nn import functional as F
+from torch.nn.utils import parameters_to_vector
 from transformers.modeling_outputs import CausalLMOutput
 
 from pipeline.config import LoraTrainConfig
@@ -83,9 +84,6 @@ def network(fmt: Format, size: float = 1.0) -> float:
     return rounded(magnified(size), longest_sum(made(FLOAT64)), FLOAT32 if fmt is FLOAT64 else fmt)
 
 
-# Embeddings
-
-
 @formats(*NETWORKS)
 @pytest.mark.parametrize("size", SIZES)
 def test_embeddings_of_any_size_are_projected_and_answered(check: Check, fmt: Format, size: float) -> None:
@@ -103,9 +101,6 @@ def test_embeddings_of_any_size_are_projected_and_answered(check: Check, fmt: Fo
     check(name, fmt, lambda f: answered(made(f), size), lambda f: network(f, size))
 
 
-# Padding
-
-
 @formats(*NETWORKS)
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_a_row_of_nothing_but_padding_spoils_no_other(check: Check, fmt: Format, side: str) -> None:
@@ -115,25 +110,18 @@ def test_a_row_of_nothing_but_padding_spoils_no_other(check: Check, fmt: Format,
     mask, none = torch.ones_like(ids), torch.zeros(3, 0, DIM, device=fmt.device)
     mask[1] = 0
     mask[2, slice(None, 4) if side == "left" else slice(5, None)] = 0
-
-    @torch.no_grad()
-    def lost(_: Format) -> torch.Tensor:
-        beside = model.llm(inputs_embeds=model.embed(ids, none), attention_mask=mask).logits
-        alone = model(ids[:1], none[:1]).logits
-        # NaN where any logit is not finite.
-        return torch.where(beside.isfinite().all(), (beside[:1] - alone) / beside.abs().max(), torch.nan)
-
+    words = model.embed(ids, none).detach().requires_grad_()
+    beside = model.llm(inputs_embeds=words, attention_mask=mask).logits
+    with torch.no_grad():
+        lost = (beside[:1] - model(ids[:1], none[:1]).logits) / beside.abs().max()
+    if not beside.isfinite().all():
+        lost = torch.tensor(torch.nan)
     name = f"a row of nothing but padding, padded on the {side}, beside others"
-    check(name, fmt, lost, 2 * network(fmt), 0.0)
+    check(name, fmt, lambda _: lost, 2 * network(fmt), 0.0)
 
     if fmt is FLOAT32:
-        labels = ids.masked_fill(mask == 0, IGNORE_INDEX)
-        words = model.embed(ids, none).detach().requires_grad_()
-        loss = F.cross_entropy(model.llm(inputs_embeds=words, attention_mask=mask).logits.mT, labels)
+        loss = F.cross_entropy(beside.mT, ids.masked_fill(mask == 0, IGNORE_INDEX))
         check(f"{name}: gradients", fmt, lambda _: torch.autograd.grad(loss, words)[0])
-
-
-# Adapters
 
 
 @formats(*NETWORKS)
@@ -163,16 +151,14 @@ def test_what_is_trained_is_float32_and_moves_as_adam_says(check: Check, fmt: Fo
     model(ids, features, labels=ids.masked_fill(ids > 199, IGNORE_INDEX)).loss.backward()
     for parameter in trained:
         parameter.grad.mul_(1e-6)
-    before = torch.cat([p.detach().flatten().double() for p in trained])
+    before = parameters_to_vector(trained).detach().double()
     slope = torch.cat([p.grad.flatten().double() for p in trained])
     torch.optim.AdamW(trained, lr=rate, weight_decay=0).step()
-    after = torch.cat([p.detach().flatten().double() for p in trained])
+    after = parameters_to_vector(trained).detach().double()
     exact = -rate * slope / (slope.abs() + 1e-8)
     bound = (8 + float(before.abs().max()) / float(exact.abs().max())) * FLOAT32.roundoff
     check("first step of Adam, gradients times 1e-6", fmt, lambda _: after - before, bound, exact.cpu().numpy())
 
-
-# Losses
 
 STEPS = np.array([[0, 1, -1, 3, 3], [7, -7, 0, 0, 1], [2, 2, 2, 2, 2], [-5, 4, 4, -5, 6]])
 """Logits by multiples: one loss each of several rows, among them ties. Times a power of two they are logits that every
@@ -196,9 +182,7 @@ def test_labels_that_are_all_ignored_weigh_nothing(check: Check, fmt: Format) ->
 
 @formats(*NETWORKS)
 @pytest.mark.parametrize("power", [0, 12, 120])
-def test_losses_of_answers_are_cross_entropies(
-    check: Check, monkeypatch: pytest.MonkeyPatch, fmt: Format, power: int
-) -> None:
+def test_losses_are_cross_entropies(check: Check, monkeypatch: pytest.MonkeyPatch, fmt: Format, power: int) -> None:
     """Of a language model that says the same whatever it reads, its first column foretelling the second.
 
     2^120 is a three hundredth of the largest number of float32; 7 x 2^12 is near that of float16.
@@ -218,8 +202,5 @@ def test_losses_of_answers_are_cross_entropies(
     ids = torch.tensor([[1, target] for target in TARGETS], device=fmt.device)
     labels = ids.clone()
     labels[:, 0] = IGNORE_INDEX
-
-    def loss(_: Format) -> torch.Tensor:
-        return model(ids, torch.zeros(len(ids), 0, DIM, device=fmt.device), labels=labels).loss
-
-    check(f"loss of answers, logits of 2^{power}", fmt, loss, bound, exact)
+    loss = model(ids, torch.zeros(len(ids), 0, DIM, device=fmt.device), labels=labels).loss
+    check(f"loss of answers, logits of 2^{power}", fmt, lambda _: loss, bound, exact)

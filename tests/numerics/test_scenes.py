@@ -26,9 +26,6 @@ TOLERANCE = 1e-4
 SIDE, PITCH = 32, 0.2
 
 
-# Contact
-
-
 def ball(pitch: float = PITCH, side: int = SIDE, radius: float = 10.0) -> Floats:
     """The gap in mm under a ball in its parabolic approximation, side x side."""
     axis = (np.arange(side) - (side - 1) / 2) * pitch
@@ -141,9 +138,6 @@ def test_an_imprint_is_finite_at_any_force_and_modulus(check: Check, method: Met
     check(f"imprint of a {body}, {method or 'auto'}: forces to 1e6 N, moduli to 1e4", FLOAT32, imprint)
 
 
-# Relief
-
-
 def test_a_thread_is_round_up_to_its_rim(check: Check) -> None:
     """roundings: r^2 - x^2 cancels at the rim and is off by 6 u r^2 at most, its root by the root of that."""
     offset = np.linspace(0, 1, 257) ** 0.125 * 0.75
@@ -161,9 +155,6 @@ def test_roughness_deviates_as_much_as_the_grid_carries(check: Check, rms: float
     exact = rms * math.sqrt(max(0.0, 1 - (2 * pitch / layer.longest) ** (2 * layer.hurst)))
     name = f"roughness of {rms:g} mm, pixels of {pitch:g} mm: deviation"
     check(name, FLOAT32, lambda _: found, 2 * summing(SIDE * SIDE, FLOAT32), exact)
-
-
-# Light
 
 
 @pytest.mark.parametrize("size", [1e-30, 1.0, 1e6])

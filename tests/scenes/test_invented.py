@@ -53,9 +53,7 @@ def drawn(classes: tuple[int, int, int], rng: np.random.Generator) -> Recipe:
     return Recipe(modulus=1 + classes[0] + rng.random(), body=Flat())
 
 
-def test_it_is_written_as_a_catalogue_whose_objects_depend_on_seed_and_number(
-    here: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_it_is_written_as_a_catalogue_of_seed_and_number(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(invented, "draw", drawn)
     recipes = []
     for objects, seed in ((27, 0), (54, 0), (27, 1)):

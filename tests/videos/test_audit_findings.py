@@ -120,8 +120,6 @@ def test_contact_is_relative_to_the_noise_of_the_data(strengths: list[float], lo
         assert named(louder) == named(1.0)
 
 
-# Labels
-
 SHROUT_FLEISS = [[9, 2, 5, 8], [6, 1, 3, 2], [8, 4, 6, 8], [7, 1, 2, 6], [10, 5, 6, 9], [6, 2, 4, 7]]
 """The example of Shrout and Fleiss 1979: six targets, four judges."""
 RNG = np.random.default_rng(0)

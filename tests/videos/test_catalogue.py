@@ -214,8 +214,6 @@ def test_a_language_that_cannot_be_graded_is_refused(tmp_path: Path, changes: di
         load_catalogue(tmp_path)
 
 
-# Free text
-
 CATALOGUE = load_catalogue(PHYSICLEAR)
 
 
@@ -237,9 +235,7 @@ CATALOGUE = load_catalogue(PHYSICLEAR)
         ("neither hard nor soft", {1}, set(), set()),
     ],
 )
-def test_classes_are_read_from_free_text(
-    text: str, hardness: set[int], roughness: set[int], bumpiness: set[int]
-) -> None:
+def test_free_text_names_classes(text: str, hardness: set[int], roughness: set[int], bumpiness: set[int]) -> None:
     assert [levels_named(text, p) for p in CATALOGUE.properties] == [hardness, roughness, bumpiness]
 
 

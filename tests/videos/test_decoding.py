@@ -69,9 +69,7 @@ def test_pictures_of_motion_jpeg_are_opencvs_bit_for_bit(tmp_path: Path, count: 
 
 @pytest.mark.parametrize(("codec", "pixels", "suffix"), [("libx264", "yuv420p", "mp4"), ("ffv1", "yuv444p", "mkv")])
 @pytest.mark.parametrize(("transfer", "hdr"), [(0, False), (1, False), (16, True), (18, True)])
-def test_a_recording_in_hdr_is_known(
-    tmp_path: Path, codec: str, pixels: str, suffix: str, transfer: int, hdr: bool
-) -> None:
+def test_hdr_is_known(tmp_path: Path, codec: str, pixels: str, suffix: str, transfer: int, hdr: bool) -> None:
     with Decoder(encode(tmp_path / f"v.{suffix}", moving_square(3), codec, pixels, transfer=transfer)) as decoder:
         assert decoder.header.hdr == hdr
 
@@ -84,9 +82,7 @@ def test_a_recording_in_hdr_is_known(
         *(("mpeg4", "yuv420p", "mov"), ("rawvideo", "bgr24", "avi"), ("png", "rgb24", "mov")),
     ],
 )
-def test_pictures_and_fitted_frames_follow_range_and_format(
-    tmp_path: Path, codec: str, pixels: str, suffix: str
-) -> None:
+def test_pictures_follow_range_and_format(tmp_path: Path, codec: str, pixels: str, suffix: str) -> None:
     for height, width in ((13, 17), (97, 18)):
         path = encode(tmp_path / f"v.{suffix}", [gradient(height, width)[::s] for s in (1, -1, 1)], codec, pixels)
         expected, found = np.stack(opencv(path)).astype(int), np.stack(list(decode(path)))

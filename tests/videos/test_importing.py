@@ -105,9 +105,7 @@ def pictures() -> list[np.ndarray]:
         *(("sqlite3", "bgr8"), ("sqlite3", "png"), ("mcap", "bgr8")),
     ],
 )
-def test_pictures_come_back_as_they_were_sent(
-    tmp_path: Path, pictures: list[np.ndarray], kind: str, encoding: str
-) -> None:
+def test_pictures_come_back_as_sent(tmp_path: Path, pictures: list[np.ndarray], kind: str, encoding: str) -> None:
     bag = write_bag(tmp_path, kind, pictures[18:22], encoding)
     # A single file of a ROS 2 bag is enough.
     for source in (bag, *bag.glob("*.mcap"), *bag.glob("*.db3")):

@@ -118,9 +118,7 @@ def warmed(frames: list[np.ndarray], gains: list[float]) -> list[np.ndarray]:
         ("release", [1.3, 1.3, 1.2, 1.2, 1.1], "press"),
     ],
 )
-def test_a_warm_up_changes_neither_contact_nor_what_is_kept(
-    tmp_path: Path, name: str, gains: list[float], shape: str
-) -> None:
+def test_a_warm_up_changes_nothing_else(tmp_path: Path, name: str, gains: list[float], shape: str) -> None:
     """Against the same press without the frames whose light is not yet that of the others."""
     depths = {"press": rise(100), "throughout": [0.0] * 100, "start": rise(100)[::-1]}[shape]
     steady = film(depths)
