@@ -95,6 +95,8 @@ def test_harder_objects_and_larger_forces_press_deeper(method: Method) -> None:
     assert all(less <= more for less, more in itertools.pairwise(imprint.radii))
     assert (imprint.skins.shape, imprint.skins.dtype) == ((FORCES + 1, SIDE, SIDE), np.float32)
     assert not press(BUMPY, 0.0, 1.0, PITCH, method).skins.any()
+    # A contact over the whole patch.
+    assert press(ball(3000.0), 50.0, 0.03, PITCH).radii[-1] == pytest.approx(30 / np.sqrt(np.pi), rel=0.01)
 
 
 def test_frames_between_two_forces_are_near_what_pressing_gives() -> None:
@@ -105,10 +107,6 @@ def test_frames_between_two_forces_are_near_what_pressing_gives() -> None:
         np.testing.assert_array_equal(imprint.at(force), imprint.skins[-1])
     assert not imprint.at(0.0).any()
     assert (imprint.radius(0.0), imprint.radius(8.0)) == (0, pytest.approx(imprint.radii[-1]))
-
-
-def test_a_contact_over_the_whole_patch() -> None:
-    assert press(ball(3000.0), 50.0, 0.03, PITCH).radii[-1] == pytest.approx(30 / np.sqrt(np.pi), rel=0.01)
 
 
 @settings(max_examples=25, deadline=None)

@@ -26,17 +26,14 @@ def test_the_field_is_its_hankel_transform(ratio: float) -> None:
 
 @given(st.floats(0, 1e6), st.floats(0, 1e3))
 def test_the_share_is_one_inside_and_falls_outside(distance: float, radius: float) -> None:
+    """Far away it is that of a point torque: u = T / (4 pi G r^2), so that the share is 4 a^3 / (3 pi r^3)."""
     share = float(share_of_turn(distance, radius))
     assert 0 <= share <= 1 + 1e-12
     if radius > 0 and distance <= radius:
         assert share == pytest.approx(1)
     assert share >= float(share_of_turn(distance * 1.5 + 1e-9, radius)) - 1e-12
-
-
-def test_far_away_the_field_is_that_of_a_point_torque() -> None:
-    """u = T / (4 pi G r^2), so that the share is 4 a^3 / (3 pi r^3)."""
-    for distance in (30.0, 300.0, 3e5):
-        assert float(share_of_turn(distance, 1.0)) == pytest.approx(4 / (3 * math.pi * distance**3), rel=1e-3)
+    for far in (30.0, 300.0, 3e5):
+        assert float(share_of_turn(far, 1.0)) == pytest.approx(4 / (3 * math.pi * far**3), rel=1e-3)
 
 
 def test_the_surface_turns_with_the_object_inside_and_stays_far_away() -> None:

@@ -24,16 +24,16 @@ pytestmark = pytest.mark.usefixtures("few_permutations")
 
 
 def test_objects_stand_in_one_part() -> None:
+    """An unused video is in no part."""
     clean = leaks(probes(), GOOD_SPLIT, OTHER)
     assert [f.measured for f in of(clean, "object in two parts")] == ["0 of 8 objects"]
     assert [f.measured for f in of(clean, "same content")] == ["0 of 24 files"]
     assert [f.item for f in of(clean, "near-duplicate")] == ["all"]
-    crossing = [f for f in leaks(probes(), {**GOOD_SPLIT, "rug_1": Part.TEST}, OTHER) if f.severity is ERROR]
-    assert [(f.check, f.item, f.measured) for f in crossing] == [("object in two parts", "rug", "test, validation")]
-    spare = leaks(probes(), {**GOOD_SPLIT, "rug_1": Part.UNUSED}, OTHER)
-    without = leaks(probes(), {}, OTHER)
-    assert not [f for f in (*clean, *spare, *without) if f.severity is ERROR], "an unused video is in no part"
+    spare, without = leaks(probes(), {**GOOD_SPLIT, "rug_1": Part.UNUSED}, OTHER), leaks(probes(), {}, OTHER)
     assert of(without, "session in two parts") == []
+    crossing = leaks(probes(), {**GOOD_SPLIT, "rug_1": Part.TEST}, OTHER)
+    errors = [(f.check, f.item, f.measured) for f in (*clean, *spare, *without, *crossing) if f.severity is ERROR]
+    assert errors == [("object in two parts", "rug", "test, validation")]
 
 
 @pytest.mark.parametrize(
@@ -171,27 +171,28 @@ def test_sessions_are_told_apart_by_the_untouched_picture(monkeypatch: pytest.Mo
 
 
 def test_formats_and_names_are_sessions_of_their_own() -> None:
-    look = tuple(np.linspace(50, 130, 144))
-    found_videos = [
-        *(probe(f"rug_{i}", thumbnail=look) for i in range(3)),
-        *(probe(f"potato_{i}", thumbnail=look, fps=10.0) for i in range(2)),
-        probe("lemon_0", thumbnail=look, session="monday"),
-        probe("lemon_1", thumbnail=look, session="tuesday", fps=10.0),
+    look = {"thumbnail": tuple(np.linspace(50, 130, 144))}
+    found = [
+        *(probe(f"rug_{i}", **look) for i in range(3)),
+        *(probe(f"potato_{i}", **look, fps=10.0) for i in range(2)),
+        probe("lemon_0", **look, session="monday"),
+        probe("lemon_1", **look, session="tuesday", fps=10.0),
     ]
     fast, slow = "25 frames/s, 320x240, look 1", "10 frames/s, 320x240, look 1"
-    assert sessions(found_videos) == [fast, fast, fast, slow, slow, "monday", "tuesday"]
+    assert sessions(found) == [fast, fast, fast, slow, slow, "monday", "tuesday"]
 
 
 def test_a_session_in_training_and_test_is_a_warning() -> None:
-    def named(session: dict[str, str]) -> list[tuple[str, str, Severity]]:
-        found_videos = [probe(p.video_id, session=session.get(p.object_id, "monday")) for p in probes()]
-        return [(f.item, f.measured, f.severity) for f in of(leaks(found_videos, parts, OTHER), "session in two parts")]
-
     parts = dict.fromkeys(OBJECTS[:5], Part.TRAIN) | {"millet": Part.VALIDATION, "lemon": Part.TEST}
-    assert named({}) == [("monday", "15 train, 3 validation, 3 test", WARNING)]
-    assert named({"lemon": "tuesday"}) == []
-    assert named({"lemon": "tuesday", "orange": "tuesday"}) == [], "an unused video shares nothing"
-    assert named({"lemon": "tuesday", "rug": "tuesday"}) == [("tuesday", "3 train, 3 test", WARNING)]
+    for others, expected in (
+        ({}, [("monday", "15 train, 3 validation, 3 test", WARNING)]),
+        ({"lemon"}, []),
+        ({"lemon", "orange"}, []),  # An unused video shares nothing.
+        ({"lemon", "rug"}, [("tuesday", "3 train, 3 test", WARNING)]),
+    ):
+        found = [probe(p.video_id, session="tuesday" if p.object_id in others else "monday") for p in probes()]
+        shared = of(leaks(found, parts, OTHER), "session in two parts")
+        assert [(f.item, f.measured, f.severity) for f in shared] == expected
 
 
 def test_what_a_session_holds() -> None:

@@ -73,11 +73,9 @@ def test_the_reference_of_usual_lengths(tmp_path: Path, count: int, expected: tu
 
 @pytest.mark.parametrize(("count", "name"), [(12, "contact"), (50, "salient"), (126, "contact")])
 def test_a_video_that_starts_in_contact_takes_its_reference_from_the_end(tmp_path: Path, count: int, name: str) -> None:
-    backward = rise(count)[::-1]
-    found = scanned(tmp_path / "back.avi", film(backward), name)
+    found = scanned(tmp_path / "back.avi", film(rise(count)[::-1]), name)
     still = scanned(tmp_path / "still.avi", film([0.0] * count, seed=1))
-    assert found.probe.starts_touching
-    assert not still.probe.starts_touching
+    assert (found.probe.starts_touching, still.probe.starts_touching) == (True, False)
     assert np.abs(found.reference.astype(int) - still.reference).mean() < 1.5, "no trace of contact"
     assert found.probe.contact_end < 1 < 2 < found.probe.contact
     if name != "salient":
@@ -85,13 +83,10 @@ def test_a_video_that_starts_in_contact_takes_its_reference_from_the_end(tmp_pat
         assert max(k.score for k in found.kept) == pytest.approx(found.probe.contact)
 
 
-def test_contact_throughout_is_not_taken_for_a_start_in_contact(tmp_path: Path) -> None:
-    found = scanned(tmp_path / "v.avi", film([80.0] * 40)).probe
-    assert not found.starts_touching
-    assert found.contact < 1
-
-
-def test_a_step_of_the_light_is_no_contact(tmp_path: Path) -> None:
+def test_neither_contact_throughout_nor_a_step_of_the_light_is_contact(tmp_path: Path) -> None:
+    throughout = scanned(tmp_path / "throughout.avi", film([80.0] * 40)).probe
+    assert not throughout.starts_touching
+    assert throughout.contact < 1
     stepped = scanned(tmp_path / "light.avi", film([0.0] * 50, light=[0.0] * 25 + [12.0] * 25)).probe
     without = scanned(tmp_path / "dark.avi", film([0.0] * 50)).probe
     touched = scanned(tmp_path / "touched.avi", film(rise(50))).probe
