@@ -24,6 +24,7 @@ TITLES = {
     "property_combinations": "Property combinations: objects each",
     "video_lengths": "Video lengths, in frames that decode",
     "annotator_agreement": "Annotator agreement, ICC(3,k) with its 95 % interval",
+    "audit": "Data audit",
 }
 HEADINGS = {"row": "", "with_videos": "With videos"}
 
@@ -72,17 +73,18 @@ def dataset_frame(
     return pd.DataFrame(rows, columns=list(COLUMNS)).astype(dict.fromkeys(COLUMNS[2:7], "Int64"))
 
 
-def dataset_tables(folder: Path, dataset: str) -> Iterator[tuple[str, str, pd.DataFrame, str]]:
+def dataset_tables(folder: Path, dataset: str) -> Iterator[tuple[str, str, str, pd.DataFrame, str]]:
     """The tables of a report's dataset.csv and audit.csv, where there are such: text in every cell.
 
     Yields:
-        Title, caption, table and the name of its file.
+        Key, title, caption, table and the name of its file.
     """
     if (folder / "dataset.csv").is_file():
         frame = pd.read_csv(folder / "dataset.csv", dtype=str).fillna("")
         for key, rows in frame.groupby("table", sort=False):
             shown = rows.drop(columns="table").loc[:, lambda f: (f != "").any()]
-            yield TITLES[str(key)], "", shown.rename(columns=lambda c: HEADINGS.get(c, c.capitalize())), "dataset.csv"
+            shown = shown.rename(columns=lambda c: HEADINGS.get(c, c.capitalize()))
+            yield str(key), TITLES[str(key)], "", shown, "dataset.csv"
     audit = read_frame(folder / "audit.csv", AUDIT)
     rows = audit[audit["check"] == AGREEMENT]
     if len(rows):
@@ -90,8 +92,8 @@ def dataset_tables(folder: Path, dataset: str) -> Iterator[tuple[str, str, pd.Da
         values = printed[printed["task"] == "annotator_agreement"].set_index("measure")["value"].map("{:.3f}".format)
         shown = pd.DataFrame(
             {"": rows["item"], "Measured": rows["measured"].astype(str), "Published": rows["item"].map(values)}
-        )
-        yield TITLES["annotator_agreement"], "", shown.dropna(axis="columns", how="all"), "audit.csv"
+        ).dropna(axis="columns", how="all")
+        yield "annotator_agreement", TITLES["annotator_agreement"], "", shown, "audit.csv"
     if len(audit):
         # Counted by check, with what needs attention first.
         rank = {"error": 0, "warning": 1, "info": 2}
@@ -101,4 +103,4 @@ def dataset_tables(folder: Path, dataset: str) -> Iterator[tuple[str, str, pd.Da
         columns = {"Findings": checks.size().astype(str), "The first of them": checks.first()}
         counts = ", ".join(f"{n} {severity}" for severity, n in audit["severity"].value_counts(sort=False).items())
         shown = pd.DataFrame(columns).reset_index().rename(columns=str.capitalize)
-        yield "Data audit", f"{counts}; counted by check.", shown, "audit.csv"
+        yield "audit", TITLES["audit"], f"{counts}; counted by check.", shown, "audit.csv"

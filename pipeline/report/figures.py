@@ -164,12 +164,10 @@ def draw_curves(curves: pd.DataFrame) -> Figure:
 
 def _panels(count: int, width: float, height: float, left: float = 0.0, across: int = 4) -> tuple[Figure, list[Axes]]:
     """A figure of so many panels, `across` in a row, each of this width and height in inches, with room at the left."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     across, down = min(count, across), -(-count // across)
     figure = Figure(figsize=(width * across + left, height * down), layout="constrained")
-    FigureCanvasAgg(figure)
     grid = list(figure.subplots(down, across, squeeze=False).flat)
     for unused in grid[count:]:
         unused.remove()

@@ -1,15 +1,14 @@
 """One page over all reports: reports/index.html, drawn from the files in reports/ and from nothing else.
 
 It needs no network, runs no script and opens from disk. Its tables are those of the registry
-(`pipeline.report.tables`); this module adds what stands around them: all reports side by side, the tasks and effects
-as lines, speed against error, numerical stability, and what is missing.
+(`pipeline.report.tables`), as in each README; this module adds what stands around them: all reports side by side, speed
+against error, numerical stability, and what is missing.
 """
 
 from __future__ import annotations
 
 import base64
 import hashlib
-import math
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -22,31 +21,17 @@ from pipeline.config.params import PARAMS_FILE, load_params
 from pipeline.core.errors import UserError
 from pipeline.core.io import write_text
 from pipeline.report.dataset import dataset_tables
-from pipeline.report.load import KEYS, Report, cells, load_report, read_frame
+from pipeline.report.load import Report, load_report, read_frame
 from pipeline.report.readme import OTHER_MODELS, sections
 from pipeline.report.render import draw_table, render
-from pipeline.report.tables import (
-    PARTS,
-    SHIPPED_TABLE,
-    TABLES,
-    difference,
-    headline,
-    measured,
-    number,
-    side_by_side,
-    task_title,
-    whole,
-)
-from pipeline.tasks import TASKS
+from pipeline.report.tables import FIVE_TASKS, SHIPPED_TABLE, TABLES, Table, side_by_side
 
 PAGE = Path("reports/index.html")
 LARGEST = 1_500_000
 """Bytes of the page at most, so that it opens at once on a phone."""
 SPEED = ("question", "setting", "cost", "unit", "cost_ratio", "error", "error_of", "low", "high", "front")
 STABILITY = ("part", "case", "format", "finite", "error", "bound", "verdict")
-MODELS = ("7b", "13b")
-EXPECTED = ("effects.csv", "audit.csv", "samples.json", "curves.csv", "confusion.csv")
-OLDER = "the report is older than this file: `dvc repro report` at its scale writes it"
+UNFOLDED = {table.key for table in TABLES if not table.folded}
 BESIDE = (
     (
         "encoder_errors.csv",
@@ -96,7 +81,7 @@ def write_page(root: Path) -> Path:
     paper = []
     for title, every in (("Five tasks of the paper", False), ("Every row of the paper", True)):
         if reports and len(frame := side_by_side(reports, every=every)):
-            paper.append(draw_table(frame, title, "*/scores.csv", at_lines=False))
+            paper.append(draw_table(frame, title))
     style = " ".join(render("style.css").split())
     text = render(
         "page.html",
@@ -105,8 +90,8 @@ def write_page(root: Path) -> Path:
         chapters=chapters,
         paper=paper,
         other_models=OTHER_MODELS,
-        speed=list(_speed(folder, gaps)),
-        stability=_stability(folder, gaps),
+        speed=list(_speed(folder)),
+        stability=_stability(folder),
         gaps=gaps,
     )
     text = re.sub(r"\n\s*", "\n", text)
@@ -125,7 +110,7 @@ def _chapters(folder: Path, gaps: list[Gap], current: str) -> list[dict[str, Any
         except (UserError, ValueError) as error:
             gaps.append((place.name, "the whole report", str(error).replace(f"{folder}/", "")))
         except KeyError as error:
-            gaps.append((place.name, "the whole report", f"its provenance.json lacks {error}: {OLDER}"))
+            gaps.append((place.name, "the whole report", f"its provenance.json lacks {error}; write it anew"))
 
     def later(c: dict[str, Any]) -> tuple[bool, bool, bool, bool]:
         return not c["current"], c["scale"] == "smoke", c["looked_at"] != "", c["source"] != "videos"
@@ -135,25 +120,15 @@ def _chapters(folder: Path, gaps: list[Gap], current: str) -> list[dict[str, Any
 
 def _chapter(report: Report, gaps: list[Gap]) -> dict[str, Any]:
     """What the template shows of one report."""
-    name, said = report.name, report.provenance
-    tasks, (effects, points) = _tasks(report), _effects(report)
-    unasked = {*report.published["task"]} - {line["task"] for line in tasks}
-    gaps += [(name, task_title(task), "the full system was not asked") for task in TASKS if task in unasked]
-    gaps += [(name, file, OLDER) for file in EXPECTED if not (report.folder / file).is_file()]
-    shipped, title, frame = {}, SHIPPED_TABLE.title, SHIPPED_TABLE.build(report)
-    if len(frame):
-        html = draw_table(frame, title, f"{name}/scores.csv")
-        shipped = {"title": title, "caption": SHIPPED_TABLE.caption, "html": html}
     return {
         **sections(report),
         "report": report,
-        "scale": said["scale"],
-        "source": said["source"],
-        "shipped": shipped,
-        "tasks": tasks,
-        "effects": effects,
-        "points": points,
+        "scale": report.provenance["scale"],
+        "source": report.provenance["source"],
+        "shipped": _table(report, SHIPPED_TABLE),
+        "tasks": _table(report, FIVE_TASKS),
         "blocks": _blocks(report, gaps),
+        "figures": sorted((report.folder / "figures").glob("*.png")),
         "files": sorted(p.relative_to(report.folder).as_posix() for p in report.folder.rglob("*.*") if p.is_file()),
     }
 
@@ -166,120 +141,56 @@ def left_to_users(reports: Iterable[Report]) -> list[Gap]:
     return [("paper", what, why) for name, what, why in BY_USER if name not in known]
 
 
-def _line(row: dict[str, Any], file: str, index: int, said: str, note: str, **places: float) -> dict[str, Any]:
-    """What the template draws of a row: dot, interval and chance, at `places` in percent of the line's width.
-
-    A place that the row lacks is None. `index` is that of the row in its file.
-    """
-    found = {name: None if pd.isna(place) else round(float(place), 2) for name, place in places.items()}
-    title = task_title(row["task"]).removesuffix(f" ({row['task']})")
-    words = {"task": row["task"], "title": title, "source": f"{file}:{index + 2}", "said": said, "note": note}
-    return {"chance": None, "published": {}, **words, **found}
+def _table(report: Report, table: Table) -> dict[str, Any]:
+    """One of the registry's tables; empty where it has no row."""
+    return _block(report, table.key, table.title, table.caption, table.build(report), f"{table.source}.csv")
 
 
-def _tasks(report: Report) -> list[dict[str, Any]]:
-    """The tasks that were asked, with the full system's accuracy on real touch over all seeds."""
-    printed, rows, lines = cells(report.published), headline(report.scores), []
-    for index, row in zip(rows.index, rows.to_dict("records"), strict=True):
-        places = {name: 100 * row[name] for name in ("low", "high", "chance")}
-        note, value = f"{row['right']:g} of {row['n']:g} right", 100 * row["accuracy"]
-        line = _line(row, f"{report.name}/scores.csv", index, measured(row), note, value=value, **places)
-        found = {model: printed.get((*(row[k] for k in KEYS), model)) for model in MODELS}
-        line["published"] = {m: (f"{c[0]:.1f}", f"n {c[1]:.0f}", c[0]) for m, c in found.items() if c}
-        lines.append(line)
-    return lines
-
-
-def _effects(report: Report) -> tuple[dict[str, list[dict[str, Any]]], float]:
-    """The effects on whole answers by part, and half the width of their line in points: the next 25, at most 100."""
-    rows = report.effects[whole(report.effects)]
-    largest = 100 * rows[["difference", "low", "high"]].abs().max(axis=None) if len(rows) else 0.0
-    points = min(100.0, 25.0 * max(1, math.ceil(largest / 25)))
-    groups: dict[str, list[dict[str, Any]]] = {}
-    for index, row in zip(rows.index, rows.to_dict("records"), strict=True):
-        places = {
-            n: 50 + 5000 * row[c] / points for n, c in (("value", "difference"), ("low", "low"), ("high", "high"))
-        }
-        line = _line(row, f"{report.name}/effects.csv", index, difference(row), number(row["p_holm"], 3), **places)
-        part = PARTS.get(row["part"], row["part"])
-        groups.setdefault(f"{part[:1].upper()}{part[1:]}: {row['change']}", []).append(line)
-    return groups, points
+def _block(report: Report, key: str, title: str, caption: str, frame: pd.DataFrame, file: str) -> dict[str, Any]:
+    """A table as the template shows it; empty where it has no row."""
+    source = f"{report.name}/{file}"
+    # A row of the audit's table stands for many lines of the file.
+    html = draw_table(frame, title, "" if key == "audit" else source)
+    shown = key in UNFOLDED and report.provenance["scale"] != "smoke"
+    block = {"key": key, "title": title, "caption": caption, "file": source, "open": shown, "html": html}
+    return block if len(frame) else {}
 
 
 def _blocks(report: Report, gaps: list[Gap]) -> list[dict[str, Any]]:
     """The registry's tables, then those about data and encoders; one of the registry without a row is a gap."""
-    found = [(t.title, t.caption, t.build(report), f"{t.source}.csv", t.key) for t in TABLES]
+    found = [_table(report, table) for table in TABLES]
     gaps += [
-        (report.name, title, f"no row of its {file} belongs there: nothing such was run")
-        for title, _, frame, file, _ in found
-        if frame.empty
+        (report.name, table.title, f"no row of its {table.source}.csv belongs there: nothing such was run")
+        for table, block in zip(TABLES, found, strict=True)
+        if not block
     ]
     for file, title, caption in BESIDE:
         if (report.folder / file).is_file():
-            found.append((title, caption, _shown(pd.read_csv(report.folder / file)), file, Path(file).stem))
-    for title, caption, frame, file in dataset_tables(report.folder, report.provenance["dataset"]):
-        key = "audit" if title == "Data audit" else re.split("[:,]", title)[0].replace(" ", "-").lower()
-        found.append((title, caption, frame, file, key))
-    smoke = report.provenance["scale"] == "smoke"
-    unfolded = {table.key for table in TABLES if not (table.folded or smoke)}
-    return [
-        {
-            "key": f"{report.name}-{key}",
-            "title": title,
-            "caption": caption,
-            "file": f"{report.name}/{file}",
-            "open": key in unfolded,
-            # A row of the audit's table stands for many lines of the file.
-            "html": draw_table(frame, title, f"{report.name}/{file}", at_lines=key != "audit"),
-        }
-        for title, caption, frame, file, key in found
-        if len(frame)
-    ]
+            frame = _shown(pd.read_csv(report.folder / file))
+            found.append(_block(report, Path(file).stem, title, caption, frame, file))
+    found += [_block(report, *told) for told in dataset_tables(report.folder, report.provenance["dataset"])]
+    return [block for block in found if block]
 
 
-def _speed(folder: Path, gaps: list[Gap]) -> Iterator[dict[str, Any]]:
-    """Each question of speed_error.csv: its figure, as `make bench` drew it, its front in words, its table."""
-    rows = _measured(folder / "speed_error.csv", SPEED, "make bench", gaps)
-    rows["front"] = rows["front"].astype(str).eq("True")
-    for question, group in rows.groupby("question", sort=False):
+def _speed(folder: Path) -> Iterator[dict[str, Any]]:
+    """Each question of speed_error.csv: its figure, as `make bench` drew it, and its table."""
+    for question, group in read_frame(folder / "speed_error.csv", SPEED).groupby("question", sort=False):
         figure = f"speed_error/{re.sub(r'[^a-z0-9]+', '-', str(question).lower()).strip('-')}.png"
-        shown = group.drop(columns="question").assign(front=group["front"].where(group["error"].notna()))
         yield {
             "question": question,
             "costs": "; ".join(group["unit"].dropna().unique()),
             "errors": "; ".join(group["error_of"].dropna().unique()),
             "figure": figure if (folder / figure).is_file() else "",
-            "front": group[group["front"]].sort_values("cost_ratio").map(_cell_text).to_dict("records"),
-            "html": draw_table(_shown(shown), str(question), "speed_error.csv"),
+            "html": draw_table(_shown(group.drop(columns="question")), str(question), "speed_error.csv"),
         }
 
 
-def _stability(folder: Path, gaps: list[Gap]) -> dict[str, Any]:
-    """How many cases passed by part and number format, and the cases that failed."""
-    rows = _measured(folder / "stability.csv", STABILITY, "make stability", gaps)
-    if rows.empty:
-        return {"cases": 0}
+def _stability(folder: Path) -> dict[str, Any]:
+    """How many cases were run, and those that failed."""
+    rows = read_frame(folder / "stability.csv", STABILITY)
     failed = rows[rows["verdict"].ne("pass")]
-    groups = rows.assign(passed=rows["verdict"].eq("pass")).groupby(["part", "format"])["passed"]
-    counts = (groups.sum().astype(str) + "/" + groups.size().astype(str)).unstack(fill_value="")
-    counts.insert(0, "Part", counts.index)
-    return {
-        "cases": len(rows),
-        "failed": len(failed),
-        "failures": draw_table(_shown(failed), "Cases that failed", "stability.csv") if len(failed) else "",
-        "table": draw_table(counts, "Cases that passed, by part and number format", "stability.csv", at_lines=False),
-    }
-
-
-def _measured(file: Path, columns: tuple[str, ...], command: str, gaps: list[Gap]) -> pd.DataFrame:
-    """The rows of a file of reports/; where it has none or is broken, that is a gap."""
-    try:
-        rows, why = read_frame(file, columns), f"nothing was measured yet: `{command}` measures it"
-    except UserError as error:
-        rows, why = pd.DataFrame(columns=list(columns)), str(error)
-    if rows.empty:
-        gaps.append((file.stem.partition("_")[0], file.name, why))
-    return rows
+    table = draw_table(_shown(failed), "Cases that failed", "stability.csv") if len(failed) else ""
+    return {"cases": len(rows), "failed": len(failed), "table": table}
 
 
 def _shown(rows: pd.DataFrame) -> pd.DataFrame:

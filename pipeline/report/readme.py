@@ -10,9 +10,10 @@ from typing import Any
 
 import pandas as pd
 
+from pipeline.core.errors import counted
 from pipeline.core.records import Shown
 from pipeline.report.load import Report
-from pipeline.report.render import count, markdown, render, size
+from pipeline.report.render import markdown, render, size
 from pipeline.report.tables import FIVE_TASKS, PARTS, SHIPPED_TABLE, SHOWN_WORDS, TABLES, headline, measured, number
 from pipeline.weights import is_random
 
@@ -116,7 +117,7 @@ def _against_chance(rows: pd.DataFrame, whose: str = "The full system's") -> str
         f"{kind} in {row['task']} with {measured(row.to_dict())} % (chance {number(row['chance'], scale=100)})"
         for kind, row in (("best", rows.loc[over.idxmax()]), ("worst", rows.loc[over.idxmin()]))
     )
-    tasks = f"{len(above)} of {count(len(rows), 'task')}{named}"
+    tasks = f"{len(above)} of {counted(len(rows), 'task')}{named}"
     text = f"{whose} interval lies above chance in {tasks}"
     text += f" and below it in {', '.join(below['task'])}" if len(below) else ""
     # Nothing is best that is no better than a guess.

@@ -9,8 +9,7 @@ import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup, escape
 
-HEADS = ("Task", "Measure", "Severity")
-"""Columns whose equal cells become one heading over their rows."""
+from pipeline.core.errors import counted
 
 
 def inline(text: str, folder: str = "") -> Markup:
@@ -19,11 +18,6 @@ def inline(text: str, folder: str = "") -> Markup:
     html = re.sub(r"\*(\w[^*]*)\*", r"<em>\1</em>", html)
     html = re.sub(r"`(.+?)`", r"<code>\1</code>", html)
     return Markup(re.sub(r"\[([^]]+)\]\(([\w./-]+)\)", rf'<a href="{escape(folder)}\2">\1</a>', html))
-
-
-def count(number: int, noun: str) -> str:
-    """Such as "1 task" and "2 tasks"."""
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def size(parameters: int) -> str:
@@ -48,7 +42,7 @@ TEMPLATES = Environment(
     undefined=StrictUndefined,
 )
 """Only what is put into .html is escaped."""
-TEMPLATES.filters |= {"inline": inline, "count": count, "size": size, "model": model}
+TEMPLATES.filters |= {"inline": inline, "count": counted, "size": size, "model": model}
 
 
 def render(template: str, **values: Any) -> str:
@@ -62,27 +56,16 @@ def markdown(frame: pd.DataFrame) -> str:
     return "".join("| " + " | ".join(str(cell).replace("|", "\\|") for cell in row) + " |\n" for row in rows)
 
 
-def draw_table(frame: pd.DataFrame, title: str, file: str, at_lines: bool = True) -> Markup:
-    """A table as HTML; rows of one task, measure or severity are brought together under a heading.
+def draw_table(frame: pd.DataFrame, title: str, file: str = "") -> Markup:
+    """A table as HTML.
 
     Args:
         frame: text in every cell.
-        file: the CSV that it comes from.
-        at_lines: whether the frame's index is that of the CSV, so that each row can name its line.
+        file: the CSV that it comes from, where the frame's index is that of the CSV, so that each row names its line.
     """
-    kinds = {name: _kind(name, frame[name]) for name in frame}
-    words = [name for name, kind in kinds.items() if kind == "words"]
-    group = next((name for name in HEADS if name in words and len(words) > 1), None)
-    first = [name for name in words if name != group][:1]
-    columns = [*first, *(name for name in frame if name not in (group, *first))]
-    if group:
-        frame = frame.iloc[pd.factorize(frame[group])[0].argsort(kind="stable")]
-    rows = [
-        (f"{file}:{index + 2}" if at_lines else file, row.get(group), [row[name] for name in columns])
-        for index, row in zip(frame.index, frame.to_dict("records"), strict=True)
-    ]
-    heads = [(name, kinds[name]) for name in columns]
-    return Markup(render("table.html", title=title, heads=heads, named=bool(first), rows=rows))
+    heads = [(name, _kind(name, frame[name])) for name in frame]
+    rows = [(f"{file}:{index + 2}" if file else "", cells) for index, *cells in frame.itertuples(name=None)]
+    return Markup(render("table.html", title=title, heads=heads, rows=rows))
 
 
 def _kind(name: str, column: pd.Series[Any]) -> str:

