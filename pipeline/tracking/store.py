@@ -157,9 +157,8 @@ class Store:
         points = [Metric(*metric) for metric in metrics]
         own = [Param(name, value) for name, value in (params or {}).items()]
         marks = [RunTag(name, value) for name, value in (tags or {}).items()]
-        # MLflow takes 100 parameters or tags a call. Synchronous, so that a failure shows here.
-        for i in range(0, max(map(len, (points, own, marks))), 100):
-            self.client.log_batch(run, *(items[i : i + 100] for items in (points, own, marks)), synchronous=True)
+        # Synchronous, so that a failure shows here.
+        self.client.log_batch(run, points, own, marks, synchronous=True)
 
     def finish(self, run: str, end: int, tags: Mapping[str, str]) -> None:
         """Set a run's final tags, as the last step, and end it."""
