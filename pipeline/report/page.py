@@ -90,8 +90,8 @@ def write_page(root: Path) -> Path:
         chapters=chapters,
         paper=paper,
         other_models=OTHER_MODELS,
-        speed=list(_speed(folder)),
-        stability=_stability(folder),
+        speed=list(_speed(folder, gaps)),
+        stability=_stability(folder, gaps),
         gaps=gaps,
     )
     text = re.sub(r"\n\s*", "\n", text)
@@ -172,9 +172,9 @@ def _blocks(report: Report, gaps: list[Gap]) -> list[dict[str, Any]]:
     return [block for block in found if block]
 
 
-def _speed(folder: Path) -> Iterator[dict[str, Any]]:
+def _speed(folder: Path, gaps: list[Gap]) -> Iterator[dict[str, Any]]:
     """Each question of speed_error.csv: its figure, as `make bench` drew it, and its table."""
-    for question, group in read_frame(folder / "speed_error.csv", SPEED).groupby("question", sort=False):
+    for question, group in _measured(folder / "speed_error.csv", SPEED, gaps).groupby("question", sort=False):
         figure = f"speed_error/{re.sub(r'[^a-z0-9]+', '-', str(question).lower()).strip('-')}.png"
         yield {
             "question": question,
@@ -185,12 +185,21 @@ def _speed(folder: Path) -> Iterator[dict[str, Any]]:
         }
 
 
-def _stability(folder: Path) -> dict[str, Any]:
+def _stability(folder: Path, gaps: list[Gap]) -> dict[str, Any]:
     """How many cases were run, and those that failed."""
-    rows = read_frame(folder / "stability.csv", STABILITY)
+    rows = _measured(folder / "stability.csv", STABILITY, gaps)
     failed = rows[rows["verdict"].ne("pass")]
     table = draw_table(_shown(failed), "Cases that failed", "stability.csv") if len(failed) else ""
     return {"cases": len(rows), "failed": len(failed), "table": table}
+
+
+def _measured(file: Path, columns: tuple[str, ...], gaps: list[Gap]) -> pd.DataFrame:
+    """The rows of a file of reports/, none where there is no such file; a broken one is a gap."""
+    try:
+        return read_frame(file, columns)
+    except UserError as error:
+        gaps.append((file.stem.partition("_")[0], file.name, str(error)))
+        return pd.DataFrame(columns=list(columns))
 
 
 def _shown(rows: pd.DataFrame) -> pd.DataFrame:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import shutil
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
+
+import pandas as pd
 
 from tests.closure import ROOT
 
@@ -53,15 +54,12 @@ def edit(file: Path, **changed: Any) -> None:
 
 
 def rows_of(file: Path) -> list[dict[str, Any]]:
-    with file.open(encoding="utf-8", newline="") as stream:
-        return list(csv.DictReader(stream))
+    """Every cell as the text that stands there."""
+    return pd.read_csv(file, dtype=str, keep_default_na=False).to_dict("records")
 
 
 def write_rows(file: Path, rows: list[dict[str, Any]]) -> None:
-    with file.open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    pd.DataFrame(rows).to_csv(file, index=False)
 
 
 class Page:
