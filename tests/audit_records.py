@@ -25,8 +25,7 @@ OBJECTS = ("baseball", "cotton_ball", "pillow", "potato", "rug", "millet", "lemo
 GOOD_SPLIT = {o: (Part.TRAIN, Part.VALIDATION, Part.TEST)[i % 3] for i, o in enumerate(OBJECTS)}
 SCENE = ScenesConfig(frames=24, width=128, height=96)
 OTHER = Catalogue(
-    language=PHYSICLEAR.language.model_copy(update={"dataset": ""}),
-    objects={o: PHYSICLEAR.objects[o] for o in OBJECTS},
+    language=PHYSICLEAR.language.model_copy(update={"dataset": ""}), objects={o: PHYSICLEAR.objects[o] for o in OBJECTS}
 )
 """Eight objects of a data set that the paper says nothing about."""
 
@@ -35,29 +34,18 @@ def probe(video_id: str = "rug_0", **changes: object) -> Probe:
     """What a flawless video measures; its contact and its untouched picture are its own."""
     rng = np.random.default_rng(derive_seed(video_id))
     contact = rng.normal(size=24 * 18)
+    file = {"session": "", "header_frames": 126, "frames": 126, "fps": 25.0, "width": 320, "height": 240}
+    more = {"hdr": False, "rotation": 0, "irregular": 1.0, "kept": 37, "saturated": 0.0, "unsteady": 0}
+    light = {"brightness": 90.0, "brightness_step": 0.4, "contact": 1.4, "quiet": 0.25, "contact_end": 0.3}
     good: dict[str, object] = {
+        **file,
+        **more,
+        **light,
         "video_id": video_id,
         "object_id": video_id.rpartition("_")[0],
         "path": f"{video_id}.mov",
         "sha256": f"sha of {video_id}",
-        "session": "",
-        "header_frames": 126,
-        "frames": 126,
-        "fps": 25.0,
-        "width": 320,
-        "height": 240,
-        "hdr": False,
-        "rotation": 0,
-        "irregular": 1.0,
-        "kept": 37,
-        "brightness": 90.0,
-        "brightness_step": 0.4,
-        "saturated": 0.0,
-        "contact": 1.4,
-        "quiet": 0.25,
-        "contact_end": 0.3,
         "starts_touching": False,
-        "unsteady": 0,
         "untouched": (0, 2, 4, 6),
         "thumbnail": tuple(rng.normal(90, 1, 6 * 8 * 3)),
         "signature": tuple(contact / np.linalg.norm(contact)),
@@ -73,9 +61,7 @@ def assigned(found: Sequence[Probe], parts: dict[str, Part]) -> list[Assignment]
     """Parts by video id, else by object."""
     return [
         Assignment(
-            video_id=p.video_id,
-            object_id=p.object_id,
-            part=parts.get(p.video_id, parts.get(p.object_id, Part.UNUSED)),
+            video_id=p.video_id, object_id=p.object_id, part=parts.get(p.video_id, parts.get(p.object_id, Part.UNUSED))
         )
         for p in found
     ]

@@ -200,11 +200,8 @@ def contents(folder: Path, *parts: str) -> dict[str, str]:
 
 
 def refuse(row: BadInput) -> dict[str, str]:
-    """Give the input to its `octopi` command or stage, in this process and the working directory; say what was wrong.
-
-    Returns:
-        By column of the drill's table, empty where all is well.
-    """
+    """Give the input to its `octopi` command or stage, in this process and the working directory; say what was wrong,
+    by column of the drill's table, empty where all is well."""
     row.prepare()
     before = contents(Path())
     words = [*row.command.split(), *row.arguments]

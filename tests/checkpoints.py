@@ -56,14 +56,7 @@ def write_clip(folder: Path, seed: int = 0, config: dict[str, dict[str, Any]] = 
 def write_llama(
     folder: Path, seed: int = 0, *, bos: bool = True, pad: str | None = "<pad>", shard: str = "5GB", **shapes: object
 ) -> Path:
-    """A Llama with a byte-level tokenizer as `save_pretrained` lays it out.
-
-    Args:
-        bos: Whether the tokenizer begins a text with its token for that.
-        pad: Its padding token.
-        shard: Largest file of weights.
-        shapes: What is to be otherwise in LlamaConfig.
-    """
+    """A Llama with a byte-level tokenizer as `save_pretrained` lays it out; `shapes` go to its LlamaConfig."""
     from tokenizers import Tokenizer, decoders, models, pre_tokenizers, processors
     from transformers import LlamaConfig, LlamaForCausalLM, PreTrainedTokenizerFast
 
@@ -78,18 +71,9 @@ def write_llama(
     named = {"bos_token": "<s>", "eos_token": "</s>", "unk_token": "<unk>"} | ({"pad_token": pad} if pad else {})
     PreTrainedTokenizerFast(tokenizer_object=tokenizer, **named).save_pretrained(folder)
     torch.manual_seed(seed)
-    usual = {
-        "vocab_size": len(vocabulary),
-        "hidden_size": 32,
-        "intermediate_size": 64,
-        "num_hidden_layers": 2,
-        "num_attention_heads": 4,
-        "num_key_value_heads": 2,
-        "max_position_embeddings": 2048,
-        "bos_token_id": 1,
-        "eos_token_id": 2,
-        "pad_token_id": 0,
-    }
+    usual = {"vocab_size": len(vocabulary), "hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2}
+    usual |= {"num_attention_heads": 4, "num_key_value_heads": 2, "max_position_embeddings": 2048}
+    usual |= {"bos_token_id": 1, "eos_token_id": 2, "pad_token_id": 0}
     LlamaForCausalLM(LlamaConfig(**(usual | shapes))).save_pretrained(folder, max_shard_size=shard)  # type: ignore[arg-type]
     return folder
 
@@ -103,14 +87,12 @@ def write_vicuna(folder: Path, words: str, **shapes: object) -> Path:
     pieces = Tokenizer(models.BPE(unk_token="<unk>", byte_fallback=True))
     pieces.pre_tokenizer = pre_tokenizers.Metaspace(prepend_scheme="first")
     letters = [f"<0x{byte:02X}>" for byte in range(256)]
-    trainer = trainers.BpeTrainer(
-        vocab_size=1500, special_tokens=["<unk>", "<s>", "</s>", *letters], show_progress=False
-    )
+    special = ["<unk>", "<s>", "</s>", *letters]
+    trainer = trainers.BpeTrainer(vocab_size=1500, special_tokens=special, show_progress=False)
     pieces.train_from_iterator([words], trainer)
     learnt = json.loads(pieces.to_str())["model"]
-    tokenizer = LlamaTokenizer(
-        vocab=learnt["vocab"], merges=[tuple(pair) for pair in learnt["merges"]], pad_token="<unk>"
-    )
+    merges = [tuple(pair) for pair in learnt["merges"]]
+    tokenizer = LlamaTokenizer(vocab=learnt["vocab"], merges=merges, pad_token="<unk>")
     tokenizer.save_pretrained(folder)
     narrow = {"hidden_size": 64, "intermediate_size": 128, "num_attention_heads": 4, "vocab_size": len(tokenizer)}
     vicuna = {"max_position_embeddings": 4096, "rms_norm_eps": 1e-5, "pad_token_id": 0, "tie_word_embeddings": False}

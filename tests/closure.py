@@ -33,9 +33,7 @@ def imported(file: Path) -> set[Path]:
 
 
 def closure(script: Path, unfollowed: Collection[str] = ()) -> list[str]:
-    """Project files that running `script` can import, itself included, relative to the root and sorted.
-
-    What the files in `unfollowed` import does not count.
+    """Project files that running `script` can import, itself included, but nothing that those in `unfollowed` import.
 
     Packages' empty __init__ files are left out: they cannot change a result.
     """

@@ -25,7 +25,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from pipeline.core.errors import UserError
-from pipeline.core.records import Video
+from pipeline.core.records import Classification, Part, Video
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 
 if TYPE_CHECKING:
@@ -274,19 +274,21 @@ def few_permutations(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pipeline.videos.audit.leakage.PERMUTATIONS", 50)
 
 
+def classified(
+    video_id: str,
+    name: str,
+    expected: int,
+    predicted: int,
+    probabilities: tuple[float, ...] = (1.0,),
+    part: Part = Part.TEST,
+) -> Classification:
+    """What a head said of a video, which is called after its object."""
+    whose = {"video_id": video_id, "object_id": video_id.rpartition("_")[0], "part": part, "property": name}
+    return Classification(**whose, expected=expected, predicted=predicted, probabilities=probabilities)
+
+
 def fake_videos(objects: Iterable[str], per_object: int = 3) -> list[Video]:
     """Records of videos that do not exist, each with its own content."""
-    return [
-        Video(
-            video_id=f"{o}_{i}",
-            object_id=o,
-            path=f"{o}_{i}.avi",
-            sha256=f"sha of {o}_{i}",
-            frames=10,
-            fps=25,
-            width=32,
-            height=24,
-        )
-        for o in objects
-        for i in range(per_object)
-    ]
+    shape = {"frames": 10, "fps": 25, "width": 32, "height": 24}
+    names = [(o, f"{o}_{i}") for o in objects for i in range(per_object)]
+    return [Video(video_id=v, object_id=o, path=f"{v}.avi", sha256=f"sha of {v}", **shape) for o, v in names]

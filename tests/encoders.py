@@ -33,8 +33,7 @@ PARTS = {o: Part.VALIDATION if i > 4 else Part.TRAIN for i, o in enumerate(OBJEC
 def write_tower(folder: Path, *, averages: bool = False) -> Path:
     """A tiny CLIP none of whose biases is 0 and none of whose scales is 1: fresh ones would hide a wrong layer.
 
-    Args:
-        averages: Whether its embedding is read from the mean over patches, in place of the class token.
+    With `averages` its embedding is read from the mean over patches, in place of the class token.
     """
     file = write_clip(folder) / "open_clip_model.safetensors"
     if averages:
@@ -65,15 +64,9 @@ def encoder_data(folder: Path, catalogue: Catalogue, parts: Mapping[str, Part], 
 
 
 def config(weights: Path, recipe: Recipe, **changes: object) -> EncoderConfig:
-    return EncoderConfig.model_validate(
-        {
-            "recipe": recipe,
-            "weights": str(weights),
-            "prompts": 3,
-            **({"backbone": ("scenes",), "reference": "subtract"} if recipe == "tuned" else {}),
-            **changes,
-        }
-    )
+    tuned = {"backbone": ("scenes",), "reference": "subtract"} if recipe == "tuned" else {}
+    own = {"recipe": recipe, "weights": str(weights), "prompts": 3}
+    return EncoderConfig.model_validate({**own, **tuned, **changes})
 
 
 def training(data: EncoderData, setting: EncoderConfig, seed: int = 0, **more: Any) -> Training:

@@ -38,9 +38,8 @@ from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.split import assign
 from pipeline.weights import is_random
 from tests.closure import ROOT
+from tests.conftest import classified
 from tests.models import model_folder
-
-VIDEOS_AN_OBJECT = 2
 
 
 def fake_params(*overrides: str) -> Params:
@@ -52,9 +51,7 @@ def fake_params(*overrides: str) -> Params:
 def write_run(root: Path, params: Params, *, objects: Sequence[str] = (), skill: float = 0.6) -> Params:
     """Write params.yaml and data/ of a finished run below `root`; returns the parameters.
 
-    Args:
-        objects: those that have videos; all of `scenes.objects` by default.
-        skill: the share of right answers and classifications.
+    `objects` have videos, all of `scenes.objects` by default; `skill` is the share of right answers and classes.
     """
     rng = random.Random(1)
     catalogue = load_catalogue(Path(params.data.catalogue))
@@ -65,7 +62,7 @@ def write_run(root: Path, params: Params, *, objects: Sequence[str] = (), skill:
             (root / folder).parent.mkdir(parents=True, exist_ok=True)
             (root / folder).symlink_to(model_folder(Path(folder).name))
     data, parts = root / "data", {o.object_id: o.splits["paper"] for o in catalogue.objects.values()}
-    videos = [_video(o, i, rng) for o in sorted(objects or params.scenes.objects) for i in range(VIDEOS_AN_OBJECT)]
+    videos = [_video(o, i, rng) for o in sorted(objects or params.scenes.objects) for i in range(2)]
     assignments = [Assignment(video_id=v.video_id, object_id=v.object_id, part=parts[v.object_id]) for v in videos]
     write_table(data / "videos.parquet", Video, videos)
     splits = dict.fromkeys(params.ablation.seeds, assignments)
@@ -120,18 +117,12 @@ def _video(object_id: str, number: int, rng: random.Random) -> Video:
 def _classify(a: Assignment, catalogue: Catalogue, skill: float, rng: random.Random) -> list[Classification]:
     if a.part not in (Part.VALIDATION, Part.TEST):
         return []
-    return [
-        Classification(
-            video_id=a.video_id,
-            object_id=a.object_id,
-            part=a.part,
-            property=p.name,
-            expected=label,
-            predicted=label if rng.random() < skill else rng.randrange(len(p.levels)),
-            probabilities=tuple(1 / len(p.levels) for _ in p.levels) if len(p.levels) != 3 else (0.2, 0.3, 0.5),
-        )
-        for p, label in zip(catalogue.properties, catalogue.labels(a.object_id), strict=True)
-    ]
+    said = []
+    for p, label in zip(catalogue.properties, catalogue.labels(a.object_id), strict=True):
+        predicted = label if rng.random() < skill else rng.randrange(len(p.levels))
+        probabilities = tuple(1 / len(p.levels) for _ in p.levels) if len(p.levels) != 3 else (0.2, 0.3, 0.5)
+        said.append(classified(a.video_id, p.name, label, predicted, probabilities, a.part))
+    return said
 
 
 def _out_of_fold(a: Assignment, catalogue: Catalogue, skill: float, rng: random.Random) -> OutOfFold:
