@@ -7,16 +7,18 @@ import random
 import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.core.records import Classification, Part
+from pipeline.core.records import Classification
 from pipeline.evaluation.grading import conclude
 from pipeline.evaluation.scores import RULES, effect_rows, score_rows
 from pipeline.tasks import TASKS
 from pipeline.tasks.questions import build_questions
 from pipeline.videos.catalogue import Catalogue
+from tests.conftest import classified
 from tests.tasks.shared import CATALOGUE, POOL
 
 ASKED = {"OPD": 60, "PC": 120, "PSS": 120, "POM": 60, "PSR": 40}
@@ -32,17 +34,8 @@ def heads(
         for place, prop in enumerate(CATALOGUE.properties):
             mean = means[object_id][place] if means else classes[place]
             sure = tuple(float(k == classes[place]) for k in range(3))
-            said.append(
-                Classification(
-                    video_id=f"{object_id}_0",
-                    object_id=object_id,
-                    part=Part.TEST,
-                    property=prop.name,
-                    expected=0,
-                    predicted=classes[place],
-                    probabilities=(1 - mean / 2, 0.0, mean / 2) if means else sure,
-                )
-            )
+            probabilities = (1 - mean / 2, 0.0, mean / 2) if means else sure
+            said.append(classified(f"{object_id}_0", prop.name, 0, classes[place], probabilities))
     return said
 
 
@@ -76,9 +69,7 @@ def test_right_classes_lead_to_right_answers_in_the_words_of_right_answers() -> 
 
 def test_wrong_classes_lead_to_what_a_plain_reading_of_them_leads_to() -> None:
     levels = shuffled(1)
-    found = {
-        s.question_id: s for s in conclude(QUESTIONS, heads(levels), CATALOGUE) if s.measure in ("choice", "combined")
-    }
+    found = {s.question_id: s for s in conclude(QUESTIONS, heads(levels), CATALOGUE) if s.measure == "choice"}
     names = CATALOGUE.property_names
     for q in QUESTIONS:
         said = [levels[o] for o in q.objects]
@@ -95,15 +86,10 @@ def test_wrong_classes_lead_to_what_a_plain_reading_of_them_leads_to() -> None:
             expected = "abc"[own.index(extreme)]
         elif q.task == "POM":
             options = sorted(q.objects, key=lambda o: CATALOGUE.objects[o].name.lower())
-            costs = {
-                order: sum(
-                    abs(a - b)
-                    for place, n in enumerate(order)
-                    for a, b in zip(said[place], TRUE[options[int(n) - 1]], strict=True)
-                )
-                for order in map("".join, itertools.permutations("123"))
-            }
-            best = [order for order, cost in costs.items() if cost == min(costs.values())]
+            true = np.array([TRUE[o] for o in options])
+            orders = list(itertools.permutations(range(3)))
+            costs = [np.abs(said - true[list(order)]).sum() for order in orders]
+            best = ["".join(str(n + 1) for n in o) for o, cost in zip(orders, costs, strict=True) if cost == min(costs)]
             if len(best) > 1:
                 continue
             expected = best[0]
@@ -117,18 +103,13 @@ def test_wrong_classes_lead_to_what_a_plain_reading_of_them_leads_to() -> None:
 def test_the_right_answers_are_not_looked_at(seed: int) -> None:
     """Whatever the objects' labels are said to be, answers to PC and PSS stay as they are."""
     labels = shuffled(seed)
-    objects = {
-        o: entry.model_copy(update={"ratings": tuple((level,) for level in labels[o])})
-        for o, entry in CATALOGUE.objects.items()
-    }
+    ratings = {o: tuple((level,) for level in labels[o]) for o in TRUE}
+    objects = {o: entry.model_copy(update={"ratings": ratings[o]}) for o, entry in CATALOGUE.objects.items()}
     relabelled = Catalogue(language=CATALOGUE.language, objects=objects)
     asked = [q for q in QUESTIONS if q.task in ("PC", "PSS")]
     blind = [q.model_copy(update={"gold": q.gold.model_copy(update={"choice": "", "labels": ()})}) for q in asked]
-    answers = [
-        [s.predicted for s in conclude(qs, heads(shuffled(7)), c)]
-        for qs, c in ((asked, CATALOGUE), (blind, relabelled))
-    ]
-    assert answers[0] == answers[1]
+    seen, unseen = conclude(asked, heads(shuffled(7)), CATALOGUE), conclude(blind, heads(shuffled(7)), relabelled)
+    assert [s.predicted for s in seen] == [s.predicted for s in unseen]
 
 
 @pytest.mark.parametrize("task", ["PSS", "POM", "PSR"])

@@ -19,9 +19,8 @@ TESTED = {
     for split in ("paper", "release")
 }
 BRISTLES, HANDLE, BRUSH = "hairbrush_bristles", "hairbrush_handle", "toilet_brush_bristles"
-CLOTH, TOWEL, ORANGE, ERASER, ICE, PEG = (
-    *("microfiber_cloth", "bath_towel", "orange", "eraser", "ice_block", "clothes_peg"),
-)
+CLOTH, TOWEL, ORANGE = "microfiber_cloth", "bath_towel", "orange"
+ERASER, ICE, PEG = "eraser", "ice_block", "clothes_peg"
 PAIRS = {
     ("release", "published"): {
         "stains": ({CLOTH}, {BRISTLES}),

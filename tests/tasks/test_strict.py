@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import random
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -49,10 +48,9 @@ def test_descriptions_are_cut_like_the_published_ones(
     assert list(as_published(text, right, CATALOGUE).values()) == cut_at_words(text, CATALOGUE.structured(right))
 
 
-@pytest.mark.parametrize("task", ["OPD", "PC", "PSS", "POM"])
-def test_gold_answers_are_strictly_right_and_so_is_what_follows_them(task: str) -> None:
-    assert ASKED[task]
-    for question in ASKED[task]:
+def test_gold_answers_are_strictly_right_and_so_is_what_follows_them() -> None:
+    assert {task for task, asked in ASKED.items() if asked} == TASKS.keys()
+    for question in (q for task in ("OPD", "PC", "PSS", "POM") for q in ASKED[task]):
         for dialogue in question.dialogues:
             text = dialogue.turns[-1].assistant
             assert all(s.strict for s in grade(question, text).values())
@@ -60,32 +58,30 @@ def test_gold_answers_are_strictly_right_and_so_is_what_follows_them(task: str) 
             assert not any(s.strict for s in grade(question, text.upper()).values())
             assert all(s.correct for s in grade(question, text.upper()).values()), "reading is tolerant"
 
-
-@pytest.mark.parametrize("task", ["PSR", "RIPE"])
-def test_what_was_graded_by_hand_has_no_strict_score(task: str) -> None:
-    for question in ASKED[task]:
-        dialogue = question.dialogue(Opd.ALL)
-        assert grade(question, *(turn.assistant for turn in dialogue.turns))["choice"].strict is None
+    # What was graded by hand has no strict score.
+    for question in ASKED["PSR"] + ASKED["RIPE"]:
+        outputs = [turn.assistant for turn in question.dialogue(Opd.ALL).turns]
+        assert grade(question, *outputs)["choice"].strict is None
 
 
-@pytest.mark.parametrize(
-    ("said", "read", "strict"),
-    [
-        ("Conclusion: Yes, the first object is harder.", True, True),
-        ("Conclusion: Yes.", True, False),
-        ("Conclusion: yes, the first object is harder.", True, False),
-        ("Yes, the first object is harder.", True, True),
-        ("conclusion: Yes, the first object is harder.", True, False),
-        ("Conclusion: No. Conclusion: Yes, the first object is harder. No.", True, True),
-        ("Conclusion: No, the second object is harder.", False, False),
-    ],
-)
-def test_a_comparison_is_read_and_compared(said: str, read: bool, strict: bool) -> None:
+VERDICT = "Yes, the first object is harder."
+COMPARED = {
+    f"Conclusion: {VERDICT}": (True, True),
+    "Conclusion: Yes.": (True, False),
+    f"Conclusion: {VERDICT.lower()}": (True, False),
+    VERDICT: (True, True),
+    f"conclusion: {VERDICT}": (True, False),
+    f"Conclusion: No. Conclusion: {VERDICT} No.": (True, True),
+    "Conclusion: No, the second object is harder.": (False, False),
+}
+"""An answer, and whether it is right by rules and by the published comparison."""
+
+
+def test_a_comparison_is_read_and_compared() -> None:
     questions = build_questions(POOL, {"PC": 60}, seed=1, distinct=True)
-    verdict = "Yes, the first object is harder."
-    question = next(q for q in questions if q.dialogues[0].turns[-1].assistant == verdict)
-    score = grade(question, said)["choice"]
-    assert (score.correct, score.strict) == (read, strict)
+    question = next(q for q in questions if q.dialogues[0].turns[-1].assistant == VERDICT)
+    scores = {said: grade(question, said)["choice"] for said in COMPARED}
+    assert {said: (score.correct, score.strict) for said, score in scores.items()} == COMPARED
 
 
 def test_a_matching_in_another_order_is_read_but_not_compared() -> None:

@@ -69,10 +69,8 @@ LABELS = st.lists(st.tuples(*(st.integers(0, len(p.levels) - 1) for p in CATALOG
 @given(LABELS, st.integers(0, 3))
 def test_a_superlative_is_the_extreme_of_all_that_the_part_has(labels: list[tuple[int, ...]], seed: int) -> None:
     """Whatever classes there are; a middle one is asked for where nothing beyond it is there."""
-    objects = {
-        name: CATALOGUE.objects[name].model_copy(update={"ratings": tuple((label,) for label in own)})
-        for name, own in zip(CATALOGUE.objects, labels, strict=False)
-    }
+    ratings = {name: tuple((label,) for label in own) for name, own in zip(CATALOGUE.objects, labels, strict=False)}
+    objects = {name: CATALOGUE.objects[name].model_copy(update={"ratings": own}) for name, own in ratings.items()}
     pool = Pool(Part.TEST, Catalogue(language=CATALOGUE.language, objects=objects), {o: [f"{o}_0"] for o in objects})
     questions = build_questions(pool, {"PSS": 18}, seed=seed, distinct=True)
     asked = set()
@@ -103,7 +101,7 @@ def test_a_description_is_graded_property_by_property() -> None:
     question = next(q for q in QUESTIONS["OPD"] if q.gold.labels == ((2, 0, 0),))
     found = grade(question, "Overall, it presents a hard and slightly rough surface with no bumps.")
     assert [(s.measure, s.correct) for s in found] == [
-        *(("hardness", True), ("roughness", False), ("bumpiness", True), ("combined", False)),
+        *(("hardness", True), ("roughness", False), ("bumpiness", True), ("combined", False))
     ]
     assert (found[1].predicted, found[3].expected) == ("slightly rough", "hard, smooth, no bumps")
 
@@ -162,10 +160,10 @@ def test_markdown_and_the_like_leave_what_is_read(task: str, data: st.DataObject
     if data.draw(st.booleans()):
         text = text.replace("Conclusion:", data.draw(st.sampled_from(["\n\n### Conclusion\n", "\n**Conclusion:**"])))
     text = data.draw(st.sampled_from(OPENINGS)) + text
-    plain, decorated = grade(question, *before, last), grade(question, *before, text)
-    assert [(s.predicted, s.parsed, s.correct) for s in decorated] == [
-        (s.predicted, s.parsed, s.correct) for s in plain
-    ]
+    plain, decorated = (
+        [(s.predicted, s.parsed, s.correct) for s in grade(question, *before, said)] for said in (last, text)
+    )
+    assert decorated == plain
 
 
 UNREAD = {
