@@ -31,16 +31,8 @@ def test_shipped_scale_is_valid_and_survives_writing(scale: str, tmp_path: Path)
 def test_a_new_scale_is_a_file(tmp_path: Path) -> None:
     conf = shutil.copytree(CONF, tmp_path / "conf")
     (conf / "lab.yaml").write_text("defaults: [small, _self_]\nscale: lab\nlora: {rank: 4}\n")
-    assert shipped_scales(conf) == [
-        "finetune",
-        "invented",
-        "lab",
-        "paper-13b",
-        "paper-7b",
-        "rehearsal",
-        "small",
-        "smoke",
-    ]
+    names = "finetune, invented, lab, paper-13b, paper-7b, rehearsal, small, smoke"
+    assert ", ".join(shipped_scales(conf)) == names
     params = compose("lab", conf=conf)
     assert (params.scale, params.lora.rank, params.report_name) == ("lab", 4, "lab-scenes")
     write_params(params, tmp_path / "params.yaml")
@@ -53,46 +45,35 @@ def test_committed_params_are_written_as_they_are(tmp_path: Path) -> None:
     assert (tmp_path / "params.yaml").read_text() == (ROOT / "params.yaml").read_text()
 
 
+# Further ones take the whole way in tests/bad_inputs.py.
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
-        (["frames.per_vido=1"], ["frames.per_vido", "did you mean per_video"]),
-        (["nothing=1"], ["nothing", "allowed here"]),
-        (["frames.size=64"], ["frames.size is called frames.pixels now"]),
-        (["frames.per_video=0"], ["frames.per_video", "greater than or equal to 1"]),
-        (["split.name='Side ways'"], ["split.name", "Side ways", "pattern"]),
-        (["split.fold=1"], ["split.fold is not a parameter", "folds"]),
-        (["split.name=kfold", "split.folds=3", "ablation.seeds=[0,1,3]"], ["ablation.seeds [0, 1, 3]", "3 folds"]),
-        (["ablation.seeds=[1,1]"], ["ablation.seeds", "repeats"]),
-        (["ablation.opd=[none]"], ["ablation.opd", "lacks the full system's value all"]),
-        (["ablation.lora=[perhaps]"], ["ablation.lora", "'with' or 'without'"]),
-        (["align.batch_size=10"], ["align", "does not divide"]),
-        (["data.dir=elsewhere"], ["data.dir", "data/scenes/videos"]),
-        (["lora.target_modules=all"], ["lora.target_modules", "'all-linear'"]),
-        (["runtime.device=tpu"], ["runtime.device", "'cuda'"]),
-        (["lora.alpha=1e309"], ["lora.alpha", "finite"]),
-        (["encoder.epochs=true"], ["encoder", "epochs is true"]),
-        (["justaword"], ["key=value"]),
-        (["a b=[1"], ["a b"]),
+        (["nothing=1"], "nothing.*allowed here"),
+        (["frames.size=64"], "frames.size is called frames.pixels now"),
+        (["frames.per_video=0"], "frames.per_video.*greater than or equal to 1"),
+        (["split.fold=1"], "split.fold is not a parameter.*folds"),
+        (["split.name=kfold", "split.folds=3", "ablation.seeds=[0,1,3]"], r"ablation.seeds \[0, 1, 3\].*3 folds"),
+        (["ablation.seeds=[1,1]"], "ablation.seeds.*repeats"),
+        (["ablation.opd=[none]"], "ablation.opd.*lacks the full system's value all"),
+        (["ablation.lora=[perhaps]"], "ablation.lora.*'with' or 'without'"),
+        (["lora.target_modules=all"], "lora.target_modules.*'all-linear'"),
+        (["runtime.device=tpu"], "runtime.device.*'cuda'"),
+        (["lora.alpha=1e309"], "lora.alpha.*finite"),
+        (["encoder.epochs=true"], "encoder.*epochs is true"),
+        (["a b=[1"], "a b"),
     ],
 )
-def test_wrong_override_is_one_line_with_key_and_mend(overrides: list[str], words: list[str]) -> None:
-    with pytest.raises(UserError) as caught:
+def test_wrong_override_is_one_line_with_key_and_mend(overrides: list[str], words: str) -> None:
+    with refused(words):
         compose("smoke", overrides, conf=CONF)
-    message = str(caught.value)
-    assert "\n" not in message
-    for word in words:
-        assert word in message
 
 
 @pytest.mark.parametrize(
     ("text", "word"),
     [
-        (b"", "octopi scale smoke"),
-        (b"scale: [", "not YAML"),
         (b"scale: smoke\n", "missing"),
         ((ROOT / "params.yaml").read_bytes().replace(b"  pixels:", b"  size:"), "frames.size is called frames.pixels"),
-        (b"seed: 1\nseed: 2\n", "seed stands twice"),
         (b"align: {epochs: 1, epochs: 2}\n", "epochs stands twice"),
         ("scale: smoke\n".encode("utf-16"), "not UTF-8"),
         (None, "no such file"),
@@ -208,34 +189,23 @@ def test_too_few_objects_are_found_before_any_training(
 
 
 def test_variants_are_the_product_of_the_lists() -> None:
-    params = compose(
-        "smoke", ["ablation.encoders=[finetuned,base]", "ablation.opd=[all,needed]", "ablation.seeds=[3,5]"]
-    )
+    lists = ["ablation.encoders=[finetuned,base]", "ablation.opd=[all,needed]", "ablation.seeds=[3,5]"]
+    params = compose("smoke", lists, conf=CONF)
     keys = [v.key for v in params.ablation.variants()]
     assert len(keys) == len(set(keys)) == 2 * 2 * 2 * 2
-    assert keys[0] == "finetuned-with-all-3"
     assert [v.key for v in params.ablation.variants() if v.full] == ["finetuned-with-all-3", "finetuned-with-all-5"]
 
 
 def test_prune_keeps_what_params_name_and_removes_the_rest(tmp_path: Path) -> None:
     params = compose("smoke", conf=CONF)
-    names = (
-        "models/with/base-all-0",
-        "models/without/base-all-1",
-        "answers/finetuned-with-all-0",
-        "answers/old",
-        "encoder/3",
-    )
-    for name in (*names, "cross_validation/backbone", "cross_validation/old"):
+    kept = {"models/with/base-all-0", "answers/finetuned-with-all-0", "cross_validation/backbone"}
+    for name in (*kept, "models/without/base-all-1", "answers/old", "encoder/3", "cross_validation/old"):
         (tmp_path / name).mkdir(parents=True)
     (tmp_path / "answers" / ".DS_Store").touch()
     prune(params, tmp_path)
     assert (tmp_path / "answers" / ".DS_Store").is_file(), "it is no variant's"
     left = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_dir() and not list(p.iterdir())}
-    assert left == {
-        *("models/with/base-all-0", "models/without", "answers/finetuned-with-all-0", "encoder"),
-        "cross_validation/backbone",
-    }
+    assert left == kept | {"models/without", "encoder"}
     shutil.rmtree(tmp_path)
     prune(params, tmp_path)
 
@@ -252,9 +222,8 @@ def test_prune_keeps_what_params_name_and_removes_the_rest(tmp_path: Path) -> No
 def test_a_scale_of_ones_own_is_checked(text: str | bytes, words: str, tmp_path: Path) -> None:
     conf = Path(shutil.copytree(CONF, tmp_path / "conf"))
     (conf / "mine.yaml").write_bytes(text if isinstance(text, bytes) else text.encode())
-    with pytest.raises(UserError, match=words) as caught:
+    with refused(words):
         compose("mine", conf=conf)
-    assert "\n" not in str(caught.value)
 
 
 def test_a_recipe_brings_its_settings_and_gives_way_to_yours() -> None:
@@ -263,9 +232,8 @@ def test_a_recipe_brings_its_settings_and_gives_way_to_yours() -> None:
         composed = compose("smoke", [f"encoder.recipe={recipe}"], conf=CONF)
         assert composed.encoder.recipe == recipe
         assert composed.language == smoke.language.model_copy(update={"bos": recipe != "release"})
-        assert (composed.align.train_embeddings, composed.lora.max_grad_norm) == (
-            ("all", 0.0) if recipe == "release" else ("new", 1.0)
-        )
+        settings = ("all", 0.0) if recipe == "release" else ("new", 1.0)
+        assert (composed.align.train_embeddings, composed.lora.max_grad_norm) == settings
         assert composed.encoder.backbone == ("clip",)
     clip = "encoder.backbone=[clip]"
     release = compose("small", ["encoder.recipe=release", clip], conf=CONF).encoder
