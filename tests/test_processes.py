@@ -47,16 +47,23 @@ TELLING = (
 STOPPED = "slow: stopped; finished stages stay, and `octopi repro` goes on from there"
 
 
-def interrupted(folder: Path, *command: str) -> tuple[int, list[str]]:
-    """Run a command, press Ctrl-C when `now` is printed, and give its status and the lines from there on."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "SHELL": "/bin/sh"}
-    environment["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    process = subprocess.Popen(
-        command, cwd=folder, env=environment, text=True,
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT), "SHELL": "/bin/sh"}
+ENVIRONMENT["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+
+
+def launch(folder: Path, *command: str, errors: int, **environment: str) -> subprocess.Popen[str]:
+    """Start a command in a session of its own, as a terminal does."""
+    return subprocess.Popen(
+        command, cwd=folder, env={**ENVIRONMENT, **environment}, text=True,
+        stdout=subprocess.PIPE, stderr=errors, start_new_session=True,
         # What a script starts in the background is born deaf to Ctrl-C, as this process then is.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
+
+
+def interrupted(folder: Path, *command: str) -> tuple[int, list[str]]:
+    """Run a command, press Ctrl-C when `now` is printed, and give its status and the lines from there on."""
+    process = launch(folder, *command, errors=subprocess.STDOUT)
     try:
         assert process.stdout
         while (line := process.stdout.readline()) != "now\n":
@@ -95,7 +102,7 @@ def test_ctrl_c_ends_the_processes_of_a_stage(tmp_path: Path, body: str) -> None
 def test_threads_are_limited_before_and_after_torch_is_imported(code: str) -> None:
     """Some stages import it when they need it."""
     code = f"from pipeline.core.runtime import limit_threads; {code}; print(torch.get_num_threads())"
-    environment = {**os.environ, "OMP_NUM_THREADS": "2", "PYTHONPATH": str(ROOT)}
+    environment = {**ENVIRONMENT, "OMP_NUM_THREADS": "2"}
     assert subprocess.check_output([sys.executable, "-c", code], text=True, env=environment) == "1\n"
 
 
@@ -110,7 +117,7 @@ def test_a_stage_runs_the_code_beside_it_or_refuses(tmp_path: Path) -> None:
 
     def split(folder: Path, code: Path) -> tuple[str, str]:
         command = [sys.executable, "stages/split.py"]
-        environment = {**os.environ, "PYTHONPATH": str(code)}
+        environment = {**ENVIRONMENT, "PYTHONPATH": str(code)}
         done = subprocess.run(command, cwd=folder, env=environment, text=True, capture_output=True, check=False)
         assert done.returncode == 1
         return done.stdout, done.stderr
@@ -156,17 +163,7 @@ def started(here: Path, launcher: str, what: str) -> subprocess.Popen[str]:
     (here / "home" / "accelerate" / "default_config.yaml").write_text(yaml.safe_dump(own | {"num_processes": 1}))
     (here / "two.yaml").write_text(yaml.safe_dump(own | {"distributed_type": "MULTI_CPU", "num_processes": 2}))
     write_params(compose("smoke", [f"runtime.launcher={launcher}"], conf=ROOT / "conf"), here / "params.yaml")
-    programs = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    return subprocess.Popen(
-        ["python", "stage.py", what],
-        env={**os.environ, "PATH": programs, "PYTHONPATH": str(ROOT), "HF_HOME": str(here / "home")},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-        # A background shell has it ignored.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
+    return launch(here, "python", "stage.py", what, errors=subprocess.PIPE, HF_HOME=str(here / "home"))
 
 
 @pytest.mark.parametrize(
@@ -191,10 +188,7 @@ def test_a_stage_starts_itself_by_the_launcher(here: Path, launcher: str, line: 
 
 @pytest.mark.parametrize(
     ("launcher", "number"),
-    [
-        (SHIPPED, signal.SIGINT),
-        ("accelerate launch --cpu --config_file two.yaml", signal.SIGKILL),
-    ],
+    [(SHIPPED, signal.SIGINT), ("accelerate launch --cpu --config_file two.yaml", signal.SIGKILL)],
 )
 def test_a_stage_that_is_ended_leaves_no_process(here: Path, launcher: str, number: signal.Signals) -> None:
     process = started(here, launcher, "waits")
@@ -228,8 +222,7 @@ def test_a_stage_removes_what_killed_ones_were_writing(here: Path) -> None:
 def test_a_folder_that_was_killed_is_made_anew_and_one_in_the_making_left_alone(tmp_path: Path) -> None:
     kill = "import os; from pathlib import Path; from pipeline.core.io import atomic_folder"
     kill += "; making = atomic_folder(Path('[a]')); (making.__enter__() / 'half').touch(); os.kill(os.getpid(), 9)"
-    env = {**os.environ, "PYTHONPATH": str(ROOT)}
-    assert subprocess.run([sys.executable, "-c", kill], cwd=tmp_path, env=env, check=False).returncode == -9
+    assert subprocess.run([sys.executable, "-c", kill], cwd=tmp_path, env=ENVIRONMENT, check=False).returncode == -9
     (rest,) = tmp_path.iterdir()
     living, other = tmp_path / f".[a].{os.getppid()}.part", rest.with_name(rest.name.replace("[a]", "a"))
     living.mkdir()
@@ -244,7 +237,7 @@ def test_any_path_is_printed(tmp_path: Path) -> None:
     """On a terminal whose locale takes no bytes but UTF-8."""
     out = not_utf8(tmp_path, "found?.csv")
     command = [sys.executable, "-c", "from pipeline.cli import main; main()", "data", "audit"]
-    env = {**os.environ, "PYTHONIOENCODING": "utf-8:strict", "PYTHONPATH": str(ROOT)}
+    env = {**ENVIRONMENT, "PYTHONIOENCODING": "utf-8:strict"}
     done = subprocess.run(
         [*command, not_utf8(tmp_path, "none?"), "--out", out],
         cwd=tmp_path, env=env, capture_output=True, text=True, check=False,
@@ -342,8 +335,7 @@ if __name__ == "__main__":
 
 def run_script(text: str, folder: Path, *arguments: str) -> None:
     (folder / "work.py").write_text(text)
-    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    env = {**os.environ, "PYTHONPATH": path, "PYTHONWARNINGS": "ignore"}
+    env = {**ENVIRONMENT, "PYTHONWARNINGS": "ignore"}
     command = [sys.executable, "work.py", *arguments]
     done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
@@ -367,24 +359,18 @@ def hashes(folder: Path) -> dict[str, str]:
     return {f.name: hashlib.sha256(f.read_bytes()).hexdigest() for f in folder.iterdir()}
 
 
-def work_on(backend: str, folder: Path, videos: Path) -> dict[str, str]:
-    """The sha256 of each file that two workers make of the videos; what is said of bad jobs is checked here."""
-    folder.mkdir()
-    run_script(SCRIPT, folder, backend, str(videos), str(ROOT / "pipeline" / "physiclear"))
-    refused, died = (folder / "said").read_text().splitlines()
-    assert refused == "file 7 is broken; mend it"
-    assert died.startswith("numbers: a process died at or soon after "), died
-    assert died.endswith("Run again")
-    # No worker outlives the work.
-    wait_until_ended(p for p in psutil.process_iter(["cwd"]) if p.info["cwd"] == str(folder))
-    return hashes(folder / "out")
-
-
 @pytest.mark.parametrize("backend", ["processes", pytest.param("ray", marks=needs_ray)])
 def test_two_workers_make_the_same_bytes_on_either_backend(
     backend: str, made_alone: dict[str, str], tiny_videos: Path, tmp_path: Path
 ) -> None:
-    assert work_on(backend, tmp_path / "there", tiny_videos) == made_alone
+    run_script(SCRIPT, tmp_path, backend, str(tiny_videos), str(ROOT / "pipeline" / "physiclear"))
+    refused, died = (tmp_path / "said").read_text().splitlines()
+    assert refused == "file 7 is broken; mend it"
+    assert died.startswith("numbers: a process died at or soon after "), died
+    assert died.endswith("Run again")
+    # No worker outlives the work.
+    wait_until_ended(p for p in psutil.process_iter(["cwd"]) if p.info["cwd"] == str(tmp_path))
+    assert hashes(tmp_path / "out") == made_alone
 
 
 @needs_ray
