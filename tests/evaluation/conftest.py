@@ -45,21 +45,11 @@ def graded(
 ) -> list[Graded]:
     """One answer a question; the last `unread` could not be read."""
     about = objects or (PAIRS if measure == "choice" else [(o,) for o in OBJECTS] * 3)
-    variant = {"encoder": Encoder(encoder), "lora": Lora(lora), "opd": Opd(opd), "touch": Touch(touch)}
+    whose = {"encoder": Encoder(encoder), "lora": Lora(lora), "opd": Opd(opd), "touch": Touch(touch)}
+    whose |= {"task": task, "measure": measure, "seed": seed, "trained": seed}
+    whose |= {"truncated": False, "expected": "a", "predicted": ""}
+    read = [i < len(right) - unread for i in range(len(right))]
     return [
-        Graded(
-            question_id=f"{task}-{i:03}",
-            task=task,
-            measure=measure,
-            correct=correct,
-            parsed=i < len(right) - unread,
-            truncated=False,
-            expected="a",
-            predicted="",
-            objects=about[i],
-            seed=seed,
-            trained=seed,
-            **variant,
-        )
-        for i, correct in enumerate(right)
+        Graded(question_id=f"{task}-{i:03}", correct=right[i], parsed=read[i], objects=about[i], **whose)
+        for i in range(len(right))
     ]

@@ -18,18 +18,11 @@ from pipeline.evaluation.calibration import (
     reliability,
     rescale,
 )
+from tests.conftest import classified
 
 
 def said(expected: int, *probabilities: float, object_id: str = "rug") -> Classification:
-    return Classification(
-        video_id=f"{object_id}_0",
-        object_id=object_id,
-        part=Part.TEST,
-        property="hardness",
-        expected=expected,
-        predicted=int(np.argmax(probabilities)),
-        probabilities=probabilities,
-    )
+    return classified(f"{object_id}_0", "hardness", expected, int(np.argmax(probabilities)), probabilities)
 
 
 def drawn(count: int, temperature: float, seed: int = 0) -> list[Classification]:

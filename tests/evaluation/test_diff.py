@@ -8,10 +8,10 @@ import re
 import shutil
 import subprocess
 from contextlib import chdir
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-import yaml
 from dvc.repo import Repo
 from typer.testing import CliRunner
 
@@ -23,39 +23,34 @@ from tests.conftest import refused
 from tests.evaluation.conftest import graded
 
 REPORT = "reports/smoke-scenes"
-CHAIN = {
-    "stages": {
-        "questions": {
-            "cmd": "mkdir -p data/questions/0 && cp made/evaluation.jsonl data/questions/0/",
-            "deps": ["made/evaluation.jsonl"],
-            "outs": ["data/questions"],
-        },
-        "grade": {
-            "cmd": "cp made/graded.parquet data/",
-            "deps": ["made/graded.parquet", "data/questions"],
-            "params": ["epochs"],
-            "outs": ["data/graded.parquet"],
-        },
-        "report": {
-            "cmd": f"mkdir -p {REPORT} && cp made/metrics.json {REPORT}/",
-            "deps": ["made/metrics.json", "data/graded.parquet"],
-            "metrics": [{f"{REPORT}/metrics.json": {"cache": False}}],
-        },
-    }
-}
+CHAIN = f"""
+stages:
+  questions:
+    cmd: mkdir -p data/questions/0 && cp made/evaluation.jsonl data/questions/0/
+    deps: [made/evaluation.jsonl]
+    outs: [data/questions]
+  grade:
+    cmd: cp made/graded.parquet data/
+    deps: [made/graded.parquet, data/questions]
+    params: [epochs]
+    outs: [data/graded.parquet]
+  report:
+    cmd: mkdir -p {REPORT} && cp made/metrics.json {REPORT}/
+    deps: [made/metrics.json, data/graded.parquet]
+    metrics: [{REPORT}/metrics.json: {{cache: false}}]
+"""
 BEFORE = [i % 3 == 0 for i in range(18)]
 AFTER = [i % 3 == 0 or i % 6 in (1, 2, 4) for i in range(18)]
 
 
+@dataclass
 class History:
     """The repository; every `commit` reproduces before it commits."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    folder: Path
 
     def git(self, *arguments: str) -> str:
-        identity = ("-c", "user.name=a", "-c", "user.email=a@b.c")
-        command = ["git", *identity, *arguments]
+        command = ["git", "-c", "user.name=a", "-c", "user.email=a@b.c", *arguments]
         return subprocess.run(command, cwd=self.folder, capture_output=True, text=True, check=True).stdout.strip()
 
     def write(self, name: str, text: str) -> None:
@@ -67,10 +62,9 @@ class History:
         answers = graded("OPD", right, measure="combined")
         answers += graded("OPD", BEFORE, measure="combined", encoder="base")
         write_table(self.folder / "made" / "graded.parquet", Graded, answers)
-        rows = [
-            {"question_id": f"OPD-{i:03}", "videos": [f"o_{videos if i < 3 else 0}"], "gold": "x"} for i in range(18)
-        ]
-        self.write("made/evaluation.jsonl", "".join(json.dumps(row) + "\n" for row in rows))
+        asked = [(f"OPD-{i:03}", f"o_{videos if i < 3 else 0}") for i in range(18)]
+        rows = [json.dumps({"question_id": name, "videos": [video], "gold": "x"}) for name, video in asked]
+        self.write("made/evaluation.jsonl", "\n".join(rows) + "\n")
         self.write("made/metrics.json", json.dumps({"OPD": metric}))
 
     def commit(self, tag: str) -> None:
@@ -91,7 +85,7 @@ def history(tmp_path_factory: pytest.TempPathFactory) -> History:
     found.git("init", "--quiet")
     Repo.init(str(found.folder)).close()
     found.write(".dvc/config", "[core]\n    analytics = false\n")
-    found.write("dvc.yaml", yaml.safe_dump(CHAIN))
+    found.write("dvc.yaml", CHAIN)
     found.write(".gitignore", "/data/\n")
     found.write("params.yaml", "epochs: 4\nencoder: {sizes: [1, 2]}\n")
     found.answers(BEFORE)
@@ -109,28 +103,20 @@ def history(tmp_path_factory: pytest.TempPathFactory) -> History:
 @pytest.fixture
 def copy(history: History, tmp_path: Path) -> History:
     """One to change."""
-    shutil.copytree(history.folder, tmp_path / "copy", symlinks=True)
-    return History(tmp_path / "copy")
-
-
-def test_a_reproduction_done_twice_differs_in_nothing(history: History) -> None:
-    found = compare(history.folder, "first", "again")
-    assert not found["differs"]
-    assert found["tested"] == found["notes"] == []
-    assert not compare(history.folder, "asked")["differs"], "the working tree is as committed"
+    return History(shutil.copytree(history.folder, tmp_path / "copy", symlinks=True))
 
 
 def test_what_changed_is_named_with_what_it_moved(history: History) -> None:
+    same = compare(history.folder, "first", "again")
+    assert not same["differs"], "a reproduction done twice"
+    assert same["tested"] == same["notes"] == []
+    assert not compare(history.folder, "asked")["differs"], "the working tree is as committed"
     found = compare(history.folder, "again", "longer")
     assert found["parameters"] == [{"name": "epochs", "old": "4", "new": "5"}]
     assert found["metrics"] == [{"name": "smoke-scenes.OPD", "old": "0.25", "new": "0.75"}]
-    back = compare(history.folder, "longer", "again")
-    assert [row["difference"] for row in back["tested"]] == [-row["difference"] for row in found["tested"]]
-
-
-def test_the_paired_test_is_on_the_same_questions_and_over_objects(history: History) -> None:
-    """The base encoder answered as before, so that one system is tested; p by going through all signs."""
-    (row,) = compare(history.folder, "again", "longer")["tested"]
+    # The base encoder answered as before, so that one system is tested; p by going through all signs.
+    (row,), (back,) = found["tested"], compare(history.folder, "longer", "again")["tested"]
+    assert back["difference"] == -row["difference"]
     assert (row["part"], row["task"], row["n"], row["objects"]) == ("finetuned with all real", "OPD", 18, 6)
     assert row["difference"] == pytest.approx((sum(AFTER) - sum(BEFORE)) / 18, abs=1e-6)
     sums = [sum(AFTER[i] - BEFORE[i] for i in range(o, 18, 6)) for o in range(6)]
@@ -166,37 +152,30 @@ def test_the_working_tree_is_what_lies_on_disk(copy: History) -> None:
     assert found["tested"] == []
 
 
-@pytest.mark.parametrize(
-    ("file", "text"),
-    [
-        ("params.yaml", "{"),
-        (f"{REPORT}/metrics.json", "{"),
-        ("dvc.lock", "{"),
-        ("dvc.lock", "stages: [align]\n"),
-        ("dvc.lock", "stages: {align: 3}\n"),
-    ],
-)
-def test_a_broken_file_is_named(copy: History, file: str, text: str) -> None:
-    copy.write(file, text)
-    with refused(f"^workspace: .*{re.escape(Path(file).name)}.*; restore it from Git$"):
-        compare(copy.folder, "HEAD")
+def test_a_broken_file_is_named(copy: History) -> None:
+    broken = [(name, "{") for name in ("params.yaml", f"{REPORT}/metrics.json", "dvc.lock")]
+    for name, text in (*broken, ("dvc.lock", "stages: [align]\n"), ("dvc.lock", "stages: {align: 3}\n")):
+        good = (copy.folder / name).read_text()
+        copy.write(name, text)
+        with refused(f"^workspace: .*{re.escape(Path(name).name)}.*; restore it from Git$"):
+            compare(copy.folder, "HEAD")
+        copy.write(name, good)
 
 
 def test_an_address_is_shown_without_its_password(copy: History) -> None:
-    copy.write("dvc.yaml", yaml.safe_dump({**CHAIN, "params": ["params.yaml"]}))
+    copy.write("dvc.yaml", f"{CHAIN}params: [params.yaml]\n")
     copy.write("params.yaml", "epochs: 4\ntracking: {uri: 'http://ada:S3cret@host'}\n")
     found = json.dumps(compare(copy.folder, "HEAD"))
     assert "tracking.uri" in found
     assert "S3cret" not in found
 
 
-@pytest.mark.parametrize("revision", ["nowhere", "--all", "HEAD:params.yaml", "first..again"])
-def test_an_unknown_revision_is_refused(history: History, revision: str) -> None:
-    with refused(f"^{revision}: no commit of a Git repository"):
-        compare(history.folder, revision)
-
-
-def test_outside_of_a_project_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unknown_revision_or_folder_is_refused(
+    history: History, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for revision in ("nowhere", "--all", "HEAD:params.yaml", "first..again"):
+        with refused(f"^{revision}: no commit of a Git repository"):
+            compare(history.folder, revision)
     monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
     with refused(f"^{tmp_path}: .*not a git repository; go to a clone of the project$"):
         compare(tmp_path, "HEAD")
@@ -209,11 +188,7 @@ def test_what_a_person_sees(history: History, tmp_path: Path, monkeypatch: pytes
     file = tmp_path / "out" / "compared.json"
     other = CliRunner().invoke(app, ["diff", "again", "longer", "--json", str(file)])
     assert other.exit_code == 0, other.output
-    for words in (
-        r"epochs +4 +5",
-        r"smoke-scenes\.OPD +0\.25 +0\.75",
-        r"finetuned with all real +new - old +OPD",
-    ):
+    for words in (r"epochs +4 +5", r"smoke-scenes\.OPD +0\.25 +0\.75", r"finetuned with all real +new - old +OPD"):
         assert re.search(words, other.output), words
     history.git("update-ref", "refs/exps/ab/cdef/odd-name", "longer")
     assert re.search(r"epochs +4 +5", CliRunner().invoke(app, ["diff", "again", "odd-name"]).output)

@@ -64,9 +64,7 @@ def test_by_hand() -> None:
 
 
 @given(about=designs(), right=RIGHT, seed=st.integers(0, 9))
-def test_it_holds_the_accuracy_and_wilsons_and_depends_on_no_order_or_name(
-    about: About, right: list[bool], seed: int
-) -> None:
+def test_it_holds_wilsons_and_depends_on_no_order_or_name(about: About, right: list[bool], seed: int) -> None:
     values = np.array(right[: len(about)], dtype=float)
     found = accuracy_interval(values, about)
     assume(found is not None)

@@ -39,10 +39,7 @@ def test_neighbours_are_those_of_a_library(scale: float) -> None:
             own = [ok for r, ok in zip(found, right, strict=True) if r.expected[place] == level]
             if own:
                 assert rows[f"{p.name}: {word}", "base"].accuracy == pytest.approx(np.mean(own), abs=1e-6)
-
-
-def test_one_object_has_no_neighbours() -> None:
-    assert nearest_neighbours(np.zeros((3, 2)), videos(1, 3), CATALOGUE, 0) == []
+    assert nearest_neighbours(np.zeros((3, 2)), videos(1, 3), CATALOGUE, 0) == [], "one object has none"
 
 
 @pytest.mark.parametrize("count", [2, 3, 40])

@@ -95,20 +95,6 @@ def test_sign_flip_of_darwins_maize() -> None:
     assert float(sign_flip(np.ones(40), design_of(single(40, 1)))) == 1 / (DRAWS + 1)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_sign_flip_against_scipy(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    values = rng.integers(-1, 2, size=35) + 0.1 * rng.integers(-3, 4, size=35)
-    theirs = stats.permutation_test(
-        (values.reshape(7, 5).sum(axis=1),),
-        lambda x, axis: x.sum(axis=axis),
-        permutation_type="samples",
-        n_resamples=np.inf,
-        vectorized=True,
-    )
-    assert float(sign_flip(values, design_of(single(7, 5)))) == pytest.approx(theirs.pvalue, abs=1e-12)
-
-
 def test_pairs_are_split_by_least_squares_and_all_signs_gone_through() -> None:
     """Each difference as the mean of its objects' effects; their shares of the sum are flipped, one by one."""
     about = tuple(itertools.combinations("abcde", 2))

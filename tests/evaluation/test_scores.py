@@ -15,6 +15,7 @@ from pipeline.evaluation.intervals import accuracy_interval
 from pipeline.evaluation.paired import paired
 from pipeline.evaluation.scores import candidate_rows, effect_rows, error_rows, score_rows, with_holm
 from pipeline.tasks import TASKS
+from tests.conftest import classified
 from tests.evaluation.conftest import CATALOGUE, PAIRS, graded
 
 RNG = np.random.default_rng(1)
@@ -43,9 +44,7 @@ def test_one_seed_and_all_of_them() -> None:
     assert (pooled.n, pooled.unread) == (15, 1.5)
     assert (pooled.right, pooled.accuracy) == pytest.approx((means.sum(), means.mean()), abs=1e-6)
     assert (pooled.low, pooled.high) == pytest.approx(accuracy_interval(means, PAIRS), abs=1e-6)
-
-
-def test_over_seeds_only_what_all_of_them_answered() -> None:
+    # Over seeds only what all of them answered.
     rows = score_rows(graded("PC", [True] * 15) + graded("PC", [False] * 10, seed=1), CATALOGUE)
     assert [(r.seed, r.n, r.accuracy) for r in rows] == [("0", 15, 1), ("1", 10, 0), ("all", 10, 0.5)]
     assert score_rows([], CATALOGUE) == []
@@ -134,19 +133,12 @@ def test_effects_are_the_full_system_less_one_part() -> None:
     assert effect_rows(graded("PC", full[0]), CATALOGUE) == [], "nothing to compare with"
 
 
-def heads(
-    part: Part, predicted: dict[str, tuple[int, int, int]], expected: tuple[int, int, int]
-) -> list[Classification]:
+Classes = tuple[int, int, int]
+
+
+def heads(part: Part, predicted: dict[str, Classes], expected: Classes) -> list[Classification]:
     return [
-        Classification(
-            video_id=video,
-            object_id=video[:-2],
-            part=part,
-            property=name,
-            expected=e,
-            predicted=p,
-            probabilities=(1.0,),
-        )
+        classified(video, name, e, p, part=part)
         for video, classes in predicted.items()
         for name, e, p in zip(CATALOGUE.property_names, expected, classes, strict=True)
     ]
@@ -177,12 +169,9 @@ def test_recall_of_each_class_is_scikit_learns() -> None:
         own = [c for c in said if c.property == p.name]
         true, taken = [c.expected for c in own], [c.predicted for c in own]
         known = recall_score(true, taken, labels=sorted(set(true)), average=None)
-        found = [
-            row(rows, task="heads_recall", seed="all", measure=f"{p.name}: {p.levels[level]}")
-            for level in sorted(set(true))
-        ]
-        assert [r.accuracy for r in found] == pytest.approx(known.tolist(), abs=1e-6)
-        assert [r.n for r in found] == [true.count(level) for level in sorted(set(true))]
+        for level, recall in zip(sorted(set(true)), known, strict=True):
+            found = row(rows, task="heads_recall", seed="all", measure=f"{p.name}: {p.levels[level]}")
+            assert (found.accuracy, found.n) == (pytest.approx(recall, abs=1e-6), true.count(level))
     assert {r.measure for r in rows if r.task == "heads_recall" and "bump" in r.measure} == {"bumpiness: big bumps"}
 
 
@@ -204,9 +193,8 @@ CONSTANT = out_of_fold([(WRONG, HALF, WRONG, RIGHT), (HALF, HALF, WRONG, RIGHT)]
 
 def test_cross_validation_is_the_mean_over_repeats() -> None:
     rows = score_rows([], CATALOGUE, None, {"backbone": FROZEN})
-    assert {(r.task, r.encoder, r.lora, r.opd, r.touch, r.seed, r.n) for r in rows} == {
-        ("cross_validation", "backbone", "", "", "", "all", 4)
-    }
+    named = {(r.task, r.encoder, r.lora, r.opd, r.touch, r.seed, r.n) for r in rows}
+    assert named == {("cross_validation", "backbone", "", "", "", "all", 4)}
     combined = row(rows, measure="combined")
     shares = np.array([0.5, 0.5, 0.5, 1])
     assert (combined.accuracy, combined.right) == (shares.mean(), shares.sum())
@@ -216,13 +204,8 @@ def test_cross_validation_is_the_mean_over_repeats() -> None:
 
 def test_encoders_are_compared_video_by_video() -> None:
     (found,) = candidate_rows({"backbone": FROZEN, "constant": CONSTANT}, "backbone")
-    assert (found.part, found.change, found.n, found.objects, found.seeds) == (
-        "encoder",
-        "constant - backbone",
-        4,
-        3,
-        2,
-    )
+    assert (found.part, found.change) == ("encoder", "constant - backbone")
+    assert (found.n, found.objects, found.seeds) == (4, 3, 2)
     gains = np.array([[-1, 0, 0, 0], [0, -1, -1, 0]], dtype=float)
     gap = paired(gains, ABOUT)
     expected = (gap.difference, gap.low, gap.high, gap.p)
