@@ -78,9 +78,8 @@ def by_question(rows: list[Row], folder: Path) -> dict[str, dict[str, Row]]:
 
 
 def score(**columns: object) -> ScoreRow:
-    return ScoreRow.model_validate(
-        {"seed": "all", "chance": 0.1, "right": 9, "unread": 0, "n": 24, "sets": 8, **columns}
-    )
+    usual = {"seed": "all", "chance": 0.1, "right": 9, "unread": 0, "n": 24, "sets": 8}
+    return ScoreRow.model_validate(usual | columns)
 
 
 def test_frames(project: Path, tmp_path: Path) -> None:

@@ -85,9 +85,7 @@ def test_a_figure_a_question_and_stale_ones_go(tmp_path: Path) -> None:
     drawn = draw(table, tmp_path)
     assert [p.name for p in drawn] == ["which-where.png", "no-error.png"]
     assert sorted(p.name for p in (tmp_path / FOLDER).iterdir()) == sorted(p.name for p in drawn)
-    first = [p.read_bytes() for p in drawn]
-    assert all(b.startswith(b"\x89PNG") and len(b) > 5000 for b in first)
-    assert [p.read_bytes() for p in draw(table, tmp_path)] == first
+    assert all(p.read_bytes().startswith(b"\x89PNG") for p in drawn)
 
 
 def test_the_committed_table_is_consistent() -> None:
@@ -122,18 +120,9 @@ def test_errors_have_intervals_over_objects() -> None:
     assert mean_of([1.0], ["a"]) == Error(1.0, n=1)
     share = share_of([1, 0, 0, 1], [(o,) for o in "abcd"])
     assert share.low < share.value == 0.5 < share.high
-    row = {
-        "task": "t",
-        "measure": "m",
-        "encoder": "e",
-        "seed": "all",
-        "right": 4,
-        "unread": 0,
-        "chance": 0.1,
-        "n": 9,
-        "sets": 4,
-    }
-    score = ScoreRow.model_validate({**row, "accuracy": 0.5, "low": 0.4, "high": 0.7})
+    named = {"task": "t", "measure": "m", "encoder": "e", "seed": "all"}
+    counted = {"right": 4, "unread": 0, "chance": 0.1, "n": 9, "sets": 4}
+    score = ScoreRow.model_validate({**named, **counted, "accuracy": 0.5, "low": 0.4, "high": 0.7})
     assert error_of(score).columns == pytest.approx({"error": 0.5, "low": 0.3, "high": 0.6, "n": 9})
     assert error_of(score.model_copy(update={"low": None, "high": None})).columns == {"error": 0.5, "n": 9}
 
