@@ -25,6 +25,8 @@ REDUCED = (
     f"scenes.objects=[{','.join(OBJECTS)}]",
     "scenes.videos_per_object=2",
     "scenes.frames=12",
+    "scenes.width=96",
+    "scenes.height=72",
     "questions.train={opd:12,pc:12,pss:12,pom:12}",
     "questions.evaluation={opd:4,pc:4,pss:4,pom:4,psr:4}",
     "encoder.epochs=1",
@@ -73,5 +75,5 @@ def copy_project(folder: Path) -> Project:
     project = Project(folder)
     project.run("git", "init", "--quiet")
     project.run("dvc", "init", "--quiet")
-    project.run("dvc", "config", "core.analytics", "false")
+    (folder / ".dvc" / "config").write_text("[core]\nanalytics = false\n")
     return project

@@ -38,24 +38,18 @@ def test_everything_a_person_looks_at_is_there(project: Project) -> None:
     assert (project.folder / "mlruns" / "mlflow.db").is_file()
     assert (project.folder / "reports" / "index.html").is_file()
     shown = read_json(report / "samples.json")
-    assert [(s["question_id"], s["part"], len(s["answered"])) for s in shown["examples"]] == [
-        ("rice-a", "train", 2),
-        ("rice-b", "train", 2),
-    ]
+    examples = [(s["question_id"], s["part"], len(s["answered"])) for s in shown["examples"]]
+    assert examples == [("rice-a", "train", 2), ("rice-b", "train", 2)]
     assert list(shown["not_asked"]) == ["toothbrush"]
-    header, values = project.run("dvc", "metrics", "show", "--md").splitlines()[:3:2]
-    assert header.count("|") - 2 <= 12, header
-    assert "smoke-scenes" in values
+    assert "smoke-scenes" in project.run("dvc", "metrics", "show", "--md")
 
 
 def test_the_packaged_model_answers_as_the_evaluation_did(project: Project) -> None:
     key, data = "finetuned-with-all-0", project.folder / "data"
     model = Octopi.from_pretrained(project.folder / "models" / key, device="cpu")
-    words = [
-        project.folder / place / "words.safetensors"
-        for place in ("data/models/without/finetuned-all-0", f"models/{key}/language")
-    ]
-    assert not torch.equal(*(load_file(file)["weight"] for file in words)), "both trainings train them"
+    trainings = (data / "models/without/finetuned-all-0", project.folder / "models" / key / "language")
+    words = [load_file(folder / "words.safetensors")["weight"] for folder in trainings]
+    assert not torch.equal(*words), "both trainings train them"
     questions = read_jsonl(data / "questions" / "0" / "evaluation.jsonl", Question)
     predictions = read_jsonl(data / "answers" / key / "real.jsonl", Prediction)
     files = {f.stem: f for f in (data / "scenes" / "videos").rglob("*.*")}
@@ -104,7 +98,6 @@ def test_two_processes_train_like_one(project: Project) -> None:
     for launcher in (["python"], two):
         project.run(*launcher, "stages/align.py", "finetuned", "all", "0")
         results.append(load_file(project.folder / "data/models/without/finetuned-all-0/connector.safetensors"))
-    project.run("octopi", "scale", *REDUCED)
     assert results[0].keys() == results[1].keys()
     # Of AdamW's one step of 3e-3. Where a gradient is as small as its epsilon of 1e-8, the step follows rounding.
     for name, value in results[0].items():
@@ -114,6 +107,7 @@ def test_two_processes_train_like_one(project: Project) -> None:
 def test_a_further_fold_trains_none_of_the_others_anew(project: Project) -> None:
     """One of three folds, then two, by the published recipe: how answers are pooled is tests/report/test_folds.py's."""
     folds = ("encoder.recipe=release", "encoder.epochs=1", "split.name=kfold", "split.folds=3")
+    folds += ("cross_validation.models=[constant]",)
     project.run("octopi", "scale", *REDUCED, *folds, "ablation.seeds=[1]")
     project.run("dvc", "repro", "report")
     data, report = project.folder / "data", project.folder / "reports" / "smoke-scenes"
@@ -129,12 +123,10 @@ def test_a_further_fold_trains_none_of_the_others_anew(project: Project) -> None
     assert (data / "questions" / "2" / "train.jsonl").is_file()
     trained = ("finetune_encoder@1", "align@finetuned-all-1", "lora@finetuned-all-1", "answer@finetuned-with-all-1")
     assert "up to date" in project.run("dvc", "status", *trained)
-    project.run("octopi", "scale", *REDUCED)
 
 
 def test_going_back_to_a_scale_restores_it(project: Project) -> None:
-    """After other recipes, folds and a seed: their encoders and their report lie there now."""
-    project.run("octopi", "scale", *REDUCED, "seed=1")
+    """After other recipes and folds: their encoders and their report lie there now."""
     project.run("octopi", "scale", *REDUCED)
     shutil.rmtree(project.folder / "data" / "models" / "with")
     output = project.run("dvc", "repro")

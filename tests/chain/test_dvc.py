@@ -21,14 +21,8 @@ from tests.closure import ROOT, closure
 from tests.project import OBJECTS, REDUCED, copy_project
 
 TOLD = {
-    *(
-        "pipeline/__init__.py",
-        "pipeline/core/errors.py",
-        "pipeline/config/__init__.py",
-        "pipeline/config/params.py",
-        "pipeline/core/stage.py",
-    ),
-    *("pipeline/core/parallel.py", "pipeline/tracking"),
+    *("pipeline/__init__.py", "pipeline/config/__init__.py", "pipeline/config/params.py", "pipeline/tracking"),
+    *("pipeline/core/errors.py", "pipeline/core/parallel.py", "pipeline/core/stage.py"),
 }
 """How a stage is told what to do and says what it did. They change no result. Of `config.py`, which every stage reads,
 that holds for all but what it computes: a parameter is a dependency by its value, and params.yaml has them all."""
@@ -79,10 +73,6 @@ def test_config_computes_nothing_else() -> None:
     sections = [kind for kind in vars(config).values() if isinstance(kind, type) and issubclass(kind, config.Section)]
     own = {n for s in sections for n, value in vars(s).items() if isinstance(value, FunctionType | property)}
     assert {name for name in own if not name.startswith("_")} == {*COMPUTED, "report_name"}
-
-
-def test_every_script_is_a_stage() -> None:
-    assert {f.stem for f in (ROOT / "stages").glob("*.py")} == set(stages())
 
 
 def leaves(values: Any, key: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
@@ -138,10 +128,9 @@ def test_a_split_without_a_test_object_is_one_warning(tmp_path: Path, caplog: py
     project.run("octopi", "scale", *REDUCED, f"scenes.objects=[{learnt}]", "cross_validation.folds=2")
     said = [line for line in project.run("dvc", "repro", "questions").splitlines() if "WARNING" in line]
     with Repo(str(project.folder)) as repo:
-        for stage in repo.index.stages:
-            for dependency in stage.deps if stage.name.startswith("answer@") else ():
-                if dependency.exists:
-                    dependency.save()
+        for stage in (stage for stage in repo.index.stages if stage.name.startswith("answer@")):
+            for dependency in (dependency for dependency in stage.deps if dependency.exists):
+                dependency.save()
     assert [line for line in caplog.messages if "is empty" in line] == []
     assert len(said) == 1
     assert "7 of 7 test objects have no videos (bath_towel, " in said[0]
@@ -169,16 +158,15 @@ def test_every_parameter_is_a_stages_or_is_known_to_change_nothing() -> None:
     assert found - covered == NONE.keys()
 
 
-@pytest.mark.parametrize("name", sorted(stages()))
-def test_a_command_is_the_same_whatever_the_parameters(name: str) -> None:
+def test_a_command_is_the_same_whatever_the_parameters() -> None:
     """DVC runs a stage anew where its command is another."""
-    own = stages()[name]
-    filled = set(re.findall(r"\$\{(.*?)\}", own["cmd"]))
-    assert filled == {f"item.{axis}" for axis in own.get("matrix", {})}
+    assert {f.stem for f in (ROOT / "stages").glob("*.py")} == set(stages()), "every script is a stage"
+    for name, own in stages().items():
+        filled = set(re.findall(r"\$\{(.*?)\}", own["cmd"]))
+        assert filled == {f"item.{axis}" for axis in own.get("matrix", {})}, name
 
 
 def test_what_changes_answers_is_a_parameter_of_what_answers() -> None:
-    batches = {"answer": "language.generation_batch_size"}
-    batches |= dict.fromkeys(("embed", "cross_validate"), "encoder.embed_batch_size")
-    batches |= {"finetune_encoder": "encoder.max_grad_norm"}
-    assert {name for name, key in batches.items() if key not in stages()[name]["params"]} == set()
+    keys = {"answer": "language.generation_batch_size", "finetune_encoder": "encoder.max_grad_norm"}
+    keys |= dict.fromkeys(("embed", "cross_validate"), "encoder.embed_batch_size")
+    assert {name for name, key in keys.items() if key not in stages()[name]["params"]} == set()

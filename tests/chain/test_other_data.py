@@ -14,9 +14,8 @@ import yaml
 from safetensors.numpy import load_file
 
 from pipeline.config import SplitConfig
-from pipeline.core.errors import UserError
 from pipeline.core.io import read_jsonl, read_table
-from pipeline.core.records import Assignment, Opd, Part, Prediction, Question
+from pipeline.core.records import Assignment, Opd, Part, Question
 from pipeline.report.build import write_report
 from pipeline.scenes.recipe import recipe_of
 from pipeline.tasks import TASKS
@@ -26,9 +25,10 @@ from pipeline.videos.catalogue.wording import levels_named
 from pipeline.videos.files import list_videos
 from pipeline.videos.split import assign_objects
 from tests.closure import ROOT
+from tests.conftest import refused
 from tests.fake_run import fake_params, write_run
 from tests.project import OBJECTS, REDUCED, Project, copy_project
-from tests.tasks.shared import drafted
+from tests.tasks.shared import drafted, grade
 
 PHYSICLEAR = ROOT / "pipeline" / "physiclear"
 LEVELS = ["not sticky", "slightly sticky", "sticky", "very sticky"]
@@ -41,18 +41,12 @@ def write_catalogue(folder: Path, *, name: str = "stickiness", split: str = "min
     del language["dataset"]
     for prop in language["properties"]:
         del prop["cues"]
-    language["properties"].append(
-        {
-            "name": name,
-            "levels": LEVELS,
-            "more": "stickier",
-            "less": "less sticky",
-            "most": "stickiest",
-            "least": "least sticky",
-            "alone": "Overall, it is {level} to the touch.",
-            "phrases": [[f"it lets go like number {n}"] for n in range(4)],
-        }
-    )
+    words = {"more": "stickier", "less": "less sticky", "most": "stickiest", "least": "least sticky"}
+    told = {
+        "alone": "Overall, it is {level} to the touch.",
+        "phrases": [[f"it lets go like number {n}"] for n in range(4)],
+    }
+    language["properties"].append({"name": name, "levels": LEVELS, **words, **told})
     language["unstructured"] = language["unstructured"].replace(" and", ",").replace(".", f", and {{{name}}}.")
     language["structured"] = language["structured"].replace(".", f" that is {{{name}}}.")
     target, other = {name: [2, 3]}, {name: [0, 1]}
@@ -60,16 +54,11 @@ def write_catalogue(folder: Path, *, name: str = "stickiness", split: str = "min
     folder.mkdir(parents=True)
     (folder / "properties.yaml").write_text(yaml.safe_dump(language, sort_keys=False))
     known = load_catalogue(PHYSICLEAR).objects
-    with (folder / "objects.csv").open("w", newline="") as stream:
-        writer = csv.writer(stream)
-        writer.writerow(
-            ["object_id", f"split_{split}", "name", "hardness", "roughness", "bumpiness", name, "ripeness_thing"]
-        )
-        for number, (object_id, part) in enumerate(zip(OBJECTS, PARTS, strict=True)):
-            ratings = [" ".join(map(str, r)) for r in known[object_id].ratings]
-            writer.writerow(
-                [object_id, part, known[object_id].name, *ratings, f"{number % 4} {number % 4}", number % 3]
-            )
+    rows = [f"object_id,split_{split},name,hardness,roughness,bumpiness,{name},ripeness_thing"]
+    for number, (object_id, part) in enumerate(zip(OBJECTS, PARTS, strict=True)):
+        ratings = ",".join(" ".join(map(str, r)) for r in known[object_id].ratings)
+        rows.append(f'{object_id},{part},"{known[object_id].name}",{ratings},{number % 4} {number % 4},{number % 3}')
+    (folder / "objects.csv").write_text("\n".join(rows))
     return folder
 
 
@@ -80,70 +69,63 @@ def rows(report: Path, table: str) -> list[dict[str, str]]:
 
 def check_report(report: Path, name: str) -> None:
     """Rows for the fourth property wherever there are rows for properties, and nothing of the paper's."""
-    chances = {
-        row["measure"]: float(row["chance"]) for row in rows(report, "scores") if row["task"] in ("OPD", "heads")
-    }
+    scores = rows(report, "scores")
+    chances = {row["measure"]: float(row["chance"]) for row in scores if row["task"] in ("OPD", "heads")}
     expected = dict.fromkeys(("hardness", "roughness", "bumpiness"), 1 / 3) | {name: 1 / 4, "combined": 1 / 108}
     assert chances == pytest.approx(expected, abs=1e-6)
-    about = Counter(row["task"] for row in rows(report, "scores") if row["measure"] == name)
-    assert {"OPD", "heads", "cross_validation"} <= about.keys()
+    assert {"OPD", "heads", "cross_validation"} <= {row["task"] for row in scores if row["measure"] == name}
     videos = {row["video_id"] for row in rows(report, "confusion") if row["property"] == name}
-    heads = next(row for row in rows(report, "scores") if (row["task"], row["measure"]) == ("heads", name))
+    heads = next(row for row in scores if (row["task"], row["measure"]) == ("heads", name))
     assert len(videos) == float(heads["n"])
-    counts = [row for row in rows(report, "dataset") if row["row"].startswith(f"{name}: ")]
-    assert [row["row"] for row in counts] == [f"{name}: {level}" for level in LEVELS]
-    assert [int(row["objects"]) for row in counts] == [3, 2, 2, 2]
-    together = [row for row in rows(report, "dataset") if row["table"] == "property_combinations"]
+    dataset = rows(report, "dataset")
+    counts = {row["row"]: int(row["objects"]) for row in dataset if row["row"].startswith(f"{name}: ")}
+    assert [*counts.items()] == [(f"{name}: {level}", n) for level, n in zip(LEVELS, (3, 2, 2, 2), strict=True)]
+    together = [row for row in dataset if row["table"] == "property_combinations"]
     assert sum(int(row["objects"]) for row in together) == len(OBJECTS)
     assert all(row["row"].endswith(tuple(LEVELS)) for row in together)
-    assert not any(row["published"] for row in rows(report, "dataset"))
+    assert not any(row["published"] for row in dataset)
     readme = (report / "README.md").read_text()
     assert "48.10" not in readme, "the paper's figures are about another data set"
     assert name in readme
 
 
 @pytest.fixture(scope="module")
-def tacky(tmp_path_factory: pytest.TempPathFactory) -> Catalogue:
-    """A catalogue whose fourth property has a name of two words."""
-    return load_catalogue(write_catalogue(tmp_path_factory.mktemp("other") / "catalogue", name="surface_tack"))
-
-
-def pool_of_nine(catalogue: Catalogue) -> Pool:
+def pool(tmp_path_factory: pytest.TempPathFactory) -> Pool:
+    """Of a catalogue whose fourth property has a name of two words."""
+    catalogue = load_catalogue(write_catalogue(tmp_path_factory.mktemp("other") / "catalogue", name="surface_tack"))
     return Pool(Part.TEST, catalogue, {o: [f"{o}_0"] for o in catalogue.objects})
 
 
 @pytest.mark.parametrize("task", list(TASKS))
-def test_every_task_asks_about_it_and_reads_its_own_answers(tacky: Catalogue, task: str) -> None:
-    questions = drafted(task, pool_of_nine(tacky), 1)
+def test_every_task_asks_about_it_and_reads_its_own_answers(pool: Pool, task: str) -> None:
+    questions = drafted(task, pool, 1)
     assert any("surface_tack" in q.gold.properties for q in questions)
     for question in questions:
         assert all(len(labels) == 4 for labels in question.gold.labels)
         for dialogue in question.dialogues:
             said = " ".join(part for turn in dialogue.turns for part in (turn.user, turn.assistant))
             assert "_" not in said, "a name is spoken in words"
-            outputs = tuple(turn.assistant for turn in dialogue.turns)
-            answer = Prediction(question_id="x", task=task, outputs=outputs, truncated=False, tokens=1)
-            assert all(s.correct for s in TASKS[task].grade(question, answer, tacky)), outputs
+            outputs = [turn.assistant for turn in dialogue.turns]
+            assert all(s.correct for s in grade(question, *outputs, catalogue=pool.catalogue)), outputs
 
 
-def test_a_described_fourth_property_is_graded(tacky: Catalogue) -> None:
-    question = next(q for q in drafted("OPD", pool_of_nine(tacky), 1) if q.gold.labels[0][3] == 2)
-    dialogue = question.dialogue(Opd.ALL)
-    (turn,) = dialogue.turns
+def test_a_described_fourth_property_is_graded(pool: Pool) -> None:
+    question = next(q for q in drafted("OPD", pool, 1) if q.gold.labels[0][3] == 2)
+    (turn,) = question.dialogue(Opd.ALL).turns
     for said, right in (("slightly sticky", False), ("sticky", True), ("", False)):
         text = turn.assistant.replace("is sticky.", f"is {said}.")
-        answer = Prediction(question_id="x", task="OPD", outputs=(text,), truncated=False, tokens=1)
-        scores = {s.measure: s for s in TASKS["OPD"].grade(question, answer, tacky)}
+        scores = {s.measure: s for s in grade(question, text, catalogue=pool.catalogue)}
         assert list(scores) == ["hardness", "roughness", "bumpiness", "surface_tack", "combined"]
         assert scores["surface_tack"].predicted == said
         assert [scores[m].correct for m in ("hardness", "surface_tack", "combined")] == [True, right, right]
-    assert TASKS["OPD"].chance(tacky)["combined"] == pytest.approx(1 / 108)
+    assert TASKS["OPD"].chance(pool.catalogue)["combined"] == pytest.approx(1 / 108)
 
 
-def test_scenes_need_three_properties_and_take_more(tacky: Catalogue) -> None:
-    assert recipe_of("rice", narrowed(tacky, slice(3)), 0) == recipe_of("rice", tacky, 0)
-    with pytest.raises(UserError, match=r"hardness.*data\.source=videos"):
-        recipe_of("rice", narrowed(tacky, slice(1, None)), 0)
+def test_scenes_need_three_properties_and_take_more(pool: Pool) -> None:
+    whole = pool.catalogue
+    assert recipe_of("rice", narrowed(whole, slice(3)), 0) == recipe_of("rice", whole, 0)
+    with refused(r"hardness.*data\.source=videos"):
+        recipe_of("rice", narrowed(whole, slice(1, None)), 0)
 
 
 def narrowed(catalogue: Catalogue, kept: slice) -> Catalogue:
@@ -160,12 +142,8 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
     write_catalogue(project.folder / "my catalogue")
     few = ("questions.train={opd:8,pc:24,pss:24,pom:6}", "questions.evaluation={opd:8,pc:24,pss:24,pom:6,psr:4}")
     timm = (
-        "cross_validation.models=[constant]",
-        "encoder.recipe=tuned",
-        "encoder.backbone=[timm,scenes]",
-        "pretrain.objects=16",
-        "pretrain.steps=3",
-        "encoder.weights=data/weights/efficientnet-lite0",
+        *("encoder.recipe=tuned", "encoder.backbone=[timm,scenes]", "encoder.weights=data/weights/efficientnet-lite0"),
+        *("pretrain.objects=16", "pretrain.steps=3", "cross_validation.models=[constant]"),
     )
     project.run("octopi", "scale", *REDUCED, *few, *timm, "data.catalogue='my catalogue'", "split.name=mine")
     project.run("dvc", "repro", "questions", "embed")
@@ -199,11 +177,6 @@ def test_the_report_has_its_rows(tmp_path: Path) -> None:
     check_report(tmp_path / "reports" / params.report_name, "stickiness")
 
 
-def blocks(page: str, language: str) -> list[str]:
-    """The fenced blocks of a page in one language, without the indentation that lists give them."""
-    return [dedent(text) for text in re.findall(rf"^ *```{language}\n(.*?)^ *```$", page, re.M | re.S)]
-
-
 def test_the_documented_example_is_valid(tmp_path: Path) -> None:
     page = (ROOT / "docs" / "data.md").read_text()
     for name, text in re.findall(r"^`my-lab/([^`]+)`\n\n```\w+\n(.*?)^```$", page, re.M | re.S):
@@ -226,7 +199,9 @@ def test_the_documented_example_is_valid(tmp_path: Path) -> None:
 
 
 def test_the_documented_fourth_property_is_valid(tmp_path: Path) -> None:
-    added, sentences = blocks((ROOT / "docs" / "data.md").read_text(), "yaml")[1:]
+    page = (ROOT / "docs" / "data.md").read_text()
+    # Lists indent their blocks.
+    added, sentences = map(dedent, re.findall(r"^ *```yaml\n(.*?)^ *```$", page, re.M | re.S)[1:])
     language = yaml.safe_load((PHYSICLEAR / "properties.yaml").read_text())
     del language["dataset"]
     language["properties"] += yaml.safe_load(added)

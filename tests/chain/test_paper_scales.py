@@ -10,9 +10,7 @@ from __future__ import annotations
 import json
 import os
 from collections import Counter
-from pathlib import Path
 
-import cv2
 import pytest
 import torch
 import yaml
@@ -22,7 +20,7 @@ from pipeline.core.io import read_jsonl
 from pipeline.core.records import Prediction
 from tests.checkpoints import write_clip, write_vicuna
 from tests.closure import ROOT
-from tests.conftest import moving_square
+from tests.conftest import encode, moving_square
 from tests.project import OBJECTS, Project, copy_project
 
 WIDTH = 64
@@ -78,7 +76,8 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
     folder = project.folder
     project.environment |= {"PYTHONPATH": f"{folder}{os.pathsep}{ROOT}", "OMP_NUM_THREADS": "1"}
     for number, name in enumerate(f"{o}_{n}" for o in OBJECTS for n in range(2)):
-        write_mov(folder / "physiclear" / f"{name}.mov", number)
+        # In the public data set's container, codec and size.
+        encode(folder / "physiclear" / f"{name}.mov", moving_square(12, number, 320, 240), "mpeg4", "yuv420p")
     write_clip(folder / "weights" / "clip-vit-large-patch14", config=VIT_L)
     words = "\n".join(f.read_text() for f in sorted((ROOT / "pipeline" / "physiclear").glob("*.*")))
     for scale, layers in LAYERS.items():
@@ -87,15 +86,6 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
     shipped = yaml.safe_load((folder / "conf" / "accelerate" / "fsdp.yaml").read_text())
     (folder / "cpu.yaml").write_text(yaml.safe_dump({**shipped, "use_cpu": True, "main_process_port": 0}))
     return project
-
-
-def write_mov(path: Path, seed: int) -> None:
-    """A video in the public data set's container, codec and size."""
-    path.parent.mkdir(exist_ok=True)
-    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"mp4v"), 25.0, (320, 240))
-    for frame in moving_square(12, seed, 320, 240):
-        writer.write(frame)
-    writer.release()
 
 
 def launches(project: Project) -> dict[str, dict[str, object]]:
@@ -107,10 +97,8 @@ def launches(project: Project) -> dict[str, dict[str, object]]:
 def check_trained(project: Project, scale: str) -> None:
     """Trained parameters are finite and of the shapes that the published layouts and the scale give."""
     folder = project.folder / "data" / "models" / "with" / "finetuned-all-0"
-    connector, adapter = (
-        load_file(folder / "connector.safetensors"),
-        load_file(folder / "adapter" / "adapter_model.safetensors"),
-    )
+    connector = load_file(folder / "connector.safetensors")
+    adapter = load_file(folder / "adapter" / "adapter_model.safetensors")
     # An adapter is written in its base's format.
     for values, dtype in ((connector.values(), torch.float32), (adapter.values(), torch.bfloat16)):
         assert all(value.dtype == dtype and value.isfinite().all() for value in values)
@@ -151,13 +139,12 @@ def test_paper_7b_to_the_report(project: Project) -> None:
     for noted in project.folder.glob("*-?.json"):
         noted.unlink()
     project.run("octopi", "scale", "paper-7b", *FEW, f"{LAUNCHER} whole")
-    output = project.run("dvc", "repro", "lora")
+    output = project.run("dvc", "repro", "report")
     assert "Running stage 'align@finetuned-all-0'" in output
     assert "Running stage 'embed'" not in output
     assert "Running stage 'finetune_encoder" not in output
     assert list(launches(project).values()) == [{"processes": 2}] * 4
     check_trained(project, "paper-7b")
-    project.run("dvc", "repro", "report")
-    report = project.folder / "reports" / "paper-7b-videos" / "README.md"
-    assert "weights/vicuna-7b-v1.5" in report.read_text()
-    assert "Published 7b" in report.read_text()
+    report = (project.folder / "reports" / "paper-7b-videos" / "README.md").read_text()
+    assert "weights/vicuna-7b-v1.5" in report
+    assert "Published 7b" in report
