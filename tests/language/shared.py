@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 from torch.nn import functional as F
-from transformers import MistralConfig, MistralForCausalLM
 
 from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig, TrainConfig
 from pipeline.core.embeddings import EmbeddingStore
 from pipeline.core.io import save_tensors, write_table
 from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Embedding, Opd, Question
-from pipeline.language.chat import encode, render
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import Job, Material, add_lora, assemble, fit
 from pipeline.training import trainer
@@ -27,10 +25,7 @@ CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")
 
 def write_store(folder: Path, frames: Sequence[tuple[str, int, str]], tensor: torch.Tensor) -> EmbeddingStore:
     """Embeddings of these frames: their videos, their places and how they are flipped."""
-    index = [
-        Embedding(video_id=video, frame_index=frame, flip=flip, row=row)
-        for row, (video, frame, flip) in enumerate(frames)
-    ]
+    index = [Embedding(video_id=v, frame_index=f, flip=flip, row=row) for row, (v, f, flip) in enumerate(frames)]
     write_table(folder / INDEX_FILE, Embedding, index)
     save_tensors(folder / TENSOR_FILE, {TENSOR: tensor})
     return EmbeddingStore(folder)
@@ -74,21 +69,6 @@ def adapted(model: OctopiForCausalLM, config: LoraTrainConfig = LORA) -> OctopiF
     return model.eval()
 
 
-def mistral(vocab_size: int, window: int | None) -> MistralForCausalLM:
-    """Its layers see the last `window` tokens alone."""
-    shapes = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 4}
-    return MistralForCausalLM(
-        MistralConfig(vocab_size=vocab_size, num_key_value_heads=2, sliding_window=window, **shapes)
-    )
-
-
-def prompt(question: Question, opd: Opd, model: OctopiForCausalLM) -> list[int]:
-    """Token ids of a question's first turn."""
-    dialogue = question.dialogue(opd)
-    text = render(dialogue.turns, model.tokenizer, system_prompt="", frames=FRAMES, complete=False)
-    return list(encode(text, model.tokenizer).input_ids)
-
-
 def call(model: OctopiForCausalLM) -> dict[str, torch.Tensor]:
     """A question about two frames."""
     ids = torch.tensor([[5, model.start_id, model.frame_id, model.frame_id, model.end_id, 7, 9]])
@@ -103,35 +83,9 @@ def assert_comes_back(model: OctopiForCausalLM, folder: Path, **how: str) -> Oct
     return again
 
 
-def by_transformers(
-    model: OctopiForCausalLM, ids: list[int], features: torch.Tensor, ends: Sequence[int], limit: int
-) -> list[int]:
-    """What follows one prompt, alone and without padding, by `generate` and its own cache."""
-    row = torch.tensor([ids])
-    new = model.llm.generate(
-        inputs_embeds=model.embed(row, features[None]),
-        attention_mask=torch.ones_like(row),
-        max_new_tokens=limit,
-        do_sample=False,
-        eos_token_id=list(ends),
-        pad_token_id=0,
-    )
-    return [int(token) for token in new[0]]
-
-
-def embedded(
-    model: OctopiForCausalLM,
-    ids: list[int],
-    features: torch.Tensor,
-    words: torch.Tensor,
-    own: Mapping[str, torch.Tensor],
-) -> torch.Tensor:
-    """`embed` of one row by the letter: token for token, with a counter of frames.
-
-    Args:
-        words: The word embeddings.
-        own: The connector's parameters.
-    """
+def embedded(model: OctopiForCausalLM, ids: list[int], features: torch.Tensor, words: torch.Tensor) -> torch.Tensor:
+    """`embed` of one row by the letter: token for token, with a counter of frames, and the embeddings of `words`."""
+    own = dict(model.connector.named_parameters())
     frames, rows = iter(features), []
     for token in ids:
         if token == model.frame_id:

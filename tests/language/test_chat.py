@@ -29,12 +29,6 @@ VICUNA = (
     "{% elif m.role == 'user' %}USER: {{ m.content }} ASSISTANT:"
     "{% else %}{% generation %} {{ m.content }}{{ eos_token }}{% endgeneration %}{% endif %}{% endfor %}"
 )
-LLAMA3 = (
-    "{{ bos_token }}{% for m in messages %}<|head|>{{ m.role }}<|/head|>\n\n"
-    "{{ m.content | trim }}<|eot|>{% endfor %}"
-    "{% if add_generation_prompt %}<|head|>assistant<|/head|>\n\n{% endif %}"
-)
-"""As Llama-3 writes it, with shorter names."""
 PSR = (
     Turn(user=f"Feel {TACTILE} and {TACTILE}. Describe both.", assistant="a) It is soft.\n\nb) It is hard — très dur."),
     Turn(user="Which is better for a wound?", assistant="The first, since 1 < 2."),
@@ -52,9 +46,8 @@ def sentence_piece() -> PreTrainedTokenizerFast:
     trainer = trainers.BpeTrainer(vocab_size=420, special_tokens=special + letters, show_progress=False)
     tokenizer.train_from_iterator([f"USER: {t.user} ASSISTANT: {t.assistant}" for t in PSR], trainer)
     tokenizer.post_processor = processors.TemplateProcessing(single="<s> $A", special_tokens=[("<s>", 1)])
-    return PreTrainedTokenizerFast(
-        tokenizer_object=tokenizer, bos_token="<s>", eos_token="</s>", unk_token="<unk>", pad_token="<unk>"
-    )
+    named = {"bos_token": "<s>", "eos_token": "</s>", "unk_token": "<unk>", "pad_token": "<unk>"}
+    return PreTrainedTokenizerFast(tokenizer_object=tokenizer, **named)
 
 
 @pytest.fixture(scope="module", params=[pytest.param("smollm2", marks=pytest.mark.slow), "bytes", "sentence pieces"])
@@ -83,12 +76,10 @@ def reference(
 ) -> tuple[list[int], list[int]]:
     """Token ids and labels by transformers alone."""
     video = "<tact_start>" + frames * "<tact_frame>" + "<tact_end>"
-    messages = [{"role": "system", "content": system}] if system else []
+    said = [("system", system)] if system else []
     for turn in turns:
-        messages += [
-            {"role": "user", "content": turn.user.replace(TACTILE, video)},
-            {"role": "assistant", "content": turn.assistant},
-        ]
+        said += [("user", turn.user.replace(TACTILE, video)), ("assistant", turn.assistant)]
+    messages = [{"role": role, "content": text} for role, text in said]
     found = tokenizer.apply_chat_template(
         messages, chat_template=template, return_assistant_tokens_mask=True, return_dict=True
     )
@@ -100,9 +91,8 @@ def reference(
     return ids, labels
 
 
-TALKS = st.lists(st.tuples(WORDS, WORDS), min_size=1, max_size=3).map(
-    lambda talk: tuple(Turn(user=u, assistant=f"It is {a}") for u, a in talk)
-)
+TURNS = st.builds(Turn, user=WORDS, assistant=WORDS.map("It is {}".format))
+TALKS = st.lists(TURNS, min_size=1, max_size=3).map(tuple)
 
 
 @settings(max_examples=30)
@@ -128,6 +118,11 @@ CHATML = (
     "{% for m in messages %}<|im_start|>{{ m.role }}\n{{ m.content }}<|im_end|>\n{% endfor %}"
     "{% if add_generation_prompt %}<|im_start|>assistant\n{% endif %}"
 )
+LLAMA3 = (
+    "{{ bos_token }}{% for m in messages %}<|head|>{{ m.role }}<|/head|>\n\n{{ m.content | trim }}<|eot|>{% endfor %}"
+    "{% if add_generation_prompt %}<|head|>assistant<|/head|>\n\n{% endif %}"
+)
+"""As Llama-3 writes it, with shorter names."""
 QWEN3 = """{%- set ns = namespace(last=-1) %}
 {%- for m in messages %}{% if m.role == 'user' %}{% set ns.last = loop.index0 %}{% endif %}{% endfor %}
 {%- for m in messages %}
@@ -164,18 +159,20 @@ def knows_all(request: pytest.FixtureRequest) -> PreTrainedTokenizerFast:
 
 @pytest.mark.parametrize("family", FAMILIES)
 @settings(max_examples=20)
-@given(talk=st.lists(st.tuples(WORDS, WORDS), min_size=1, max_size=3))
+@given(talk=TALKS)
 def test_what_a_template_writes_before_an_answer_is_asked_and_not_learnt(
-    family: str, knows_all: PreTrainedTokenizerFast, talk: list[tuple[str, str]]
+    family: str, knows_all: PreTrainedTokenizerFast, talk: tuple[Turn, ...]
 ) -> None:
     """Before each answer alike, in training and in every prompt, against the format written by hand."""
     template, lead, message = FAMILIES[family]
     knows_all.chat_template = template
-    turns = tuple(Turn(user=f"Feel {u}.", assistant=f"It is {a}.") for u, a in talk)
-    trained = encode(render(turns, knows_all, system_prompt="", frames=1, complete=True), knows_all)
+    turns = tuple(Turn(user=f"Feel {t.user}.", assistant=f"{t.assistant}.") for t in talk)
+    whole = render(turns, knows_all, system_prompt="", frames=1, complete=True)
+    trained = encode(whole, knows_all)
+    opening, _, closing = message.format(role="assistant", text="|text|").partition("|text|")
+    end = knows_all.convert_tokens_to_ids(closing.strip())
     text = "<s>" if family == "llama3" else ""
     for number, turn in enumerate(turns, 1):
-        opening, _, closing = message.format(role="assistant", text="|text|").partition("|text|")
         text += message.format(role="user", text=turn.user) + opening + lead
         prompt = render(turns[:number], knows_all, system_prompt="", frames=1, complete=False)
         assert prompt.text == text
@@ -184,14 +181,11 @@ def test_what_a_template_writes_before_an_answer_is_asked_and_not_learnt(
         assert trained.input_ids[:place] == asked.input_ids
         text += turn.assistant + closing
         learnt = list(takewhile(lambda label: label != IGNORE_INDEX, trained.labels[place:]))
-        assert [trained.labels[place - 1], learnt[-1]] == [
-            IGNORE_INDEX,
-            knows_all.convert_tokens_to_ids(closing.strip()),
-        ]
+        assert [trained.labels[place - 1], learnt[-1]] == [IGNORE_INDEX, end]
         assert str(knows_all.decode(learnt[:-1])).strip() == turn.assistant
-    assert render(turns, knows_all, system_prompt="", frames=1, complete=True).text == text
+    assert whole.text == text
     assert sum(label != IGNORE_INDEX and a == IGNORE_INDEX for a, label in pairwise(trained.labels)) == len(turns)
-    assert end_ids(knows_all) == (2, knows_all.convert_tokens_to_ids(closing.strip()))
+    assert end_ids(knows_all) == (2, end)
 
 
 REFUSED = {
@@ -221,21 +215,13 @@ class Model(LlamaForCausalLM): config_class = Config
 class Tokenizer(PreTrainedTokenizerFast): pass
 """
     )
-    edit(
-        folder / "config.json",
-        model_type="own",
-        auto_map={"AutoConfig": "own.Config", "AutoModelForCausalLM": "own.Model"},
-    )
-    edit(
-        folder / "tokenizer_config.json",
-        tokenizer_class="Tokenizer",
-        auto_map={"AutoTokenizer": [None, "own.Tokenizer"]},
-    )
+    model, tokenizer = {"AutoConfig": "own.Config", "AutoModelForCausalLM": "own.Model"}, [None, "own.Tokenizer"]
+    edit(folder / "config.json", model_type="own", auto_map=model)
+    edit(folder / "tokenizer_config.json", tokenizer_class="Tokenizer", auto_map={"AutoTokenizer": tokenizer})
     monkeypatch.setattr("builtins.input", lambda *_: "y")
     monkeypatch.setattr("sys.stdin", io.StringIO("y\n" * 4))
-    for load in (lambda: load_llm(folder, torch.float32), lambda: load_tokenizer(folder)):
-        with suppress(UserError):
-            load()
-        assert not ran.exists()
+    with suppress(UserError):
+        load_tokenizer(folder)
     with refused(r"^language\.weights: "):
         load_llm(folder, torch.float32)
+    assert not ran.exists()

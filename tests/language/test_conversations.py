@@ -18,8 +18,6 @@ from pipeline.core.embeddings import EmbeddingStore
 from pipeline.core.io import read_table, save_tensors
 from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Embedding, Turn
 from pipeline.core.runtime import derive_seed
-from pipeline.language.base import load_tokenizer
-from pipeline.language.chat import IGNORE_INDEX, encode, render
 from pipeline.language.conversations import FILLER, UpdateSampler, collate
 from pipeline.language.generate import write_prompt
 from pipeline.language.training import Material, assemble
@@ -29,18 +27,16 @@ from tests.language.shared import FRAMES, generation, taking
 
 def test_without_a_begin_token_all_else_is_the_same(held: Material) -> None:
     """As the published code trains and asks."""
-    tokenizer = load_tokenizer(Path(held.language.weights))
-    turns = [Turn(user="Feel {tactile}.", assistant="Soft.")]
-    rendered = render(turns, tokenizer, system_prompt="", frames=2, complete=True)
-    usual, without = (encode(rendered, tokenizer, bos=bos) for bos in (True, False))
-    assert (without.input_ids, without.labels) == (usual.input_ids[1:], usual.labels[1:])
-    _, theirs = assemble(replace(held, language=held.language.model_copy(update={"bos": False})), taking(6), "test")
-    _, ours = assemble(held, taking(6), "test")
-    assert [[1, *e["input_ids"].tolist()] for e in theirs.written] == [e["input_ids"].tolist() for e in ours.written]
-    asked = write_prompt(turns, tokenizer, generation(1).model_copy(update={"bos": False}), FRAMES)
-    assert asked == tuple(
-        i for i, label in zip(without.input_ids, without.labels, strict=True) if label == IGNORE_INDEX
+    (_, ours), (model, theirs) = (
+        assemble(replace(held, language=held.language.model_copy(update={"bos": bos})), taking(6), "test")
+        for bos in (True, False)
     )
+    for own, other in zip(ours.written, theirs.written, strict=True):
+        assert own["input_ids"][0] == 1
+        assert all(torch.equal(own[name][1:], value) for name, value in other.items())
+    turns = [Turn(user="Feel {tactile}.", assistant="Soft.")]
+    without = write_prompt(turns, model.tokenizer, generation(1).model_copy(update={"bos": False}), FRAMES)
+    assert write_prompt(turns, model.tokenizer, generation(1), FRAMES) == (1, *without)
 
 
 def test_same_draws_for_same_epoch_and_others_for_another(held: Material) -> None:
@@ -84,7 +80,7 @@ def test_an_update_has_the_same_questions_on_any_number_of_devices(
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
 def test_given_descriptions_are_not_learnt_and_stand_beside_other_touches(share: float, held: Material) -> None:
     _, usual = assemble(held, taking(1000), "test")
-    _, data = assemble(held, taking(1000, given=share), "test")
+    model, data = assemble(held, taking(1000, given=share), "test")
     several, changed = 0, 0
     for index, (own, question) in enumerate(zip(usual.questions, data.questions, strict=True)):
         assert question == own.model_copy(update={"videos": question.videos}), "asked and answered as before"
@@ -95,17 +91,12 @@ def test_given_descriptions_are_not_learnt_and_stand_beside_other_touches(share:
             continue
         changed += 1
         assert question.videos in {q.videos for q in usual.questions if len(q.videos) == len(own.videos) > 1}
-        text = held_text(data.written[index]["input_ids"].tolist(), learnt, held)
-        dialogue = question.dialogue(held.opd)
-        assert text.split() == " ".join(t.assistant[t.described :] for t in dialogue.turns).split()
+        # The words that are learnt, without the tokens that end a turn.
+        text = model.tokenizer.decode(data.written[index]["input_ids"][learnt], skip_special_tokens=True)
+        turns = question.dialogue(held.opd).turns
+        assert text.split() == " ".join(t.assistant[t.described :] for t in turns).split()
     assert several
     assert changed == pytest.approx(share * several, abs=1)
-
-
-def held_text(ids: list[int], learnt: torch.Tensor, held: Material) -> str:
-    """The words that are learnt, without the tokens that end a turn."""
-    tokenizer = load_tokenizer(Path(held.language.weights))
-    return tokenizer.decode([i for i, one in zip(ids, learnt, strict=True) if one], skip_special_tokens=True)
 
 
 def test_nothing_is_learnt_of_what_fills_up_an_update(held: Material) -> None:
@@ -128,6 +119,5 @@ def test_an_embedding_that_is_not_finite_is_named_by_its_video(
     tensor = store.tensor.clone()
     tensor[entry.row, 2] = value
     save_tensors(tmp_path / TENSOR_FILE, {TENSOR: tensor})
-    wanted = f"safetensors: {entry.video_id} has an embedding that is not finite.*dvc repro"
-    with refused(wanted):
+    with refused(f"safetensors: {entry.video_id} has an embedding that is not finite.*dvc repro"):
         EmbeddingStore(tmp_path)

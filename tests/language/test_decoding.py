@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from torch.nn import functional as F
-from transformers import DynamicCache, LlamaForCausalLM
+from transformers import DynamicCache, LlamaForCausalLM, MistralConfig, MistralForCausalLM
 
 from pipeline.config import LanguageConfig
 from pipeline.language import decoding
@@ -16,10 +16,18 @@ from pipeline.language.chat import IGNORE_INDEX
 from pipeline.language.decoding import greedy
 from pipeline.language.octopi import OctopiForCausalLM
 from tests.checkpoints import write_llama
-from tests.language.shared import DIM, LORA, adapted, by_transformers, mistral
+from tests.language.shared import DIM, LORA, adapted
 
 MANY = (5, 9, 13, 40, 41)
 """Tokens that end an answer: so many that rows end at different places."""
+
+
+def by_transformers(model: OctopiForCausalLM, ids: list[int], features: torch.Tensor, limit: int) -> list[int]:
+    """What follows one prompt, alone and without padding, by `generate` and its own cache."""
+    row = torch.tensor([ids])
+    given = {"inputs_embeds": model.embed(row, features[None]), "attention_mask": torch.ones_like(row)}
+    how = {"max_new_tokens": limit, "do_sample": False, "eos_token_id": list(MANY), "pad_token_id": 0}
+    return list(map(int, model.llm.generate(**given, **how)[0]))
 
 
 def asked(model: OctopiForCausalLM, shared: int) -> tuple[list[list[int]], list[torch.Tensor]]:
@@ -36,13 +44,19 @@ def asked(model: OctopiForCausalLM, shared: int) -> tuple[list[list[int]], list[
     return prompts, features
 
 
+def mistral(window: int | None) -> MistralForCausalLM:
+    """Its layers see the last `window` tokens alone."""
+    shapes = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 4}
+    return MistralForCausalLM(MistralConfig(vocab_size=260, num_key_value_heads=2, sliding_window=window, **shapes))
+
+
 @pytest.fixture(scope="module", params=["llama", "window"])
 def steady(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> OctopiForCausalLM:
     """A Llama, and a model whose layers see the last eight tokens alone."""
     folder = write_llama(tmp_path_factory.mktemp("llama"), seed=4)
     if request.param == "window":
         torch.manual_seed(2)
-        mistral(260, window=8).save_pretrained(folder)
+        mistral(window=8).save_pretrained(folder)
     torch.manual_seed(1)
     return OctopiForCausalLM.from_base(folder, DIM).eval()
 
@@ -57,10 +71,7 @@ def test_each_row_is_decoded_as_it_is_alone(
     limits = [1 + (5 * number) % 17 for number in range(len(prompts))]
     found = greedy(steady, prompts, features, MANY, limits)
     with torch.inference_mode():
-        expected = [
-            by_transformers(steady, p, f, MANY, limit) for p, f, limit in zip(prompts, features, limits, strict=True)
-        ]
-    assert found == expected
+        assert found == [by_transformers(steady, *each) for each in zip(prompts, features, limits, strict=True)]
     assert len({len(row) for row in found}) > 3, "rows end at different places"
 
 
@@ -85,12 +96,9 @@ def test_loss_and_gradients_are_those_of_all_at_once(language: LanguageConfig, t
     model.double()
     if kind == "checkpointing":
         model.train().llm.gradient_checkpointing_enable(gradient_checkpointing_kwargs={"use_reentrant": False})
-    ids = torch.randint(4, 250, (3, 24))
-    ids[:, :10] = ids[0, :10]
-    if kind == "nothing shared":
-        ids[1, 0] += 1
-    if kind == "one row":
-        ids = ids[:1]
+    ids = torch.randint(4, 250, (1 if kind == "one row" else 3, 24))
+    if kind != "nothing shared":
+        ids[1:, :10] = ids[0, :10]
     features = torch.randn(len(ids), 2, DIM, dtype=torch.float64)
     if kind != "no frames":
         ids[:, 12:16] = torch.tensor([model.start_id, model.frame_id, model.frame_id, model.end_id])
@@ -141,23 +149,22 @@ def test_answers_are_those_of_a_llama_with_these_embeddings(tied: bool, tmp_path
     model = OctopiForCausalLM.from_base(folder, DIM).eval()
     torch.nn.init.normal_(model.train_words().weight, generator=torch.manual_seed(5))
     plain = LlamaForCausalLM.from_pretrained(folder)
-    head = plain.lm_head.weight.detach().clone()
-    plain.lm_head.weight = torch.nn.Parameter(head)
+    plain.lm_head.weight = torch.nn.Parameter(plain.lm_head.weight.detach().clone())
     plain.model.embed_tokens.weight = torch.nn.Parameter(model.words.weight.detach().clone())
     prompts = [[1, 50, 60, 70, 80, 90], [1, 50, 60, 71, 80, 93, 94]]
     said = greedy(model, prompts, [torch.zeros(0, DIM)] * 2, (), [8, 8])
-    for prompt, tokens in zip(prompts, said, strict=True):
-        ids = list(prompt)
-        while len(ids) < len(prompt) + 8:
-            ids.append(int(plain(torch.tensor([ids])).logits[0, -1].argmax()))
-        assert tokens == ids[len(prompt) :]
-    assert len({tuple(tokens) for tokens in said}) == 2
+    for ids, tokens in zip(prompts, said, strict=True):
+        for token in tokens:
+            assert token == plain(torch.tensor([ids])).logits[0, -1].argmax()
+            ids.append(token)
+    assert [len(tokens) for tokens in said] == [8, 8]
+    assert said[0] != said[1]
 
 
 @pytest.mark.parametrize("window", [None, 8])
 def test_the_cache_gives_back_what_transformers_own_does(window: int | None) -> None:
     torch.manual_seed(0)
-    llm = mistral(50, window).eval()
+    llm = mistral(window).eval()
     own, other = roomy_cache(llm.config), DynamicCache(config=llm.config)
     for start, stop in ((0, 5), (5, 6), (6, 7), (7, 7 + AHEAD), (7 + AHEAD, 8 + AHEAD)):
         ids = torch.randint(0, 50, (3, stop - start), generator=torch.manual_seed(stop))

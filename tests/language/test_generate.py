@@ -11,23 +11,29 @@ import torch
 from pipeline.config import LanguageConfig
 from pipeline.core.embeddings import EmbeddingStore
 from pipeline.core.records import Opd, Question
-from pipeline.language.chat import TACT_FRAME
+from pipeline.language.chat import TACT_FRAME, encode, render
 from pipeline.language.conversations import evaluation_features
 from pipeline.language.generate import answer
 from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import assemble
 from tests.checkpoints import write_llama
 from tests.conftest import refused
-from tests.language.shared import DIM, FRAMES, generation, material, prompt, taking
+from tests.language.shared import DIM, FRAMES, generation, material, taking
+
+
+def prompt(question: Question, opd: Opd, model: OctopiForCausalLM) -> list[int]:
+    """Token ids of a question's first turn."""
+    turns = question.dialogue(opd).turns
+    text = render(turns, model.tokenizer, system_prompt="", frames=FRAMES, complete=False)
+    return list(encode(text, model.tokenizer).input_ids)
 
 
 def by_hand(model: OctopiForCausalLM, question: Question, store: EmbeddingStore, opd: Opd, count: int) -> list[int]:
     """The likeliest tokens, the whole sequence anew for each, without cache or padding."""
-    said, start = prompt(question, opd, model), len(prompt(question, opd, model))
-    features = evaluation_features(question, store, FRAMES)[None]
+    said, features = prompt(question, opd, model), evaluation_features(question, store, FRAMES)[None]
     for _ in range(count):
         said.append(int(model(torch.tensor([said]), features).logits[0, -1].argmax()))
-    return said[start:]
+    return said[-count:]
 
 
 def test_an_answer_at_the_limit_is_whole_and_one_beyond_is_cut(
@@ -36,9 +42,7 @@ def test_an_answer_at_the_limit_is_whole_and_one_beyond_is_cut(
     """A token that the model says after some others is made the end token."""
     asked = [q for q in questions if q.task == "OPD"][:3]
     assert all(p.truncated and p.tokens == 8 for p in answer(model, store, asked, Opd.ALL, generation(4, 8), FRAMES))
-    said = {q.question_id: by_hand(model, q, store, Opd.ALL, 8) for q in asked}
-    question = next(q for q in asked if len(set(said[q.question_id])) > 1)
-    new = said[question.question_id]
+    question, new = next((q, new) for q in asked if len(set(new := by_hand(model, q, store, Opd.ALL, 8))) > 1)
     place = next(i for i in range(1, 8) if new[i] not in new[:i])
     other = copy.copy(model)
     other.tokenizer = copy.deepcopy(model.tokenizer)
@@ -57,16 +61,13 @@ def test_an_answer_ends_where_the_positions_do_whatever_its_neighbours(
     asked = sorted((q for q in questions if q.task == "PSS"), key=lambda q: len(prompt(q, Opd.ALL, wide)))
     lengths = {q.question_id: len(prompt(q, Opd.ALL, wide)) for q in asked}
     most = max(lengths.values()) + 5
-    torch.manual_seed(0)
     folder = write_llama(tmp_path / "tight", pad="</s>", max_position_embeddings=most)
     tight = OctopiForCausalLM.from_base(folder, DIM)
     alone, together = (answer(tight, store, asked, Opd.ALL, generation(size, 40), FRAMES) for size in (1, 50))
     assert alone == together
-    room = {name: min(40, most - length) for name, length in lengths.items()}
-    assert len(set(room.values())) > 2
-    for prediction in together:
-        assert prediction.tokens <= room[prediction.question_id]
-        assert prediction.truncated == (prediction.tokens == room[prediction.question_id])
+    room = [min(40, most - lengths[p.question_id]) for p in together]
+    assert len(set(room)) > 2
+    assert all(p.tokens <= own and p.truncated == (p.tokens == own) for p, own in zip(together, room, strict=True))
     assert any(p.tokens == 5 for p in together)
 
 
