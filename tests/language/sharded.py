@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import sys
@@ -57,54 +58,44 @@ def shard_on_cpus() -> None:
 
 
 def watch(said: dict[str, Any]) -> None:
-    """Note how parameters are held and what format they compute in, of the first batch."""
+    """Note how parameters are held, and what format they compute in."""
     step = TrainableTrainer.training_step
 
     def watched(self: TrainableTrainer, model: Module, *args: Any, **kwargs: Any) -> torch.Tensor:
         if "sharded" not in said:
-            said["sharded"] = all(isinstance(p, DTensor) for p in model.parameters())
-            said["share"] = sum(p.to_local().numel() for p in model.parameters()) / sum(
-                p.numel() for p in model.parameters()
-            )
-            projection = model.get_submodule("connector.projection.0")
+            parameters = list(model.parameters())
+            said["sharded"] = all(isinstance(p, DTensor) for p in parameters)
+            said["share"] = sum(p.to_local().numel() for p in parameters) / sum(p.numel() for p in parameters)
 
             def note(module: Module, *_: object) -> None:
                 said["computes"] = str(module.weight.dtype)
 
-            hook = projection.register_forward_hook(note)
-            loss = step(self, model, *args, **kwargs)
-            hook.remove()
-            return loss
+            model.get_submodule("connector.projection.0").register_forward_hook(note)
         return step(self, model, *args, **kwargs)
 
     TrainableTrainer.training_step = watched
 
 
 def main() -> None:
-    folder, weights, embeddings, what = Path(sys.argv[1]), sys.argv[2], Path(sys.argv[3]), sys.argv[4]
+    place, weights, embeddings, what = sys.argv[1:]
+    folder, rank, updates = Path(place), os.environ["RANK"], itertools.count(1)
     shard_on_cpus()
     torch.set_num_threads(1)
     questions = read_jsonl(folder / "questions.jsonl", Question)
-    held = material(LanguageConfig(weights=weights), questions, EmbeddingStore(embeddings))
-    rank = os.environ["RANK"]
+    held = material(LanguageConfig(weights=weights), questions, EmbeddingStore(Path(embeddings)))
+
+    def die(*_: object) -> None:
+        if next(updates) == DIES and rank == "1":
+            os.kill(os.getpid(), signal.SIGKILL)
+
     if what == "killed":
         for kind in KINDS:
             said: dict[str, Any] = {}
             watch(said)
-            trained = run(kind, held, folder / "whole")
+            save_tensors(folder / f"{kind}-whole-{rank}.safetensors", run(kind, held, folder / "whole").state)
             write_json(folder / f"{kind}-{rank}.json", said)
-            save_tensors(folder / f"{kind}-whole-{rank}.safetensors", trained.state)
-        counter = iter(range(1, 100))
-
-        def die(*_: object) -> None:
-            if next(counter) == DIES and rank == "1":
-                os.kill(os.getpid(), signal.SIGKILL)
-
         register_optimizer_step_pre_hook(die)
-        run("lora", held, folder / "killed")
-    else:
-        trained = run("lora", held, folder / "killed")
-        save_tensors(folder / f"lora-resumed-{rank}.safetensors", trained.state)
+    save_tensors(folder / f"lora-resumed-{rank}.safetensors", run("lora", held, folder / "killed").state)
 
 
 if __name__ == "__main__":

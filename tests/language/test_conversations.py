@@ -18,7 +18,7 @@ from pipeline.core.embeddings import EmbeddingStore
 from pipeline.core.io import read_table, save_tensors
 from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Embedding, Turn
 from pipeline.core.runtime import derive_seed
-from pipeline.language.conversations import FILLER, UpdateSampler, collate
+from pipeline.language.conversations import FILLER, UpdateSampler
 from pipeline.language.generate import write_prompt
 from pipeline.language.training import Material, assemble
 from tests.conftest import refused
@@ -26,7 +26,6 @@ from tests.language.shared import FRAMES, generation, taking
 
 
 def test_without_a_begin_token_all_else_is_the_same(held: Material) -> None:
-    """As the published code trains and asks."""
     (_, ours), (model, theirs) = (
         assemble(replace(held, language=held.language.model_copy(update={"bos": bos})), taking(6), "test")
         for bos in (True, False)
@@ -37,14 +36,6 @@ def test_without_a_begin_token_all_else_is_the_same(held: Material) -> None:
     turns = [Turn(user="Feel {tactile}.", assistant="Soft.")]
     without = write_prompt(turns, model.tokenizer, generation(1).model_copy(update={"bos": False}), FRAMES)
     assert write_prompt(turns, model.tokenizer, generation(1), FRAMES) == (1, *without)
-
-
-def test_same_draws_for_same_epoch_and_others_for_another(held: Material) -> None:
-    _, data = assemble(held, taking(6), "test")
-    first = [data[i]["features"] for i in range(len(data))]
-    assert all(torch.equal(a, data[i]["features"]) for i, a in enumerate(first))
-    data.follow(lambda: 1)
-    assert not all(torch.equal(a, data[i]["features"]) for i, a in enumerate(first))
 
 
 @settings(max_examples=30)
@@ -97,16 +88,6 @@ def test_given_descriptions_are_not_learnt_and_stand_beside_other_touches(share:
         assert text.split() == " ".join(t.assistant[t.described :] for t in turns).split()
     assert several
     assert changed == pytest.approx(share * several, abs=1)
-
-
-def test_nothing_is_learnt_of_what_fills_up_an_update(held: Material) -> None:
-    model, data = assemble(held, taking(3), "test")
-    alone, beside = (collate([data[i] for i in chosen]) for chosen in ((0,), (0, FILLER)))
-    torch.testing.assert_close(model(**beside).loss, model(**alone).loss, rtol=1e-5, atol=0)
-    loss = model(**collate([data[FILLER], data[FILLER]]), num_items_in_batch=9).loss
-    loss.backward()
-    assert float(loss.detach()) == 0
-    assert not any(p.grad is None or p.grad.any() for p in model.connector.parameters()), "there, as devices want it"
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])

@@ -130,15 +130,12 @@ def test_what_all_rows_begin_with_is_read_for_one(language: LanguageConfig, monk
     ids = torch.randint(4, 250, (4, 30), generator=torch.Generator().manual_seed(0))
     ids[:, :20] = ids[0, :20]
     ids[:, 20:23] = torch.tensor([model.start_id, model.frame_id, model.end_id])
-    labels = ids.clone()
+    labels, features = ids.clone(), torch.randn(4, 1, DIM)
     labels[:, :25] = IGNORE_INDEX
-    model(ids, torch.randn(4, 1, DIM), labels=labels)
+    model(ids, features, labels=labels)
     assert sum(places) <= 20 + 4 * (30 - 20 + 1)
     places.clear()
-    greedy(model, ids.tolist(), list(torch.randn(4, 1, DIM)), (), [1] * 4)
-    assert sum(places) == 20 + 4 * 10
-    places.clear()
-    greedy(model, ids.tolist(), list(torch.randn(4, 1, DIM)), (), [1, 1, 1, 9])
+    greedy(model, ids.tolist(), list(features), (), [1, 1, 1, 9])
     assert sum(places) == 20 + 4 * 10 + 8, "who has ended is computed no further"
 
 

@@ -11,7 +11,7 @@ import torch
 from pipeline.config import LanguageConfig
 from pipeline.core.embeddings import EmbeddingStore
 from pipeline.core.records import Opd, Question
-from pipeline.language.chat import TACT_FRAME, encode, render
+from pipeline.language.chat import encode, render
 from pipeline.language.conversations import evaluation_features
 from pipeline.language.generate import answer
 from pipeline.language.octopi import OctopiForCausalLM
@@ -95,11 +95,6 @@ def test_batch_size_changes_no_answer(
     assert {p.question_id: len(p.outputs) for p in one} == turns
     if opd is Opd.NONE:
         assert not [p for p in one if p.task == "OPD"], "without descriptions there is nothing to ask"
-
-
-def test_frame_token_never_comes_out_as_text(model: OctopiForCausalLM) -> None:
-    assert model.frame_id >= model.llm.get_input_embeddings().num_embeddings
-    assert TACT_FRAME not in model.tokenizer.decode(range(model.llm.config.vocab_size))
 
 
 def test_embeddings_of_another_length_or_of_no_such_video_are_refused(

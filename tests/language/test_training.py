@@ -123,20 +123,13 @@ def test_running_away_ends_in_one_line_and_leaves_the_last_good_checkpoint(held:
 
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
-def test_each_part_learns_at_its_own_rate_and_in_float32(dtype: str, held: Material, checkpoints: Path) -> None:
-    rates = {"projection_learning_rate": 1e-9, "learning_rate": 1e-2}
-    config = CONFIG.model_copy(update={**rates, "epochs": 1})
+def test_what_is_trained_is_float32_and_comes_back(dtype: str, held: Material, checkpoints: Path) -> None:
     language = held.language.model_copy(update={"dtype": dtype})
     model, data = assemble(replace(held, language=language), taking(8), "test")
-    add_lora(model, config)
-    before = {n: p.detach().clone() for n, p in model.named_parameters()}
+    add_lora(model, CONFIG)
+    fit(model, data, CONFIG, CPU, Job("lora", "x", 0))
     for name, parameter in model.named_parameters():
         assert parameter.dtype == (torch.float32 if parameter.requires_grad else getattr(torch, dtype)), name
-    fit(model, data, config, CPU, Job("lora", "x", 0))
-    moved = {n: float((p.detach() - before[n]).abs().max()) for n, p in model.named_parameters()}
-    assert max(v for n, v in moved.items() if n.startswith("connector.")) < 1e-6
-    assert min(v for n, v in moved.items() if "lora_B" in n) > 1e-3
-    assert max(v for n, v in moved.items() if "base_layer" in n or "embed_tokens" in n) == 0
     model.save_pretrained(checkpoints / "saved")
     saved = load_file(checkpoints / "saved" / "adapter" / "adapter_model.safetensors")
     assert {v.dtype for v in saved.values()} == {getattr(torch, dtype)}, "written in the base's format"
@@ -144,7 +137,7 @@ def test_each_part_learns_at_its_own_rate_and_in_float32(dtype: str, held: Mater
         for name, value in model.named_parameters():
             value.copy_(value.to(getattr(torch, dtype)) if "lora_" in name else value)
     assert_comes_back(model, checkpoints / "saved", dtype=dtype)
-    write_model_card(checkpoints / "saved", held, data, config)
+    write_model_card(checkpoints / "saved", held, data, CONFIG)
     card = (checkpoints / "saved" / "README.md").read_text()
     assert all(line in card for line in ("fine-tuned with LoRA", "| rank | 4 |", f"base_model:\n- {language.weights}"))
 
