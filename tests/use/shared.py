@@ -130,14 +130,12 @@ def make(where: Path, variant: Variant, *overrides: str) -> Made:
     questions = build_questions(pool_of(Part.TEST, parts, catalogue), ASKED, seed=0, distinct=False, facts=True)
     predictions = answer(model.eval(), embeddings, questions, variant.opd, params.language, params.frames.per_video)
     write_jsonl(data / "answers" / variant.key / "real.jsonl", predictions)
-    rows = [
-        {"task": t, "measure": TASKS[t].measure, **variant._asdict(), "touch": "real", "n": 8, "sets": 4, "chance": 0.5}
-        | {"right": 5, "unread": 0, "accuracy": 0.625, "low": 0.25, "high": 0.875}
-        for t in ASKED
-    ]
-    (where / "reports" / params.report_name).mkdir(parents=True)
-    pd.DataFrame(rows).to_csv(where / "reports" / params.report_name / "scores.csv", index=False)
-    write_json(where / "reports" / params.report_name / "provenance.json", {"settings": "Looked at before."})
+    measured = {"touch": "real", "n": 8, "sets": 4, "chance": 0.5, "right": 5, "unread": 0}
+    measured |= {"accuracy": 0.625, "low": 0.25, "high": 0.875, **variant._asdict()}
+    (report := where / "reports" / params.report_name).mkdir(parents=True)
+    scores = pd.DataFrame([{"task": t, "measure": TASKS[t].measure, **measured} for t in ASKED])
+    scores.to_csv(report / "scores.csv", index=False)
+    write_json(report / "provenance.json", {"settings": "Looked at before."})
     out = where / "models" / variant.key
     package(data, params, variant, Base.of(Path("llama")), out)
     return Made(out, videos, questions, predictions, classified, params, variant)
@@ -150,19 +148,13 @@ def replay(
     opd: Opd,
     files: Mapping[str, Path],
 ) -> int:
-    """Ask the evaluation's questions turn by turn, from the files: the answers must be the stored ones.
-
-    Returns:
-        How many questions were asked.
-    """
+    """Ask the evaluation's questions turn by turn, from the files, and count them: answers must be the stored ones."""
     asked = {q.question_id: q for q in questions}
     said = set()
     for prediction in predictions:
         question, history = asked[prediction.question_id], []
-        dialogue = question.dialogue(opd)
-        assert dialogue is not None
         videos = iter(question.videos)
-        for turn, stored in zip(dialogue.turns, prediction.outputs, strict=True):
+        for turn, stored in zip(question.dialogue(opd).turns, prediction.outputs, strict=True):
             shown = tuple(files[next(videos)] for _ in range(turn.user.count("{tactile}")))
             answer = model.ask(turn.user, shown, history=history)
             assert answer == stored, question.question_id

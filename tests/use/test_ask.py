@@ -7,6 +7,7 @@ import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from unittest import mock
 
 import pytest
 from typer.testing import CliRunner, Result
@@ -14,14 +15,13 @@ from typer.testing import CliRunner, Result
 from pipeline.cli import app, main
 from pipeline.core import runtime
 from pipeline.use import ask as asking
-from pipeline.use.ask import Chat, describe_folder, videos_of
+from pipeline.use.ask import Chat, describe_folder
 from pipeline.use.model import Octopi
 from tests.conftest import not_utf8, refused
 from tests.report.shared import rows_of
 from tests.use.shared import Made
 
 QUESTION = "Describe {tactile}."
-OWN = "mug: hard, smooth, no bumps; rug: soft, rough, no bumps"
 Command = Callable[..., Result]
 
 
@@ -41,7 +41,6 @@ def by_command(octopi: Octopi, monkeypatch: pytest.MonkeyPatch) -> Command:
 def test_an_answer_for_machines_however_long_it_takes(
     made: Made, octopi: Octopi, files: list[Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Progress is no part of it."""
     monkeypatch.setattr(runtime, "QUICK", 0)
     monkeypatch.setattr(sys, "argv", ["octopi", "ask", QUESTION, str(files[0]), "--model", str(made.folder), "--json"])
     with pytest.raises(SystemExit):
@@ -94,12 +93,9 @@ def test_a_chat(octopi: Octopi, files: list[Path]) -> None:
 
 
 def test_a_stopped_answer_is_forgotten(octopi: Octopi, monkeypatch: pytest.MonkeyPatch) -> None:
-    def stop(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
     said: list[str] = []
     chat = Chat(octopi, said.append)
-    monkeypatch.setattr(octopi, "stream", stop)
+    monkeypatch.setattr(octopi, "stream", mock.Mock(side_effect=KeyboardInterrupt))
     chat.run(["Hello?", "/reset"])
     assert not chat.history
     assert "stopped" in said[0]
@@ -116,13 +112,6 @@ def folder(files: list[Path], tmp_path: Path) -> Path:
     (place / "gone.mov").symlink_to(place / "nowhere.mov")
     (place.parent / "linked").symlink_to(place)
     return place.parent
-
-
-def test_what_holds_no_video_is_refused(tmp_path: Path) -> None:
-    with refused("no such file or folder"):
-        videos_of([tmp_path / "nothing"])
-    with refused("holds no video"):
-        videos_of([tmp_path])
 
 
 def test_a_folder_is_described(
@@ -157,6 +146,9 @@ def test_names_that_are_no_text_are_described_once(
 
 def test_described_by_command(by_command: Command, folder: Path, files: list[Path], tmp_path: Path) -> None:
     out, alone = tmp_path / "out.csv", tmp_path / "alone.csv"
+    (tmp_path / "empty").mkdir()
+    for place, words in (("nothing", "no such file or folder"), ("empty", "holds no video")):
+        assert words in str(by_command("describe", tmp_path / place, status=1).exception)
     assert f"{out}: 5 videos, 2 of them not described" in by_command("describe", folder, "--csv", out).stdout
     by_command("describe", files[0], "--csv", alone)
     assert [row["file"] for row in rows_of(alone)] == [files[0].name]
@@ -177,11 +169,9 @@ def test_described_compared_ranked_and_matched_by_command(
         return found.stdout
 
     one, two, three = map(str, files)
-    known = octopi.describe(one)
-    table = said("describe", one)
+    known, table = octopi.describe(one), said("describe", one)
     shares = (f"({max(found.values()):.0%})" for found in known.probabilities.values())
-    for word in (files[0].name, *known.levels, *known.levels.values(), *shares, "in words"):
-        assert word in table
+    assert all(word in table for word in (files[0].name, *known.levels, *known.levels.values(), *shares))
     assert said("compare", one, two, "hardness") == octopi.compare(one, two, "hardness").answer + "\n"
     ranked = octopi.rank([three, one, two], "roughness")
     scale, *lines, answer = said("rank", "roughness", three, one, two).rstrip("\n").split("\n")
@@ -191,7 +181,8 @@ def test_described_compared_ranked_and_matched_by_command(
     folder = said("rank", "roughness", files[0].parent).splitlines()[1:]
     assert {Path(line.split("  ")[1]) for line in folder} == set(files[0].parent.iterdir())
     own = {"mug": ["hard", "smooth", "no bumps"], "rug": ["soft", "rough", "no bumps"]}
-    for named, given in (("rug, millet", ["rug", "millet"]), (OWN, own)):
+    typed = "mug: hard, smooth, no bumps; rug: soft, rough, no bumps"
+    for named, given in (("rug, millet", ["rug", "millet"]), (typed, own)):
         matched = octopi.match([one, two], given)
         *lines, answer = said("match", one, two, "--names", named).rstrip("\n").split("\n")
         assert answer == matched.answer
@@ -204,16 +195,15 @@ def test_a_killed_description_goes_on(
     monkeypatch.setattr(asking, "BATCH", 1)
     whole, out = tmp_path / "whole.csv", tmp_path / "out.csv"
     describe_folder(octopi, [folder], whole)
-    text, describe_all = whole.read_text(), octopi.describe_all
-    described: list[object] = []
-    monkeypatch.setattr(octopi, "describe_all", lambda videos: described.extend(videos) or describe_all(videos))
+    text, describe_all = whole.read_text(), mock.Mock(wraps=octopi.describe_all)
+    monkeypatch.setattr(octopi, "describe_all", describe_all)
     for end in (0, 5, len(text) // 2, len(text) - 1):
         out.write_text(text[:end])
-        described.clear()
+        describe_all.reset_mock()
         assert describe_folder(octopi, [folder], out) == (5, 2)
         assert out.read_text() == text
         done = sum(".avi" in line and "broken" not in line for line in text[:end].split("\n")[:-1])
-        assert len(described) == 3 - done
+        assert sum(len(call.args[0]) for call in describe_all.mock_calls) == 3 - done
 
 
 @pytest.mark.parametrize(

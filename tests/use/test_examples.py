@@ -65,7 +65,6 @@ def test_the_script_runs(made: Made, monkeypatch: pytest.MonkeyPatch, capsys: py
 
 
 def test_the_notebook_runs(made: Made) -> None:
-    """With the paths of a tiny model in place of its own."""
     notebook = nbformat.read(EXAMPLES / "touch.ipynb", as_version=4)
     nbformat.validate(notebook)
     cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
@@ -80,10 +79,11 @@ def test_the_notebook_runs(made: Made) -> None:
             cell.source = cell.source.replace(ours, theirs)
     place = {"metadata": {"path": str(made.folder.parents[1])}}
     done = nbclient.NotebookClient(notebook, timeout=None, resources=place).execute()
-    shown = []
-    for outputs in (cell.outputs for cell in done.cells if cell.cell_type == "code"):
-        said = [o for o in outputs if o.get("name") != "stderr"]
-        shown.append("".join(o.get("text", "") or o.data["text/plain"] for o in said))
+    shown = [
+        "".join(o.get("text", "") or o.data["text/plain"] for o in cell.outputs if o.get("name") != "stderr")
+        for cell in done.cells
+        if cell.cell_type == "code"
+    ]
     assert shown[1] == "('hardness', 'roughness', 'bumpiness')"
     assert "'hardness'" in shown[2]
     assert shown[3].strip(), "an answer"

@@ -44,10 +44,10 @@ def test_each_press_is_found_once_with_untouched_pictures_in_front(drift: float,
 
 
 def test_a_light_that_changes_for_good_is_no_endless_press() -> None:
-    plain = recording(TOUCHED, LENGTH)[:25]
-    other = [np.clip(p * np.linspace(0.8, 1.2, 64)[None, :, None], 0, 255).astype(np.uint8) for p in plain]
-    pressed = recording(TOUCHED, LENGTH)[TOUCHED[0].start : TOUCHED[0].stop]
-    pressed = [np.clip(p * np.linspace(0.8, 1.2, 64)[None, :, None], 0, 255).astype(np.uint8) for p in pressed]
+    pictures = recording(TOUCHED, LENGTH)
+    light = np.linspace(0.8, 1.2, 64)[None, :, None]
+    changed = [np.clip(picture * light, 0, 255).astype(np.uint8) for picture in pictures]
+    plain, other, pressed = pictures[:25], changed[:25], changed[TOUCHED[0].start : TOUCHED[0].stop]
     film = [*plain, *other * 31, *pressed, *other]
     found = list(live.presses(shots(film, range(len(film)))))
     assert [press[-1].recorded // STEP_NS > len(plain) * 32 for press in found] == [True], "but the press after it"
@@ -68,8 +68,7 @@ class Camera:
     """OpenCV's, whose every third read brings nothing, and that is unplugged at its end."""
 
     def __init__(self, pictures: Sequence[np.ndarray], name: object) -> None:
-        self.left, self.reads = list(pictures), 0
-        self.opens = name == 0
+        self.left, self.reads, self.opens = list(pictures), 0, name == 0
 
     def isOpened(self) -> bool:
         return self.opens

@@ -60,8 +60,8 @@ QUESTIONS = ("How hard is it? {tactile}", "Which is softer, {tactile} or {tactil
 
 def test_what_is_logged_says_what_it_is(logged: Logged, loaded: Any, made: Made) -> None:
     info = mlflow.models.get_model_info(logged.address)
-    inputs = {column["name"]: column for column in info.signature.inputs.to_dict()}
-    assert {name: column["type"] for name, column in inputs.items()} == {"question": "string", "videos": "array"}
+    inputs = {column["name"]: column["type"] for column in info.signature.inputs.to_dict()}
+    assert inputs == {"question": "string", "videos": "array"}
     assert [column["name"] for column in info.signature.outputs.to_dict()] == ["answer"]
     assert info.metadata["variant"] == made.variant.key
     assert info.metadata["base"]["files"] == json.loads((made.folder / "config.json").read_text())["base"]["files"]
@@ -73,9 +73,8 @@ def test_what_is_logged_says_what_it_is(logged: Logged, loaded: Any, made: Made)
 FRESH = """
 import json, sys
 import mlflow.pyfunc, pandas as pd
-model = mlflow.pyfunc.load_model(sys.argv[1])
-rows = json.load(sys.stdin)
-said = model.predict(pd.DataFrame(rows, columns=["question", "videos"]))
+rows = pd.DataFrame(json.load(sys.stdin), columns=["question", "videos"])
+said = mlflow.pyfunc.load_model(sys.argv[1]).predict(rows)
 import pipeline
 print(json.dumps({"said": list(said["answer"]), "code": pipeline.__file__}))
 """
@@ -84,10 +83,9 @@ print(json.dumps({"said": list(said["answer"]), "code": pipeline.__file__}))
 def test_a_process_without_this_repository_answers(
     logged: Logged, octopi: Octopi, files: list[Path], tmp_path: Path
 ) -> None:
-    env = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
-    env["MLFLOW_TRACKING_URI"] = logged.client.tracking_uri
+    env = {**os.environ, "MLFLOW_TRACKING_URI": logged.client.tracking_uri, "OCTOPI_BASE": logged.base}
+    env.pop("PYTHONPATH", None)
     rows = json.dumps([[QUESTIONS[0], [encoded(files[0])]]])
-    env["OCTOPI_BASE"] = logged.base
     command = [sys.executable, "-c", FRESH, logged.address]
     done = subprocess.run(command, input=rows, env=env, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -117,8 +115,7 @@ def test_over_http_answers_are_those_of_the_library(
     broken = ask(client, asked[0])
     assert broken.status_code == 500
     assert "row 1: the model broke" in broken.text
-    assert "Traceback" not in broken.text
-    assert "ZeroDivision" not in broken.text
+    assert not re.search("Traceback|ZeroDivision", broken.text)
 
 
 def test_bad_rows_and_tables_are_400(client: TestClient, files: list[Path]) -> None:
@@ -135,5 +132,4 @@ def test_bad_rows_and_tables_are_400(client: TestClient, files: list[Path]) -> N
         bad = ask(client, *rows)
         assert bad.status_code == 400
         assert words in bad.text
-        assert "Traceback" not in bad.text
-        assert "octopi-" not in bad.text, "the folder of the videos"
+        assert not re.search("Traceback|octopi-", bad.text), "nor the folder of the videos"

@@ -1,13 +1,15 @@
-"""A packaged model answers as the evaluation did, and refuses what it cannot answer in one line."""
+"""A packaged model answers as the evaluation did, remembers touches, and refuses what it cannot answer in one line."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
+from sklearn.metrics.pairwise import cosine_similarity
 
 from pipeline.core.io import tensor_shapes
 from pipeline.core.records import Encoder, Lora, Opd, Part, Variant
@@ -16,34 +18,32 @@ from pipeline.use import encoding
 from pipeline.use import model as model_code
 from pipeline.use.encoding import VideoEncoder
 from pipeline.use.frames import read_touch
-from pipeline.use.model import Octopi, with_marks
-from pipeline.use.results import Exchange
+from pipeline.use.memory import TOUCHES, Remembered, most_similar
+from pipeline.use.model import Octopi
 from pipeline.videos.decoding import decode
 from tests.conftest import moving_square, refused, write_video
 from tests.use.shared import PARTS, Made, make, replay
 
-FULL = Variant(Encoder.FINETUNED, Lora.WITH, Opd.ALL, 0)
 TUNED = ("encoder.recipe=tuned", "encoder.reference=subtract", "encoder.standardize=false")
 
 
-def answers_as_stored(made: Made, every: int = 1) -> int:
+def answers_as_stored(model: Octopi, made: Made, every: int = 1) -> int:
     """Ask the stored questions, or every so many of them; how many were asked."""
-    model = Octopi.from_pretrained(made.folder, device="cpu")
     files = {f.stem: f for f in made.videos.iterdir()}
     return replay(model, made.questions, made.predictions[::every], made.variant.opd, files)
 
 
-def test_its_answers_equal_the_stored_predictions(made: Made) -> None:
-    assert answers_as_stored(made, every=2) >= 25
+def test_its_answers_equal_the_stored_predictions(made: Made, octopi: Octopi) -> None:
+    assert answers_as_stored(octopi, made, every=2) >= 25
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("variant", "overrides"),
     [
-        (FULL._replace(opd=Opd.NONE, lora=Lora.WITHOUT), (*TUNED, "encoder.backbone=[timm,scenes]")),
-        (FULL._replace(encoder=Encoder.BASE), ("encoder.recipe=release", "frames.selection=contact")),
-        (FULL._replace(encoder=Encoder.BASE, opd=Opd.NEEDED), (*TUNED, "encoder.backbone=[clip,scenes]")),
+        (Variant(Encoder.FINETUNED, Lora.WITHOUT, Opd.NONE, 0), (*TUNED, "encoder.backbone=[timm,scenes]")),
+        (Variant(Encoder.BASE, Lora.WITH, Opd.ALL, 0), ("encoder.recipe=release", "frames.selection=contact")),
+        (Variant(Encoder.BASE, Lora.WITH, Opd.NEEDED, 0), (*TUNED, "encoder.backbone=[clip,scenes]")),
     ],
     ids=["tuned", "release", "base of two backbones"],
 )
@@ -57,7 +57,7 @@ def test_of_other_recipes_too(
         whole = tensor_shapes(tmp_path / "clip" / "model.safetensors")
         assert kept.items() < whole.items(), "what follows the stage that is read stays behind"
     monkeypatch.chdir("/")
-    assert answers_as_stored(made) >= 40
+    assert answers_as_stored(Octopi.from_pretrained(made.folder, device="cpu"), made) >= 40
 
 
 def test_heads_say_what_the_stage_stored(made: Made, octopi: Octopi) -> None:
@@ -87,42 +87,31 @@ def test_each_video_is_decoded_once_a_call(
     octopi: Octopi, files: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """However many there are, and however little of them is remembered; where they are, one call takes all."""
-    seen: list[str] = []
-    monkeypatch.setattr(
-        encoding, "read_touch", lambda video, *a, **k: (seen.append(str(video)), read_touch(video, *a, **k))[1]
-    )
+    reading = mock.Mock(wraps=read_touch)
+    monkeypatch.setattr(encoding, "read_touch", reading)
     videos = [tmp_path / f"{i}.avi" for i in range(6)]
     for number, video in enumerate(videos):
         video.write_bytes(files[number % 3].read_bytes())
     octopi.ask_all([("Describe {tactile}.", video) for video in (*videos, *videos)], max_new_tokens=1)
-    assert seen == list(map(str, videos))
+    assert [call.args[0] for call in reading.mock_calls] == videos
     monkeypatch.setattr(encoding, "REMEMBERED", 0)
     octopi.look(files[0])
     for call in (octopi.describe_all, lambda given: octopi.rank(given, "hardness")):
-        seen.clear()
+        reading.reset_mock()
         call(videos)
-        assert seen == list(map(str, videos))
+        assert [call.args[0] for call in reading.mock_calls] == videos
 
 
 def test_one_video_needs_no_list_and_an_array_is_as_its_file(octopi: Octopi, files: list[Path]) -> None:
     said = octopi.ask("Describe {tactile}.", files[:1])
     array = np.stack([frame[:, :, ::-1] for frame in decode(files[0])])
     assert octopi.ask("Describe {tactile}.", files[0]) == octopi.ask("Describe {tactile}.", str(files[0])) == said
+    assert octopi.ask("{tactile} {tactile} Softer?", files[:2]) == octopi.ask("Softer?", files[:2]), "they go in front"
     assert octopi.ask("Describe {tactile}.", array) == octopi.ask("Describe {tactile}.", [array])
     file, other = octopi.look(files[0]), octopi.look(array)
     assert file.numbers == other.numbers
     assert np.abs(file.frames.astype(int) - other.frames).mean() < 2
     assert np.abs(file.reference.astype(int) - other.reference).mean() < 2
-
-
-def test_history_changes_the_answer_and_is_the_callers(octopi: Octopi, files: list[Path]) -> None:
-    first = octopi.ask("Describe {tactile}.", files[:1])
-    history = [Exchange("Describe {tactile}.", tuple(files[:1]), first)]
-    follow = octopi.ask("And now?", history=history)
-    assert follow == octopi.ask("And now?", history=history)
-    other = [Exchange("Describe {tactile}.", tuple(files[1:2]), first)]
-    assert follow != octopi.ask("And now?", history=other)
-    assert octopi.ask("Describe {tactile}.", files[:1]) == first, "it remembers nothing"
 
 
 def test_look_shows_where_it_touches(octopi: Octopi) -> None:
@@ -148,14 +137,12 @@ def test_typed_tasks(octopi: Octopi, files: list[Path], monkeypatch: pytest.Monk
         "Describe these two": "a) soft. b) hard.",
         "I must sleep": "The most suitable object is b), because of its hardness.",
     }
-    asked: list[str] = []
 
-    def ask(question: str, videos: object = (), **_: object) -> str:
-        asked.append(question)
+    def answer(question: str, *_: object, **__: object) -> str:
         return next(text for start, text in reversed(said.items()) if start in question)
 
     # What the tasks make of any answer; that answers are the evaluation's is tested above.
-    monkeypatch.setattr(octopi, "ask", ask)
+    monkeypatch.setattr(octopi, "ask", ask := mock.Mock(side_effect=answer))
     compared = octopi.compare(files[0], files[1], "hardness")
     assert (compared.choice, compared.question.count("{tactile}")) == ("no", 2)
     ranked = octopi.rank(files, "Hardness")
@@ -182,22 +169,21 @@ def test_typed_tasks(octopi: Octopi, files: list[Path], monkeypatch: pytest.Monk
     assert (model_code.APART in own.notes) == (own.heads != own.names)
     monkeypatch.setattr(octopi, "numbered", True)
     said["match"] = "Conclusion: a) is object 1, b) is object 3 and c) is object 2."
-    matched = octopi.match(files, names)
-    assert matched.names == (names[0], names[2], names[1])
-    assert not any(name in matched.question for name in names)
+    numbered = octopi.match(files, names)
+    assert numbered.names == matched.names
+    assert not any(name in numbered.question for name in names)
     chosen = octopi.scenario("I must sleep.", files[:2])
     assert chosen.choice == 1
-    assert [q.count("{tactile}") for q in asked[-2:]] == [2, 0], "described first"
-    for record in (compared, ranked, matched, chosen):
+    assert [call.args[0].count("{tactile}") for call in ask.mock_calls[-2:]] == [2, 0], "described first"
+    for record in (compared, ranked, numbered, chosen):
         assert record.model_validate_json(record.model_dump_json()) == record
 
 
 def test_tasks_ask_in_the_wording_of_training(made: Made, octopi: Octopi, files: list[Path]) -> None:
     asked = [t.user for q in made.questions for d in q.dialogues if d.opd is Opd.ALL for t in d.turns]
-    comparatives = {p.name: p.more for p in octopi.catalogue.properties}
-    name, more = next(found for found in comparatives.items() if any(found[1] in user for user in asked))
-    question = octopi.compare(files[0], files[1], name).question
-    assert any(question.split("than")[1] in user for user in asked if more in user)
+    known = next(p for p in octopi.catalogue.properties if any(p.more in user for user in asked))
+    question = octopi.compare(files[0], files[1], known.name).question
+    assert any(question.split("than")[1] in user for user in asked if known.more in user)
 
 
 @pytest.mark.parametrize(
@@ -221,14 +207,6 @@ def test_questions_that_do_not_fit_are_refused(
             ask(question, files[:count])
 
 
-def test_videos_without_marks_stand_in_front() -> None:
-    for videos in range(4):
-        marked = "Soft?" + "{tactile}" * videos
-        assert with_marks("Soft?", videos) == "{tactile} " * videos + "Soft?"
-        if videos:
-            assert with_marks(marked, videos) == marked
-
-
 def test_videos_that_cannot_be_used_are_refused(octopi: Octopi, tmp_path: Path, files: list[Path]) -> None:
     (tmp_path / "empty.avi").touch()
     (tmp_path / "text.avi").write_text("no video")
@@ -239,8 +217,7 @@ def test_videos_that_cannot_be_used_are_refused(octopi: Octopi, tmp_path: Path, 
     shapes = ((32, 32, 3), (4, 3, 32, 32), (0, 32, 32, 3))
     arrays = [np.zeros(shape, np.uint8) for shape in shapes] + [np.zeros((4, 32, 32, 3), np.float32)]
     bad: list[tuple[Any, str]] = [
-        (tmp_path / "nothing.avi", "no such file"),
-        (tmp_path, "no such file"),
+        *((path, "no such file") for path in (tmp_path / "nothing.avi", tmp_path)),
         (tmp_path / "empty.avi", "empty"),
         (tmp_path / "text.avi", "no frame decodes"),
         (tmp_path / "cut.avi", "no frame decodes|show no touch"),
@@ -290,8 +267,7 @@ def test_a_little_touch_and_a_damaged_video_are_noted(
     (cut := tmp_path / "cut.avi").write_bytes(whole[: 2 * len(whole) // 3])
     assert any("damaged: only" in note for note in octopi.look(cut).notes)
     assert octopi.look(files[0]).notes == ()
-    strength = octopi.look(files[0]).strength
-    quiet = octopi.config.model_copy(update={"quiet": 0.8 * strength})
+    quiet = octopi.config.model_copy(update={"quiet": 0.8 * octopi.look(files[0]).strength})
     weak = VideoEncoder(made.folder, quiet, octopi.catalogue, octopi.encoder.device)
     assert [n.partition(":")[0] for n in weak.encode(files[0]).touch.notes] == ["little touches the sensor"]
     compared = octopi.compare(files[0], cut, "hardness")
@@ -314,3 +290,58 @@ def test_what_is_unlike_training_is_noted_and_no_training_video_is(octopi: Octop
     assert any("unlike training" in note for note in octopi.look(noise).notes)
     trained = [video for video in made.videos.iterdir() if PARTS[video.stem[:-2]] is not Part.TEST]
     assert not [note for video in trained for note in octopi.look(video).notes if "unlike" in note]
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
+def test_the_most_similar_comes_first_by_its_nearest_touch(scale: float) -> None:
+    rng = np.random.default_rng(0)
+    known = rng.normal(size=(40, 16)) * scale
+    known[7] = 0  # As of a frame that says nothing: like nothing, and no division by zero.
+    names = [f"object {i % 13}" for i in range(40)]
+    remembered = [
+        Remembered(name=name, classes=("soft", "rough", "no bumps"), encoder="e", embedding=tuple(vector))
+        for name, vector in zip(names, known.tolist(), strict=True)
+    ]
+    for query in (*rng.normal(size=(5, 16)), known[3], -known[3], np.zeros(16)):
+        found = most_similar(query, remembered)
+        cosines = cosine_similarity(query[None], known)[0]
+        best = {name: max(c for c, n in zip(cosines, names, strict=True) if n == name) for name in names}
+        assert {s.name: s.similarity for s in found} == pytest.approx(best, abs=1e-12)
+        assert [s.similarity for s in found] == sorted((s.similarity for s in found), reverse=True)
+
+
+def test_a_remembered_touch_is_recognised_and_told(octopi: Octopi, files: list[Path], tmp_path: Path) -> None:
+    named, memory = dict(zip(("my ice", "my millet", "my towel"), files, strict=True)), tmp_path / "touches"
+    assert [octopi.remember(name, file, memory) for name, file in named.items()] == [1, 2, 3]
+    told = octopi.reminded("Which is softer?", files[:2], memory)
+    ice, millet = (", ".join(octopi.recognise(file, memory).objects[0].classes) for file in files[:2])
+    assert told == f"{ice} is my ice. {millet} is my millet. {{tactile}} {{tactile}} Which is softer?"
+    assert octopi.ask("Which is softer?", files[:2], memory=memory) == octopi.ask(told, files[:2])
+    for name, file in named.items():
+        found = octopi.recognise(file, memory)
+        assert (found.objects[0].name, found.touches, len(found.objects)) == (name, 3, 3)
+        assert found.objects[0].similarity == pytest.approx(1, abs=1e-6)
+        assert found.objects[0].classes == tuple(octopi.describe(file, sentence=False).levels.values())
+    assert octopi.remember("my ice", files[1], memory) == 4
+    assert len(octopi.recognise(files[0], memory).objects) == 3, "an object is named once"
+
+
+def test_what_is_no_memory_is_refused_and_stays(octopi: Octopi, files: list[Path], tmp_path: Path) -> None:
+    memory = tmp_path / "touches"
+    with refused("no memory of touches; `octopi remember"):
+        octopi.recognise(files[0], memory)
+    with refused("name is empty"):
+        octopi.remember(" ", files[0], memory)
+    octopi.remember("my ice", files[0], memory)
+    written = (memory / TOUCHES).read_text()
+    still = np.full((20, 64, 64, 3), 90, np.uint8)
+    with refused("press"):
+        octopi.remember("nothing", still, memory)
+    assert (memory / TOUCHES).read_text() == written
+    (memory / TOUCHES).write_text(written[:-20])
+    with refused("line 1: not a Remembered"):
+        octopi.remember("my millet", files[1], memory)
+    (memory / TOUCHES).write_text(written.replace('"encoder":"', '"encoder":"another'))
+    for call in (lambda: octopi.recognise(files[0], memory), lambda: octopi.remember("a", files[1], memory)):
+        with refused("another encoder's"):
+            call()

@@ -7,6 +7,7 @@ import re
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from pipeline.use.serve import make_app, read_token
 from pipeline.use.server import listen
 from tests.conftest import HUNG, refused
 from tests.use.fake import CHAT, FakeOctopi, body, digest, events, part, said, text, user
-from tests.use.videos import claims_frames, video
+from tests.use.videos import video
 
 TOKEN = "0123456789abcdef"
 LIMITS = Limits(body_bytes=400_000, videos=3, frames=200)
@@ -54,17 +55,13 @@ def error(response: Any, status: int) -> str:
     return message
 
 
-# ---- OpenAI's forms ----
-
-
 def test_an_answer_has_openai_s_form(client: TestClient) -> None:
     """By the types of OpenAI's own client, which know every field and what it may be."""
     began = time.time()
     response = client.post(CHAT, json=body(user(text("How soft is it?"), part(video(1)))))
     answer = ChatCompletion.model_validate(response.json())
     assert response.json()["notes"] == ["video 1: little touches the sensor"]
-    assert answer.id.startswith("chatcmpl-")
-    assert answer.model == "octopi"
+    assert (answer.id[:9], answer.model) == ("chatcmpl-", "octopi")
     assert abs(answer.created - began) < HUNG
     (choice,) = answer.choices
     assert (choice.index, choice.message.role, choice.finish_reason) == (0, "assistant", "stop")
@@ -120,13 +117,9 @@ def test_videos_stand_where_their_parts_or_marks_stand(client: TestClient, conte
 
 def test_a_conversation_and_what_is_let_through(client: TestClient, fake: FakeOctopi) -> None:
     before = user(text("First"), part(video(1)))
-    messages = [
-        {"role": "system", "content": "You are a robot."},
-        before,
-        {"role": "assistant", "content": [text("Soft.")]},
-        {"role": "developer", "content": [text("x")]},
-        user(text("Second"), part(video(2))),
-    ]
+    answered = [{"role": "assistant", "content": [text("Soft.")]}, {"role": "developer", "content": [text("x")]}]
+    messages = [{"role": "system", "content": "You are a robot."}, before, *answered]
+    messages.append(user(text("Second"), part(video(2))))
     more = {"temperature": 0.2, "top_p": 1, "seed": 4, "user": "r2", "n": 1, "tools": [], "stop": None, "x": {"y": 1}}
     response = client.post(CHAT, json=body(*messages, max_tokens=7, **more))
     assert said(response.json()) == f"{{tactile}} Second | First>Soft.:{digest(video(1))} | {digest(video(2))} "
@@ -134,9 +127,6 @@ def test_a_conversation_and_what_is_let_through(client: TestClient, fake: FakeOc
     client.post(CHAT, json=body(user("a"), max_completion_tokens=5000))
     client.post(CHAT, json=body(user("a")))
     assert fake.tokens[-2:] == [1024, None]
-
-
-# ---- refused ----
 
 
 def test_who_is_let_in(client: TestClient, fake: FakeOctopi) -> None:
@@ -149,21 +139,14 @@ def test_who_is_let_in(client: TestClient, fake: FakeOctopi) -> None:
     health = client.get("/health", headers={"Authorization": ""})
     assert health.json() == {"status": "ok", "model": "octopi", "waiting": 0, "places": 2}
     # Without a token, only names of this machine: another site's may be pointed at it.
-    for base, status in {
-        **dict.fromkeys(("http://127.0.0.1:8000", "http://localhost", "http://[::1]:80"), 200),
-        **dict.fromkeys(("http://evil.example", "http://127.0.0.1.evil.example"), 403),
-    }.items():
-        with TestClient(make_app(fake, "octopi"), base_url=base) as tokenless:
-            assert tokenless.get("/v1/models").status_code == status
+    with TestClient(make_app(fake, "octopi")) as tokenless:
+        for host in ("127.0.0.1:8000", "localhost", "[::1]:80"):
+            assert tokenless.get("/v1/models", headers={"Host": host}).status_code == 200
+        for host in ("evil.example", "127.0.0.1.evil.example"):
+            assert tokenless.get("/v1/models", headers={"Host": host}).status_code == 403
 
 
 ASK = user("hello")
-
-
-def url(text: str) -> dict[str, Any]:
-    return body(user({"type": "video_url", "video_url": {"url": text}}))
-
-
 BAD: list[tuple[bytes | dict[str, Any], int, str]] = [
     (b"", 422, "JSON"),
     (b"[" * 100_000, 422, "JSON"),
@@ -190,14 +173,10 @@ BAD: list[tuple[bytes | dict[str, Any], int, str]] = [
     (body(ASK, logprobs=True), 422, "logprobs"),
     (body(ASK, response_format={"type": "json_object"}), 422, "response_format"),
     (body(ASK, max_tokens=0), 422, "max_tokens"),
-    (url("file:///etc/passwd"), 422, "data URI"),
-    (url("/etc/passwd"), 422, "base64"),
-    (url("data:video/mp4;base64,AAA"), 422, "messages.0.content.0"),
+    (body(user({"type": "video_url", "video_url": {"url": "/etc/passwd"}})), 422, "content.0: broken base64"),
     (body(user(part(b"no video at all"))), 422, "video 1: no video"),
-    (body(user(part(claims_frames(10**6)))), 413, "longer than 200 frames"),
     (body(user(*[part(video())] * 4)), 413, "4 videos"),
     (body(user("one {tactile} and no video")), 422, "{tactile}"),
-    (body(user(text("{tactile} {tactile}"), part(video()))), 422, "{tactile}"),
     (body(user(text("blank"), part(video()))), 422, "video 1: 12 frames show no touch"),
 ]
 
@@ -233,22 +212,18 @@ def test_a_model_that_breaks_and_one_that_refuses_late(client: TestClient) -> No
 def test_429_when_all_places_are_taken(client: TestClient, fake: FakeOctopi) -> None:
     asked = fake.asked
     fake.gate = threading.Event()
-    answers: list[Any] = []
-    waiting = [threading.Thread(target=lambda: answers.append(client.post(CHAT, json=body(ASK)))) for _ in range(2)]
-    try:
-        for thread in waiting:
-            thread.start()
-        while client.get("/health").json()["waiting"] < 2:
-            time.sleep(0.01)
-        response = client.post(CHAT, json=body(ASK))
-        assert "2 places" in error(response, 429)
-        assert 1 <= int(response.headers["retry-after"]) <= 600
-    finally:
-        fake.gate.set()
-        for thread in waiting:
-            thread.join(HUNG)
-        fake.gate = None
-    assert [a.status_code for a in answers] == [200, 200]
+    with ThreadPoolExecutor(2) as pool:
+        waiting = [pool.submit(client.post, CHAT, json=body(ASK)) for _ in range(2)]
+        try:
+            while client.get("/health").json()["waiting"] < 2:
+                time.sleep(0.01)
+            response = client.post(CHAT, json=body(ASK))
+        finally:
+            fake.gate.set()
+    fake.gate = None
+    assert "2 places" in error(response, 429)
+    assert 1 <= int(response.headers["retry-after"]) <= 600
+    assert [a.result().status_code for a in waiting] == [200, 200]
     assert fake.asked == asked + 2
     assert client.post(CHAT, json=body(ASK)).status_code == 200
 
@@ -276,11 +251,7 @@ def test_metrics_are_prometheus_text_and_count(client: TestClient) -> None:
     assert "octopi_answer_seconds_sum" in after
 
 
-# ---- the command ----
-
-
 def test_addresses() -> None:
-    """Others than this machine's need a token."""
     for host, token in (("127.0.0.1", ""), ("localhost", ""), ("0.0.0.0", "x" * 16)):
         listen(host, 0, token).close()
     with listen("127.0.0.1", 0) as taken:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import runpy
 from collections import Counter
@@ -28,6 +27,7 @@ from pipeline.use import folder
 from pipeline.use.adapt import adapt
 from pipeline.use.folder import SHIPPED, Base, find_base, read_folder
 from pipeline.use.model import Octopi
+from tests.checkpoints import edit
 from tests.closure import ROOT
 from tests.conftest import fake_videos, refused
 from tests.models import model_folder
@@ -57,25 +57,19 @@ def test_its_figures_are_those_of_the_readmes_first_table() -> None:
     begin = next(i for i, line in enumerate(lines) if line.startswith("| | Synthetic touches"))
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[begin + 2 : begin + 7]]
     card = re.findall(r"\(([A-Z]+)\) \| \d+ \| (\S+ \[.*?\]) \| (\S+) \[", (SHIPPED / "README.md").read_text())
-    real = load_report(ROOT / "reports" / "small-videos").scores
-    real = real[(real["seed"] == ALL_SEEDS) & real["measure"].isin({"choice", "combined"})]
-    printed = published()
-    printed = printed[(printed["model"] == "7b") & (printed["encoder"] == "finetuned") & (printed["lora"] == "with")]
-    printed = printed[(printed["opd"] == "all") & printed["measure"].isin({"choice", "combined"})]
-    theirs = printed.set_index("task")["value"]
+    choice = "measure in ['choice', 'combined']"
+    real = load_report(ROOT / "reports" / "small-videos").scores.query(f"seed == {ALL_SEEDS!r} and {choice}")
+    full = "model == '7b' and encoder == 'finetuned' and lora == 'with' and opd == 'all'"
+    theirs = published().query(f"{full} and {choice}").set_index("task")["value"]
     for (task, shipped, rules), row in zip(card, rows, strict=True):
         accuracy, low, high = config.scores[task]
         assert shipped == f"{100 * accuracy:.1f} [{100 * low:.1f}, {100 * high:.1f}]"
-        keys = (("finetuned", "with", "real"), ("finetuned", "", "real"))
-        keys = (("octopi-small", "", "touch"), ("octopi-small", "", "classes"), *keys)
-        own = real[real["task"] == task].set_index(["encoder", "lora", "touch"])
-        zero, zero_rules, tuned, by_rule = (dict(own.loc[key]) for key in keys)
-        there = (
-            measured(zero),
-            f"{100 * zero_rules['accuracy']:.1f}",
-            measured(tuned),
-            f"{100 * by_rule['accuracy']:.1f}",
-        )
+        own, there = real[real["task"] == task].set_index(["encoder", "lora", "touch"]), []
+        for model, by_rule in (
+            (("octopi-small", "", "touch"), ("octopi-small", "", "classes")),
+            (("finetuned", "with", "real"), ("finetuned", "", "real")),
+        ):
+            there += [measured(dict(own.loc[model])), f"{100 * own.loc[by_rule]['accuracy']:.1f}"]
         chance = {"OPD": 100 / 27, "POM": 100 / 6, "PSR": 50}.get(task, 100 / 3)
         assert row[1:] == [shipped, rules, *there, f"{chance:.1f}", f"{theirs[task]:.1f}"]
         assert task not in row[0], "in words"
@@ -85,24 +79,19 @@ def test_its_language_model_is_made_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    cache = tmp_path / "cache" / "octopi"
-    made: list[Path] = []
+    cached = tmp_path / "cache" / "octopi" / "smollm2"
 
     def make(name: str, to: Path) -> None:
-        assert name == "smollm2"
-        made.append(to)
-        to.mkdir(parents=True)
+        assert (name, to) == ("smollm2", cached)
+        to.mkdir(parents=True)  # Which fails where it is made again.
         (to / "model.safetensors").write_bytes(b"weights")
 
     monkeypatch.setattr(folder, "make", make)
     monkeypatch.chdir(tmp_path)
-    lone = tmp_path / "model"
-    lone.mkdir()
     known = Base(folder="data/weights/smollm2", files={"model.safetensors": sha256(b"weights").hexdigest()})
-    assert find_base(lone, known) == cache / "smollm2"
+    assert find_base(tmp_path / "model", known) == cached
     assert "smollm2 is made of an installed package" in caplog.text
-    assert find_base(lone, known) == cache / "smollm2"
-    assert made == [cache / "smollm2"]
+    assert find_base(tmp_path / "model", known) == cached
 
 
 @pytest.fixture(scope="module")
@@ -148,9 +137,8 @@ def test_a_runs_videos_are_asked_about_as_they_are_and_standardised(
     monkeypatch.setattr("pipeline.core.runtime.limit_threads", lambda _: None)
 
     def run(objects: dict[str, str]) -> list[GradedVision]:
-        videos = [
-            v.model_copy(update={"path": f"{objects[v.object_id]}.mp4"}) for v in fake_videos(objects, per_object=1)
-        ]
+        videos = fake_videos(objects, per_object=1)
+        videos = [v.model_copy(update={"path": f"{objects[v.object_id]}.mp4"}) for v in videos]
         write_table(tmp_path / "data" / "videos.parquet", Video, videos)
         runpy.run_path(str(ROOT / "stages" / "shipped.py"), run_name="__main__")
         return read_table(tmp_path / "data" / "shipped.parquet", GradedVision)
@@ -187,11 +175,9 @@ def test_a_copy_for_another_sensor_standardises_by_its_videos(octopi: Octopi, tm
     assert mine.ask("Is it soft?", videos[0])
     with refused("is there already"):
         adapt(octopi, videos, tmp_path / "mine")
-    told = read_json(tmp_path / "mine" / "config.json")
-    (tmp_path / "mine" / "config.json").write_text(
-        json.dumps({**told, "language": {**told["language"], "touch_noise": 0.0}})
-    )
+    told = tmp_path / "mine" / "config.json"
+    edit(told, language={**read_json(told)["language"], "touch_noise": 0.0})
     assert read_folder(tmp_path / "mine")[0] == mine.config, "as models of before say it"
-    (tmp_path / "mine" / "config.json").write_text(json.dumps({**told, "language": "none"}))
+    edit(told, language="none")
     with refused("config.json: language"):
         read_folder(tmp_path / "mine")
