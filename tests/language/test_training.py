@@ -288,6 +288,7 @@ def test_word_embeddings_are_trained_and_the_base_is_not(
     fit(model, data, SMALL.model_copy(update={"epochs": 1}), CPU, Job("align", "x", 0))
     changed = set((model.words.weight != start).any(1).nonzero().flatten().tolist())
     assert len(changed) > 20
+    assert 1 in changed, "which pads"
     assert changed <= set(torch.cat([each["input_ids"] for each in data.written]).tolist())
     assert all(torch.equal(p, base[n]) for n, p in model.llm.named_parameters())
 
@@ -316,7 +317,8 @@ def test_adapters_go_on_with_the_words_that_alignment_trained(held: Material, ch
 
 def test_a_projection_without_schedule_keeps_its_rate(held: Material, checkpoints: Path) -> None:
     """Eight questions make two updates an epoch; the rest of what is trained warms up for two of six, then falls."""
-    config = CONFIG.model_copy(update={"epochs": 3, "projection_schedule": "constant", "warmup_ratio": 1 / 3})
+    rates = {"learning_rate": 2e-3, "projection_schedule": "constant", "warmup_ratio": 1 / 3}
+    config = CONFIG.model_copy(update={**rates, "epochs": 3})
     model, data = assemble(held, taking(8), "test")
     model.train_words()
     add_lora(model, config)
