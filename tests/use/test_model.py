@@ -27,14 +27,14 @@ from tests.use.shared import PARTS, Made, make, replay
 TUNED = ("encoder.recipe=tuned", "encoder.reference=subtract", "encoder.standardize=false")
 
 
-def answers_as_stored(model: Octopi, made: Made, every: int = 1) -> int:
-    """Ask the stored questions, or every so many of them; how many were asked."""
+def answers_as_stored(model: Octopi, made: Made) -> int:
+    """Ask every other of the stored questions; how many were asked."""
     files = {f.stem: f for f in made.videos.iterdir()}
-    return replay(model, made.questions, made.predictions[::every], made.variant.opd, files)
+    return replay(model, made.questions, made.predictions[::2], made.variant.opd, files)
 
 
 def test_its_answers_equal_the_stored_predictions(made: Made, octopi: Octopi) -> None:
-    assert answers_as_stored(octopi, made, every=2) >= 25
+    assert answers_as_stored(octopi, made) >= 25
 
 
 @pytest.mark.slow
@@ -57,7 +57,7 @@ def test_of_other_recipes_too(
         whole = tensor_shapes(tmp_path / "clip" / "model.safetensors")
         assert kept.items() < whole.items(), "what follows the stage that is read stays behind"
     monkeypatch.chdir("/")
-    assert answers_as_stored(Octopi.from_pretrained(made.folder, device="cpu"), made) >= 40
+    assert answers_as_stored(Octopi.from_pretrained(made.folder, device="cpu"), made) >= 20
 
 
 def test_heads_say_what_the_stage_stored(made: Made, octopi: Octopi) -> None:
