@@ -25,7 +25,8 @@ COMPARING = ("PC", "PSS", "POM", "PSR")
 QUESTION = "Which is the softest? a) {tactile}, b) {tactile}, c) {tactile}. Describe each object before answering."
 DESCRIBE = "Describe the touch. {tactile}"
 MODEL = "the shipped model"
-RULES = "heads and rules, no language model (told the classes of POM's objects and PSR's scenario)"
+RULES = "its heads and rules alone"
+"""They are told the classes of POM's objects and of PSR's scenarios."""
 SHOWN = {MODEL: Shown.TOUCH, RULES: Shown.CLASSES}
 
 
@@ -53,7 +54,7 @@ def measure(root: Path, triples: int = 12, batch: int = 32) -> list[Row]:
     compared = make_rows(
         "comparing three touches",
         {name: times[1:] for name, times in costs.items()},  # The first one loads and warms up.
-        unit="ms a question, from the video files on",
+        unit="ms a question",
         baseline=MODEL,
         errors={
             name: Error(
@@ -64,7 +65,7 @@ def measure(root: Path, triples: int = 12, batch: int = 32) -> list[Row]:
             )
             for name, es in own.items()
         },
-        error_of=f"mean error over {', '.join(COMPARING)}; the interval's ends are means of the tasks' ends",
+        error_of=f"mean over {', '.join(COMPARING)} (of the ends, too)",
         machine=machine(f"{torch.get_num_threads()} threads"),
     )
     return [*compared, *tokens(octopi, videos, batch)]
