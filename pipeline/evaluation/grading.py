@@ -44,12 +44,22 @@ def conclude(questions: Sequence[Question], classified: Iterable[Classification]
     said: dict[str, dict[str, tuple[int, float]]] = defaultdict(dict)
     for c in classified:
         said[c.video_id][c.property] = (c.predicted, sum(i * p for i, p in enumerate(c.probabilities)))
-    scores: list[Score] = []
+    predictions = []
     for question in questions:
         if all(video in said for video in question.videos):
             classes = [[said[video][name] for name in catalogue.property_names] for video in question.videos]
-            scores += TASKS[question.task].follow(question, classes, catalogue)
-    return scores
+            answer = TASKS[question.task].conclude(question, classes, catalogue)
+            if answer is not None:
+                predictions.append(
+                    Prediction(
+                        question_id=question.question_id,
+                        task=question.task,
+                        outputs=(answer,),
+                        truncated=False,
+                        tokens=0,
+                    )
+                )
+    return grade(questions, predictions, catalogue)
 
 
 def vision_models(folder: Path) -> dict[Path, VisionModel]:

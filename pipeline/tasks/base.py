@@ -115,16 +115,6 @@ class TaskDefinition(ABC):
         """
         return None
 
-    def follow(self, question: Question, classes: Classes, catalogue: Catalogue) -> list[Score]:
-        """The scores of what `conclude` answers; none where it has no answer."""
-        answer = self.conclude(question, classes, catalogue)
-        if answer is None:
-            return []
-        said = Prediction(
-            question_id=question.question_id, task=question.task, outputs=(answer,), truncated=False, tokens=0
-        )
-        return self.grade(question, said, catalogue)
-
     def adjective(self, question: Question, catalogue: Catalogue) -> str:
         """The adjective that the question asks by, such as "softer"; empty where it asks by none."""
         if not self.adjectives:

@@ -139,5 +139,5 @@ def test_the_command_merges_and_names_what_is_allowed(
     assert [row.question for row in read_rows(CSV)] == ["other", "contact", "contact"]
     assert (CSV.parent / FOLDER / "contact.png").is_file()
     assert "x 2  error 0.05 (front)" in capsys.readouterr().out
-    with pytest.raises(SystemExit, match="frames, encoder, language, contact, serving"):
+    with pytest.raises(SystemExit, match="frames, encoder, language, contact, systems, serving"):
         command.main(["startup"])
