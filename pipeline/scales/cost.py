@@ -6,6 +6,7 @@ frozen weight; Kaplan et al. 2020, section 2.1) and from a device's rate. Stages
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -181,12 +182,14 @@ def _round(number: float) -> str:
 def measured_rate(side: int = 1024, seconds: float = 0.5) -> float:
     """Floating-point operations a second of float32 matrix products on this processor, the median of several."""
     import torch
-    from torch.utils.benchmark import Timer
 
-    matrices = {"a": torch.rand(side, side), "b": torch.rand(side, side)}
-    # By itself it times one thread.
-    timer = Timer("a @ b", globals=matrices, num_threads=torch.get_num_threads())
-    return 2 * side**3 / timer.blocked_autorange(min_run_time=seconds).median
+    a, b = torch.rand(side, side), torch.rand(side, side)
+    times, end = list[float](), time.perf_counter() + seconds
+    while len(times) < 3 or time.perf_counter() < end:
+        begin = time.perf_counter()
+        a @ b
+        times.append(time.perf_counter() - begin)
+    return float(2 * side**3 / sorted(times)[len(times) // 2])
 
 
 def fits(uses: list[Use], gib: float) -> Iterator[str]:
