@@ -57,6 +57,10 @@ def test_committed_params_are_written_as_they_are(tmp_path: Path) -> None:
         (["ablation.seeds=[1,1]"], "ablation.seeds.*repeats"),
         (["ablation.opd=[none]"], "ablation.opd.*lacks the full system's value all"),
         (["lora.skip_contradicted=true"], "lora.skip_contradicted.*encoder.embedding=logits"),
+        (
+            ["lora.skip_contradicted=true", "encoder={embedding:logits,standardize:true}", "questions.two_turns=0.5"],
+            "lora.skip_contradicted.*questions.two_turns=0",
+        ),
         (["ablation.lora=[perhaps]"], "ablation.lora.*'with' or 'without'"),
         (["lora.target_modules=all"], "lora.target_modules.*'all-linear'"),
         (["runtime.device=tpu"], "runtime.device.*'cuda'"),
