@@ -81,6 +81,8 @@ class Store:
 
         for name in ("alembic", "mlflow"):
             logging.getLogger(name).setLevel(logging.ERROR)
+        # Metrics are logged for the model that MLFLOW_ACTIVE_MODEL_ID names, which this server may not know.
+        mlflow.clear_active_model()
         # Ten attempts to open a broken database take 107 s.
         mlflow.store.db.utils.MAX_RETRY_COUNT = 1
         here, home = Path.cwd(), main_folder()

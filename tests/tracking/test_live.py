@@ -113,6 +113,7 @@ def test_a_curve_stands_in_its_run_whatever_the_shell_says(chain: FakeChain, mon
     names |= {found.name for found in vars(fluent).values() if isinstance(found, _EnvironmentVariable)}
     for name in sorted({*names, "MLFLOW_REGISTRY_URI", "MLFLOW_ENABLE_ASYNC_LOGGING"}):
         monkeypatch.setenv(name, STRAY.get(name, "1" if "URI" not in name else "sqlite:///stray.db"))
+    fluent._ACTIVE_MODEL_CONTEXT.reset()  # As where MLflow is imported only now.
     with live(Stage(ALIGN, watched(chain.params))) as callbacks:
         fit(chain.params, callbacks)
     assert sorted(run.info.run_name for run in runs()) == sorted([ALIGN, chain.params.report_name])
@@ -125,7 +126,7 @@ def test_a_curve_stands_in_its_run_whatever_the_shell_says(chain: FakeChain, mon
     assert not Path("stray.db").exists()
 
 
-STRAY = {"MLFLOW_RUN_ID": "0" * 32, "MLFLOW_TAGS": '{"stray": "1"}'}
+STRAY = {"MLFLOW_ACTIVE_MODEL_ID": "m-" + "0" * 32, "MLFLOW_RUN_ID": "0" * 32, "MLFLOW_TAGS": '{"stray": "1"}'}
 
 
 @pytest.mark.parametrize(("error", "status"), [(RuntimeError, "FAILED"), (KeyboardInterrupt, "KILLED")])
