@@ -104,33 +104,14 @@ def test_two_processes_train_like_one(project: Project) -> None:
         torch.testing.assert_close(value, results[1][name], atol=1e-5, rtol=1e-5)
 
 
-def test_a_further_fold_trains_none_of_the_others_anew(project: Project) -> None:
-    """One of three folds, then two, by the published recipe: how answers are pooled is tests/report/test_folds.py's."""
-    folds = ("encoder.recipe=release", "encoder.epochs=1", "split.name=kfold", "split.folds=3")
-    folds += ("cross_validation.models=[constant]",)
-    project.run("octopi", "scale", *REDUCED, *folds, "ablation.seeds=[1]")
-    project.run("dvc", "repro", "report")
-    data, report = project.folder / "data", project.folder / "reports" / "smoke-scenes"
-    asked = (read_jsonl(data / "questions" / "1" / f"{part}.jsonl", Question) for part in ("train", "evaluation"))
-    learnt, tested = ({o for q in questions for o in q.objects} for questions in asked)
-    assert tested
-    assert not learnt & tested
-    embeddings = load_file(data / "embeddings" / "finetuned-1" / "embeddings.safetensors")
-    assert all(value.isfinite().all() for value in embeddings.values())
-    assert "1 of 3 folds (1) are in" in (report / "README.md").read_text()
-    project.run("octopi", "scale", *REDUCED, *folds, "ablation.seeds=[1,2]")
-    project.run("dvc", "repro", "questions")
-    assert (data / "questions" / "2" / "train.jsonl").is_file()
-    trained = ("finetune_encoder@1", "align@finetuned-all-1", "lora@finetuned-all-1", "answer@finetuned-with-all-1")
-    assert "up to date" in project.run("dvc", "status", *trained)
-
-
 def test_going_back_to_a_scale_restores_it(project: Project) -> None:
-    """After other recipes and folds: their encoders and their report lie there now."""
+    """After other questions and another batch size: what those made lies there now."""
+    project.run("octopi", "scale", *REDUCED, "questions.seed=1")
+    project.run("dvc", "repro", "questions")
     project.run("octopi", "scale", *REDUCED)
     shutil.rmtree(project.folder / "data" / "models" / "with")
     output = project.run("dvc", "repro")
-    assert "is cached - skipping run, checking out outputs" in output
+    assert "Stage 'questions' is cached - skipping run, checking out outputs" in output
     assert "Running stage 'lora" not in output
     assert (project.folder / METRICS).read_bytes() == (project.folder / "first.json").read_bytes()
     # Last, since it leaves the project without its videos.

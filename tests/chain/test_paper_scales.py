@@ -1,8 +1,8 @@
 """The paper's scales on narrow checkpoints with the published names and layouts, each training in two processes.
 
-What is set beside a scale is where things lie, how much there is of them and the device: CPUs, which gloo connects.
-Of each matrix one cell runs, since the others are the same command with another argument (tests/chain/test_chain.py
-has them). Nearly all of the time is importing: some thirty processes start.
+What is set beside a scale is where things lie, how much there is of them, folds, and the device: CPUs, which gloo
+connects. Of each matrix one cell runs, since the others are the same command with another argument. Nearly all of the
+time is importing: some fifteen processes start.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import yaml
 from safetensors.torch import load_file
 
 from pipeline.core.io import read_jsonl
-from pipeline.core.records import Prediction
+from pipeline.core.records import Prediction, Question
 from tests.checkpoints import write_clip, write_vicuna
 from tests.closure import ROOT
 from tests.conftest import encode, moving_square
@@ -35,6 +35,7 @@ VIT_L = {
 }
 """As open_clip_config.json of OpenAI's ViT-L/14 has it, but for widths, layers and words."""
 LAYERS = {"paper-7b": 2, "paper-13b": 3}
+SYSTEM = "finetuned-with-all-1"
 FEW = (
     "data.dir=physiclear",
     "runtime.device=cpu",
@@ -49,18 +50,19 @@ FEW = (
     "align.samples=32",
     "lora.samples=32",
     "runtime.save_steps=1",
+    "split.name=kfold",
+    "split.folds=3",
 )
-LAUNCHED = '''"""Runs a stage as accelerate launched it, with layers sharded if asked to, and notes how."""
+LAUNCHED = '''"""Runs a stage as accelerate launched it, with layers sharded on CPUs, and notes how."""
 import json, os, runpy, sys
 from pathlib import Path
 from accelerate.state import PartialState
 from tests.language.sharded import shard_on_cpus, watch
 
 said = {}
-_, how, *sys.argv = sys.argv
-if how == "sharded":
-    shard_on_cpus()
-    watch(said)
+_, *sys.argv = sys.argv
+shard_on_cpus()
+watch(said)
 try:
     runpy.run_path(sys.argv[0], run_name="__main__")
 finally:
@@ -89,14 +91,14 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
 
 
 def launches(project: Project) -> dict[str, dict[str, object]]:
-    """What each process of the last trainings noted."""
+    """What each process of the trainings noted."""
     files = [f for stage in ("align", "lora") for f in project.folder.glob(f"{stage}-?.json")]
     return {f.stem: json.loads(f.read_text()) for f in files}
 
 
-def check_trained(project: Project, scale: str) -> None:
+def check_trained(project: Project) -> None:
     """Trained parameters are finite and of the shapes that the published layouts and the scale give."""
-    folder = project.folder / "data" / "models" / "with" / "finetuned-all-0"
+    folder = project.folder / "data" / "models" / "with" / "finetuned-all-1"
     connector = load_file(folder / "connector.safetensors")
     adapter = load_file(folder / "adapter" / "adapter_model.safetensors")
     # An adapter is written in its base's format.
@@ -105,15 +107,16 @@ def check_trained(project: Project, scale: str) -> None:
     # The class token before its projection, as the paper's code hands it on.
     assert connector["projection.0.weight"].shape[1] == WIDTH
     layer = "base_model.model.model.layers.{}.self_attn.{}.lora_{}.weight"
-    expected = {layer.format(i, p, ab) for i in range(LAYERS[scale]) for p in ("q_proj", "k_proj") for ab in "AB"}
-    assert adapter.keys() == expected
+    layers = range(LAYERS["paper-13b"])
+    assert adapter.keys() == {layer.format(i, p, ab) for i in layers for p in ("q_proj", "k_proj") for ab in "AB"}
     assert {min(value.shape) for value in adapter.values()} == {64}, "rank 128, of a layer that is 64 wide"
     assert {max(value.shape) for value in adapter.values()} == {128}
     assert any(value.any() for name, value in adapter.items() if "lora_B" in name), "it was trained"
 
 
 def test_paper_13b_from_videos_to_the_report(project: Project) -> None:
-    table = project.run("octopi", "scale", "paper-13b", *FEW, f"{LAUNCHER} sharded")
+    """One of three folds."""
+    table = project.run("octopi", "scale", "paper-13b", *FEW, "ablation.seeds=[1]", LAUNCHER)
     assert "align                   2" in table, "two devices are counted"
     project.run("octopi", "repro")
     noted = launches(project)
@@ -121,30 +124,37 @@ def test_paper_13b_from_videos_to_the_report(project: Project) -> None:
     for each in noted.values():
         assert (each["processes"], each["sharded"], each["computes"]) == (2, True, "torch.float32")
         assert float(str(each["share"])) < 0.6
-    check_trained(project, "paper-13b")
+    check_trained(project)
     for touch in ("real", "removed", "swapped", "noise"):
-        said = read_jsonl(project.folder / "data" / "answers" / "finetuned-with-all-0" / f"{touch}.jsonl", Prediction)
+        said = read_jsonl(project.folder / "data" / "answers" / SYSTEM / f"{touch}.jsonl", Prediction)
         assert Counter(p.task for p in said) == dict.fromkeys(("OPD", "PC", "PSS", "POM", "PSR"), 4)
-    report = project.folder / "reports" / "paper-13b-videos"
-    assert "weights/vicuna-13b-v1.5" in (report / "README.md").read_text()
-    assert (project.folder / "models" / "finetuned-with-all-0" / "README.md").is_file()
+    readme = (project.folder / "reports" / "paper-13b-videos" / "README.md").read_text()
+    assert "weights/vicuna-13b-v1.5" in readme
+    assert "1 of 3 folds (1) are in" in readme
+    assert (project.folder / "models" / SYSTEM / "README.md").is_file()
     assert not list((project.folder / "checkpoints").glob("*/*")), "nothing waits any more"
 
 
-def test_paper_7b_to_the_report(project: Project) -> None:
-    """On the same encoder, since everything before alignment is the same in both scales; here the layers are whole.
+def test_a_fold_tests_objects_that_it_did_not_train_on(project: Project) -> None:
+    asked = (project.folder / "data" / "questions" / "1" / f"{part}.jsonl" for part in ("train", "evaluation"))
+    learnt, tested = ({o for q in read_jsonl(file, Question) for o in q.objects} for file in asked)
+    assert tested
+    assert not learnt & tested
 
-    Without the patch accelerate does not shard on CPUs, and shares the questions out alone.
-    """
-    for noted in project.folder.glob("*-?.json"):
-        noted.unlink()
-    project.run("octopi", "scale", "paper-7b", *FEW, f"{LAUNCHER} whole")
-    output = project.run("dvc", "repro", "report")
-    assert "Running stage 'align@finetuned-all-0'" in output
+
+def test_paper_7b_begins_with_the_same_encoder(project: Project) -> None:
+    """Everything before alignment is the same in both scales."""
+    project.run("octopi", "scale", "paper-7b", *FEW, "ablation.seeds=[1]", LAUNCHER)
+    output = project.run("dvc", "repro", "--dry", "report")
+    assert "Running stage 'align@finetuned-all-1'" in output
     assert "Running stage 'embed'" not in output
     assert "Running stage 'finetune_encoder" not in output
-    assert list(launches(project).values()) == [{"processes": 2}] * 4
-    check_trained(project, "paper-7b")
-    report = (project.folder / "reports" / "paper-7b-videos" / "README.md").read_text()
-    assert "weights/vicuna-7b-v1.5" in report
-    assert "Published 7b" in report
+
+
+def test_a_further_fold_trains_none_of_the_others_anew(project: Project) -> None:
+    """How answers are pooled is tests/report/test_folds.py's."""
+    project.run("octopi", "scale", "paper-13b", *FEW, "ablation.seeds=[1,2]", LAUNCHER)
+    project.run("dvc", "repro", "questions")
+    assert (project.folder / "data" / "questions" / "2" / "train.jsonl").is_file()
+    trained = ("finetune_encoder@1", "align@finetuned-all-1", "lora@finetuned-all-1", f"answer@{SYSTEM}")
+    assert "up to date" in project.run("dvc", "status", *trained)
