@@ -130,6 +130,9 @@ class SplitConfig(Section):
     """Used by development and kfold."""
     test_objects: Positive = 7
     """Test objects of the development split."""
+    train_objects: Annotated[int, Field(ge=0)] = 0
+    """Of kfold: train on so many of a fold's training objects, and leave the others unused, to see how many objects are
+    enough. Of two numbers the larger has all objects of the smaller. 0: all."""
     folds: Annotated[int, Field(ge=3, le=50)] = 5
     """Of kfold. Each seed of `ablation.seeds` has one for its test: seed s has fold s modulo `folds`."""
     missing: Literal["report", "error"] = "report"
@@ -385,7 +388,8 @@ class AblationConfig(Section):
     """
 
     encoders: tuple[Encoder, ...] = (Encoder.FINETUNED, Encoder.BASE)
-    """What the language model is given; the fine-tuned encoder is trained in any case, for the encoder's own table."""
+    """What the language model is given; the fine-tuned encoder is trained in any case, for the encoder's own table.
+    `words` gives its heads' classes as text (with `encoder.embedding=logits`): does reading touch cost accuracy?"""
     lora: tuple[Lora, ...] = (Lora.WITH, Lora.WITHOUT)
     """`without` answers with the alignment's checkpoint."""
     opd: tuple[Opd, ...] = (Opd.ALL, Opd.NONE)
@@ -498,6 +502,14 @@ class Params(Section):
                 f"ablation.seeds {list(self.ablation.seeds)} test on some of the {self.split.folds} folds more often "
                 "than on others; take as many seeds for each fold"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _heads_speak(self) -> Self:
+        if Encoder.WORDS in self.ablation.encoders and self.encoder.embedding != "logits":
+            raise ValueError("ablation.encoders: words are read off the heads' logits; set encoder.embedding=logits")
+        if Encoder.WORDS in self.ablation.encoders and self.packaged == "all":
+            raise ValueError("packaged=all: a variant that is given words reads no videos; set packaged=full")
         return self
 
     @model_validator(mode="after")

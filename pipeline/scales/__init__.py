@@ -133,12 +133,13 @@ def check_objects(params: Params, catalogue: Catalogue) -> str:
         training, tested = (sorted(o for o in present if parts.get(o) == part) for part in (Part.TRAIN, Part.TEST))
         fold = params.split.fold_of(seed)
         where = f"split.name={params.split.name}" + (f", fold {fold}" if fold is not None else "")
-        if absent := untested(parts, present):
+        if fold is None and (absent := untested(parts, present)):
             lacking = f"{where}: {absent}"
         if len(training) < FEWEST_TRAINING_OBJECTS:
+            mend = "raise split.train_objects" if params.split.train_objects else "choose another split.name"
             raise UserError(
                 f"{where}: {len(training)} training objects have videos, but questions about three objects need three; "
-                "add objects, or choose another split.name"
+                f"add objects, or {mend}"
             )
         if len(tested) == 1 and Touch.SWAPPED in params.ablation.touch:
             raise UserError(

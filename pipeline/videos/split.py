@@ -31,8 +31,8 @@ def assign(catalogue: Catalogue, videos: Sequence[Video], config: SplitConfig, s
 
     `development` tests on some of the paper's training objects and leaves the paper's test objects unused. `kfold`
     deals all objects that have videos into folds: the seed's fold is for test, so that over all folds every object is
-    tested once. One in eight of the other objects is for validation. Any other name is that of a `split_` column of
-    the catalogue.
+    tested once. One in eight of the other objects is for validation. Of the rest `train_objects` are for training, 0
+    being all. Any other name is that of a `split_` column of the catalogue.
 
     Args:
         seed: of `ablation.seeds`; only kfold has another split for another one.
@@ -116,7 +116,11 @@ def _deal(catalogue: Catalogue, present: Collection[str], config: SplitConfig, f
     tested = _balanced(labels, config.folds, derive_seed(config.seed, "kfold"))[fold]
     learnt = {o: label for o, label in labels.items() if o not in tested}
     chosen = _balanced(learnt, min(VALIDATION, len(learnt)), derive_seed(config.seed, f"validation {fold}"))[0]
-    return {o: Part.TEST if o in tested else Part.VALIDATION if o in chosen else Part.TRAIN for o in labels}
+    rest = sorted(learnt.keys() - set(chosen))
+    random.Random(derive_seed(config.seed, f"training {fold}")).shuffle(rest)
+    unused = rest[config.train_objects :] if config.train_objects else []
+    known = {**dict.fromkeys(tested, Part.TEST), **dict.fromkeys(chosen, Part.VALIDATION)}
+    return {**dict.fromkeys(labels, Part.TRAIN), **dict.fromkeys(unused, Part.UNUSED), **known}
 
 
 def _balanced(labels: Mapping[str, tuple[int, ...]], count: int, seed: int) -> list[list[str]]:

@@ -73,6 +73,16 @@ def test_folds_have_each_class_alike(seed: int) -> None:
         assert max(counts) - min(counts) <= 2, (place, level)
 
 
+def test_fewer_training_objects_change_no_other_part() -> None:
+    """And are nested."""
+    few, more, whole = (parts(fold=1, name="kfold", folds=3, train_objects=n) for n in (5, 10, 0))
+    assert few[Part.TRAIN] < more[Part.TRAIN] < whole[Part.TRAIN]
+    assert (len(few[Part.TRAIN]), len(more[Part.TRAIN])) == (5, 10)
+    for split in (few, more):
+        assert split[Part.TRAIN] | split[Part.UNUSED] == whole[Part.TRAIN]
+        assert all(split[part] == whole[part] for part in (Part.TEST, Part.VALIDATION))
+
+
 @settings(max_examples=12)
 @given(st.integers(0, 2**31 - 1), st.integers(1, 30), st.sets(st.sampled_from(OBJECTS), min_size=20))
 @example(0, 7, set(OBJECTS))
