@@ -19,7 +19,7 @@ def main() -> None:
         config = run.params.align
         material = Material.load(DATA, run.params, encoder, opd, seed)
         model, data = assemble(material, config, "align")
-        if config.begin_with_words and not run.params.language.start:
+        if config.begin_with_words and material.per_video and not run.params.language.start:
             begin_with_words(model, data, material.catalogue, material.seed)
         if config.train_embeddings == "all" and model.words is None:
             model.train_words()

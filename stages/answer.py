@@ -1,6 +1,7 @@
 """Let one variant answer the evaluation questions; the full system also under every input ablation."""
 
 from dataclasses import replace
+from pathlib import Path
 
 from pipeline.core.embeddings import EmbeddingStore
 from pipeline.core.io import read_jsonl, write_jsonl
@@ -8,8 +9,10 @@ from pipeline.core.parallel import device_here
 from pipeline.core.records import Encoder, Lora, Opd, Question, Touch, Variant
 from pipeline.core.runtime import name_dtype
 from pipeline.core.stage import DATA, matrix_key, stage
+from pipeline.language.classes import in_words
 from pipeline.language.generate import ModelSource, answer
 from pipeline.language.input_ablation import ablate_input
+from pipeline.videos.catalogue import load_catalogue
 
 
 def main() -> None:
@@ -24,8 +27,11 @@ def main() -> None:
         model = replace(source, device=device_here(device))()
         asked = DATA / "questions" / str(variant.seed)
         questions = read_jsonl(asked / "evaluation.jsonl", Question)
+        words = variant.encoder is Encoder.WORDS
+        if words:
+            questions = in_words(questions, store, load_catalogue(Path(params.data.catalogue)))
         for touch in (Touch.REAL, *(params.ablation.touch if variant.full else ())):
-            per_video = 0 if touch is Touch.REMOVED else params.frames.per_video
+            per_video = 0 if words or touch is Touch.REMOVED else params.frames.per_video
             given = ablate_input(store, touch, questions, variant.seed)
             predictions = answer(model, given, questions, variant.opd, language, per_video, source)
             write_jsonl(DATA / "answers" / variant.key / f"{touch}.jsonl", predictions)

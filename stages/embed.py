@@ -1,5 +1,6 @@
 """Compute the embeddings of every kept frame, by the base encoder and each fine-tuned one."""
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -48,6 +49,8 @@ def main() -> None:
         check_encoder(Path(params.encoder.weights), params.frames.pixels, params.encoder.backbone)
         splits = {seed: read_table(DATA / "splits" / f"{seed}.parquet", Assignment) for seed in params.ablation.seeds}
         for which in params.ablation.encoders:
+            if which is Encoder.WORDS:
+                continue
             if which is Encoder.BASE:
                 # It has no seed: its embeddings are computed once and standardised for each.
                 found = embed(run, union(splits.values()), None)
@@ -57,6 +60,10 @@ def main() -> None:
             for seed, split in splits.items():
                 trained = DATA / "encoder" / str(seed) / "encoder.safetensors"
                 write(run, f"{which}-{seed}", split, *embed(run, split, trained))
+        if Encoder.WORDS in params.ablation.encoders:
+            for seed in splits:
+                own = DATA / "embeddings" / f"{Encoder.FINETUNED}-{seed}"
+                shutil.copytree(own, own.with_name(f"{Encoder.WORDS}-{seed}"), dirs_exist_ok=True)
 
 
 if __name__ == "__main__":

@@ -47,6 +47,8 @@ class Encoder(StrEnum):
 
     FINETUNED = "finetuned"
     BASE = "base"
+    WORDS = "words"
+    """The fine-tuned one; its heads' classes, as text, stand in the place of embeddings."""
 
 
 class Lora(StrEnum):

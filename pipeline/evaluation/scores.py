@@ -62,6 +62,7 @@ RULES = Setting(Encoder.FINETUNED, None, None, Touch.REAL)
 CHANGES: tuple[tuple[str, Setting, Setting], ...] = (
     ("language", FULL, RULES),
     ("encoder", FULL, FULL._replace(encoder=Encoder.BASE)),
+    ("encoder", FULL, FULL._replace(encoder=Encoder.WORDS)),
     ("lora", FULL, FULL._replace(lora=Lora.WITHOUT)),
     ("opd", FULL, FULL._replace(opd=Opd.NONE)),
     ("opd", FULL, FULL._replace(opd=Opd.NEEDED)),

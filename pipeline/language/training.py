@@ -7,12 +7,9 @@ import random
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
-from itertools import permutations
 from pathlib import Path
 from typing import Self
 
-import torch
 from transformers import TrainerCallback
 
 from pipeline.config import (
@@ -24,12 +21,13 @@ from pipeline.config import (
     TrainConfig,
 )
 from pipeline.core.card import write_card
-from pipeline.core.embeddings import STATISTICS_FILE, EmbeddingStore, Statistics
+from pipeline.core.embeddings import EmbeddingStore
 from pipeline.core.errors import UserError
 from pipeline.core.io import fingerprint, read_jsonl
 from pipeline.core.records import TENSOR_FILE, Encoder, Opd, Question
 from pipeline.core.runtime import derive_seed, name_dtype, seed_everything
 from pipeline.language.base import ADAPTER_WEIGHTS
+from pipeline.language.classes import in_words, uncontradicted
 from pipeline.language.conversations import ConversationDataset, UpdateSampler, collate
 from pipeline.language.octopi import ADAPTER_DIR, CONFIG_FILE, OctopiForCausalLM, read_config
 from pipeline.training.trainer import (
@@ -42,9 +40,6 @@ from pipeline.training.trainer import (
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 
 logger = logging.getLogger(__name__)
-
-COMPARED = ("PC", "PSS", "POM")
-"""Tasks of which a question can be contradicted by the property heads."""
 
 
 def add_lora(model: OctopiForCausalLM, config: LoraTrainConfig) -> None:
@@ -108,13 +103,15 @@ class Material:
         catalogue = load_catalogue(Path(params.data.catalogue))
         begun = Path(start) / LANGUAGE_DIR / ADAPTER_DIR
         adapter = begun if start and begun.is_dir() else None
+        questions, store = read_jsonl(asked, Question), EmbeddingStore(embedded)
+        words = encoder is Encoder.WORDS
         return cls(
-            questions=read_jsonl(asked, Question),
-            store=EmbeddingStore(embedded),
+            questions=in_words(questions, store, catalogue) if words else questions,
+            store=store,
             catalogue=catalogue,
             opd=opd,
             language=params.language.model_copy(update={"dtype": dtype}),
-            per_video=params.frames.per_video,
+            per_video=0 if words else params.frames.per_video,
             flip_probability=params.encoder.flip_probability,
             seed=params.seed + seed,
             source=params.data.source,
@@ -194,56 +191,6 @@ def assemble(
         given=given,
     )
     return model, data
-
-
-def uncontradicted(questions: Sequence[Question], store: EmbeddingStore, catalogue: Catalogue) -> list[Question]:
-    """Leave out comparisons whose right answer does not follow, by their task's rule, from the heads' logits.
-
-    What touch contradicts cannot be learnt from touch: such questions teach to guess. Descriptions, which are about one
-    video each, stay.
-
-    Args:
-        store: Of logits. Those of training objects are from heads that did not see the object, so that as many are
-            wrong as of new objects.
-    """
-    scaled = Statistics.load(store.folder / STATISTICS_FILE)
-    sizes = [len(p.levels) for p in catalogue.properties]
-
-    @cache
-    def classes(video: str) -> list[tuple[int, float]]:
-        logits = store.tensor[store.rows(video)].double() * scaled.scale + scaled.mean
-        found = [part.softmax(1).mean(0) for part in logits.split(sizes, dim=1)]
-        return [(int(p.argmax()), float(p @ torch.arange(len(p)).double())) for p in found]
-
-    return [q for q in questions if q.task not in COMPARED or follows(q, [classes(v) for v in q.videos], catalogue)]
-
-
-def follows(question: Question, seen: Sequence[Sequence[tuple[int, float]]], catalogue: Catalogue) -> bool:
-    """Whether a comparison's right answer is the one that the tasks' rules draw from these classes.
-
-    The rules (`TaskDefinition.conclude`) stand beside the graders. They are written out here once more, from the right
-    answer's side, so that a changed grader does not train every model anew; a test holds them to be the same.
-
-    Args:
-        seen: By video and property, the class and the expected class.
-    """
-    labels = question.gold.labels
-    if question.task == "POM":
-
-        def off(order: Sequence[int]) -> tuple[float, ...]:
-            pairs = [pair for said, i in zip(seen, order, strict=True) for pair in zip(said, labels[i], strict=True)]
-            return tuple(sum(abs(said[k] - label) for said, label in pairs) for k in (0, 1))
-
-        # Of equally near matchings the first one counts, in the order of object ids.
-        return min(permutations(sorted(range(len(seen)), key=question.objects.__getitem__)), key=off) == (0, 1, 2)
-    place = catalogue.property_index(question.gold.properties[0])
-    own, said = [label[place] for label in labels], [video[place] for video in seen]
-    if question.task == "PC":
-        (first, _), (second, _) = said
-        return (first > second, first < second) == (own[0] > own[1], own[0] < own[1])
-    right = "abc".index(question.gold.choice)
-    furthest = max if own[right] == max(own) else min
-    return furthest(range(len(said)), key=said.__getitem__) == right
 
 
 def with_given(questions: Sequence[Question], opd: Opd, share: float, seed: int) -> tuple[list[Question], set[str]]:

@@ -179,7 +179,7 @@ def embedded(params: Params, data: Path, catalogue: Catalogue) -> tuple[dict[str
     for seed in sorted(params.ablation.seeds):
         split = read_table(data / "splits" / f"{seed}.parquet", Assignment)
         tested = sorted((a for a in split if a.part is Part.TEST), key=lambda a: a.video_id)
-        for encoder in sorted(params.ablation.encoders):
+        for encoder in sorted({*params.ablation.encoders} - {Encoder.WORDS}):
             folder = data / "embeddings" / f"{encoder}-{seed}"
             if len(tested) < 2 or not (folder / TENSOR_FILE).is_file():
                 continue

@@ -32,10 +32,16 @@ CHOICE, COMBINED = "choice", "combined"
 NOT_ANSWERED = (HEADS, VALIDATION_HEADS, RECALL, CROSS_VALIDATION, NEIGHBOURS, ADJECTIVES)
 """Tasks of scores.csv that no language model with touch answered."""
 PUBLISHED_MODELS = ("7b", "13b", "CLIP", "PG-InstructBLIP")
-SYSTEM_WORDS = {"base": "base encoder", "without": "without LoRA", "none": "without OPD", "needed": "OPD as needed"}
+SYSTEM_WORDS = {
+    "base": "base encoder",
+    "words": "told the heads' classes in words",
+    "without": "without LoRA",
+    "none": "without OPD",
+    "needed": "OPD as needed",
+}
 SHOWN_WORDS = {"frames": "frames of the videos", "photos": "photos of the objects"}
 """What vision-only models were shown, in the place where others have their touch."""
-ENCODERS = {"finetuned": "fine-tuned", "base": "base"}
+ENCODERS = {"finetuned": "fine-tuned", "base": "base", "words": "fine-tuned, its classes in words"}
 PARTS = {"language": "language model", "lora": "LoRA", "opd": "OPD"}
 """Parts of the full system that are called otherwise than in effects.csv."""
 
@@ -328,7 +334,12 @@ TABLES: tuple[Table, ...] = (
             folded=False,
         )
         for axis, name, caption in (
-            ("encoder", "the encoder", "The tactile encoder fine-tuned on properties, or as it was before."),
+            (
+                "encoder",
+                "the encoder",
+                "The tactile encoder fine-tuned on properties, or as it was before. Told in words, a language model is "
+                "trained and asked with the classes of the fine-tuned one's heads as text, and reads no touch.",
+            ),
             ("lora", "LoRA", "With end-to-end fine-tuning of the language model, or after alignment alone."),
         )
         for kind, title, columns in (

@@ -1,0 +1,102 @@
+"""The classes that property heads predict, read from embeddings that are their logits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cache
+from itertools import permutations
+
+import torch
+
+from pipeline.core.embeddings import STATISTICS_FILE, EmbeddingStore, Statistics
+from pipeline.core.records import Question
+from pipeline.language.chat import TACTILE
+from pipeline.videos.catalogue import Catalogue
+
+COMPARED = ("PC", "PSS", "POM")
+"""Tasks of which a question can be contradicted by the property heads."""
+
+
+def classes_of(store: EmbeddingStore, catalogue: Catalogue) -> Callable[[str], list[tuple[int, float]]]:
+    """A function from a video to its predicted class and expected class, property by property.
+
+    Args:
+        store: Of logits (`encoder.embedding=logits`). Those of training objects are from heads that did not see the
+            object, so that as many classes are wrong as of new objects.
+    """
+    scaled = Statistics.load(store.folder / STATISTICS_FILE)
+    sizes = [len(p.levels) for p in catalogue.properties]
+
+    @cache
+    def classes(video: str) -> list[tuple[int, float]]:
+        logits = store.tensor[store.rows(video)].double() * scaled.scale + scaled.mean
+        found = [part.softmax(1).mean(0) for part in logits.split(sizes, dim=1)]
+        return [(int(p.argmax()), float(p @ torch.arange(len(p)).double())) for p in found]
+
+    return classes
+
+
+def in_words(questions: Sequence[Question], store: EmbeddingStore, catalogue: Catalogue) -> list[Question]:
+    """The questions with each video's predicted classes as text in its place, such as "(soft, rough, no bumps)".
+
+    A language model that is trained and asked this way need not read touch. What it lacks then is lacking in language.
+    """
+    said = classes_of(store, catalogue)
+    changed = []
+    for question in questions:
+        texts = [
+            f"({', '.join(p.levels[level] for p, (level, _) in zip(catalogue.properties, said(video), strict=True))})"
+            for video in question.videos
+        ]
+        dialogues = []
+        for dialogue in question.dialogues:
+            left, turns = iter(texts), []
+            for turn in dialogue.turns:
+                first, *rest = turn.user.split(TACTILE)
+                user = first + "".join(next(left) + part for part in rest)
+                turns.append(turn.model_copy(update={"user": user}))
+            dialogues.append(dialogue.model_copy(update={"turns": tuple(turns)}))
+        changed.append(question.model_copy(update={"dialogues": tuple(dialogues)}))
+    return changed
+
+
+def uncontradicted(questions: Sequence[Question], store: EmbeddingStore, catalogue: Catalogue) -> list[Question]:
+    """Leave out comparisons whose right answer does not follow, by their task's rule, from the heads' logits.
+
+    What touch contradicts cannot be learnt from touch: such questions teach to guess. Descriptions, which are about one
+    video each, stay.
+
+    Args:
+        store: Of logits. Those of training objects are from heads that did not see the object, so that as many are
+            wrong as of new objects.
+    """
+    said = classes_of(store, catalogue)
+    return [q for q in questions if q.task not in COMPARED or follows(q, [said(v) for v in q.videos], catalogue)]
+
+
+def follows(question: Question, seen: Sequence[Sequence[tuple[int, float]]], catalogue: Catalogue) -> bool:
+    """Whether a comparison's right answer is the one that the tasks' rules draw from these classes.
+
+    The rules (`TaskDefinition.conclude`) stand beside the graders. They are written out here once more, from the right
+    answer's side, so that a changed grader does not train every model anew; a test holds them to be the same.
+
+    Args:
+        seen: By video and property, the class and the expected class.
+    """
+    labels = question.gold.labels
+    if question.task == "POM":
+
+        def off(order: Sequence[int]) -> tuple[float, ...]:
+            pairs = [pair for said, i in zip(seen, order, strict=True) for pair in zip(said, labels[i], strict=True)]
+            return tuple(sum(abs(said[k] - label) for said, label in pairs) for k in (0, 1))
+
+        # Of equally near matchings the first one counts, in the order of object ids.
+        return min(permutations(sorted(range(len(seen)), key=question.objects.__getitem__)), key=off) == (0, 1, 2)
+    place = catalogue.property_index(question.gold.properties[0])
+    own, said = [label[place] for label in labels], [video[place] for video in seen]
+    if question.task == "PC":
+        (first, _), (second, _) = said
+        return (first > second, first < second) == (own[0] > own[1], own[0] < own[1])
+    right = "abc".index(question.gold.choice)
+    furthest = max if own[right] == max(own) else min
+    return furthest(range(len(said)), key=said.__getitem__) == right
