@@ -138,6 +138,12 @@ class SplitConfig(Section):
     missing: Literal["report", "error"] = "report"
     """What to do about validation or test objects without videos: go on and leave cells empty, or stop."""
 
+    @model_validator(mode="after")
+    def _fewer_objects_of_folds(self) -> Self:
+        if self.train_objects and self.name != "kfold":
+            raise ValueError("split.train_objects leaves out objects of a fold; set split.name=kfold")
+        return self
+
     def fold_of(self, seed: int) -> int | None:
         """The fold that a seed of `ablation.seeds` tests on; None where all seeds share one split."""
         return seed % self.folds if self.name == "kfold" else None

@@ -87,6 +87,8 @@ class Material:
     per_video: int
     flip_probability: float
     seed: int
+    words: bool = False
+    """Whether the heads' classes, as text, stand in the place of embeddings."""
     source: str = "videos"
     """`data.source`: whether the videos are synthetic."""
     files: tuple[Path, ...] = ()
@@ -103,15 +105,15 @@ class Material:
         catalogue = load_catalogue(Path(params.data.catalogue))
         begun = Path(start) / LANGUAGE_DIR / ADAPTER_DIR
         adapter = begun if start and begun.is_dir() else None
-        questions, store = read_jsonl(asked, Question), EmbeddingStore(embedded)
         words = encoder is Encoder.WORDS
         return cls(
-            questions=in_words(questions, store, catalogue) if words else questions,
-            store=store,
+            questions=read_jsonl(asked, Question),
+            store=EmbeddingStore(embedded),
             catalogue=catalogue,
             opd=opd,
             language=params.language.model_copy(update={"dtype": dtype}),
             per_video=0 if words else params.frames.per_video,
+            words=words,
             flip_probability=params.encoder.flip_probability,
             seed=params.seed + seed,
             source=params.data.source,
@@ -176,6 +178,9 @@ def assemble(
     drawn, given = usable[: config.samples], set[str]()
     if isinstance(config, LoraTrainConfig) and config.given:
         drawn, given = with_given(drawn, material.opd, config.given, material.seed)
+    if material.words:
+        # Last, since until here videos may be exchanged.
+        drawn = in_words(drawn, material.store, material.catalogue)
     data = ConversationDataset(
         drawn,
         material.opd,
@@ -285,7 +290,9 @@ def write_model_card(folder: Path, material: Material, data: ConversationDataset
             "seed": material.seed,
         },
         limits=(
-            "It reads embeddings of the one encoder above; those of another mean nothing to it.",
+            "It reads classes in words, and no embeddings."
+            if material.words
+            else "It reads embeddings of the one encoder above; those of another mean nothing to it.",
             "It was trained on templates of "
             + ", ".join(sorted(tasks))
             + " alone: other questions, and scenarios (PSR), were not trained on.",

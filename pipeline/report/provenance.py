@@ -71,7 +71,7 @@ def provenance(
         "test_videos": len(test),
         "videos": len(videos),
         "seeds": list(seeds),
-        "folds": {"of": params.split.folds, "tested": folds} if folds else None,
+        "folds": {"of": params.split.folds, "tested": folds, "trained": params.split.train_objects} if folds else None,
         "replicates": len({params.split.replicate_of(seed) for seed in seeds}),
         # What people noted about the test objects of this report, or else of its split.
         "settings": notes.get(f"{params.report_name}/{params.split.name}", notes.get(params.split.name, "")),

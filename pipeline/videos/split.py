@@ -118,6 +118,10 @@ def _deal(catalogue: Catalogue, present: Collection[str], config: SplitConfig, f
     chosen = _balanced(learnt, min(VALIDATION, len(learnt)), derive_seed(config.seed, f"validation {fold}"))[0]
     rest = sorted(learnt.keys() - set(chosen))
     random.Random(derive_seed(config.seed, f"training {fold}")).shuffle(rest)
+    if config.train_objects > len(rest):
+        raise UserError(
+            f"split.train_objects is {config.train_objects}, but fold {fold} has {len(rest)} training objects; lower it"
+        )
     unused = rest[config.train_objects :] if config.train_objects else []
     known = {**dict.fromkeys(tested, Part.TEST), **dict.fromkeys(chosen, Part.VALIDATION)}
     return {**dict.fromkeys(labels, Part.TRAIN), **dict.fromkeys(unused, Part.UNUSED), **known}

@@ -56,7 +56,7 @@ def test_two_replicates_of_three_folds_test_each_object_twice(twice: Path) -> No
     confusion = pd.read_csv(folder / "confusion.csv")
     assert (confusion.groupby(["seed", "property"]).size() == len(tested)).all()
     said = load_report(folder).provenance
-    assert (said["replicates"], said["folds"]) == (2, {"of": 3, "tested": [0, 1, 2]})
+    assert (said["replicates"], said["folds"]) == (2, {"of": 3, "tested": [0, 1, 2], "trained": 0})
     assert len(said["test_objects"]) * 2 == said["test_videos"] == len(tested)
     text = (folder / "README.md").read_text()
     assert "each of them in one of 3 folds that were not trained on, 2 times." in text

@@ -81,6 +81,10 @@ def test_fewer_training_objects_change_no_other_part() -> None:
     for split in (few, more):
         assert split[Part.TRAIN] | split[Part.UNUSED] == whole[Part.TRAIN]
         assert all(split[part] == whole[part] for part in (Part.TEST, Part.VALIDATION))
+    count = len(whole[Part.TRAIN])
+    assert parts(fold=1, name="kfold", folds=3, train_objects=count) == whole
+    with refused(rf"split\.train_objects is {count + 1}, but fold 1 has {count} training objects"):
+        parts(fold=1, name="kfold", folds=3, train_objects=count + 1)
 
 
 @settings(max_examples=12)
