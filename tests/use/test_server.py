@@ -47,6 +47,15 @@ def waiting(address: str) -> int:
     return int(httpx2.get(f"{address}/health", timeout=HUNG).json()["waiting"])
 
 
+def listens(address: str) -> bool:
+    """Asks nothing: a request that comes just as the server stops may be dropped without an answer."""
+    try:
+        socket.create_connection(("127.0.0.1", int(address.rpartition(":")[2])), HUNG).close()
+    except ConnectionError:
+        return False
+    return True
+
+
 def wait_for(condition: Callable[[], bool]) -> None:
     end = time.monotonic() + HUNG
     while not condition():
@@ -170,8 +179,7 @@ def test_stopping_finishes_what_was_asked_and_leaves_no_process() -> None:
         wait_for(lambda: waiting(address) == 4 and len(psutil.Process(process.pid).children()) > 0)
         children = psutil.Process(process.pid).children()
         process.send_signal(signal.SIGTERM)
-        with pytest.raises(httpx2.ConnectError):
-            wait_for(lambda: waiting(address) < 0)
+        wait_for(lambda: not listens(address))
         print(file=process.stdin, flush=True)
         assert [a.result().status_code for a in answers] == [200] * 4
         for i, answer in enumerate(answers[:3]):
