@@ -39,7 +39,7 @@ from pipeline.scales.memory import (
     tower_kept,
     trained_parameters,
 )
-from pipeline.weights.shapes import parameters, read_language, read_tower
+from pipeline.weights.check import parameters, read_language, read_tower
 from tests.checkpoints import write_clip, write_llama
 from tests.closure import ROOT
 

@@ -24,7 +24,7 @@ class Commands(TyperGroup):
     """Ends a command that Ctrl-C stops with one line."""
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command; typer alone would say nothing of Ctrl-C."""
+        """Typer alone would say nothing of Ctrl-C."""
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
@@ -32,11 +32,7 @@ class Commands(TyperGroup):
             raise typer.Exit(130) from None
 
 
-app = typer.Typer(
-    cls=Commands,
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-)
+app = typer.Typer(cls=Commands, no_args_is_help=True, pretty_exceptions_enable=False)
 data_app = typer.Typer(help="Look at a folder of tactile videos.", no_args_is_help=True)
 app.add_typer(data_app, name="data")
 import_app = typer.Typer(help="Make videos of other recordings.", no_args_is_help=True)
@@ -291,6 +287,9 @@ def diff(
     typer.echo(describe(found))
 
 
+Video = Annotated[str, typer.Argument(help="A video.")]
+Another = Annotated[str, typer.Argument(help="Another one.")]
+Property = Annotated[str, typer.Argument(help="Such as hardness.")]
 Model = Annotated[Path | None, typer.Option(help="Folder of a trained model; by default the one that is shipped.")]
 Base = Annotated[
     Path | None, typer.Option(help="Folder of its language model, where it lies in none of the known places.")
@@ -323,23 +322,20 @@ def ask(
 
     if isfile(question):  # pathlib's raises where a question is longer than a file's name may be.
         raise UserError(f"{question}: is a file; write the question before it")
-    if json and not question:
-        raise UserError("--json takes a question")
-    if memory and not question:
-        raise UserError("--memory takes a question")
+    if not question and (json or memory):
+        raise UserError(f"--{'json' if json else 'memory'} takes a question")
     asked = _load(model, base, device)
     if memory:
         question = asked.reminded(question, videos or (), memory)
 
-    say = partial(typer.echo, nl=False)
     if not question:
-        Chat(asked, say).run(lines_of_terminal())
+        Chat(asked, partial(typer.echo, nl=False)).run(lines_of_terminal())
     elif json:
         typer.echo(dumps(answer_once(asked, question, videos or ()), ensure_ascii=False))
     else:
         for piece in asked.stream(question, videos or ()):
-            say(piece)
-        say("\n")
+            typer.echo(piece, nl=False)
+        typer.echo()
         _print_notes(asked.notes(videos or (), question))
 
 
@@ -373,12 +369,7 @@ def describe(
 
 @app.command()
 def compare(
-    a: Annotated[str, typer.Argument(help="A video.")],
-    b: Annotated[str, typer.Argument(help="Another one.")],
-    property: Annotated[str, typer.Argument(help="Such as hardness.")],
-    model: Model = None,
-    base: Base = None,
-    device: Device = "auto",
+    a: Video, b: Another, property: Property, model: Model = None, base: Base = None, device: Device = "auto"
 ) -> None:
     """Say whether the first video has more of a property than the second."""
     found = _load(model, base, device).compare(a, b, property)
@@ -388,7 +379,7 @@ def compare(
 
 @app.command()
 def rank(
-    property: Annotated[str, typer.Argument(help="Such as hardness.")],
+    property: Property,
     paths: Annotated[list[Path], typer.Argument(metavar="VIDEOS...", help="Two videos or more, or folders of them.")],
     model: Model = None,
     base: Base = None,
@@ -451,11 +442,7 @@ def remember(
 
 @app.command()
 def recognise(
-    video: Annotated[str, typer.Argument(help="A video.")],
-    memory: Memory = TOUCHES,
-    model: Model = None,
-    base: Base = None,
-    device: Device = "auto",
+    video: Video, memory: Memory = TOUCHES, model: Model = None, base: Base = None, device: Device = "auto"
 ) -> None:
     """Say which remembered objects a touch is like, the most similar first."""
     found = _load(model, base, device).recognise(video, memory)

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import io
 import json
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
 import pyarrow.parquet as pq
@@ -24,14 +23,14 @@ from pipeline.core.errors import UserError, without_secrets
 from pipeline.core.records import EffectRow, Graded
 from pipeline.evaluation.scores import difference, grouped, with_holm
 from pipeline.tasks import TASKS
+from pipeline.weights import first_words
 
 GRADED, QUESTIONS = "data/graded.parquet", "data/questions"
 SHOWN = 40
 Rows = list[dict[str, Any]]
 
 
-@dataclass(frozen=True)
-class State:
+class State(NamedTuple):
     """The project at one point of its history: its files as Git, the disk and DVC's cache have them."""
 
     name: str
@@ -64,7 +63,7 @@ class State:
         rows = None if content is None else pq.read_table(io.BytesIO(content)).to_pylist()
         return None if rows is None else [Graded.model_validate(row) for row in rows]
 
-    def questions(self) -> dict[str, object]:
+    def asked(self) -> dict[str, object]:
         """By id, over all seeds, what makes a question this one: its videos and its right answer."""
         files = self.files.glob(f"{QUESTIONS}/*/evaluation.jsonl")
         rows = (json.loads(line) for file in files for line in (self.read(file) or b"").splitlines())
@@ -107,8 +106,8 @@ def compare(root: Path, old: str, new: str = "") -> dict[str, Any]:
 def describe(found: dict[str, Any]) -> str:
     """A comparison for a terminal; long lists are cut."""
     parts = [f"{found['old']} -> {found['new']}" if found["differs"] else "No parameter, metric or answer differs"]
-    for title, rows in found.items():
-        if isinstance(rows, list) and rows and title != "notes":
+    for title in ("parameters", "metrics", "tested"):
+        if rows := found[title]:
             table = pd.DataFrame(rows[:SHOWN]).fillna("").to_string(index=False, max_colwidth=72)
             rest = f"\n... and {len(rows) - SHOWN} more; --json FILE has them all" if len(rows) > SHOWN else ""
             parts.append(f"{title.capitalize()}\n{table}{rest}")
@@ -118,22 +117,19 @@ def describe(found: dict[str, Any]) -> str:
 def _tested(one: State, two: State) -> tuple[Rows, list[str]]:
     """Each system against itself on the questions that both asked, pooled over the seeds that both have; notes."""
     try:
-        answers = {state.name: state.answers() for state in (one, two)}
+        graded = [one.answers(), two.answers()]
     except ValueError as error:
-        why = " ".join(str(error).split())[:200]
-        return [], [f"No paired test: {GRADED} is not as grading writes it today ({why})."]
-    if lacking := " and ".join(name for name, found in answers.items() if found is None):
+        return [], [f"No paired test: {GRADED} is not as grading writes it today ({first_words(error)})."]
+    if lacking := " and ".join(state.name for state, found in zip((one, two), graded, strict=True) if found is None):
         return [], [f"No paired test: {GRADED} of {lacking} is not at hand; `dvc pull` or `dvc repro` there brings it."]
-    asked = [one.questions(), two.questions()]
-    if not all(asked):  # Then objects alone must tell whether a question is the same.
-        asked = [{}, {}]
-    graded = [answers[state.name] or [] for state in (one, two)]
+    asked = [one.asked(), two.asked()]
+    # Where one side's are not at hand, objects alone must tell whether a question is the same.
     meant = [
-        {g.question_id: (videos.get(g.question_id), g.objects) for g in found}
-        for found, videos in zip(graded, asked, strict=True)
+        {g.question_id: (all(asked) and own.get(g.question_id), g.objects) for g in found or ()}
+        for own, found in zip(asked, graded, strict=True)
     ]
     same = {question for question, meaning in meant[0].items() if meaning == meant[1].get(question)}
-    before, after = (grouped(g for g in found if g.question_id in same) for found in graded)
+    before, after = (grouped(g for g in found or () if g.question_id in same) for found in graded)
     rows = []
     for (task, measure), settings in after.items():
         for setting, runs in settings.items() if task in TASKS and measure == TASKS[task].measure else ():

@@ -8,7 +8,7 @@ from pathlib import Path
 from pipeline.config.params import load_params
 from pipeline.core.errors import UserError
 
-CHAIN, LOCK = "dvc.yaml", "dvc.lock"
+CHAIN = "dvc.yaml"
 INTERRUPTED = ("exited with 130", "exited with -2")
 """How DVC's error ends for a stage that Ctrl-C ended, the second where it had hardly begun or was at its end."""
 
@@ -28,16 +28,14 @@ def outdated(root: Path) -> tuple[int, int]:
 
     try:
         with Repo(str(root)) as repo:
-            changed, graph = set(repo.status(targets=[CHAIN])), repo.index.graph
+            changed, graph = repo.status(targets=[CHAIN]), repo.index.graph
     except SCMError:
         raise UserError(f"{root.resolve()}: no Git repository, which DVC needs; clone it, or `git init`") from None
     except DvcException as error:
         back = "`git checkout dvc.lock` brings back the last one of Git; without one, delete it"
-        mend = back if LOCK in str(error) else "mend it"
-        raise UserError(f"{' '.join(str(error).split())}; {mend}") from None
-    waiting = {stage for stage in graph if stage.addressing in changed}
-    for stage in tuple(waiting):
-        waiting |= nx.ancestors(graph, stage)
+        raise UserError(f"{' '.join(str(error).split())}; {back if 'dvc.lock' in str(error) else 'mend it'}") from None
+    started = [stage for stage in graph if stage.addressing in changed]
+    waiting = set(started).union(*(nx.ancestors(graph, stage) for stage in started))
     return len(waiting), sum(stage.path_in_repo == CHAIN for stage in graph)
 
 
@@ -58,8 +56,7 @@ def reproduce(root: Path, arguments: list[str]) -> int:
         return not stopped
 
     params = load_params(root / "params.yaml")
-    name = params.report_name
-    waiting, total = outdated(root)
+    name, (waiting, total) = params.report_name, outdated(root)
     if waiting:
         print(f"{name}: up to {waiting} of {total} stages will run", flush=True)
     if waiting or arguments:

@@ -6,6 +6,7 @@ function receives its own section, never the root.
 
 from __future__ import annotations
 
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -26,8 +27,6 @@ QuestionCounts = dict[str, Annotated[int, Field(ge=0)]]
 Recipe = Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]*$")]
 """A name in `pipeline.encoder.recipes.RECIPES`; `octopi scale` checks that it is one."""
 Backend = Literal["processes", "ray"]
-CLIP_RECIPES = ("paper", "release")
-"""Recipes that are for `encoder.backbone=[clip]` alone."""
 TrainedEmbeddings = Literal["all", "new"]
 Selection = Literal["salient", "release", "contact"]
 Compared = Annotated[str, Field(pattern=r"^(constant|backbone|backbone-tuned)(-[1-9][0-9]*)?$")]
@@ -52,11 +51,10 @@ class Section(BaseModel):
     def _true_is_no_number(cls, values: object) -> object:
         """Python counts `true` as 1, and so `epochs: true` would train for one epoch."""
         for name, value in values.items() if isinstance(values, dict) else ():
-            field = cls.model_fields.get(name)
-            if field is None or field.annotation is bool or isinstance(field.annotation, type(BaseModel)):
-                continue
+            kind = cls.model_fields[name].annotation if name in cls.model_fields else bool
             inner = value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else [value]
-            if any(isinstance(each, bool) for each in inner):
+            section = isinstance(kind, type(BaseModel))  # Which looks at its own values.
+            if kind is not bool and not section and any(isinstance(each, bool) for each in inner):
                 raise ValueError(f"{name} is {str(value).lower()}, but no switch")
         return values
 
@@ -116,7 +114,7 @@ class FramesConfig(Section):
     """Frames drawn of those that are kept (paper: 5)."""
     pixels: Annotated[int, Field(ge=16, le=1024)] = 224
     """Side of the square that frames are stored at; a CLIP's own or more, as larger frames are averaged. No key may be
-    called `size` or `nfiles`: DVC's run cache leaves those out, and would bring back frames of another size."""
+    called `size` or `nfiles`: DVC's run cache leaves those out."""
     fit: Literal["crop", "squash"] = "crop"
     """`crop`: the centre, then to `pixels`. `squash`: the whole frame, aspect lost."""
 
@@ -131,8 +129,8 @@ class SplitConfig(Section):
     test_objects: Positive = 7
     """Test objects of the development split."""
     train_objects: Annotated[int, Field(ge=0)] = 0
-    """Of kfold: train on so many of a fold's training objects, and leave the others unused, to see how many objects are
-    enough. Of two numbers the larger has all objects of the smaller. 0: all."""
+    """Of kfold: train on so many of a fold's training objects, to see how many are enough; the larger of two numbers
+    has all objects of the smaller. 0: all."""
     folds: Annotated[int, Field(ge=3, le=50)] = 5
     """Of kfold. Each seed of `ablation.seeds` has one for its test: seed s has fold s modulo `folds`."""
     missing: Literal["report", "error"] = "report"
@@ -162,26 +160,22 @@ class QuestionsConfig(Section):
     """By the task's name in lower case; a task without a number gets none. With kfold these are for each fold."""
     evaluation: QuestionCounts
     scenarios: Literal["published", "ours"] = "published"
-    """Scenario questions (PSR): whose right and wrong objects. `published`: the published code's. `ours`: this
-    project's reading of the situations, with clearer contrasts. A catalogue's own scenarios are asked in any case."""
+    """Scenario questions (PSR): whose right and wrong objects, the published code's or this project's reading of the
+    situations, with clearer contrasts. A catalogue's own scenarios are asked in any case."""
     wording: Literal["object", "class"] = "object"
     """Wording of free descriptions. `object`: each object has one phrase per class, as published. `class`: every object
-    has its class's first phrase. Several phrases split a class's probability in greedy decoding, which favours the
-    class with the fewest first words; they also let a model recognise objects where there are few."""
+    has its class's first phrase, since several split a class's probability in greedy decoding."""
     facts: bool = False
     """Begin matching questions with what the named objects are like, for a language model that has never heard of
-    them: then touch and reasoning are asked for and no knowledge of the world. Tables say so."""
+    them: then no knowledge of the world is asked for. Tables say so."""
     names: Literal["catalogue", "number"] = "catalogue"
-    """What objects are called. `number`: "object 7", as in the training of the shipped model, which cannot repeat other
-    names. Such a name says nothing about its object; `facts` do."""
+    """What objects are called. `number`: "object 7", as in the training of the shipped model, which copies no other."""
     inexact: Annotated[float, Field(ge=0, le=1)] = 0.0
     """`facts` in training: probability that a stated class is a neighbour of the right one; the right matching stays
-    the nearest. An encoder errs in this way, and from exact facts the model would learn to look for equal classes
-    alone."""
+    the nearest. An encoder errs so, and from exact facts the model would learn to look for equal classes alone."""
     restate: bool = False
-    """Where everything is described (OPD `all`), have answers to PC and PSS name the classes of the one property that
-    is asked for, and which object has more or less of it, before they conclude: for a language model too small to find
-    and compare at once. Reports say so."""
+    """Where everything is described (OPD `all`), answers to PC and PSS name the classes of the property asked for, and
+    which object has more or less of it, before they conclude: for a model too small to find and compare at once."""
     two_turns: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """Share of the training questions about several videos that become a dialogue in OPD mode `all`: the first turn
     describes all videos, as in scenarios (PSR), and each later one asks a question about them."""
@@ -235,24 +229,15 @@ class EncoderConfig(Section):
     """Not in params.yaml: the file of the backbone `scenes`. A packaged model has one of its own."""
 
     @model_validator(mode="after")
-    def _batches_divide(self) -> Self:
-        micro = self.micro_batch_size
+    def _settings_fit(self) -> Self:
+        micro, named = self.micro_batch_size, ",".join(self.backbone)
         if 0 < micro < self.batch_size and self.batch_size % micro:
             raise ValueError(f"encoder.micro_batch_size {micro} does not divide batch_size {self.batch_size}")
-        return self
-
-    @model_validator(mode="after")
-    def _logits_are_standardised(self) -> Self:
         if self.embedding == "logits" and not self.standardize:
             raise ValueError("encoder.embedding: logits have any scale; set encoder.standardize=true")
-        return self
-
-    @model_validator(mode="after")
-    def _backbones_fit(self) -> Self:
-        named = ",".join(self.backbone)
         if len(set(self.backbone)) < len(self.backbone):
             raise ValueError(f"encoder.backbone=[{named}] names one twice")
-        if self.recipe in CLIP_RECIPES and self.backbone != ("clip",):
+        if self.recipe in ("paper", "release") and self.backbone != ("clip",):
             raise ValueError(
                 f"encoder.recipe={self.recipe} is for CLIP alone, but encoder.backbone=[{named}]; set "
                 "encoder.backbone=[clip] and encoder.weights, or encoder.recipe=tuned"
@@ -316,8 +301,7 @@ class LanguageConfig(Section):
     takes it away). A chat template's own stays."""
     normalize_touch: bool = False
     """Scale each projected tactile embedding to the root mean square of the word embeddings. Otherwise alignment at a
-    high rate makes them a hundred times as long as words, which drowns what attention adds to them, such as the video
-    that they belong to."""
+    high rate makes them a hundred times as long, which drowns what attention adds, such as their video."""
     max_new_tokens: Annotated[int, Field(ge=1, le=4096)] = 256
     """Of an answer; fewer where the language model has no more positions. Longer answers are cut and marked."""
     generation_batch_size: Positive = 32
@@ -364,8 +348,8 @@ class AlignConfig(TrainConfig):
     """Word embeddings that are trained, here and in the end-to-end training that follows: `all`, the whole layer
     (paper), or only those of the two `new` tokens. All take another 16 bytes a value, 2 GiB for Vicuna-7b."""
     begin_with_words: bool = False
-    """First fit the projection to the word embeddings of each object's classes: for a small model, which would need
-    many more questions to tell the frames of one video from those of the next."""
+    """First fit the projection to the word embeddings of each object's classes: for a small model, which would else
+    need many more questions to tell one video's frames from the next one's."""
 
 
 class LoraTrainConfig(TrainConfig):
@@ -389,8 +373,7 @@ class LoraTrainConfig(TrainConfig):
 class AblationConfig(Section):
     """Which variants of the system are trained and compared: the product of the lists.
 
-    The full system (fine-tuned encoder, with LoRA, all descriptions) is always among them, since every effect is a
-    difference to it.
+    The full system (fine-tuned encoder, with LoRA, all descriptions) is among them: every effect is a difference to it.
     """
 
     encoders: tuple[Encoder, ...] = (Encoder.FINETUNED, Encoder.BASE)
@@ -418,13 +401,8 @@ class AblationConfig(Section):
 
     def variants(self) -> list[Variant]:
         """All answering systems, in the lists' order; input ablations belong to the full system alone."""
-        return [
-            Variant(encoder, lora, opd, seed)
-            for seed in self.seeds
-            for encoder in self.encoders
-            for lora in self.lora
-            for opd in self.opd
-        ]
+        chosen = product(self.seeds, self.encoders, self.lora, self.opd)
+        return [Variant(encoder, lora, opd, seed) for seed, encoder, lora, opd in chosen]
 
 
 class TrackingConfig(Section):
@@ -493,13 +471,9 @@ class Params(Section):
     runtime: RuntimeConfig
 
     @model_validator(mode="after")
-    def _scenes_have_their_place(self) -> Self:
+    def _sections_fit(self) -> Self:
         if self.data.source == "scenes" and Path(self.data.dir) != SCENES_DIR:
             raise ValueError(f"data.dir must be {SCENES_DIR} where data.source is scenes (set data.source=videos?)")
-        return self
-
-    @model_validator(mode="after")
-    def _replicates_hold_the_same_folds(self) -> Self:
         held: dict[int, set[int | None]] = {}
         for seed in self.ablation.seeds:
             held.setdefault(self.split.replicate_of(seed), set()).add(self.split.fold_of(seed))
@@ -508,18 +482,10 @@ class Params(Section):
                 f"ablation.seeds {list(self.ablation.seeds)} test on some of the {self.split.folds} folds more often "
                 "than on others; take as many seeds for each fold"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _heads_speak(self) -> Self:
         if Encoder.WORDS in self.ablation.encoders and self.encoder.embedding != "logits":
             raise ValueError("ablation.encoders: words are read off the heads' logits; set encoder.embedding=logits")
         if Encoder.WORDS in self.ablation.encoders and self.packaged == "all":
             raise ValueError("packaged=all: a variant that is given words reads no videos; set packaged=full")
-        return self
-
-    @model_validator(mode="after")
-    def _heads_can_contradict(self) -> Self:
         if self.lora.skip_contradicted and self.encoder.embedding != "logits":
             raise ValueError("lora.skip_contradicted reads the heads' logits; set encoder.embedding=logits")
         if self.lora.skip_contradicted and self.questions.two_turns:

@@ -93,17 +93,16 @@ class OneKeyLoader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: igno
 def explain(error: ValidationError) -> str:
     """The first problem of a validation in one line: key, value, what is allowed."""
     detail = error.errors(include_url=False)[0]
-    key = ".".join(str(part) for part in detail["loc"])
-    if detail["type"] == "extra_forbidden":
-        if key in RENAMED:
-            return f"{key} is called {RENAMED[key]} now; write that name"
+    key, kind, message = ".".join(map(str, detail["loc"])), detail["type"], detail["msg"].removeprefix("Value error, ")
+    if key in RENAMED:
+        return f"{key} is called {RENAMED[key]} now; write that name"
+    if kind == "extra_forbidden":
         known = list(getattr(kind_of(detail["loc"][:-1]), "model_fields", ()))
         hint = did_you_mean(str(detail["loc"][-1]), known)
         return f"{key} is not a parameter; {hint}allowed here: {', '.join(known)}"
-    message = detail["msg"].removeprefix("Value error, ")
-    if detail["type"] == "missing":
+    if kind == "missing":
         return f"{key} is missing; run `octopi scale` again to write a whole params.yaml"
-    if detail["type"] == "value_error":
+    if kind == "value_error":
         return f"{key}: {message}" if key else message
     return f"{key} is {detail['input']!r}: {message}"
 

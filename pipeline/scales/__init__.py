@@ -28,6 +28,7 @@ from pipeline.videos.split import FEWEST_TRAINING_OBJECTS, assign_objects, untes
 from pipeline.weights.check import check_encoder_files, check_language_files
 
 CONF = Path("conf")
+QUOTED = r"""'.*'|".*\""""
 HEADER = "# Written by `octopi scale`; change it with that command, or edit conf/ and run it again.\n"
 
 
@@ -51,18 +52,26 @@ def compose(name: str, overrides: Sequence[str] = (), conf: Path = CONF) -> Para
     scales = shipped_scales(conf)
     if name not in scales:
         raise UserError(f"scale {name!r} is not known; allowed: {', '.join(scales)}")
+    forced, texts = list[str](), dict[str, str]()
     for override in overrides:
-        if "=" not in override:
+        key, equals, value = override.partition("=")
+        if not equals:
             raise UserError(f"{override!r} is no override; write key=value, for example split.name=development")
-    # Every key may be set here; whether it exists is the validation's matter, since that knows what is allowed.
-    forced = [o if o.startswith(("+", "~")) else f"++{_literal(o)}" for o in overrides]
+        if kind_of(key.lstrip("+").split(".")) is str and not re.fullmatch(QUOTED, value, re.DOTALL):
+            # As it stands: Hydra's grammar would read brackets, commas or blanks of a path.
+            texts[key.lstrip("+")] = value
+        else:
+            # Every key may be set; whether it exists is the validation's matter, since that knows what is allowed.
+            forced.append(override if key.startswith(("+", "~")) else f"++{override}")
     # A recipe brings its own values; they give way to what is set beside it.
-    asked = dict(o.lstrip("+").split("=", 1) for o in overrides).get("encoder.recipe")
-    if asked is not None and (conf / "recipe" / f"{asked}.yaml").is_file():
-        forced.insert(0, f"recipe={asked}")
+    if (conf / "recipe" / f"{texts.get('encoder.recipe')}.yaml").is_file():
+        forced.insert(0, f"recipe={texts['encoder.recipe']}")
     try:
         with initialize_config_dir(str(conf.resolve()), version_base=None):
-            values = OmegaConf.to_container(hydra_compose(name, overrides=forced), resolve=True)
+            composed = hydra_compose(name, overrides=forced)
+        for key, value in texts.items():
+            OmegaConf.update(composed, key, value, force_add=True)
+        values = OmegaConf.to_container(composed, resolve=True)
     except (HydraException, OmegaConfBaseException, yaml.YAMLError, UnicodeDecodeError) as error:
         raise UserError(f"scale {name}: {' '.join(str(error).split())}") from None
     assert isinstance(values, dict)
@@ -72,16 +81,6 @@ def compose(name: str, overrides: Sequence[str] = (), conf: Path = CONF) -> Para
             f"{conf / name}.yaml: it calls itself {params.scale}, and would replace its reports; write scale: {name}"
         )
     return params
-
-
-def _literal(override: str) -> str:
-    """The override with a text as it stands: Hydra's grammar would read brackets, commas or blanks of a path."""
-    key, value = override.split("=", 1)
-    if kind_of(key.split(".")) is not str or (len(value) > 1 and value[0] == value[-1] and value[0] in "'\""):
-        return override
-    # Hydra halves backslashes only where a quotation mark follows.
-    escaped = re.sub(r"(\\*)('|$)", lambda found: found[1] * 2 + ("\\'" if found[2] else ""), value)
-    return f"{key}='{escaped}'"
 
 
 def check_inputs(params: Params) -> str:
@@ -96,9 +95,9 @@ def check_inputs(params: Params) -> str:
     launched(params.runtime.launcher)
     check_backend(params.runtime.parallel)
     folder = Path(params.data.dir)
+    if params.data.source == "videos" and folder.is_file():
+        raise UserError(f"data.dir: {folder} is a file; name the folder that the videos are in")
     if params.data.source == "videos" and not folder.is_dir():
-        if folder.exists():
-            raise UserError(f"data.dir: {folder} is a file; name the folder that the videos are in")
         raise UserError(
             f"data.dir: {folder} does not exist; import the public data set (README, section Real videos) or name the "
             "folder with data.dir=..."

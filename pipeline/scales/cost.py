@@ -6,7 +6,6 @@ frozen weight; Kaplan et al. 2020, section 2.1) and from a device's rate. Stages
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -17,7 +16,7 @@ from pipeline.scales.memory import BYTES, FULL, GIB, Shapes, Use, launched, trai
 from pipeline.tasks.questions import counts_by_task
 from pipeline.videos.files import list_videos
 from pipeline.weights import DOWNLOADED
-from pipeline.weights.shapes import layers, parameters, read_language
+from pipeline.weights.check import layers, parameters, read_language
 
 GB = 1e9
 
@@ -48,14 +47,14 @@ REST = ("pretrain", "cross_validate", "finetune_encoder", "embed")
 
 
 class Hours(NamedTuple):
-    """Of a stage over all its variants."""
+    """What all runs of a stage, over its variants, take together."""
 
     stage: str
     runs: int
     work: float
-    """Floating-point operations of all runs."""
+    """Floating-point operations."""
     read: float = 0.0
-    """Bytes of weights that all runs read again for each token they say."""
+    """Bytes of weights that are read again for each token said."""
 
     def on(self, flops: float, bandwidth: float | None) -> float:
         """Hours at these rates: the longer of computing and reading."""
@@ -182,14 +181,11 @@ def _round(number: float) -> str:
 def measured_rate(side: int = 1024, seconds: float = 0.5) -> float:
     """Floating-point operations a second of float32 matrix products on this processor, the median of several."""
     import torch
+    from torch.utils.benchmark import Timer
 
-    a, b = torch.rand(side, side), torch.rand(side, side)
-    times, end = list[float](), time.perf_counter() + seconds
-    while len(times) < 3 or time.perf_counter() < end:
-        begin = time.perf_counter()
-        a @ b
-        times.append(time.perf_counter() - begin)
-    return float(2 * side**3 / sorted(times)[len(times) // 2])
+    factors = {"a": torch.rand(side, side), "b": torch.rand(side, side)}
+    timer = Timer("a @ b", globals=factors, num_threads=torch.get_num_threads())
+    return float(2 * side**3 / timer.blocked_autorange(min_run_time=seconds).median)
 
 
 def fits(uses: list[Use], gib: float) -> Iterator[str]:

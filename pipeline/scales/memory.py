@@ -17,13 +17,12 @@ import yaml
 
 from pipeline.config import EncoderConfig, LoraTrainConfig, Params, TrainConfig
 from pipeline.core.errors import UserError
-from pipeline.core.records import Part, Question, Turn
+from pipeline.core.records import Part
 from pipeline.scenes.invented import catalogue_of
 from pipeline.tasks.base import Pool
 from pipeline.tasks.questions import build_questions, counts_by_task
 from pipeline.videos.catalogue import Catalogue
-from pipeline.weights.check import TOKENIZER, read_tokenizer
-from pipeline.weights.shapes import layers, linear, parameters, read_language, read_tower
+from pipeline.weights.check import TOKENIZER, layers, linear, parameters, read_language, read_tokenizer, read_tower
 
 if TYPE_CHECKING:
     from open_clip.transformer import VisionTransformer
@@ -63,7 +62,7 @@ class Use(NamedTuple):
     @property
     def total(self) -> float:
         """The sum of the four."""
-        return self.parameters + self.optimizer + self.activations + self.cache
+        return sum(self[2:])
 
 
 class Lengths(NamedTuple):
@@ -126,10 +125,24 @@ def read_shapes(params: Params) -> Shapes:
 
 
 def count(params: Params, shapes: Shapes) -> list[Use]:
-    """The memory of all stages that run a base model whose shapes are known."""
-    uses: list[Use] = []
-    if shapes.tower is not None:
-        uses += encoder_uses(params, shapes.tower, sum(len(p.levels) for p in shapes.catalogue.properties))
+    """The memory of all stages that run a base model whose shapes are known: of the encoder's, those by gradients."""
+    uses, config, tower = list[Use](), params.encoder, shapes.tower
+    if tower is not None:
+        width, depth = tower.transformer.width, len(layers(tower))
+        classes = sum(len(p.levels) for p in shapes.catalogue.properties)
+        if config.recipe in ("paper", "release"):
+            trained = min(depth, config.prompt_layers or depth) * config.prompts * width
+            if config.recipe == "paper":
+                trained += (width + 1) * width + (features(config, tower) + 1) * classes
+            else:
+                trained += (width + 1) * 512 + 513 * classes
+            pictures = params.frames.per_video * min(config.micro_batch_size or config.batch_size, config.batch_size)
+            size = BYTES["float32" if config.autocast == "none" else config.autocast]
+            activations = sum(tower_kept(tower, pictures, config.prompts, size))
+            held = FULL * (parameters(tower) + trained)
+            uses.append(Use("finetune_encoder", 1, held, ADAM * trained, activations))
+        _, passing = tower_kept(tower, config.embed_batch_size, config.prompts, FULL)
+        uses.append(Use("embed", 1, FULL * parameters(tower), 0, passing))
     if shapes.llm is not None:
         uses += language_uses(params, shapes.llm, shapes.embedding, shapes.lengths)
     return uses
@@ -171,27 +184,11 @@ def tower_kept(tower: VisionTransformer, frames: int, prompts: int, size: int) -
     return tokens * (len(blocks) * layer + (width + 2) * FULL) + copies, 4 * tokens * wide * size
 
 
-def encoder_uses(params: Params, tower: VisionTransformer, classes: int) -> Iterator[Use]:
-    """Fine-tuning by gradients (recipes `paper` and `release`), and embedding; `classes` counts all properties'."""
-    config, width = params.encoder, tower.transformer.width
-    if config.recipe in ("paper", "release"):
-        trained = min(len(layers(tower)), config.prompt_layers or len(layers(tower))) * config.prompts * width
-        if config.recipe == "paper":
-            trained += (width + 1) * width + (features(config, tower) + 1) * classes
-        else:
-            trained += (width + 1) * 512 + 513 * classes
-        pictures = params.frames.per_video * min(config.micro_batch_size or config.batch_size, config.batch_size)
-        size = BYTES["float32" if config.autocast == "none" else config.autocast]
-        activations = sum(tower_kept(tower, pictures, config.prompts, size))
-        yield Use("finetune_encoder", 1, FULL * (parameters(tower) + trained), ADAM * trained, activations)
-    _, passing = tower_kept(tower, config.embed_batch_size, config.prompts, FULL)
-    yield Use("embed", 1, FULL * parameters(tower), 0, passing)
-
-
 def language_uses(params: Params, llm: PreTrainedModel, embedding: int, lengths: Lengths) -> Iterator[Use]:
     """Alignment, LoRA and answering; `embedding` is the length of a tactile one."""
-    language, hidden, maps = params.language, llm.config.hidden_size, linear(llm)
-    size, middle, blocks = BYTES[language.dtype], maps["down_proj"][0], len(layers(llm))
+    language = params.language
+    hidden, maps, blocks = llm.config.hidden_size, linear(llm), len(layers(llm))
+    size, middle = BYTES[language.dtype], maps["down_proj"][0]
     held = NF4 if language.quantization == "nf4" else size
     # Linear maps alone are held in four bits.
     layer = sum(a * b for a, b in maps.values())
@@ -236,13 +233,9 @@ def trained_parameters(params: Params, llm: PreTrainedModel, embedding: int) -> 
     Words are a copy beside the frozen ones, which a tied head still needs.
     """
     hidden = llm.config.hidden_size
+    connector = (embedding + 1) * hidden + (hidden + 1) * hidden + 2 * hidden
     words = llm.config.vocab_size * hidden if params.align.train_embeddings == "all" else 0
-    ends = sum(map(sum, adapted(llm, params.lora).values()))
-    return (
-        (embedding + 1) * hidden + (hidden + 1) * hidden + 2 * hidden,
-        words,
-        len(layers(llm)) * params.lora.rank * ends,
-    )
+    return connector, words, len(layers(llm)) * params.lora.rank * sum(map(sum, adapted(llm, params.lora).values()))
 
 
 def adapted(llm: PreTrainedModel, config: LoraTrainConfig) -> dict[str, tuple[int, int]]:
@@ -294,19 +287,12 @@ def launched(launcher: str) -> tuple[int, bool]:
 def longest(params: Params, catalogue: Catalogue, language: Path) -> Lengths:
     """Look for the longest conversations among questions on all objects, in tokens of the folder's language model."""
     tokenizer = read_tokenizer(language) if (language / TOKENIZER).is_file() else None
-    config = params.questions
+    config, rows = params.questions, {Part.TRAIN: list[tuple[int, int]](), Part.TEST: list[tuple[int, int]]()}
 
     def tokens(text: str) -> int:
         return len(tokenizer.encode(text).ids) if tokenizer else -(-len(text) // LETTERS)
 
-    def length(question: Question, turns: Sequence[Turn]) -> int:
-        text = " ".join([params.language.system_prompt, *(f"USER: {t.user} ASSISTANT: {t.assistant}" for t in turns)])
-        # A video is its frames and two delimiters.
-        return tokens(text.replace("{tactile}", "")) + len(question.videos) * (params.frames.per_video + 2)
-
-    training: list[tuple[int, int]] = []
-    prompts: list[int] = []
-    for part in (Part.TRAIN, Part.TEST):
+    for part, found in rows.items():
         wanted = counts_by_task(config, "train" if part == Part.TRAIN else "evaluation")
         questions = build_questions(
             Pool(part, catalogue, {o: [f"{o}_0"] for o in catalogue.objects}),
@@ -318,11 +304,16 @@ def longest(params: Params, catalogue: Catalogue, language: Path) -> Lengths:
             two_turns=config.two_turns if part == Part.TRAIN else 0.0,
         )
         for question, turns in ((q, d.turns) for q in questions for d in q.dialogues if d.opd in params.ablation.opd):
-            if part == Part.TRAIN:
-                training.append((length(question, turns), sum(tokens(t.assistant) + 1 for t in turns)))
-            else:
-                prompts.append(length(question, [*turns[:-1], Turn(user=turns[-1].user, assistant="")]))
-    columns = ([t for t, _ in training], [a for _, a in training], prompts)
+            said = [t.assistant for t in turns]
+            if part == Part.TEST:
+                said[-1] = ""  # What is asked for.
+            shown = [f"USER: {t.user} ASSISTANT: {answer}" for t, answer in zip(turns, said, strict=True)]
+            text = " ".join([params.language.system_prompt, *shown]).replace("{tactile}", "")
+            # A video is its frames and two delimiters.
+            length = tokens(text) + len(question.videos) * (params.frames.per_video + 2)
+            found.append((length, sum(tokens(answer) + 1 for answer in said)))
+    training, prompts = rows[Part.TRAIN], [length for length, _ in rows[Part.TEST]]
+    columns = ([length for length, _ in training], [learnt for _, learnt in training], prompts)
     means = (sum(numbers) / max(1, len(numbers)) for numbers in columns)
     return Lengths(*max(training, default=(0, 0)), max(prompts, default=0), *means)
 

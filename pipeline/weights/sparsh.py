@@ -10,10 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pipeline.core.errors import UserError
 from pipeline.core.records import GAIN, MIDDLE
+from pipeline.weights import first_words
 
 if TYPE_CHECKING:
     import torch
@@ -76,22 +77,11 @@ def write(folder: Path, stored: Mapping[str, torch.Tensor], key: str) -> None:
         model = timm.create_model("vit_base_patch16_224", pretrained=False, **form)
         model.load_state_dict(state)
     except (KeyError, ValueError, IndexError, AttributeError, RuntimeError) as error:
-        why = " ".join(str(error).split())[:200]
         raise UserError(
-            f"{key}: not the layout of Sparsh's DINO encoders ({why}); download facebook/sparsh-dino-base"
+            f"{key}: not the layout of Sparsh's DINO encoders ({first_words(error)}); download "
+            "facebook/sparsh-dino-base"
         ) from None
-    means = {
-        "mean": (MEAN,) * 3,
-        "std": (float(STD),) * 3,
-        "input_size": (3, SIDE, SIDE),
-        "license": LICENCE,
-        "tag": "sparsh",
-    }
-    save_for_hf(
-        model,
-        str(folder),
-        model_config={"pretrained_cfg": means},
-        data_config=means,
-        model_args=form,
-        safe_serialization=True,
-    )
+    means: dict[str, Any] = {"mean": (MEAN,) * 3, "std": (float(STD),) * 3}
+    told = {**means, "input_size": (3, SIDE, SIDE), "license": LICENCE, "tag": "sparsh"}
+    how = {"model_config": {"pretrained_cfg": told}, "data_config": told, "model_args": form}
+    save_for_hf(model, str(folder), safe_serialization=True, **how)

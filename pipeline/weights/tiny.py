@@ -10,23 +10,15 @@ from typing import TYPE_CHECKING, Any
 from pipeline.core.errors import UserError
 from pipeline.core.io import save_tensors, write_json
 from pipeline.core.runtime import derive_seed
-from pipeline.weights import CLIP_CONFIG, CLIP_WEIGHTS, MADE
+from pipeline.weights import CLIP_CONFIG, CLIP_WEIGHTS
 
 if TYPE_CHECKING:
     from transformers import PreTrainedTokenizerFast
 
-TAUGHT = "drawn at random and taught nothing"
-ABOUT = "A model with random weights. It knows nothing: figures that it makes are chance."
 CLIP: dict[str, dict[str, Any]] = {
     "model_cfg": {
         "embed_dim": 64,
-        "vision_cfg": {
-            "image_size": MADE["tiny-clip"].size,
-            "patch_size": 8,
-            "width": 128,
-            "layers": 4,
-            "head_width": 32,
-        },
+        "vision_cfg": {"image_size": 64, "patch_size": 8, "width": 128, "layers": 4, "head_width": 32},
         "text_cfg": {"context_length": 8, "vocab_size": 64, "width": 32, "heads": 1, "layers": 1},
     },
     "preprocess_cfg": {"mean": [0.481, 0.458, 0.408], "std": [0.269, 0.261, 0.276]},
@@ -55,11 +47,9 @@ MOST_TOKENS = 2048
 
 
 def write_clip(folder: Path, catalogue: Path, seed: int, *, name: str, form: Mapping[str, Any]) -> None:
-    """Write a CLIP with a vision transformer as open_clip lays it out. It has no words, so needs no catalogue.
+    """Write a CLIP of a configuration `form` as open_clip lays it out. It has no words, so needs no catalogue.
 
-    Args:
-        name: Its name in `MADE`, of which its draws depend.
-        form: Its configuration.
+    Its draws depend on its name in `MADE`.
     """
     import open_clip
     import torch
@@ -76,10 +66,8 @@ def write_llama(
 ) -> None:
     """Write a Llama, and a tokenizer of the catalogue's words, as transformers lays them out.
 
-    Args:
-        name: Its name in `MADE`, of which its draws depend.
-        form: What `LlamaConfig` takes; without `vocab_size` it has as many words as the tokenizer.
-        dtype: Of what is drawn and written: a model of 7 billion weights takes 27 GB in float32.
+    `form` is what `LlamaConfig` takes; without `vocab_size` it has as many words as the tokenizer. Weights are drawn,
+    by the name in `MADE`, and written in `dtype`: 7 billion take 27 GB in float32.
     """
     import torch
     from transformers import AutoModelForCausalLM, LlamaConfig
