@@ -6,7 +6,7 @@ frozen weight; Kaplan et al. 2020, section 2.1) and from a device's rate. Stages
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ from pipeline.scales.memory import BYTES, FULL, GIB, Shapes, Use, launched, trai
 from pipeline.tasks.questions import counts_by_task
 from pipeline.videos.files import list_videos
 from pipeline.weights import DOWNLOADED
-from pipeline.weights.check import layers, parameters, read_language
+from pipeline.weights.check import layers, parameters
 
 GB = 1e9
 
@@ -75,16 +75,16 @@ def costs(params: Params, shapes: Shapes, uses: list[Use], card: str = "") -> It
         videos = len(params.scenes.objects or shapes.catalogue.objects) * params.scenes.videos_per_object
     else:
         videos = len(list_videos(place, shapes.catalogue).files) if place.is_dir() else 0
-    for folder in (Path(params.encoder.weights), Path(params.language.weights)):
+    for folder, llm in ((Path(params.encoder.weights), None), (Path(params.language.weights), shapes.llm)):
         found = next((d for d in DOWNLOADED.values() if d.folder == folder.name), None)
         if found and not folder.is_dir():
-            llm = read_language(folder)
-            size = f", {parameters(llm) * 2 / GB:.0f} GB" if llm is not None else ", 1.7 GB, its text tower included"
-            yield f"Download: {found.repository}{size}, to {folder} (README, section Real weights)."
+            size = f"{parameters(llm) * 2 / GB:.0f} GB" if llm is not None else "1.7 GB, its text tower included"
+            yield f"Download: {found.repository}, {size}, to {folder} (README, section Real weights)."
     if params.data.source == "videos" and not place.is_dir():
         yield f"Videos: {params.data.dir} is not there (README, section Real videos)."
-    yield disk(params, shapes, videos)
-    yield from describe(work(params, shapes, videos), params, card)
+    hours = work(params, shapes, videos)
+    yield disk(params, shapes, videos, {h.stage: h.runs for h in hours})
+    yield from describe(hours, params, card)
     if card:
         yield from fits(uses, CARDS[card].gib)
     devices, sharded = launched(params.runtime.launcher)
@@ -96,17 +96,14 @@ def costs(params: Params, shapes: Shapes, uses: list[Use], card: str = "") -> It
         )
 
 
-def disk(params: Params, shapes: Shapes, videos: int) -> str:
+def disk(params: Params, shapes: Shapes, videos: int, runs: Mapping[str, int]) -> str:
     """What the chain writes of its own: embeddings, trained models, and the checkpoints of the one that trains."""
     shown = videos * params.frames.per_video * FULL * shapes.embedding * (4 if params.encoder.flip_probability else 1)
     total = shown * len(params.ablation.encoders) * len(params.ablation.seeds)
     parts = [f"embeddings {_round(total / GB)}" if videos else "embeddings not known without the videos"]
     if shapes.llm is not None:
         connector, words, adapters = trained_parameters(params, shapes.llm, shapes.embedding)
-        variants = params.ablation.variants()
-        aligned = len({(v.encoder, v.opd, v.seed) for v in variants})
-        lora = sum(v.lora == "with" for v in variants)
-        models = FULL * ((connector + words) * (aligned + lora) + adapters * lora)
+        models = FULL * ((connector + words) * (runs["align"] + runs["lora"]) + adapters * runs["lora"])
         # Weights and Adam's two means.
         checkpoints = 3 * FULL * (connector + words + adapters)
         parts += [f"data/models {_round(models / GB)}", f"checkpoints {_round(checkpoints / GB)} while one trains"]

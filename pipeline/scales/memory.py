@@ -198,11 +198,8 @@ def language_uses(params: Params, llm: PreTrainedModel, embedding: int, lengths:
     shards = devices if sharded else 1
     outside = parameters(llm) - parameters(layers(llm))
     gathered = GATHERED * layer * held + outside * size + FULL * (connector + words) if shards > 1 else 0.0
-    trainings: tuple[tuple[str, TrainConfig, int], ...] = (
-        ("align", params.align, connector + words),
-        ("lora", params.lora, connector + words + adapters),
-    )
-    for stage, config, trained in trainings:
+    all_trained = connector + words + adapters
+    for stage, config, trained in (("align", params.align, connector + words), ("lora", params.lora, all_trained)):
         # What comes and goes at the widest place: the logits and their gradient, or three of a layer's middle.
         tokens, logits = config.micro_batch_size * lengths.training, config.micro_batch_size * lengths.answer
         passing = max(2 * logits * llm.config.vocab_size * FULL, 3 * tokens * middle * size)
@@ -219,7 +216,7 @@ def language_uses(params: Params, llm: PreTrainedModel, embedding: int, lengths:
     yield Use(
         "answer",
         1,
-        parameters=frozen + FULL * (connector + words + adapters),
+        parameters=frozen + FULL * all_trained,
         optimizer=0,
         # The prompts are read at once: the widest maps' outcomes, and a mask for each pair of tokens.
         activations=rows * lengths.prompt * (3 * middle + 2 * hidden + lengths.prompt) * size,
@@ -273,10 +270,8 @@ def launched(launcher: str) -> tuple[int, bool]:
         given, _ = parser.parse_known_args(shlex.split(launcher))
     except (argparse.ArgumentError, ValueError) as error:
         raise UserError(f"runtime.launcher: {error}") from None
-    if given.config_file is None:
-        return given.num_processes or 1, False
     try:
-        settings = yaml.safe_load(given.config_file.read_text(encoding="utf-8"))
+        settings = yaml.safe_load(given.config_file.read_text(encoding="utf-8")) if given.config_file else {}
         return given.num_processes or int(settings.get("num_processes", 1)), settings.get("distributed_type") == "FSDP"
     except (OSError, yaml.YAMLError, AttributeError, TypeError, ValueError):
         raise UserError(

@@ -9,7 +9,7 @@ import json
 from collections.abc import Callable, Collection, Iterable
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
 
 from pipeline.config import EncoderConfig
 from pipeline.core.errors import UserError, did_you_mean
@@ -24,12 +24,11 @@ MADE_DIR = Path("data/weights")
 
 
 class Origin(NamedTuple):
-    """A file of an installed package, known by its hash."""
+    """A file of an installed package, by its place among the package's, known by its hash."""
 
     package: str
     version: str
     file: str
-    """Its place among the package's files."""
     sha256: str
 
     def find(self) -> Path:
@@ -49,7 +48,7 @@ class Made(NamedTuple):
 
     kind: Literal["clip", "timm", "language"]
     origin: Origin | None = None
-    """Where its weights come from; None where they are drawn at random."""
+    """None where its weights are drawn at random."""
     size: int = 0
     """Of a CLIP: side of its frames."""
 
@@ -145,20 +144,17 @@ def check_encoder(folder: Path, size: int, backbone: Collection[str]) -> None:
             raise UserError(f"encoder.backbone: {name} is no backbone; {hint}known: {', '.join(BACKBONES)}")
         if BACKBONES[name].key != "weights":
             continue
-        made_anew = _to_be_made(folder, name, "encoder.weights")
-        wanted = MADE[folder.name].size if made_anew else frame_side(folder, name)
-        if size < wanted:
-            raise UserError(
-                f"frames.pixels is {size} but the encoder in {folder} takes {wanted} or more; set "
-                f"frames.pixels={wanted}"
-            )
+        anew = _to_be_made(folder, name, "encoder.weights")
+        if size < (wanted := MADE[folder.name].size if anew else frame_side(folder, name)):
+            need = f"the encoder in {folder} takes {wanted} or more; set frames.pixels={wanted}"
+            raise UserError(f"frames.pixels is {size} but {need}")
 
 
 def frame_side(folder: Path, backbone: str) -> int:
     """Pixels that a backbone wants frames to have at least, by the configuration in `encoder.weights`.
 
     Raises:
-        UserError: where that is missing or no such one, or the weights are.
+        UserError: where that or the weights are missing, or it is of something else.
     """
     known = BACKBONES[backbone]
     files, mend = known.files(folder), _mend(folder, known.get)
@@ -174,10 +170,8 @@ def frame_side(folder: Path, backbone: str) -> int:
 def check_language(folder: Path, key: str = "language.weights", *, exists: bool = False) -> None:
     """Raise UserError where `folder` holds no transformers model as safetensors, with a fast tokenizer.
 
-    Args:
-        folder: One below data/weights/ may still have to be made.
-        key: The parameter that names it.
-        exists: Whether it must be there now.
+    One below data/weights/ may still have to be made, unless it must be there now (`exists`). `key` is the parameter
+    that names it.
     """
     if not exists and _to_be_made(folder, "language", key):
         return
@@ -211,8 +205,7 @@ def load_language(folder: Path, key: str, **how: Any) -> PreTrainedModel:
     wrong += [f"{name} is {[*own]}, not {[*wanted]}" for name, own, wanted in sorted(told["mismatched_keys"])]
     if wrong:
         raise UserError(f"{key}: {folder} does not fit its config.json ({wrong[0]}); take both from one model")
-    loaded: PreTrainedModel = model
-    return loaded
+    return cast("PreTrainedModel", model)
 
 
 def first_words(error: object) -> str:
@@ -226,8 +219,8 @@ def check_finite(folder: Path, key: str, values: Iterable[tuple[str, torch.Tenso
     `values` have the name of their file's tensor, or the end of it.
     """
     for name, value in values:
-        # The extremes are not finite where a value is not; unlike a mask of all values, they take no memory, and a
-        # twentieth of the time. Bytes, of four-bit weights, have nothing that is not finite.
+        # The extremes are not finite where a value is not; unlike a mask of all, they take no memory, and a twentieth
+        # of the time. Bytes, of four-bit weights, are always finite.
         if value.numel() and value.dtype.itemsize > 1 and not all(e.isfinite() for e in value.aminmax()):
             files = sorted(folder.glob("*.safetensors"))
             file = next((f for f in files if any(stored.endswith(name) for stored in tensor_shapes(f))), folder)

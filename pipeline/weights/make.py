@@ -63,8 +63,8 @@ class Recipe(NamedTuple):
     """How a base model is made."""
 
     write: Callable[[Path, Path, int], None]
-    """Writes configuration and weights into a folder that is empty. Its further arguments are the file with the
-    published weights (for a model that is drawn the catalogue's folder) and the seed."""
+    """Writes it into an empty folder. Further arguments: the file with the published weights (for a model that is drawn
+    the catalogue's folder) and the seed."""
     card: Mapping[str, object]
     """Front matter of its card, in Hugging Face's keys; `taught` is what reports say of it."""
     about: str
@@ -116,10 +116,9 @@ PACKAGED = {name for name, made in MADE.items() if made.origin}
 
 
 def make(name: str, folder: Path, *, seed: int = 0, catalogue: Path = CATALOGUE) -> None:
-    """Make a base model, whole or not at all; what lies in the folder is replaced.
+    """Make a base model of `RECIPES`, whole or not at all; what lies in the folder is replaced.
 
     Args:
-        name: In `RECIPES`.
         seed: Of the weights of a random model.
         catalogue: Folder whose words the tokenizer of a random language model knows.
 

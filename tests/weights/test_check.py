@@ -62,12 +62,10 @@ LLAMA: list[Damage] = [
     (lambda f: (f / "tokenizer.json").write_text(""), "tokenizer.json is no fast tokenizer"),
     NO_WIDTH,
     (lambda f: cut(f / ONE), "model.safetensors is cut off or not a safetensors file .*; download it"),
-    (lambda f: (f / ONE).write_bytes((f / ONE).read_bytes() + b"x"), "model.safetensors is cut off"),
     (lambda f: (f / ONE).write_text("version https://git-lfs"), "model.safetensors is cut off"),
     (lambda f: (f / ONE).rename(f / "pytorch_model.bin"), "only pickles"),
     (lambda f: (f / "tokenizer.json").unlink(), "tokenizer.json does not exist"),
     (lambda f: (f / "tokenizer_config.json").write_text("{"), "_config.json is not a JSON object"),
-    (lambda f: (f / "config.json").write_bytes("{}".encode("utf-16")), "is not a JSON object"),
     (lambda f: (f / "config.json").write_text("[]"), "/config.json is not a JSON object"),
     (lambda f: edit(f / "config.json", model_type=None), "cannot be loaded .*model_type"),
     (lambda f: edit(f / "config.json", num_attention_heads=0), "cannot be loaded .*zero"),
@@ -86,7 +84,6 @@ CLIP: list[Damage] = [
     (lambda f: vision(f, layers=3), 'Missing key.* "transformer.resblocks.2'),
     (lambda f: vision(f, width=48), "does not fit its open_clip_config.json .*mismatch for class_embedding"),
     (lambda f: vision(f, layers=[3, 4, 6, 3]), "is no vision transformer"),
-    (lambda f: vision(f, timm_model_name="test_vit"), "is no vision transformer"),
     (lambda f: (f / CLIP_FORM).write_text("{}"), "open_clip_config.json"),
 ]
 NO_TIMM = "is no configuration of a timm backbone"
@@ -95,7 +92,6 @@ TIMM: list[Damage] = [
     (lambda f: (f / ONE).rename(f / "pytorch_model.bin"), "pickles are refused"),
     (lambda f: (f / "config.json").unlink(), "config.json does not exist; set encoder.weights=data/weights/"),
     (lambda f: (f / "config.json").write_text("{}"), NO_TIMM),
-    (lambda f: (f / "config.json").write_text("no JSON"), NO_TIMM),
     (lambda f: (f / "config.json").write_text("[]"), NO_TIMM),
 ]
 
@@ -202,12 +198,10 @@ def test_whole_models_of_several_kinds_pass(kind: str, tied: bool) -> None:
 
 def test_a_padding_token_beyond_the_words_passes() -> None:
     """As LLaMA's checkpoints often have one; the chain gives it a row when it adds its own tokens."""
-    folder = write_llama(Path("llama"))
-    file = folder / "tokenizer.json"
-    form = json.loads(file.read_text())
-    form["added_tokens"].append(form["added_tokens"][0] | {"id": 260, "content": "[PAD]"})
-    file.write_text(json.dumps(form))
-    check_language_files(folder)
+    file = write_llama(Path("llama")) / "tokenizer.json"
+    added = json.loads(file.read_text())["added_tokens"]
+    edit(file, added_tokens=[*added, added[0] | {"id": 260, "content": "[PAD]"}])
+    check_language_files(Path("llama"))
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32])
@@ -258,7 +252,6 @@ NO_FIT = r"^encoder.weights: \w+ does not fit its (open_clip_)?config.json"
 @pytest.mark.parametrize(
     ("kind", "damage", "words"),
     [
-        ("llama", lambda f: (f / "tokenizer.json").write_text(""), "^language.weights: .*llama"),
         ("llama", lambda f: (f / "tokenizer.json").write_text("{}"), "^language.weights: .*llama"),
         ("shards", spoil_a_shard, rf"^language.weights: {DOWN} in shards/model-0000\d-of-00007.safetensors {NAN}"),
         ("clip", lambda f: spoil(f, CLIP_FILE, f"visual.{MLP}"), f"{MLP} in clip/{CLIP_FILE} {NAN}"),
