@@ -153,8 +153,7 @@ def check_encoder(folder: Path, size: int, backbone: Collection[str]) -> None:
 def frame_side(folder: Path, backbone: str) -> int:
     """Pixels that a backbone wants frames to have at least, by the configuration in `encoder.weights`.
 
-    Raises:
-        UserError: where that or the weights are missing, or it is of something else.
+    Raises UserError where that or the weights are missing, or it is of something else.
     """
     known = BACKBONES[backbone]
     files, mend = known.files(folder), _mend(folder, known.get)
@@ -188,10 +187,8 @@ def check_language(folder: Path, key: str = "language.weights", *, exists: bool 
 def load_language(folder: Path, key: str, **how: Any) -> PreTrainedModel:
     """The language model of a folder as transformers loads it: from disk alone, and running no code of the folder's.
 
-    `key` is the parameter that names it; `how` goes to `from_pretrained`: `device_map="meta"` reads names and shapes.
-
-    Raises:
-        UserError: where shards, index or configuration are broken, or a tensor is missing or of another shape.
+    Raises UserError where shards, index or configuration are broken, or a tensor is missing or of another shape. `key`
+    is the parameter that names it; `how` goes to `from_pretrained`: `device_map="meta"` reads names and shapes alone.
     """
     from transformers import AutoModelForCausalLM
 

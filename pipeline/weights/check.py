@@ -53,10 +53,8 @@ folder's name."""
 def read_tower(folder: Path) -> VisionTransformer | None:
     """The vision tower in a folder of open_clip's; where it is not there, the one published under its name.
 
-    None for a name that is not known, and for a tower that is no vision transformer of open_clip's own.
-
-    Raises:
-        UserError: for a broken configuration.
+    None for a name that is not known, and for a tower that is no vision transformer of open_clip's own. Raises
+    UserError for a broken configuration.
     """
     file = folder / CLIP_CONFIG
     if not file.is_file() and folder.name not in PUBLISHED_CLIP:
@@ -80,10 +78,8 @@ def read_tower(folder: Path) -> VisionTransformer | None:
 def read_language(folder: Path) -> PreTrainedModel | None:
     """The language model in a folder of transformers'; where it is not there, the one published under its name.
 
-    None for a name that is not known, and for layers that are not built like a Llama's.
-
-    Raises:
-        UserError: for a broken configuration.
+    None for a name that is not known, and for layers that are not built like a Llama's. Raises UserError for a broken
+    configuration.
     """
     file = folder / LLM_CONFIG
     if not file.is_file() and folder.name not in PUBLISHED_LANGUAGE:
