@@ -90,29 +90,26 @@ class OneKeyLoader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: igno
         return values
 
 
-def explain(error: ValidationError) -> str:
-    """The first problem of a validation in one line: key, value, what is allowed."""
-    detail = error.errors(include_url=False)[0]
-    key, kind, message = ".".join(map(str, detail["loc"])), detail["type"], detail["msg"].removeprefix("Value error, ")
-    if key in RENAMED:
-        return f"{key} is called {RENAMED[key]} now; write that name"
-    if kind == "extra_forbidden":
-        known = list(getattr(kind_of(detail["loc"][:-1]), "model_fields", ()))
-        hint = did_you_mean(str(detail["loc"][-1]), known)
-        return f"{key} is not a parameter; {hint}allowed here: {', '.join(known)}"
-    if kind == "missing":
-        return f"{key} is missing; run `octopi scale` again to write a whole params.yaml"
-    if kind == "value_error":
-        return f"{key}: {message}" if key else message
-    return f"{key} is {detail['input']!r}: {message}"
-
-
 def validate(values: Mapping[str, Any], origin: str) -> Params:
-    """Check values against the schema; `origin` begins an error's line."""
+    """Check values against the schema; `origin` begins the line about the first that is wrong."""
     try:
         return Params.model_validate(values)
     except ValidationError as error:
-        raise UserError(f"{origin}: {explain(error)}") from None
+        detail = error.errors(include_url=False)[0]
+    key, kind, message = ".".join(map(str, detail["loc"])), detail["type"], detail["msg"].removeprefix("Value error, ")
+    if key in RENAMED:
+        line = f"{key} is called {RENAMED[key]} now; write that name"
+    elif kind == "extra_forbidden":
+        known = list(getattr(kind_of(detail["loc"][:-1]), "model_fields", ()))
+        hint = did_you_mean(str(detail["loc"][-1]), known)
+        line = f"{key} is not a parameter; {hint}allowed here: {', '.join(known)}"
+    elif kind == "missing":
+        line = f"{key} is missing; run `octopi scale` again to write a whole params.yaml"
+    elif kind == "value_error":
+        line = f"{key}: {message}" if key else message
+    else:
+        line = f"{key} is {detail['input']!r}: {message}"
+    raise UserError(f"{origin}: {line}")
 
 
 def kind_of(key: Iterable[int | str]) -> Any:
