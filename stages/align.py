@@ -7,8 +7,7 @@ from pipeline.core.records import Encoder, Measurement, Opd
 from pipeline.core.stage import DATA, matrix_key, stage
 from pipeline.tracking.live import live
 
-
-def main() -> None:
+if __name__ == "__main__":
     encoder, opd, seed = matrix_key(encoder=Encoder, opd=Opd, seed=None)
     key = f"{encoder}-{opd}-{seed}"
     with stage("align", key, launched=True) as run:
@@ -34,7 +33,3 @@ def main() -> None:
             shutil.copytree(material.adapter, out / ADAPTER_DIR, dirs_exist_ok=True)
         write_table(out / "history.parquet", Measurement, trained.history)
         write_model_card(out, material, data, config)
-
-
-if __name__ == "__main__":
-    main()

@@ -14,8 +14,7 @@ from pipeline.language.generate import ModelSource, answer
 from pipeline.language.input_ablation import ablate_input
 from pipeline.videos.catalogue import load_catalogue
 
-
-def main() -> None:
+if __name__ == "__main__":
     variant = Variant(*matrix_key(encoder=Encoder, lora=Lora, opd=Opd, seed=None))
     with stage("answer", variant.key) as run:
         params, language = run.params, run.params.language
@@ -42,7 +41,3 @@ def main() -> None:
                 examples = read_jsonl(asked / "examples.jsonl", Question)
                 shown = answer(model, store, examples, variant.opd, language, per_video, source)
                 write_jsonl(DATA / "answers" / variant.key / "examples.jsonl", shown)
-
-
-if __name__ == "__main__":
-    main()

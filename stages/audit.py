@@ -10,8 +10,7 @@ from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.frames.store import PROBES_FILE
 from pipeline.videos.split import read_splits
 
-
-def main() -> None:
+if __name__ == "__main__":
     with stage("audit") as run:
         findings = audit_chain(
             Path(run.params.data.dir),
@@ -25,7 +24,3 @@ def main() -> None:
         # What later stages depend on: always the same bytes, so that a new warning retrains nothing.
         write_text(out / "passed", "no errors\n")
         run.metrics.update(summary(findings))
-
-
-if __name__ == "__main__":
-    main()

@@ -13,8 +13,7 @@ from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.frames.store import REFERENCES_FILE, TABLE_FILE, FrameStore
 from pipeline.weights import backbone_files, check_encoder
 
-
-def main() -> None:
+if __name__ == "__main__":
     numbered = [word for word in sys.argv[1:] if kind_of(word)[0] in MODELS and kind_of(word)[1] != 0]
     (name,) = matrix_key(model=(*MODELS, *numbered))
     with stage("cross_validate", name) as run:
@@ -33,7 +32,3 @@ def main() -> None:
         write_table(DATA / "cross_validation" / name / "out_of_fold.parquet", OutOfFold, predictions)
         right = [p.expected == p.predicted for p in predictions]
         run.metrics["combined.accuracy"] = sum(right) / len(right)
-
-
-if __name__ == "__main__":
-    main()

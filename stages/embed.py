@@ -43,7 +43,7 @@ def write(run: Stage, key: str, split: Sequence[Assignment], raw: torch.Tensor, 
     run.metrics[f"{key}.norm"] = float(tensor.norm(dim=1).mean())
 
 
-def main() -> None:
+if __name__ == "__main__":
     with stage("embed") as run:
         params = run.params
         check_encoder(Path(params.encoder.weights), params.frames.pixels, params.encoder.backbone)
@@ -64,7 +64,3 @@ def main() -> None:
             for seed in splits:
                 own = DATA / "embeddings" / f"{Encoder.FINETUNED}-{seed}"
                 shutil.copytree(own, own.with_name(f"{Encoder.WORDS}-{seed}"), dirs_exist_ok=True)
-
-
-if __name__ == "__main__":
-    main()

@@ -9,8 +9,7 @@ from pipeline.core.stage import DATA, stage
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.frames.extract import extract_frames
 
-
-def main() -> None:
+if __name__ == "__main__":
     with stage("extract_frames") as run:
         data = run.params.data
         found = extract_frames(
@@ -25,7 +24,3 @@ def main() -> None:
         run.metrics["objects"] = len({v.object_id for v in found.videos})
         run.metrics["frames"] = sum(v.frames for v in found.videos)
         run.metrics["kept_frames"] = len(found.frames)
-
-
-if __name__ == "__main__":
-    main()

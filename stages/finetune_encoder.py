@@ -14,8 +14,7 @@ from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.frames.store import REFERENCES_FILE, TABLE_FILE, FrameStore
 from pipeline.weights import backbone_files, check_encoder
 
-
-def main() -> None:
+if __name__ == "__main__":
     (seed,) = matrix_key(seed=None)
     with stage("finetune_encoder", str(seed)) as run:
         params = run.params
@@ -45,7 +44,3 @@ def main() -> None:
             for name in dict.fromkeys(c.property for c in chosen):
                 right = [c.expected == c.predicted for c in chosen if c.property == name]
                 run.metrics[f"{part}.{name}.accuracy"] = sum(right) / len(right)
-
-
-if __name__ == "__main__":
-    main()

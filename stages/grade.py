@@ -8,8 +8,7 @@ from pipeline.core.stage import DATA, stage
 from pipeline.evaluation.grading import EXTERNAL, grade, grade_vision_models
 from pipeline.videos.catalogue import load_catalogue
 
-
-def main() -> None:
+if __name__ == "__main__":
     with stage("grade") as run:
         catalogue = load_catalogue(Path(run.params.data.catalogue)).called(run.params.questions.names)
         graded = []
@@ -26,7 +25,3 @@ def main() -> None:
         seen = grade_vision_models(outside, files, run.params.split.replicate_of, catalogue)
         write_table(DATA / "graded_vision.parquet", GradedVision, seen)
         run.metrics["answers"] = len({(g.variant, g.touch, g.question_id) for g in graded})
-
-
-if __name__ == "__main__":
-    main()

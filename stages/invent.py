@@ -6,14 +6,9 @@ from pipeline.config import INVENTED
 from pipeline.core.stage import stage
 from pipeline.scenes.invented import write_catalogue
 
-
-def main() -> None:
+if __name__ == "__main__":
     with stage("invent") as run:
         INVENTED.mkdir(parents=True, exist_ok=True)
         if Path(run.params.data.catalogue) == INVENTED:
             write_catalogue(run.params.invent, INVENTED)
             run.metrics["objects"] = run.params.invent.objects
-
-
-if __name__ == "__main__":
-    main()

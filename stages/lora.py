@@ -5,8 +5,7 @@ from pipeline.core.records import Encoder, Measurement, Opd
 from pipeline.core.stage import DATA, matrix_key, stage
 from pipeline.tracking.live import live
 
-
-def main() -> None:
+if __name__ == "__main__":
     encoder, opd, seed = matrix_key(encoder=Encoder, opd=Opd, seed=None)
     key = f"{encoder}-{opd}-{seed}"
     with stage("lora", key, launched=True) as run:
@@ -27,7 +26,3 @@ def main() -> None:
         model.save_pretrained(out, trained.state)
         write_table(out / "history.parquet", Measurement, trained.history)
         write_model_card(out, material, data, config)
-
-
-if __name__ == "__main__":
-    main()

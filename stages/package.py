@@ -8,8 +8,7 @@ from pipeline.use.package import package
 
 MODELS = Path("models")
 
-
-def main() -> None:
+if __name__ == "__main__":
     with stage("package") as run:
         params = run.params
         base = Base.of(Path(params.language.weights))
@@ -17,7 +16,3 @@ def main() -> None:
         for variant in wanted:
             package(DATA, params, variant, base, MODELS / variant.key)
         run.metrics["models"] = len(wanted)
-
-
-if __name__ == "__main__":
-    main()

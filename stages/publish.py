@@ -8,15 +8,10 @@ from pipeline.report.page import write_page
 from pipeline.tracking.publish import publish
 from pipeline.tracking.store import TrackingError
 
-
-def main() -> None:
+if __name__ == "__main__":
     with stage("publish") as run:
         write_page(Path())
         try:
             print(publish(run.params), flush=True)
         except TrackingError as error:
             logging.getLogger(__name__).warning("%s", error)
-
-
-if __name__ == "__main__":
-    main()

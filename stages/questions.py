@@ -9,8 +9,7 @@ from pipeline.tasks.examples import build_examples
 from pipeline.tasks.questions import build_questions, counts_by_task, pool_of
 from pipeline.videos.catalogue import load_catalogue
 
-
-def main() -> None:
+if __name__ == "__main__":
     with stage("questions") as run:
         config = run.params.questions
         catalogue = load_catalogue(Path(run.params.data.catalogue)).asking(config.scenarios, config.wording)
@@ -38,7 +37,3 @@ def main() -> None:
                     run.metrics[f"{seed}.{name}.{task}"] = sum(q.task == task for q in questions)
             examples = build_examples(assignments, catalogue, seed=config.seed)
             write_jsonl(DATA / "questions" / str(seed) / "examples.jsonl", examples)
-
-
-if __name__ == "__main__":
-    main()

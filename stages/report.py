@@ -5,11 +5,6 @@ from pathlib import Path
 from pipeline.core.stage import stage
 from pipeline.report.build import write_report
 
-
-def main() -> None:
+if __name__ == "__main__":
     with stage("report") as run:
         run.metrics.update(write_report(run.params, Path()))
-
-
-if __name__ == "__main__":
-    main()

@@ -8,8 +8,7 @@ from pipeline.use.folder import SHIPPED
 from pipeline.use.model import Octopi
 from pipeline.use.shipped import answers_about
 
-
-def main() -> None:
+if __name__ == "__main__":
     with stage("shipped") as run:
         graded: list[GradedVision] = []
         if run.params.shipped:
@@ -20,7 +19,3 @@ def main() -> None:
             graded = answers_about(octopi, run.params, read_table(DATA / "videos.parquet", Video))
             run.metrics["answers"] = len({(g.shown, g.question_id) for g in graded if g.shown is not Shown.CLASSES})
         write_table(DATA / "shipped.parquet", GradedVision, graded)
-
-
-if __name__ == "__main__":
-    main()

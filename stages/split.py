@@ -9,8 +9,7 @@ from pipeline.core.stage import DATA, stage
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.split import assign, assign_objects, untested
 
-
-def main() -> None:
+if __name__ == "__main__":
     with stage("split") as run:
         catalogue, config = load_catalogue(Path(run.params.data.catalogue)), run.params.split
         videos = read_table(DATA / "videos.parquet", Video)
@@ -24,7 +23,3 @@ def main() -> None:
             present = {video.object_id for video in videos}
             lacking = untested(assign_objects(catalogue, present, config), present)
             logging.getLogger(__name__).warning("%s", lacking)
-
-
-if __name__ == "__main__":
-    main()

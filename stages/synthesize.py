@@ -9,8 +9,7 @@ from pipeline.scenes.recipe import load_recipes
 from pipeline.scenes.video import SceneRow, share_as_labelled, synthesize
 from pipeline.videos.catalogue import load_catalogue
 
-
-def main() -> None:
+if __name__ == "__main__":
     with stage("synthesize") as run:
         folder, config = Path(run.params.data.catalogue), run.params.scenes
         catalogue = load_catalogue(folder)
@@ -21,7 +20,3 @@ def main() -> None:
         write_csv(SCENES_DIR.with_name("scenes.csv"), SceneRow, rows)
         run.metrics["videos"] = len(rows)
         run.metrics["as_labelled"] = share_as_labelled(rows, catalogue) if rows else 0.0
-
-
-if __name__ == "__main__":
-    main()

@@ -6,8 +6,7 @@ from pipeline.core.stage import stage
 from pipeline.weights import MADE_DIR, made
 from pipeline.weights.make import make
 
-
-def main() -> None:
+if __name__ == "__main__":
     with stage("weights") as run:
         params = run.params
         MADE_DIR.mkdir(parents=True, exist_ok=True)
@@ -16,7 +15,3 @@ def main() -> None:
         for name in names:
             make(name, MADE_DIR / name, seed=params.seed, catalogue=Path(params.data.catalogue))
         run.metrics["made"] = len(names)
-
-
-if __name__ == "__main__":
-    main()
