@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -18,10 +17,8 @@ from pipeline.core.runtime import derive_seed
 from pipeline.encoder.folds import Fold, Labels, cross_validate
 from pipeline.encoder.frame_classifier import Clips, choose_strength, fit_frame_heads
 from pipeline.encoder.model import FrameEncoder, load_backbones
+from pipeline.videos.catalogue import Catalogue
 from pipeline.weights.make import make
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 
 @contextmanager
@@ -35,8 +32,7 @@ def weights() -> Iterator[Path]:
 @cache
 def _backbone(folder: Path) -> FrameEncoder:
     torch.set_num_threads(1)
-    (loaded,) = load_backbones(EncoderConfig(recipe="tuned", backbone=("timm",), weights=str(folder)))
-    return loaded
+    return load_backbones(EncoderConfig(recipe="tuned", backbone=("timm",), weights=str(folder)))[0]
 
 
 @torch.inference_mode()
@@ -48,19 +44,18 @@ def features(pictures: np.ndarray, folder: Path) -> np.ndarray:
 
 
 def heads_error(
-    learnt: Clips, tested: Clips, labels: Labels, objects: Sequence[str], classes: Sequence[int], folds: int, deals: int
+    learnt: Clips, tested: Clips, objects: Sequence[str], catalogue: Catalogue, folds: int, deals: int
 ) -> Error:
     """`errors.WRONG` of frame heads in grouped folds, their penalty chosen inside the training objects.
 
     Args:
         learnt: What the heads are trained on: videos x frames x features.
         tested: What they are tested on, of the same videos in the same order.
-        labels: Videos x properties.
         objects: Each video's object; folds depend on these alone.
-        classes: How many classes each property has.
         deals: How often the folds are dealt.
     """
-    owners = np.array(objects)
+    owners, classes = np.array(objects), [len(p.levels) for p in catalogue.properties]
+    labels: Labels = np.array([catalogue.labels(o) for o in objects])
 
     def predict(fold: Fold) -> Labels:
         training = (learnt[fold.trained], labels[fold.trained], owners[fold.trained].tolist(), classes)

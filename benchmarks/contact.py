@@ -6,7 +6,6 @@ objects.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.classifier import features, heads_error, weights
-from benchmarks.errors import WRONG, Error, mean_of
+from benchmarks.errors import WRONG, mean_of
 from benchmarks.table import Row, make_rows
 from benchmarks.timing import machine, timed
 from pipeline.config import ScenesConfig
@@ -66,28 +65,18 @@ def measure(root: Path, objects: int | None = None, videos: int = 3, folds: int 
     pictures = [mean_of([scene.pictures[i] for scene in seen], owners) for i in range(len(models()))]
     # Heads learn from the scenes of each model and are tested on those of the finest.
     clips = [np.stack([scene.features[i] for scene in seen]) for i in range(len(models()))]
-    labels, classes = np.array([catalogue.labels(o) for o in owners]), [len(p.levels) for p in catalogue.properties]
-    wrong = [heads_error(learnt, clips[0], labels, owners, classes, folds, deals) for learnt in clips]
+    wrong = [heads_error(learnt, clips[0], owners, catalogue, folds, deals) for learnt in clips]
     steps = "root mean square error of a frame in contact, 8-bit steps"
-    return [
-        *_question("contact", seen, "winkler", pictures, steps),
-        *_question("contact, for a classifier", seen, "layer, every pixel", wrong, WRONG),
-    ]
-
-
-def _question(
-    question: str, seen: Sequence[_Scene], baseline: str, errors: Sequence[Error], error_of: str
-) -> list[Row]:
-    names = list(models())
-    return make_rows(
-        question,
-        {name: [scene.costs[i] for scene in seen] for i, name in enumerate(names)},
-        unit="ms a frame",
-        baseline=baseline,
-        errors=dict(zip(names, errors, strict=True)),
-        error_of=error_of,
-        machine=machine("1 thread a scene"),
-    )
+    costs = {name: [scene.costs[i] for scene in seen] for i, name in enumerate(models())}
+    rows: list[Row] = []
+    for question, baseline, found, error_of in (
+        ("contact", "winkler", pictures, steps),
+        ("contact, for a classifier", "layer, every pixel", wrong, WRONG),
+    ):
+        errors = dict(zip(costs, found, strict=True))
+        shared = {"unit": "ms a frame", "machine": machine("1 thread a scene")}
+        rows += make_rows(question, costs, baseline=baseline, errors=errors, error_of=error_of, **shared)
+    return rows
 
 
 @dataclass(frozen=True)
@@ -127,10 +116,8 @@ def _look(weights: Path, job: _Job) -> _Scene:
     # Noise is drawn from the seed alone, so that pictures of two models share it.
     truth = films[0][hardest].astype(np.float32)
     pictures = [float(np.sqrt(np.mean((frames[hardest] - truth) ** 2))) for frames in films]
-    return _Scene(tuple(costs), tuple(pictures), tuple(_features(frames, weights) for frames in films))
-
-
-def _features(frames: Sequence[Image], weights: Path) -> np.ndarray:
-    reference = np.mean(np.stack([frames[i] for i in reference_indices(len(frames))]), axis=0).round().astype(np.uint8)
-    chosen = np.linspace(0, len(frames) - 1, SHOWN + 2).round().astype(int)[1:-1]
-    return features(subtract(np.stack([frames[i] for i in chosen]), reference), weights)
+    chosen, described = np.linspace(0, FRAMES - 1, SHOWN + 2).round().astype(int)[1:-1], []
+    for frames in films:
+        reference = np.mean([frames[i] for i in reference_indices(FRAMES)], axis=0).round().astype(np.uint8)
+        described.append(features(subtract(np.stack([frames[i] for i in chosen]), reference), weights))
+    return _Scene(tuple(costs), tuple(pictures), tuple(described))

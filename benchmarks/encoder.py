@@ -6,7 +6,6 @@ The encoder is frozen and has seen no label; each size is judged by a grouped cr
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -32,25 +31,16 @@ SIDES, FRAMES = (120, 90, 60, 30), 5
 """Pixels, of which the first are the baseline, and frames a video."""
 
 
-@dataclass(frozen=True)
-class Size:
-    """How much is measured."""
-
-    videos: int = 25
-    """That are timed, spread over the objects."""
-    repeats: int = 5
-    folds: int = 5
-    deals: int = 3
-
-
-def measure(root: Path, size: Size | None = None) -> list[Row]:
+def measure(root: Path, timed: int = 25, repeats: int = 5, folds: int = 5, deals: int = 3) -> list[Row]:
     """Over the videos that `frames.bench_videos` finds.
+
+    Args:
+        timed: How many videos are timed, spread over the objects.
 
     Raises:
         UserError: without pretrained weights, or as `frames.bench_videos`.
     """
-    size = size or Size()
-    folder, catalogue = bench_videos(root, size.folds)
+    folder, catalogue = bench_videos(root, folds)
     pretrained = root / PRETRAINED
     if not pretrained.is_file():
         raise UserError(f"{pretrained}: no such file; `octopi scale small`, `dvc repro pretrain` make it")
@@ -71,18 +61,20 @@ def measure(root: Path, size: Size | None = None) -> list[Row]:
         clips = ClipDataset(store, [LabelledVideo(v.video_id, ()) for v in videos], per_video=FRAMES)
         items = [clips[video] for video in range(len(videos))]
     objects = [video.object_id for video in videos]
-    labels, classes = np.array([catalogue.labels(o) for o in objects]), [len(p.levels) for p in catalogue.properties]
     runs, errors = {}, {}
     for side in SIDES:
-        pictures = [_resized(item["frames"], side) for item in items]
+        # Difference pictures, uint8, k x side x side x RGB, by area.
+        shape, method = (side, side), cv2.INTER_AREA
+        resized = [[cv2.resize(p, shape, interpolation=method) for p in item["frames"].numpy()] for item in items]
+        pictures = [torch.from_numpy(np.stack(own)) for own in resized]
         runs[f"{side} pixels"] = partial(describe, pictures)
         seen = np.stack([describe(pictures, video) for video in range(len(videos))])
-        errors[f"{side} pixels"] = heads_error(seen, seen, labels, objects, classes, size.folds, size.deals)
+        errors[f"{side} pixels"] = heads_error(seen, seen, objects, catalogue, folds, deals)
     # At equal distances in the order of the videos, which is by object.
-    count = min(size.videos, len(videos))
+    count = min(timed, len(videos))
     return make_rows(
         "frame size",
-        interleaved(runs, [i * len(videos) // count for i in range(count)], size.repeats),
+        interleaved(runs, [i * len(videos) // count for i in range(count)], repeats),
         unit="ms a video, encoder alone",
         baseline=f"{SIDES[0]} pixels",
         errors=errors,
@@ -90,9 +82,3 @@ def measure(root: Path, size: Size | None = None) -> list[Row]:
         counts={name: {"frames": float(FRAMES)} for name in runs},
         machine=machine("1 thread"),
     )
-
-
-def _resized(pictures: torch.Tensor, side: int) -> torch.Tensor:
-    """Difference pictures, uint8, k x side x side x RGB, by area."""
-    smaller = [cv2.resize(picture, (side, side), interpolation=cv2.INTER_AREA) for picture in pictures.numpy()]
-    return torch.from_numpy(np.stack(smaller))

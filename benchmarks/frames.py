@@ -85,12 +85,10 @@ def measure(root: Path, folds: int = 5, deals: int = 10) -> list[Row]:
         found = run_parallel(partial(_sample, folder), files, "frame selection", "video")
         samples = [s for s in found if s is not None]
     objects = [s.object_id for s in samples]
-    labels = np.array([catalogue.labels(o) for o in objects])
-    classes = [len(p.levels) for p in catalogue.properties]
     costs, errors, counts = {}, {}, {}
     for place, setting in enumerate(SETTINGS):
         clips = np.stack([s.features[place] for s in samples])
-        errors[setting] = heads_error(clips, clips, labels, objects, classes, folds, deals)
+        errors[setting] = heads_error(clips, clips, objects, catalogue, folds, deals)
         costs[setting] = [s.costs[place] for s in samples]
         counts[setting] = {"frames": fmean(s.frames[place] for s in samples)}
     return make_rows(

@@ -7,7 +7,6 @@ questions about noise pictures, as no cost depends on what they show.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from statistics import fmean
@@ -39,28 +38,27 @@ Way = Callable[[None], list[str]]
 """Answers to all questions."""
 
 
-@dataclass(frozen=True)
-class Size:
-    """How much is measured."""
+def measure(
+    root: Path,
+    repeats: int = 5,
+    questions: int = 64,
+    aligned: int = 192,
+    limit: int = 160,
+    sizes: Sequence[int] = (1, 8, 32),
+) -> list[Row]:
+    """Both questions.
 
-    repeats: int = 5
-    asked: int = 64
-    """Questions answered in a repeat."""
-    aligned: int = 192
-    """Conversations that are trained on before."""
-    limit: int = 160
-    """New tokens of an answer."""
-    batches: tuple[int, ...] = (1, 8, 32)
-
-
-def measure(root: Path, size: Size | None = None) -> list[Row]:
-    """Both questions."""
-    size = size or Size()
+    Args:
+        questions: Answered in a repeat.
+        aligned: Conversations that are trained on before.
+        limit: New tokens of an answer.
+        sizes: Of batches.
+    """
     torch.set_num_threads(1)
     with TemporaryDirectory() as folder:
-        model, store, asked = prepare(root, size, Path(folder))
-        ask = partial(_texts, store, asked, size.limit)
-        batches: dict[str, Way] = {f"{batch} at a time": partial(ask, model, batch) for batch in size.batches}
+        model, store, asked = prepare(root, aligned, questions, Path(folder))
+        ask = partial(_texts, store, asked, limit)
+        batches: dict[str, Way] = {f"{batch} at a time": partial(ask, model, batch) for batch in sizes}
         formats: dict[str, Way] = {}
         names: tuple[DtypeName, ...] = ("float32", "bfloat16")
         for name in names:
@@ -68,15 +66,17 @@ def measure(root: Path, size: Size | None = None) -> list[Row]:
             base = model.octopi_config
             other = OctopiForCausalLM.from_base(base.base_model, base.tactile_dim, dtype=name)
             other.connector.load_state_dict(model.connector.state_dict())
-            formats[name] = partial(ask, other, size.batches[-1])
+            formats[name] = partial(ask, other, sizes[-1])
         return [
             row
             for question, ways in (("answering", batches), ("number format, language model", formats))
-            for row in _question(question, ways, asked, model, size.repeats)
+            for row in _question(question, ways, asked, model, repeats)
         ]
 
 
-def prepare(root: Path, size: Size, folder: Path) -> tuple[OctopiForCausalLM, EmbeddingStore, list[Question]]:
+def prepare(
+    root: Path, aligned: int, asked: int, folder: Path
+) -> tuple[OctopiForCausalLM, EmbeddingStore, list[Question]]:
     """The model of params.yaml, its connector trained on some conversations; embeddings, kept in `folder`; questions.
 
     Questions are about every third object of the catalogue.
@@ -88,9 +88,9 @@ def prepare(root: Path, size: Size, folder: Path) -> tuple[OctopiForCausalLM, Em
     catalogue = load_catalogue(root / params.data.catalogue)
     videos = [Assignment(video_id=f"{o}_0", object_id=o, part=Part.TRAIN) for o in list(catalogue.objects)[::3]]
     pool = pool_of(Part.TRAIN, videos, catalogue)
-    aligned, asked = (
+    learnt, questions = (
         build_questions(pool, {t: -(-n // len(ASKED)) for t in ASKED}, seed=seed, distinct=False)[:n]
-        for seed, n in enumerate((size.aligned, size.asked))
+        for seed, n in enumerate((aligned, asked))
     )
     rng, shape = np.random.default_rng(0), (FRAMES, *encoder.visual.image_size, 3)
     names = [video.video_id for video in videos]
@@ -104,7 +104,7 @@ def prepare(root: Path, size: Size, folder: Path) -> tuple[OctopiForCausalLM, Em
     write_table(folder / INDEX_FILE, Embedding, index)
     store = EmbeddingStore(folder)
     data = ConversationDataset(
-        aligned,
+        learnt,
         Opd.ALL,
         store,
         model.tokenizer,
@@ -122,15 +122,11 @@ def prepare(root: Path, size: Size, folder: Path) -> tuple[OctopiForCausalLM, Em
         model(**collate([data[i] for i in order[start : start + UPDATE]])).loss.backward()
         optimiser.step()
         optimiser.zero_grad()
-    return model, store, asked
+    return model, store, questions
 
 
 def _question(
-    question: str,
-    ways: Mapping[str, Way],
-    asked: Sequence[Question],
-    model: OctopiForCausalLM,
-    repeats: int,
+    question: str, ways: Mapping[str, Way], asked: Sequence[Question], model: OctopiForCausalLM, repeats: int
 ) -> list[Row]:
     """Milliseconds an answer by each of the ways, and how often they do not answer as the first."""
     said = {name: way(None) for name, way in ways.items()}

@@ -37,17 +37,16 @@ def measure(root: Path, clients: int = CLIENTS, each: int = EACH) -> list[Row]:
     Raises:
         UserError: where there is no trained model or no video.
     """
-    folder = SHIPPED
     place = root / load_params(root / "params.yaml").data.dir
     videos = video_files(place)[0][:clients]
     if not videos:
         raise UserError(f"{place}: holds no video to ask about; `dvc repro` makes or finds some")
-    ask = [*COMMAND, "ask", QUESTION, str(videos[0]), "--model", str(folder)]
+    ask = [*COMMAND, "ask", QUESTION, str(videos[0]), "--model", str(SHIPPED)]
     done, first = timed(partial(subprocess.run, ask, capture_output=True, text=True, check=False))
     if done.returncode:
         raise UserError(str(done.stderr).strip() or "octopi ask failed")
-    with served(folder) as address:
-        bodies = [body(folder.name, video) for video in videos]
+    with served(SHIPPED) as address:
+        bodies = [body(SHIPPED.name, video) for video in videos]
         alone = {b: post(address, b) for b in bodies}
         once = [timed(partial(post, address, b))[1] for b in bodies]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from statistics import fmean
@@ -48,8 +47,8 @@ def measure(root: Path, triples: int = 12, batch: int = 32) -> list[Row]:
     groups = [videos[i : i + 3] for i in range(0, len(videos) - 2, 3)][: triples + 1]
     costs: dict[str, list[float]] = {RULES: [], MODEL: []}
     for group in groups:
-        seen = timed(partial(each, octopi.encoder.encode, group))[1]
-        costs[RULES].append(seen + timed(partial(each, octopi.encoder.classify, group))[1])
+        seen = timed(partial(list, map(octopi.encoder.encode, group)))[1]
+        costs[RULES].append(seen + timed(partial(list, map(octopi.encoder.classify, group)))[1])
         costs[MODEL].append(seen + timed(partial(octopi.ask, QUESTION, group))[1])
     compared = make_rows(
         "comparing three touches",
@@ -69,12 +68,6 @@ def measure(root: Path, triples: int = 12, batch: int = 32) -> list[Row]:
         machine=machine(f"{torch.get_num_threads()} threads"),
     )
     return [*compared, *tokens(octopi, videos, batch)]
-
-
-def each(do: Callable[[Path], object], videos: Sequence[Path]) -> None:
-    """Do it with each video."""
-    for video in videos:
-        do(video)
 
 
 def tokens(octopi: Octopi, videos: list[Path], batch: int) -> list[Row]:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import median
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError
 
 from benchmarks.errors import Error
 from pipeline.core.errors import UserError, first_problem
@@ -44,14 +44,6 @@ class Row(Record):
     front: bool | None = None
     """Whether no other setting of the question costs as little with as little error and less of one of them."""
     machine: str = ""
-
-    @model_validator(mode="after")
-    def _interval_holds_error(self) -> Row:
-        if self.low is not None and self.high is not None:
-            assert self.error is not None, "an interval without an error"
-            assert self.low <= self.error + 1e-6, f"{self.low} above {self.error}"
-            assert self.error <= self.high + 1e-6, f"{self.error} above {self.high}"
-        return self
 
 
 def front(costs: Sequence[float], errors: Sequence[float]) -> list[bool]:

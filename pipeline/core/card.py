@@ -53,18 +53,18 @@ def write_card(
         files = sorted(path.glob("*.safetensors")) if path.is_dir() else [path]
         lines += [f"  - `{file.name}`, sha256 {sha256(file)}" for file in files]
     for heading, values in (("Training data", data), ("Hyper-parameters", settings)):
-        lines += ["", f"## {heading}", "", "| | |", "|---|---|"]
-        lines += [f"| {name} | {_shown(value)} |" for name, value in values.items()]
+        lines += ["", f"## {heading}", "", "| | |", "|---|---|", *map(_row, values.items())]
     for heading, rows in tables.items():
         if rows:
             lines += ["", f"## {heading}", "", _row(rows[0]), _row(["---"] * len(rows[0]))]
-            lines += [_row(row.values()) for row in rows]
+            lines += (_row(row.values()) for row in rows)
     lines += ["", "## What it cannot do", "", *(f"- {limit}" for limit in limits)]
     write_text(folder / CARD_FILE, "\n".join(lines) + "\n")
 
 
 def _row(cells: Iterable[object]) -> str:
-    return f"| {' | '.join(map(_shown, cells))} |"
+    shown = (", ".join(map(str, cell)) if isinstance(cell, (list, tuple)) else str(cell) for cell in cells)
+    return f"| {' | '.join(shown)} |"
 
 
 def front_matter(folder: Path) -> dict[str, Any]:
@@ -77,7 +77,3 @@ def front_matter(folder: Path) -> dict[str, Any]:
     except yaml.YAMLError:  # Of another's model: it is then as good as none.
         front = None
     return front if isinstance(front, dict) else {}
-
-
-def _shown(value: object) -> str:
-    return ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)

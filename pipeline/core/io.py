@@ -17,7 +17,6 @@ import types
 import typing
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -197,13 +196,12 @@ def load_tensors(path: Path) -> dict[str, torch.Tensor]:
 
     check_made(path)
     try:
-        tensors: dict[str, torch.Tensor] = load_file(path)
+        return dict(load_file(path))
     except SafetensorError as error:
         raise UserError(
             f"{path}: not a safetensors file ({error}); pickled checkpoints are refused because they can run "
             "code: convert it with safetensors.torch.save_file, or run `dvc repro` again"
         ) from None
-    return tensors
 
 
 def tensor_shapes(path: Path, mend: str = "get it again") -> dict[str, tuple[int, ...]]:
@@ -267,11 +265,9 @@ def _arrow(hint: Any) -> pa.DataType:
     import pyarrow as pa
 
     origin = typing.get_origin(hint)
-    if origin is tuple:
-        return pa.list_(_arrow(typing.get_args(hint)[0]))
-    if origin is typing.Literal or (isinstance(hint, type) and issubclass(hint, Enum)):
+    if origin in (tuple, types.UnionType):  # Of one type; or of one and None, which every column may hold.
+        first = _arrow(typing.get_args(hint)[0])
+        return pa.list_(first) if origin is tuple else first
+    if origin is typing.Literal or issubclass(hint, str):
         return pa.string()
-    if origin is types.UnionType:
-        return _arrow(next(a for a in typing.get_args(hint) if a is not type(None)))
-    simple: dict[Any, pa.DataType] = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
-    return simple[hint]
+    return {int: pa.int64(), float: pa.float64(), bool: pa.bool_()}[hint]

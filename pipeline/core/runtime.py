@@ -49,13 +49,11 @@ def resolve_device(name: DeviceName) -> torch.device:
     """The device of that name; `auto` takes CUDA, then Apple's MPS, then the CPU."""
     import torch
 
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "mps" if torch.backends.mps.is_available() else "cpu"
-    elif name == "cuda" and not torch.cuda.is_available():
-        raise UserError("runtime.device: cuda is asked for but torch sees no CUDA device; use auto or cpu")
-    elif name == "mps" and not torch.backends.mps.is_available():
-        raise UserError("runtime.device: mps is asked for but torch sees no MPS device; use auto or cpu")
-    return torch.device(name)
+    there = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
+    chosen = next(kind for kind, usable in there.items() if usable) if name == "auto" else name
+    if not there[chosen]:
+        raise UserError(f"runtime.device: {name} is asked for but torch sees no {name.upper()} device; use auto or cpu")
+    return torch.device(chosen)
 
 
 def name_dtype(name: DtypeName, device: DeviceName = "auto") -> DtypeName:
@@ -68,14 +66,12 @@ def name_dtype(name: DtypeName, device: DeviceName = "auto") -> DtypeName:
 
     if name != "auto":
         return name
-    match resolve_device(device).type:
-        case "cuda":
-            fast = torch.cuda.is_bf16_supported(including_emulation=False)
-        case "cpu":
-            # No public name asks the processor.
-            fast = torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
-        case _:
-            fast = False
+    fast, kind = False, resolve_device(device).type
+    if kind == "cuda":
+        fast = torch.cuda.is_bf16_supported(including_emulation=False)
+    elif kind == "cpu":
+        # No public name asks the processor.
+        fast = torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
     return "bfloat16" if fast else "float32"
 
 
@@ -91,10 +87,8 @@ def limit_threads(count: int) -> None:
     """Let torch use this many CPU threads, also where it is imported later; 0 leaves it as it is."""
     if count:
         os.environ["OMP_NUM_THREADS"] = str(count)
-    if count and "torch" in sys.modules:
-        import torch
-
-        torch.set_num_threads(count)
+        if "torch" in sys.modules:
+            sys.modules["torch"].set_num_threads(count)
 
 
 def processor() -> str:
@@ -114,12 +108,9 @@ QUICK = 5.0
 
 
 class LogLines:
-    """Writes progress to a log file: a line each tenth, with the seconds that are left.
+    """Writes progress to a log file: a line each tenth of `total` units, with the seconds that are left.
 
     Args:
-        label: What it is.
-        total: How many units there are.
-        unit: Their name.
         after: Units that were done before, in a run that is resumed.
     """
 
@@ -134,9 +125,8 @@ class LogLines:
         if tenth > self._tenth and now - self._said >= QUICK:
             self._tenth, self._said = tenth, now
             left = (now - self._started) * (self.total - done) / max(1, done - self.after)
-            note = f", {note}" if note else ""
-            said = f"{self.label}: {self.unit} {done} of {self.total}{note}, {left:.0f} s left"
-            print(said, file=sys.stderr, flush=True)
+            said = ", ".join(filter(None, (f"{self.unit} {done} of {self.total}", note, f"{left:.0f} s left")))
+            print(f"{self.label}: {said}", file=sys.stderr, flush=True)
 
 
 @contextmanager

@@ -129,17 +129,16 @@ def stage(name: str, key: str | None = None, *, launched: bool = False) -> Itera
                     f"{PARAMS_FILE} was changed while it ran; what it made fits the old one, so run it again"
                 )
             if _main_process():
-                _write_run(running, started)
+                _write_run(running)
                 shutil.rmtree(CHECKPOINTS / full, ignore_errors=True)
                 said = ", ".join(f"{k} {v:g}" for k, v in list(running.metrics.items())[:4])
-                print(f"{full}: done in {time.time() - started:.1f} s{': ' if said else ''}{said}", flush=True)
+                print(f"{full}: done in {time.time() - running.started:.1f} s{': ' if said else ''}{said}", flush=True)
     except UserError as error:
         sys.exit(f"{full}: {error}")
     except Exception as error:
         if isinstance(error, MemoryError) or any(words in str(error) for words in NO_MEMORY):
             sys.exit(f"{full}: out of memory; lower the batch sizes in params.yaml")
-        refused = disk_error(error)
-        if refused is None:
+        if (refused := disk_error(error)) is None:
             raise
         sys.exit(f"{full}: {refused}")
 
@@ -203,11 +202,10 @@ def _main_process() -> bool:
     return os.environ.get("RANK", "0") == "0"
 
 
-def _write_run(running: Stage, started: float) -> None:
+def _write_run(running: Stage) -> None:
     """Write runs/NAME.json: times, seconds, device, most memory in MiB (the GPU's, where one was used) and metrics."""
     import psutil
 
-    process = psutil.Process()
     peak = 0.0
     if sys.platform != "win32":
         import resource
@@ -220,10 +218,10 @@ def _write_run(running: Stage, started: float) -> None:
     write_json(
         RUNS / f"{running.name}.json",
         {
-            "started": datetime.fromtimestamp(started, UTC).isoformat(timespec="milliseconds"),
+            "started": datetime.fromtimestamp(running.started, UTC).isoformat(timespec="milliseconds"),
             "ended": datetime.now(UTC).isoformat(timespec="milliseconds"),
-            "startup_seconds": round(started - process.create_time(), 3),
-            "seconds": round(time.time() - started, 3),
+            "startup_seconds": round(running.started - psutil.Process().create_time(), 3),
+            "seconds": round(time.time() - running.started, 3),
             "device": device,
             "peak_memory_mb": round(peak, 1),
             "metrics": running.metrics,

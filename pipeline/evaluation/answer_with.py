@@ -20,11 +20,10 @@ from functools import lru_cache
 from itertools import chain
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
-from pydantic import Field
+from pydantic import Field, HttpUrl, TypeAdapter, ValidationError
 
 from pipeline.config import Params
 from pipeline.core.errors import UserError
@@ -213,7 +212,7 @@ def _answer(question: Question, told: str, asker: _Asker, show: Show) -> Predict
         first, *others = (turn.user if messages else told + turn.user).split("{tactile}")
         content: list[dict[str, Any]] = [{"type": "text", "text": first}]
         for text in others:
-            content += [{"type": "image_url", "image_url": {"url": url}} for url in show(*next(touched))]
+            content += map(_picture, show(*next(touched)))
             content += [{"type": "text", "text": text}] if text else []
         messages.append({"role": "user", "content": content})
         reply = asker.ask(messages)
@@ -225,19 +224,13 @@ def _answer(question: Question, told: str, asker: _Asker, show: Show) -> Predict
             break
         messages.append({"role": "assistant", "content": reply.text})
     unsaid = len(dialogue.turns) - len(replies)
-    return Prediction(
-        question_id=question.question_id,
-        task=question.task,
-        outputs=(*(r.text for r in replies), *[""] * unsaid),
-        truncated=any(r.ended == "length" for r in replies),
-        tokens=sum(r.tokens for r in replies),
-    )
+    return _predicted(question, (*(r.text for r in replies), *[""] * unsaid), replies)
 
 
 def _classify(question: Question, catalogue: Catalogue, asker: _Asker, show: Show) -> Prediction | None:
     """The published prompts about one object, told as a description; what is not one of their classes stays unknown."""
     ((video, object_id),) = zip(question.videos, question.objects, strict=True)
-    pictures = [{"type": "image_url", "image_url": {"url": url}} for url in show(video, object_id)]
+    pictures = [*map(_picture, show(video, object_id))]
     told, replies = {}, []
     for prop in catalogue.properties:
         choices, classes = PUBLISHED[prop.name]
@@ -249,13 +242,17 @@ def _classify(question: Question, catalogue: Catalogue, asker: _Asker, show: Sho
         # One that names two classes has chosen none.
         named = [level for words, level in classes.items() if re.search(rf"\b{words}\b", reply.text.lower())]
         told[prop.name] = prop.levels[named[0]] if len(named) == 1 else "unknown"
-    return Prediction(
-        question_id=question.question_id,
-        task=question.task,
-        outputs=(catalogue.language.structured.format(**told),),
-        truncated=any(r.ended == "length" for r in replies),
-        tokens=sum(r.tokens for r in replies),
-    )
+    return _predicted(question, (catalogue.language.structured.format(**told),), replies)
+
+
+def _predicted(question: Question, outputs: tuple[str, ...], replies: Sequence[Reply]) -> Prediction:
+    cut, tokens = any(r.ended == "length" for r in replies), sum(r.tokens for r in replies)
+    whose = {"question_id": question.question_id, "task": question.task}
+    return Prediction(**whose, outputs=outputs, truncated=cut, tokens=tokens)
+
+
+def _picture(url: str) -> dict[str, Any]:
+    return {"type": "image_url", "image_url": {"url": url}}
 
 
 class _Asker:
@@ -370,13 +367,10 @@ def _read_cache(file: Path) -> dict[str, Reply]:
 def _check(endpoint: Endpoint) -> None:
     """Refuse what is no URL, or holds a secret."""
     try:
-        parts = urlsplit(endpoint.url)
-        whole = parts.scheme in ("http", "https") and parts.hostname and parts.port != 0
-    except ValueError:
-        whole = False
-    if not whole:
-        raise UserError(f"--endpoint: {endpoint.url} is no URL such as https://api.openai.com/v1")
-    if parts.username or parts.password or parts.query or parts.fragment:
+        url = TypeAdapter(HttpUrl).validate_python(endpoint.url)
+    except ValidationError:
+        raise UserError(f"--endpoint: {endpoint.url} is no URL such as https://api.openai.com/v1") from None
+    if url.username or url.password or url.query or url.fragment:
         raise UserError("--endpoint: the URL is written beside the answers; put a key into OPENAI_API_KEY instead")
     if not endpoint.model.strip():
         raise UserError("--model: is empty; name one that the endpoint has")

@@ -122,29 +122,16 @@ def calibration_rows(encoders: Sequence[Sequence[Classification]]) -> list[Calib
     Args:
         encoders: The classifications of validation and test videos by each.
     """
-    given: dict[str, list[Classification]] = {}
-    tempered: dict[str, list[Classification]] = {}
-    for classified in encoders:
-        for before, after in calibrated(classified):
-            given.setdefault(before.property, []).append(before)
-            tempered.setdefault(after.property, []).append(after)
+    pairs = [pair for classified in encoders for pair in calibrated(classified)]
     rows = []
-    for name, answers in tempered.items():
+    for name in dict.fromkeys(before.property for before, _ in pairs):
+        given, answers = zip(*(pair for pair in pairs if pair[0].property == name), strict=True)
         bins = reliability(answers)
         low, high = error_interval(answers)
-        rows.append(
-            CalibrationRow(
-                property=name,
-                probability="all",
-                n=len(answers),
-                mean_probability=np.average(bins["mean_probability"], weights=bins["n"]),
-                right=np.average(bins["right"], weights=bins["n"]),
-                error=calibration_error(answers),
-                low=low,
-                high=high,
-                without_temperature=calibration_error(given[name]),
-            )
-        )
+        whole = {column: np.average(bins[column], weights=bins["n"]) for column in ("mean_probability", "right")}
+        whole |= {"n": len(answers), "error": calibration_error(answers), "low": low, "high": high}
+        whole |= {"without_temperature": calibration_error(given)}
+        rows.append(CalibrationRow(property=name, probability="all", **whole))
         for place, b in bins.iterrows():
             words = f"{place / BINS:.1f} to {(place + 1) / BINS:.1f}"
             error = abs(b["right"] - b["mean_probability"])

@@ -50,15 +50,8 @@ def conclude(questions: Sequence[Question], classified: Iterable[Classification]
             classes = [[said[video][name] for name in catalogue.property_names] for video in question.videos]
             answer = TASKS[question.task].conclude(question, classes, catalogue)
             if answer is not None:
-                predictions.append(
-                    Prediction(
-                        question_id=question.question_id,
-                        task=question.task,
-                        outputs=(answer,),
-                        truncated=False,
-                        tokens=0,
-                    )
-                )
+                said_so = {"question_id": question.question_id, "task": question.task, "outputs": (answer,)}
+                predictions.append(Prediction(**said_so, truncated=False, tokens=0))
     return grade(questions, predictions, catalogue)
 
 
@@ -91,12 +84,10 @@ def grade_vision_models(
     for place, source in vision_models(folder).items():
         for seed, file in questions.items():
             if source.questions.get(str(seed)) != fingerprint(file):
-                again = "run `octopi answer-with` again"
-                logging.warning(f"{place}: no answers to the questions of seed {seed} as they are now; {again}")
+                lacks = f"no answers to the questions of seed {seed} as they are now"
+                logging.warning(f"{place}: {lacks}; run `octopi answer-with` again")
                 continue
+            whose = {"model": source.model, "shown": source.shown, "seed": replicate_of(seed)}
             scores = grade(read_jsonl(file, Question), read_jsonl(place / f"{seed}.jsonl", Prediction), catalogue)
-            graded += [
-                GradedVision(**s.model_dump(), model=source.model, shown=source.shown, seed=replicate_of(seed))
-                for s in scores
-            ]
+            graded += [GradedVision(**score.model_dump(), **whose) for score in scores]
     return graded

@@ -14,7 +14,7 @@ together, with Student's t); Miller 2024, arXiv 2411.00640 (clustered questions 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -31,8 +31,7 @@ LEVEL = 0.95
 TINY = 1e-12
 """Variances up to it are rounding."""
 DISTINCT = 1e-3
-"""A variance component is estimated only where the smallest eigenvalue of the scaled moments exceeds this; below it,
-the component cannot be told apart from the others."""
+"""Smallest eigenvalue of the scaled moments at which a variance component can be told apart from the others."""
 
 
 class Interval(NamedTuple):
@@ -55,15 +54,9 @@ class Design:
     totals: Values
     """By factor: by how much a unit of its variance adds to that of the sum over questions."""
 
-    @property
-    def questions(self) -> int:
-        """How many there are."""
-        return int(self.membership.shape[0])
-
-    @property
-    def objects(self) -> int:
-        """How many there are."""
-        return int(self.membership.shape[1])
+    questions: int
+    objects: int
+    """How many there are."""
 
     @property
     def estimable(self) -> bool:
@@ -99,7 +92,7 @@ def design_of(objects: tuple[Objects, ...]) -> Design:
         if not factors or np.linalg.eigvalsh(moments / np.outer(scale, scale))[0] > DISTINCT:
             factors.append(factor)
     totals = np.array([float((f.sum(axis=0) ** 2).sum()) for f in factors])
-    return Design(membership, tuple(factors), _moments(factors), totals)
+    return Design(membership, tuple(factors), _moments(factors), totals, *membership.shape)
 
 
 def coverage_note(objects: Sequence[Objects]) -> str:
@@ -152,8 +145,7 @@ def accuracy_interval(values: Values, objects: Sequence[Objects]) -> Interval | 
     design = design_of(tuple(row for row, _ in ordered))
     if not design.estimable:
         return None
-    low, high = wilson(np.array([value for _, value in ordered]), design)
-    return Interval(float(low), float(high))
+    return Interval(*map(float, wilson(np.array([value for _, value in ordered]), design)))
 
 
 def wilson(values: Values, design: Design) -> tuple[Values, Values]:
@@ -179,11 +171,9 @@ def _moments(factors: Sequence[Values]) -> Values:
     return np.array([[float(((a.T @ b) ** 2).sum()) for b in centred] for a in centred])
 
 
-def _groups(rows: Iterable[Objects]) -> Values:
-    """Questions x groups, from the names of the groups that each question is in."""
-    named = [set(row) for row in rows]
-    place = {name: i for i, name in enumerate(sorted(set().union(*named)))}
-    matrix = np.zeros((len(named), len(place)))
-    for i, row in enumerate(named):
-        matrix[i, [place[name] for name in row]] = 1
-    return matrix
+def _groups(rows: Sequence[Objects]) -> Values:
+    """Questions x groups, 0 or 1, from the names of the groups that each question is in."""
+    from sklearn.preprocessing import MultiLabelBinarizer
+
+    found: Values = MultiLabelBinarizer().fit_transform(rows).astype(np.float64)
+    return found

@@ -74,13 +74,6 @@ def map_frame(features: NDArray[np.float64], videos: Sequence[Assignment], catal
         for number, (x, y) in zip(chosen, places, strict=True):
             video = videos[number]
             labels = zip(catalogue.properties, catalogue.labels(video.object_id), strict=True)
-            rows.append(
-                {
-                    "method": method,
-                    "video_id": video.video_id,
-                    "x": float(f"{x:.5g}"),
-                    "y": float(f"{y:.5g}"),
-                    **{p.name: p.levels[level] for p, level in labels},
-                }
-            )
+            place = {"method": method, "video_id": video.video_id, "x": float(f"{x:.5g}"), "y": float(f"{y:.5g}")}
+            rows.append(place | {p.name: p.levels[level] for p, level in labels})
     return pd.DataFrame(rows)

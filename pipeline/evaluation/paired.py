@@ -69,16 +69,9 @@ def paired(values: Values, objects: Sequence[Objects]) -> Difference:
         return Difference(mean, questions, design.objects, seeds)
     error, centre, freedom = (float(x) for x in standard_error(values, design))
     half = float(stats.t.ppf((1 + LEVEL) / 2, freedom)) * error
-    return Difference(
-        difference=mean,
-        n=questions,
-        objects=design.objects,
-        seeds=seeds,
-        low=max(-1.0, min(centre - half, mean)),
-        high=min(1.0, max(centre + half, mean)),
-        p=float(sign_flip(values.mean(axis=0), design)),
-        smallest_effect=smallest_effect(error, freedom),
-    )
+    low, high = max(-1.0, min(centre - half, mean)), min(1.0, max(centre + half, mean))
+    p = float(sign_flip(values.mean(axis=0), design))
+    return Difference(mean, questions, design.objects, seeds, low, high, p, smallest_effect(error, freedom))
 
 
 def standard_error(values: Values, design: Design) -> tuple[Values, Values, Values]:
@@ -143,13 +136,14 @@ def flip_units(design: Design) -> Values:
     little. Where effects cannot be estimated, each connected component of objects is flipped as a whole.
     """
     shares = design.membership / design.membership.sum(axis=1, keepdims=True)
+    units: Values
     if np.linalg.matrix_rank(shares) == design.objects:
         # The shares of a question sum to 1, so fitted and measured differences have the same sum.
-        units: Values = np.linalg.pinv(shares) * shares.sum(axis=0)[:, None]
-        return units
-    count, part = connected_components(design.membership.T @ design.membership > 0, directed=False)
-    parts: Values = np.equal.outer(np.arange(count), part[design.membership.argmax(axis=1)]).astype(np.float64)
-    return parts
+        units = np.linalg.pinv(shares) * shares.sum(axis=0)[:, None]
+    else:
+        count, part = connected_components(design.membership.T @ design.membership > 0, directed=False)
+        units = np.equal.outer(np.arange(count), part[design.membership.argmax(axis=1)]).astype(np.float64)
+    return units
 
 
 @lru_cache(maxsize=256)

@@ -79,6 +79,11 @@ class Answer(NamedTuple):
     parsed: bool = True
     strict: bool | None = None
 
+    @classmethod
+    def of(cls, score: Score) -> Answer:
+        """Of a graded measure."""
+        return cls(score.correct, score.objects, score.parsed, score.strict)
+
 
 Runs = Mapping[int, Mapping[str, Answer]]
 """By seed and question."""
@@ -122,8 +127,7 @@ def score_rows(
     # Vision-only models.
     by_model: dict[tuple[str, ...], dict[int, dict[str, Answer]]] = defaultdict(lambda: defaultdict(dict))
     for g in vision:
-        answer = Answer(g.correct, g.objects, g.parsed, g.strict)
-        by_model[g.task, g.measure, g.model, g.shown][g.seed][g.question_id] = answer
+        by_model[g.task, g.measure, g.model, g.shown][g.seed][g.question_id] = Answer.of(g)
     for (task, measure, model, shown), runs in by_model.items():
         chance = TASKS[task].chance(catalogue)[measure]
         rows += _rows(runs, task=task, measure=measure, chance=chance, encoder=model, opd=Opd.ALL, touch=shown)
@@ -229,15 +233,8 @@ def error_rows(out_of_fold: Mapping[str, Sequence[OutOfFold]], catalogue: Catalo
             if len({*expected, *predicted}) > 1:
                 levels = range(len(prop.levels))
                 kappa = float(cohen_kappa_score(expected, predicted, weights="quadratic", labels=levels))
-            rows.append(
-                ErrorRow(
-                    encoder=name,
-                    property=prop.name,
-                    absolute_error=float(np.abs(np.subtract(expected, predicted)).mean()),
-                    kappa=kappa,
-                    n=len({r.video_id for r in records}),
-                )
-            )
+            off, n = np.abs(np.subtract(expected, predicted)).mean(), len({r.video_id for r in records})
+            rows.append(ErrorRow(encoder=name, property=prop.name, absolute_error=off, kappa=kappa, n=n))
     return rows
 
 
@@ -296,8 +293,7 @@ def grouped(graded: Iterable[Graded]) -> dict[tuple[str, str], dict[Setting, dic
         lambda: defaultdict(lambda: defaultdict(dict))
     )
     for g in graded:
-        setting = Setting(g.encoder, g.lora, g.opd, g.touch)
-        found[g.task, g.measure][setting][g.seed][g.question_id] = Answer(g.correct, g.objects, g.parsed, g.strict)
+        found[g.task, g.measure][Setting(g.encoder, g.lora, g.opd, g.touch)][g.seed][g.question_id] = Answer.of(g)
     return found
 
 
@@ -306,7 +302,7 @@ def _table(graded: Iterable[Graded], catalogue: Catalogue, concluded: Mapping[in
     found = grouped(graded)
     for seed, scores in concluded.items():
         for s in scores:
-            found[s.task, s.measure][RULES][seed][s.question_id] = Answer(s.correct, s.objects, s.parsed, s.strict)
+            found[s.task, s.measure][RULES][seed][s.question_id] = Answer.of(s)
     keys = [(task, measure) for task, definition in TASKS.items() for measure in definition.chance(catalogue)]
     return {key: found[key] for key in keys if key in found}
 

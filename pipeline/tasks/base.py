@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from pipeline.core.records import Dialogue, Gold, Opd, Part, Prediction, Question, Score, Turn
@@ -60,15 +60,12 @@ class Draft:
 
     def numbered(self, question_id: str, task: str, part: Part) -> Question:
         """The question as it is written to disk."""
-        return Question(
-            question_id=question_id,
-            task=task,
-            part=part,
-            videos=self.videos,
-            objects=self.objects,
-            dialogues=self.dialogues,
-            gold=self.gold,
-        )
+        asked = {name: value for name, value in vars(self).items() if name != "finding"}
+        return Question(question_id=question_id, task=task, part=part, **asked)
+
+    def with_dialogues(self, dialogues: Iterable[Dialogue]) -> Draft:
+        """The same question, asked or answered in other words."""
+        return replace(self, dialogues=tuple(dialogues))
 
 
 class TaskDefinition(ABC):
@@ -115,7 +112,7 @@ class TaskDefinition(ABC):
         """
         return None
 
-    def adjective(self, question: Question, catalogue: Catalogue) -> str:
+    def adjective(self, question: Question | Draft, catalogue: Catalogue) -> str:
         """The adjective that the question asks by, such as "softer"; empty where it asks by none."""
         if not self.adjectives:
             return ""
@@ -171,7 +168,7 @@ def before_concluding(draft: Draft, told: str) -> Draft:
             said = last.assistant.replace("Conclusion: ", f"{told} Conclusion: ", 1)
             last = last.model_copy(update={"assistant": said})
         dialogues.append(Dialogue(opd=dialogue.opd, turns=(*before, last)))
-    return replace(draft, dialogues=tuple(dialogues))
+    return draft.with_dialogues(dialogues)
 
 
 def draft_about(
@@ -211,10 +208,8 @@ def in_turns(draft: Draft, more: Sequence[Draft], catalogue: Catalogue) -> Draft
             conclusions share one.
     """
     asked = {d.opd: d.turns for d in draft.dialogues}
-    if set(map(len, asked.values())) != {1} or not {Opd.ALL, Opd.NONE} <= asked.keys():
-        return draft
-    (whole,), _ = asked[Opd.ALL], asked[Opd.NONE]
-    if not whole.described or not 1 < len(draft.videos) <= len(LETTERS):
+    single = set(map(len, asked.values())) == {1} and asked.keys() >= {Opd.ALL, Opd.NONE}
+    if not single or not asked[Opd.ALL][0].described or not 1 < len(draft.videos) <= len(LETTERS):
         return draft
     first = descriptions(catalogue, draft.objects)
     turns = [Turn(user=described_first(len(draft.videos)), assistant=first, described=len(first))]
@@ -226,12 +221,8 @@ def in_turns(draft: Draft, more: Sequence[Draft], catalogue: Catalogue) -> Draft
         named = [text.removesuffix(f"{x}) ") + f"{x})" for text, x in zip(texts, LETTERS, strict=False)]
         question = "".join([*named, end])
         turns.append(Turn(user=question, assistant=told.assistant[told.described :].strip()))
-    return replace(
-        draft,
-        dialogues=tuple(
-            Dialogue(opd=d.opd, turns=tuple(turns) if d.opd is Opd.ALL else d.turns) for d in draft.dialogues
-        ),
-    )
+    asked[Opd.ALL] = tuple(turns)
+    return draft.with_dialogues(Dialogue(opd=mode, turns=own) for mode, own in asked.items())
 
 
 def described_first(count: int, aspects: str = "") -> str:

@@ -46,18 +46,9 @@ class ObjectPropertyDescription(TaskDefinition):
             scored(question, prediction, p.name, p.levels[e], None if g is None else p.levels[g], strict[p.name])
             for p, e, g in zip(catalogue.properties, expected, predicted, strict=True)
         ]
-        complete = all(s.parsed for s in scores)
-        scores.append(
-            scored(
-                question,
-                prediction,
-                "combined",
-                ", ".join(s.expected for s in scores),
-                ", ".join(s.predicted for s in scores) if complete else None,
-                strict["combined"],
-            )
-        )
-        return scores
+        right, said = (", ".join(getattr(s, side) for s in scores) for side in ("expected", "predicted"))
+        whole = said if all(s.parsed for s in scores) else None
+        return [*scores, scored(question, prediction, "combined", right, whole, strict["combined"])]
 
     def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str:
         return catalogue.structured(tuple(level for level, _ in classes[0]))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import random
 import re
-from dataclasses import replace
 from typing import Literal
 
 from pipeline.core.records import Dialogue, Opd, Prediction, Question, Score, Turn
@@ -90,24 +89,14 @@ class PropertyComparison(TaskDefinition):
         told, prefixes = in_words(choice, comparative, prop), [f"{o} object:" for o in ORDINALS]
         answer = concluded(pool.catalogue, objects, told, [prop.name], prefixes)
         found = {"yes": self.listed[0], "no": self.listed[1], "same": "neither"}[choice]
+        finding = f"{comparative.capitalize()}: {found}."
         return draft_about(
-            pool,
-            objects,
-            rng,
-            turns=single_turn(user, answer),
-            choice=choice,
-            properties=[prop.name],
-            finding=f"{comparative.capitalize()}: {found}.",
+            pool, objects, rng, turns=single_turn(user, answer), choice=choice, properties=[prop.name], finding=finding
         )
-
-    def _asked_for(self, draft: Draft, catalogue: Catalogue) -> tuple[Property, str]:
-        """The property that a question compares, and its comparative, which the finding begins with."""
-        prop = catalogue.properties[catalogue.property_index(draft.gold.properties[0])]
-        return prop, prop.more if draft.finding.startswith(f"{prop.more.capitalize()}:") else prop.less
 
     def plainly(self, draft: Draft, catalogue: Catalogue, rng: random.Random) -> Draft:
         """ "Which is softer?", videos in front or behind, which is answered by the name of one, or by "Both"."""
-        _, comparative = self._asked_for(draft, catalogue)
+        comparative = self.adjective(draft, catalogue)
         places = ("{{tactile}} {{tactile}} Which is {}?", "Which is {}? {{tactile}} {{tactile}}")
         user, dialogues = rng.choice(places).format(comparative), []
         for dialogue in draft.dialogues:
@@ -115,16 +104,17 @@ class PropertyComparison(TaskDefinition):
             said = re.sub(r"(?:Yes|No), the (?=first|second)", "The ", turn.assistant)
             plain = turn.model_copy(update={"user": user, "assistant": said})
             dialogues.append(Dialogue(opd=dialogue.opd, turns=(plain,)))
-        return replace(draft, dialogues=tuple(dialogues))
+        return draft.with_dialogues(dialogues)
 
     def as_choice(self, draft: Draft, catalogue: Catalogue) -> Draft | None:
         """ "Which object is softer?", answered as scenarios want it: "The most suitable object is b), ..."."""
         if draft.gold.choice == "same":
             return None
-        prop, comparative = self._asked_for(draft, catalogue)
-        ask = psr.REQUEST.format(question=f"Which object is {comparative}?", based=psr.BASED)
-        turn = Turn(user=ask, assistant=psr.in_words("ab"[draft.gold.choice == "no"], prop.spoken))
-        return replace(draft, dialogues=tuple(Dialogue(opd=d.opd, turns=(turn,)) for d in draft.dialogues))
+        spoken = catalogue.properties[catalogue.property_index(draft.gold.properties[0])].spoken
+        question = f"Which object is {self.adjective(draft, catalogue)}?"
+        ask = psr.REQUEST.format(question=question, based=psr.BASED)
+        turn = Turn(user=ask, assistant=psr.in_words("ab"[draft.gold.choice == "no"], spoken))
+        return draft.with_dialogues(Dialogue(opd=d.opd, turns=(turn,)) for d in draft.dialogues)
 
     def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str:
         place, word = catalogue.property_index(question.gold.properties[0]), self.adjective(question, catalogue)
@@ -133,8 +123,7 @@ class PropertyComparison(TaskDefinition):
         return in_words(compare(first, second, word == prop.more), word, prop)
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
-        predicted = read(prediction.outputs[0])
-        return choice_score(question, prediction, predicted, published=True)
+        return choice_score(question, prediction, read(prediction.outputs[0]), published=True)
 
 
 TASK = PropertyComparison()

@@ -6,7 +6,6 @@ import itertools
 import random
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 
 from pipeline.core.records import Dialogue, Opd, Prediction, Question, Score
 from pipeline.tasks.base import (
@@ -35,9 +34,8 @@ FACT_DRAWS = 60
 
 def fact(catalogue: Catalogue, object_id: str, labels: Sequence[int] | None = None) -> str:
     """What an object is like: "hard, smooth, no bumps is a ruler."; by these classes in place of its own, if given."""
-    labels = labels or catalogue.labels(object_id)
-    classes = [p.levels[level] for p, level in zip(catalogue.properties, labels, strict=True)]
-    return sentence(classes, catalogue.objects[object_id].name)
+    classes = zip(catalogue.properties, labels or catalogue.labels(object_id), strict=True)
+    return sentence([p.levels[level] for p, level in classes], catalogue.objects[object_id].name)
 
 
 def sentence(classes: Iterable[str], name: str) -> str:
@@ -149,14 +147,12 @@ class PropertyObjectMatching(TaskDefinition):
     def with_facts(self, draft: Draft, catalogue: Catalogue, rng: random.Random, inexact: float = 0.0) -> Draft:
         """The question after facts about its objects, so that it tests touch and reasoning, not knowledge of
         objects."""
-        told = facts(catalogue, draft.objects, rng, inexact)
-
-        def begin(dialogue: Dialogue) -> Dialogue:
+        told, dialogues = facts(catalogue, draft.objects, rng, inexact), []
+        for dialogue in draft.dialogues:
             first, *rest = dialogue.turns
             first = first.model_copy(update={"user": f"{told} {first.user}"})
-            return dialogue.model_copy(update={"turns": (first, *rest)})
-
-        return replace(draft, dialogues=tuple(map(begin, draft.dialogues)))
+            dialogues.append(Dialogue(opd=dialogue.opd, turns=(first, *rest)))
+        return draft.with_dialogues(dialogues)
 
     def restated(self, draft: Draft, catalogue: Catalogue) -> Draft:
         """The question whose answer states the fact about each video's object, between descriptions and conclusion."""
@@ -164,11 +160,9 @@ class PropertyObjectMatching(TaskDefinition):
         return before_concluding(draft, " ".join(f"{x}) {fact(catalogue, o)}" for x, o in told))
 
     def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str:
-        """The matching that `nearest` finds."""
         return in_words(catalogue, nearest(classes, catalogue, question.objects))
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
-        """Read from "a) is NAME": each letter must name exactly one option, and no option twice."""
         names = sorted((catalogue.objects[o].name for o in question.objects), key=str.lower)
         found = read(prediction.outputs[0], names)
         predicted = "".join(str(found[x] + 1) for x in LETTERS) if found else None

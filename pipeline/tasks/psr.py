@@ -108,11 +108,8 @@ class PropertyScenarioReasoning(TaskDefinition):
 
 
 def _matching(pool: Pool, classes: Mapping[str, tuple[int, ...]]) -> list[str]:
-    def fits(object_id: str) -> bool:
-        labels = pool.catalogue.labels(object_id)
-        return all(labels[pool.catalogue.property_index(name)] in allowed for name, allowed in classes.items())
-
-    return [o for o in pool.objects if fits(o)]
+    wanted = [(pool.catalogue.property_index(name), allowed) for name, allowed in classes.items()]
+    return [o for o in pool.objects if all(pool.catalogue.labels(o)[place] in allowed for place, allowed in wanted)]
 
 
 TASK = PropertyScenarioReasoning()

@@ -69,16 +69,10 @@ class PropertySuperlativeSelection(TaskDefinition):
         objects.insert(position, rng.choice([o for o, level in levels.items() if level == extreme]))
         superlative = prop.most if most else prop.least
         user = asked(rng.choice(TEMPLATES), superlative, prop.spoken)
-        conclusion = f"{LETTERS[position]}) is the {superlative}."
-        return draft_about(
-            pool,
-            objects,
-            rng,
-            turns=single_turn(user, concluded(pool.catalogue, objects, conclusion, [prop.name])),
-            choice=LETTERS[position],
-            properties=[prop.name],
-            finding=f"{superlative.capitalize()}: {LETTERS[position]}).",
-        )
+        letter = LETTERS[position]
+        turns = single_turn(user, concluded(pool.catalogue, objects, f"{letter}) is the {superlative}.", [prop.name]))
+        finding = f"{superlative.capitalize()}: {letter})."
+        return draft_about(pool, objects, rng, turns=turns, choice=letter, properties=[prop.name], finding=finding)
 
     def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str:
         place, word = catalogue.property_index(question.gold.properties[0]), self.adjective(question, catalogue)
@@ -87,8 +81,7 @@ class PropertySuperlativeSelection(TaskDefinition):
         return f"{LETTERS[extreme]}) is the {word}."
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
-        predicted = read(prediction.outputs[0])
-        return choice_score(question, prediction, predicted, published=True)
+        return choice_score(question, prediction, read(prediction.outputs[0]), published=True)
 
 
 TASK = PropertySuperlativeSelection()

@@ -29,7 +29,6 @@ from tests.use.shared import make
 
 LENGTH = 20
 """Frames of a video; the published rule leaves out videos of ten."""
-TINY = language.Size(repeats=1, asked=3, aligned=4, limit=3, batches=(1, 3))
 
 
 @pytest.fixture(scope="module")
@@ -93,18 +92,18 @@ def test_frames(project: Path, tmp_path: Path) -> None:
 
 
 def test_encoder(project: Path, tmp_path: Path) -> None:
-    size = encoder.Size(videos=1, repeats=1, folds=2, deals=1)
+    reduced = {"timed": 1, "repeats": 1, "folds": 2, "deals": 1}
     with refused("repro pretrain"):
-        encoder.measure(project, size)
+        encoder.measure(project, **reduced)
     torch.manual_seed(0)
     save_trainable(SceneEncoder(), project / encoder.PRETRAINED)
-    found = by_question(encoder.measure(project, size), tmp_path)
+    found = by_question(encoder.measure(project, **reduced), tmp_path)
     assert list(found["frame size"]) == ["120 pixels", "90 pixels", "60 pixels", "30 pixels"]
     assert all((row.n, row.frames) == (12, 5) for row in found["frame size"].values())
 
 
 def test_language(project: Path, tmp_path: Path) -> None:
-    found = by_question(language.measure(project, TINY), tmp_path)
+    found = by_question(language.measure(project, 1, questions=3, aligned=4, limit=3, sizes=(1, 3)), tmp_path)
     assert list(found) == ["answering", "number format, language model"]
     assert [row.error for row in found["answering"].values()] == [0, 0], "one at a time and three say the same"
     assert found["number format, language model"]["float32"].error == 0
