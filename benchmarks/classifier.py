@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 
-from benchmarks.errors import Error, share_of
+from benchmarks.table import Error, share_of
 from pipeline.config import EncoderConfig
 from pipeline.core.runtime import derive_seed
 from pipeline.encoder.folds import Fold, Labels, cross_validate
@@ -46,7 +46,7 @@ def features(pictures: np.ndarray, folder: Path) -> np.ndarray:
 def heads_error(
     learnt: Clips, tested: Clips, objects: Sequence[str], catalogue: Catalogue, folds: int, deals: int
 ) -> Error:
-    """`errors.WRONG` of frame heads in grouped folds, their penalty chosen inside the training objects.
+    """`table.WRONG` of frame heads in grouped folds, their penalty chosen inside the training objects.
 
     Args:
         learnt: What the heads are trained on: videos x frames x features.

@@ -13,9 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.classifier import features, heads_error, weights
-from benchmarks.errors import WRONG, mean_of
-from benchmarks.table import Row, make_rows
-from benchmarks.timing import machine, timed
+from benchmarks.table import WRONG, Row, machine, make_rows, mean_of, timed
 from pipeline.config import ScenesConfig
 from pipeline.config.params import load_params
 from pipeline.core.parallel import run_parallel

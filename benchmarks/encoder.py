@@ -15,10 +15,8 @@ import numpy as np
 import torch
 
 from benchmarks.classifier import heads_error
-from benchmarks.errors import WRONG
 from benchmarks.frames import bench_videos
-from benchmarks.table import Row, make_rows
-from benchmarks.timing import interleaved, machine
+from benchmarks.table import WRONG, Row, interleaved, machine, make_rows
 from pipeline.config import PRETRAINED, FramesConfig
 from pipeline.core.errors import UserError
 from pipeline.encoder.clips import ClipDataset, LabelledVideo

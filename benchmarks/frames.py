@@ -16,9 +16,7 @@ from typing import get_args
 import numpy as np
 
 from benchmarks.classifier import features, heads_error, weights
-from benchmarks.errors import WRONG
-from benchmarks.table import Row, make_rows
-from benchmarks.timing import machine, timed
+from benchmarks.table import WRONG, Row, machine, make_rows, timed
 from pipeline.config import FramesConfig, Selection
 from pipeline.config.params import load_params
 from pipeline.core.errors import UserError

@@ -15,9 +15,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 
-from benchmarks.errors import share_of
-from benchmarks.table import Row, make_rows
-from benchmarks.timing import interleaved, machine
+from benchmarks.table import Row, interleaved, machine, make_rows, share_of
 from pipeline.config import EncoderConfig, LanguageConfig
 from pipeline.config.params import load_params
 from pipeline.core.embeddings import FLIPS, EmbeddingStore

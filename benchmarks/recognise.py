@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.errors import Error, share_of
-from benchmarks.table import Row, make_rows
+from benchmarks.table import Error, Row, make_rows, share_of
 from pipeline.config.params import load_params
 from pipeline.core.io import read_table
 from pipeline.core.records import Probe, Video

@@ -18,8 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.table import Row, make_rows
-from benchmarks.timing import machine, timed
+from benchmarks.table import Row, machine, make_rows, timed
 from pipeline.config.params import load_params
 from pipeline.core.errors import UserError
 from pipeline.use.folder import SHIPPED

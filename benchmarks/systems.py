@@ -8,9 +8,7 @@ from statistics import fmean
 
 import torch
 
-from benchmarks.errors import Error, error_of
-from benchmarks.table import Row, make_rows
-from benchmarks.timing import machine, timed
+from benchmarks.table import Error, Row, machine, make_rows, timed
 from pipeline.config.params import load_params
 from pipeline.core.errors import UserError
 from pipeline.core.io import read_csv
@@ -39,7 +37,7 @@ def measure(root: Path, triples: int = 12, batch: int = 32) -> list[Row]:
     file = root / "reports" / params.report_name / "scores.csv"
     scores = read_csv(file, ScoreRow) if file.is_file() else []
     rows = [r for r in scores if r.encoder == SHIPPED.name and r.task in COMPARING and r.measure == "choice"]
-    own = {name: [error_of(r) for r in rows if r.touch == shown] for name, shown in SHOWN.items()}
+    own = {name: [Error.of(r) for r in rows if r.touch == shown] for name, shown in SHOWN.items()}
     if not all(own.values()):
         raise UserError(f"{file}: has no answers of the shipped model; run `make repro` first")
     videos = video_files(root / params.data.dir)[0]

@@ -1,20 +1,110 @@
-"""The rows of reports/speed_error.csv: ratios, the Pareto front, and the merge of a section's rows into the file."""
+"""What sections share: times of settings that take turns, errors with intervals, rows of reports/speed_error.csv."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from statistics import median
+from statistics import fmean, median, stdev
+from time import perf_counter
+from typing import TypeVar
 
+import numpy as np
 from pydantic import Field, ValidationError
 
-from benchmarks.errors import Error
 from pipeline.core.errors import UserError, first_problem
 from pipeline.core.io import write_csv
-from pipeline.core.records import Record
+from pipeline.core.records import Record, ScoreRow
+from pipeline.core.runtime import cores, processor
+from pipeline.evaluation.intervals import accuracy_interval
 
 CSV = Path("reports") / "speed_error.csv"
+WRONG = "share of videos of unseen objects of which not every property is right"
+R = TypeVar("R")
+T = TypeVar("T")
+
+
+def timed(run: Callable[[], R]) -> tuple[R, float]:
+    """What one call gives, and the milliseconds that it takes."""
+    started = perf_counter()
+    found = run()
+    return found, 1000 * (perf_counter() - started)
+
+
+def interleaved(
+    settings: Mapping[str, Callable[[T], object]], items: Sequence[T], repeats: int, warm: bool = True
+) -> dict[str, list[float]]:
+    """Milliseconds an item: of each setting one figure a repeat, the median over the items.
+
+    All settings have their turn at an item before the next item, so that a busy machine slows all alike.
+
+    Args:
+        warm: Run every setting once before, uncounted.
+    """
+    for run in settings.values() if warm else ():
+        run(items[0])
+    found: dict[str, list[float]] = {name: [] for name in settings}
+    for _ in range(repeats):
+        spent: dict[str, list[float]] = {name: [] for name in settings}
+        for item in items:
+            for name, run in settings.items():
+                spent[name].append(timed(partial(run, item))[1])
+        for name, own in spent.items():
+            found[name].append(median(own))
+    return found
+
+
+def machine(threads: str) -> str:
+    """The processor, how many cores there are and how many were used."""
+    return f"{processor()}, {cores()} cores, {threads}"
+
+
+@dataclass(frozen=True)
+class Error:
+    """An error, and the ends of its interval where there are objects enough."""
+
+    value: float
+    low: float | None = None
+    high: float | None = None
+    n: int | None = None
+    """Videos, answers or scenes that it is over."""
+
+    @classmethod
+    def of(cls, score: ScoreRow) -> Error:
+        """One less the accuracy of a row of scores.csv."""
+        low, high = (None if end is None else 1 - end for end in (score.high, score.low))
+        return cls(1 - score.accuracy, low, high, score.n)
+
+    @property
+    def columns(self) -> dict[str, float]:
+        """As a row of the table names them."""
+        columns = {"error": self.value, "low": self.low, "high": self.high, "n": self.n}
+        return {name: value for name, value in columns.items() if value is not None}
+
+
+def share_of(wrong: Sequence[float] | np.ndarray, objects: Sequence[tuple[str, ...]]) -> Error:
+    """The share of what is wrong, with the interval of the reports.
+
+    Args:
+        wrong: From 0 (right) to 1, of each question or video.
+        objects: What each is about.
+    """
+    values = np.array(wrong, dtype=np.float64)
+    low, high = accuracy_interval(values, objects) or (None, None)
+    return Error(float(values.mean()), low, high, len(values))
+
+
+def mean_of(values: Sequence[float], objects: Sequence[str]) -> Error:
+    """The mean of a quantity that is not negative, with Student's t over the objects' means, as many of each object."""
+    from scipy.stats import t
+
+    means = [fmean(v for v, o in zip(values, objects, strict=True) if o == own) for own in sorted(set(objects))]
+    if len(means) < 2:
+        return Error(fmean(values), n=len(values))
+    half = float(t.ppf(0.975, len(means) - 1)) * stdev(means) / len(means) ** 0.5
+    return Error(fmean(means), max(fmean(means) - half, 0.0), fmean(means) + half, len(values))
 
 
 class Row(Record):

@@ -14,6 +14,7 @@ if __name__ == "__main__":
         config = run.params.questions
         catalogue = load_catalogue(Path(run.params.data.catalogue)).asking(config.scenarios, config.wording)
         catalogue = catalogue.called(config.names)
+        training = {name: getattr(config, name) for name in ("inexact", "two_turns", "plainly")}
         for seed in run.params.ablation.seeds:
             assignments = read_table(DATA / "splits" / f"{seed}.parquet", Assignment)
             for name, part, counts, distinct in (
@@ -26,11 +27,9 @@ if __name__ == "__main__":
                     seed=config.seed,
                     distinct=distinct,
                     facts=config.facts,
-                    inexact=config.inexact if part is Part.TRAIN else 0.0,
                     restate=config.restate,
-                    two_turns=config.two_turns if part is Part.TRAIN else 0.0,
-                    plainly=config.plainly if part is Part.TRAIN else 0.0,
                     fold=run.params.split.fold_of(seed),
+                    **(training if part is Part.TRAIN else {}),
                 )
                 write_jsonl(DATA / "questions" / str(seed) / f"{name}.jsonl", questions)
                 for task in counts:

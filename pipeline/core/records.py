@@ -438,7 +438,8 @@ class EffectRow(Record):
     """Of the 95 % interval for new objects and, with several seeds, new seeds; None as in scores."""
     high: Optional = None
     p: Optional = None
-    """Of the sign-flip test over objects."""
+    """Two-sided, of sign flips over objects. It takes few values (with seven objects none below 2/128) and is about
+    these runs alone, so it and the interval may disagree."""
     p_holm: Optional = None
     """Holm's adjustment over all rows of the report."""
     smallest_effect: Optional = None

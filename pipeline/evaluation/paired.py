@@ -30,7 +30,7 @@ POWER, SIZE = 0.8, 0.05
 
 @dataclass(frozen=True)
 class Difference:
-    """How much more often one setting is right than another; shares from -1 to 1.
+    """How much more often one setting is right than another, as columns of `EffectRow`; shares from -1 to 1.
 
     All but the difference is None where the questions cannot show that objects differ.
     """
@@ -40,14 +40,9 @@ class Difference:
     objects: int
     seeds: int
     low: float | None = None
-    """Of the 95 % interval for new objects and, with several seeds, new seeds."""
     high: float | None = None
     p: float | None = None
-    """Two-sided, of sign flips over objects. It takes few values (with seven objects none below 2/128) and is about
-    these runs alone, so it and the interval may disagree."""
     smallest_effect: float | None = None
-    """Minimum detectable effect: the smallest true difference that such a comparison finds in four of five repetitions;
-    above 1 there is none."""
 
 
 def paired(values: Values, objects: Sequence[Objects]) -> Difference:

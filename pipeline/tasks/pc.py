@@ -7,19 +7,8 @@ import re
 from typing import Literal
 
 from pipeline.core.records import Dialogue, Opd, Prediction, Question, Score, Turn
-from pipeline.tasks import psr
-from pipeline.tasks.base import (
-    ORDINALS,
-    Classes,
-    Draft,
-    Pool,
-    TaskDefinition,
-    choice_score,
-    concluded,
-    conclusion,
-    draft_about,
-    single_turn,
-)
+from pipeline.tasks import base, psr
+from pipeline.tasks.base import Classes, Draft, Pool, TaskDefinition
 from pipeline.videos.catalogue import Catalogue, Property
 
 TEMPLATES = (
@@ -57,7 +46,7 @@ def in_words(choice: Reading, comparative: str, prop: Property) -> str:
 def read(answer: str) -> Reading | None:
     """One of `CHOICES`, from how the conclusion begins: "Yes", "No" or "Both"; "yes and no" is none of them."""
     pattern = r"\W*(yes|no|both)\b(?!\s*(?:and|or|/)\s*(?:yes|no|both)\b|\s+(?:idea|answer|conclusion|clue)\b)"
-    found = {m[1].lower() for part in conclusion(answer) if (m := re.match(pattern, part, flags=re.IGNORECASE))}
+    found = {m[1].lower() for part in base.conclusion(answer) if (m := re.match(pattern, part, flags=re.IGNORECASE))}
     readings: dict[str, Reading] = {"yes": "yes", "no": "no", "both": "same"}
     return readings[found.pop()] if len(found) == 1 else None
 
@@ -86,12 +75,18 @@ class PropertyComparison(TaskDefinition):
             return None
         comparative = prop.more if rising else prop.less
         user = asked(rng.choice(TEMPLATES), comparative, prop.spoken)
-        told, prefixes = in_words(choice, comparative, prop), [f"{o} object:" for o in ORDINALS]
-        answer = concluded(pool.catalogue, objects, told, [prop.name], prefixes)
+        told, prefixes = in_words(choice, comparative, prop), [f"{o} object:" for o in base.ORDINALS]
+        answer = base.concluded(pool.catalogue, objects, told, [prop.name], prefixes)
         found = {"yes": self.listed[0], "no": self.listed[1], "same": "neither"}[choice]
         finding = f"{comparative.capitalize()}: {found}."
-        return draft_about(
-            pool, objects, rng, turns=single_turn(user, answer), choice=choice, properties=[prop.name], finding=finding
+        return base.draft_about(
+            pool,
+            objects,
+            rng,
+            turns=base.single_turn(user, answer),
+            choice=choice,
+            properties=[prop.name],
+            finding=finding,
         )
 
     def plainly(self, draft: Draft, catalogue: Catalogue, rng: random.Random) -> Draft:
@@ -123,7 +118,7 @@ class PropertyComparison(TaskDefinition):
         return in_words(compare(first, second, word == prop.more), word, prop)
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
-        return choice_score(question, prediction, read(prediction.outputs[0]), published=True)
+        return base.choice_score(question, prediction, read(prediction.outputs[0]), published=True)
 
 
 TASK = PropertyComparison()

@@ -8,20 +8,8 @@ import re
 from collections.abc import Iterable, Sequence
 
 from pipeline.core.records import Dialogue, Opd, Prediction, Question, Score
-from pipeline.tasks.base import (
-    LETTERS,
-    Classes,
-    Draft,
-    Pool,
-    TaskDefinition,
-    before_concluding,
-    choice_score,
-    concluded,
-    conclusion,
-    draft_about,
-    lettered,
-    single_turn,
-)
+from pipeline.tasks import base
+from pipeline.tasks.base import Classes, Draft, Pool, TaskDefinition
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.catalogue.wording import unmarked
 
@@ -80,7 +68,7 @@ def steps(some: Iterable[Sequence[float]], others: Iterable[Sequence[float]]) ->
 def asked(opening: str, names: Iterable[str]) -> dict[Opd, str]:
     """The question in every OPD mode; `names` in the order of the options."""
     names = list(names)
-    opening = opening.format(videos=lettered(len(names)))
+    opening = opening.format(videos=base.lettered(len(names)))
     request = REQUEST.format(options=", ".join(f"{i}) {name}" for i, name in enumerate(names, 1)))
     # Every property may tell the objects apart, so `needed` is `all`.
     whole = f"{opening} Describe the object in each video, then m{request}"
@@ -92,9 +80,9 @@ def read(answer: str, names: Sequence[str]) -> dict[str, int] | None:
     known = [unmarked(name).lower() for name in names]
     said = "|".join(re.escape(name) for name in sorted(known, key=len, reverse=True))
     pattern = rf"\b([abc])(?:\)|(?=\s*[:=-]|\s+is\b))(?:\s*:|\s*=|\s*->?|\s+is)?\s+({said})(?!'?\w|\s+or\b)"
-    pairs = re.findall(pattern, " ".join(conclusion(answer)), flags=re.IGNORECASE)
+    pairs = re.findall(pattern, " ".join(base.conclusion(answer)), flags=re.IGNORECASE)
     found = {letter.lower(): known.index(name.lower()) for letter, name in pairs}
-    letters, places = list(LETTERS[: len(known)]), list(range(len(known)))
+    letters, places = list(base.LETTERS[: len(known)]), list(range(len(known)))
     whole = len(pairs) == len(known) and sorted(found) == letters and sorted(found.values()) == places
     return found if whole else None
 
@@ -115,7 +103,7 @@ def nearest(classes: Classes, catalogue: Catalogue, objects: Iterable[str] | Non
 
 def in_words(catalogue: Catalogue, objects: Sequence[str]) -> str:
     """The conclusion in words, for three object ids in the order of their videos."""
-    names = [f"{letter}) is {catalogue.objects[o].name}" for letter, o in zip(LETTERS, objects, strict=True)]
+    names = [f"{letter}) is {catalogue.objects[o].name}" for letter, o in zip(base.LETTERS, objects, strict=True)]
     return f"{names[0]}, {names[1]} and {names[2]}."
 
 
@@ -141,8 +129,8 @@ class PropertyObjectMatching(TaskDefinition):
         order = ORDERS[stratum % len(ORDERS)]
         objects = [options[int(number) - 1] for number in order]
         user = asked(rng.choice(OPENINGS), [catalogue.objects[o].name for o in options])
-        turns = single_turn(user, concluded(catalogue, objects, in_words(catalogue, objects)))
-        return draft_about(pool, objects, rng, turns=turns, choice=order, properties=catalogue.property_names)
+        turns = base.single_turn(user, base.concluded(catalogue, objects, in_words(catalogue, objects)))
+        return base.draft_about(pool, objects, rng, turns=turns, choice=order, properties=catalogue.property_names)
 
     def with_facts(self, draft: Draft, catalogue: Catalogue, rng: random.Random, inexact: float = 0.0) -> Draft:
         """The question after facts about its objects, so that it tests touch and reasoning, not knowledge of
@@ -156,8 +144,8 @@ class PropertyObjectMatching(TaskDefinition):
 
     def restated(self, draft: Draft, catalogue: Catalogue) -> Draft:
         """The question whose answer states the fact about each video's object, between descriptions and conclusion."""
-        told = zip(LETTERS, draft.objects, strict=True)
-        return before_concluding(draft, " ".join(f"{x}) {fact(catalogue, o)}" for x, o in told))
+        told = zip(base.LETTERS, draft.objects, strict=True)
+        return base.before_concluding(draft, " ".join(f"{x}) {fact(catalogue, o)}" for x, o in told))
 
     def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str:
         return in_words(catalogue, nearest(classes, catalogue, question.objects))
@@ -165,8 +153,8 @@ class PropertyObjectMatching(TaskDefinition):
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         names = sorted((catalogue.objects[o].name for o in question.objects), key=str.lower)
         found = read(prediction.outputs[0], names)
-        predicted = "".join(str(found[x] + 1) for x in LETTERS) if found else None
-        return choice_score(question, prediction, predicted, published=True)
+        predicted = "".join(str(found[x] + 1) for x in base.LETTERS) if found else None
+        return base.choice_score(question, prediction, predicted, published=True)
 
 
 TASK = PropertyObjectMatching()

@@ -6,20 +6,8 @@ import random
 from collections.abc import Mapping, Sequence
 
 from pipeline.core.records import Opd, Prediction, Question, Score, Turn
-from pipeline.tasks.base import (
-    BEGUN,
-    LETTERS,
-    Classes,
-    Draft,
-    Pool,
-    TaskDefinition,
-    choice_score,
-    chosen_letter,
-    described_first,
-    descriptions,
-    draft_about,
-    lettered,
-)
+from pipeline.tasks import base
+from pipeline.tasks.base import Classes, Draft, Pool, TaskDefinition
 from pipeline.videos.catalogue import Catalogue
 
 BASED = " based on physical property descriptions of the two objects"
@@ -33,9 +21,9 @@ def asked(question: str, aspects: str) -> dict[Opd, tuple[str, ...]]:
     """The turns of every OPD mode: first a description, of `aspects` alone or of all, then the situation."""
     second = REQUEST.format(question=question, based=BASED)
     return {
-        Opd.NONE: (f"Given two tactile videos: {lettered(2)}. {REQUEST.format(question=question, based='')}",),
-        Opd.NEEDED: (described_first(2, aspects), second),
-        Opd.ALL: (described_first(2), second),
+        Opd.NONE: (f"Given two tactile videos: {base.lettered(2)}. {REQUEST.format(question=question, based='')}",),
+        Opd.NEEDED: (base.described_first(2, aspects), second),
+        Opd.ALL: (base.described_first(2), second),
     }
 
 
@@ -47,7 +35,7 @@ def in_words(letter: str, reasons: str) -> str:
 def read(answer: str) -> str | None:
     """The letter in "The most suitable object is x)", or "... for this is x)"; "x) or y)", or two letters, are none."""
     said = r"most suitable object(?: for [^.;]*?)? is:? CHOICE"
-    return chosen_letter(answer, LETTERS[:2], said, rf"{BEGUN}CHOICE is the (?:most suitable|best)\b")
+    return base.chosen_letter(answer, base.LETTERS[:2], said, rf"{base.BEGUN}CHOICE is the (?:most suitable|best)\b")
 
 
 class PropertyScenarioReasoning(TaskDefinition):
@@ -76,17 +64,17 @@ class PropertyScenarioReasoning(TaskDefinition):
         names = [p for p in catalogue.property_names if p in scenario.target or p in scenario.other]
         spoken = {p.name: p.spoken for p in catalogue.properties}
         reasons, aspects = (" and ".join(spoken[p] for p in chosen) for chosen in (scenario.target, names))
-        answer = in_words(LETTERS[position], reasons)
+        answer = in_words(base.LETTERS[position], reasons)
         said = {
             Opd.NONE: (answer,),
-            Opd.NEEDED: (descriptions(catalogue, objects, names), answer),
-            Opd.ALL: (descriptions(catalogue, objects), answer),
+            Opd.NEEDED: (base.descriptions(catalogue, objects, names), answer),
+            Opd.ALL: (base.descriptions(catalogue, objects), answer),
         }
         turns = {
             mode: [Turn(user=user, assistant=answer) for user, answer in zip(users, said[mode], strict=True)]
             for mode, users in asked(scenario.question, aspects).items()
         }
-        return draft_about(pool, objects, rng, turns=turns, choice=LETTERS[position], properties=names)
+        return base.draft_about(pool, objects, rng, turns=turns, choice=base.LETTERS[position], properties=names)
 
     def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str | None:
         """The video whose classes are nearest to the suitable ones; ties go by the expected classes."""
@@ -101,10 +89,10 @@ class PropertyScenarioReasoning(TaskDefinition):
             pairs = [(video[catalogue.property_index(name)], levels) for name, levels in scenario.target.items()]
             return tuple(sum(min(abs(said[i] - x) for x in levels) for said, levels in pairs) for i in (0, 1))
 
-        return f"The most suitable object is {LETTERS[min((0, 1), key=lambda i: distance(classes[i]))]})."
+        return f"The most suitable object is {base.LETTERS[min((0, 1), key=lambda i: distance(classes[i]))]})."
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
-        return choice_score(question, prediction, read(prediction.outputs[-1]))
+        return base.choice_score(question, prediction, read(prediction.outputs[-1]))
 
 
 def _matching(pool: Pool, classes: Mapping[str, tuple[int, ...]]) -> list[str]:

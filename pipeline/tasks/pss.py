@@ -5,20 +5,8 @@ from __future__ import annotations
 import random
 
 from pipeline.core.records import Opd, Prediction, Question, Score
-from pipeline.tasks.base import (
-    LETTERS,
-    LISTED,
-    Classes,
-    Draft,
-    Pool,
-    TaskDefinition,
-    choice_score,
-    chosen_letter,
-    concluded,
-    draft_about,
-    lettered,
-    single_turn,
-)
+from pipeline.tasks import base
+from pipeline.tasks.base import Classes, Draft, Pool, TaskDefinition
 from pipeline.videos.catalogue import Catalogue
 
 TEMPLATES = (
@@ -30,7 +18,7 @@ TEMPLATES = (
 
 def asked(template: tuple[str, str], superlative: str, spoken: str) -> dict[Opd, str]:
     """The question by a template, in every OPD mode; `spoken` is the property as a sentence has it."""
-    opening, request = template[0].format(videos=lettered(3)), template[1].format(superlative=superlative)
+    opening, request = template[0].format(videos=base.lettered(3)), template[1].format(superlative=superlative)
     return {
         Opd.NONE: f"{opening} {request[0].upper()}{request[1:]}",
         Opd.NEEDED: f"{opening} Describe the {spoken} of each object and then {request}",
@@ -41,7 +29,7 @@ def asked(template: tuple[str, str], superlative: str, spoken: str) -> dict[Opd,
 def read(answer: str) -> str | None:
     """The one letter that the conclusion calls the superlative."""
     named = (r"CHOICE is (?:\w+ly )?the\b(?! same)", r"(?:\w+est|(?:most|least) \w+)(?: \w+)? is CHOICE")
-    return chosen_letter(answer, LETTERS, *named, concluded=True)
+    return base.chosen_letter(answer, base.LETTERS, *named, concluded=True)
 
 
 class PropertySuperlativeSelection(TaskDefinition):
@@ -49,7 +37,7 @@ class PropertySuperlativeSelection(TaskDefinition):
 
     name = "PSS"
     title = "Property Superlative Selection"
-    listed = LISTED
+    listed = base.LISTED
     adjectives = ("most", "least")
     choices = 3
 
@@ -69,19 +57,21 @@ class PropertySuperlativeSelection(TaskDefinition):
         objects.insert(position, rng.choice([o for o, level in levels.items() if level == extreme]))
         superlative = prop.most if most else prop.least
         user = asked(rng.choice(TEMPLATES), superlative, prop.spoken)
-        letter = LETTERS[position]
-        turns = single_turn(user, concluded(pool.catalogue, objects, f"{letter}) is the {superlative}.", [prop.name]))
+        letter = base.LETTERS[position]
+        turns = base.single_turn(
+            user, base.concluded(pool.catalogue, objects, f"{letter}) is the {superlative}.", [prop.name])
+        )
         finding = f"{superlative.capitalize()}: {letter})."
-        return draft_about(pool, objects, rng, turns=turns, choice=letter, properties=[prop.name], finding=finding)
+        return base.draft_about(pool, objects, rng, turns=turns, choice=letter, properties=[prop.name], finding=finding)
 
     def conclude(self, question: Question, classes: Classes, catalogue: Catalogue) -> str:
         place, word = catalogue.property_index(question.gold.properties[0]), self.adjective(question, catalogue)
         furthest = max if word == catalogue.properties[place].most else min
         extreme = furthest(range(len(classes)), key=lambda i: classes[i][place])
-        return f"{LETTERS[extreme]}) is the {word}."
+        return f"{base.LETTERS[extreme]}) is the {word}."
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
-        return choice_score(question, prediction, read(prediction.outputs[0]), published=True)
+        return base.choice_score(question, prediction, read(prediction.outputs[0]), published=True)
 
 
 TASK = PropertySuperlativeSelection()

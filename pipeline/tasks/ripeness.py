@@ -9,19 +9,8 @@ import random
 import re
 
 from pipeline.core.records import Opd, Prediction, Question, Score, Turn
-from pipeline.tasks.base import (
-    BEGUN,
-    LETTERS,
-    Draft,
-    Pool,
-    TaskDefinition,
-    choice_score,
-    chosen_letter,
-    described_first,
-    descriptions,
-    draft_about,
-    lettered,
-)
+from pipeline.tasks import base
+from pipeline.tasks.base import Draft, Pool, TaskDefinition
 from pipeline.videos.catalogue import Catalogue
 
 NUMBERS = {1: "one", 2: "two", 3: "three", 4: "four"}
@@ -57,24 +46,26 @@ class Ripeness(TaskDefinition):
         telling = [p for p, *classes in zip(catalogue.properties, *ranked, strict=True) if len(set(classes)) > 1]
         names, spoken = zip(*((p.name, p.spoken) for p in telling or catalogue.properties), strict=True)
         aspects = " and ".join(spoken)
-        answer = f"The riper {fruit} is {LETTERS[position]}), because of its {aspects}."
+        answer = f"The riper {fruit} is {base.LETTERS[position]}), because of its {aspects}."
         talk = Turn(user=papers_question(catalogue, fruit), assistant=f"First to last: {', '.join(spoken)}.")
         ask = f"Each shows one {fruit}. Which {fruit} is riper? Use the format 'The riper {fruit} is x), because xxx'."
-        whole = Turn(user=described_first(2), assistant=descriptions(catalogue, objects))
-        needed = Turn(user=described_first(2, aspects), assistant=descriptions(catalogue, objects, names))
+        whole = Turn(user=base.described_first(2), assistant=base.descriptions(catalogue, objects))
+        needed = Turn(user=base.described_first(2, aspects), assistant=base.descriptions(catalogue, objects, names))
         last = Turn(user=ask, assistant=answer)
         turns = {
-            Opd.NONE: [talk, Turn(user=f"Given two tactile videos: {lettered(2)}. {ask}", assistant=answer)],
+            Opd.NONE: [talk, Turn(user=f"Given two tactile videos: {base.lettered(2)}. {ask}", assistant=answer)],
             Opd.NEEDED: [talk, needed, last],
             Opd.ALL: [talk, whole, last],
         }
-        return draft_about(pool, objects, rng, turns=turns, choice=LETTERS[position], properties=names)
+        return base.draft_about(pool, objects, rng, turns=turns, choice=base.LETTERS[position], properties=names)
 
     def grade(self, question: Question, prediction: Prediction, catalogue: Catalogue) -> list[Score]:
         """Read from "The riper FRUIT is x)"; two different letters there are no answer."""
         fruits = "|".join(map(re.escape, _fruits(catalogue)))
-        said = (rf"riper (?:{fruits}|one) is CHOICE", rf"{BEGUN}CHOICE is (?:the )?riper\b")
-        return choice_score(question, prediction, chosen_letter(prediction.outputs[-1], LETTERS[:2], *said))
+        said = (rf"riper (?:{fruits}|one) is CHOICE", rf"{base.BEGUN}CHOICE is (?:the )?riper\b")
+        return base.choice_score(
+            question, prediction, base.chosen_letter(prediction.outputs[-1], base.LETTERS[:2], *said)
+        )
 
 
 def _fruits(catalogue: Catalogue) -> list[str]:

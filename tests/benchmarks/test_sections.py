@@ -76,9 +76,15 @@ def by_question(rows: list[Row], folder: Path) -> dict[str, dict[str, Row]]:
     return found
 
 
-def score(**columns: object) -> ScoreRow:
-    usual = {"seed": "all", "chance": 0.1, "right": 9, "unread": 0, "n": 24, "sets": 8}
-    return ScoreRow.model_validate(usual | columns)
+@pytest.fixture
+def trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of a tiny trained model, in a project with videos, which is the working directory."""
+    monkeypatch.chdir(tmp_path)
+    made = make(tmp_path, Variant(Encoder.FINETUNED, Lora.WITH, Opd.ALL, 0))
+    values = yaml.safe_load((ROOT / "params.yaml").read_text())
+    values["data"] |= {"source": "videos", "dir": "videos"}
+    (tmp_path / "params.yaml").write_text(yaml.safe_dump(values))
+    return made.folder
 
 
 def test_frames(project: Path, tmp_path: Path) -> None:
@@ -110,29 +116,15 @@ def test_language(project: Path, tmp_path: Path) -> None:
 
 
 def test_systems_take_errors_from_the_report_and_times_from_the_shipped_model(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    made = make(tmp_path, Variant(Encoder.FINETUNED, Lora.WITH, Opd.ALL, 0))
-    monkeypatch.setattr(systems, "SHIPPED", made.folder)
-    values = yaml.safe_load((ROOT / "params.yaml").read_text())
-    values["data"] |= {"source": "videos", "dir": "videos"}
-    (tmp_path / "params.yaml").write_text(yaml.safe_dump(values))
+    monkeypatch.setattr(systems, "SHIPPED", trained)
     with refused("scores.csv: has no answers of the shipped model; run `make repro` first"):
         systems.measure(tmp_path)
+    usual = {"encoder": trained.name, "measure": "choice", "opd": "all", "seed": "all", "chance": 0.1}
+    usual |= {"right": 9, "unread": 0, "n": 8, "sets": 8}
     scores = [
-        score(
-            measure="choice",
-            encoder=made.folder.name,
-            lora="",
-            opd="all",
-            n=8,
-            task=task,
-            touch=touch,
-            accuracy=right,
-            low=right - 0.1,
-            high=right + 0.2,
-        )
+        ScoreRow(task=task, touch=touch, accuracy=right, low=right - 0.1, high=right + 0.2, **usual)
         for touch, right in (("touch", 0.5), ("classes", 0.75))
         for task in systems.COMPARING
     ]
@@ -157,13 +149,9 @@ def test_contact(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert all(row.n == 6 for row in found["contact, for a classifier"].values())
 
 
-def test_serving_asks_a_fresh_process_and_a_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    made = make(tmp_path, Variant(Encoder.FINETUNED, Lora.WITH, Opd.ALL, 0))
-    values = yaml.safe_load((ROOT / "params.yaml").read_text())
-    values["data"] |= {"source": "videos", "dir": "videos"}
-    (tmp_path / "params.yaml").write_text(yaml.safe_dump(values))
-    assert made.folder.parent == tmp_path / "models"
+def test_serving_asks_a_fresh_process_and_a_server(
+    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rows = {row.setting: row for row in serving.measure(tmp_path, clients=3, each=2)}
     once, crowded = rows["a server, one client: median"], rows["a server, 3 clients: median"]
     assert once.cost_ratio == 1

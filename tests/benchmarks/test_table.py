@@ -9,10 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks import __main__ as command
-from benchmarks.errors import Error, error_of, mean_of, share_of
 from benchmarks.figures import FOLDER, draw
-from benchmarks.table import CSV, Row, front, make_rows, merge, read_rows
-from benchmarks.timing import interleaved
+from benchmarks.table import CSV, Error, Row, front, interleaved, make_rows, mean_of, merge, read_rows, share_of
 from pipeline.core.records import ScoreRow
 from tests.conftest import ROOT, refused
 
@@ -120,8 +118,8 @@ def test_errors_have_intervals_over_objects() -> None:
     named = {"task": "t", "measure": "m", "encoder": "e", "seed": "all"}
     counted = {"right": 4, "unread": 0, "chance": 0.1, "n": 9, "sets": 4}
     score = ScoreRow.model_validate({**named, **counted, "accuracy": 0.5, "low": 0.4, "high": 0.7})
-    assert error_of(score).columns == pytest.approx({"error": 0.5, "low": 0.3, "high": 0.6, "n": 9})
-    assert error_of(score.model_copy(update={"low": None, "high": None})).columns == {"error": 0.5, "n": 9}
+    assert Error.of(score).columns == pytest.approx({"error": 0.5, "low": 0.3, "high": 0.6, "n": 9})
+    assert Error.of(score.model_copy(update={"low": None, "high": None})).columns == {"error": 0.5, "n": 9}
 
 
 def test_the_command_merges_and_names_what_is_allowed(
