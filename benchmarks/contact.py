@@ -44,14 +44,7 @@ def models() -> dict[str, ScenesConfig]:
 
 
 def measure(root: Path, objects: int | None = None, videos: int = 3, folds: int = 5, deals: int = 3) -> list[Row]:
-    """Both questions, on objects of the catalogue of params.yaml.
-
-    Args:
-        objects: How many, at equal distances in the catalogue; all by default.
-        videos: Scenes an object.
-        folds: Of the classifier's cross-validation.
-        deals: How often they are dealt.
-    """
+    """Both questions, on scenes of so many objects, at equal distances in the catalogue of params.yaml, or of all."""
     data = load_params(root / "params.yaml").data
     catalogue = load_catalogue(root / data.catalogue)
     recipes = load_recipes(root / data.catalogue, catalogue, 0)
@@ -71,9 +64,15 @@ def measure(root: Path, objects: int | None = None, videos: int = 3, folds: int 
         ("contact", "winkler", pictures, steps),
         ("contact, for a classifier", "layer, every pixel", wrong, WRONG),
     ):
-        errors = dict(zip(costs, found, strict=True))
-        shared = {"unit": "ms a frame", "machine": machine("1 thread a scene")}
-        rows += make_rows(question, costs, baseline=baseline, errors=errors, error_of=error_of, **shared)
+        rows += make_rows(
+            question,
+            costs,
+            unit="ms a frame",
+            baseline=baseline,
+            errors=dict(zip(costs, found, strict=True)),
+            error_of=error_of,
+            machine=machine("1 thread a scene"),
+        )
     return rows
 
 

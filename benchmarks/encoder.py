@@ -30,14 +30,7 @@ SIDES, FRAMES = (120, 90, 60, 30), 5
 
 
 def measure(root: Path, timed: int = 25, repeats: int = 5, folds: int = 5, deals: int = 3) -> list[Row]:
-    """Over the videos that `frames.bench_videos` finds.
-
-    Args:
-        timed: How many videos are timed, spread over the objects.
-
-    Raises:
-        UserError: without pretrained weights, or as `frames.bench_videos`.
-    """
+    """Over the videos of `frames.bench_videos`, so many of them `timed`; a UserError without pretrained weights."""
     folder, catalogue = bench_videos(root, folds)
     pretrained = root / PRETRAINED
     if not pretrained.is_file():

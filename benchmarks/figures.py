@@ -37,7 +37,10 @@ def draw(rows: Sequence[Row], reports: Path) -> list[Path]:
         if measured:
             _trade(axes, measured)
         else:
-            _bars(axes, own)
+            bars = axes.barh([row.setting for row in own], [row.cost_ratio for row in own], color="C0")
+            axes.bar_label(bars, [f" {row.cost_ratio:.3g}" for row in own])
+            axes.invert_yaxis()
+            axes.margins(x=0.12)
         path = reports / FOLDER / f"{re.sub(r'[^a-z0-9]+', '-', question.lower()).strip('-')}.png"
         with atomic(path) as temporary:
             figure.savefig(temporary, format="png", metadata={"Software": None})
@@ -45,13 +48,6 @@ def draw(rows: Sequence[Row], reports: Path) -> list[Path]:
     for stale in {*(reports / FOLDER).glob("*.png")} - {*drawn}:
         stale.unlink()
     return drawn
-
-
-def _bars(axes: Axes, rows: Sequence[Row]) -> None:
-    bars = axes.barh([row.setting for row in rows], [row.cost_ratio for row in rows], color="C0")
-    axes.bar_label(bars, [f" {row.cost_ratio:.3g}" for row in rows])
-    axes.invert_yaxis()
-    axes.margins(x=0.12)
 
 
 def _trade(axes: Axes, rows: Sequence[Row]) -> None:

@@ -70,12 +70,7 @@ class Sample:
 def measure(root: Path, folds: int = 5, deals: int = 10) -> list[Row]:
     """Every setting on the same videos by the same folds; frames are drawn as for evaluation.
 
-    Args:
-        folds: Of the cross-validation.
-        deals: How often folds are dealt; with three, a setting moves by a point or two.
-
-    Raises:
-        UserError: as `bench_videos`.
+    With three deals of the folds in place of ten, a setting moves by a point or two.
     """
     videos, catalogue = bench_videos(root, folds)
     files = list_videos(videos, catalogue).files

@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from statistics import fmean
-from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
@@ -18,15 +17,15 @@ import torch
 from benchmarks.table import Row, interleaved, machine, make_rows, share_of
 from pipeline.config import EncoderConfig, LanguageConfig
 from pipeline.config.params import load_params
-from pipeline.core.embeddings import FLIPS, EmbeddingStore
-from pipeline.core.io import save_tensors, write_table
-from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Assignment, Embedding, Opd, Part, Question
+from pipeline.core.embeddings import EmbeddingStore
+from pipeline.core.records import Opd, Part, Question
 from pipeline.core.runtime import DtypeName, seed_everything
 from pipeline.encoder.clip import base_encoder
 from pipeline.language.conversations import ConversationDataset, UpdateSampler, collate
 from pipeline.language.generate import answer
 from pipeline.language.octopi import OctopiForCausalLM
-from pipeline.tasks.questions import build_questions, pool_of
+from pipeline.tasks.base import Pool
+from pipeline.tasks.questions import build_questions
 from pipeline.videos.catalogue import load_catalogue
 
 FRAMES, UPDATE = 5, 16
@@ -53,29 +52,26 @@ def measure(
         sizes: Of batches.
     """
     torch.set_num_threads(1)
-    with TemporaryDirectory() as folder:
-        model, store, asked = prepare(root, aligned, questions, Path(folder))
-        ask = partial(_texts, store, asked, limit)
-        batches: dict[str, Way] = {f"{batch} at a time": partial(ask, model, batch) for batch in sizes}
-        formats: dict[str, Way] = {}
-        names: tuple[DtypeName, ...] = ("float32", "bfloat16")
-        for name in names:
-            # The frozen weights in fewer bits; the connector stays in float32.
-            base = model.octopi_config
-            other = OctopiForCausalLM.from_base(base.base_model, base.tactile_dim, dtype=name)
-            other.connector.load_state_dict(model.connector.state_dict())
-            formats[name] = partial(ask, other, sizes[-1])
-        return [
-            row
-            for question, ways in (("answering", batches), ("number format, language model", formats))
-            for row in _question(question, ways, asked, model, repeats)
-        ]
+    model, store, asked = prepare(root, aligned, questions)
+    ask = partial(_texts, store, asked, limit)
+    batches: dict[str, Way] = {f"{batch} at a time": partial(ask, model, batch) for batch in sizes}
+    formats: dict[str, Way] = {}
+    names: tuple[DtypeName, ...] = ("float32", "bfloat16")
+    for name in names:
+        # The frozen weights in fewer bits; the connector stays in float32.
+        base = model.octopi_config
+        other = OctopiForCausalLM.from_base(base.base_model, base.tactile_dim, dtype=name)
+        other.connector.load_state_dict(model.connector.state_dict())
+        formats[name] = partial(ask, other, sizes[-1])
+    return [
+        row
+        for question, ways in (("answering", batches), ("number format, language model", formats))
+        for row in _question(question, ways, asked, model, repeats)
+    ]
 
 
-def prepare(
-    root: Path, aligned: int, asked: int, folder: Path
-) -> tuple[OctopiForCausalLM, EmbeddingStore, list[Question]]:
-    """The model of params.yaml, its connector trained on some conversations; embeddings, kept in `folder`; questions.
+def prepare(root: Path, aligned: int, asked: int) -> tuple[OctopiForCausalLM, EmbeddingStore, list[Question]]:
+    """The model of params.yaml, its connector trained on some conversations; embeddings of noise; questions.
 
     Questions are about every third object of the catalogue.
     """
@@ -84,23 +80,18 @@ def prepare(
     encoder = base_encoder(EncoderConfig(weights=str(root / params.encoder.weights))).eval()
     model = OctopiForCausalLM.from_base(root / params.language.weights, encoder.dim)
     catalogue = load_catalogue(root / params.data.catalogue)
-    videos = [Assignment(video_id=f"{o}_0", object_id=o, part=Part.TRAIN) for o in list(catalogue.objects)[::3]]
-    pool = pool_of(Part.TRAIN, videos, catalogue)
+    videos = {o: [f"{o}_0"] for o in list(catalogue.objects)[::3]}
+    pool = Pool(Part.TRAIN, catalogue, videos)
     learnt, questions = (
         build_questions(pool, {t: -(-n // len(ASKED)) for t in ASKED}, seed=seed, distinct=False)[:n]
         for seed, n in enumerate((aligned, asked))
     )
     rng, shape = np.random.default_rng(0), (FRAMES, *encoder.visual.image_size, 3)
-    names = [video.video_id for video in videos]
-    pictures = {name: torch.from_numpy(rng.integers(0, 256, shape, dtype=np.uint8)) for name in names}
-    rows = [(v, x, f) for v in names for x in FLIPS for f in range(FRAMES)]
-    index = [Embedding(video_id=v, frame_index=f, flip=x, row=row) for row, (v, x, f) in enumerate(rows)]
-    with torch.inference_mode():
-        # Mirrored noise is noise: one embedding serves all four.
-        blocks = [encoder(pictures[v], torch.zeros(FRAMES)).repeat(len(FLIPS), 1) for v in names]
-    save_tensors(folder / TENSOR_FILE, {TENSOR: torch.cat(blocks)})
-    write_table(folder / INDEX_FILE, Embedding, index)
-    store = EmbeddingStore(folder)
+    pictures = [torch.from_numpy(rng.integers(0, 256, shape, dtype=np.uint8)) for _ in videos]
+    with torch.no_grad():
+        embeddings = torch.cat([encoder(each, torch.zeros(FRAMES)) for each in pictures])
+    rows = {name: range(i * FRAMES, (i + 1) * FRAMES) for i, (name,) in enumerate(videos.values())}
+    store = EmbeddingStore().with_rows(rows, embeddings)
     data = ConversationDataset(
         learnt,
         Opd.ALL,
@@ -108,7 +99,7 @@ def prepare(
         model.tokenizer,
         system_prompt="",
         per_video=FRAMES,
-        flip_probability=0.5,
+        flip_probability=0.0,
         seed=0,
         positions=model.positions,
         by_question=False,

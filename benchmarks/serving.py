@@ -44,23 +44,20 @@ def measure(root: Path, clients: int = CLIENTS, each: int = EACH) -> list[Row]:
     done, first = timed(partial(subprocess.run, ask, capture_output=True, text=True, check=False))
     if done.returncode:
         raise UserError(str(done.stderr).strip() or "octopi ask failed")
-    with served(SHIPPED) as address:
-        bodies = [body(SHIPPED.name, video) for video in videos]
+    with served() as address:
+        bodies = [body(video) for video in videos]
         alone = {b: post(address, b) for b in bodies}
         once = [timed(partial(post, address, b))[1] for b in bodies]
 
-        other: list[bytes] = []
-
-        def again(data: bytes) -> None:
-            # In bfloat16 an answer may depend on its neighbours in a batch.
-            if post(address, data) != alone[data]:
-                other.append(data)
-
-        def client(number: int) -> list[float]:
-            return [timed(partial(again, bodies[(number + i) % len(bodies)]))[1] for i in range(each)]
+        def client(number: int) -> list[tuple[bool, float]]:
+            """Of each request whether its answer is another than alone, and milliseconds."""
+            asked = [bodies[(number + i) % len(bodies)] for i in range(each)]
+            answers = [timed(partial(post, address, b)) for b in asked]
+            return [(said != alone[b], spent) for b, (said, spent) in zip(asked, answers, strict=True)]
 
         with ThreadPoolExecutor(clients) as pool:
-            loaded = [spent for found in pool.map(client, range(clients)) for spent in found]
+            # In bfloat16 an answer may depend on its neighbours in a batch.
+            other, loaded = zip(*(one for found in pool.map(client, range(clients)) for one in found), strict=True)
     costs = {"a fresh process, first answer": first}
     for who, spent in (("one client", once), (f"{clients} clients", loaded)):
         for what, share in (("median", 50), ("95 % are quicker", 95)):
@@ -70,18 +67,18 @@ def measure(root: Path, clients: int = CLIENTS, each: int = EACH) -> list[Row]:
         {name: [spent] for name, spent in costs.items()},
         unit="ms an answer",
         baseline="a server, one client: median",
-        machine=machine(f"clients on the same; {len(loaded)} requests, none lost, {len(other)} unlike the one alone"),
+        machine=machine(f"clients on the same; {len(loaded)} requests, none lost, {sum(other)} unlike the one alone"),
     )
 
 
-def body(model: str, video: Path) -> bytes:
+def body(video: Path) -> bytes:
     """A request in the form of OpenAI's chat completions."""
     touch = base64.b64encode(video.read_bytes()).decode()
     content = [
         {"type": "text", "text": QUESTION},
         {"type": "video_url", "video_url": {"url": f"data:video/mp4;base64,{touch}"}},
     ]
-    return json.dumps({"model": model, "messages": [{"role": "user", "content": content}]}).encode()
+    return json.dumps({"model": SHIPPED.name, "messages": [{"role": "user", "content": content}]}).encode()
 
 
 def post(address: str, data: bytes) -> str:
@@ -100,14 +97,14 @@ def post(address: str, data: bytes) -> str:
 
 
 @contextmanager
-def served(folder: Path) -> Iterator[str]:
-    """The address of a server of that model, which ends with the block."""
-    running = subprocess.Popen([*COMMAND, "serve", str(folder), "--port", "0"], stdout=subprocess.PIPE, text=True)
+def served() -> Iterator[str]:
+    """The address of a server of the shipped model, which ends with the block."""
+    running = subprocess.Popen([*COMMAND, "serve", str(SHIPPED), "--port", "0"], stdout=subprocess.PIPE, text=True)
     try:
         assert running.stdout is not None
         line = running.stdout.readline()
         if " answers at " not in line:
-            raise UserError(f"octopi serve {folder}: does not start")
+            raise UserError(f"octopi serve {SHIPPED}: does not start")
         yield line.split(" answers at ")[1].split(";")[0]
     finally:
         running.send_signal(signal.SIGTERM)

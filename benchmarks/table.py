@@ -38,10 +38,8 @@ def interleaved(
 ) -> dict[str, list[float]]:
     """Milliseconds an item: of each setting one figure a repeat, the median over the items.
 
-    All settings have their turn at an item before the next item, so that a busy machine slows all alike.
-
-    Args:
-        warm: Run every setting once before, uncounted.
+    All settings have their turn at an item before the next item, so that a busy machine slows all alike. Every one is
+    run once before, uncounted, unless `warm` is False.
     """
     for run in settings.values() if warm else ():
         run(items[0])
@@ -85,12 +83,7 @@ class Error:
 
 
 def share_of(wrong: Sequence[float] | np.ndarray, objects: Sequence[tuple[str, ...]]) -> Error:
-    """The share of what is wrong, with the interval of the reports.
-
-    Args:
-        wrong: From 0 (right) to 1, of each question or video.
-        objects: What each is about.
-    """
+    """The share of what is wrong (from 0, right, to 1, of each question or video), with the interval of the reports."""
     values = np.array(wrong, dtype=np.float64)
     low, high = accuracy_interval(values, objects) or (None, None)
     return Error(float(values.mean()), low, high, len(values))

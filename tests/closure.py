@@ -9,12 +9,6 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent
 
 
-def module_file(name: str) -> Path | None:
-    """The file of a dotted module name inside the project, or None for anything else."""
-    base = ROOT / Path(*name.split("."))
-    return next((f for f in (base.with_suffix(".py"), base / "__init__.py") if f.is_file()), None)
-
-
 def imported(file: Path) -> set[Path]:
     """Project files that a file imports, at its top or inside functions, with their packages."""
     names: set[str] = set()
@@ -24,12 +18,9 @@ def imported(file: Path) -> set[Path]:
         elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
             names.add(node.module)
             names |= {f"{node.module}.{alias.name}" for alias in node.names}
-    files: set[Path] = set()
-    for name in names:
-        parts = name.split(".")
-        found = [module_file(".".join(parts[: i + 1])) for i in range(len(parts))]
-        files |= {f for f in found if f is not None}
-    return files
+    paths = {ROOT.joinpath(*name.split(".")[:depth]) for name in names for depth in range(1, name.count(".") + 2)}
+    files = {file for path in paths for file in (path.with_suffix(".py"), path / "__init__.py")}
+    return {file for file in files if file.is_file()}
 
 
 def closure(script: Path, unfollowed: Collection[str] = ()) -> list[str]:

@@ -207,9 +207,7 @@ def load_tensors(path: Path) -> dict[str, torch.Tensor]:
 def tensor_shapes(path: Path, mend: str = "get it again") -> dict[str, tuple[int, ...]]:
     """Names and shapes of the tensors in a safetensors file; only its header is read, and held to the file's length.
 
-    Args:
-        path: It is there.
-        mend: What to do where it is broken, for the UserError.
+    A broken file is a UserError that ends with `mend`.
     """
     from safetensors import SafetensorError, safe_open
 

@@ -183,8 +183,7 @@ def choose_examples(training: Sequence[Question], task: str) -> list[Question]:
 def instruction(catalogue: Catalogue, shown: Shown, examples: Sequence[Question]) -> str:
     """What stands before a question: what is seen, the properties with their classes, and how an answer is worded.
 
-    Args:
-        examples: Training questions of the task, told in words; none where it is never trained.
+    Examples are training questions of the task, told in words; there are none where it is never trained.
     """
     classes = "; ".join(f"{p.spoken} ({', '.join(p.levels)})" for p in catalogue.properties)
     form = catalogue.language.structured.format(**{p.name: f"<{p.spoken}>" for p in catalogue.properties})

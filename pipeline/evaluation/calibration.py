@@ -57,13 +57,11 @@ def rescale(probabilities: npt.ArrayLike, temperature: float) -> Floats:
 
 
 def fit_temperature(classified: Sequence[Classification]) -> float:
-    """The temperature that makes the expected classes likeliest; 1 where there is nothing to fit it on.
+    """The temperature that makes the expected classes of one property likeliest; 1 where there are none to fit it on.
 
-    Videos of one object are alike, so each object counts once, by its videos' mean. With few objects the data say
-    little, so the temperature's logarithm has a normal prior of mean 0 and deviation log(`PRIOR`).
-
-    Args:
-        classified: Of one property, on videos that nothing was trained on.
+    It is fitted on videos that nothing was trained on. Those of one object are alike, so each object counts once, by
+    its videos' mean. With few objects the data say little, so the temperature's logarithm has a normal prior of mean 0
+    and deviation log(`PRIOR`).
     """
     from scipy.optimize import minimize_scalar
 
@@ -117,10 +115,9 @@ def calibrated(classified: Sequence[Classification]) -> Iterator[tuple[Classific
 
 
 def calibration_rows(encoders: Sequence[Sequence[Classification]]) -> list[CalibrationRow]:
-    """Test videos of all encoders together, by property; a row for all of them, then one a bin.
+    """Test videos of all encoders together, by property: a row for all of them, then one a bin.
 
-    Args:
-        encoders: The classifications of validation and test videos by each.
+    `encoders` holds the classifications of validation and test videos by each.
     """
     pairs = [pair for classified in encoders for pair in calibrated(classified)]
     rows = []

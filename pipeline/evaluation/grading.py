@@ -6,6 +6,7 @@ import logging
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from pydantic import ValidationError
 
@@ -45,13 +46,12 @@ def conclude(questions: Sequence[Question], classified: Iterable[Classification]
     for c in classified:
         said[c.video_id][c.property] = (c.predicted, sum(i * p for i, p in enumerate(c.probabilities)))
     predictions = []
-    for question in questions:
-        if all(video in said for video in question.videos):
-            classes = [[said[video][name] for name in catalogue.property_names] for video in question.videos]
-            answer = TASKS[question.task].conclude(question, classes, catalogue)
-            if answer is not None:
-                said_so = {"question_id": question.question_id, "task": question.task, "outputs": (answer,)}
-                predictions.append(Prediction(**said_so, truncated=False, tokens=0))
+    for q in questions:
+        if all(video in said for video in q.videos):
+            classes = [[said[video][name] for name in catalogue.property_names] for video in q.videos]
+            if (told := TASKS[q.task].conclude(q, classes, catalogue)) is not None:
+                answer = Prediction(question_id=q.question_id, task=q.task, outputs=(told,), truncated=False, tokens=0)
+                predictions.append(answer)
     return grade(questions, predictions, catalogue)
 
 
@@ -87,7 +87,7 @@ def grade_vision_models(
                 lacks = f"no answers to the questions of seed {seed} as they are now"
                 logging.warning(f"{place}: {lacks}; run `octopi answer-with` again")
                 continue
-            whose = {"model": source.model, "shown": source.shown, "seed": replicate_of(seed)}
+            whose: dict[str, Any] = {"model": source.model, "shown": source.shown, "seed": replicate_of(seed)}
             scores = grade(read_jsonl(file, Question), read_jsonl(place / f"{seed}.jsonl", Prediction), catalogue)
             graded += [GradedVision(**score.model_dump(), **whose) for score in scores]
     return graded

@@ -126,11 +126,8 @@ class TaskDefinition(ABC):
         return {"choice": 1 / self.choices}
 
     def with_facts(self, draft: Draft, catalogue: Catalogue, rng: random.Random, inexact: float = 0.0) -> Draft:
-        """The question with facts about the objects that it names; unchanged if it names none.
-
-        Args:
-            inexact: Probability that a stated class is a neighbour of the right one.
-        """
+        """The question with facts about the objects that it names, each class in them with the probability `inexact` a
+        neighbour of the right one; unchanged if it names none."""
         return draft
 
     def plainly(self, draft: Draft, catalogue: Catalogue, rng: random.Random) -> Draft:
@@ -249,11 +246,8 @@ def concluded(
     only: Sequence[str] = (),
     prefixes: Sequence[str] = LISTED,
 ) -> dict[Opd, str]:
-    """The answer in every OPD mode: descriptions of all objects, then the conclusion.
-
-    Args:
-        only: Properties that `needed` describes.
-    """
+    """The answer in every OPD mode: descriptions of all objects, in mode `needed` of `only` some properties, then the
+    conclusion."""
     needed, whole = (descriptions(catalogue, objects, some, prefixes) for some in (only, ()))
     return {
         Opd.NONE: conclusion,
@@ -333,9 +327,8 @@ def choice_score(
 ) -> list[Score]:
     """The score of a question with one right choice, as `scored` has it.
 
-    Args:
-        published: Also compare as the published code does: letter by letter from the last "Conclusion: " on, or the
-            whole answer where there is none.
+    `published` compares also as the published code does: letter by letter from the last "Conclusion: " on, or the whole
+    answer where there is none.
     """
     strict = None
     if published:

@@ -34,9 +34,7 @@ def sentence(classes: Iterable[str], name: str) -> str:
 def facts(catalogue: Catalogue, objects: Sequence[str], rng: random.Random, inexact: float = 0.0) -> str:
     """What each object is like, in random order.
 
-    Args:
-        inexact: Chance that the class of a property is a neighbour of the right one. The right matching stays nearer
-            than any other.
+    With the chance `inexact` a class is a neighbour of the right one; the right matching stays nearer than any other.
     """
     right = [catalogue.labels(o) for o in objects]
     told = right

@@ -90,12 +90,6 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
     return project
 
 
-def launches(project: Project) -> dict[str, dict[str, object]]:
-    """What each process of the trainings noted."""
-    files = [f for stage in ("align", "lora") for f in project.folder.glob(f"{stage}-?.json")]
-    return {f.stem: json.loads(f.read_text()) for f in files}
-
-
 def check_trained(project: Project) -> None:
     """Trained parameters are finite and of the shapes that the published layouts and the scale give."""
     folder = project.folder / "data" / "models" / "with" / "finetuned-all-1"
@@ -119,7 +113,8 @@ def test_paper_13b_from_videos_to_the_report(project: Project) -> None:
     table = project.run("octopi", "scale", "paper-13b", *FEW, "ablation.seeds=[1]", LAUNCHER)
     assert "align                   2" in table, "two devices are counted"
     project.run("octopi", "repro")
-    noted = launches(project)
+    files = [f for stage in ("align", "lora") for f in project.folder.glob(f"{stage}-?.json")]
+    noted = {f.stem: json.loads(f.read_text()) for f in files}
     assert noted.keys() == {f"{stage}-{rank}" for stage in ("align", "lora") for rank in (0, 1)}
     for each in noted.values():
         assert (each["processes"], each["sharded"], each["computes"]) == (2, True, "torch.float32")

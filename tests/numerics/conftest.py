@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator
-from dataclasses import astuple, fields
 from pathlib import Path
 
 import pytest
 import torch
 
-from pipeline.core.io import atomic
+from pipeline.core.io import write_csv
 from tests.numerics.harness import Check, Format, Row
 
 ROWS = pytest.StashKey[list[Row]]()
@@ -26,12 +24,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
     if path := session.config.getoption("--stability-csv", default=None):
-        with atomic(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as stream:
-            writer = csv.writer(stream, lineterminator="\n")
-            writer.writerow([f.name for f in fields(Row)])
-            # In an order that does not depend on which test ran first.
-            ordered = sorted(session.config.stash[ROWS], key=lambda r: (r.part, r.case, list(Format).index(r.format)))
-            writer.writerows(map(astuple, ordered))
+        # In an order that does not depend on which test ran first.
+        ordered = sorted(session.config.stash[ROWS], key=lambda r: (r.part, r.case, list(Format).index(r.format)))
+        write_csv(path, Row, ordered)
 
 
 @pytest.fixture(scope="module")

@@ -11,6 +11,8 @@ import numpy.typing as npt
 import pytest
 import torch
 
+from pipeline.core.records import Record
+
 Floats = npt.NDArray[np.float64]
 
 
@@ -56,8 +58,7 @@ def formats(*some: Format) -> pytest.MarkDecorator:
     return pytest.mark.parametrize("fmt", [pytest.param(f, marks=lacking if f is FLOAT16 else (), id=f) for f in some])
 
 
-@dataclass(frozen=True)
-class Row:
+class Row(Record):
     """One hard case in one number format, as it stands in the table."""
 
     part: str
@@ -111,7 +112,8 @@ class Check:
                 error = float(np.abs(found - wanted).max(initial=0)) / (float(np.abs(wanted).max(initial=0)) or 1)
         right = finite and (error is None or limit is None or error <= limit)
         digits = ["" if x is None else f"{x:.1e}" if x else "0" for x in (error, limit)]
-        self.rows.append(Row(self.part, case, fmt.value, finite, *digits, "pass" if right else "fail"))
+        verdict = {"finite": finite, "error": digits[0], "bound": digits[1], "verdict": "pass" if right else "fail"}
+        self.rows.append(Row(part=self.part, case=case, format=fmt.value, **verdict))
         assert right, f"{case} in {fmt}: error {error}, at most {limit}" if finite else f"{case} in {fmt}: not finite"
 
 
