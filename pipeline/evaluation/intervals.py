@@ -53,10 +53,9 @@ class Design:
     """Factors x factors: the sum of squares of centred group sums that a unit of each variance is expected to bring."""
     totals: Values
     """By factor: by how much a unit of its variance adds to that of the sum over questions."""
-
     questions: int
     objects: int
-    """How many there are."""
+    """How many there are of each."""
 
     @property
     def estimable(self) -> bool:

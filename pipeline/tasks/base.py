@@ -246,7 +246,7 @@ def concluded(
     only: Sequence[str] = (),
     prefixes: Sequence[str] = LISTED,
 ) -> dict[Opd, str]:
-    """The answer in every OPD mode: descriptions of all objects, in mode `needed` of `only` some properties, then the
+    """The answer in every OPD mode: descriptions of all objects (in mode `needed` of the properties `only`), then the
     conclusion."""
     needed, whole = (descriptions(catalogue, objects, some, prefixes) for some in (only, ()))
     return {

@@ -78,7 +78,6 @@ class PropertyComparison(TaskDefinition):
         told, prefixes = in_words(choice, comparative, prop), [f"{o} object:" for o in base.ORDINALS]
         answer = base.concluded(pool.catalogue, objects, told, [prop.name], prefixes)
         found = {"yes": self.listed[0], "no": self.listed[1], "same": "neither"}[choice]
-        finding = f"{comparative.capitalize()}: {found}."
         return base.draft_about(
             pool,
             objects,
@@ -86,7 +85,7 @@ class PropertyComparison(TaskDefinition):
             turns=base.single_turn(user, answer),
             choice=choice,
             properties=[prop.name],
-            finding=finding,
+            finding=f"{comparative.capitalize()}: {found}.",
         )
 
     def plainly(self, draft: Draft, catalogue: Catalogue, rng: random.Random) -> Draft:
