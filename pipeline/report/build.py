@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
+from statistics import fmean, median
 
 import pandas as pd
 
@@ -37,9 +39,8 @@ from pipeline.evaluation.calibration import CalibrationRow, calibrated, calibrat
 from pipeline.evaluation.grading import EXTERNAL, conclude, vision_models
 from pipeline.evaluation.neighbours import map_frame, means, nearest_neighbours
 from pipeline.evaluation.scores import ErrorRow, candidate_rows, effect_rows, error_rows, score_rows
-from pipeline.report.dataset import dataset_frame
 from pipeline.report.figures import draw_figures
-from pipeline.report.load import load_report
+from pipeline.report.load import load_report, published
 from pipeline.report.provenance import provenance
 from pipeline.report.readme import render_readme
 from pipeline.report.samples import choose_examples, choose_samples
@@ -157,6 +158,47 @@ def finish_report(folder: Path) -> dict[str, float]:
     write_json(folder / "metrics.json", metrics)
     write_text(folder / "README.md", render_readme(report, figures))
     return metrics
+
+
+def dataset_frame(
+    catalogue: Catalogue, videos: Sequence[Video], splits: Sequence[Sequence[Assignment]]
+) -> pd.DataFrame:
+    """The paper's tables about its data set: a row a class, a combination of classes that an object has or the paper
+    counts, and a figure of lengths.
+
+    Of several splits, an object counts in each part that any of them puts it in.
+    Published figures stand beside where the catalogue is the paper's, joined by (table, row).
+    """
+    printed = published(catalogue.language.dataset)
+    values = printed[printed["model"] == ""].set_index(["task", "measure"])["value"].to_dict()
+    levels = [p.levels for p in catalogue.properties]
+    labels = [catalogue.labels(o) for o in catalogue.objects]
+    classes = [[words[n] for n in own] for words, *own in zip(levels, *labels, strict=True)]
+    filmed = {v.object_id for v in videos}
+    parts = {(a.object_id, a.part) for assignments in splits for a in assignments}
+    counted = ["objects", "with_videos", Part.TRAIN, Part.VALIDATION, Part.TEST]
+    counts = [[1, o in filmed, *((o, part) in parts for part in counted[2:])] for o in catalogue.objects]
+    objects = pd.DataFrame(counts, columns=[str(name) for name in counted]).astype("Int64")
+    # By property and for all of them: what each object is, and what it can be.
+    groups: list[tuple[str, str, list[str], list[str]]] = [
+        ("property_counts", f"{p.name}: ", own, list(p.levels))
+        for p, own in zip(catalogue.properties, classes, strict=True)
+    ]
+    have, every = ([", ".join(words) for words in them] for them in (zip(*classes, strict=True), product(*levels)))
+    found = []
+    for table, before, own, names in (*groups, ("property_combinations", "", have, every)):
+        rows = objects.groupby(own).sum().reindex(names, fill_value=0)
+        beside = [values.get((table, name)) for name in names]
+        rows = rows.assign(table=table, row=[before + name for name in names], frames=None, published=beside)
+        found.append(rows[(rows["objects"] > 0) | rows["published"].notna() | (table == "property_counts")])
+    if videos:
+        lengths = [v.frames for v in videos]
+        figures = {"average": fmean(lengths), "median": median(lengths)}
+        figures |= {"minimum": float(min(lengths)), "maximum": float(max(lengths))}
+        rows = pd.DataFrame({"row": [*figures], "frames": [*figures.values()]})
+        beside = [values.get(("video_lengths", row)) for row in figures]
+        found.append(rows.assign(table="video_lengths", published=beside))
+    return pd.concat(found)[["table", "row", *objects, "frames", "published"]]
 
 
 def confusion_frame(by_seed: Mapping[int, Sequence[Classification]], catalogue: Catalogue) -> pd.DataFrame:

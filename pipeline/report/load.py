@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ DATASETS = (DATASET, "avocados")
 
 @dataclass(frozen=True)
 class Report:
-    """The files of one folder in reports/. A file that a report lacks is an empty frame, dictionary or list."""
+    """The files of one folder in reports/, such as reports/smoke-scenes; without a row where it lacks a file."""
 
     folder: Path
     scores: pd.DataFrame
@@ -35,12 +35,7 @@ class Report:
     published: pd.DataFrame
     """The paper's figures; empty where the report is about other data."""
     provenance: dict[str, Any]
-    samples: dict[str, Any]
-
-    @property
-    def name(self) -> str:
-        """Its folder's name, such as `smoke-scenes`."""
-        return self.folder.name
+    samples: dict[str, Any] = field(default_factory=dict)
 
 
 def load_report(folder: Path) -> Report:
@@ -49,12 +44,12 @@ def load_report(folder: Path) -> Report:
         raise UserError(f"{folder}: no report (scores.csv, provenance.json); `dvc repro report` writes one")
     provenance, samples = read_json(folder / "provenance.json"), folder / "samples.json"
     return Report(
-        folder=folder,
-        scores=read_frame(folder / "scores.csv", SCORE_COLUMNS),
-        effects=read_frame(folder / "effects.csv", EFFECT_COLUMNS),
-        published=published(str(provenance.get("dataset", ""))),
-        provenance=provenance,
-        samples=read_json(samples) if samples.is_file() else {},
+        folder,
+        read_frame(folder / "scores.csv", SCORE_COLUMNS),
+        read_frame(folder / "effects.csv", EFFECT_COLUMNS),
+        published(str(provenance.get("dataset", ""))),
+        provenance,
+        read_json(samples) if samples.is_file() else {},
     )
 
 
@@ -70,9 +65,7 @@ def read_frame(file: Path, columns: tuple[str, ...]) -> pd.DataFrame:
     missing = [name for name in columns if name not in frame]
     if missing:
         raise UserError(f"{file}: lacks {', '.join(missing)}; write it anew")
-    text = [name for name in frame if name in TEXT]
-    frame[text] = frame[text].fillna("")
-    return frame
+    return frame.fillna({name: "" for name in frame if name in TEXT})
 
 
 @cache
@@ -85,9 +78,3 @@ def published(dataset: str = DATASET) -> pd.DataFrame:
     """
     every = read_frame(Path(__file__).with_name("published.csv"), (*KEYS, "model", "value", "n", "dataset"))
     return every[every["dataset"] == dataset].drop(columns="dataset")
-
-
-def cells(published: pd.DataFrame) -> dict[tuple[str, ...], tuple[float, float]]:
-    """Published value and n by (task, measure, encoder, lora, opd, model)."""
-    keys = zip(*(published[k] for k in (*KEYS, "model")), strict=True)
-    return dict(zip(keys, zip(published["value"], published["n"], strict=True), strict=True))

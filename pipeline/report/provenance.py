@@ -36,6 +36,13 @@ ARCHITECTURES = {
     "gpt_neox": "GPT-NeoX",
     "tf_efficientnet_lite0": "EfficientNet-Lite0",
 }
+BEYOND = {
+    "questions": ("wording", "names", "inexact", "restate", "two_turns", "plainly"),
+    "language": ("start", "normalize_touch"),
+    "align": ("weighting", "begin_with_words"),
+    "lora": ("weighting", "target_modules", "dropout", "given"),
+}
+"""Settings by which a small model is trained otherwise than the paper's."""
 
 
 def provenance(
@@ -56,50 +63,37 @@ def provenance(
     """
     rows = "\n".join(video.model_dump_json() for video in videos)
     test = {a.video_id: a.object_id for assignments in splits for a in assignments if a.part is Part.TEST}
-    seeds, fold_of = params.ablation.seeds, params.split.fold_of
-    folds = sorted({fold for seed in seeds if (fold := fold_of(seed)) is not None})
+    seeds, split = params.ablation.seeds, params.split
+    folds = sorted({fold for seed in seeds if (fold := split.fold_of(seed)) is not None})
     notes: dict[str, str] = yaml.safe_load(NOTES.read_text(encoding="utf-8"))
-    commit = _git(root, "log", "-1", "--format=%H", "--", *CODE) or UNKNOWN
     return {
         "report": params.report_name,
         "scale": params.scale,
         "source": params.data.source,
         "dataset": catalogue.language.dataset,
         "properties": {p.name: list(p.levels) for p in catalogue.properties},
-        "split": params.split.name,
+        "split": split.name,
         "test_objects": sorted(set(test.values())),
         "test_videos": len(test),
         "videos": len(videos),
         "seeds": list(seeds),
-        "folds": {"of": params.split.folds, "tested": folds, "trained": params.split.train_objects} if folds else None,
-        "replicates": len({params.split.replicate_of(seed) for seed in seeds}),
+        "folds": {"of": split.folds, "tested": folds, "trained": split.train_objects} if folds else None,
+        "replicates": len({split.replicate_of(seed) for seed in seeds}),
         # What people noted about the test objects of this report, or else of its split.
-        "settings": notes.get(f"{params.report_name}/{params.split.name}", notes.get(params.split.name, "")),
+        "settings": notes.get(f"{params.report_name}/{split.name}", notes.get(split.name, "")),
         "intervals": coverage_note(asked),
         "facts_told": params.questions.facts,
         "beyond_paper": beyond_paper(params),
         "command": "dvc repro",
-        "commit": commit,
+        "commit": _git(root, "log", "-1", "--format=%H", "--", *CODE) or UNKNOWN,
         "changed": bool(_git(root, "status", "--porcelain", "--", *CODE)),
-        "params_sha256": hashlib.sha256((root / PARAMS_FILE).read_bytes()).hexdigest(),
+        "params_sha256": sha256(root / PARAMS_FILE),
         "data_sha256": hashlib.sha256(rows.encode()).hexdigest(),
         "encoder": encoder_words(params.encoder),
-        "base_models": {
-            "encoder": base_model(root, params.encoder.weights),
-            "language": base_model(root, params.language.weights),
-        },
+        "base_models": {part: base_model(root, getattr(params, part).weights) for part in ("encoder", "language")},
         "python": platform.python_version(),
         "packages": {name: metadata.version(name) for name in PACKAGES},
     }
-
-
-BEYOND = {
-    "questions": ("wording", "names", "inexact", "restate", "two_turns", "plainly"),
-    "language": ("start", "normalize_touch"),
-    "align": ("weighting", "begin_with_words"),
-    "lora": ("weighting", "target_modules", "dropout", "given"),
-}
-"""Settings by which a small model is trained otherwise than the paper's."""
 
 
 def beyond_paper(params: Params) -> dict[str, Any]:
@@ -129,17 +123,15 @@ def base_model(root: Path, folder: str) -> dict[str, Any]:
     `parameters` are counted from the headers of its safetensors files. Where files are missing, they are 0 and the
     hash is "unknown". Of a place of this machine the last part alone is named.
     """
-    where = root / folder
-    elsewhere = folder.startswith("~") or Path(folder).is_absolute()
-    kind = "model"
+    where, kind = root / folder, "model"
     if (where / "open_clip_config.json").is_file():
         kind = "CLIP"
     elif (where / "config.json").is_file():
         config = json.loads((where / "config.json").read_text(encoding="utf-8"))
-        name = str(config.get("model_type") or config.get("architecture", "model"))
+        name = str(config.get("model_type") or config.get("architecture", kind))
         kind = ARCHITECTURES.get(name, name)
     return {
-        "folder": Path(folder).name if elsewhere else folder,
+        "folder": Path(folder).name if folder.startswith("~") or Path(folder).is_absolute() else folder,
         "kind": kind,
         "parameters": sum(prod(s) for file in where.glob("*.safetensors") for s in tensor_shapes(file).values()),
         "sha256": digest(where),
@@ -149,12 +141,10 @@ def base_model(root: Path, folder: str) -> dict[str, Any]:
 
 def digest(folder: Path) -> str:
     """SHA-256 over the names and hashes of a folder's files, hidden ones (downloads leave them) left out."""
-    found = {path.relative_to(folder): path for path in folder.rglob("*") if path.is_file()}
-    files = sorted(name for name in found if not any(part.startswith(".") for part in name.parts))
-    total = hashlib.sha256()
-    for name in files:
-        total.update(f"{name.as_posix()} {sha256(found[name])}\n".encode())
-    return total.hexdigest() if files else UNKNOWN
+    names = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
+    shown = [name for name in names if not any(part.startswith(".") for part in name.parts)]
+    listed = "".join(f"{name.as_posix()} {sha256(folder / name)}\n" for name in shown)
+    return hashlib.sha256(listed.encode()).hexdigest() if shown else UNKNOWN
 
 
 def _git(root: Path, *arguments: str) -> str:

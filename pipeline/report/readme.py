@@ -13,7 +13,7 @@ import pandas as pd
 from pipeline.core.errors import counted
 from pipeline.core.records import Shown
 from pipeline.report.load import Report
-from pipeline.report.render import markdown, render, size
+from pipeline.report.render import Block, render, size
 from pipeline.report.tables import FIVE_TASKS, PARTS, SHIPPED_TABLE, SHOWN_WORDS, TABLES, headline, measured, number
 from pipeline.weights import is_random
 
@@ -34,54 +34,48 @@ OTHER_MODELS = (
 
 def render_readme(report: Report, figures: Sequence[str]) -> str:
     """The text of README.md; `figures` are names of the files in figures/ that were drawn."""
-    # How the shipped model answers about the run's videos, where it was asked.
-    shipped: dict[str, str] = {}
-    rows = SHIPPED_TABLE.select(report)
-    if len(rows):
-        against = _against_chance(rows[rows["touch"] == Shown.TOUCH], f"`{rows['encoder'].iloc[0]}`'s")
-        shown_rows = markdown(SHIPPED_TABLE.build(report))
-        shipped = {"title": SHIPPED_TABLE.title, "caption": f"{SHIPPED_TABLE.caption} {against}", "rows": shown_rows}
-    # The table of the first screen says whose figures these are in its heads.
-    first = FIVE_TASKS.build(report)
-    parameters = size(report.provenance["base_models"]["language"]["parameters"])
-    first["Measured % [95 %]"] = "**" + first["Measured % [95 %]"] + "**"
-    first.columns = first.columns.str.replace("Measured", f"Measured here ({parameters} model)")
-    first.columns = first.columns.str.replace(r"Published (\d+b)", r"Published (Vicuna \1)", regex=True)
-    values = {
-        **sections(report),
-        "shipped": shipped,
-        "five_tasks": markdown(first) if len(first) else "",
-        "other_models": OTHER_MODELS if len(report.published) else "",
-        "figures": figures,
-        "files": [p.name for pattern in ("*.csv", "samples.json") for p in sorted(report.folder.glob(pattern))],
-    }
-    built = {table: table.build(report) for table in TABLES}
-    shown: dict[str, dict[str, str]] = {}
-    text = ""
+    told, shown, text = sections(report), list[Block](), ""
+    files = [p.name for pattern in ("*.csv", "samples.json") for p in sorted(report.folder.glob(pattern))]
     # Each table that still fits in, and the names of the others.
-    for table in [None, *(table for table, frame in built.items() if len(frame) and not table.folded)]:
-        more = {**shown, table.title: {"caption": table.caption, "rows": markdown(built[table])}} if table else {}
-        elsewhere = [other.title for other, frame in built.items() if len(frame) and other.title not in more]
-        longer = render("readme.md", **values, tables=more, elsewhere=elsewhere)
+    for table in [None, *(table for table in told["tables"] if table.open)]:
+        more = [*shown, table] if table else []
+        elsewhere = [other.title for other in told["tables"] if other.key not in {block.key for block in more}]
+        longer = render("readme.md", **told, shown=more, elsewhere=elsewhere, figures=figures, files=files)
         if not text or longer.count("\n") <= MOST_LINES:
             text, shown = longer, more
     return text
 
 
 def sections(report: Report) -> dict[str, Any]:
-    """What the README and the page say of a report in words.
+    """What the README and the page say of a report.
 
     Returns:
-        `name`; `finding`; `plumbing`, a warning where a base model is a random one; `looked_at`, how recipes were
-        chosen by the test objects, if these are the development split's; `stands_on`, what a figure is worth: models
-        with their size, test objects, seeds; `origin`: command, commit, data, base models by hash, packages.
+        `name`; `shipped`, how the shipped model answers about the run's videos, and `tasks`, the full system's answers:
+        a `Block` each, or None; `tables`, the other blocks of the registry; `finding`; `plumbing`, a warning where a
+        base model is a random one; `looked_at`, how recipes were chosen by the test objects, if these are the
+        development split's; `other_models`, where published figures stand beside; `stands_on`, what a figure is worth:
+        models with their size, test objects, seeds; `origin`: command, commit, data, base models by hash, packages.
     """
-    said = report.provenance
+    said, shipped, tasks = report.provenance, SHIPPED_TABLE.block(report), FIVE_TASKS.block(report)
+    if shipped:
+        rows = SHIPPED_TABLE.select(report)
+        against = _against_chance(rows[rows["touch"] == Shown.TOUCH], f"`{rows['encoder'].iloc[0]}`'s")
+        shipped = shipped._replace(caption=f"{shipped.caption} {against}")
+    if tasks:
+        # The table of the first screen says whose figures these are in its heads.
+        heads = tasks.frame.columns.str.replace(
+            "Measured", f"Measured here ({size(said['base_models']['language']['parameters'])} model)"
+        )
+        tasks.frame.columns = heads.str.replace(r"Published (\d+b)", r"Published (Vicuna \1)", regex=True)
     return {
-        "name": report.name,
+        "name": report.folder.name,
+        "shipped": shipped,
+        "tasks": tasks,
+        "tables": [block for table in TABLES if (block := table.block(report))],
         "finding": finding(report),
         "plumbing": PLUMBING if at_random(said) else "",
         "looked_at": said["settings"] if said["split"] == "development" else "",
+        "other_models": OTHER_MODELS if len(report.published) else "",
         "stands_on": render("stands_on.md", said=said, shown=SHOWN_WORDS).splitlines(),
         "origin": render("origin.md", said=said).splitlines(),
     }
@@ -92,11 +86,16 @@ def finding(report: Report) -> list[str]:
 
     Where a base model is a random one, the first sentence says so.
     """
-    rows = headline(report.scores)
+    rows, effects = headline(report.scores), report.effects
     solved = set(rows.loc[rows["low"] > rows["chance"], "task"])
     chance = CHANCE if at_random(report.provenance) else ""
     who = render("who.md", said=report.provenance, vicuna=VICUNA).strip()
-    rest = _touch(report.effects, solved), _rules(report.effects), _parts(report.effects, solved)
+    of = effects["part"].where(effects["part"].isin(("touch", "language")), "parts")
+    rest = (
+        _touch(effects[of == "touch"], solved, _impossible(effects)),
+        _rules(effects[of == "language"]),
+        _parts(effects[of == "parts"], solved, _impossible(effects)),
+    )
     return [" ".join(filter(None, sentences)) for sentences in ((chance, who), (_against_chance(rows),), rest)]
 
 
@@ -110,42 +109,41 @@ def _against_chance(rows: pd.DataFrame, whose: str = "The full system's") -> str
     if not len(rows):
         return "No answer of the full system was graded."
     over = rows["accuracy"] - rows["chance"]
-    above = rows[rows["low"] > rows["chance"]]
-    below = rows[rows["high"] < rows["chance"]]
-    named = f" ({', '.join(above['task'])})" if len(above) else ""
-    extremes = " and ".join(
-        f"{kind} in {row['task']} with {measured(row.to_dict())} % (chance {number(row['chance'], scale=100)})"
-        for kind, row in (("best", rows.loc[over.idxmax()]), ("worst", rows.loc[over.idxmin()]))
-    )
-    tasks = f"{len(above)} of {counted(len(rows), 'task')}{named}"
-    text = f"{whose} interval lies above chance in {tasks}"
-    text += f" and below it in {', '.join(below['task'])}" if len(below) else ""
+    above, below = (rows.loc[side, "task"] for side in (rows["low"] > rows["chance"], rows["high"] < rows["chance"]))
+    text = f"{whose} interval lies above chance in {len(above)} of {counted(len(rows), 'task')}"
+    text += f" ({', '.join(above)})" if len(above) else ""
+    text += f" and below it in {', '.join(below)}" if len(below) else ""
     # Nothing is best that is no better than a guess.
-    return f"{text}. Against chance it is {extremes}." if len(rows) > 1 and over.max() > 0 else f"{text}."
+    if len(rows) > 1 and over.max() > 0:
+        extremes = (
+            f"{kind} in {row['task']} with {measured(row.to_dict())} % (chance {number(row['chance'], scale=100)})"
+            for kind, row in (("best", rows.loc[over.idxmax()]), ("worst", rows.loc[over.idxmin()]))
+        )
+        text += f". Against chance it is {' and '.join(extremes)}"
+    return f"{text}."
 
 
-def _touch(effects: pd.DataFrame, solved: Collection[str]) -> str:
+def _touch(rows: pd.DataFrame, solved: Collection[str], impossible: str) -> str:
     """Whether answers use touch. In a task no better than chance (not in `solved`) a difference cannot show it.
 
     Without touch, answers may lose their form; unreadable ones count as wrong, which makes a difference of its own.
     """
-    rows = effects[effects["part"] == "touch"]
     if not len(rows):
         return "Whether answers depend on touch was not tested."
     *others, last = [change.partition(" - ")[2] for change in dict.fromkeys(rows["change"])]
     instead = f"{', '.join(others)} or {last}" if others else last
     fact = f"with real touch, against touch that was {instead}, accuracy differs by {_span(rows)}, task by task"
-    better = rows[(rows["p_holm"] < ALPHA) & (rows["difference"] > 0)]
-    sure, likely = better[better["task"].isin(solved)], rows[(rows["low"] > 0) & rows["task"].isin(solved)]
-    if len(sure):
-        rest = [task for task in dict.fromkeys(better["task"]) if task not in solved]
-        none = f" In {' and '.join(rest)} real touch brings no more than chance, so the difference shows nothing."
-        return f"Answers use touch in {', '.join(dict.fromkeys(sure['task']))}: {fact}.{none if rest else ''}"
+    better = dict.fromkeys(rows.loc[(rows["p_holm"] < ALPHA) & (rows["difference"] > 0), "task"])
+    likely = rows[(rows["low"] > 0) & rows["task"].isin(solved)]
+    if sure := [task for task in better if task in solved]:
+        rest = " and ".join(task for task in better if task not in solved)
+        none = f" In {rest} real touch brings no more than chance, so the difference shows nothing."
+        return f"Answers use touch in {', '.join(sure)}: {fact}.{none if rest else ''}"
     if len(likely):
         some = f"{len(likely)} of {len(rows)} intervals lie above 0, none is significant after Holm's adjustment"
-        return f"Answers may use touch: {fact}; {some}{_impossible(effects)}."
+        return f"Answers may use touch: {fact}; {some}{impossible}."
     none = "none significant after Holm's adjustment where real touch brings more than chance"
-    return f"That answers use touch is not shown: {fact}, {none}{_impossible(effects)}."
+    return f"That answers use touch is not shown: {fact}, {none}{impossible}."
 
 
 def _span(rows: pd.DataFrame) -> str:
@@ -153,45 +151,43 @@ def _span(rows: pd.DataFrame) -> str:
 
 
 def _impossible(effects: pd.DataFrame) -> str:
-    """A note where too few objects rule out significance: the p of a sign-flip test is at least 2 / 2**objects."""
-    objects = int(effects["objects"].max())
-    # Holm's adjustment multiplies the smallest p by the number of tests.
-    return f" ({objects} objects are too few for that)" if effects["p"].count() * 2.0 ** (1 - objects) >= ALPHA else ""
+    """A note where too few objects rule out significance: the p of a sign-flip test is at least 2 / 2**objects, and
+    Holm's adjustment multiplies the smallest p by the number of tests."""
+    objects = effects["objects"].max()
+    few = effects["p"].count() * 2.0 ** (1 - objects) >= ALPHA
+    return f" ({objects:.0f} objects are too few for that)" if few else ""
 
 
-def _rules(effects: pd.DataFrame) -> str:
+def _rules(rows: pd.DataFrame) -> str:
     """How the full system stands to what its encoder's heads and plain rules answer without a language model."""
-    rows = effects[effects["part"] == "language"]
     if not len(rows):
         return ""
     sure = rows[rows["p_holm"] < ALPHA]
     sides = {"ahead": sure.loc[sure["difference"] > 0, "task"], "behind": sure.loc[sure["difference"] < 0, "task"]}
     said = [f"{side} in {', '.join(tasks)}" for side, tasks in sides.items() if len(tasks)]
-    stands = " and ".join(said) or "in no task ahead or behind"
     return (
         "The encoder's property heads and plain rules answer the same questions without a language model; the full "
-        f"system differs from them by {_span(rows)}, task by task, and is {stands} (Holm)."
+        f"system differs from them by {_span(rows)}, task by task, and is "
+        f"{' and '.join(said) or 'in no task ahead or behind'} (Holm)."
     )
 
 
-def _parts(effects: pd.DataFrame, solved: Collection[str]) -> str:
+def _parts(rows: pd.DataFrame, solved: Collection[str], impossible: str) -> str:
     """What encoder, LoRA and OPD bring; a gain that ends no better than chance is one of form, not of right answers."""
-    rows = effects[~effects["part"].isin(("touch", "language"))]
     if not len(rows):
         return ""
     form = rows["difference"].gt(0) & ~rows["task"].isin(solved)
-    named = rows.assign(part=rows["part"].replace(PARTS))
-    gains = named["part"] + " in " + named["task"] + (100 * named["difference"]).map(" {:+.1f}".format)
+    parts = rows["part"].replace(PARTS)
+    gains = parts + " in " + rows["task"] + (100 * rows["difference"]).map(" {:+.1f}".format)
     words, only = (", ".join(gains[rows["p_holm"].lt(ALPHA) & kind]) for kind in (~form, form))
-    *others, last = dict.fromkeys(named["part"])
+    *others, last = dict.fromkeys(parts)
     all_of_them = f"{len(rows)} effects of {', '.join(others)}{' and ' if others else ''}{last}"
     also = f" Significant too, but answers are no better than chance even so: {only} points." if only else ""
     if words:
         return f"Of {all_of_them} these hold up (Holm): {words} points.{also}"
     if only:
         return f"None of {all_of_them} holds up.{also}"
-    smallest = rows["smallest_effect"].min()
-    found = ""
+    smallest, found = rows["smallest_effect"].min(), ""
     if smallest <= 1:
         found = f"; even before it the smallest that this design could have found is {100 * smallest:.0f} points"
-    return f"None of {all_of_them} is significant after Holm's adjustment{_impossible(effects) or found}."
+    return f"None of {all_of_them} is significant after Holm's adjustment{impossible or found}."

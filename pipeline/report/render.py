@@ -3,13 +3,27 @@
 from __future__ import annotations
 
 import re
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup, escape
 
 from pipeline.core.errors import counted
+
+
+class Block(NamedTuple):
+    """A table that is shown, with what stands above it."""
+
+    key: str
+    title: str
+    caption: str
+    frame: pd.DataFrame
+    """Text in every cell."""
+    file: str
+    """The CSV of the report that it comes from; the frame's index is that of the CSV."""
+    open: bool = False
+    """Whether it is shown unasked."""
 
 
 def inline(text: str, folder: str = "") -> Markup:
@@ -34,6 +48,22 @@ def model(facts: dict[str, Any]) -> str:
     return f"`{facts['folder']}`, a {size(facts['parameters'])} {facts['kind']}, {taught}"
 
 
+def markdown(frame: pd.DataFrame, bold: str = "") -> str:
+    """A table in Markdown; bars in cells are escaped, columns whose heads begin with `bold` are so."""
+    rows = [list(frame.columns), ["---"] * len(frame.columns)]
+    marks = ["**" if bold and name.startswith(bold) else "" for name in frame]
+    rows += [[f"{m}{cell}{m}" for m, cell in zip(marks, row, strict=True)] for row in frame.to_numpy()]
+    return "".join("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |\n" for row in rows)
+
+
+def kinds(frame: pd.DataFrame) -> list[str]:
+    """How each column is shown on the page: what was measured here never looks like what the paper printed."""
+    firsts = [name.partition(" ")[0].lower() for name in frame]
+    numbers = [all(re.fullmatch(r"[-+\d.,e/ \[\]()]*", cell) for cell in frame[name]) for name in frame]
+    named = {"measured", "published"}
+    return [f if f in named else "number" if n else "words" for f, n in zip(firsts, numbers, strict=True)]
+
+
 TEMPLATES = Environment(
     loader=PackageLoader("pipeline.report"),
     autoescape=select_autoescape(),
@@ -42,35 +72,9 @@ TEMPLATES = Environment(
     undefined=StrictUndefined,
 )
 """Only what is put into .html is escaped."""
-TEMPLATES.filters |= {"inline": inline, "count": counted, "size": size, "model": model}
+TEMPLATES.filters |= {f.__name__: f for f in (inline, counted, size, model, markdown, kinds)}
 
 
 def render(template: str, **values: Any) -> str:
     """The text of a file in templates/."""
     return TEMPLATES.get_template(template).render(**values)
-
-
-def markdown(frame: pd.DataFrame) -> str:
-    """A table in Markdown, of cells that are text; bars in cells are escaped."""
-    rows = [list(frame.columns), ["---"] * len(frame.columns), *frame.to_numpy().tolist()]
-    return "".join("| " + " | ".join(str(cell).replace("|", "\\|") for cell in row) + " |\n" for row in rows)
-
-
-def draw_table(frame: pd.DataFrame, title: str, file: str = "") -> Markup:
-    """A table as HTML.
-
-    Args:
-        frame: text in every cell.
-        file: the CSV that it comes from, where the frame's index is that of the CSV, so that each row names its line.
-    """
-    heads = [(name, _kind(name, frame[name])) for name in frame]
-    rows = [(f"{file}:{index + 2}" if file else "", cells) for index, *cells in frame.itertuples(name=None)]
-    return Markup(render("table.html", title=title, heads=heads, rows=rows))
-
-
-def _kind(name: str, column: pd.Series[Any]) -> str:
-    """How a column is shown: what was measured here never looks like what the paper printed."""
-    kind = name.partition(" ")[0].lower()
-    if kind in ("measured", "published"):
-        return kind
-    return "number" if all(re.fullmatch(r"[-+\d.,e/ \[\]()]*", cell) for cell in column) else "words"

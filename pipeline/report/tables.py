@@ -1,6 +1,6 @@
-"""The tables of a report: each an entry here, a selection of scores.csv or effects.csv.
+"""The tables of a report: each an entry in tables.yaml, a selection of scores.csv or effects.csv.
 
-To add one, add an entry to `TABLES`. A newly registered task is in all that its kind belongs to, without a change here.
+A newly registered task is in all that its kind belongs to, without a change here.
 """
 
 from __future__ import annotations
@@ -8,9 +8,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from operator import itemgetter
+from pathlib import Path
 from typing import Any
 
 import pandas as pd
+import yaml
 
 from pipeline.core.records import (
     ADJECTIVES,
@@ -21,16 +23,23 @@ from pipeline.core.records import (
     RECALL,
     VALIDATION_HEADS,
     Shown,
+    Touch,
 )
-from pipeline.report.load import DATASET, DATASETS, KEYS, Report, cells, published
+from pipeline.report.load import DATASET, DATASETS, KEYS, Report, published
+from pipeline.report.render import Block
 from pipeline.tasks import TASKS
 
-Select = Callable[[pd.DataFrame], "pd.Series[bool]"]
-Cell = Callable[[dict[str, Any]], str]
 FULL = {"encoder": "finetuned", "lora": "with", "opd": "all"}
 CHOICE, COMBINED = "choice", "combined"
-NOT_ANSWERED = (HEADS, VALIDATION_HEADS, RECALL, CROSS_VALIDATION, NEIGHBOURS, ADJECTIVES)
-"""Tasks of scores.csv that no language model with touch answered."""
+NOT_ANSWERED = {
+    HEADS: "Property heads",
+    VALIDATION_HEADS: "Property heads, validation videos",
+    RECALL: "Property heads, class by class",
+    CROSS_VALIDATION: "Cross-validation",
+    NEIGHBOURS: "Nearest neighbour",
+    ADJECTIVES: "By adjective",
+}
+"""Tasks of scores.csv that no language model with touch answered, in words."""
 PUBLISHED_MODELS = ("7b", "13b", "CLIP", "PG-InstructBLIP")
 SYSTEM_WORDS = {
     "base": "base encoder",
@@ -48,25 +57,24 @@ PARTS = {"language": "language model", "lora": "LoRA", "opd": "OPD"}
 
 @dataclass(frozen=True)
 class Table:
-    """One table: a selection of rows and the columns that are shown of them."""
+    """One table, as tables.yaml has it and says what its entries mean."""
 
     key: str
     title: str
     caption: str
-    """Plain sentences: what the rows are, and what to mind."""
-    rows: Select
-    """Of scores.csv it is given the rows over all seeds."""
-    columns: tuple[str, ...]
-    """Names of `COLUMNS`; "published" stands for a column a published model."""
+    rows: str
+    columns: list[str]
     source: str = "scores"
-    """`scores` or `effects`."""
-    folded: bool = True
-    """Whether the page shows it only when asked."""
+    varied: str = ""
+    open: bool = False
 
     def select(self, report: Report) -> pd.DataFrame:
         """The rows of the table as the CSV has them, in the order of tasks, measures and systems."""
-        frame = report.effects if self.source == "effects" else over_seeds(report.scores)
-        return ordered(frame[self.rows(frame).astype(bool)]) if len(frame) else frame
+        frame = report.effects if self.source == "effects" else marked(over_seeds(report.scores))
+        rows = ordered(frame.query(self.rows, engine="python"))
+        if self.varied and rows.loc[rows["by"] == "model", self.varied].nunique() < 2:
+            return rows.iloc[:0]
+        return rows
 
     def build(self, report: Report) -> pd.DataFrame:
         """The table as it is shown: text in every cell, headings as column names; no row where nothing was measured.
@@ -83,16 +91,60 @@ class Table:
                 shown[heading] = [cell(row) for row in rows.to_dict("records")]
         return pd.DataFrame(shown, index=rows.index, dtype=object)
 
+    def block(self, report: Report) -> Block | None:
+        """The table with its words; None where it has no row."""
+        frame = self.build(report)
+        return Block(self.key, self.title, self.caption, frame, f"{self.source}.csv", self.open) if len(frame) else None
+
 
 def over_seeds(scores: pd.DataFrame) -> pd.DataFrame:
     """The rows of scores.csv that are over all seeds."""
     return scores[scores["seed"] == ALL_SEEDS]
 
 
+def marked(scores: pd.DataFrame) -> pd.DataFrame:
+    """Rows of scores.csv with the columns by which tables choose among them.
+
+    `by` is what answered: the language model, told real touch (`model`) or another (`other touch`), `rules` from the
+    heads' classes, the model that is `shipped`, `vision` alone, or the task where it is none of answering. `lacks` are
+    the axes in which a variant is not the full system; OPD as needed, which the paper's tables lack, is `needed`.
+    `whole` is a measure which says that an answer is right, not only a part of it; `trained` is a task that is trained.
+    """
+
+    def by(task: str, lora: str, touch: str) -> str:
+        if task in NOT_ANSWERED:
+            return task
+        if touch == Touch.REAL:
+            return "model" if lora else "rules"
+        return "vision" if touch in SHOWN_WORDS else "shipped" if touch in {*Shown} else "other touch"
+
+    def lacks(*axes: str) -> str:
+        own = zip(FULL.items(), axes, strict=True)
+        return " ".join("needed" if value == "needed" else axis for (axis, full), value in own if value != full)
+
+    untrained = [name for name, task in TASKS.items() if not task.trained]
+    return scores.assign(
+        by=[*map(by, scores["task"], scores["lora"], scores["touch"])],
+        lacks=[*map(lacks, *(scores[axis] for axis in FULL))],
+        whole=scores["measure"].isin({CHOICE, COMBINED, *(task.measure for task in TASKS.values())}),
+        trained=~scores["task"].isin(untrained),
+    )
+
+
 def headline(scores: pd.DataFrame) -> pd.DataFrame:
     """The full system's rows of scores.csv, a row a task that was asked."""
-    rows = over_seeds(scores)
-    return ordered(rows[answers(rows) & whole(rows) & _differs(rows)])
+    return ordered(marked(over_seeds(scores)).query("whole and by == 'model' and lacks == ''"))
+
+
+def ordered(frame: pd.DataFrame) -> pd.DataFrame:
+    """Tasks in the registry's order, whole answers before parts, the full system before what lacks something."""
+    tasks = {task: place for place, task in enumerate((*TASKS, *NOT_ANSWERED))}
+    rank = pd.DataFrame({"task": frame["task"].map(lambda task: tasks.get(task, len(tasks)))}, index=frame.index)
+    rank["measure"] = frame["measure"] != COMBINED
+    rank["named"] = pd.factorize(frame["measure"])[0]
+    for axis in FULL:
+        rank[axis] = frame[axis] != FULL[axis] if axis in frame else False
+    return frame.loc[rank.sort_values(list(rank.columns), kind="stable").index]
 
 
 def side_by_side(reports: Mapping[str, Report], *, every: bool) -> pd.DataFrame:
@@ -108,8 +160,8 @@ def side_by_side(reports: Mapping[str, Report], *, every: bool) -> pd.DataFrame:
         about |= {dataset: published(dataset) for dataset in DATASETS}
     place, blocks = [*KEYS, "touch"], []
     for dataset, printed in sorted(about.items(), key=lambda pair: pair[0] != DATASET):
-        rows = ordered(printed[printed["model"].isin(PUBLISHED_MODELS)].assign(touch="real").drop_duplicates(place))
-        rows = rows if every else rows[whole(rows) & _differs(rows)]
+        rows = printed[printed["model"].isin(PUBLISHED_MODELS)].assign(touch=str(Touch.REAL)).drop_duplicates(place)
+        rows = ordered(rows if every else marked(rows).query("whole and lacks == ''"))
         other = "" if dataset == DATASET else f", {dataset}"
         shown = {"Task": [task_title(task) + other for task in rows["task"]]}
         if every:
@@ -124,6 +176,17 @@ def side_by_side(reports: Mapping[str, Report], *, every: bool) -> pd.DataFrame:
         blocks.append(pd.DataFrame(shown, dtype=object))
     table = pd.concat(blocks, ignore_index=True).fillna("")
     return table[sorted(table, key=lambda name: name.startswith("Measured"))]
+
+
+def _beside(rows: pd.DataFrame, published: pd.DataFrame) -> dict[str, list[str]]:
+    """The published cells of these rows, a column a model that has any."""
+    columns = {}
+    for model in PUBLISHED_MODELS:
+        cells = rows[[*KEYS]].merge(published[published["model"] == model], "left", [*KEYS])
+        if cells["value"].notna().any():
+            pairs = zip(cells["value"], cells["n"], strict=True)
+            columns[f"Published {model} % (n)"] = ["" if pd.isna(v) else f"{v:.2f} ({n:.0f})" for v, n in pairs]
+    return columns
 
 
 def number(value: float, digits: int = 1, scale: float = 1.0) -> str:
@@ -145,16 +208,7 @@ def difference(row: dict[str, Any]) -> str:
 
 def task_title(task: str) -> str:
     """What a task is called in words, such as "Property comparison (PC)"."""
-    titles = {
-        HEADS: "Property heads",
-        VALIDATION_HEADS: "Property heads, validation videos",
-        RECALL: "Property heads, class by class",
-        CROSS_VALIDATION: "Cross-validation",
-        NEIGHBOURS: "Nearest neighbour",
-        ADJECTIVES: "By adjective",
-        **{name: task.title for name, task in TASKS.items()},
-    }
-    return f"{titles[task]} ({task})" if task in TASKS else titles.get(task, task)
+    return f"{TASKS[task].title} ({task})" if task in TASKS else NOT_ANSWERED.get(task, task)
 
 
 def system(row: dict[str, Any]) -> str:
@@ -180,7 +234,7 @@ def system(row: dict[str, Any]) -> str:
     return ", ".join(words) or "Octopi (full system)"
 
 
-COLUMNS: dict[str, tuple[str, Cell]] = {
+COLUMNS: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
     "task": ("Task", lambda row: task_title(row["task"])),
     "measure": ("Measure", lambda row: "all properties right" if row["measure"] == COMBINED else row["measure"]),
     "system": ("System", system),
@@ -205,225 +259,7 @@ COLUMNS: dict[str, tuple[str, Cell]] = {
 }
 """Heading of a column, and how its cell is written."""
 
-
-def ordered(frame: pd.DataFrame) -> pd.DataFrame:
-    """Tasks in the registry's order, whole answers before parts, the full system before what lacks something."""
-    tasks = [*TASKS, *NOT_ANSWERED]
-    rank = pd.DataFrame(index=frame.index)
-    rank["task"] = frame["task"].map(lambda task: tasks.index(task) if task in tasks else len(tasks))
-    rank["measure"] = frame["measure"].map(lambda measure: measure != COMBINED).astype(int)
-    rank["named"] = pd.factorize(frame["measure"])[0]
-    for axis in (axis for axis in FULL if axis in frame):
-        rank[axis] = (frame[axis] != FULL[axis]).astype(int)
-    return frame.loc[rank.sort_values(list(rank.columns), kind="stable").index]
-
-
-def _beside(rows: pd.DataFrame, published: pd.DataFrame) -> dict[str, list[str]]:
-    """The published cells of these rows, a column a model that has any."""
-    printed, columns = cells(published), {}
-    for model in PUBLISHED_MODELS:
-        found = [printed.get((*key, model)) for key in zip(*(rows[k] for k in KEYS), strict=True)]
-        if any(found):
-            columns[f"Published {model} % (n)"] = [f"{cell[0]:.2f} ({cell[1]:.0f})" if cell else "" for cell in found]
-    return columns
-
-
-def answers(frame: pd.DataFrame) -> pd.Series[bool]:
-    """Answers of the language model to real touch."""
-    return ~frame["task"].isin(NOT_ANSWERED) & (frame["touch"] == "real") & (frame["lora"] != "")
-
-
-def rules(frame: pd.DataFrame) -> pd.Series[bool]:
-    """What follows by rule from the property heads' classes."""
-    return ~frame["task"].isin(NOT_ANSWERED) & (frame["touch"] == "real") & (frame["lora"] == "")
-
-
-def whole(frame: pd.DataFrame) -> pd.Series[bool]:
-    """Measures that say that an answer is right, not only a part of it."""
-    return frame["measure"].isin({CHOICE, COMBINED, *(task.measure for task in TASKS.values())})
-
-
-def _differs(frame: pd.DataFrame, *axes: str) -> pd.Series[bool]:
-    """Variants that are the full system but for these axes. OPD as needed is left out: the paper's tables lack it."""
-    same = frame["opd"] != "needed"
-    for axis, value in FULL.items():
-        same &= (frame[axis] == value) | (axis in axes)
-    return same
-
-
-def _variants(*axes: str, described: bool, trained: bool | None = None) -> Select:
-    """Rows of variants that are the full system but for these axes, and of vision-only models.
-
-    Of descriptions only, or of choices only; choices come with what follows by rule. `trained` keeps only tasks that
-    are trained on, or only those that are not.
-    """
-
-    def select(frame: pd.DataFrame) -> pd.Series[bool]:
-        rows = answers(frame) & _differs(frame, *axes) | frame["touch"].isin(SHOWN_WORDS)
-        if not described:
-            rows |= rules(frame)
-        if trained is not None:
-            rows &= frame["task"].isin([name for name, task in TASKS.items() if not task.trained]) != trained
-        return rows & ((frame["measure"] != CHOICE) == described)
-
-    return select
-
-
-def _ablated(axis: str, *, described: bool) -> Select:
-    """Rows of variants that are the full system but for one axis, without vision-only models; none where the run varied
-    nothing in it."""
-
-    def select(frame: pd.DataFrame) -> pd.Series[bool]:
-        rows = _variants(axis, described=described)(frame) & ~frame["touch"].isin(SHOWN_WORDS)
-        return rows & (frame.loc[rows & answers(frame), axis].nunique() > 1)
-
-    return select
-
-
-SHOWN = ("system", "measured", "asked", "chance", "unread")
-PAPER, PROPERTIES = ("task", *SHOWN, "published"), ("measure", *SHOWN, "published")
-
-FIVE_TASKS = Table(
-    "five_tasks",
-    "The full system",
-    "Whole answers to real touch, over all seeds; below each, what follows by rule from the property heads.",
-    lambda f: (answers(f) & _differs(f) | rules(f)) & whole(f),
-    ("task", "system", "measured", "asked", "unread", "chance", "published"),
-)
-"""A report's first table, two rows a task that was asked."""
-SHIPPED_TABLE = Table(
-    "shipped",
-    "The model that is shipped, on these videos",
-    "It was trained on synthetic touches of invented objects, and has met none of these objects.",
-    lambda f: f["touch"].isin({Shown.TOUCH, Shown.STANDARDISED, Shown.CLASSES}) & whole(f),
-    ("task", "system", "measured", "asked", "unread", "chance"),
-)
-"""Before all else where it was asked."""
-TABLES: tuple[Table, ...] = (
-    Table(
-        "understanding",
-        "Physical understanding",
-        "Questions about what was touched, with descriptions before the conclusion (OPD) and without.",
-        _variants("opd", described=False, trained=True),
-        PAPER,
-        folded=False,
-    ),
-    Table(
-        "reasoning",
-        "Scenario reasoning",
-        "Which of two objects fits a scenario: asked of every system, never trained.",
-        _variants("opd", described=False, trained=False),
-        PAPER,
-        folded=False,
-    ),
-    Table(
-        "description",
-        "Object property description",
-        "Describing one object, as a language model's answer and by the encoder's property heads on the same videos.",
-        lambda f: _variants(described=True)(f) | f["task"].eq(HEADS),
-        PROPERTIES,
-        folded=False,
-    ),
-    *(
-        Table(
-            f"{axis}_{kind}",
-            f"Ablation of {name}: {title}",
-            caption,
-            _ablated(axis, described=kind == "properties"),
-            columns,
-            folded=False,
-        )
-        for axis, name, caption in (
-            (
-                "encoder",
-                "the encoder",
-                "The tactile encoder fine-tuned on properties, or as it was before. Told in words, a language model is "
-                "trained and asked with the classes of the fine-tuned one's heads as text, and reads no touch.",
-            ),
-            ("lora", "LoRA", "With end-to-end fine-tuning of the language model, or after alignment alone."),
-        )
-        for kind, title, columns in (
-            ("properties", "property description", PROPERTIES),
-            ("understanding", "understanding and reasoning", PAPER),
-        )
-    ),
-    Table(
-        "effects",
-        "What each part brings",
-        "The full system minus the system that lacks one part, on the same questions. p is of a test by sign flips "
-        "over objects; p, Holm is corrected for all comparisons of the report.",
-        lambda f: f["part"] != "touch",
-        ("part", "change", "task", "measure", "difference", "p", "p_holm", "smallest", "n", "objects", "seeds"),
-        source="effects",
-        folded=False,
-    ),
-    Table(
-        "touch_effects",
-        "Is touch used?",
-        "What the full system loses where its touch is replaced. No loss means that answers do not depend on touch.",
-        lambda f: f["part"] == "touch",
-        ("change", "task", "measure", "difference", "p", "p_holm", "smallest", "n", "objects", "seeds"),
-        source="effects",
-    ),
-    Table(
-        "touch",
-        "Input ablations",
-        "The full system with its touch, and with another object's (swapped), none (removed) or noise.",
-        lambda f: ~f["task"].isin(NOT_ANSWERED) & whole(f) & _differs(f),
-        ("task", "touch", "measured", "asked", "chance", "unread"),
-    ),
-    Table(
-        "variants",
-        "All variants",
-        "Every combination of encoder, LoRA and OPD that was trained.",
-        lambda f: answers(f) & whole(f),
-        ("task", "encoder", "lora", "opd", "measured", "asked", "chance", "unread", "published"),
-    ),
-    Table(
-        "strict",
-        "How answers are read",
-        "Measured: by rules. As published: the right text must stand there. Scenarios were graded by hand.",
-        lambda f: answers(f) & _differs(f, *FULL) & f["strict"].notna(),
-        ("task", "measure", "system", "measured", "strict", "asked"),
-    ),
-    Table(
-        "heads",
-        "Property heads of the tactile encoder",
-        "What the encoder's heads say of test and validation videos, without a language model.",
-        lambda f: f["task"].isin((HEADS, VALIDATION_HEADS)),
-        ("task", "measure", "encoder", "measured", "asked", "chance", "published"),
-    ),
-    Table(
-        "recall",
-        "Recall of the property heads",
-        "Of the test videos of each class, the share that the heads take for it; figures/confusion.png has the others.",
-        lambda f: f["task"].eq(RECALL),
-        ("measure", "measured", "asked", "chance"),
-    ),
-    Table(
-        "cross_validation",
-        "Encoders and baselines over all objects",
-        "Grouped cross-validation: a model judges only videos of objects that it never saw. With few test objects this "
-        "is the main evidence about encoders. backbone-10: learnt from ten objects a fold.",
-        lambda f: f["task"].eq(CROSS_VALIDATION),
-        ("measure", "system", "measured", "asked", "chance"),
-    ),
-    Table(
-        "adjectives",
-        "Adjective by adjective",
-        "The full system's comparisons and superlatives, and what follows by rule, counted by the word asked by: "
-        "whether a property, or a direction of it, is the harder one.",
-        lambda f: f["task"].eq(ADJECTIVES),
-        ("measure", "system", "measured", "asked", "chance"),
-    ),
-    Table(
-        "neighbours",
-        "What embeddings tell by themselves",
-        "Of the test videos, the share whose nearest neighbour among other objects' videos has their class, by the "
-        "embeddings of the fine-tuned encoder and of the base one (mean over frames); then those of each class alone, "
-        "which say what the map shows: classes that overlap have few of their own about them. Paired differences are "
-        "in encoder_effects.csv.",
-        lambda f: f["task"].eq(NEIGHBOURS),
-        ("measure", "encoder", "measured", "asked", "chance"),
-    ),
-)
+_ENTRIES = yaml.safe_load(Path(__file__).with_name("tables.yaml").read_text(encoding="utf-8"))
+FIVE_TASKS, SHIPPED_TABLE, *TABLES = [Table(key, **entry) for key, entry in _ENTRIES.items()]
+"""A report's first table, two rows a task that was asked; what stands before all else where the shipped model was
+asked; the others."""

@@ -20,9 +20,8 @@ from pipeline.core.io import read_jsonl, read_table, write_table
 from pipeline.core.records import Classification, Graded, GradedVision, Part, Prediction, Question, Shown
 from pipeline.evaluation.calibration import fit_temperature
 from pipeline.report.build import MOST_METRICS, finish_report, without_places, write_report
-from pipeline.report.dataset import dataset_tables
 from pipeline.report.load import DATASET, load_report
-from pipeline.report.page import write_page
+from pipeline.report.page import data_tables, write_page
 from pipeline.report.provenance import base_model, digest
 from pipeline.report.tables import NOT_ANSWERED, TABLES
 from pipeline.videos.catalogue import Catalogue
@@ -176,15 +175,15 @@ def test_the_papers_examples_come_with_their_answers(written: Path, tmp_path: Pa
 
 
 def test_the_data_sets_tables_count_objects_and_set_the_papers_beside(written: Path) -> None:
-    counts, _, lengths, agreement, audit = [frame for *_, frame, _ in dataset_tables(written, DATASET)]
-    counts = counts.set_index("")
+    shown = {block.key: block.frame for block in data_tables(written, DATASET)}
+    counts = shown["property_counts"].set_index("")
     soft = {"Objects": "11", "With videos": "6", "Train": "4", "Validation": "1", "Test": "1", "Published": "26.0"}
     assert dict(counts.loc["hardness: soft"]) == soft
     assert counts["With videos"].astype(int).sum() == 3 * 19
-    assert list(lengths[""]) == ["average", "median", "minimum", "maximum"]
-    assert list(agreement["Published"]) == ["0.894", "0.979", "0.792"]
-    assert audit["Findings"].tolist() == ["3"]
-    others = {key: frame for key, _, _, frame, _ in dataset_tables(written, "Other")}
+    assert list(shown["video_lengths"][""]) == ["average", "median", "minimum", "maximum"]
+    assert list(shown["annotator_agreement"]["Published"]) == ["0.894", "0.979", "0.792"]
+    assert shown["audit"]["Findings"].tolist() == ["3"]
+    others = {block.key: block.frame for block in data_tables(written, "Other")}
     assert "Published" not in others["annotator_agreement"]
 
 

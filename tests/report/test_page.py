@@ -9,7 +9,6 @@ import re
 import shutil
 from collections import Counter
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from typer.testing import CliRunner
@@ -18,7 +17,6 @@ from pipeline.cli import app
 from pipeline.core.errors import UserError
 from pipeline.report import page as module
 from pipeline.report.page import LARGEST, PAGE, left_to_users, write_page
-from pipeline.tasks import TASKS
 from tests.closure import ROOT
 from tests.report.conftest import report, score
 from tests.report.shared import Page, edit, rows_of, words, write_reports, write_rows
@@ -185,12 +183,10 @@ def test_what_only_users_can_measure_is_missing_until_they_have(page: Page) -> N
     assert {what for _, what, _ in module.BY_USER} <= {words(e) for e in page.named("missing").iter("b")}
 
 
-def test_all_reports_stand_beside_the_paper(page: Page) -> None:
+def test_all_reports_stand_beside_the_paper_but_random_models(page: Page) -> None:
     few, _ = page.named("together").iter("table")
-    heads = [words(e) for e in few.findall("thead/tr/th")]
-    assert heads[3:] == ["Measured small-videos† % [95 %] (n)"], "and no random models"
+    assert [words(e) for e in few.findall("thead/tr/th")][3:] == ["Measured small-videos† % [95 %] (n)"]
     assert "† Settings were chosen on these test objects" in words(page.named("together"))
-    assert len(few.findall("tbody/tr")) == 5
 
 
 def test_the_papers_examples_are_shown_right_and_wrong(changed: Path) -> None:
@@ -204,22 +200,6 @@ def test_the_papers_examples_are_shown_right_and_wrong(changed: Path) -> None:
     assert [words(e[0]) for e in shown] == ["rice (train): right", "rice (train): wrong"]
     assert words(shown[0][1]).startswith("Asked Describe. Answered Rough. Asked Cooked? Answered Uncooked. Read as")
     assert "for want of videos: toothbrush (of handle and bristles)." in words(page.named("small-videos"))
-
-
-def test_a_task_is_on_the_page_once_its_scores_are_there(changed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(
-        TASKS, "TOY", SimpleNamespace(title="Telling toys apart", trained=True, measure="choice", told="")
-    )
-    scores = changed / "reports" / "small-videos" / "scores.csv"
-    rows = rows_of(scores)
-    write_rows(scores, [*rows, *({**row, "task": "TOY"} for row in rows if row["task"] == "PC")])
-    monkeypatch.chdir(changed)
-    Path("dvc.yaml").touch()  # As in a project.
-    assert CliRunner().invoke(app, ["page"]).output.startswith(f"{PAGE}: ")
-    page = Page(changed / PAGE)
-    named = [page.named(f"small-videos-{key}") for key in ("understanding", "variants")]
-    for table in (next(page.named("small-videos").iter("table")), *named):
-        assert "Telling toys apart" in words(table)
 
 
 def test_speed_and_stability_are_told(page: Page, made: Path) -> None:

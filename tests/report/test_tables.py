@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import itertools
 from pathlib import Path
+from types import SimpleNamespace
 
 import pandas as pd
 import pytest
 
 from pipeline.report import load
-from pipeline.report.dataset import dataset_frame
+from pipeline.report.build import dataset_frame
 from pipeline.report.load import KEYS, load_report, published, read_frame
-from pipeline.report.tables import TABLES, headline, side_by_side, task_title
+from pipeline.report.tables import FIVE_TASKS, SHIPPED_TABLE, TABLES, headline, side_by_side, task_title
 from pipeline.tasks import TASKS
 from pipeline.videos.catalogue import Catalogue
 from tests.conftest import refused
@@ -92,9 +93,16 @@ def test_tasks_stand_where_they_belong_whole_answers_first() -> None:
     assert list(build("description", *rows)["Published CLIP % (n)"]) == ["", "", "57.89 (38)"]
 
 
-def test_nothing_measured_is_an_empty_table_and_a_key_is_used_once() -> None:
-    assert all(table.build(report()).empty for table in TABLES)
-    assert len(BY_KEY) == len(TABLES)
+def test_nothing_measured_is_no_table() -> None:
+    assert not any(table.block(report()) for table in (FIVE_TASKS, SHIPPED_TABLE, *TABLES))
+
+
+def test_a_new_task_is_in_all_tables_of_its_kind(monkeypatch: pytest.MonkeyPatch) -> None:
+    toy = SimpleNamespace(title="Telling toys apart", trained=True, measure="choice", told="")
+    monkeypatch.setitem(TASKS, "TOY", toy)
+    for table in (FIVE_TASKS, BY_KEY["understanding"], BY_KEY["variants"]):
+        assert list(table.build(report([score("TOY")]))["Task"]) == ["Telling toys apart (TOY)"]
+    assert build("reasoning", score("TOY")).empty
 
 
 def test_read_and_compared_answers_stand_side_by_side() -> None:
