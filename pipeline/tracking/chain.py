@@ -50,7 +50,7 @@ def read_stages(params: Params) -> dict[str, ChainStage]:
             if path.is_file():
                 run = read_json(path)
                 began, ended = (datetime.fromisoformat(run[end]).timestamp() for end in ("started", "ended"))
-                ran = milliseconds(began), milliseconds(ended)
+                ran = int(1000 * began), int(1000 * ended)
                 costs = {f"system/{name}": run[name] for name in ("seconds", "startup_seconds", "peak_memory_mb")}
                 metrics = {**run["metrics"], **costs}
             found[title] = ChainStage(digest(entry), outs, ran, metrics)
@@ -124,8 +124,3 @@ def flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 def digest(value: object) -> str:
     """A short hash of what can be written as JSON."""
     return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()[:16]
-
-
-def milliseconds(seconds: float) -> int:
-    """As MLflow counts time."""
-    return int(seconds * 1000)

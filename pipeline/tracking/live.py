@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from pipeline.core.stage import Stage
-from pipeline.tracking.chain import axes, milliseconds, read_stages, settings
+from pipeline.tracking.chain import axes, read_stages, settings
 from pipeline.tracking.store import PARENT, STAGE, Store, attempt
 
 
@@ -38,7 +38,7 @@ def live(run: Stage) -> Iterator[list[Any]]:
             """Logs what history.parquet is to hold, under the same names."""
 
             def on_log(self, args: Any, state: Any, control: Any, logs: Any = None, **more: Any) -> None:
-                now = milliseconds(time.time())
+                now = int(time.time() * 1000)
                 points = [(name, value, now, state.global_step) for name, value in measured(logs or {}).items()]
                 attempt(tracking, store.log, child, points)
 
@@ -57,13 +57,13 @@ def _begin(run: Stage) -> tuple[Store, str, Any]:
     store = Store(run.params.tracking)
     from mlflow.system_metrics.system_metrics_monitor import SystemMetricsMonitor
 
-    stages, started = read_stages(run.params), milliseconds(run.started)
+    stages, started = read_stages(run.params), int(run.started * 1000)
     with store.lock:
         # A stage runs once at a time: what is still running was killed.
         store.kill({STAGE: run.name})
         parent = store.open_reproduction(run.params)
         if parent is None:
-            earlier = [ran[0] for title in store.fresh(stages) if (ran := stages[title].ran)]
+            earlier = [began for began, _, _ in store.fresh(stages).values()]
             parent = store.create(run.params.report_name, "reproduction", min([started, *earlier]))
         child = store.create(run.name, "stage", started, {STAGE: run.name, PARENT: parent})
         store.log(child, params=settings(run.params, axes(run.name)))

@@ -26,7 +26,6 @@ from pipeline.tracking.chain import (
     axes,
     digest,
     flatten,
-    milliseconds,
     read_stages,
     settings,
 )
@@ -71,16 +70,16 @@ def publish(params: Params) -> str:
 
 
 def _publish(store: Store, params: Params, stages: Mapping[str, ChainStage]) -> str:
-    now, fresh = milliseconds(time.time()), store.fresh(stages)
+    now, fresh = int(time.time() * 1000), store.fresh(stages)
     state = digest([params.report_name, *(stage.lock for stage in stages.values())])
     parent = store.open_reproduction(params)
     if parent is None:
         if not fresh and (same := store.find({KIND: "reproduction", STATE: state})):
             return f"nothing new since run {same[0].info.run_id}"
-        begin = min((ran[0] for title in fresh if (ran := stages[title].ran)), default=now)
+        begin = min((began for began, _, _ in fresh.values()), default=now)
         parent = store.create(params.report_name, "reproduction", begin)
-    for title, run in fresh.items():
-        _complete(store, params, parent, title, stages[title], run)
+    for title, ran in fresh.items():
+        _complete(store, params, parent, title, stages[title], *ran)
     done = store.find({KIND: "stage", PARENT: parent})
     ended = [run.info.end_time for run in done if LOCK in run.data.tags]
     new, links = _variants(store, params, parent, stages)
@@ -97,30 +96,29 @@ def _publish(store: Store, params: Params, stages: Mapping[str, ChainStage]) -> 
         NOTE: f"{len(ended)} stages ran, the others came from DVC's cache. Tables and figures: Artifacts, "
         "`report/README.md`.",
     }
-    store.finish(parent, max(ended, default=now), {**about, **links, STATE: state})
+    store.log(parent, tags={**about, **links, STATE: state}, end=max(ended, default=now))
     return f"run {parent} in {store.uri}: {len(ended)} stages ran, {new} variants are new"
 
 
-def _complete(store: Store, params: Params, parent: str, title: str, stage: ChainStage, run: Any | None) -> None:
+def _complete(
+    store: Store, params: Params, parent: str, title: str, stage: ChainStage, began: int, ended: int, run: Any | None
+) -> None:
     """A run of a stage that ran; one that was logged live gets what it lacks."""
-    began, ended = stage.ran or (0, 0)
+    # Keep the parameters that a live run logged: settings may have changed since.
+    own = {} if run else settings(params, axes(title))
     run_id = run.info.run_id if run else store.create(title, "stage", began, {STAGE: title, PARENT: parent})
     history = next((path for out in stage.outs if (path := Path(out) / "history.parquet").is_file()), None)
     curve = read_table(history, Measurement) if history else []
     steps = max((m.step for m in curve), default=0) or 1
     logged = set(run.data.metrics if run else ())
     there = {(name, m.step) for name in logged for m in store.client.get_metric_history(run_id, name)}
-    points = [
-        (m.name, m.value, began + (ended - began) * m.step // steps, m.step)
-        for m in curve
-        if (m.name, m.step) not in there
-    ]
+    times = {m.step: began + (ended - began) * m.step // steps for m in curve}
+    points = [(m.name, m.value, times[m.step], m.step) for m in curve if (m.name, m.step) not in there]
     # The end of a curve is no point at its step 0.
     logged |= {m.name for m in curve}
     points += [(name, float(value), ended, 0) for name, value in stage.metrics.items() if name not in logged]
-    # Keep what a live run logged: settings may have changed since.
-    store.log(run_id, points, {} if run else settings(params, axes(title)))
-    store.finish(run_id, ended, {LOCK: stage.lock})
+    store.log(run_id, points, own)
+    store.log(run_id, tags={LOCK: stage.lock}, end=ended)
 
 
 def _variants(
@@ -131,8 +129,7 @@ def _variants(
     Returns:
         How many are new, and tags with the runs of the others and the best model's address.
     """
-    scores, new, links = accuracies(params), 0, {}
-    models: list[tuple[Variant, str]] = []
+    scores, new, links, models = accuracies(params), 0, dict[str, str](), list[tuple[Variant, str]]()
     store.kill({KIND: "variant"})
     for variant in params.ablation.variants():
         stage = stages.get(f"answer@{variant.key}")
@@ -148,7 +145,7 @@ def _variants(
             if old[0].data.tags.get(PARENT) != parent:
                 links[f"variant.{variant.key}"] = run
         else:
-            begin, end = stage.ran or (milliseconds(time.time()),) * 2
+            begin, end = stage.ran or (int(time.time() * 1000),) * 2
             run = store.create(variant.key, "variant", begin, {VARIANT: variant.key, PARENT: parent})
             # Whole tasks before their parts, as the dashboard keeps the order.
             ordered = sorted(metrics.items(), key=lambda metric: ("." in metric[0], metric[0]))
@@ -165,7 +162,7 @@ def _variants(
                     store.client.log_artifacts(run, str(DATA / path), place)
             if made_of:
                 log_model(store.client, run, params, variant, folder)
-            store.finish(run, end, {CONTENT: content})
+            store.log(run, tags={CONTENT: content}, end=end)
             new += 1
         models += [(variant, run)] if made_of else []
     if models:

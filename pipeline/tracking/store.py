@@ -36,7 +36,7 @@ class TrackingError(UserError):
 
 
 def cause(error: Exception, tracking: TrackingConfig) -> str:
-    """What could not be tracked and why, in one line without passwords: the first reason of the network or the disk, as
+    """What could not be tracked and why, in one line without passwords: what the network or the disk said first, since
     MLflow's own words are about its calls."""
     chain: list[BaseException] = [error]
     while below := chain[-1].__cause__ or (None if chain[-1].__suppress_context__ else chain[-1].__context__):
@@ -113,30 +113,33 @@ class Store:
         query = " and ".join([*(f"tags.`{name}` = '{value}'" for name, value in tags.items()), *conditions])
         return list(self.client.search_runs([self.experiment], query, order_by=["attributes.start_time DESC"]))
 
-    def fresh(self, stages: Mapping[str, ChainStage]) -> dict[str, Any | None]:
-        """Stages whose last run here has no finished run there, with the one that was logged live, if any."""
+    def fresh(self, stages: Mapping[str, ChainStage]) -> dict[str, tuple[int, int, Any | None]]:
+        """Stages whose last run here has no finished run there: start, end, and the run that was logged live."""
         found = {}
         for title, stage in stages.items():
             if stage.ran:
                 times = "attributes.start_time >= {} and attributes.start_time <= {}".format(*stage.ran)
                 run = next(iter(self.find({STAGE: title}, times)), None)
                 if run is None or LOCK not in run.data.tags:
-                    found[title] = run
+                    found[title] = (*stage.ran, run)
         return found
+
+    def kill(self, tags: Mapping[str, str], but: str = "") -> str | None:
+        """Mark runs of this folder that nobody will end any more; the youngest of the name `but` is left.
+
+        Returns:
+            The run that is left.
+        """
+        running = self.find({**self.mine, **tags}, "attributes.status = 'RUNNING'")
+        left = next((str(run.info.run_id) for run in running if run.info.run_name == but), None)
+        for run in running:
+            if run.info.run_id != left:
+                self.client.set_terminated(run.info.run_id, "KILLED")
+        return left
 
     def open_reproduction(self, params: Params) -> str | None:
         """The reproduction of this folder that a training began and nobody published yet; those of other scales end."""
-        name = f"attributes.run_name = '{params.report_name}'"
-        running = self.find({KIND: "reproduction", **self.mine}, "attributes.status = 'RUNNING'", name)
-        mine = str(running[0].info.run_id) if running else None
-        self.kill({KIND: "reproduction"}, but=mine)
-        return mine
-
-    def kill(self, tags: Mapping[str, str], but: str | None = None) -> None:
-        """Mark runs of this folder that nobody will end any more."""
-        for run in self.find({**self.mine, **tags}, "attributes.status = 'RUNNING'"):
-            if run.info.run_id != but:
-                self.client.set_terminated(run.info.run_id, "KILLED")
+        return self.kill({KIND: "reproduction"}, but=params.report_name)
 
     def create(self, name: str, kind: str, start: int, tags: Mapping[str, str] | None = None) -> str:
         """Begin a run."""
@@ -152,17 +155,18 @@ class Store:
         metrics: Sequence[tuple[str, float, int, int]] = (),
         params: Mapping[str, str] | None = None,
         tags: Mapping[str, str] | None = None,
+        end: int | None = None,
     ) -> None:
-        """Add metrics (name, value, time, step), parameters and tags to a run."""
+        """Add metrics (name, value, time, step), parameters and tags to a run; with an `end`, it is finished then."""
         from mlflow.entities import Metric, Param, RunTag
 
-        points = [Metric(*metric) for metric in metrics]
-        own = [Param(name, value) for name, value in (params or {}).items()]
-        marks = [RunTag(name, value) for name, value in (tags or {}).items()]
         # Synchronous, so that a failure shows here.
-        self.client.log_batch(run, points, own, marks, synchronous=True)
-
-    def finish(self, run: str, end: int, tags: Mapping[str, str]) -> None:
-        """Set a run's final tags, as the last step, and end it."""
-        self.log(run, tags=tags)
-        self.client.set_terminated(run, "FINISHED", end)
+        self.client.log_batch(
+            run,
+            [Metric(*metric) for metric in metrics],
+            [Param(name, value) for name, value in (params or {}).items()],
+            [RunTag(name, value) for name, value in (tags or {}).items()],
+            synchronous=True,
+        )
+        if end is not None:
+            self.client.set_terminated(run, "FINISHED", end)
