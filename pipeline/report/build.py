@@ -149,14 +149,8 @@ def finish_report(folder: Path) -> dict[str, float]:
     heads = heads.sort_values("measure", key=lambda measure: measure != "combined", kind="stable")
     found = pd.concat([tasks.set_index("task"), heads.set_index("encoder_" + heads["measure"])])["accuracy"]
     metrics = {str(name): round(float(value), 6) for name, value in found.head(MOST_METRICS).items()}
-    # Classes are words, even where they read like numbers or like nothing.
-    confusion = pd.read_csv(folder / "confusion.csv", dtype=str, keep_default_na=False)
-    curves = pd.read_csv(folder / "curves.csv")
-    words = dict.fromkeys(report.provenance["properties"], str)
-    maps = pd.read_csv(folder / "map.csv", dtype={**words, "x": float, "y": float}, keep_default_na=False)
-    figures = draw_figures(folder / "figures", report.effects, confusion, curves, maps, report.provenance["properties"])
     write_json(folder / "metrics.json", metrics)
-    write_text(folder / "README.md", render_readme(report, figures))
+    write_text(folder / "README.md", render_readme(report, draw_figures(report)))
     return metrics
 
 

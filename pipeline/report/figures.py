@@ -6,7 +6,6 @@ Drawn without pyplot (no global state, no window) and saved without dates, so th
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import pandas as pd
 from matplotlib import rc_context
@@ -17,6 +16,7 @@ from matplotlib.ticker import MaxNLocator
 from sklearn.metrics import ConfusionMatrixDisplay
 
 from pipeline.core.io import atomic
+from pipeline.report.load import Report
 from pipeline.report.tables import PARTS
 
 MEASURED, QUIET, LINE, TEXT = "#0a5fb4", "#555b66", "#c9ced6", "#1a1d23"
@@ -37,25 +37,18 @@ STYLE = {
 }
 
 
-def draw_figures(
-    folder: Path,
-    effects: pd.DataFrame,
-    confusion: pd.DataFrame,
-    curves: pd.DataFrame,
-    maps: pd.DataFrame,
-    properties: Mapping[str, Sequence[str]],
-) -> list[str]:
-    """Draw what there is figures for and remove figures of an earlier run.
-
-    Args:
-        confusion: property, rated, predicted; one row a video.
-        curves: stage, name, step, value.
-        maps: encoder, method, x, y, and a column a property with classes.
-        properties: the classes of each, in rising order.
+def draw_figures(report: Report) -> list[str]:
+    """Draw what there is figures for into figures/ of a report, and remove those of an earlier run.
 
     Returns:
         The names of the files, in reading order.
     """
+    folder, effects, properties = report.folder / "figures", report.effects, report.provenance["properties"]
+    # Classes are words, even where they read like numbers or like nothing.
+    confusion = pd.read_csv(report.folder / "confusion.csv", dtype=str, keep_default_na=False)
+    curves = pd.read_csv(report.folder / "curves.csv")
+    words = {**dict.fromkeys(properties, str), "x": float, "y": float}
+    maps = pd.read_csv(report.folder / "map.csv", dtype=words, keep_default_na=False)
     drawn: dict[str, Figure] = {}
     with rc_context(STYLE):
         if len(effects):

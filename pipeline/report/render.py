@@ -42,12 +42,6 @@ def size(parameters: int) -> str:
     return "model of unknown size:"
 
 
-def model(facts: dict[str, Any]) -> str:
-    """A base model as a person would name it, such as "a 2.1 M-parameter Llama, trained on ..."."""
-    taught = facts["taught"] or "what it was taught is not noted here"
-    return f"`{facts['folder']}`, a {size(facts['parameters'])} {facts['kind']}, {taught}"
-
-
 def markdown(frame: pd.DataFrame, bold: str = "") -> str:
     """A table in Markdown; bars in cells are escaped, columns whose heads begin with `bold` are so."""
     rows = [list(frame.columns), ["---"] * len(frame.columns)]
@@ -72,7 +66,7 @@ TEMPLATES = Environment(
     undefined=StrictUndefined,
 )
 """Only what is put into .html is escaped."""
-TEMPLATES.filters |= {f.__name__: f for f in (inline, counted, size, model, markdown, kinds)}
+TEMPLATES.filters |= {f.__name__: f for f in (inline, counted, size, markdown, kinds)}
 
 
 def render(template: str, **values: Any) -> str:

@@ -15,23 +15,15 @@ from tests.report.conftest import effect, report, score
 
 def test_who_made_the_figures_comes_first_with_size_and_teaching() -> None:
     text = render_readme(report([score()], settings="Looked at before."), ["effects.png"])
-    first = text.splitlines()[2]
-    assert first.startswith(
-        "A 2.2 M-parameter Llama, taught by hand, made these figures in place of the paper's Vicuna"
-    )
-    assert "a 1.1 M-parameter CLIP with visual prompt tuning" in first
-    assert "real videos of 2 test objects, under 1 seed" in first
-    assert first.endswith("Looked at before.")
-    head = next(line for line in text.splitlines() if line.startswith("| Task"))
+    first, head = text.splitlines()[2], next(line for line in text.splitlines() if line.startswith("| Task"))
+    made = "A 2.2 M-parameter Llama, taught by hand, made these figures in place of the paper's Vicuna"
+    for words in (made, "a 1.1 M-parameter CLIP", "real videos of 2 test objects, under 1 seed", "Looked at before."):
+        assert words in first
     assert "Measured here (2.2 M-parameter model)" in head
     assert "Published (Vicuna 13b)" in head
-    assert "other models on other questions about other objects" in text
-
-
-def test_a_large_base_is_no_stand_in_and_has_no_teaching_noted() -> None:
-    said = sections(report([score()], language={"parameters": 6_738_415_616, "taught": ""}))
-    assert said["finding"][0].startswith("A 6.7 B-parameter Llama made these figures.")
-    assert "not noted" in said["stands_on"][0]
+    large = sections(report([score()], language={"parameters": 6_738_415_616, "taught": ""}))
+    assert large["finding"][0].startswith("A 6.7 B-parameter Llama made these figures."), "no stand-in"
+    assert "not noted" in large["stands_on"][0]
 
 
 def test_above_and_below_chance_are_said_only_where_the_whole_interval_is() -> None:
@@ -140,19 +132,13 @@ def test_spoilt_test_objects_are_no_headline() -> None:
 
 
 def test_what_the_figures_stand_on_is_said_in_words() -> None:
-    went_on = {"language.start": "pipeline/pretrained/octopi-small"}
-    said = report([], settings="", facts_told=True, intervals="Known to be narrow.", beyond_paper=went_on)
-    assert "its training went on from `octopi-small`, which was trained before" in finding(said)[0]
-    facts = "\n".join(sections(said)["stands_on"])
-    for words in ("2 (a, b), 4 videos, split `paper`", "Nothing is noted", "Known to be narrow.", "ask for touch"):
-        assert words in facts
-
-
-def test_a_report_names_what_the_paper_does_not_train() -> None:
     assert beyond_paper(compose("paper-7b", [], ROOT / "conf")) == {}
     found = beyond_paper(compose("small", ["lora.given=0.7"], ROOT / "conf"))
-    assert found["questions.restate"] is True
-    assert (found["lora.given"], found["questions.wording"]) == (0.7, "class")
-    facts = "\n".join(sections(report([], beyond_paper=found))["stands_on"])
-    assert all(f"`{key}={value}`" in facts for key, value in found.items())
+    assert (found["lora.given"], found["questions.restate"], found["questions.wording"]) == (0.7, True, "class")
+    found |= {"language.start": "pipeline/pretrained/octopi-small"}
+    said = report([], settings="", facts_told=True, intervals="Known to be narrow.", beyond_paper=found)
+    assert "its training went on from `octopi-small`, which was trained before" in finding(said)[0]
+    facts = "\n".join(sections(said)["stands_on"])
+    told = ["2 (a, b), 4 videos, split `paper`", "Nothing is noted", "Known to be narrow.", "ask for touch"]
+    assert all(words in facts for words in (*told, *(f"`{key}={value}`" for key, value in found.items())))
     assert "the paper has not" not in "\n".join(sections(report([], beyond_paper={}))["stands_on"])

@@ -113,14 +113,6 @@ def test_read_and_compared_answers_stand_side_by_side() -> None:
     assert build("strict", score("PC"), score("PSR")).empty, "nothing was compared"
 
 
-def test_each_data_set_has_the_papers_figures_about_it() -> None:
-    (shown,) = build("reasoning", score("RIPE"), dataset="avocados").to_dict("records")
-    assert shown["Published 13b % (n)"] == "63.00 (100)"
-    (described,) = build("description", score("OPD", "combined"), dataset="avocados").to_dict("records")
-    assert described["Published 13b % (n)"] == "35.50 (200)"
-    assert not any("Published" in name for name in build("reasoning", score("RIPE")))
-
-
 def test_reports_stand_side_by_side_with_every_row_of_the_paper() -> None:
     """7b measured two rows, 13b three others and, by seed and with other touch, what belongs to no row."""
     small = report([score("PC"), score("OPD", "combined")])
