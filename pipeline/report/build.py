@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
@@ -79,25 +80,21 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     vision = [*_read(data / "graded_vision.parquet", GradedVision), *_read(data / "shipped.parquet", GradedVision)]
     # By the lists in params.yaml, not by the files: after an ablation is narrowed, files of removed variants remain.
     models = params.cross_validation.models
-    found = {name: _read(data / "cross_validation" / name / "out_of_fold.parquet", OutOfFold) for name in models}
-    out_of_fold: dict[str, list[OutOfFold]] = {name: records for name, records in found.items() if records}
-    # The heads' classifications of each encoder; then, with the folds of a replicate pooled, the same and what follows
-    # from them by rule.
-    by_encoder: dict[int, list[Classification]] = {}
-    pooled: dict[int, list[Classification]] = {}
-    concluded: dict[int, list[Score]] = {}
-    adjectives: dict[str, str] = {}
+    places = {name: data / "cross_validation" / name / "out_of_fold.parquet" for name in models}
+    out_of_fold = {name: found for name, file in places.items() if (found := _read(file, OutOfFold))}
+    files = {seed: data / "encoder" / str(seed) / "classifications.parquet" for seed in sorted(params.ablation.seeds)}
+    by_encoder = {seed: said for seed, file in files.items() if (said := _read(file, Classification))}
+    asked = {seed: read_jsonl(data / "questions" / str(seed) / "evaluation.jsonl", Question) for seed in by_encoder}
+    every = [question for questions in asked.values() for question in questions]
+    adjectives = {q.question_id: word for q in every if (word := TASKS[q.task].adjective(q, catalogue))}
+    # With the folds of a replicate pooled, the heads' classifications and what follows from them by rule.
+    pooled: dict[int, list[Classification]] = defaultdict(list)
+    concluded: dict[int, list[Score]] = defaultdict(list)
     # As the stage `questions` took it.
     taken = catalogue.asking(params.questions.scenarios).called(params.questions.names)
-    for seed in sorted(params.ablation.seeds):
-        if classified := _read(data / "encoder" / str(seed) / "classifications.parquet", Classification):
-            asked = read_jsonl(data / "questions" / str(seed) / "evaluation.jsonl", Question)
-            replicate = params.split.replicate_of(seed)
-            by_encoder[seed] = classified
-            pooled.setdefault(replicate, []).extend(classified)
-            concluded.setdefault(replicate, []).extend(conclude(asked, classified, taken))
-            named = {q.question_id: TASKS[q.task].adjective(q, catalogue) for q in asked}
-            adjectives |= {question: word for question, word in named.items() if word}
+    for seed, classified in by_encoder.items():
+        pooled[params.split.replicate_of(seed)] += classified
+        concluded[params.split.replicate_of(seed)] += conclude(asked[seed], classified, taken)
     origin = provenance(params, catalogue, videos, splits, [g.objects for g in graded], root)
     # Without those whose answers are to other questions than today's, which were not graded.
     rated = {(g.model, g.shown) for g in vision}

@@ -153,7 +153,10 @@ def test_what_is_missing_is_said_with_the_reason(changed: Path, monkeypatch: pyt
     (reports / "smoke-scenes" / "provenance.json").write_text('{"scale": "smoke", "source": "scenes"}')
     scores = reports / "small-videos" / "scores.csv"
     write_rows(scores, [row for row in rows_of(scores) if row["task"] not in ("PSR", "cross_validation")])
-    page = Page(write_page(changed))
+    monkeypatch.chdir(changed)
+    Path("dvc.yaml").touch()  # As in a project.
+    assert CliRunner().invoke(app, ["page"]).output.startswith(f"{PAGE}: ")
+    page = Page(changed / PAGE)
     said = {words(e[0]): words(e[1]) for e in page.named("missing").iter("div")}
     for what in ("effects.csv", "Scenario", "Encoders and baselines over all objects"):
         assert what in said["small-videos"]
@@ -162,8 +165,6 @@ def test_what_is_missing_is_said_with_the_reason(changed: Path, monkeypatch: pyt
     assert "make bench" in words(page.named("speed"))
     assert "lacks format, finite" in said["stability"]
     scores.unlink()
-    monkeypatch.chdir(changed)
-    Path("dvc.yaml").touch()  # As in a project.
     assert "make repro" in str(CliRunner().invoke(app, ["page"]).exception)
 
 
