@@ -94,7 +94,7 @@ class Gate:
 
     def __init__(self, limits: Limits | None = None) -> None:
         self.limits = limits or Limits()
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._checker: subprocess.Popen[str] | None = None
 
     @contextmanager
@@ -119,46 +119,36 @@ class Gate:
     def close(self) -> None:
         """End the checking process."""
         with self._lock:
-            self._end()
+            if self._checker is not None:
+                self._checker.kill()
+                self._checker.communicate()
+                self._checker = None
 
     def _check(self, path: Path, place: str) -> None:
         with self._lock:
-            checker = self._running()
+            if self._checker is None or self._checker.poll() is not None:
+                self.close()
+                self._checker = subprocess.Popen(
+                    [sys.executable, "-m", "pipeline.use.media", json.dumps(asdict(self.limits))],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    stderr=subprocess.DEVNULL,
+                    text=True,
+                    # Ctrl-C is the server's to handle: answers in flight finish.
+                    start_new_session=True,
+                    env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+                )
             answer = ""
             with suppress(OSError):
-                print(path, file=checker.stdin, flush=True)
-                answer = checker.stdout.readline() if checker.stdout else ""
+                print(path, file=self._checker.stdin, flush=True)
+                answer = self._checker.stdout.readline() if self._checker.stdout else ""
             if not answer:
-                self._end()
-                raise Refused(
-                    f"{place}: takes too long or too much memory to decode; send a shorter or smaller one", 413
-                )
+                self.close()
+                message = f"{place}: takes too long or too much memory to decode; send a shorter or smaller one"
+                raise Refused(message, 413)
         found = json.loads(answer)
         if found["status"]:
             raise Refused(f"{place}: {found['message']}", found["status"])
-
-    def _running(self) -> subprocess.Popen[str]:
-        if self._checker is None or self._checker.poll() is not None:
-            self._end()
-            root = str(Path(__file__).resolve().parents[2])
-            places = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
-            self._checker = subprocess.Popen(
-                [sys.executable, "-m", "pipeline.use.media", json.dumps(asdict(self.limits))],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-                text=True,
-                # Ctrl-C is the server's to handle: answers in flight finish.
-                start_new_session=True,
-                env={**os.environ, "PYTHONPATH": places},
-            )
-        return self._checker
-
-    def _end(self) -> None:
-        if self._checker is not None:
-            self._checker.kill()
-            self._checker.communicate()
-            self._checker = None
 
 
 def check(path: Path, limits: Limits) -> None:

@@ -7,7 +7,7 @@ import uuid
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, Field, ValidationError, field_validator
+from pydantic import AliasChoices, BaseModel, Field, ValidationError, field_validator
 
 from pipeline.core.errors import first_problem
 from pipeline.language.chat import TACTILE
@@ -29,23 +29,16 @@ class _Text(BaseModel):
     text: str = Field(max_length=CHARACTERS)
 
 
-class _Video(BaseModel):
-    type: Literal["video_url"]
-    video_url: _Url
-
-
-class _Image(BaseModel):  # A touch as well, from a client that knows pictures only.
-    type: Literal["image_url"]
-    image_url: _Url
+class _Touch(BaseModel):  # A client that knows pictures only sends a video as one.
+    type: Literal["video_url", "image_url"]
+    video_url: _Url = Field(validation_alias=AliasChoices("video_url", "image_url"))
 
 
 class Message(BaseModel):
     """One turn."""
 
     role: Literal["system", "developer", "user", "assistant"]
-    content: list[Annotated[_Text | _Video | _Image, Field(discriminator="type")]] = Field(
-        min_length=1, max_length=MESSAGES
-    )
+    content: list[Annotated[_Text | _Touch, Field(discriminator="type")]] = Field(min_length=1, max_length=MESSAGES)
 
     @field_validator("content", mode="before")
     @classmethod
@@ -85,8 +78,8 @@ def read_request(body: bytes) -> ChatRequest:
 def read_conversation(messages: Sequence[Message]) -> list[Said]:
     """Turn messages into exchanges; the last is the question, whose answer is "".
 
-    A video stands where its part stands between two texts. Where a text of the message says `{tactile}`, videos stand
-    at those marks in order, and where there is one text without a mark, in front of it.
+    Where a text of a message says `{tactile}`, its videos stand at those marks in order; where it has one text without
+    a mark, in front of it; else a video stands where its part stands between the texts.
 
     System messages are left out: the model was trained under its own and knows no other.
 
@@ -96,29 +89,24 @@ def read_conversation(messages: Sequence[Message]) -> list[Said]:
     turns = [(i, m) for i, m in enumerate(messages) if m.role in ("user", "assistant")]
     if len(turns) % 2 == 0 or any(m.role != ("user", "assistant")[place % 2] for place, (_, m) in enumerate(turns)):
         raise Refused("messages: user and assistant must take turns, the user first and last")
-    said = [_read(message, f"messages.{i}") for i, message in turns]
-    if any(videos for _, videos in said[1::2]):
-        raise Refused("messages: an assistant's message brings a video; only the user's may")
-    answers = [*(text for text, _ in said[1::2]), ""]
-    return [(text, videos, answer) for (text, videos), answer in zip(said[::2], answers, strict=True)]
-
-
-def _read(message: Message, place: str) -> tuple[str, tuple[bytes, ...]]:
-    """The text of a message with its marks, and its videos; `place` is what an error calls it."""
-    texts = [part.text for part in message.content if isinstance(part, _Text)]
-    # Then videos get no mark by their own place in the message.
-    placed = sum(bool(text.strip()) for text in texts) == 1 or any(TACTILE in text for text in texts)
-    text, videos = "", []
-    for i, part in enumerate(message.content):
-        if isinstance(part, _Text):
-            piece = part.text
+    said: list[Said] = []
+    for number, message in turns:
+        texts = [part.text for part in message.content if isinstance(part, _Text)]
+        placed = sum(bool(text.strip()) for text in texts) == 1 or any(TACTILE in text for text in texts)
+        text, videos = "", []
+        for i, part in enumerate(message.content):
+            piece = part.text if isinstance(part, _Text) else "" if placed else TACTILE
+            if isinstance(part, _Touch):
+                videos.append(from_base64(part.video_url.url, f"messages.{number}.content.{i}"))
+            apart = text and piece and not text[-1].isspace() and not piece[0].isspace()
+            text += f" {piece}" if apart else piece
+        if message.role == "user":
+            said.append((text, tuple(videos), ""))
+        elif videos:
+            raise Refused("messages: an assistant's message brings a video; only the user's may")
         else:
-            url = part.video_url if isinstance(part, _Video) else part.image_url
-            videos.append(from_base64(url.url, f"{place}.content.{i}"))
-            piece = "" if placed else TACTILE
-        apart = text and piece and not text[-1].isspace() and not piece[0].isspace()
-        text += f" {piece}" if apart else piece
-    return text, tuple(videos)
+            said[-1] = (*said[-1][:2], text)
+    return said
 
 
 class Reply:
@@ -134,20 +122,14 @@ class Reply:
 
     def whole(self, text: str) -> Json:
         """A `chat.completion`."""
-        return self._made("chat.completion", "stop", message={"role": "assistant", "content": text, "refusal": None})
+        message = {"role": "assistant", "content": text, "refusal": None}
+        return {**self.chunk(message, "stop", "message"), "object": "chat.completion"}
 
-    def chunk(self, delta: Mapping[str, str], finish: str | None = None) -> Json:
+    def chunk(self, said: Mapping[str, str | None], finish: str | None = None, called: str = "delta") -> Json:
         """A `chat.completion.chunk`."""
-        return self._made("chat.completion.chunk", finish, delta=delta)
-
-    def _made(self, kind: str, finish: str | None, **said: Mapping[str, str | None]) -> Json:
-        choice = {"index": 0, **said, "logprobs": None, "finish_reason": finish}
-        return {**self.head, "object": kind, "choices": [choice], **({"notes": self.notes} if finish else {})}
-
-
-def model_entry(name: str, created: int) -> Json:
-    """An entry of `/v1/models`."""
-    return {"id": name, "object": "model", "created": created, "owned_by": "octopi-pipeline"}
+        choice = {"index": 0, called: said, "logprobs": None, "finish_reason": finish}
+        notes = {"notes": self.notes} if finish else {}
+        return {**self.head, "object": "chat.completion.chunk", "choices": [choice], **notes}
 
 
 def error_body(message: str, status: int) -> Json:

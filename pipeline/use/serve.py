@@ -11,32 +11,32 @@ import hmac
 import json
 import math
 import os
-import threading
 import time
 from collections import Counter
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterable
+from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Iterable
 from contextlib import ExitStack, aclosing, asynccontextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from fastapi import APIRouter, Depends, FastAPI, Request
 from fastapi.exceptions import HTTPException
 from fastapi.responses import JSONResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.exceptions import HTTPException as AnyHTTPException
 from starlette.requests import ClientDisconnect
-from starlette.types import Message, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from pipeline.core.errors import UserError
 from pipeline.use.media import PLACE, Gate, Limits, Refused
-from pipeline.use.protocol import ChatRequest, Json, Reply, error_body, model_entry, read_conversation, read_request
+from pipeline.use.protocol import ChatRequest, Json, Reply, error_body, read_conversation, read_request
 from pipeline.use.results import Exchange
 from pipeline.use.server import Failed, Worker, listen, make_server
 
 if TYPE_CHECKING:
     from pipeline.use.model import Octopi
 
-UPLOAD_SECONDS, DRAIN_SECONDS = 30.0, 5.0
-"""How long a client may take for a body, and for the rest of one that is not wanted."""
+UPLOAD_SECONDS, DRAIN_SECONDS, LOOK_SECONDS = 30.0, 5.0, 0.1
+"""How long a client may take for a body, and for the rest of one that is not wanted; and how often is looked whether
+it is still there."""
 MOST_TOKENS = 1024
 """The longest answer that a client may ask for."""
 SHORTEST_TOKEN = 16
@@ -80,18 +80,13 @@ def read_token(file: Path | None) -> str:
 class Service:
     """What the routes share."""
 
-    def __init__(self, model: Octopi, name: str, *, token: str, limits: Limits, places: int) -> None:
-        self.model, self.name, self.token, self.limits = model, name, token, limits
-        self.places, self.created = places, int(time.time())
+    def __init__(self, model: Octopi, name: str, *, token: str, limits: Limits | None, places: int) -> None:
+        self.model, self.name, self.token, self.places = model, name, token, places
         self.gate, self.worker = Gate(limits), Worker()
+        self.taken: set[Reply] = set()
+        """The places: a reply each to a request that is read, checked, waiting or answered."""
         self.requests: Counter[int] = Counter()
         self.videos = 0
-        self._free = threading.Semaphore(places)
-
-    @property
-    def taken(self) -> int:
-        """Requests that are read, checked, waiting or answered."""
-        return self.places - self._free._value
 
     async def check_token(self, request: Request) -> None:
         """Raise 401 without the right token, or 403 where the server has none and is called by another machine's name.
@@ -115,18 +110,16 @@ class Service:
 
     async def chat(self, request: Request) -> Response:
         """Answer `/v1/chat/completions`."""
-        if not self._free.acquire(blocking=False):
+        if len(self.taken) >= self.places:
             mean = self.worker.seconds / self.worker.answers if self.worker.answers else 1.0
-            wait = str(min(600, max(1, math.ceil(mean * self.taken))))
-            raise HTTPException(
-                429, f"all {self.places} places are taken; come again in {wait} s", {"Retry-After": wait}
-            )
+            wait = str(min(600, max(1, math.ceil(mean * len(self.taken)))))
+            message = f"all {self.places} places are taken; come again in {wait} s"
+            raise HTTPException(429, message, {"Retry-After": wait})
         reply = Reply(self.name)
         with ExitStack() as stack:
-            stack.callback(self._free.release)
-            body = await _read(request, self.limits.body_bytes)
-            wanted, exchanges = await asyncio.to_thread(self._prepare, body, stack)
-            del body
+            self.taken.add(reply)
+            stack.callback(self.taken.remove, reply)
+            wanted, exchanges = await asyncio.to_thread(self._prepare, await self._read(request), stack)
             # From here on the worker gives the place back, when it needs the files no more.
             pieces = self.worker.answer(lambda: self._ask(wanted, exchanges, reply), stack.pop_all().close)
         self.videos += sum(len(exchange.videos) for exchange in exchanges)
@@ -134,6 +127,24 @@ class Service:
             first = await _unless_left(request, anext(pieces, ""))
             return StreamingResponse(_events(reply, first, pieces), media_type="text/event-stream")
         return JSONResponse(reply.whole(await _unless_left(request, _join(pieces))))
+
+    async def _read(self, request: Request) -> bytes:
+        """The body, of limited size and time."""
+        if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
+            # A page of another site may send other types without asking the browser's leave.
+            raise HTTPException(415, "send Content-Type: application/json")
+        data, most = bytearray(), self.gate.limits.body_bytes
+        try:
+            async with asyncio.timeout(UPLOAD_SECONDS):
+                async for chunk in request.stream():
+                    data += chunk
+                    if len(data) > most:
+                        message = f"the request is larger than {most} bytes; send fewer or shorter videos"
+                        raise HTTPException(413, message)
+        except TimeoutError:
+            message = f"the request took longer than {UPLOAD_SECONDS:g} s to arrive"
+            raise HTTPException(408, message, {"Connection": "close"}) from None
+        return bytes(data)
 
     def _prepare(self, body: bytes, stack: ExitStack) -> tuple[ChatRequest, list[Exchange]]:
         """The request and its conversation, whose videos are files until the stack is closed."""
@@ -160,7 +171,7 @@ class Service:
 {by_status}# TYPE octopi_videos_total counter
 octopi_videos_total {self.videos}
 # TYPE octopi_requests_waiting gauge
-octopi_requests_waiting {self.taken}
+octopi_requests_waiting {len(self.taken)}
 # TYPE octopi_requests_places gauge
 octopi_requests_places {self.places}
 # TYPE octopi_answer_seconds summary
@@ -169,50 +180,17 @@ octopi_answer_seconds_count {self.worker.answers}
 """
 
 
-async def _read(request: Request, most: int) -> bytes:
-    """The body, at most so many bytes and not for ever."""
-    if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
-        # A page of another site may send other types without asking the browser's leave.
-        raise HTTPException(415, "send Content-Type: application/json")
-    data = bytearray()
-    try:
-        async with asyncio.timeout(UPLOAD_SECONDS):
-            async for chunk in request.stream():
-                data += chunk
-                if len(data) > most:
-                    raise HTTPException(413, f"the request is larger than {most} bytes; send fewer or shorter videos")
-    except TimeoutError:
-        message = f"the request took longer than {UPLOAD_SECONDS:g} s to arrive"
-        raise HTTPException(408, message, {"Connection": "close"}) from None
-    return bytes(data)
-
-
-async def _drain(request: Request, most: int) -> None:
-    """Read the rest of a body that is not wanted: a client that is still sending would not see the answer."""
-    with suppress(Exception):
-        async with asyncio.timeout(DRAIN_SECONDS):
-            async for chunk in request.stream():
-                most -= len(chunk)
-                if most < 0:
-                    return
-
-
-async def _unless_left(request: Request, work: Any) -> str:
+async def _unless_left(request: Request, work: Awaitable[str]) -> str:
     """The result of `work`, which is given up when the client hangs up."""
-
-    async def left() -> None:
-        while (await request.receive())["type"] != "http.disconnect":
-            pass
-
-    tasks = [asyncio.ensure_future(work), asyncio.create_task(left())]
+    task = asyncio.ensure_future(work)
     try:
-        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        if not tasks[0].done():
-            raise ClientDisconnect
-        return str(tasks[0].result())
+        while not task.done():
+            if await request.is_disconnected():
+                raise ClientDisconnect
+            await asyncio.wait([task], timeout=LOOK_SECONDS)
+        return task.result()
     finally:
-        for task in tasks:
-            task.cancel()
+        task.cancel()
 
 
 async def _join(pieces: AsyncIterator[str]) -> str:
@@ -241,8 +219,6 @@ def _client_message(error: Exception) -> tuple[str, int]:
     """What a client is told of an error, and the status."""
     if isinstance(error, AnyHTTPException):
         return str(error.detail), error.status_code
-    if isinstance(error, ClientDisconnect):
-        return "the client has left", 499
     status = error.status if isinstance(error, Refused) else 422 if isinstance(error, UserError) else 500
     # Videos lie in a folder of ours, whose name is nobody's business.
     return PLACE.sub(r"video \1", " ".join(str(error).split())), status
@@ -258,7 +234,8 @@ def make_app(model: Octopi, name: str, *, token: str = "", limits: Limits | None
         limits: Of one request.
         places: Requests at once, from the first byte to the answer; the next gets 429.
     """
-    service = Service(model, name, token=token, limits=limits or Limits(), places=places)
+    service = Service(model, name, token=token, limits=limits, places=places)
+    entry = {"id": name, "object": "model", "created": int(time.time()), "owned_by": "octopi-pipeline"}
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -271,50 +248,60 @@ def make_app(model: Octopi, name: str, *, token: str = "", limits: Limits | None
     guarded.post("/v1/chat/completions")(service.chat)
 
     @guarded.get("/v1/models")
-    async def models() -> dict[str, Any]:
-        return {"object": "list", "data": [model_entry(name, service.created)]}
+    async def models() -> Json:
+        return {"object": "list", "data": [entry]}
 
     @guarded.get("/v1/models/{wanted:path}")
-    async def one_model(wanted: str) -> dict[str, Any]:
+    async def one_model(wanted: str) -> Json:
         service.check_name(wanted)
-        return model_entry(name, service.created)
+        return entry
 
     @guarded.get("/metrics")
     async def metrics() -> Response:
         return PlainTextResponse(service.metrics(), media_type="text/plain; version=0.0.4")
 
     @app.get("/health")
-    async def health() -> dict[str, Any]:
-        return {"status": "ok", "model": name, "waiting": service.taken, "places": places}
+    async def health() -> Json:
+        return {"status": "ok", "model": name, "waiting": len(service.taken), "places": places}
 
+    @app.exception_handler(AnyHTTPException)
+    @app.exception_handler(UserError)
+    @app.exception_handler(Failed)
     async def refuse(request: Request, error: Exception) -> Response:
         message, status = _client_message(error)
         if status != 408:
-            await _drain(request, 4 * service.limits.body_bytes)
+            # The rest of the body is read: a client that is still sending would not see the answer.
+            left = 4 * service.gate.limits.body_bytes
+            with suppress(Exception):
+                async with asyncio.timeout(DRAIN_SECONDS):
+                    async for chunk in request.stream():
+                        left -= len(chunk)
+                        if left < 0:
+                            break
         return JSONResponse(error_body(message, status), status, getattr(error, "headers", None))
 
+    @app.exception_handler(ClientDisconnect)
+    async def left(_: Request, __: Exception) -> Response:
+        return Response(status_code=499)  # As nginx numbers it; nobody reads it.
+
+    @app.exception_handler(Exception)
     async def fail(_: Request, __: Exception) -> Response:
-        service.requests[500] += 1  # What nothing foresaw is answered outside of `_Count`.
+        service.requests[500] += 1  # What nothing foresaw is answered outside of `count`.
         return JSONResponse(error_body(str(Failed()), 500), 500)
 
+    def count(inner: ASGIApp) -> ASGIApp:
+        """Count answers by status. No `@app.middleware`, behind which a stream never learns that its client left."""
+
+        async def counted(scope: Scope, receive: Receive, send: Send) -> None:
+            async def sent(message: Message) -> None:
+                if message["type"] == "http.response.start":
+                    service.requests[message["status"]] += 1
+                await send(message)
+
+            await inner(scope, receive, sent)
+
+        return counted
+
     app.include_router(guarded)
-    for kind in (AnyHTTPException, UserError, Failed, ClientDisconnect):
-        app.add_exception_handler(kind, refuse)
-    app.add_exception_handler(Exception, fail)
-    app.add_middleware(_Count, counts=service.requests)
+    app.add_middleware(count)
     return app
-
-
-class _Count:
-    """Counts answers by status. No `@app.middleware`, behind which a stream never learns that its client has left."""
-
-    def __init__(self, app: Any, counts: Counter[int]) -> None:
-        self.app, self.counts = app, counts
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        async def counting(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                self.counts[message["status"]] += 1
-            await send(message)
-
-        await self.app(scope, receive, counting)

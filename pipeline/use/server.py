@@ -39,7 +39,7 @@ class Failed(Exception):
 
 @dataclass(frozen=True)
 class Job:
-    """A question on its way; the arguments of `Worker.answer`, and where its pieces go."""
+    """A question on its way: the arguments of `Worker.answer`, where pieces go, and whether nobody waits for them."""
 
     ask: Callable[[], Iterable[Any]]
     done: Callable[[], object]
@@ -57,9 +57,7 @@ class Job:
 
 
 class Worker:
-    """The thread that holds the model: it answers what waits in one batch where the model can, else one by one.
-
-    What comes meanwhile waits for the next batch.
+    """The thread that holds the model: what waits is answered in one batch, and what comes meanwhile in the next.
 
     Attributes:
         answers: How many were given in full.
@@ -113,19 +111,19 @@ class Worker:
         self._thread.join()
 
     def _work(self) -> None:
-        waiting: Job | None
-        while (waiting := self._jobs.get()) is not None:
-            jobs: list[Job | None] = [waiting]
-            while len(jobs) < TOGETHER and jobs[-1] is not None and not self._jobs.empty():
-                jobs.append(self._jobs.get())
+        while (job := self._jobs.get()) is not None:
+            jobs = [job]
+            while len(jobs) < TOGETHER and not self._jobs.empty():
+                if (job := self._jobs.get()) is None:
+                    self._jobs.put(None)  # It ends the loop when these are answered.
+                    break
+                jobs.append(job)
             started = time.monotonic()
-            self._answer([job for job in jobs if job is not None])
+            self._answer(jobs)
             self.seconds += time.monotonic() - started
-            if jobs[-1] is None:
-                return
 
     def _answer(self, jobs: Sequence[Job]) -> None:
-        """Answer these: what cannot be in a batch by itself, then the others in one."""
+        """Answer what cannot be in a batch by itself, then the others in one."""
         batch: list[tuple[Job, Any]] = []
         for job in jobs:
             if job.left.is_set():
