@@ -143,17 +143,27 @@ def describe_folder(model: Octopi, paths: Sequence[Path], out: Path) -> tuple[in
     Raises:
         UserError: for a folder without videos, or a file that another model or something else wrote.
     """
-    files, known = videos_of(paths), model.catalogue.properties
-    probabilities = [f"{p.name}: {level}" for p in known for level in p.levels]
+    files, label = videos_of(paths), f"{model.name} {model.config.digest}"
+    probabilities = [f"{p.name}: {level}" for p in model.catalogue.properties for level in p.levels]
     columns = ["file", *model.properties, *probabilities, "sentence", "frames", "notes", "error", "model"]
-    done = _done(out, columns, _label_of(model))
+    csv.writer(head := io.StringIO(), lineterminator="\n").writerow(columns)
+    # A kill may have cut a character in two; a file that was sent may have others.
+    text = out.read_text(encoding="utf-8", errors="replace") if out.is_file() else ""
+    whole, begun = text[: text.rfind("\n") + 1], head.getvalue()
+    rows = list(csv.DictReader(io.StringIO(whole)))
+    if not (text.startswith(begun) or begun.startswith(text)) or any(row["model"] != label for row in rows):
+        raise UserError(f"{out}: is no description by {label}; name another file with --csv")
+    write_text(out, whole or begun)  # Without what a kill left of a last line.
+    done = {row["file"]: row["error"] for row in rows}
     rest = [(file, name) for file, name in files if name not in done]
     failed = sum(bool(error) for error in done.values())
-    if not out.is_file() or not done:
-        write_text(out, _row(columns))
-    with progress(len(rest), "describe", "video") as advance, out.open("a", encoding="utf-8", newline="") as stream:
+    with (
+        progress(len(rest), "describe", "video") as advance,
+        out.open("a", encoding="utf-8", errors="backslashreplace", newline="") as stream,
+    ):
+        writer = csv.DictWriter(stream, columns, lineterminator="\n")
         for row in _describe(model, rest):
-            stream.write(_row([row.get(column, "") for column in columns]))
+            writer.writerow({**row, "model": label})
             stream.flush()
             failed += bool(row.get("error"))
             advance()
@@ -200,33 +210,13 @@ def videos_of(paths: Sequence[Path]) -> list[tuple[Path, str]]:
     return found
 
 
-def _label_of(model: Octopi) -> str:
-    """What a CSV calls a model, by which rows of another one are told apart."""
-    return f"{model.name} {model.config.digest}"
-
-
-def _done(out: Path, columns: Sequence[str], name: str) -> dict[str, str]:
-    """Files that a CSV has already, each with its error; what a kill left of a last line is cut off."""
-    if not out.is_file():
-        return {}
-    # A kill may have cut a character in two; a file that was sent may have others.
-    text = out.read_text(encoding="utf-8", errors="replace")
-    whole, begun = text[: text.rfind("\n") + 1], _row(columns)
-    rows = list(csv.DictReader(io.StringIO(whole)))
-    if not (text.startswith(begun) or begun.startswith(text)) or any(row["model"] != name for row in rows):
-        raise UserError(f"{out}: is no description by {name}; name another file with --csv")
-    if whole != text:
-        write_text(out, whole)
-    return {row["file"]: row["error"] for row in rows}
-
-
 def _describe(model: Octopi, files: Sequence[tuple[Path, str]]) -> Iterator[dict[str, object]]:
     """A row for each video: its description, or the error that says why there is none."""
     for start in range(0, len(files), BATCH):
         rows: list[dict[str, object]] = []
         good = []
         for file, name in files[start : start + BATCH]:
-            row: dict[str, object] = {"file": name, "model": _label_of(model)}
+            row: dict[str, object] = {"file": name}
             rows.append(row)
             try:
                 model.look(file)
@@ -240,9 +230,3 @@ def _describe(model: Octopi, files: Sequence[tuple[Path, str]]) -> Iterator[dict
             row |= {"sentence": " ".join(found.sentence.split()), "frames": " ".join(map(str, found.frames))}
             row["notes"] = "; ".join(note for note in found.notes if note not in model.doubts)
         yield from rows
-
-
-def _row(cells: Iterable[object]) -> str:
-    stream = io.StringIO()
-    csv.writer(stream, lineterminator="\n").writerow(cells)
-    return readable(stream.getvalue())

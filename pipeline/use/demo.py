@@ -9,7 +9,7 @@ import base64
 import re
 import shutil
 import tempfile
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import aclosing, asynccontextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,6 +25,7 @@ from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from pipeline.config import ScenesConfig
 from pipeline.core.errors import UserError
+from pipeline.core.records import GAIN, MIDDLE
 from pipeline.scenes.light import make_sensor
 from pipeline.scenes.recipe import Recipe, load_recipes
 from pipeline.scenes.render import make_scene, render
@@ -43,7 +44,7 @@ HOSTS = ["127.0.0.1", "localhost"]
 MOST_BYTES, MOST_TOUCHES = 200_000_000, 30
 """Of one video; and touches that are remembered, the last ones."""
 SCENE, SCENE_FRAMES = ScenesConfig(), 60
-GLOW = 24.0
+GLOW = 6.0
 """Difference to the untouched sensor, in 8-bit steps, that is painted at full strength where it touches."""
 
 
@@ -66,12 +67,9 @@ class Asked(BaseModel):
 class Session:
     """The model, the touches that were shown to it, and one thread that all its work is done in."""
 
-    def __init__(
-        self, model: Octopi, catalogue: Catalogue | None = None, recipes: dict[str, Recipe] | None = None
-    ) -> None:
-        self.model = model
-        self.scenes = recipes or {}
-        self.names = {o: catalogue.objects[o].name for o in self.scenes} if catalogue else {}
+    def __init__(self, model: Octopi, catalogue: Catalogue, recipes: Mapping[str, Recipe]) -> None:
+        self.model, self.scenes = model, recipes
+        self.names = {object_id: catalogue.objects[object_id].name for object_id in recipes}
         self.folder = Path(tempfile.mkdtemp(prefix="octopi-demo-"))
         self.videos: dict[str, Path] = {}
         self.worker = Worker()
@@ -118,7 +116,7 @@ class Session:
             "touched": [uri(picture) for picture in where(touch)],
             "reference": uri(touch.reference),
             "contact": touch.contact,
-            "notes": list(dict.fromkeys([*said.notes, *touch.notes])),
+            "notes": said.notes,
             "levels": said.levels,
             "probabilities": said.probabilities,
         }
@@ -155,7 +153,7 @@ def where(touch: Touch) -> Pictures:
     """The frames with a red glow where they differ from the untouched sensor; as `touch.frames`."""
     found = []
     for frame, difference in zip(touch.frames, touch.difference, strict=True):
-        change = 2 * np.abs(difference.astype(np.float32) - 128).max(axis=2)
+        change = np.abs(difference.astype(np.float32) - MIDDLE).max(axis=2) / GAIN
         share = np.clip(cv2.GaussianBlur(change, (0, 0), frame.shape[0] / 60) / GLOW, 0, 1)[:, :, None]
         found.append(frame * (1 - share) + np.array([230, 30, 60]) * share)
     painted: Pictures = np.rint(found).astype(np.uint8)

@@ -44,11 +44,6 @@ class EncodedVideo(NamedTuple):
     embedding: torch.Tensor
     """float32, dim: the mean over its frames, before property heads and as the encoder has it."""
 
-    @property
-    def size(self) -> int:
-        """Bytes of its pictures."""
-        return sum(p.nbytes for p in (self.touch.frames, self.touch.reference, self.touch.difference))
-
 
 class Classified(NamedTuple):
     """Predictions of the property heads, in the catalogue's order of properties."""
@@ -87,8 +82,11 @@ class VideoEncoder:
             features = standard if config.encoder.standardize else raw
             self._encoded[key] = EncodedVideo(name, touch, touch.strength > config.quiet, features, raw.mean(0))
         self._encoded.move_to_end(key)
-        while len(self._encoded) > 1 and sum(encoded.size for encoded in self._encoded.values()) > REMEMBERED:
+        touches = [encoded.touch for encoded in self._encoded.values()]
+        sizes = [t.frames.nbytes + t.reference.nbytes + t.difference.nbytes for t in touches]
+        while len(sizes) > 1 and sum(sizes) > REMEMBERED:
             self._encoded.popitem(last=False)
+            sizes.pop(0)
         return self._encoded[key]
 
     @torch.inference_mode()

@@ -1,11 +1,4 @@
-"""The folder that a trained model is used from: what is in it, and how it is read.
-
-    config.json            frames, encoder, language model, calibration; everything below by hash
-    catalogue.json         the properties and objects that it has words for
-    encoder/               encoder.safetensors (prompts or last stage, and heads), statistics.safetensors, backbone/
-    language/              connector.safetensors, adapter/, and words.safetensors where all words were trained
-    base/                  the language model itself, where it was put in
-    README.md              the model card
+"""The folder that a trained model is used from (docs/use.md lists what is in it), and how it is read.
 
 All weights are safetensors, all else is text: reading it runs no code. Apart from `base/` it needs nothing but the base
 language model, which is named by hash.

@@ -147,7 +147,7 @@ class Octopi:
         """
         if memory is not None:
             question = self.reminded(question, _listed(videos), memory)
-        return self._reply([self._prompt((*history, Exchange(question, _listed(videos), "")))], max_new_tokens)[0]
+        return self._reply([self._prompt(question, videos, history)], max_new_tokens)[0]
 
     def stream(
         self,
@@ -158,15 +158,13 @@ class Octopi:
         max_new_tokens: int | None = None,
     ) -> Stream:
         """As `ask`, in pieces of text as they come. Bad input is refused here, before the first piece is asked for."""
-        prompt, features = self._prompt((*history, Exchange(question, _listed(videos), "")))
-        return Stream(self.llm, prompt, features, self._language(max_new_tokens))
+        return Stream(self.llm, *self._prompt(question, videos, history), self._language(max_new_tokens))
 
     def ask_all(
         self, asked: Sequence[tuple[str, Video | Sequence[Video]]], *, max_new_tokens: int | None = None
     ) -> list[str]:
         """As `ask`, of many questions in one batch."""
-        prompts = [self._prompt([Exchange(question, _listed(videos), "")]) for question, videos in asked]
-        return self._reply(prompts, max_new_tokens)
+        return self._reply([self._prompt(question, videos) for question, videos in asked], max_new_tokens)
 
     def look(self, video: Video) -> Touch:
         """The frames of a video that the model is given, and what they show.
@@ -214,7 +212,7 @@ class Octopi:
             )
             described.append(description)
             if sentence and self.config.opd is not Opd.NONE:
-                asked.append(self._prompt([Exchange(opd.TEMPLATES[0], (video,), "")], untouched=True))
+                asked.append(self._prompt(opd.TEMPLATES[0], video, untouched=True))
         said = self._reply(asked, None) or [""] * len(videos)
         return [d.model_copy(update={"sentence": s}) for d, s in zip(described, said, strict=True)]
 
@@ -274,10 +272,8 @@ class Octopi:
         if len(videos) != len(names) or len(videos) not in (2, 3):
             given = f"{counted(len(videos), 'video')} and {counted(len(names), 'name')} ({'; '.join(names)})"
             raise UserError(f"{given}: two or three of each can be matched; write {self._example()}; ...")
-        if isinstance(names, Mapping):
-            objects = [self._described_object(name, classes) for name, classes in names.items()]
-        else:
-            objects = [self._object(name) for name in names]
+        told = names if isinstance(names, Mapping) else {}
+        objects = [self._object(name, told.get(name)) for name in names]
         if len({o.object_id for o in objects}) < len(names):
             raise UserError(f"{', '.join(names)}: a name is given twice; name {len(names)} objects")
         # What the question calls each object, and its own name, which the answer is given in.
@@ -287,7 +283,7 @@ class Octopi:
         listed = [o.name for o in found.values()]
         catalogue = Catalogue(language=self.catalogue.language, objects=found)
         question = pom.asked(pom.OPENINGS[len(listed) == 2], listed)[self.config.opd]
-        if self.config.facts or isinstance(names, Mapping):
+        if self.config.facts or told:
             facts = pom.facts(catalogue, list(found), random.Random(derive_seed("facts", *listed)))
             question = f"{facts} {question}"
         answer = self.ask(question, videos)
@@ -354,9 +350,19 @@ class Octopi:
         return [said.text for said in reply(self.llm, prompts, features, self._language(max_new_tokens), label="")]
 
     def _prompt(
-        self, conversation: Sequence[Exchange], *, untouched: bool = False
+        self,
+        question: str,
+        videos: Video | Sequence[Video],
+        history: Sequence[Exchange] = (),
+        *,
+        untouched: bool = False,
     ) -> tuple[tuple[int, ...], torch.Tensor]:
-        """Token ids of a conversation whose last answer is to be said, and its frames' embeddings."""
+        """Token ids of a conversation whose last answer is to be said, and its frames' embeddings.
+
+        Args:
+            untouched: Lets a video pass in which nothing is touched.
+        """
+        conversation = (*history, Exchange(question, _listed(videos), ""))
         turns = [Turn(user=with_marks(e.question, len(e.videos)), assistant=e.answer) for e in conversation]
         prompt = write_prompt(turns, self.llm.tokenizer, self.config.language, self.config.frames.per_video)
         positions = self.llm.positions
@@ -386,10 +392,15 @@ class Octopi:
         means = (sum(level * p for level, p in enumerate(each)) for each in found.probabilities)
         return list(zip(found.levels, means, strict=True))
 
-    def _object(self, name: str) -> Object:
-        """The object of the catalogue that is named by its name or its id."""
-        objects = self.catalogue.objects
-        known = {o.name.lower(): o for o in objects.values()} | objects
+    def _object(self, name: str, classes: Sequence[str] | None) -> Object:
+        """The catalogue's object of that name or id; or one of these classes, in the order of the properties."""
+        if classes is not None:
+            levels = [p.levels for p in self.catalogue.properties]
+            if len(classes) != len(levels) or any(c not in known for c, known in zip(classes, levels, strict=True)):
+                raise UserError(f"{name} ({', '.join(classes)}): write a class of every property ({self._example()})")
+            ratings = tuple((known.index(c),) for c, known in zip(classes, levels, strict=True))
+            return Object(object_id=name.lower(), name=name, splits={}, ratings=ratings)
+        known = {o.name.lower(): o for o in self.catalogue.objects.values()} | self.catalogue.objects
         for key in (name, name.lower()):
             if key in known:
                 return known[key]
@@ -397,14 +408,6 @@ class Octopi:
         raise UserError(
             f"{name}: the model's catalogue has no such object; {hint}tell what it is like ({self._example()})"
         )
-
-    def _described_object(self, name: str, classes: Sequence[str]) -> Object:
-        """An object that the caller describes by its classes, in the order of the properties."""
-        levels = [p.levels for p in self.catalogue.properties]
-        if len(classes) != len(levels) or any(c not in known for c, known in zip(classes, levels, strict=True)):
-            raise UserError(f"{name} ({', '.join(classes)}): write a class of every property ({self._example()})")
-        ratings = tuple((known.index(c),) for c, known in zip(classes, levels, strict=True))
-        return Object(object_id=name.lower(), name=name, splits={}, ratings=ratings)
 
     def _example(self) -> str:
         return "NAME: " + ", ".join("|".join(p.levels) for p in self.catalogue.properties)

@@ -64,16 +64,16 @@ def package(data: Path, params: Params, variant: Variant, base: Base, out: Path)
     catalogue = load_catalogue(Path(params.data.catalogue))
     classified = read_table(data / "encoder" / str(variant.seed) / "classifications.parquet", Classification)
     embeddings = data / "embeddings" / f"{variant.encoder}-{variant.seed}"
-    by_property = {p.name: [c for c in classified if c.property == p.name] for p in catalogue.properties}
+    validated = [c for c in classified if c.part == Part.VALIDATION]
     temperatures = {
-        name: fit_temperature([c for c in rows if c.part == Part.VALIDATION]) for name, rows in by_property.items()
+        p.name: fit_temperature([c for c in validated if c.property == p.name]) for p in catalogue.properties
     }
     report, seed = Path("reports") / params.report_name, str(params.split.replicate_of(variant.seed))
     scores = _scores(report / "scores.csv", (variant.encoder, variant.lora, variant.opd, Touch.REAL, seed))
     ruled = _scores(report / "scores.csv", (variant.encoder, "", "", Touch.REAL, seed))
     with atomic_folder(out) as folder:
         _copy(data / "encoder" / str(variant.seed) / TRAINED, folder / ENCODER_DIR / TRAINED)
-        files, card = backbone_files(params.encoder), Path(params.encoder.weights) / CARD_FILE
+        files, card = backbone_files(encoder), Path(encoder.weights) / CARD_FILE
         if card.is_file() and any(file.parent == card.parent for file in files):
             files.append(card)
         if "timm" in encoder.backbone:

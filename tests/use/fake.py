@@ -12,15 +12,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from pipeline.config import FramesConfig
 from pipeline.core.errors import UserError
+from pipeline.use.frames import read_touch
 from pipeline.use.model import with_marks
 from pipeline.use.results import Description, Touch, Video
 from pipeline.use.server import listen, make_server
-from pipeline.videos.files import VideoFile
-from pipeline.videos.frames.scan import Scan, scan
 from tests.conftest import HUNG
 from tests.use.videos import uri
 
@@ -50,21 +47,8 @@ class FakeOctopi:
 
     def look(self, video: Path) -> Touch:
         self.threads.add(threading.get_ident())
-        settings = FramesConfig(pixels=96, fraction=0.15, selection="contact")
-        found = scan(VideoFile(video, str(video), "x", "x_0"), settings)
-        if not isinstance(found, Scan):
-            raise UserError(f"{video}: {found.measured}")
-        frames = np.stack([kept.image for kept in found.kept])
-        difference = 128 + (frames.astype(int) - found.reference) // 2
-        return Touch(
-            frames=frames,
-            numbers=tuple(kept.index for kept in found.kept),
-            reference=found.reference,
-            difference=np.clip(difference, 0, 255).astype(np.uint8),
-            contact=0.25,
-            strength=found.probe.contact,
-            notes=(),
-        )
+        settings = FramesConfig(pixels=96, fraction=0.15, per_video=KEPT, selection="contact")
+        return read_touch(video, settings, quiet=0.0)
 
     def describe(self, video: Video, *, sentence: bool = True) -> Description:
         share = {p: {level: 1 / 2 ** (i + 1) for i, level in enumerate(names)} for p, names in LEVELS.items()}

@@ -91,7 +91,7 @@ def test_it_imports_nothing_of_ours() -> None:
 
 
 def test_a_question_about_files_is_answered_piece_by_piece(node: Any, tmp_path: Path) -> None:
-    videos = [press(tmp_path / "a.mp4"), press(tmp_path / "b.mkv", turned=True)]
+    videos = [press(tmp_path / "a.mp4"), press(tmp_path / "b.mkv", begin=12)]
     asked = goal("Is {tactile} softer than {tactile} ?", *videos)
     result = node.execute(asked)
     assert (asked.ends, result.error) == (["succeed"], "")

@@ -31,18 +31,6 @@ def blank(count: int, width: int = 16, height: int = 16) -> bytes:
         return encode(Path(folder, "v.mp4"), (frame for _ in range(count)), "mpeg4", "yuv420p").read_bytes()
 
 
-def press(file: Path, turned: bool = False) -> Path:
-    """A video of a disc that presses into a sensor's uneven light."""
-    y, x = np.mgrid[:96, :128]
-    ground = np.stack([90 + x / 3, 110 + y / 3, 100 + (x + y) / 5], axis=2)
-    frames = []
-    for index in range(30):
-        depth = max(0.0, min(index - 8, 28 - index, 6)) * 8
-        side = np.sign((y - 48) if turned else (x - 64)) * (np.hypot(x - 64, y - 48) < 22)
-        frames.append(np.clip(ground + depth * side[:, :, None], 0, 255).astype(np.uint8))
-    return encode(file, frames, codec="mpeg4", pixels="yuv420p", bits=2_000_000)
-
-
 def recording(
     touched: Sequence[range], length: int, height: int = 48, width: int = 64, drift: float = 0.0
 ) -> list[np.ndarray]:
@@ -57,6 +45,12 @@ def recording(
         light = drift * index * np.cos(x / 20)[:, :, None]
         pictures.append(np.clip(ground + light + pressed + rng.normal(0, 1, ground.shape), 0, 255).astype(np.uint8))
     return pictures
+
+
+def press(file: Path, begin: int = 8) -> Path:
+    """A video of a disc of 24 pixels' radius that presses into a sensor of 128 x 96 pixels."""
+    frames = recording([range(begin, 26)], 30, height=96, width=128)
+    return encode(file, frames, codec="mpeg4", pixels="yuv420p", bits=2_000_000)
 
 
 def uri(data: bytes, kind: str = "video/mp4") -> str:
