@@ -19,9 +19,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fastapi import APIRouter, Depends, FastAPI, Request
-from fastapi.exceptions import HTTPException
 from fastapi.responses import JSONResponse, PlainTextResponse, Response, StreamingResponse
-from starlette.exceptions import HTTPException as AnyHTTPException
+from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -217,7 +216,7 @@ async def _events(reply: Reply, first: str, pieces: AsyncGenerator[str]) -> Asyn
 
 def _client_message(error: Exception) -> tuple[str, int]:
     """What a client is told of an error, and the status."""
-    if isinstance(error, AnyHTTPException):
+    if isinstance(error, HTTPException):
         return str(error.detail), error.status_code
     status = error.status if isinstance(error, Refused) else 422 if isinstance(error, UserError) else 500
     # Videos lie in a folder of ours, whose name is nobody's business.
@@ -264,19 +263,19 @@ def make_app(model: Octopi, name: str, *, token: str = "", limits: Limits | None
     async def health() -> Json:
         return {"status": "ok", "model": name, "waiting": len(service.taken), "places": places}
 
-    @app.exception_handler(AnyHTTPException)
+    @app.exception_handler(HTTPException)
     @app.exception_handler(UserError)
     @app.exception_handler(Failed)
     async def refuse(request: Request, error: Exception) -> Response:
         message, status = _client_message(error)
         if status != 408:
             # The rest of the body is read: a client that is still sending would not see the answer.
-            left = 4 * service.gate.limits.body_bytes
+            rest = 4 * service.gate.limits.body_bytes
             with suppress(Exception):
                 async with asyncio.timeout(DRAIN_SECONDS):
                     async for chunk in request.stream():
-                        left -= len(chunk)
-                        if left < 0:
+                        rest -= len(chunk)
+                        if rest < 0:
                             break
         return JSONResponse(error_body(message, status), status, getattr(error, "headers", None))
 
