@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.config import FramesConfig, ScenesConfig
+from pipeline.config import ScenesConfig
 from pipeline.core.records import Assignment, Finding, Part, Probe, Severity
 from pipeline.core.runtime import derive_seed
 from pipeline.scenes.light import make_sensor
@@ -15,9 +15,8 @@ from pipeline.scenes.recipe import recipe_of
 from pipeline.scenes.render import make_scene, render
 from pipeline.videos.audit.leakage import check_leakage
 from pipeline.videos.catalogue import Catalogue, load_catalogue
-from pipeline.videos.files import VideoFile
-from pipeline.videos.frames.scan import Scan, scan
 from tests.closure import ROOT
+from tests.frame_rules import scanned
 
 ERROR, WARNING, INFO = Severity.ERROR, Severity.WARNING, Severity.INFO
 PHYSICLEAR = load_catalogue(ROOT / "pipeline" / "physiclear")
@@ -94,6 +93,4 @@ def recorded(object_id: str, seed: int, sensor: int = 0) -> list[np.ndarray]:
 
 
 def look_at(path: Path, video_id: str) -> Probe:
-    found = scan(VideoFile(path, path.name, video_id.rpartition("_")[0], video_id), FramesConfig(pixels=16))
-    assert isinstance(found, Scan)
-    return found.probe
+    return scanned(path, video_id=video_id).probe

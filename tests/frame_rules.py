@@ -15,7 +15,9 @@ from PIL import Image as Pillow
 from pipeline.config import FramesConfig
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.decoding import Decoder, planes
+from pipeline.videos.files import VideoFile
 from pipeline.videos.frames.extract import Extraction, extract_frames
+from pipeline.videos.frames.scan import Scan, scan
 
 CONFIG = FramesConfig(pixels=16)
 FILES = ("frames.npy", "references.npy", "frames.parquet", "probes.parquet")
@@ -44,6 +46,12 @@ def pressing(count: int, seed: int = 0, width: int = 80, height: int = 60) -> li
 def frames_of(path: Path) -> list[av.VideoFrame]:
     with Decoder(path) as decoder:
         return list(decoder.frames())
+
+
+def scanned(path: Path, config: FramesConfig = CONFIG, video_id: str = "rug_0") -> Scan:
+    found = scan(VideoFile(path, path.name, video_id.rpartition("_")[0], video_id), config)
+    assert isinstance(found, Scan)
+    return found
 
 
 def salience(frames: Sequence[np.ndarray], fraction: str) -> list[tuple[int, float]]:

@@ -6,10 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pipeline.scenes.bumps import Digits, Domes, Plates, Ridges
 from pipeline.scenes.geometry import Bar, Body, Flat, Round, Wedge
 from pipeline.scenes.recipe import Recipe
-from pipeline.scenes.relief import AnyLayer, Creases, Grains, Rough, Strands, Weave
+from pipeline.scenes.relief import AnyLayer, Creases, Digits, Domes, Grains, Plates, Ridges, Rough, Strands, Weave
 
 MODULUS_MPA = (0.015, 100.0)
 """Beyond a hundred times the gel's modulus nothing changes."""

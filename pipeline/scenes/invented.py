@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -90,8 +90,9 @@ def write_catalogue(config: InventConfig, folder: Path) -> None:
     """
     work = CHECKPOINTS / "invent" / fingerprint(config.seed, *code_of("invent"))
     work.mkdir(parents=True, exist_ok=True)
-    jobs = [_Job(n, config.seed, work / f"{n:05d}.json") for n in range(config.objects)]
-    for _ in run_parallel(_draw, [job for job in jobs if not job.file.is_file()], "invented objects", "object"):
+    files = [work / f"{number:05d}.json" for number in range(config.objects)]
+    missing = [file for file in files if not file.is_file()]
+    for _ in run_parallel(partial(_draw, config.seed), missing, "invented objects", "object"):
         pass
     catalogue = invented_catalogue(config)
     with atomic_folder(folder) as new:
@@ -101,8 +102,8 @@ def write_catalogue(config: InventConfig, folder: Path) -> None:
         header = ",".join(("object_id", "name", *catalogue.property_names))
         write_text(new / OBJECTS, "\n".join([header, *rows]) + "\n")
         # JSON is YAML, and is written and read many times as fast.
-        entries = zip(catalogue.objects, jobs, strict=True)
-        write_text(new / SCENES, "".join(f"{o}: {job.file.read_text()}\n" for o, job in entries))
+        entries = zip(catalogue.objects, files, strict=True)
+        write_text(new / SCENES, "".join(f"{o}: {file.read_text()}\n" for o, file in entries))
 
 
 def draw(classes: tuple[int, int, int], rng: np.random.Generator) -> Recipe:
@@ -130,17 +131,9 @@ def _measures(recipe: Recipe, roughness: int, bumpiness: int, force: float, rng:
     return BUMPS[bumpiness][0] <= bump_share(skin[view], PITCH) <= BUMPS[bumpiness][1]
 
 
-@dataclass(frozen=True)
-class _Job:
-    number: int
-    seed: int
-    file: Path
-
-    def __str__(self) -> str:
-        return f"object {self.number}"
-
-
-def _draw(job: _Job) -> None:
+def _draw(seed: int, file: Path) -> None:
+    """Draw the object whose number a file is named after."""
     cv2.setNumThreads(1)
-    rng = np.random.default_rng(derive_seed(job.seed, "invented", job.number))
-    write_text(job.file, json.dumps(draw(classes_of(job.number), rng).model_dump(mode="json")))
+    number = int(file.stem)
+    rng = np.random.default_rng(derive_seed(seed, "invented", number))
+    write_text(file, json.dumps(draw(classes_of(number), rng).model_dump(mode="json")))

@@ -18,9 +18,8 @@ from pipeline.config.params import OneKeyLoader
 from pipeline.core.errors import UserError, first_problem
 from pipeline.core.records import Record
 from pipeline.core.runtime import derive_seed
-from pipeline.scenes.bumps import Domes, Ridges
 from pipeline.scenes.geometry import IMAGE_MM, Body, Flat, Round
-from pipeline.scenes.relief import AnyLayer, Rough
+from pipeline.scenes.relief import AnyLayer, Domes, Ridges, Rough
 from pipeline.videos.catalogue import Catalogue
 
 SCENES = "scenes.yaml"
@@ -63,8 +62,7 @@ def load_recipes(folder: Path, catalogue: Catalogue, seed: int) -> dict[str, Rec
     """A recipe for every object of the catalogue: listed in the folder's `scenes.yaml`, else drawn by `recipe_of`.
 
     Raises:
-        UserError: naming file, object and key, for what is no YAML, an unknown object, a missing, unknown or
-            impossible value; and as `recipe_of` where an object has to be drawn.
+        UserError: naming file, object and key; and as `recipe_of` where an object has to be drawn.
     """
     listed = _read(folder / SCENES, catalogue) if (folder / SCENES).is_file() else {}
     return {o: listed[o] if o in listed else recipe_of(o, catalogue, seed) for o in catalogue.objects}

@@ -2,8 +2,8 @@
 
 A layer is a frozen record with the key `kind`, so that a line of YAML is a layer. Its `sample` gives one random patch
 (side x side, mm, pointing towards the sensor) from a generator; layers of a surface add up. Statistics do not depend on
-the grid's pitch, down to what the grid can carry. Here are the textures that cover everything; `bumps` has those that
-stand alone.
+the grid's pitch, down to what the grid can carry. First come textures that cover everything, then bumps that stand
+alone.
 """
 
 from __future__ import annotations
@@ -11,27 +11,67 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal
 
+import cv2
 import numpy as np
+import scipy.fft
 from pydantic import Field
 
-from pipeline.scenes.bumps import Digits, Domes, Plates, Ridges
-from pipeline.scenes.grid import (
-    Degrees,
-    Grid,
-    Heights,
-    Layer,
-    Length,
-    Relief,
-    Share,
-    field,
-    shifted,
-    thread,
-    waves,
-    window,
-)
+from pipeline.core.records import Record
+from pipeline.scenes.grid import Grid, Heights, Length
+
+Relief = Annotated[float, Field(ge=-5, le=5, allow_inf_nan=False)]
+"""Height in mm; below 0 for pits, grooves and engraving."""
+Share = Annotated[float, Field(ge=0, le=1)]
+Degrees = Annotated[float, Field(ge=-360, le=360)]
+DRAWN_MM = 0.06
+"""Digits are drawn at least this fine, whatever the grid."""
 
 
-class Rough(Layer):
+def cap(radius: Heights, edge: float) -> Heights:
+    """1 inside, 0 from radius 1 on, a raised cosine over the outer `edge`."""
+    flank: Heights = np.cos(np.clip((radius - (1 - edge)) / edge, 0, 1) * np.float32(math.pi / 2)) ** 2
+    return flank
+
+
+def thread(offset: Heights, radius: float) -> Heights:
+    """The upper half of a cylinder, 0 on top; beside it as deep as its middle."""
+    upper: Heights = np.sqrt(np.maximum(np.float32(radius * radius) - offset * offset, 0)) - np.float32(radius)
+    return upper
+
+
+def shifted(grid: Grid, angle: float, across: float, along: float, rng: np.random.Generator) -> tuple[Heights, Heights]:
+    """Coordinates across and along the body, turned by `angle` and shifted by a random part of a period."""
+    u, v = grid.axes(angle)
+    return u + np.float32(rng.uniform(0, across)), v + np.float32(rng.uniform(0, along))
+
+
+def waves(grid: Grid, degrees: float = 0.0, stretch: float = 1.0) -> Heights:
+    """Wave numbers 1 / wavelength in 1/mm of a half spectrum, lengthened `stretch` times along a direction."""
+    side = scipy.fft.next_fast_len(grid.side, real=True)
+    qx = np.fft.rfftfreq(side, grid.pitch).astype(np.float32)[None, :]
+    qy = np.fft.fftfreq(side, grid.pitch).astype(np.float32)[:, None]
+    cosine, sine = np.float32(math.cos(math.radians(degrees))), np.float32(math.sin(math.radians(degrees)))
+    return np.hypot(qx * cosine + qy * sine, (qy * cosine - qx * sine) * np.float32(stretch))
+
+
+def field(grid: Grid, amplitude: Heights, rng: np.random.Generator) -> Heights:
+    """A Gaussian random field with these amplitudes, mean 0 and variance 1 over the patch (0 where all are 0)."""
+    side = amplitude.shape[0]
+    noise = scipy.fft.rfft2(rng.standard_normal((side, side), dtype=np.float32))
+    values: Heights = scipy.fft.irfft2(noise * amplitude, s=(side, side))[: grid.side, : grid.side]
+    values = values - values.mean()
+    spread = float(values.std())
+    return values / np.float32(spread) if spread > 0 else values
+
+
+def window(centre: float, radius: float, grid: Grid) -> slice:
+    """The pixels of a row or column within `radius` mm of a place; may be empty."""
+    middle = (grid.side - 1) / 2
+    first = max(0, math.ceil((centre - radius) / grid.pitch + middle))
+    return slice(first, max(first, math.floor((centre + radius) / grid.pitch + middle) + 1))
+
+
+class Rough(Record):
     """Self-affine roughness: amplitude ~ q^-(1 + H) up to the wavelength `longest`, none beyond.
 
     Persson et al., J. Phys.: Condens. Matter 17 (2005) R1, eq. 3. Waves that the grid cannot carry are left out, not
@@ -61,7 +101,7 @@ class Rough(Layer):
         return field(grid, amplitude, rng) * np.float32(self.rms * math.sqrt(carried))
 
 
-class Creases(Layer):
+class Creases(Record):
     """Crumpled paper: facets between folds; a height below 0 makes the facets cushions.
 
     height (1 - (sqrt(g^2 + fold^2) - fold) / 2), where g is a Gaussian field of one wavelength and variance 1.
@@ -85,7 +125,7 @@ class Creases(Layer):
         return np.float32(self.height) * (1 - (apart - np.float32(self.fold)) * np.float32(0.5))
 
 
-class Weave(Layer):
+class Weave(Record):
     """Cloth: two crossing families of round threads that bend over and under each other.
 
     Peirce, J. Textile Inst. 28 (1937) T45: the axis of thread k runs at (crimp / 2) cos(2 pi (v / s + k) / repeat),
@@ -117,7 +157,7 @@ class Weave(Layer):
         return bent
 
 
-class Strands(Layer):
+class Strands(Record):
     """Bundles of long round strands side by side: sides of bristles, wires, cords, hair, wool.
 
     Each strand is a cylinder at a depth of its own; a bundle meanders as a whole. Several bundles in random directions
@@ -148,7 +188,7 @@ class Strands(Layer):
         return total
 
 
-class Grains(Layer):
+class Grains(Record):
     """A heap of ellipsoids in random places, directions and depths, seen from above: rice, millet, crumbs.
 
     Their outlines add up to `packing` of the surface; the envelope of the upper halves is what can be touched.
@@ -183,6 +223,118 @@ class Grains(Layer):
             seen = total[rows, columns]
             np.maximum(seen, np.where(rest > 0, upper, -np.inf), out=seen)
         return total
+
+
+class Domes(Record):
+    """Round bumps on a hexagonal lattice, each strayed at random: peel, dots, buttons, loops of pile, ends of bristles.
+
+    Where none meet they cover occupied pi w^2 / (2 sqrt 3 s^2) of the surface (density of a hexagonal packing).
+    """
+
+    kind: Literal["domes"] = "domes"
+    height: Relief
+    width: Length
+    spacing: Length
+    """Between centres."""
+    edge: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """Share of the radius over which the flank falls: 1 a dome, little a button with a flat top."""
+    jitter: Share = 0.3
+    """How far they stray, as a share of half the spacing; bumps that meet do not add up."""
+    occupied: Share = 1.0
+    """Share of the lattice's places that bear a bump."""
+    uneven: Share = 0.2
+    """By which share heights differ."""
+
+    def sample(self, grid: Grid, rng: np.random.Generator) -> Heights:
+        """One bump after the other, each into the few pixels that it covers."""
+        half, stray = self.width / 2, self.jitter * self.spacing / 2
+        rise = self.spacing * math.sqrt(3) / 2
+        reach = grid.span / 2 + half + stray
+        numbers = np.arange(-math.ceil(reach / rise) - 1, math.ceil(reach / rise) + 2)
+        column, row = np.meshgrid(numbers, numbers)
+        places = np.stack([(column + row % 2 / 2) * self.spacing, row * rise], axis=-1).reshape(-1, 2)
+        places += rng.uniform(0, 1, 2) * (self.spacing, rise) + stray * rng.uniform(-1, 1, places.shape)
+        tall = 1 - self.uneven * rng.random(len(places), dtype=np.float32)
+        kept = (rng.random(len(places)) < self.occupied) & (np.abs(places).max(axis=1) < grid.span / 2 + half)
+        total, x = np.zeros((grid.side, grid.side), np.float32), grid.line()
+        for (px, py), height in zip(places[kept], tall[kept], strict=True):
+            columns, rows = window(px, half, grid), window(py, half, grid)
+            radius: Heights = np.hypot(x[None, columns] - np.float32(px), x[rows, None] - np.float32(py))
+            radius /= np.float32(half)
+            seen = total[rows, columns]
+            np.maximum(seen, height * cap(radius, self.edge), out=seen)
+        return total * np.float32(self.height)
+
+
+class Ridges(Record):
+    """Parallel ridges with the profile of `Domes`: ribs, grooves, corrugation, seams."""
+
+    kind: Literal["ridges"] = "ridges"
+    height: Relief
+    width: Length
+    spacing: Length
+    edge: Annotated[float, Field(gt=0, le=1)] = 1.0
+    angle: Degrees = 0.0
+    """Direction of the ridges; 0 along the body."""
+
+    def sample(self, grid: Grid, rng: np.random.Generator) -> Heights:
+        """In a random place."""
+        spacing = max(self.spacing, self.width)
+        u, _ = shifted(grid, self.angle, spacing, spacing, rng)
+        offset: Heights = np.abs(u - np.round(u / spacing) * spacing)
+        return np.float32(self.height) * cap(offset / np.float32(self.width / 2), self.edge)
+
+
+class Plates(Record):
+    """Raised rectangles with round corners (superellipses of power 4) on a lattice: keys, tiles, basketwork."""
+
+    kind: Literal["plates"] = "plates"
+    height: Relief
+    size: tuple[Length, Length]
+    """Across and along the body."""
+    gap: Length
+    edge: Annotated[float, Field(gt=0, le=1)] = 0.3
+    uneven: Share = 0.0
+
+    def sample(self, grid: Grid, rng: np.random.Generator) -> Heights:
+        """In a random place of the lattice."""
+        across, along = self.size[0] + self.gap, self.size[1] + self.gap
+        u, v = shifted(grid, 0.0, across, along, rng)
+        column, row = np.round(u / across), np.round(v / along)
+        du, dv = (u - column * across) / (self.size[0] / 2), (v - row * along) / (self.size[1] / 2)
+        radius: Heights = np.sqrt(np.hypot(np.square(du), np.square(dv)))
+        table = rng.random((64, 64), dtype=np.float32)
+        tall = 1 - self.uneven * table[row.astype(np.intp) & 63, column.astype(np.intp) & 63]
+        raised: Heights = np.float32(self.height) * tall * cap(radius, self.edge)
+        return raised
+
+
+class Digits(Record):
+    """Random digits in rows, embossed or (height below 0) engraved: number wheels, stamped codes."""
+
+    kind: Literal["digits"] = "digits"
+    height: Relief
+    size: Length
+    """Height of a digit."""
+    stroke: Length
+    spacing: tuple[Length, Length]
+    """Between digits and between rows."""
+
+    def sample(self, grid: Grid, rng: np.random.Generator) -> Heights:
+        """Hershey's strokes (OpenCV), rounded by a Gaussian of a quarter of their width."""
+        finer = math.ceil(grid.pitch / DRAWN_MM)
+        pixel, side = grid.pitch / finer, grid.side * finer
+        canvas = np.zeros((side, side), np.uint8)
+        scale = self.size / pixel / 21  # Digits of this font are 21 pixels high.
+        steps = (self.spacing[0] / pixel, self.spacing[1] / pixel)
+        for y in np.arange(rng.uniform(0, steps[1]), side + steps[1], steps[1]):
+            for x in np.arange(rng.uniform(-1, 0) * steps[0], side, steps[0]):
+                place = (round(x), round(y))
+                thick = max(1, round(self.stroke / pixel))
+                cv2.putText(canvas, str(rng.integers(10)), place, cv2.FONT_HERSHEY_SIMPLEX, scale, 255, thick)
+        smooth = cv2.GaussianBlur(canvas.astype(np.float32), (0, 0), max(0.5, self.stroke / 4 / pixel))
+        drawn: Heights = cv2.resize(smooth, (grid.side, grid.side), interpolation=cv2.INTER_AREA)
+        return drawn * np.float32(self.height / 255)
 
 
 AnyLayer = Annotated[

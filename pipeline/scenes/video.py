@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -67,15 +68,12 @@ def synthesize(recipes: Mapping[str, Recipe], config: ScenesConfig, folder: Path
     if unknown:
         raise UserError(f"scenes.objects: {', '.join(unknown)} is not in the catalogue; take ids from objects.csv")
     folder.mkdir(parents=True, exist_ok=True)
+    objects, numbers = sorted(set(config.objects) or recipes), range(config.videos_per_object)
+    jobs = [_Job(o, n, recipes[o]) for o in objects for n in numbers]
     rows = []
     # A video waits in a hidden folder until it is whole.
     with tempfile.TemporaryDirectory(f".{os.getpid()}.part", ".", folder) as staging:
-        jobs = [
-            _Job(recipes[o], config, derive_seed(config.seed, o, n), o, f"{o}_{n}.mp4", Path(staging))
-            for o in sorted(set(config.objects) or recipes)
-            for n in range(config.videos_per_object)
-        ]
-        for row in run_parallel(_write, jobs, "scenes", "video"):
+        for row in run_parallel(partial(_write, Path(staging), config), jobs, "scenes", "video"):
             os.replace(Path(staging) / row.video, folder / row.video)
             rows.append(row)
     return sorted(rows, key=lambda row: row.video)
@@ -92,32 +90,26 @@ def share_as_labelled(rows: Sequence[SceneRow], catalogue: Catalogue) -> float:
     return round(fitting / len(rows), 4)
 
 
-@dataclass(frozen=True)
-class _Job:
-    """All that a process needs to make one video."""
-
-    recipe: Recipe
-    config: ScenesConfig
-    seed: int
+class _Job(NamedTuple):
     object_id: str
-    name: str
-    staging: Path
+    number: int
+    recipe: Recipe
 
     def __str__(self) -> str:
-        return self.name
+        return f"{self.object_id}_{self.number}.mp4"
 
 
-def _write(job: _Job) -> SceneRow:
-    config, path = job.config, job.staging / job.name
+def _write(staging: Path, config: ScenesConfig, job: _Job) -> SceneRow:
+    recipe, seed = job.recipe, derive_seed(config.seed, job.object_id, job.number)
     frames, fps = config.frames, config.fps
     if frames == "recorded":
-        frames, fps = draw_length(np.random.default_rng(derive_seed(job.seed, "length")))
-    sensor = make_sensor(config.width, config.height, derive_seed(config.seed, "sensor", job.seed % SENSORS))
-    scene = make_scene(job.recipe, config, frames, job.seed)
-    write_film(path, render(scene, config, sensor, job.seed), fps)
-    imprint, measured = scene.imprint, measure_scene(scene, job.recipe, config)
+        frames, fps = draw_length(np.random.default_rng(derive_seed(seed, "length")))
+    sensor = make_sensor(config.width, config.height, derive_seed(config.seed, "sensor", seed % SENSORS))
+    scene = make_scene(recipe, config, frames, seed)
+    write_film(staging / str(job), render(scene, config, sensor, seed), fps)
+    imprint, measured = scene.imprint, measure_scene(scene, recipe, config)
     return SceneRow(
-        video=job.name,
+        video=str(job),
         object_id=job.object_id,
         frames=frames,
         fps=fps,
@@ -125,7 +117,7 @@ def _write(job: _Job) -> SceneRow:
         method=str(imprint.method),
         error=None if imprint.error is None else round(imprint.error, 4),
         residual=round(imprint.residual, 6),
-        modulus=job.recipe.modulus,
+        modulus=recipe.modulus,
         texture=round(measured.texture, 5),
         bump=round(measured.bump, 4),
         hardness=measured.hardness,

@@ -33,7 +33,6 @@ FULL_RANGE, BT709 = 2, 1
 """As FFmpeg numbers colour ranges and colour spaces."""
 HDR = (16, 18)
 """PQ and HLG, as ITU-T H.273 numbers transfer characteristics."""
-
 REFORMATTER = VideoReformatter()
 """One a process: it keeps its tables from frame to frame."""
 
@@ -65,14 +64,13 @@ class Decoder:
         stream.thread_type = "NONE"
         stream.codec_context.thread_count = 1
         fps = float(stream.average_rate or 0)
+        fps = fps if math.isfinite(fps) and fps > 0 else 0.0
         seconds = float(stream.duration * stream.time_base) if stream.duration and stream.time_base else 0.0
-        valid = math.isfinite(fps) and fps > 0
         promised = stream.frames
         if promised and "mov" in self._container.format.name:
             # An edit list may show fewer frames than are stored.
             promised = sum(not entry.is_discard for entry in stream.index_entries)
-        frames = promised or (round(seconds * fps) if valid else 0)
-        self.header = Header(frames, fps if valid else 0.0, stream.codec_context.color_trc in HDR)
+        self.header = Header(promised or round(seconds * fps), fps, stream.codec_context.color_trc in HDR)
 
     def __enter__(self) -> Self:
         return self
@@ -126,19 +124,10 @@ def turns(frame: av.VideoFrame) -> int:
     return round(frame.rotation / 90) % 4
 
 
-def brightness(frame: av.VideoFrame) -> Image:
-    """The first plane of a frame, uint8, height x width: a view that keeps the frame alive."""
-    return _plane(frame.planes[0])
-
-
 def planes(frame: av.VideoFrame) -> tuple[Image, ...]:
-    """Brightness and the two colour differences, as `brightness`; each has a height and width of its own."""
-    return tuple(_plane(plane) for plane in frame.planes)
-
-
-def _plane(plane: av.video.plane.VideoPlane) -> Image:
-    padded: Image = np.frombuffer(memoryview(plane), np.uint8).reshape(plane.height, plane.line_size)
-    return padded[:, : plane.width]
+    """Brightness and two colour differences, each uint8, height x width of its own: views that keep the frame alive."""
+    padded = [np.frombuffer(memoryview(p), np.uint8).reshape(p.height, p.line_size) for p in frame.planes]
+    return tuple(plane[:, : own.width] for plane, own in zip(padded, frame.planes, strict=True))
 
 
 @cache
@@ -146,17 +135,11 @@ def _colours(full: bool, bt709: bool) -> npt.NDArray[np.float64]:
     """The 3 x 4 matrix from (Y, U, V, 1) to (R, G, B) in 8-bit steps."""
     red, blue = (0.2126, 0.0722) if bt709 else (0.299, 0.114)
     green = 1 - red - blue
-    matrix = np.array(
-        [
-            [1, 0, 2 * (1 - red)],
-            [1, -2 * blue * (1 - blue) / green, -2 * red * (1 - red) / green],
-            [1, 2 * (1 - blue), 0],
-        ]
-    )
-    scale = np.ones(3) if full else np.array([255 / 219, 255 / 224, 255 / 224])
-    matrix = matrix * scale
-    shift = -matrix @ np.array([0 if full else 16, 128, 128])
-    return np.column_stack([matrix, shift])
+    from_green = -2 * blue * (1 - blue) / green, -2 * red * (1 - red) / green
+    matrix = np.array([[1, 0, 2 * (1 - red)], [1, *from_green], [1, 2 * (1 - blue), 0]])
+    if not full:
+        matrix = matrix * np.array([255 / 219, 255 / 224, 255 / 224])
+    return np.column_stack([matrix, -matrix @ np.array([0 if full else 16, 128, 128])])
 
 
 def _reformat(frame: av.VideoFrame, pixels: str) -> av.VideoFrame:

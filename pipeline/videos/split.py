@@ -27,20 +27,7 @@ ORIGIN = "paper"
 
 
 def assign(catalogue: Catalogue, videos: Sequence[Video], config: SplitConfig, seed: int = 0) -> list[Assignment]:
-    """Put every video into a part of the split of one seed, by its object.
-
-    `development` tests on some of the paper's training objects and leaves the paper's test objects unused. `kfold`
-    deals all objects that have videos into folds: the seed's fold is for test, so that over all folds every object is
-    tested once. One in eight of the other objects is for validation. Of the rest `train_objects` are for training, 0
-    being all. Any other name is that of a `split_` column of the catalogue.
-
-    Args:
-        seed: of `ablation.seeds`; only kfold has another split for another one.
-
-    Raises:
-        UserError: if there is no such split, no training video remains, there are too few objects for the test
-            objects or folds asked for, or (with `missing: error`) a validation or test object has no video.
-    """
+    """Put every video into the part of its object (`assign_objects`)."""
     parts = assign_objects(catalogue, {video.object_id for video in videos}, config, seed)
     return [
         Assignment(video_id=v.video_id, object_id=v.object_id, part=parts.get(v.object_id, Part.UNUSED)) for v in videos
@@ -50,10 +37,20 @@ def assign(catalogue: Catalogue, videos: Sequence[Video], config: SplitConfig, s
 def assign_objects(
     catalogue: Catalogue, present: Collection[str], config: SplitConfig, seed: int = 0
 ) -> dict[str, Part]:
-    """The part of each object under one seed, by id; `present` are the objects that have videos.
+    """The part of each object under one seed, by id.
+
+    `development` tests on some of the paper's training objects and leaves the paper's test objects unused. `kfold`
+    deals all objects that have videos into folds: the seed's fold is for test, so that over all folds every object is
+    tested once. One in eight of the other objects is for validation. Of the rest `train_objects` are for training, 0
+    being all. Any other name is that of a `split_` column of the catalogue.
+
+    Args:
+        present: the objects that have videos.
+        seed: of `ablation.seeds`; only kfold has another split for another one.
 
     Raises:
-        UserError: as `assign`.
+        UserError: if there is no such split, no training video remains, there are too few objects for the test
+            objects or folds asked for, or (with `missing: error`) a validation or test object has no video.
     """
     columns, name = catalogue.split_names, config.name
     ruled = [rule for rule in RULED_SPLITS if rule != "development" or ORIGIN in columns]

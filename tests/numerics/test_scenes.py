@@ -14,9 +14,9 @@ import pytest
 from pipeline.scenes.contact import Method, press
 from pipeline.scenes.elastic.kernels import Gel, Kernel, half_space_table, layer_table, make_kernel
 from pipeline.scenes.elastic.solver import Solution, solve
-from pipeline.scenes.grid import Grid, thread
+from pipeline.scenes.grid import Grid
 from pipeline.scenes.light import make_sensor, shade
-from pipeline.scenes.relief import Rough
+from pipeline.scenes.relief import Rough, thread
 from tests.numerics.bounds import summing
 from tests.numerics.harness import FLOAT32, FLOAT64, SOLVED, Check, Floats, Format, formats
 

@@ -8,10 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.scenes.bumps import Domes, Ridges
 from pipeline.scenes.geometry import IMAGE_MM
 from pipeline.scenes.recipe import BUMP_SHARE, MODULUS_MPA, ROUGH_RMS_MM, load_recipes, recipe_of
-from pipeline.scenes.relief import Rough
+from pipeline.scenes.relief import Domes, Ridges, Rough
 from pipeline.videos.catalogue import Catalogue
 from tests.conftest import ROOT, refused
 

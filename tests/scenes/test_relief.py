@@ -10,12 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.scenes.bumps import Digits, Domes, Plates, Ridges
-from pipeline.scenes.grid import Grid, Layer
-from pipeline.scenes.relief import Creases, Grains, Rough, Strands, Weave
+from pipeline.scenes.grid import Grid
+from pipeline.scenes.relief import AnyLayer, Creases, Digits, Domes, Grains, Plates, Ridges, Rough, Strands, Weave
 
 GRID = Grid(320, 0.1)
-LAYERS: tuple[Layer, ...] = (
+LAYERS: tuple[AnyLayer, ...] = (
     Rough(rms=0.03, longest=2.0),
     Rough(rms=0.03, longest=2.0, stretch=4, angle=30),
     Creases(height=0.3, spacing=2.0),
@@ -31,12 +30,12 @@ LAYERS: tuple[Layer, ...] = (
 )
 
 
-def patch(layer: Layer, seed: int = 0, grid: Grid = GRID) -> np.ndarray:
+def patch(layer: AnyLayer, seed: int = 0, grid: Grid = GRID) -> np.ndarray:
     return layer.sample(grid, np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize("layer", LAYERS, ids=lambda layer: layer.kind)
-def test_statistics_do_not_depend_on_the_pitch(layer: Layer) -> None:
+def test_statistics_do_not_depend_on_the_pitch(layer: AnyLayer) -> None:
     grids = [Grid(round(32 / pitch), pitch) for pitch in (0.06, 0.12)]
     fine, coarse = (np.mean([patch(layer, seed, grid).std() for seed in range(6)]) for grid in grids)
     assert fine == pytest.approx(coarse, rel=0.12)
@@ -44,7 +43,7 @@ def test_statistics_do_not_depend_on_the_pitch(layer: Layer) -> None:
 
 
 @given(st.sampled_from(LAYERS), st.integers(1, 40), st.floats(0.02, 5), st.integers(0, 9))
-def test_any_grid_will_do(layer: Layer, side: int, pitch: float, seed: int) -> None:
+def test_any_grid_will_do(layer: AnyLayer, side: int, pitch: float, seed: int) -> None:
     found, again = (patch(layer, seed, Grid(side, pitch)) for _ in range(2))
     np.testing.assert_array_equal(found, again)
     assert (found.shape, found.dtype) == ((side, side), np.float32)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.config import FramesConfig, ScenesConfig
+from pipeline.config import ScenesConfig
 from pipeline.scenes import video
 from pipeline.scenes.contact import GEL
 from pipeline.scenes.geometry import IMAGE_MM, Round
@@ -19,8 +19,8 @@ from pipeline.scenes.video import share_as_labelled, synthesize
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.decoding import decode
 from pipeline.videos.files import list_videos
-from pipeline.videos.frames.scan import Scan, scan
 from tests.conftest import ROOT, refused
+from tests.frame_rules import scanned
 
 SMALL = ScenesConfig(objects=("rug",), videos_per_object=2, frames=8, width=64, height=48)
 PLAIN = Recipe(modulus=100.0, body=Round(radii=(30.0, 30.0)))
@@ -88,9 +88,7 @@ def test_files_are_equal_for_equal_seeds_and_as_their_rows_say(
     assert [row.video for row in rows] == sorted(first) == ["rug_0.mp4", "rug_1.mp4"]
     assert first["rug_0.mp4"] != first["rug_1.mp4"], "each video has its own patch, motion and noise"
     for row, file in zip(rows, list_videos(folders[0], catalogue).files, strict=True):
-        found = scan(file, FramesConfig(pixels=16))
-        assert isinstance(found, Scan)
-        probe = found.probe
+        probe = scanned(file.path).probe
         assert (probe.frames, probe.width, probe.height, probe.fps) == (row.frames, 64, 48, row.fps)
         assert (row.frames, row.fps) in ([(8, 25.0)] if frames == 8 else RECORDED)
 

@@ -85,7 +85,7 @@ def test_a_changed_copy_is_found(tmp_path: Path, presses: list[Probe], start: in
         (copy, Part.UNUSED, Part.TEST, WARNING),
         (twice, Part.TRAIN, Part.TRAIN, INFO),  # One object pressed twice alike is no warning.
     ):
-        parts = {original.video_id: one, others.video_id: two}
+        parts = {v.video_id: part for v, part in ((original, one), (others, two)) if part != Part.UNUSED}
         *near, _ = leakage.near_copies([*presses, original, others], parts)
         found = [f for f in near if f.item not in {p.path for p in presses}]
         assert [(f.item, f.severity) for f in found] == [(others.path, severity)]

@@ -30,7 +30,7 @@ from pipeline.videos.frames.reference import reference_indices
 from pipeline.videos.frames.scan import Scan, scan
 from pipeline.videos.frames.selection import kept_count
 from tests.conftest import encode, moving_square, not_utf8, refused, write_video
-from tests.frame_rules import CONFIG, FILES, Place, constant, frames_of, luma, pressing, published, salience
+from tests.frame_rules import CONFIG, FILES, Place, constant, frames_of, luma, pressing, published, salience, scanned
 
 NAMES = ["baseball_0", "baseball_1", "baseball_10", "potato_0", "potato_2", "rug_0", "rug_1"]
 """The videos of `tiny_videos`, sorted by object and number."""
@@ -257,12 +257,11 @@ def test_a_cut_off_video_warns(tmp_path: Path, catalogue: Catalogue, caplog: pyt
 def test_a_header_that_lies_changes_nothing(tmp_path: Path, selection: str, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_video(tmp_path / "rug_0.avi", pressing(40))
 
-    def scanned() -> tuple[Probe, list[tuple[int, float, bytes]]]:
-        found = scan(VideoFile(path, path.name, "rug", "rug_0"), FramesConfig(pixels=16, selection=selection))
-        assert isinstance(found, Scan)
+    def look() -> tuple[Probe, list[tuple[int, float, bytes]]]:
+        found = scanned(path, FramesConfig(pixels=16, selection=selection))
         return found.probe, [(k.index, k.score, k.image.tobytes()) for k in found.kept]
 
-    probe, kept = scanned()
+    probe, kept = look()
     init, promised = Decoder.__init__, 0
 
     def lying(self: Decoder, path: Path) -> None:
@@ -271,7 +270,7 @@ def test_a_header_that_lies_changes_nothing(tmp_path: Path, selection: str, monk
 
     monkeypatch.setattr(Decoder, "__init__", lying)
     for promised in (0, 1, 7, 39, 41, 4000):
-        assert scanned() == (probe.model_copy(update={"header_frames": promised}), kept)
+        assert look() == (probe.model_copy(update={"header_frames": promised}), kept)
 
 
 def test_an_uneven_rate_is_measured(tmp_path: Path, catalogue: Catalogue) -> None:

@@ -27,9 +27,9 @@ from pipeline.videos.decoding import Decoder, decode
 from pipeline.videos.files import list_videos
 from pipeline.videos.film import write_film
 from pipeline.videos.frames.reference import LONGEST
-from pipeline.videos.frames.scan import Scan, scan
 from pipeline.videos.importing.bags import shots
 from pipeline.videos.importing.presses import QUIET, RELEASED, ROUNDING, SHORTEST, FrameTime, cut, presses
+from tests.frame_rules import scanned
 from tests.use.videos import recording
 
 pytest.importorskip("rosbags", reason="needs rosbags: pip install -e '.[robot]'")
@@ -137,8 +137,7 @@ def test_each_press_becomes_a_video_that_the_chain_takes(
         assert [r.frame for r in rows] == list(range(end - begin))
         inside = [r.contact for r in rows if begin + r.frame in touched]
         assert min(inside) > 3 * max(r.contact for r in rows if begin + r.frame not in touched)
-        seen = scan(file, FramesConfig(pixels=32, per_video=3, selection="contact"))
-        assert isinstance(seen, Scan)
+        seen = scanned(file.path, FramesConfig(pixels=32, per_video=3, selection="contact"))
         assert (seen.probe.frames, seen.probe.fps, seen.probe.starts_touching) == (len(rows), 25.0, False)
         assert all(begin + kept.index in touched for kept in seen.kept), "what is kept shows contact"
         # The film is lossy; a frame's neighbours in it must not be what it shows.

@@ -11,14 +11,13 @@ from hypothesis import strategies as st
 
 from pipeline.config import FramesConfig
 from pipeline.use.frames import read_touch
-from pipeline.videos.decoding import brightness, decode
-from pipeline.videos.files import VideoFile
+from pipeline.videos.decoding import decode, planes
 from pipeline.videos.frames.fit import fit
 from pipeline.videos.frames.reference import LONGEST, MOST_FRAMES, reference_indices, thumbnail
-from pipeline.videos.frames.scan import Scan, scan
+from pipeline.videos.frames.scan import Scan
 from pipeline.videos.frames.subtraction import subtract
 from tests.conftest import encode, write_video
-from tests.frame_rules import frames_of
+from tests.frame_rules import frames_of, scanned
 from tests.numerics.test_frames import subtracted
 
 WIDTH, HEIGHT = 120, 90
@@ -36,11 +35,9 @@ def film(depths: list[float], seed: int = 0, light: list[float] | None = None) -
     return frames
 
 
-def scanned(path: Path, frames: list[np.ndarray], name: str = "contact", *, lossless: bool = False) -> Scan:
+def filmed(path: Path, frames: list[np.ndarray], name: str = "contact", *, lossless: bool = False) -> Scan:
     (encode if lossless else write_video)(path, frames)
-    found = scan(VideoFile(path, path.name, "rug", "rug_0"), FramesConfig(pixels=32, selection=name))
-    assert isinstance(found, Scan)
-    return found
+    return scanned(path, FramesConfig(pixels=32, selection=name))
 
 
 def rise(count: int) -> list[float]:
@@ -61,7 +58,7 @@ def test_the_reference_spans_a_tenth_at_most(frames: int) -> None:
 def test_the_reference_of_usual_lengths(tmp_path: Path, count: int, expected: tuple[int, ...]) -> None:
     """50 and 126 frames: five seconds at 10 and 25 frames a second."""
     assert reference_indices(count) == expected
-    found = scanned(path := tmp_path / "v.avi", film(rise(count)))
+    found = filmed(path := tmp_path / "v.avi", film(rise(count)))
     fitted = np.array([fit(frame, FramesConfig(pixels=32)) for frame in frames_of(path)], np.float64)
     np.testing.assert_array_equal(found.reference, np.rint(fitted[list(expected)].mean(axis=0)))
     assert not found.probe.starts_touching
@@ -73,8 +70,8 @@ def test_the_reference_of_usual_lengths(tmp_path: Path, count: int, expected: tu
 
 @pytest.mark.parametrize(("count", "name"), [(12, "contact"), (50, "salient"), (126, "contact")])
 def test_a_video_that_starts_in_contact_takes_its_reference_from_the_end(tmp_path: Path, count: int, name: str) -> None:
-    found = scanned(tmp_path / "back.avi", film(rise(count)[::-1]), name)
-    still = scanned(tmp_path / "still.avi", film([0.0] * count, seed=1))
+    found = filmed(tmp_path / "back.avi", film(rise(count)[::-1]), name)
+    still = filmed(tmp_path / "still.avi", film([0.0] * count, seed=1))
     assert (found.probe.starts_touching, still.probe.starts_touching) == (True, False)
     assert np.abs(found.reference.astype(int) - still.reference).mean() < 1.5, "no trace of contact"
     assert found.probe.contact_end < 1 < 2 < found.probe.contact
@@ -84,12 +81,12 @@ def test_a_video_that_starts_in_contact_takes_its_reference_from_the_end(tmp_pat
 
 
 def test_neither_contact_throughout_nor_a_step_of_the_light_is_contact(tmp_path: Path) -> None:
-    throughout = scanned(tmp_path / "throughout.avi", film([80.0] * 40)).probe
+    throughout = filmed(tmp_path / "throughout.avi", film([80.0] * 40)).probe
     assert not throughout.starts_touching
     assert throughout.contact < 1
-    stepped = scanned(tmp_path / "light.avi", film([0.0] * 50, light=[0.0] * 25 + [12.0] * 25)).probe
-    without = scanned(tmp_path / "dark.avi", film([0.0] * 50)).probe
-    touched = scanned(tmp_path / "touched.avi", film(rise(50))).probe
+    stepped = filmed(tmp_path / "light.avi", film([0.0] * 50, light=[0.0] * 25 + [12.0] * 25)).probe
+    without = filmed(tmp_path / "dark.avi", film([0.0] * 50)).probe
+    touched = filmed(tmp_path / "touched.avi", film(rise(50))).probe
     assert stepped.brightness_step == pytest.approx(12, abs=1)
     assert without.brightness_step < 0.5
     assert stepped.contact < without.contact + 0.5 < touched.contact / 3
@@ -117,11 +114,11 @@ def test_a_warm_up_changes_nothing_else(tmp_path: Path, name: str, gains: list[f
     """Against the same press without the frames whose light is not yet that of the others."""
     depths = {"press": rise(100), "throughout": [0.0] * 100, "start": rise(100)[::-1]}[shape]
     steady = film(depths)
-    found = scanned(tmp_path / "warm.avi", warmed(steady, gains), name, lossless=True)
+    found = filmed(tmp_path / "warm.avi", warmed(steady, gains), name, lossless=True)
     cold = found.probe.unsteady
     # At the end of a slow rise a change of a step in eight frames is left in.
     assert max(1, len(gains) - 6) <= cold <= len(gains)
-    expected = scanned(tmp_path / "cut.avi", warmed(steady, gains)[cold:], name, lossless=True)
+    expected = filmed(tmp_path / "cut.avi", warmed(steady, gains)[cold:], name, lossless=True)
     assert found.probe.untouched == tuple(i + cold for i in expected.probe.untouched)
     np.testing.assert_array_equal(found.reference, expected.reference)
     for measure in ("contact", "contact_end", "starts_touching", "brightness", "thumbnail"):
@@ -137,8 +134,8 @@ def test_a_warm_up_changes_nothing_else(tmp_path: Path, name: str, gains: list[f
 def test_real_presses_after_a_warm_up(real_data: Path, tmp_path: Path, name: str) -> None:
     """At 25 and at 10 frames a second, where contact begins before a tenth of the video is steady."""
     frames = list(decode(real_data / f"{name}.mov"))
-    steady = scanned(tmp_path / "steady.avi", frames, "contact", lossless=True)
-    warm = scanned(tmp_path / "warm.avi", warmed(frames, WARM_UP), "contact", lossless=True)
+    steady = filmed(tmp_path / "steady.avi", frames, "contact", lossless=True)
+    warm = filmed(tmp_path / "warm.avi", warmed(frames, WARM_UP), "contact", lossless=True)
     assert (steady.probe.unsteady, warm.probe.unsteady) == (0, 8)
     assert warm.probe.contact == pytest.approx(steady.probe.contact, rel=0.1)
     assert np.abs(warm.reference.astype(int) - steady.reference).mean() < 1
@@ -157,7 +154,7 @@ def test_a_steady_press_has_the_reference_that_it_had(tmp_path: Path) -> None:
     for number, (depths, light, unsteady) in enumerate(
         (([4.0 * i for i in range(60)], None, 0), (rise(100), None, 0), (rise(100), late, 0), (rise(60), flicker, 60))
     ):
-        found = scanned(tmp_path / f"{number}.avi", film(depths, light=light), "salient", lossless=True).probe
+        found = filmed(tmp_path / f"{number}.avi", film(depths, light=light), "salient", lossless=True).probe
         assert (found.unsteady, found.untouched) == (unsteady, reference_indices(len(depths)))
 
 
@@ -167,7 +164,7 @@ def test_thumbnails_keep_the_shape(tmp_path: Path, height: int, width: int) -> N
     thumb = thumbnail(frame)
     rows, columns = (max(1, round(80 * min(1, share))) for share in (height / width, width / height))
     assert thumb.shape == (rows, columns, 3)
-    assert (thumb[..., 0] == brightness(frame)[0, 0]).all()
+    assert (thumb[..., 0] == planes(frame)[0][0, 0]).all()
 
 
 @given(st.tuples(*[st.integers(1, 20)] * 2), st.integers(0, 2**32), st.sampled_from([3, 40, 256]))

@@ -37,7 +37,7 @@ ALPHA = 0.1
 objects give the test little power, and to miss a leak costs more than to look into a false one."""
 LEARNT_FROM = (Part.TRAIN, Part.VALIDATION)
 Parts = Mapping[str, Part]
-"""By video id; empty where no split was asked for."""
+"""Training, validation or test by video id, without those that are in none."""
 
 
 def check_leakage(
@@ -48,15 +48,16 @@ def check_leakage(
         return
     recorded = sessions(probes)
     for assignments in splits or [()]:
-        parts = {a.video_id: a.part for a in assignments}
+        # What is unused stands in no part, like what no split knows.
+        parts = {a.video_id: a.part for a in assignments if a.part != Part.UNUSED}
         stands: dict[str, set[Part]] = defaultdict(set)
         for p in probes:
-            if parts.get(p.video_id, Part.UNUSED) != Part.UNUSED:
+            if p.video_id in parts:
                 stands[p.object_id].add(parts[p.video_id])
         crossing = [name for name in sorted(stands) if len(stands[name]) > 1]
         for name in crossing:
             yield finding("object in two parts", name, ", ".join(sorted(stands[name])), "one part", Severity.ERROR)
-        if parts:
+        if assignments:
             yield finding("object in two parts", "all", f"{len(crossing)} of {len(stands)} objects", "0")
         yield from _copies(probes, parts)
         yield from near_copies(probes, parts)
@@ -69,24 +70,21 @@ def sessions(probes: Sequence[Probe]) -> list[str]:
 
     The untouched picture carries the sensor's gel, dust and light. Its brightness is taken off, since that drifts.
     """
-    names = [p.session for p in probes]
-    rates = {p.video_id: rate for rate, group in by_rate([p for p in probes if not p.session]).items() for p in group}
-    formats: dict[tuple[float, int, int], list[int]] = defaultdict(list)
-    for place, p in enumerate(probes):
-        if not p.session:
-            formats[rates[p.video_id], p.width, p.height].append(place)
-    for (rate, width, height), places in formats.items():
-        pictures = np.array([probes[i].thumbnail for i in places]).reshape(len(places), -1, 3)
-        clusters = _clusters((pictures - pictures.mean(1, keepdims=True)).reshape(len(places), -1))
-        looks: dict[int, list[int]] = defaultdict(list)
-        for i, cluster in zip(places, clusters.tolist(), strict=True):
-            looks[cluster].append(i)
+    names, unnamed = {p.video_id: p.session for p in probes}, [p for p in probes if not p.session]
+    rates = {p.video_id: rate for rate, group in by_rate(unnamed).items() for p in group}
+    formats: dict[tuple[float, int, int], list[Probe]] = defaultdict(list)
+    for p in unnamed:
+        formats[rates[p.video_id], p.width, p.height].append(p)
+    for (rate, width, height), group in formats.items():
+        pictures = np.array([p.thumbnail for p in group]).reshape(len(group), -1, 3)
+        clusters = _clusters((pictures - pictures.mean(1, keepdims=True)).reshape(len(group), -1))
+        looks: dict[int, list[str]] = defaultdict(list)
+        for p, cluster in zip(group, clusters.tolist(), strict=True):
+            looks[cluster].append(p.video_id)
         # The largest cluster is the first, so that names do not depend on the order of the videos.
-        ordered = sorted(looks.values(), key=lambda own: (-len(own), min(probes[i].video_id for i in own)))
-        for number, own in enumerate(ordered, 1):
-            for i in own:
-                names[i] = f"{rate:.4g} frames/s, {width}x{height}, look {number}"
-    return names
+        for number, look in enumerate(sorted(looks.values(), key=lambda own: (-len(own), min(own))), 1):
+            names |= dict.fromkeys(look, f"{rate:.4g} frames/s, {width}x{height}, look {number}")
+    return [names[p.video_id] for p in probes]
 
 
 def _clusters(pictures: np.ndarray) -> np.ndarray:
@@ -117,8 +115,8 @@ def predictability(
 ) -> tuple[float, list[float]]:
     """How well features predict labels of objects never seen, and how well they predict permuted labels.
 
-    Ridge regression on one-hot classes, in closed form so that permutations cost one matrix product; objects are dealt
-    into folds. Labels are permuted among objects, so videos of an object keep a common label.
+    Ridge regression on one-hot classes; objects are dealt into folds. Labels are permuted among objects, so videos of
+    an object keep a common label.
 
     Args:
         features: videos x dimensions.
@@ -128,8 +126,10 @@ def predictability(
     Returns:
         The share of videos predicted right, and the same for each permutation.
     """
-    names = sorted(set(objects))
-    member = np.array([names.index(o) for o in objects])
+    from sklearn.linear_model import Ridge
+    from sklearn.preprocessing import StandardScaler
+
+    names, member = np.unique(objects, return_inverse=True)
     rng = np.random.default_rng(seed)
     fold = rng.permutation(len(names)) % min(FOLDS, len(names))
     own = np.zeros(len(names), dtype=int)
@@ -137,17 +137,13 @@ def predictability(
     orders = np.stack([own, *(rng.permutation(own) for _ in range(PERMUTATIONS))])
     classes = np.eye(max(labels) + 1)[orders]  # orders x objects x classes
     right = np.zeros(len(orders))
-    spread = features.std(0)
-    scaled = (features - features.mean(0)) / np.where(spread > 0, spread, 1) / np.sqrt(features.shape[1])
-    for number in sorted(set(fold.tolist())):
+    scaled = StandardScaler().fit_transform(features) / np.sqrt(features.shape[1])
+    for number in range(fold.max() + 1):
         test = fold[member] == number
-        centre = scaled[~test].mean(0)
-        inside, across = scaled[~test] - centre, scaled[test] - centre
-        # A video's prediction is the mean of the training labels and what its likeness to training videos adds. Videos
-        # of an object share their label, so what they add can be summed up before any label is looked at.
+        # Predictions are linear in the labels, which videos of an object share. So it is predicted how much each object
+        # counts before any label is looked at, and a permutation costs one matrix product.
         owner = np.eye(len(names))[member[~test]]
-        ridge = inside.T @ inside + RIDGE * np.eye(inside.shape[1])
-        chances = across @ np.linalg.solve(ridge, inside.T @ owner) + owner.mean(0)
+        chances = Ridge(alpha=RIDGE).fit(scaled[~test], owner).predict(scaled[test])
         scores = np.einsum("vn,onc->ovc", chances, classes, optimize=True)
         # Rounded, since sessions make classes exactly equally likely: the first then wins on every processor.
         right += (scores.round(9).argmax(2) == orders[:, member[test]]).sum(1)
@@ -233,9 +229,8 @@ def likeness_bound(largest: np.ndarray, pairs: int) -> float:
 
 
 def _crosses(parts: Parts, one: Probe, other: Probe) -> bool:
-    """Whether two videos stand in different parts of the split that are both used."""
-    both = {parts.get(one.video_id, Part.UNUSED), parts.get(other.video_id, Part.UNUSED)}
-    return len(both) == 2 and Part.UNUSED not in both
+    """Whether two videos stand in different parts of the split."""
+    return len({parts[p.video_id] for p in (one, other) if p.video_id in parts}) == 2
 
 
 def _pair(check: str, video: Probe, twin: Probe, measured: str, crosses: bool) -> Finding:
@@ -272,14 +267,12 @@ def _sessions(probes: Sequence[Probe], parts: Parts, names: Sequence[str], catal
 
 
 def _untouched_predictions(probes: Sequence[Probe], names: Sequence[str], catalogue: Catalogue) -> Iterator[Finding]:
-    """Whether the no-contact picture, or the session alone, predicts the property of an unseen object."""
+    """Whether the no-contact picture or the session alone predicts the property of an unseen object."""
     chosen = _sampled(len(probes)).tolist()
     objects = [probes[i].object_id for i in chosen]
-    distinct = sorted({names[i] for i in chosen})
-    inputs = {
-        "no-contact reference": np.array([probes[i].thumbnail for i in chosen]),
-        "session": np.eye(len(distinct))[[distinct.index(names[i]) for i in chosen]],
-    }
+    distinct, session = np.unique([names[i] for i in chosen], return_inverse=True)
+    pictures = np.array([probes[i].thumbnail for i in chosen])
+    inputs = {"no-contact reference": pictures, "session": np.eye(len(distinct))[session]}
     for place, prop in enumerate(catalogue.properties):
         labels = [catalogue.labels(o)[place] for o in objects]
         for what, features in inputs.items():

@@ -18,10 +18,10 @@ import yaml
 from pydantic import ValidationError
 
 from pipeline.core.errors import UserError, first_problem
-from pipeline.core.records import Part
+from pipeline.core.records import Part, Record
 from pipeline.core.runtime import derive_seed
 from pipeline.videos.catalogue.csv_reader import Row, read_rows
-from pipeline.videos.catalogue.wording import Entry, Language, Property, Scenario
+from pipeline.videos.catalogue.wording import Language, Property, Scenario
 
 __all__ = ["RULED_SPLITS", "Catalogue", "Language", "Object", "Property", "Scenario", "load_catalogue"]
 
@@ -30,7 +30,7 @@ RULED_SPLITS = ("development", "kfold")
 """Splits that are made by rule; no column may bear their names."""
 
 
-class Object(Entry):
+class Object(Record):
     """One object (or part of one); tuples have one entry a property, in the catalogue's order."""
 
     object_id: str
@@ -54,7 +54,7 @@ class Object(Entry):
         return tuple(math.floor(sum(r) / len(r) + 0.5) for r in self.ratings)
 
 
-class Catalogue(Entry):
+class Catalogue(Record):
     """A data set's objects and the language for them."""
 
     language: Language
@@ -136,24 +136,27 @@ def load_catalogue(folder: Path) -> Catalogue:
     """Read `properties.yaml`, `objects.csv` and, where it is there, `descriptions.csv` of a folder.
 
     Raises:
-        UserError: naming the file, line and mend, for a missing file or column, an object listed twice, two objects
-            of one name, a rating or stated label outside the classes, an unknown part of a split, or a description of
-            an object that is not listed.
+        UserError: naming the file, line and mend.
     """
     for name in (PROPERTIES, OBJECTS):
         if not (folder / name).is_file():
             raise UserError(
                 f"{folder / name}: no such file; data.catalogue must name a folder with {OBJECTS} and {PROPERTIES}"
             )
-    language = _read_language(folder / PROPERTIES)
+    try:
+        language = Language.model_validate(yaml.safe_load((folder / PROPERTIES).read_text(encoding="utf-8")))
+    except ValidationError as error:
+        raise UserError(f"{folder / PROPERTIES}: {first_problem(error)}") from None
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        raise UserError(f"{folder / PROPERTIES}: {' '.join(str(error).split())[:300]}") from None
     header, rows = read_rows(folder / OBJECTS, ["object_id", "name", *(p.name for p in language.properties)])
     splits = _split_columns(folder / OBJECTS, header, language)
-    entries = [(where, _read_object(row, language, splits, where)) for where, row in rows]
-    if not entries:
+    if not rows:
         raise UserError(f"{folder / OBJECTS}: lists no object; add one line an object")
     objects: dict[str, Object] = {}
     names: dict[str, str] = {}
-    for where, entry in entries:
+    for where, row in rows:
+        entry = _read_object(row, language, splits, where)
         if entry.object_id in objects:
             raise UserError(
                 f"{where}: {entry.object_id} is listed twice, so it could stand in two splits; keep one line an object"
@@ -168,15 +171,6 @@ def load_catalogue(folder: Path) -> Catalogue:
     for object_id, text in _read_descriptions(folder / DESCRIPTIONS, objects).items():
         objects[object_id] = objects[object_id].model_copy(update={"description": text})
     return Catalogue(language=language, objects=objects)
-
-
-def _read_language(file: Path) -> Language:
-    try:
-        return Language.model_validate(yaml.safe_load(file.read_text(encoding="utf-8")))
-    except ValidationError as error:
-        raise UserError(f"{file}: {first_problem(error)}") from None
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
-        raise UserError(f"{file}: {' '.join(str(error).split())[:300]}") from None
 
 
 def _split_columns(file: Path, header: Sequence[str], language: Language) -> dict[str, str]:

@@ -18,8 +18,7 @@ def read_rows(file: Path, needed: Sequence[str]) -> tuple[list[str], list[tuple[
     Cells are stripped and absent ones empty; empty lines are passed over, and other columns than `needed` are kept.
 
     Raises:
-        UserError: naming the file (and line) and mend, for a missing or repeated column, a line with more fields than
-            columns, or a file that is no CSV in UTF-8.
+        UserError: naming the file, line and mend.
     """
     rows = []
     # Spreadsheets put a byte order mark before their UTF-8, and commas alone on lines that once held something.

@@ -6,10 +6,13 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Iterable
+from itertools import product
 from string import Formatter
 from typing import Annotated, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from pipeline.core.records import Record
 
 OPENING = "Overall"
 """How the structured description begins: the grader reads an answer from its last such word on."""
@@ -59,13 +62,7 @@ def mentioned(text: str, phrases: Iterable[str]) -> list[str]:
     return found
 
 
-class Entry(BaseModel):
-    """A frozen part of a catalogue; unknown keys are errors."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class Property(Entry):
+class Property(Record):
     """One physical property with its ordered classes and the words for them."""
 
     name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
@@ -87,12 +84,12 @@ class Property(Entry):
     @property
     def wordings(self) -> dict[str, int]:
         """Every wording of a class, plain, with that class: its name, its phrases and its cues."""
+        return {plain(word): level for level, word in self._words()}
+
+    def _words(self) -> list[tuple[int, str]]:
         cues = self.cues or ((),) * len(self.levels)
-        return {
-            plain(word): level
-            for level, (name, phrases, more) in enumerate(zip(self.levels, self.phrases, cues, strict=True))
-            for word in (name, *phrases, *more)
-        }
+        of_levels = enumerate(zip(self.levels, self.phrases, cues, strict=True))
+        return [(level, word) for level, (name, phrases, more) in of_levels for word in (name, *phrases, *more)]
 
     @model_validator(mode="after")
     def _name_is_free_and_words_fit(self) -> Self:
@@ -107,14 +104,13 @@ class Property(Entry):
             raise ValueError(f"{self.name}: cues need one list a level (an empty one where there are none)")
         if _placeholders(self.alone) != {"level"}:
             raise ValueError(f"{self.name}: alone must hold {{level}} and no other placeholder")
-        for level, name in enumerate(self.levels):
-            for word in (name, *self.phrases[level], *(self.cues[level] if self.cues else ())):
-                if self.wordings[plain(word)] != level:
-                    raise ValueError(f"{self.name}: {word!r} stands for two levels; keep it at one")
+        for level, word in self._words():
+            if self.wordings[plain(word)] != level:
+                raise ValueError(f"{self.name}: {word!r} stands for two levels; keep it at one")
         return self
 
 
-class Scenario(Entry):
+class Scenario(Record):
     """A situation and the classes that suit it (PSR)."""
 
     name: str
@@ -126,7 +122,7 @@ class Scenario(Entry):
     other: dict[str, tuple[int, ...]] = Field(min_length=1)
 
 
-class Language(Entry):
+class Language(Record):
     """Everything in properties.yaml."""
 
     dataset: str = ""
@@ -137,48 +133,37 @@ class Language(Entry):
     scenarios: tuple[Scenario, ...] = ()
 
     @model_validator(mode="after")
-    def _names_fit(self) -> Self:
-        names = [p.name for p in self.properties]
-        if len(set(names)) < len(names):
-            raise ValueError(f"properties {', '.join(names)}: a name stands twice")
-        for template in (self.unstructured, self.structured):
-            missing, unknown = set(names) - _placeholders(template), _placeholders(template) - set(names)
-            if missing:
-                raise ValueError(f"template {template!r} does not name {', '.join(sorted(missing))}")
-            if unknown:
-                raise ValueError(f"template {template!r} names {', '.join(sorted(unknown))}, which is no property")
-        if not self.structured.startswith(f"{OPENING} ") and not self.structured.startswith(f"{OPENING},"):
-            raise ValueError(f"structured must begin with {OPENING!r}: answers are read from that word on")
-        return self
-
-    @model_validator(mode="after")
-    def _scenarios_fit(self) -> Self:
+    def _templates_scenarios_and_classes_fit(self) -> Self:
         classes = {p.name: range(len(p.levels)) for p in self.properties}
+        if len(classes) < len(self.properties):
+            raise ValueError(f"properties {', '.join(p.name for p in self.properties)}: a name stands twice")
+        for template in (self.unstructured, self.structured):
+            there = _placeholders(template)
+            if missing := classes.keys() - there:
+                raise ValueError(f"template {template!r} does not name {', '.join(sorted(missing))}")
+            if unknown := there - classes.keys():
+                raise ValueError(f"template {template!r} names {', '.join(sorted(unknown))}, which is no property")
+        if not self.structured.startswith((f"{OPENING} ", f"{OPENING},")):
+            raise ValueError(f"structured must begin with {OPENING!r}: answers are read from that word on")
         for scenario in self.scenarios:
-            unknown = (scenario.target.keys() | scenario.other.keys()) - classes.keys()
-            if unknown:
-                raise ValueError(f"scenario {scenario.name}: unknown property {', '.join(sorted(unknown))}")
             for name, levels in (*scenario.target.items(), *scenario.other.items()):
+                if name not in classes:
+                    raise ValueError(f"scenario {scenario.name}: unknown property {name}")
                 if not levels or not set(levels) <= set(classes[name]):
+                    most = len(classes[name]) - 1
                     raise ValueError(
-                        f"scenario {scenario.name}: {name} is {list(levels)}; allowed: classes from 0 to "
-                        f"{len(classes[name]) - 1}"
+                        f"scenario {scenario.name}: {name} is {list(levels)}; allowed: classes from 0 to {most}"
                     )
-        return self
-
-    @model_validator(mode="after")
-    def _classes_are_told_apart(self) -> Self:
-        """An answer names all properties in one sentence, so no class may be read where another property is meant."""
+        # An answer names all properties in one sentence, so no class may be read where another property is meant.
         around = "|".join(text for text, *_ in Formatter().parse(self.structured))
         for p in self.properties:
-            for level in p.levels:
-                others = [(q.name, word) for q in self.properties if q is not p for word in q.levels]
-                for where, word in (*others, ("structured", around)):
-                    if mentioned(word, [level]):
-                        raise ValueError(
-                            f"{p.name}: class {level!r} can also be read in {where} ({word!r}), so no answer could be "
-                            "graded; choose other words"
-                        )
+            others = [(q.name, word) for q in self.properties if q is not p for word in q.levels]
+            for level, (where, word) in product(p.levels, (*others, ("structured", around))):
+                if mentioned(word, [level]):
+                    raise ValueError(
+                        f"{p.name}: class {level!r} can also be read in {where} ({word!r}), so no answer could be "
+                        "graded; choose other words"
+                    )
         return self
 
 

@@ -13,7 +13,7 @@ import av
 import cv2
 import numpy as np
 
-from pipeline.videos.decoding import Image, brightness, planes
+from pipeline.videos.decoding import Image, planes
 
 SHARE, LONGEST = 10, 8
 """The reference spans the first tenth of a video, at most 8 frames: a third to half a second at 10 and 25 a second."""
@@ -62,22 +62,17 @@ def is_steady(thumbs: Sequence[Image]) -> bool:
     return True
 
 
-def thumbnail(frame: av.VideoFrame) -> Image:
-    """A frame with its longer side at `THUMB` pixels: uint8, height x width x (brightness, two colour differences)."""
-    small: Image = cv2.merge(_small(planes(frame)))
-    return small
+def thumbnail(frame: av.VideoFrame, channels: int = 3) -> Image:
+    """A frame with its longer side at `THUMB` pixels: uint8, height x width x (brightness, two colour differences).
 
-
-def brightness_thumbnail(frame: av.VideoFrame) -> Image:
-    """The brightness of `thumbnail` alone, for a third of its cost: uint8, height x width."""
-    return _small([brightness(frame)])[0]
-
-
-def _small(shown: Sequence[Image]) -> list[Image]:
+    With one channel it is the brightness alone, height x width, for a third of the cost.
+    """
+    shown = planes(frame)[:channels]
     height, width = shown[0].shape
     scale = THUMB / max(height, width)
     size = max(1, round(width * scale)), max(1, round(height * scale))
-    return [np.asarray(cv2.resize(plane, size, interpolation=cv2.INTER_LINEAR), dtype=np.uint8) for plane in shown]
+    small: Image = cv2.merge([cv2.resize(plane, size, interpolation=cv2.INTER_LINEAR) for plane in shown])
+    return small
 
 
 def contact_strength(thumb: Image, reference: Image) -> float:
@@ -86,11 +81,9 @@ def contact_strength(thumb: Image, reference: Image) -> float:
     Contact makes some parts brighter and others darker; a change of the light shifts all alike and cancels out. Never
     negative (triangle inequality), 0 for equal pictures and for a uniform shift that does not saturate.
     """
-    values, channels = thumb.size, 1 if thumb.ndim == 2 else thumb.shape[2]
-    whole: float = cv2.norm(thumb, reference, cv2.NORM_L1)
+    channels = 1 if thumb.ndim == 2 else thumb.shape[2]
     shift = sum(abs(a - b) for a, b in zip(cv2.mean(thumb), cv2.mean(reference), strict=True)) / channels
-    excess: float = whole / values - shift
-    return max(0.0, excess)
+    return max(0.0, float(cv2.norm(thumb, reference, cv2.NORM_L1)) / thumb.size - shift)
 
 
 def detail(thumb: Image) -> float:

@@ -18,7 +18,6 @@ from pipeline.videos.decoding import Decoder, Header, Image, turns
 from pipeline.videos.files import VideoFile
 from pipeline.videos.frames.fit import fit
 from pipeline.videos.frames.reference import (
-    brightness_thumbnail,
     contact_strength,
     detail,
     is_steady,
@@ -211,7 +210,7 @@ def run_pass(
                     if frame.time is not None:
                         found.times.append((index, frame.time))
             if found.reference and index % often == 0:
-                found.brightness_thumbnails.append(brightness_thumbnail(frame))
+                found.brightness_thumbnails.append(thumbnail(frame, channels=1))
         if frame is None:
             return found
         own = own or reference_of(untouched, config)
@@ -249,8 +248,7 @@ def _signature(pictures: list[Image], reference: Image) -> tuple[float, ...]:
 
 
 def _flat(array: np.ndarray) -> tuple[float, ...]:
-    flat: list[float] = array.astype(np.float64).round(4).ravel().tolist()
-    return tuple(flat)
+    return tuple(array.astype(np.float64).round(4).ravel().tolist())
 
 
 def _wrong(file: VideoFile, message: str) -> Finding:

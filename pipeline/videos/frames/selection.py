@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from pipeline.config import FramesConfig
-from pipeline.videos.decoding import Image, brightness, picture
+from pipeline.videos.decoding import Image, picture, planes
 from pipeline.videos.frames.fit import fit
 
 RELEASE_FEWEST = 5
@@ -51,13 +51,7 @@ def kept_count(frames: int, config: FramesConfig) -> int:
 
 def difference(brightness: Image, before: Image) -> float:
     """Sum of |brightness - before| over all pixels, exact: OpenCV adds up blocks of integers in a double."""
-    total: float = cv2.norm(brightness, before, cv2.NORM_L1)
-    return total
-
-
-def changed_pixels(grey: Image, before: Image) -> float:
-    """How many pixels differ at all between two grey frames."""
-    return float(cv2.countNonZero(cv2.absdiff(grey, before)))
+    return float(cv2.norm(brightness, before, cv2.NORM_L1))
 
 
 class BestFrames:
@@ -80,13 +74,14 @@ class BestFrames:
     def consider(self, index: int, frame: av.VideoFrame) -> None:
         """Score the change from the frame before, and offer this frame, or by the published rule the one before."""
         salient = self.config.selection == "salient"
-        now = brightness(frame) if salient else cv2.cvtColor(picture(frame), cv2.COLOR_BGR2GRAY)
+        now = planes(frame)[0] if salient else cv2.cvtColor(picture(frame), cv2.COLOR_BGR2GRAY)
         if self._before is not None:
             earlier, shown = self._before
             if salient:
                 self.offer(difference(now, shown), index, frame)
             elif index < self.frames:
-                self.offer(changed_pixels(now, shown), index - 1, earlier)
+                changed = cv2.countNonZero(cv2.absdiff(now, shown))
+                self.offer(float(changed), index - 1, earlier)
         self._before = frame, now
 
     def offer(self, score: float, index: int, frame: av.VideoFrame) -> None:

@@ -91,10 +91,9 @@ def cut(
 ) -> list[Path]:
     """Write every press of a recording as `<object_id>_<n>.mp4` with a CSV of times; numbers go on from those in `out`.
 
-    The recording is read twice, so that no more than one picture is in memory: first to measure contact, then to write.
-
     Args:
-        read: Begins the recording anew: `film`, or `bags.shots`.
+        read: Begins the recording anew (`film`, or `bags.shots`): first to measure contact, then to write, so that no
+            more than one picture is in memory.
         name: What an error calls it.
         times: A press begins at this many times the quiet level.
         whole: Write all of it as one video, without looking for presses.
@@ -123,10 +122,11 @@ def cut(
         path = out / f"{object_id}_{number}.mp4"
         pressed = itertools.islice(source, begin - position, end - position)
         position = end
-        times_of = zip(received[begin:end], stamped[begin:end], strengths[begin:end].tolist(), strict=True)
         rows = [
-            FrameTime(frame=frame, recorded_ns=arrived, stamped_ns=stamp, contact=round(strength, 3))
-            for frame, (arrived, stamp, strength) in enumerate(times_of)
+            FrameTime(
+                frame=i - begin, recorded_ns=received[i], stamped_ns=stamped[i], contact=round(float(strengths[i]), 3)
+            )
+            for i in range(begin, end)
         ]
         # The suffix says the container, so the unfinished file bears it, too.
         part = path.with_name(f".{path.stem}.{os.getpid()}.part.mp4")
@@ -244,9 +244,7 @@ def presses(strengths: npt.NDArray[np.float64], times: float = FOUND) -> list[tu
 
 
 def _measure(source: Iterator[Shot]) -> tuple[list[int], list[int], npt.NDArray[np.float64]]:
-    """Stamps, times of arrival (ns) and contact strengths of all pictures.
-
-    Contact is measured by the untouched picture at the beginning, else at the end.
+    """Stamps, times of arrival (ns) and contact strengths of all pictures, by the untouched picture at either end.
 
     First pictures in which the light still changes count as quiet.
     """
