@@ -135,8 +135,8 @@ def _colours(full: bool, bt709: bool) -> npt.NDArray[np.float64]:
     """The 3 x 4 matrix from (Y, U, V, 1) to (R, G, B) in 8-bit steps."""
     red, blue = (0.2126, 0.0722) if bt709 else (0.299, 0.114)
     green = 1 - red - blue
-    from_green = -2 * blue * (1 - blue) / green, -2 * red * (1 - red) / green
-    matrix = np.array([[1, 0, 2 * (1 - red)], [1, *from_green], [1, 2 * (1 - blue), 0]])
+    to_green = -2 * blue * (1 - blue) / green, -2 * red * (1 - red) / green
+    matrix = np.array([[1, 0, 2 * (1 - red)], [1, *to_green], [1, 2 * (1 - blue), 0]])
     if not full:
         matrix = matrix * np.array([255 / 219, 255 / 224, 255 / 224])
     return np.column_stack([matrix, -matrix @ np.array([0 if full else 16, 128, 128])])

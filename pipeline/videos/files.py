@@ -68,21 +68,20 @@ def list_videos(folder: Path, catalogue: Catalogue) -> Listing:
         empty = _error(str(folder), f"holds no video ({kinds}); set data.dir to the folder of the videos")
         return Listing((), (*findings, empty))
     # The chain's tables are UTF-8 and cannot hold such a name; `octopi describe` lists it with escapes.
-    named_so = {path: path.relative_to(folder).as_posix() for path in paths}
-    no_text = {path: name for path, name in named_so.items() if readable(name) != name}
-    findings += [_error(name, "its name is no text in UTF-8; rename it") for name in no_text.values()]
-    paths = [path for path in paths if path not in no_text]
+    relative = {path: path.relative_to(folder).as_posix() for path in paths}
+    findings += [_error(n, "its name is no text in UTF-8; rename it") for n in relative.values() if readable(n) != n]
+    paths = [path for path, name in relative.items() if readable(name) == name]
     listed = folder / LIST_FILE
     named, problems = _from_list(listed, folder, paths) if listed.is_file() else _from_names(folder, paths)
     findings += problems
     files = [f for f in named if f.object_id in catalogue.objects]
-    unknown_objects = Counter(f.object_id for f in named if f.object_id not in catalogue.objects)
-    counted = f"{unknown_objects.total()} videos of {len(unknown_objects)} objects that the catalogue lacks"
-    names = ", ".join(sorted(unknown_objects))
-    if unknown_objects and not files and all(f.severity is not Severity.ERROR for f in problems):
+    unknown = Counter(f.object_id for f in named if f.object_id not in catalogue.objects)
+    counted = f"{unknown.total()} videos of {len(unknown)} objects that the catalogue lacks"
+    names = ", ".join(sorted(unknown))
+    if unknown and not files and all(f.severity is not Severity.ERROR for f in problems):
         message = f"holds no video of an object of the catalogue; there are {counted}: {names}; add them to objects.csv"
         findings.append(_error(str(folder), message))
-    elif unknown_objects:
+    elif unknown:
         message = f"{counted} are left out; list them in objects.csv to use them: {names}"
         findings.append(finding("name", str(folder), message, severity=Severity.WARNING))
     files.sort(key=lambda f: (f.object_id, int(f.video_id.rpartition("_")[2]), f.relative))
@@ -90,7 +89,7 @@ def list_videos(folder: Path, catalogue: Catalogue) -> Listing:
         first, *others = (f.relative for f in group)
         if others:
             findings.append(_error(first, f"{video_id} is also {', '.join(others)}; keep one of them"))
-    return Listing(tuple(files), tuple(findings), tuple(sorted(unknown_objects)))
+    return Listing(tuple(files), tuple(findings), tuple(sorted(unknown)))
 
 
 def raise_errors(folder: Path, findings: Sequence[Finding]) -> None:

@@ -5,18 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from pingouin import intraclass_corr
 from scipy.special import betaincinv
 
 from pipeline.core.records import Part
-from pipeline.videos.audit.files import FOUND, by_rate, check_files
+from pipeline.videos.audit.files import by_rate, check_files
 from pipeline.videos.audit.labels import check_labels, icc3k
 from pipeline.videos.audit.leakage import check_leakage, sessions
 from pipeline.videos.catalogue import Catalogue
 from tests import audit_records as made
-from tests.audit_records import ERROR, INFO, OBJECTS, OTHER, PHYSICLEAR, WARNING, leaks, odd, of, probe, probes
+from tests.audit_records import ERROR, INFO, OBJECTS, OTHER, WARNING, leaks, odd, of, probe, probes
 
 
 def test_flawless_videos_no_videos_and_a_single_one_give_no_warning() -> None:
@@ -102,22 +100,6 @@ def test_videos_an_object_and_objects_without() -> None:
         ("all", "18 videos of 7 objects", INFO),
         ("orange", "no video", WARNING),
     ]
-
-
-@settings(max_examples=30)
-@given(st.lists(st.floats(0, 5), min_size=3, max_size=12), st.floats(1.1, 50))
-def test_contact_is_relative_to_the_noise_of_the_data(strengths: list[float], louder: float) -> None:
-    """All strengths times a factor: the same videos lack contact, however sensitive the camera is."""
-
-    def named(factor: float) -> set[str]:
-        found = [
-            probe(f"rug_{i}", contact=factor * (0.01 + s), quiet=factor * 0.3, contact_end=0.0)
-            for i, s in enumerate(strengths)
-        ]
-        return {f.item for f in of(odd(check_files(found, PHYSICLEAR)), "contact")}
-
-    if min(abs(0.01 + s - FOUND * 0.3) for s in strengths) > 1e-6:
-        assert named(louder) == named(1.0)
 
 
 SHROUT_FLEISS = [[9, 2, 5, 8], [6, 1, 3, 2], [8, 4, 6, 8], [7, 1, 2, 6], [10, 5, 6, 9], [6, 2, 4, 7]]

@@ -16,7 +16,6 @@ import cv2
 import numpy as np
 import pytest
 
-import pipeline.core.parallel
 from pipeline.config import FramesConfig
 from pipeline.core.io import read_table
 from pipeline.core.records import Finding, Frame, Probe
@@ -79,12 +78,6 @@ def test_files_hold_what_the_table_says(place: Place) -> None:
         assert (probe.kept, probe.frames, probe.header_frames) == (len(own), video.frames, video.frames)
     assert sorted(p.name for p in place.out.iterdir()) == sorted(FILES)
     assert list(place.partial.iterdir()) == []
-
-
-def test_any_number_of_processes_will_do(place: Place, whole: list[bytes], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pipeline.core.parallel, "cores", lambda: 5)
-    place.extract()
-    assert place.bytes() == whole
 
 
 def kill_after(count: int, place: Place, config: FramesConfig = CONFIG) -> None:

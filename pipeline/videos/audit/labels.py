@@ -76,8 +76,6 @@ def icc3k(ratings: Sequence[Sequence[float]]) -> tuple[float, float, float] | No
     if between <= TINY:
         return None
     unlike = float((rest**2).sum()) / free[1] / between
-    if unlike <= TINY:
-        return 1.0, 1.0, 1.0
     low, high = (1 - unlike * float(f.ppf(tail, *free)) for tail in (0.975, 0.025))
     return 1 - unlike, low, high
 
