@@ -103,15 +103,11 @@ def press(
     *,
     tolerance: float = 0.25,
 ) -> Imprint:
-    """Press a body with forces from 0 to `force`.
+    """Press a body with forces from 0 to `force` N.
 
-    Args:
-        heights: side x side, in mm, towards the gel.
-        force: The largest, in N.
-        modulus: The object's reduced modulus, in MPa.
-        pitch: In mm a pixel.
-        method: None takes the cheapest whose estimated error is below the tolerance.
-        tolerance: Relative error of the skin's slopes, which are what the light shows.
+    Heights are side x side in mm, towards the gel; the pitch is in mm a pixel, the object's reduced modulus in MPa.
+    Without a method, the cheapest is taken whose estimated error is below the tolerance: the relative error of the
+    skin's slopes, which are what the light shows.
     """
     forces = force * (np.arange(1, FORCES + 1) / FORCES) ** 1.5
     error = None
@@ -139,9 +135,7 @@ def choose(
     A grid's error is estimated as its distance to the next finer grid, which exceeds the true error as long as
     grids converge; springs are compared with the finest grid solved so far. The search stops at the first method
     whose estimate is within the tolerance. The finest grid has no reference: it gets half the error of the one before.
-
-    Returns:
-        The method, its error as estimated, and the body by it under the largest force.
+    Returns the method, its error as estimated, and the body by it under the largest force.
     """
     side, top, winkler = heights.shape[0], np.array([force]), Method("winkler")
     # A layer's influence is smooth on cells of half its thickness only.

@@ -90,15 +90,7 @@ Body = Annotated[Flat | Round | Bar | Wedge, Field(discriminator="kind")]
 def heights(body: Body, relief: Sequence[AnyLayer], side: int, pitch: float, rng: np.random.Generator) -> Heights:
     """A random patch around a body's highest point, with layers of relief that add up.
 
-    Args:
-        body: What is pressed.
-        relief: What stands out of it.
-        side: Of the patch, in pixels.
-        pitch: In mm a pixel.
-        rng: All that is random in the patch follows from it.
-
-    Returns:
-        side x side, mm, pointing towards the sensor.
+    Side x side pixels of `pitch` mm; heights are in mm and point towards the sensor.
     """
     grid = Grid(side, pitch)
     total = body.sample(grid)

@@ -123,14 +123,10 @@ def make_sensor(width: int, height: int, seed: int) -> Sensor:
 
 
 def shade(skin: Heights, sensor: Sensor, pitch: float, seed: int, drift: Drift | None = None) -> Image:
-    """One frame: height x width x BGR, uint8.
+    """One frame, with the noise of its seed: height x width x BGR, uint8.
 
-    Args:
-        skin: Indentation in mm; only its slopes count, so a constant changes nothing.
-        sensor: Of the same size.
-        pitch: In mm a pixel.
-        seed: Which noise this frame has.
-        drift: Moves the dust on the gel; lights, camera and slopes stay where they are.
+    The skin is the indentation in mm, of the sensor's size; only its slopes count, so a constant changes nothing. The
+    pitch is in mm a pixel. Drift moves the dust on the gel; lights, camera and slopes stay where they are.
     """
     height, width = skin.shape
     slope_x = cv2.Sobel(skin, cv2.CV_32F, 1, 0, scale=1 / (8 * pitch), borderType=cv2.BORDER_REPLICATE)

@@ -61,8 +61,7 @@ class Recipe(Record):
 def load_recipes(folder: Path, catalogue: Catalogue, seed: int) -> dict[str, Recipe]:
     """A recipe for every object of the catalogue: listed in the folder's `scenes.yaml`, else drawn by `recipe_of`.
 
-    Raises:
-        UserError: naming file, object and key; and as `recipe_of` where an object has to be drawn.
+    What is wrong with the file is a UserError that names it, the object and the key.
     """
     listed = _read(folder / SCENES, catalogue) if (folder / SCENES).is_file() else {}
     return {o: listed[o] if o in listed else recipe_of(o, catalogue, seed) for o in catalogue.objects}

@@ -24,10 +24,9 @@ what they get."""
 
 
 def write_film(path: Path, frames: Iterable[npt.NDArray[np.uint8]], fps: float) -> None:
-    """Write frames of one size (height x width x BGR, uint8); equal frames give equal files on one machine.
+    """Write frames of one size (height x width x BGR, uint8); UserError where the file cannot be written.
 
-    Raises:
-        UserError: if the file cannot be written.
+    Equal frames give equal files on one machine.
     """
     rate = Fraction(fps).limit_denominator(1000)
     try:

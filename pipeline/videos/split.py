@@ -42,11 +42,8 @@ def assign_objects(
     `development` tests on some of the paper's training objects and leaves the paper's test objects unused. `kfold`
     deals all objects that have videos into folds: the seed's fold is for test, so that over all folds every object is
     tested once. One in eight of the other objects is for validation. Of the rest `train_objects` are for training, 0
-    being all. Any other name is that of a `split_` column of the catalogue.
-
-    Args:
-        present: the objects that have videos.
-        seed: of `ablation.seeds`; only kfold has another split for another one.
+    being all. Any other name is that of a `split_` column of the catalogue. Present are the objects that have videos;
+    only kfold has another split for another seed (of `ablation.seeds`).
 
     Raises:
         UserError: if there is no such split, no training video remains, there are too few objects for the test
@@ -96,11 +93,7 @@ def without_videos(parts: Mapping[str, Part], present: Collection[str]) -> str:
 
 
 def read_splits(data: Path, config: SplitConfig, seeds: Sequence[int]) -> dict[int, list[Assignment]]:
-    """The splits that differ, by the first seed that has each: one a fold with kfold, else one.
-
-    Args:
-        data: the chain's data folder.
-    """
+    """The splits that differ, in the chain's data folder, by their first seed: one a fold with kfold, else one."""
     first = {config.fold_of(seed): seed for seed in reversed(seeds)}
     return {seed: read_table(data / "splits" / f"{seed}.parquet", Assignment) for seed in sorted(first.values())}
 

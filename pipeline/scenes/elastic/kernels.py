@@ -45,14 +45,10 @@ class Gel:
 def layer_response(wave: npt.ArrayLike, poisson: float) -> npt.NDArray[np.float64]:
     """How much softer than a half-space a bonded layer is to a wave of pressure: S, from 0 to about 1.
 
-    The surface sinks by 2 S(q t) / (E* q) under a pressure of wave number q, where
+    The surface sinks by 2 S(q t) / (E* q) under a pressure of wave number q >= 0, where with Poisson's ratio nu
     S(k) = [(3 - 4 nu) sinh 2k - 2k] / [(3 - 4 nu) cosh 2k + 2k^2 + 5 - 12 nu + 8 nu^2]
     (Bentall & Johnson 1968, Int. J. Mech. Sci. 10; Johnson, Contact Mechanics, 5.8). S -> 1 for waves that are short
     against the layer, and -> k (1 - 2 nu) / (2 (1 - nu)^2), springs, for long ones.
-
-    Args:
-        wave: q t, not negative.
-        poisson: The layer's Poisson's ratio.
     """
     k = np.asarray(wave, dtype=np.float64)
     a = 3 - 4 * poisson

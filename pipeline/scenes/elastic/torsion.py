@@ -39,16 +39,11 @@ def slip_turn(force: float, radius: float, shear_modulus: float) -> float:
 def twist(
     shape: tuple[int, int], centre: tuple[float, float], radius: float, radians: float, pitch: float
 ) -> tuple[Heights, Heights]:
-    """How far the gel's surface has moved, in mm: across and down, each rows x columns.
+    """How far the gel's surface has moved, in mm: across and down, each of this shape (rows x columns).
 
-    The turn may be large: every point stays at its distance from the axis.
-
-    Args:
-        shape: Rows and columns.
-        centre: Column and row of the axis, in pixels.
-        radius: Of the contact, in mm.
-        radians: By which the object has turned while it sticks; positive from the x axis to the y axis.
-        pitch: In mm a pixel.
+    The object has turned by so many radians while it sticks, positive from the x axis to the y axis; the turn may be
+    large, as every point stays at its distance from the axis. The contact's centre (column, row) is in pixels, its
+    radius in mm, the pitch in mm a pixel.
     """
     x = (np.arange(shape[1], dtype=np.float64)[None, :] - centre[0]) * pitch
     y = (np.arange(shape[0], dtype=np.float64)[:, None] - centre[1]) * pitch

@@ -30,14 +30,9 @@ def series(first: float, second: float) -> float:
 def press_springs(gap: Heights, force: float, modulus: float, pitch: float, gel: Gel) -> Heights:
     """Press an object into the gel until the pressure adds up to `force`, by bisection of the approach.
 
-    Returns how far both overlap, shared out between them, in mm: 0 outside the contact, at most the approach.
-
-    Args:
-        gap: Distance of the undeformed surfaces at first touch, in mm; not negative, and 0 somewhere.
-        force: In N, not negative.
-        modulus: The object's reduced modulus, in MPa.
-        pitch: In mm a pixel.
-        gel: The sensor's.
+    The gap is the distance of the undeformed surfaces at first touch in mm, 0 somewhere; the force is in N, the
+    object's reduced modulus in MPa, the pitch in mm a pixel. Returns how far both overlap, shared out between them, in
+    mm: 0 outside the contact, at most the approach.
     """
     if force <= 0:
         return np.zeros_like(gap)

@@ -113,18 +113,10 @@ def _sampled(count: int) -> np.ndarray:
 def predictability(
     features: np.ndarray, labels: Sequence[int], objects: Sequence[str], seed: int
 ) -> tuple[float, list[float]]:
-    """How well features predict labels of objects never seen, and how well they predict permuted labels.
+    """The share of videos whose label features predict, of objects never seen; and the same for permuted labels.
 
-    Ridge regression on one-hot classes; objects are dealt into folds. Labels are permuted among objects, so videos of
-    an object keep a common label.
-
-    Args:
-        features: videos x dimensions.
-        labels: class of each video, equal within an object.
-        objects: object of each video.
-
-    Returns:
-        The share of videos predicted right, and the same for each permutation.
+    Features are videos x dimensions; labels are classes, equal for videos of one object. Ridge regression on one-hot
+    classes; objects are dealt into folds. Labels are permuted among objects, so videos of one keep a common label.
     """
     from sklearn.linear_model import Ridge
     from sklearn.preprocessing import StandardScaler
@@ -199,11 +191,8 @@ def likeness_vectors(signatures: np.ndarray) -> np.ndarray:
     """Vectors whose products are the likenesses of contacts: correlations after what many videos share is divided out.
 
     A pattern that many videos share, such as a smooth blob, is weak evidence of a copy; one that only two share is
-    strong evidence. So signatures are whitened by their own covariance. The identity is added to it, or the common
-    pattern of two copies would itself be divided out.
-
-    Args:
-        signatures: videos x values, each of mean 0 and norm 1.
+    strong evidence. So signatures (videos x values, each of mean 0 and norm 1) are whitened by their own covariance.
+    The identity is added to it, or the common pattern of two copies would itself be divided out.
     """
     shared = np.linalg.cholesky(signatures.T @ signatures + np.eye(signatures.shape[1]))
     own = np.linalg.solve(shared, signatures.T).T
@@ -214,12 +203,9 @@ def likeness_vectors(signatures: np.ndarray) -> np.ndarray:
 def likeness_bound(largest: np.ndarray, pairs: int) -> float:
     """The likeness that, by chance, one of so many pairs of different objects exceeds with probability `CHANCE`.
 
-    Their own largest likenesses tell: under Fisher's transformation these fall off exponentially, at a rate that the
-    m-th and the m/4-th of them give, m = sqrt(pairs); the largest of all may be copies. The bound is where that tail
-    expects `CHANCE` pairs, so it grows with the logarithm of their number.
-
-    Args:
-        largest: m + 1 of them, the largest first.
+    Their own m + 1 largest likenesses tell, the largest first: under Fisher's transformation these fall off
+    exponentially, at a rate that the m-th and the m/4-th give, m = sqrt(pairs); the largest of all may be copies. The
+    bound is where that tail expects `CHANCE` pairs, so it grows with the logarithm of their number.
     """
     m = math.isqrt(pairs)
     if m < FEWEST:

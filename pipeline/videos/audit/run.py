@@ -26,8 +26,7 @@ AUDIT_FILE = "audit.csv"
 def audit_folder(folder: Path, catalogue: Catalogue, split: SplitConfig | None = None) -> list[Finding]:
     """Everything about a folder of videos, errors first; decodes every file once and raises nothing about them.
 
-    Args:
-        split: also look for what leaks between its parts, with kfold of every fold.
+    With a split also what leaks between its parts, with kfold of every fold.
     """
     probes, wrong = _scan_all(list_videos(folder, catalogue).files)
     splits = []
@@ -49,9 +48,7 @@ def audit_chain(
 ) -> list[Finding]:
     """The audit of what is decoded and split already, errors first; opens no video.
 
-    Args:
-        splits: one, or with kfold one a fold.
-        wrong: what decoding and splitting found.
+    There is one split, or with kfold one a fold; `wrong` is what decoding and splitting found.
     """
     listing = list_videos(folder, catalogue)
     found = list(listing.findings)

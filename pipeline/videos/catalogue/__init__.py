@@ -76,11 +76,9 @@ class Catalogue(Record):
         return tuple(next(iter(self.objects.values())).splits)
 
     def asking(self, source: str, wording: str = "object") -> Catalogue:
-        """The catalogue as questions take it.
+        """The catalogue as questions take it: with the scenarios that are from a source (`Scenario.source`) or none.
 
-        Args:
-            source: Only those scenarios are kept that are from it (`Scenario.source`) or from none.
-            wording: `class` keeps only the first phrase of each class.
+        The wording `class` keeps only the first phrase of each class.
         """
         scenarios = tuple(s for s in self.language.scenarios if s.source in ("", source))
         properties = self.language.properties
@@ -135,8 +133,7 @@ class Catalogue(Record):
 def load_catalogue(folder: Path) -> Catalogue:
     """Read `properties.yaml`, `objects.csv` and, where it is there, `descriptions.csv` of a folder.
 
-    Raises:
-        UserError: naming the file, line and mend.
+    What is wrong is a UserError that names the file, line and mend.
     """
     for name in (PROPERTIES, OBJECTS):
         if not (folder / name).is_file():

@@ -16,9 +16,7 @@ def read_rows(file: Path, needed: Sequence[str]) -> tuple[list[str], list[tuple[
     """The header, and each line with its place as an error names it.
 
     Cells are stripped and absent ones empty; empty lines are passed over, and other columns than `needed` are kept.
-
-    Raises:
-        UserError: naming the file, line and mend.
+    What is wrong is a UserError that names the file, line and mend.
     """
     rows = []
     # Spreadsheets put a byte order mark before their UTF-8, and commas alone on lines that once held something.

@@ -54,11 +54,8 @@ def extract_frames(folder: Path, catalogue: Catalogue, config: FramesConfig, out
     `out/frames.npy` is uint8, frames x size x size x RGB, row by row as `out/frames.parquet` says;
     `out/references.npy` likewise, one row for each video of the table of videos. Both open with
     `np.load(mmap_mode="r")`. What is finished waits in `partial`, so a killed extraction goes on where it was; memory
-    does not grow with the number of videos, and results do not depend on how many processes there are.
-
-    Raises:
-        UserError: for the first file that is wrong, naming it and the mend; all of them are listed by
-            `octopi data audit`.
+    does not grow with the number of videos, and results do not depend on how many processes there are. The first file
+    that is wrong is a UserError that names it and the mend; `octopi data audit` lists all of them.
     """
     listing = list_videos(folder, catalogue)
     raise_errors(folder, listing.findings)

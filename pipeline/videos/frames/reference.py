@@ -38,9 +38,7 @@ def reference_indices(frames: int) -> tuple[int, ...]:
 def unsteady_frames(thumbs: Iterable[Image], frames: int) -> int:
     """Number of first frames to skip until the light is steady enough for a reference; all where it never is.
 
-    Args:
-        thumbs: the video's thumbnails, in order; no more are drawn than it takes.
-        frames: how many the video has.
+    Thumbnails come in the video's order, and no more are drawn than it takes.
     """
     places = [*reference_indices(frames), reference_indices(frames)[-1] + 1]
     drawn: list[Image] = []

@@ -166,8 +166,7 @@ def run_pass(
     Args:
         promised: how many frames it has, where the header is not to be trusted.
         given: its no-contact reference; None takes it from the first frames.
-        unsteady: number of first frames to skip; only the published rule, which has no check of the light, may keep
-            them.
+        unsteady: first frames to skip; only the published rule, which has no check of the light, may keep them.
     """
     with Decoder(path) as decoder:
         found = VideoPass(decoder.header, reference=given)

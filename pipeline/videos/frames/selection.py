@@ -58,10 +58,8 @@ class BestFrames:
     """The best frames so far: those with the largest scores, equal scores in favour of the earlier frame.
 
     Frames are held as decoded and resized at the end, since most candidates are displaced by better ones. Only if the
-    held frames could take more than `HELD_BYTES`, each is resized at once.
-
-    Args:
-        frames: number of frames in the video, from its header or from a first pass.
+    held frames could take more than `HELD_BYTES`, each is resized at once. The number of frames in the video is from
+    its header or from a first pass.
     """
 
     def __init__(self, frames: int, config: FramesConfig) -> None:

@@ -21,11 +21,9 @@ PROBES_FILE = "probes.parquet"
 
 
 class FrameStore:
-    """The kept frames of all videos, memory-mapped; only what is drawn is read.
+    """The kept frames of all videos, as `extract_frames` wrote them, memory-mapped; only what is drawn is read.
 
-    Args:
-        folder: what `pipeline.videos.frames.extract` wrote.
-        reference: `subtract` gives pictures of the difference to each video's no-contact reference.
+    The reference `subtract` gives pictures of the difference to each video's no-contact reference.
     """
 
     def __init__(self, folder: Path, reference: Literal["none", "subtract"] = "none") -> None:

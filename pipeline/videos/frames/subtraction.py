@@ -16,15 +16,9 @@ RING = 8
 def subtract(frames: Pictures, reference: Pictures) -> Pictures:
     """Pictures of the difference to the reference: 128 where nothing differs, two steps for each step of difference.
 
-    A change of the light is taken off first, channel by channel: the median difference of the picture's outer ring.
-    The arithmetic is signed and saturates, so nothing wraps around.
-
-    Args:
-        frames: uint8, frames x side x side x channels.
-        reference: uint8, side x side x channels.
-
-    Returns:
-        uint8, as `frames`.
+    Frames and what they become are uint8, frames x side x side x channels; the reference is one of them. A change of
+    the light is taken off first, channel by channel: the median difference of the picture's outer ring. The arithmetic
+    is signed and saturates, so nothing wraps around.
     """
     difference = frames.astype(np.int16) - reference.astype(np.int16)
     height, width = reference.shape[:2]

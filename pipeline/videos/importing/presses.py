@@ -147,9 +147,6 @@ def cut_listed(listed: Path, out: Path, fps: float = 0.0) -> list[Path]:
         listed: CSV with the columns `file` (from the table's folder), `object_id`, and, where wanted, `begin` and `end`
             in seconds (empty: from the beginning, to the end) and `session`. One file may stand in many lines.
         fps: As `film`'s.
-
-    Raises:
-        UserError: naming the line.
     """
     header, rows = read_rows(listed, ("file", "object_id"))
     written, sessions = list[Path](), list[Recorded]()
@@ -177,13 +174,8 @@ def _seconds(where: str, column: str, text: str) -> float | None:
 def film(path: Path, fps: float = 0.0, begin: float = 0.0, end: float | None = None) -> Iterator[Shot]:
     """The pictures of a video, or of a folder of PNG or JPEG files by their names (2 before 10).
 
-    Args:
-        fps: Pictures a second; 0 for the video's own. A folder has none of its own.
-        begin: Seconds from the beginning from which on they are yielded.
-        end: Seconds at which it ends.
-
-    Raises:
-        UserError: where there is no picture, one cannot be read or has another size, or the rate is unknown.
+    From `begin` to `end`, in seconds, at `fps` pictures a second; 0 is the video's own rate, and a folder has none.
+    UserError where there is no picture, one cannot be read or has another size, or the rate is unknown.
     """
     if not path.exists():
         raise UserError(f"{path}: no such file; name a video or a folder of pictures")
@@ -220,12 +212,9 @@ def film(path: Path, fps: float = 0.0, begin: float = 0.0, end: float | None = N
 def presses(strengths: npt.NDArray[np.float64], times: float = FOUND) -> list[tuple[int, int]]:
     """Where something touches: (first frame, one behind the last), rising, none overlapping.
 
-    Hysteresis: a press reaches `times` the quiet level, and lasts while strengths lie over `RELEASED` of that.
-    Each is widened on both sides by up to `LONGEST` untouched frames, which the chain takes its reference from, but
-    not beyond the middle to its neighbour.
-
-    Args:
-        strengths: contact strength by frame, in 8-bit steps.
+    Hysteresis: a press reaches `times` the quiet level, and lasts while strengths (by frame, in 8-bit steps) lie over
+    `RELEASED` of that. Each is widened on both sides by up to `LONGEST` untouched frames, which the chain takes its
+    reference from, but not beyond the middle to its neighbour.
     """
     threshold = _threshold(strengths, times)
     labels, _ = ndimage.label(strengths > RELEASED * threshold)
