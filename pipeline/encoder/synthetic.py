@@ -164,7 +164,7 @@ def _bands(field: Heights, where: npt.NDArray[np.bool_]) -> list[float]:
 
 
 def _picture(skin: Heights, sensor: Sensor, rng: np.random.Generator, frames: FramesConfig) -> Image:
-    """The difference picture of one press: size x size x RGB, fitted as `pipeline.videos.frames.fit` does it."""
+    """The difference picture of one press: size x size x RGB, fitted as `pipeline.videos.decoding.fit` does it."""
     frame = shade(skin, sensor, PITCH, int(rng.integers(2**40)))
     coded = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(*QUALITY))])[1]
     fitted = []

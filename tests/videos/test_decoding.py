@@ -14,9 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.config import FramesConfig
-from pipeline.videos.decoding import Decoder, Header, decode, picture, planes, to_rgb, turns
+from pipeline.videos.decoding import Decoder, Header, decode, fit, picture, planes, to_rgb, turns
 from pipeline.videos.film import KEY_EVERY, write_film
-from pipeline.videos.frames.fit import fit
 from tests.conftest import encode, moving_square, refused, write_video
 from tests.frame_rules import frames_of, pillow
 

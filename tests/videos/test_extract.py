@@ -20,11 +20,10 @@ from pipeline.config import FramesConfig
 from pipeline.core.io import read_table
 from pipeline.core.records import Finding, Frame, Probe
 from pipeline.videos.catalogue import Catalogue
-from pipeline.videos.decoding import Decoder, Header
+from pipeline.videos.decoding import Decoder, Header, fit
 from pipeline.videos.files import VideoFile
 from pipeline.videos.frames import extract
 from pipeline.videos.frames.extract import Extraction
-from pipeline.videos.frames.fit import fit
 from pipeline.videos.frames.reference import reference_indices
 from pipeline.videos.frames.scan import Scan, scan
 from pipeline.videos.frames.selection import kept_count

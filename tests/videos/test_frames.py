@@ -12,9 +12,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from pipeline.config import FramesConfig
-from pipeline.videos.decoding import Decoder, picture
+from pipeline.videos.decoding import Decoder, fit, picture
 from pipeline.videos.frames import selection
-from pipeline.videos.frames.fit import fit
 from pipeline.videos.frames.reference import reference_indices, thumbnail
 from pipeline.videos.frames.scan import VideoPass, run_pass
 from pipeline.videos.frames.selection import kept_count

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from pipeline.config import FramesConfig
 from pipeline.use.frames import read_touch
-from pipeline.videos.decoding import decode, planes
-from pipeline.videos.frames.fit import fit
+from pipeline.videos.decoding import decode, fit, planes
 from pipeline.videos.frames.reference import LONGEST, MOST_FRAMES, reference_indices, thumbnail
 from pipeline.videos.frames.scan import Scan
 from pipeline.videos.frames.subtraction import subtract

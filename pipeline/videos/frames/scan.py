@@ -14,9 +14,8 @@ import numpy as np
 from pipeline.config import FramesConfig
 from pipeline.core.io import sha256
 from pipeline.core.records import Finding, Probe, Severity, finding
-from pipeline.videos.decoding import Decoder, Header, Image, turns
+from pipeline.videos.decoding import Decoder, Header, Image, fit, turns
 from pipeline.videos.files import VideoFile
-from pipeline.videos.frames.fit import fit
 from pipeline.videos.frames.reference import (
     contact_strength,
     detail,

@@ -20,8 +20,7 @@ import cv2
 import numpy as np
 
 from pipeline.config import FramesConfig
-from pipeline.videos.decoding import Image, picture, planes
-from pipeline.videos.frames.fit import fit
+from pipeline.videos.decoding import Image, fit, picture, planes
 
 RELEASE_FEWEST = 5
 HELD_BYTES = 64 * 2**20
