@@ -81,7 +81,8 @@ def adopt(name: str, source: Path, to: Path | None = None, *, trust_pickle: bool
         to: Where it goes; without it, it stays where nothing is to be converted, and else goes to weights/.
         trust_pickle: Whether pickles may be read, for their tensors alone.
 
-    Returns: where it lies.
+    Returns:
+        Where it lies.
 
     Raises:
         UserError: for a folder with something else than was published under this name, or with a broken file; for
