@@ -24,24 +24,17 @@ from pipeline.config import EncoderConfig
 from pipeline.core.errors import UserError
 from pipeline.core.io import read_json
 from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
-from pipeline.weights import CLIP_CONFIG, GET_CLIP, check_finite, frame_side
+from pipeline.weights import CLIP_CONFIG, GET_CLIP, check_finite, first_words, frame_side
 
 if TYPE_CHECKING:
     from open_clip.transformer import VisionTransformer
 
-PUBLISHED_DEVIATION = 0.02
-
 
 def load_visual_tower(folder: Path, embedding: str = "projected") -> VisionTransformer:
-    """Load the visual tower in float32, frozen and in evaluation mode; the text tower is dropped.
+    """The visual tower of a folder in open_clip's format: float32, frozen, in evaluation mode.
 
-    Args:
-        folder: In open_clip's format.
-        embedding: As `EncoderConfig.embedding`: `class_token` has the transformer's width, all else the projection's.
-
-    Raises:
-        UserError: where there are no safetensors, for a checkpoint that does not fit its configuration, or a
-            tower that is not a vision transformer (visual prompts need one).
+    With the `embedding` class_token its output has the transformer's width, else the projection's. What is no vision
+    transformer in safetensors that fit their configuration is a UserError.
     """
     import open_clip
     from safetensors import SafetensorError
@@ -56,10 +49,8 @@ def load_visual_tower(folder: Path, embedding: str = "projected") -> VisionTrans
             )
         model = open_clip.create_model(f"local-dir:{folder}", precision="fp32", require_pretrained=True)
     except (RuntimeError, ValueError, LookupError, TypeError, AttributeError, OSError, SafetensorError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise UserError(
-            f"encoder.weights: {folder} does not fit its {CLIP_CONFIG} ({reason}); {GET_CLIP.format(folder=folder)}"
-        ) from None
+        reason, remedy = first_words(error), GET_CLIP.format(folder=folder)
+        raise UserError(f"encoder.weights: {folder} does not fit its {CLIP_CONFIG} ({reason}); {remedy}") from None
     visual = model.visual
     if not isinstance(visual, open_clip.transformer.VisionTransformer) or not visual.transformer.batch_first:
         raise UserError(f"encoder.weights: {folder} is no vision transformer; visual prompts need one such as ViT-L/14")
@@ -93,7 +84,7 @@ class VisualPrompts(nn.Module):
             nn.init.kaiming_normal_(self.shared.weight, a=0, mode="fan_out")
             nn.init.zeros_(self.shared.bias)
         else:
-            nn.init.normal_(self.prompts, std=PUBLISHED_DEVIATION)
+            nn.init.normal_(self.prompts, std=0.02)
 
     def attach(self, visual: nn.Module) -> None:
         """Hook into `visual.transformer.resblocks`: tokens enter as batch x sequence x width and leave as they came."""
@@ -117,12 +108,9 @@ class VisualPrompts(nn.Module):
 
 
 class TactileEncoder(FrameEncoder):
-    """CLIP's frozen visual tower, with visual prompts or (the base encoder) without; its output is CLIP's own
-    embedding.
+    """CLIP's frozen visual tower, with visual prompts or (the base encoder) without.
 
-    Args:
-        tower: The tower; it takes frames of its own side or larger ones, which are averaged over areas.
-        prompts: Prompts for it, not yet attached.
+    It takes frames of the tower's own side, or larger ones, which are averaged over areas.
     """
 
     def __init__(self, tower: VisionTransformer, prompts: VisualPrompts | None = None) -> None:
@@ -135,7 +123,7 @@ class TactileEncoder(FrameEncoder):
             self.register_buffer(name, value, persistent=False)
         self.prompts = prompts
         if prompts is not None:
-            prompts.attach(self.visual)
+            prompts.attach(tower)
 
     def train(self, mode: bool = True) -> TactileEncoder:
         """The backbone stays in evaluation mode: frozen means that it behaves the same in training."""
@@ -144,7 +132,7 @@ class TactileEncoder(FrameEncoder):
         return self
 
     def forward(self, frames: torch.Tensor, frame_indices: torch.Tensor) -> torch.Tensor:
-        """CLIP's own embeddings: float32, batch x dim, of frames, uint8, batch x side x side x RGB."""
+        """CLIP's own embeddings: float32, batch x dim."""
         return cast(torch.Tensor, self.visual(self.pixels(frames)))
 
     def pixels(self, frames: torch.Tensor) -> torch.Tensor:

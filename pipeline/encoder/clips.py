@@ -32,29 +32,20 @@ class LabelledVideo:
     labels: tuple[int, ...]
 
 
+@dataclass
 class ClipDataset(EpochDataset[dict[str, torch.Tensor]]):
     """Items: `frames`, uint8, k x side x side x RGB; `frame_indices` in the video, int64, k; `labels`, int64.
 
     What is drawn depends on seed, epoch and video alone, so a resumed training sees what an uninterrupted one does.
-
-    Args:
-        per_video: k, frames a clip.
-        seed: Of the draws; None gives the evaluation clip (uniform intervals, no flips).
-        flip_probability: As `draw_flip` takes it.
     """
 
-    def __init__(
-        self,
-        store: FrameStore,
-        videos: Sequence[LabelledVideo],
-        *,
-        per_video: int,
-        seed: int | None = None,
-        flip_probability: float = 0.0,
-    ) -> None:
-        super().__init__()
-        self.store, self.videos, self.per_video = store, videos, per_video
-        self.seed, self.flip_probability = seed, flip_probability
+    store: FrameStore
+    videos: Sequence[LabelledVideo]
+    per_video: int
+    """k, frames a clip."""
+    seed: int | None = None
+    """Of the draws; None gives the evaluation clip (uniform intervals, no flips)."""
+    flip_probability: float = 0.0
 
     def __len__(self) -> int:
         return len(self.videos)
@@ -126,7 +117,7 @@ def describe_clips(
 def classify(
     model: PropertyClassifier, data: EncoderData, parts: Sequence[Part], batch_size: int, device: torch.device
 ) -> list[Classification]:
-    """Classify the evaluation clips of these parts: part by part and property by property, a record a video."""
+    """Classify the evaluation clips of these parts: part by part, property by property, video by video."""
     model = model.to(device).eval()
     objects = {a.video_id: a.object_id for a in data.assignments}
     records = []
@@ -144,18 +135,18 @@ def classify(
         decided = model.decide(logits)
         for index, property_ in enumerate(data.catalogue.properties):
             rows = F.softmax(logits.split(data.classes, dim=1)[index].double(), dim=1)
-            for video, row, classes in zip(videos, rows, decided.tolist(), strict=True):
-                records.append(
-                    Classification(
-                        video_id=video.video_id,
-                        object_id=objects[video.video_id],
-                        part=part,
-                        property=property_.name,
-                        expected=video.labels[index],
-                        predicted=classes[index],
-                        probabilities=tuple(row.tolist()),
-                    )
+            records += [
+                Classification(
+                    video_id=video.video_id,
+                    object_id=objects[video.video_id],
+                    part=part,
+                    property=property_.name,
+                    expected=video.labels[index],
+                    predicted=classes[index],
+                    probabilities=tuple(row.tolist()),
                 )
+                for video, row, classes in zip(videos, rows, decided.tolist(), strict=True)
+            ]
     return records
 
 

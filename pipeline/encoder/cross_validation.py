@@ -7,7 +7,7 @@ also with few training objects, which says what a new sensor needs.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
@@ -17,7 +17,7 @@ from pipeline.config import CrossValidationConfig
 from pipeline.core.errors import UserError
 from pipeline.core.io import code_of, fingerprint, read_json, write_json
 from pipeline.core.records import OutOfFold, Part
-from pipeline.core.runtime import CHECKPOINTS, derive_seed, limit_threads, progress, resolve_device
+from pipeline.core.runtime import CHECKPOINTS, derive_seed, progress, resolve_device
 from pipeline.encoder.clips import EncoderData, classify, describe_clips
 from pipeline.encoder.finetune import Training, finetune
 from pipeline.encoder.folds import Fold, Labels, Predict, cross_validate, deal
@@ -30,16 +30,10 @@ VALIDATION = 8
 
 
 def cross_validate_model(name: str, training: Training, config: CrossValidationConfig) -> list[OutOfFold]:
-    """Out-of-fold predictions of one model; finished folds survive a kill.
+    """Out-of-fold predictions of one model for all videos, which are unused so far; finished folds survive a kill.
 
-    Folds depend on the objects and `config` alone, so all models share them.
-
-    Args:
-        name: Of `MODELS`, or with a number behind it as `cross_validation.models` has it.
-        training: Of all videos with labels, in the order of the results; parts and seeds are those of the folds.
-
-    Raises:
-        UserError: where fewer objects than folds have videos.
+    Folds depend on the objects and `config` alone, so all models share them. `name` is one of `MODELS`, or with a
+    number behind it as `cross_validation.models` has it. Fewer objects than folds are a UserError.
     """
     data, (owners, labels) = training.data, _videos(training.data)
     objects = len(set(owners.tolist()))
@@ -47,7 +41,6 @@ def cross_validate_model(name: str, training: Training, config: CrossValidationC
         raise UserError(
             f"cross_validation.folds is {config.folds} but only {objects} objects have videos; lower it, to 2 at least"
         )
-    limit_threads(training.runtime.threads)
     labelled = repr([(a.video_id, data.catalogue.labels(a.object_id)) for a in data.assignments])
     settings = (name, config.model_copy(update={"models": ()}), training.config, data.per_video, labelled)
     work = CHECKPOINTS / "cross_validation" / fingerprint(*settings, *training.inputs, *code_of("cross_validate"))
@@ -95,12 +88,6 @@ def _videos(data: EncoderData) -> tuple[np.ndarray, Labels]:
     return np.array(owners), np.array([data.catalogue.labels(o) for o in owners], dtype=np.int64)
 
 
-def _dealt(data: EncoderData, parts: Mapping[str, Part]) -> EncoderData:
-    """The same videos with their objects in these parts of a split; objects that `parts` lacks are unused."""
-    assignments = [a.model_copy(update={"part": parts.get(a.object_id, Part.UNUSED)}) for a in data.assignments]
-    return replace(data, assignments=assignments)
-
-
 def _constant(training: Training) -> Predict:
     """Predict the training objects' most frequent combination of classes; of equals the lowest."""
     owners, labels = _videos(training.data)
@@ -116,12 +103,12 @@ def _constant(training: Training) -> Predict:
 
 def _frozen(training: Training) -> Predict:
     """Heads on frozen backbones. These have seen no label, so features are computed once for all folds."""
-    shown, (owners, labels) = _dealt(training.data, {}), _videos(training.data)
+    data, (owners, labels) = training.data, _videos(training.data)
     encoder, device = SideBySide(load_backbones(training.config)), resolve_device(training.runtime.device)
-    clips = describe_clips(encoder, shown, shown.videos(Part.UNUSED), training.config.embed_batch_size, device)
+    clips = describe_clips(encoder, data, data.videos(Part.UNUSED), training.config.embed_batch_size, device)
 
     def predict(fold: Fold) -> Labels:
-        known = (clips[fold.trained], labels[fold.trained], owners[fold.trained].tolist(), shown.classes)
+        known = (clips[fold.trained], labels[fold.trained], owners[fold.trained].tolist(), data.classes)
         strength, _ = choose_strength(*known, derive_seed("votes", fold.repeat, fold.number))
         return fit_frame_heads(*known, strength).predict(clips[fold.tested])
 
@@ -137,15 +124,18 @@ def _tuned(training: Training) -> Predict:
         """The frozen part has seen no label, so it is run once for all folds; where a fold is left to compute."""
         if config.recipe != "tuned":
             return None
-        every, mirrored = _dealt(training.data, {}), config.flip_probability > 0
-        return run_trunks(base_encoder(config), every, every.videos(Part.UNUSED), device, mirrored=mirrored)
+        data, mirrored = training.data, config.flip_probability > 0
+        return run_trunks(base_encoder(config), data, data.videos(Part.UNUSED), device, mirrored=mirrored)
 
     def predict(fold: Fold) -> Labels:
         seed = derive_seed("gradient", fold.repeat, fold.number) % 2**31
         trained = np.unique(owners[fold.trained]).tolist()
         chosen = deal(trained, min(VALIDATION, len(trained)), seed)[0] if len(trained) > 1 else ()
         parts = dict.fromkeys(owners[fold.tested].tolist(), Part.TEST) | dict.fromkeys(trained, Part.TRAIN)
-        data = _dealt(training.data, parts | dict.fromkeys(chosen, Part.VALIDATION))
+        parts |= dict.fromkeys(chosen, Part.VALIDATION)
+        # Objects that a model with fewer of them may not learn from stay unused.
+        dealt = [a.model_copy(update={"part": parts.get(a.object_id, a.part)}) for a in training.data.assignments]
+        data = replace(training.data, assignments=dealt)
         model, _ = finetune(replace(training, data=data, seed=seed), trunks())
         found = classify(model, data, [Part.TEST], config.batch_size, device)
         # Records come property by property, each over all tested videos in their order.

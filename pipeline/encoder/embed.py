@@ -53,15 +53,10 @@ class EncoderSource:
     state: Path | None
     """What fine-tuning trained; None for the base encoder."""
     run: float = 0.0
-    """Start time of the stage. It tells runs apart: a worker may outlive one, and the next has its files at the same
-    place."""
+    """Start time of the stage: a worker may outlive a run, and the next has its files at the same place."""
 
     def __call__(self) -> Loaded:
-        """Load them.
-
-        Raises:
-            UserError: for weights or frames that are missing or do not fit.
-        """
+        """Load them."""
         if self.state is None:
             encoder = base_encoder(self.config)
         else:
@@ -78,16 +73,10 @@ class EncoderSource:
 def embed_videos(
     loaded: Loaded, assignments: Sequence[Assignment], source: EncoderSource | None = None
 ) -> tuple[torch.Tensor, list[Embedding]]:
-    """Embed each kept frame of each used video; training videos also mirrored in all the ways that training draws.
+    """Embeddings of each kept frame of each used video, float32, rows x dim, and what each row is.
 
-    Args:
-        source: Of `loaded`, for the workers of a cluster.
-
-    Returns:
-        The embeddings (float32, rows x dim) and what each row is.
-
-    Raises:
-        UserError: naming the video, where an embedding is not finite.
+    Training videos are also embedded mirrored in all the ways that training draws. One that is not finite is a
+    UserError. `source` is that of `loaded`, for the workers of a cluster.
     """
     used = [a for a in assignments if a.part != Part.UNUSED]
     index: list[Embedding] = []
@@ -96,10 +85,8 @@ def embed_videos(
         for flip in _flips(loaded, assignment):
             for frame in frames:
                 index.append(Embedding(video_id=assignment.video_id, frame_index=frame, flip=flip, row=len(index)))
-    embeddings, row = torch.empty(0), 0
+    embeddings, row = torch.empty(len(index), loaded.encoder.dim), 0
     for block in run_with(loaded, source, _embed_video, used, "embed", "video"):
-        if not row:
-            embeddings = torch.empty(len(index), block.shape[1])
         embeddings[row : row + len(block)] = torch.from_numpy(block)
         row += len(block)
     return embeddings, index
@@ -161,19 +148,13 @@ def standardize(embeddings: torch.Tensor, known: Statistics) -> torch.Tensor:
 def logits_of(
     embeddings: torch.Tensor, index: Sequence[Embedding], split: Sequence[Assignment], catalogue: Catalogue, seed: int
 ) -> tuple[torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
-    """Replace each frame's embedding by property heads' logits: a bottleneck through which a small language model
-    cannot recognise training objects.
+    """Property heads' logits of each frame, rows x classes of all properties, float64, and the heads' linear map.
 
-    Heads know the labels of the objects that they were fitted to. A language model that learnt from such logits would
-    believe them more than it should on new objects. So the training objects are dealt into `FOLDS` parts, and each
-    video's logits are those of heads that did not see its part. All other videos get heads of all training objects.
-
-    Args:
-        embeddings: Rows x features; the heads are fitted to training videos' unmirrored ones.
-
-    Returns:
-        The logits, rows x classes of all properties, float64, and the heads of all training objects, as `Statistics`
-        has them.
+    They are a bottleneck through which a small language model cannot recognise training objects. Heads know the labels
+    of the objects that they were fitted to, by their videos' unmirrored frames. A language model that learnt from such
+    logits would believe them more than it should on new objects. So the training objects are dealt into `FOLDS` parts,
+    and each video's logits are those of heads that did not see its part. All other videos get heads of all training
+    objects, whose map is returned as `Statistics` has it.
     """
     rows: dict[str, list[int]] = defaultdict(list)
     plain: dict[str, list[int]] = defaultdict(list)

@@ -22,7 +22,7 @@ from pipeline.config import EncoderConfig, RuntimeConfig
 from pipeline.core.card import write_card
 from pipeline.core.records import Measurement, Part
 from pipeline.core.runtime import resolve_device, seed_everything
-from pipeline.encoder.clips import ClipDataset, EncoderData, check_finite
+from pipeline.encoder.clips import ClipDataset, EncoderData, LabelledVideo, check_finite
 from pipeline.encoder.frame_classifier import JointFrameClassifier, choose_strength, fit_frame_heads
 from pipeline.encoder.model import PropertyClassifier, SideBySide
 from pipeline.encoder.recipes import property_classifier
@@ -54,60 +54,47 @@ class Training:
 
 
 def finetune(training: Training, trunks: Trunks | None = None) -> tuple[PropertyClassifier, list[Measurement]]:
-    """Train the classifier of the recipe.
+    """Train the classifier of the recipe; returned with its training's curve.
+
+    `tuned` fits the heads, then tunes them and what is unfrozen of the encoder. The fitted heads count as epoch 0, and
+    the best epoch is kept (ties: the first). Without validation videos the heads are kept as they were fitted, since
+    nothing could show that tuning helps.
 
     Args:
-        trunks: Of the recipe `tuned`, where they have been run over these videos before.
-
-    Returns:
-        The classifier, and its training's curve.
+        trunks: Of the recipe `tuned`, where they have been run over these videos before, with all flips where
+            `encoder.flip_probability` is above 0.
     """
-    data, config = training.data, training.config
+    data, config, device = training.data, training.config, resolve_device(training.runtime.device)
     seed_everything(training.seed)
     model = property_classifier(config, data.classes)
     if not isinstance(model, JointFrameClassifier):
         return model, train_classifier(model, training)
-    if trunks is None:
-        assert isinstance(model.encoder, SideBySide)
-        videos = [*data.videos(Part.TRAIN), *data.videos(Part.VALIDATION)]
-        device = resolve_device(training.runtime.device)
-        trunks = run_trunks(model.encoder, data, videos, device, mirrored=config.flip_probability > 0)
-    return model, tune(model, training, trunks)
-
-
-def tune(model: JointFrameClassifier, training: Training, trunks: Trunks) -> list[Measurement]:
-    """Fit the heads, then tune them and what is unfrozen of the encoder; the best epoch is kept (ties: the first).
-
-    The fitted heads count as epoch 0. Without validation videos they are kept, since nothing could show that tuning
-    helps.
-
-    Args:
-        trunks: Of the training and validation videos, with all flips where `encoder.flip_probability` is above 0.
-    """
-    data, device, encoder = training.data, resolve_device(training.runtime.device), model.encoder
+    encoder, chosen = model.encoder, data.videos(Part.VALIDATION)
     assert isinstance(encoder, SideBySide)
+    if trunks is None:
+        videos, mirrored = [*data.videos(Part.TRAIN), *chosen], config.flip_probability > 0
+        trunks = run_trunks(encoder, data, videos, device, mirrored=mirrored)
     model.to(device)
-    owners = {a.video_id: a.object_id for a in data.assignments}
 
     @torch.inference_mode()
-    def described(part: Part) -> tuple[torch.Tensor, npt.NDArray[np.int64], list[str]]:
-        """Features of the part's evaluation clips, videos x frames x dim, with labels and objects."""
-        videos = data.videos(part)
+    def described(videos: Sequence[LabelledVideo]) -> tuple[torch.Tensor, npt.NDArray[np.int64]]:
+        """Features of the videos' evaluation clips, videos x frames x dim, and labels."""
         rows = [encoder.stages([output.to(device) for output in trunks.of(video.video_id)]) for video in videos]
         found = torch.stack(rows).float().cpu()
         check_finite(found.flatten(1), videos)
-        return found, np.array([v.labels for v in videos]), [owners[v.video_id] for v in videos]
+        return found, np.array([v.labels for v in videos])
 
-    features, labels, objects = described(Part.TRAIN)
+    features, labels = described(data.videos(Part.TRAIN))
+    objects = [a.object_id for a in data.assignments if a.part == Part.TRAIN]
     fitted = (features.numpy(), labels, objects, data.classes)
     strength, curve = choose_strength(*fitted, training.seed)
     fit_frame_heads(*fitted, strength).copy_into(model)
-    if not data.videos(Part.VALIDATION):
-        return curve
+    if not chosen:
+        return model, curve
     probe = {name: value.clone() for name, value in trainable_state(model).items()}
-    features, labels, _ = described(Part.VALIDATION)
+    features, labels = described(chosen)
     with torch.inference_mode():
-        logits = model.from_features(features.to(device))["logits"].cpu().numpy()
+        logits = torch.cat(model.classify(features.to(device)), dim=1).cpu().numpy()
     reached = accuracies(logits, labels, model.decide, data.catalogue)
     curve += [Measurement(step=0, name=name, value=value) for name, value in sorted(reached.items())]
     history = train_classifier(model, training, trunks)
@@ -115,16 +102,14 @@ def tune(model: JointFrameClassifier, training: Training, trunks: Trunks) -> lis
         with torch.no_grad():
             for name, value in trainable_state(model).items():
                 value.copy_(probe[name])
-    return [*curve, *history]
+    return model, [*curve, *history]
 
 
 def train_classifier(model: PropertyClassifier, training: Training, trunks: Trunks | None = None) -> list[Measurement]:
     """Train what is not frozen; the epoch of best combined validation accuracy is kept (ties: the first).
 
-    Without validation videos there is nothing to choose by, and the last epoch is kept.
-
-    Args:
-        trunks: As `tune` takes them: the model is shown these, and not the pictures.
+    Without validation videos there is nothing to choose by, and the last epoch is kept. Where there are `trunks`, the
+    model is shown these, and not the pictures.
     """
     # Imported here, since fitted heads need no Trainer, and importing it takes seconds.
     from pipeline.training.trainer import TrainableTrainer, checkpoint_dir, train, training_arguments
@@ -211,10 +196,8 @@ def accuracies(
 ) -> dict[str, float]:
     """Validation accuracy a property, and combined: all properties of a video right.
 
-    Args:
-        logits: Videos x (classes of all properties, side by side).
-        labels: Videos x properties.
-        decide: A classifier's decision about logits.
+    Logits are videos x (classes of all properties, side by side), labels videos x properties; `decide` is a
+    classifier's decision about logits.
     """
     right = decide(torch.from_numpy(logits)).numpy() == labels
     single = {f"validation_{p.name}": float(r.mean()) for p, r in zip(catalogue.properties, right.T, strict=True)}

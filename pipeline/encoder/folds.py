@@ -36,21 +36,12 @@ Predict = Callable[[Fold], Labels]
 
 
 def cross_validate(
-    predict: Predict,
-    objects: Sequence[str],
-    classes: Sequence[int],
-    *,
-    folds: int,
-    repeats: int,
-    seed: int = 0,
+    predict: Predict, objects: Sequence[str], classes: Sequence[int], *, folds: int, repeats: int, seed: int = 0
 ) -> Labels:
-    """Predict every video once a repeat, by a model that saw no video of its object.
+    """Predict every video once a repeat, by a model that saw no video of its object: videos x repeats x properties.
 
     Folds depend only on the objects' names and the seed: settings compared with one seed share them. Each repeat deals
     them anew; there must be at least as many objects as folds.
-
-    Returns:
-        Predicted classes, videos x repeats x properties, in the order of `objects`.
     """
     predicted = np.empty((len(objects), repeats, len(classes)), np.int64)
     for repeat in range(repeats):

@@ -1,9 +1,8 @@
 """A per-frame classifier on the features of a pretrained encoder, with joint decoding.
 
-Each property has a logistic regression on the standardised features of single frames. A video's probabilities are the
-mean over its frames. The properties are then decided together, as objects that share one class often share others.
-Logistic regression is convex, so there is nothing to schedule; its one setting, the penalty on weights, is chosen by a
-cross-validation inside the training objects.
+Each property has a logistic regression on the standardised features of single frames. Its one setting, the penalty on
+weights, is chosen by a cross-validation inside the training objects. A video's probabilities are the mean over its
+frames. The properties are then decided together, as objects that share one class often share others.
 """
 
 from __future__ import annotations
@@ -21,18 +20,15 @@ from pipeline.core.errors import UserError
 from pipeline.core.records import Measurement
 from pipeline.core.runtime import derive_seed
 from pipeline.encoder.folds import Labels, deal
-from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier, SideBySide
+from pipeline.encoder.model import FrameEncoder, Heads, PropertyClassifier
 
 FARTHEST = 5.0
 """Standardised features are clipped to this absolute value, so that one outlier frame does not outweigh all others."""
 STRENGTHS = (3e-4, 1e-3, 3e-3, 1e-2)
 """Inverse weights of the penalty (scikit-learn's C) that are tried."""
 FOLDS = 5
-ROUNDS = 500
-"""Of the solver, at most."""
 ABSENT = -10.0
 """Bias of a class that training lacks: a probability of some 5e-5."""
-
 SMOOTHING = 1 / 6
 """Objects added to each combination of classes, so that none is impossible."""
 MOST_COMBINATIONS = 100_000
@@ -44,11 +40,7 @@ Clips = npt.NDArray[np.float32]
 
 
 class JointFrameClassifier(PropertyClassifier):
-    """Standardised features, one linear layer a property, probabilities averaged over frames, one joint decision.
-
-    The decision is the combination of classes that maximises the sum of log probabilities and the log of how much more
-    often the training objects show the combination than its classes would meet by chance.
-    """
+    """Standardised features, one linear layer a property, probabilities averaged over frames, one joint decision."""
 
     def __init__(self, encoder: FrameEncoder, classes: Sequence[int]) -> None:
         super().__init__(encoder, Heads(encoder.dim, classes), classes)
@@ -58,27 +50,6 @@ class JointFrameClassifier(PropertyClassifier):
         self.register_buffer("centre", torch.zeros(encoder.dim))
         self.register_buffer("spread", torch.ones(encoder.dim))
         self.register_buffer("dependence", torch.zeros(tuple(classes)))
-
-    def forward(
-        self,
-        frames: torch.Tensor | None = None,
-        frame_indices: torch.Tensor | None = None,
-        labels: torch.Tensor | None = None,
-        num_items_in_batch: torch.Tensor | int | None = None,
-        outputs: Sequence[torch.Tensor] | None = None,
-    ) -> dict[str, torch.Tensor]:
-        """As `PropertyClassifier.forward`, or from precomputed outputs of the encoder's trunks in place of frames.
-
-        Args:
-            outputs: Of each backbone's trunk: batch x frames x what its stage takes.
-        """
-        if outputs is None:
-            assert frames is not None
-            assert frame_indices is not None
-            return super().forward(frames, frame_indices, labels, num_items_in_batch)
-        assert isinstance(self.encoder, SideBySide)
-        features = self.encoder.stages([output.flatten(0, 1) for output in outputs])
-        return self.from_features(features.view(*outputs[0].shape[:2], -1), labels, num_items_in_batch)
 
     def standardise(self, features: torch.Tensor) -> torch.Tensor:
         """Features on the training frames' scale, within `FARTHEST`."""
@@ -110,10 +81,7 @@ class FittedHeads:
     dependence: npt.NDArray[np.float64]
 
     def linear(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """Weights, classes of all properties x features, and biases that give a frame's logits from its features.
-
-        They leave out the clipping of outliers (`FARTHEST`).
-        """
+        """Weights, classes of all properties x features, and biases of a frame's logits, without `FARTHEST`."""
         weights = np.concatenate(self.weights) / self.spread
         return weights, np.concatenate(self.biases) - weights @ self.centre
 
@@ -130,7 +98,7 @@ class FittedHeads:
         return decode_jointly(self.evidence(clips), self.dependence)
 
     def copy_into(self, model: JointFrameClassifier) -> None:
-        """Copy into a model."""
+        """Have a model decide as these do."""
         own = [model.centre, model.spread, model.dependence, *model.heads.parameters()]
         heads = [array for pair in zip(self.weights, self.biases, strict=True) for array in pair]
         with torch.no_grad():
@@ -141,12 +109,7 @@ class FittedHeads:
 def fit_frame_heads(
     clips: Clips, labels: Labels, objects: Sequence[str], classes: Sequence[int], strength: float
 ) -> FittedHeads:
-    """Fit the heads of all properties.
-
-    Args:
-        classes: How many classes each property has; one that training lacks gets a probability near 0.
-        strength: One of `STRENGTHS`.
-    """
+    """Fit the heads of all properties with so many classes; one that training lacks gets a probability near 0."""
     from sklearn.linear_model import LogisticRegression
     from threadpoolctl import threadpool_limits
 
@@ -163,7 +126,7 @@ def fit_frame_heads(
         if len(present) > 1:
             # Small matrices: threads that wait for each other were seven times slower on two busy cores.
             with threadpool_limits(1):
-                fitted = LogisticRegression(C=strength, max_iter=ROUNDS).fit(scaled, wanted)
+                fitted = LogisticRegression(C=strength, max_iter=500).fit(scaled, wanted)
             rows, offsets = fitted.coef_, fitted.intercept_
             # scikit-learn gives one row, for the second class; halves of opposite sign have the same softmax.
             if len(present) == 2:
@@ -184,9 +147,8 @@ def choose_strength(
 ) -> tuple[float, list[Measurement]]:
     """The strength with the best combined accuracy in a grouped cross-validation over these objects (ties: the first).
 
-    Returns:
-        The strength, and what each reached: step i is the i-th of `STRENGTHS`. With fewer than two objects there is
-        nothing to compare, and the second is taken.
+    Beside it stands what each reached: step i is the i-th of `STRENGTHS`. With fewer than two objects there is nothing
+    to compare, and the second is taken.
     """
     if len(set(objects)) < 2:
         return STRENGTHS[1], []
@@ -208,10 +170,7 @@ def log_dependence(labels: Labels, objects: Sequence[str], classes: Sequence[int
     """log[P(a, b, ...) / (P(a) P(b) ...)] of each combination: an array with one axis a property.
 
     The joint distribution counts every object once and adds `SMOOTHING` to each cell; P(a), P(b), ... are its
-    marginals.
-
-    Raises:
-        UserError: for more than `MOST_COMBINATIONS`.
+    marginals. More than `MOST_COMBINATIONS` are a UserError.
     """
     if (number := math.prod(classes)) > MOST_COMBINATIONS:
         raise UserError(
@@ -230,14 +189,10 @@ def log_dependence(labels: Labels, objects: Sequence[str], classes: Sequence[int
 
 
 def decode_jointly(evidence: Sequence[Probabilities], dependence: Probabilities) -> Labels:
-    """The combination of each video that maximises the sum of log probabilities and the dependence.
+    """The combination of each video that maximises the sum of log probabilities and the `log_dependence`.
 
-    This is Bayes' rule where the properties' evidence is independent given the classes. Ties go to the combination that
-    comes first in lexicographic order.
-
-    Args:
-        evidence: Log probabilities, videos x classes for each property.
-        dependence: From `log_dependence`.
+    The log probabilities are, for each property, videos x classes. This is Bayes' rule where the properties' evidence
+    is independent given the classes. Ties go to the combination that comes first in lexicographic order.
     """
     combinations = np.array(list(itertools.product(*map(range, dependence.shape))), dtype=np.int64)
     scores = np.broadcast_to(dependence.ravel(), (len(evidence[0]), dependence.size)).copy()

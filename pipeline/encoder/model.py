@@ -23,14 +23,9 @@ class FrameEncoder(nn.Module):
         """Length of an embedding."""
 
     def forward(self, frames: torch.Tensor, frame_indices: torch.Tensor) -> torch.Tensor:
-        """Embed frames as the language model is given them.
+        """Embed frames as the language model is given them: float32, batch x dim.
 
-        Args:
-            frames: uint8, batch x side x side x RGB.
-            frame_indices: int64, batch: each frame's number in its video.
-
-        Returns:
-            float32, batch x dim.
+        Frames are uint8, batch x side x side x RGB, their indices int64, batch: each frame's number in its video.
         """
         raise NotImplementedError
 
@@ -42,8 +37,7 @@ class FrameEncoder(nn.Module):
     def trunk(self, frames: torch.Tensor) -> torch.Tensor:
         """Output of the frozen layers, those below all that fine-tuning changes: batch x anything.
 
-        It is computed once for each picture and reused in every epoch. By default there are no such layers, and the
-        frames are returned.
+        It is computed once for each picture and reused in every epoch. By default there are no such layers.
         """
         return frames
 
@@ -54,10 +48,7 @@ class FrameEncoder(nn.Module):
 
 
 class SideBySide(FrameEncoder):
-    """Several backbones as one encoder: their features one after the other.
-
-    They stay in evaluation mode, so that batch normalisation keeps its statistics and nothing is dropped.
-    """
+    """Several backbones as one encoder: their features one after the other."""
 
     def __init__(self, backbones: Sequence[FrameEncoder]) -> None:
         super().__init__(dim=sum(backbone.dim for backbone in backbones))
@@ -65,7 +56,7 @@ class SideBySide(FrameEncoder):
         self.eval()
 
     def train(self, mode: bool = True) -> SideBySide:
-        """Stays in evaluation mode."""
+        """Stays in evaluation mode, so that batch normalisation keeps its statistics and nothing is dropped."""
         super().train(False)
         return self
 
@@ -107,12 +98,15 @@ class PropertyClassifier(nn.Module):
 
     def forward(
         self,
-        frames: torch.Tensor,
-        frame_indices: torch.Tensor,
+        frames: torch.Tensor | None = None,
+        frame_indices: torch.Tensor | None = None,
         labels: torch.Tensor | None = None,
         num_items_in_batch: torch.Tensor | int | None = None,
+        outputs: Sequence[torch.Tensor] | None = None,
     ) -> dict[str, torch.Tensor]:
-        """Classify videos.
+        """Classify videos: `logits`, batch x (classes of all properties, side by side), and with labels `loss`.
+
+        The loss is the sum of the properties' cross-entropies, so that the heads are trained simultaneously.
 
         Args:
             frames: uint8, batch x frames x side x side x RGB.
@@ -120,26 +114,19 @@ class PropertyClassifier(nn.Module):
             labels: int64, batch x properties.
             num_items_in_batch: Labels of the whole update, so that accumulated batches weigh each video alike; by
                 default those of this batch.
-
-        Returns:
-            `logits`, batch x (classes of all properties, side by side), and with labels `loss`: the sum of the
-            properties' cross-entropies, so that the heads are trained simultaneously.
+            outputs: In place of frames what each backbone's trunk made of them: batch x frames x what its stage takes.
         """
-        features = self.encoder.describe(frames.flatten(0, 1), frame_indices.flatten())
-        return self.from_features(features.view(*frames.shape[:2], -1), labels, num_items_in_batch)
-
-    def from_features(
-        self,
-        features: torch.Tensor,
-        labels: torch.Tensor | None = None,
-        num_items_in_batch: torch.Tensor | int | None = None,
-    ) -> dict[str, torch.Tensor]:
-        """As `forward`, of the frames' features, batch x frames x dim."""
-        logits = self.classify(features)
+        if outputs is not None:
+            entering, shape = [output.flatten(0, 1) for output in outputs], outputs[0].shape
+            features = cast(SideBySide, self.encoder).stages(entering)
+        else:
+            assert frames is not None
+            assert frame_indices is not None
+            shape, features = frames.shape, self.encoder.describe(frames.flatten(0, 1), frame_indices.flatten())
+        logits = self.classify(features.view(*shape[:2], -1))
         output = {"logits": torch.cat(logits, dim=1)}
         if labels is not None:
-            pairs = zip(logits, labels.unbind(1), strict=True)
-            losses = [F.cross_entropy(z, y, reduction="sum") for z, y in pairs]
+            losses = [F.cross_entropy(z, y, reduction="sum") for z, y in zip(logits, labels.unbind(1), strict=True)]
             videos = len(labels) if num_items_in_batch is None else num_items_in_batch / len(losses)
             output = {"loss": torch.stack(losses).sum() / videos, **output}
         return output
@@ -169,12 +156,8 @@ def mean_and_deviation(maps: torch.Tensor) -> torch.Tensor:
 
 
 def load_backbones(config: EncoderConfig, *, tuned: bool = False) -> list[FrameEncoder]:
-    """The backbones of `encoder.backbone` with their pretrained weights.
+    """The backbones of `encoder.backbone` with their pretrained weights; those that do not fit are a UserError.
 
-    Args:
-        tuned: Whether what fine-tuning changes is to be unfrozen: the last stage, or prompts. All else is frozen.
-
-    Raises:
-        UserError: for weights that are missing or do not fit.
+    All is frozen but, with `tuned`, what fine-tuning changes: the last stage, or prompts.
     """
     return [import_module(BACKBONES[name].module).load_backbone(config, tuned=tuned) for name in config.backbone]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
@@ -21,15 +22,8 @@ from pipeline.encoder.synthetic import SyntheticPictures, draw_pictures
 from pipeline.training.sampling import EpochDataset
 from pipeline.training.trainer import TrainableTrainer, checkpoint_dir, train, training_arguments
 
-HIDDEN = 192
 WEIGHTS = {"quantities": 2.0, "kinds": 0.6}
 """Of the two parts of the loss."""
-WARMUP = 0.04
-"""Share of the updates."""
-HELD_OUT = 0.04
-"""Share of the objects that the loss is measured on at the end."""
-REPORTS = 24
-"""Points of the curve."""
 STRENGTH = (0.7, 1.4)
 """How much weaker or stronger the light of a picture may be."""
 
@@ -37,8 +31,7 @@ STRENGTH = (0.7, 1.4)
 class PretrainingModel(nn.Module):
     """The encoder with a head that predicts, from single pictures, what is known of invented objects.
 
-    Args:
-        drawn: What it is trained on: quantities are standardised by their mean and deviation over these.
+    Quantities are standardised by their mean and deviation over what it is trained on, `drawn`.
     """
 
     def __init__(self, encoder: SceneEncoder, drawn: SyntheticPictures) -> None:
@@ -47,20 +40,15 @@ class PretrainingModel(nn.Module):
         quantities = drawn.quantities.reshape(-1, drawn.quantities.shape[2])
         self.scale = torch.from_numpy(np.stack([quantities.mean(axis=0), quantities.std(axis=0) + 1e-6]))
         outputs = quantities.shape[1] + drawn.kinds.shape[1]
-        self.head = nn.Sequential(
-            nn.Dropout(0.1), nn.Linear(encoder.dim, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, outputs)
-        )
+        self.head = nn.Sequential(nn.Dropout(0.1), nn.Linear(encoder.dim, 192), nn.ReLU(), nn.Linear(192, outputs))
 
     def forward(self, frames: torch.Tensor, quantities: torch.Tensor, kinds: torch.Tensor) -> dict[str, torch.Tensor]:
-        """The loss on some objects: quantities, standardised, by Huber's loss, kinds by cross-entropy.
+        """The `loss` on some objects, and its parts: Huber's of standardised quantities, and cross-entropy of kinds.
 
         Args:
             frames: uint8, objects x presses x side x side x RGB.
             quantities: float32, objects x presses x quantities.
             kinds: float32, objects x kinds.
-
-        Returns:
-            `loss`, and its two parts before they are weighed.
         """
         objects, presses = frames.shape[:2]
         features = self.encoder(frames.flatten(0, 1), torch.zeros(objects * presses, dtype=torch.int64))
@@ -74,12 +62,13 @@ class PretrainingModel(nn.Module):
         return {"loss": cast(torch.Tensor, sum(WEIGHTS[name] * part for name, part in parts.items())), **parts}
 
 
+@dataclass
 class PretrainingDataset(EpochDataset[dict[str, torch.Tensor]]):
     """Pictures as `PretrainingModel` takes them; what is done to them depends on seed, epoch and object alone."""
 
-    def __init__(self, drawn: SyntheticPictures, *, augment: bool, seed: int) -> None:
-        super().__init__()
-        self.drawn, self.augment, self.seed = drawn, augment, seed
+    drawn: SyntheticPictures
+    augment: bool
+    seed: int
 
     def __len__(self) -> int:
         return len(self.drawn.pictures)
@@ -108,18 +97,17 @@ def vary(pictures: npt.NDArray[np.uint8], rng: np.random.Generator) -> npt.NDArr
 def pretrain(
     config: PretrainConfig, frames: FramesConfig, runtime: RuntimeConfig, callbacks: Sequence[TrainerCallback] = ()
 ) -> tuple[SceneEncoder, list[Measurement]]:
-    """Draw the pictures and train the encoder on them; a killed run goes on where it was.
+    """Draw pictures and train the encoder on them, which is returned with its curve; a killed run goes on.
 
-    The pictures are as large as the encoder will see frames: `frames.pixels`, or its own side where that is larger.
-
-    Returns:
-        The encoder, and the curve of its loss; `held_out_*` at the last step are over objects that it never saw.
+    The pictures are as large as the encoder will see frames: `frames.pixels`, but no larger than its own side.
+    `held_out_*` at the last step of the curve are over objects that it never saw.
     """
     seed_everything(config.seed)
     frames = frames.model_copy(update={"pixels": min(frames.pixels, SIDE)})
     shown = repr((config.objects, config.presses, config.seed))
     drawn = draw_pictures(config, frames, checkpoint_dir("pretrain", "pictures", shown, frames.fit, frames.pixels))
-    border = len(drawn.pictures) - max(1, round(HELD_OUT * len(drawn.pictures)))
+    # The loss is measured at the end on a share of the objects.
+    border = len(drawn.pictures) - max(1, round(0.04 * len(drawn.pictures)))
     training, held = (SyntheticPictures._make(a[part] for a in drawn) for part in (slice(border), slice(border, None)))
     model = PretrainingModel(SceneEncoder(), training)
     arguments = training_arguments(
@@ -130,8 +118,8 @@ def pretrain(
         max_steps=config.steps,
         learning_rate=config.learning_rate,
         weight_decay=config.weight_decay,
-        warmup_steps=round(WARMUP * config.steps),
-        logging_steps=max(1, config.steps // REPORTS),
+        warmup_steps=round(0.04 * config.steps),
+        logging_steps=max(1, config.steps // 24),
         label_names=["kinds"],
     )
     trainer = TrainableTrainer(
@@ -141,13 +129,9 @@ def pretrain(
         callbacks=callbacks,
     )
     history = train(trainer).history
-    measured = held_out(model.cpu(), PretrainingDataset(held, augment=False, seed=0))
+    items = PretrainingDataset(held, augment=False, seed=0)
+    model.cpu().eval()
+    with torch.inference_mode():
+        parts = [model(**{name: value[None] for name, value in items[i].items()}) for i in range(len(items))]
+    measured = {f"held_out_{name}": float(np.mean([float(p[name]) for p in parts])) for name in parts[0]}
     return model.encoder, [*history, *(Measurement(step=config.steps, name=n, value=v) for n, v in measured.items())]
-
-
-@torch.inference_mode()
-def held_out(model: PretrainingModel, data: PretrainingDataset) -> dict[str, float]:
-    """Parts of the loss over objects, each a mean."""
-    model.eval()
-    parts = [model(**{name: value[None] for name, value in data[i].items()}) for i in range(len(data))]
-    return {f"held_out_{name}": float(np.mean([float(p[name]) for p in parts])) for name in parts[0]}

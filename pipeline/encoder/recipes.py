@@ -29,22 +29,14 @@ def check_recipe(name: str) -> None:
 
 
 def base_encoder(config: EncoderConfig) -> FrameEncoder:
-    """The ablation's base: the off-the-shelf encoder, read as the recipe reads a fine-tuned one.
-
-    Raises:
-        UserError: for an unknown recipe, or weights that do not fit.
-    """
+    """The ablation's base: the off-the-shelf encoder, read as the recipe reads a fine-tuned one."""
     check_recipe(config.recipe)
     encoder: FrameEncoder = import_module(RECIPES[config.recipe]).base_encoder(config)
     return encoder
 
 
 def property_classifier(config: EncoderConfig, classes: Sequence[int]) -> PropertyClassifier:
-    """The classifier to fine-tune, or to load a fine-tuned state into. It is drawn from torch's seed.
-
-    Raises:
-        UserError: for an unknown recipe, or weights that do not fit.
-    """
+    """The classifier to fine-tune, or to load a fine-tuned state into. It is drawn from torch's seed."""
     check_recipe(config.recipe)
     classifier: PropertyClassifier = import_module(RECIPES[config.recipe]).property_classifier(config, classes)
     return classifier

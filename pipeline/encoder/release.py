@@ -23,10 +23,7 @@ from pipeline.encoder.model import Heads, PropertyClassifier
 if TYPE_CHECKING:
     from open_clip.transformer import VisionTransformer
 
-HIDDEN = 512
 DROPOUT = 0.5
-LONGEST_WAVE = 10_000
-"""In frames, times 2 pi (Vaswani et al. 2017, section 3.5)."""
 SHORTEST_FEATURE = 1e-6
 """Below this length a video's mean stays as it is instead of being blown up to length 1; float16 still holds it."""
 
@@ -40,7 +37,7 @@ class PublishedEncoder(TactileEncoder):
         self._token: torch.Tensor
         self.visual.get_submodule("transformer").register_forward_hook(self._keep)
 
-    def _keep(self, _: nn.Module, __: tuple[torch.Tensor, ...], tokens: torch.Tensor) -> None:
+    def _keep(self, _: nn.Module, __: object, tokens: torch.Tensor) -> None:
         self._token = tokens[:, 1:].mean(1) if self.visual.pool_type == "avg" else tokens[:, 0]
 
     def forward(self, frames: torch.Tensor, frame_indices: torch.Tensor) -> torch.Tensor:
@@ -60,9 +57,9 @@ class PublishedHeads(nn.Module):
 
     def __init__(self, dim: int, classes: Sequence[int]) -> None:
         super().__init__()
-        self.shared = nn.Linear(dim, HIDDEN)
+        self.shared = nn.Linear(dim, 512)
         self.dropout = nn.Dropout(DROPOUT)
-        self.properties = Heads(HIDDEN, classes)
+        self.properties = Heads(512, classes)
 
     def forward(self, features: torch.Tensor) -> list[torch.Tensor]:
         """Logits a property, batch x classes, of features, batch x dim."""
@@ -84,11 +81,11 @@ def property_classifier(config: EncoderConfig, classes: Sequence[int]) -> Proper
 
 
 def sinusoid(frame_indices: torch.Tensor, dim: int) -> torch.Tensor:
-    """sin and cos of t / 10000^(2 i / dim) by turns: float32, frame_indices x dim.
+    """sin and cos of t / 10000^(2 i / dim) by turns (Vaswani et al. 2017, section 3.5): float32, frame_indices x dim.
 
     Computed in float64, on the CPU since not every device has it: in float32 late frames lose digits, in half precision
     the first rates already fall together.
     """
-    rates = LONGEST_WAVE ** (-torch.arange(0, dim, 2, dtype=torch.float64) / dim)
+    rates = 10_000 ** (-torch.arange(0, dim, 2, dtype=torch.float64) / dim)
     angles = frame_indices.cpu().double()[:, None] * rates
     return torch.stack([angles.sin(), angles.cos()], dim=-1).flatten(1)[:, :dim].float().to(frame_indices.device)

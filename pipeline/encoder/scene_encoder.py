@@ -27,19 +27,17 @@ TUNED = 2
 class SceneEncoder(FrameEncoder):
     """Seven convolutions with batch normalisation, then mean and maximum over the picture: 256 numbers a frame.
 
-    It takes difference pictures (`pipeline.videos.frames.subtraction`) of any side from 16 pixels; those larger than
-    `SIDE` are averaged over areas.
+    It takes difference pictures (`pipeline.videos.frames.subtraction`) of any side from 16 pixels.
     """
 
     def __init__(self) -> None:
         super().__init__(dim=2 * CHANNELS[-1][0])
         layers: list[nn.Module] = []
-        width = 3
-        for number, (channels, stride) in enumerate(CHANNELS):
-            kernel = 3 if number else 5
+        width, kernel = 3, 5
+        for channels, stride in CHANNELS:
             convolution = nn.Conv2d(width, channels, kernel, stride, kernel // 2, bias=False)
             layers += [convolution, nn.BatchNorm2d(channels), nn.ReLU(inplace=True)]
-            width = channels
+            width, kernel = channels, 3
         self.layers = nn.Sequential(*layers).to(memory_format=torch.channels_last)
 
     @property
@@ -48,7 +46,7 @@ class SceneEncoder(FrameEncoder):
         return self.layers[-3 * TUNED :]
 
     def forward(self, frames: torch.Tensor, frame_indices: torch.Tensor) -> torch.Tensor:
-        """Embed difference pictures, uint8, batch x side x side x RGB: batch x dim, in the weights' number format."""
+        """Embeddings, batch x dim, in the weights' number format."""
         return self.stage(self.trunk(frames))
 
     def trunk(self, frames: torch.Tensor) -> torch.Tensor:
@@ -67,11 +65,7 @@ class SceneEncoder(FrameEncoder):
 
 
 def load_backbone(config: EncoderConfig, *, tuned: bool) -> SceneEncoder:
-    """The network that the stage `pretrain` wrote.
-
-    Raises:
-        UserError: where there is none, or one that does not fit.
-    """
+    """The network that the stage `pretrain` wrote; where there is none, or it does not fit, a UserError."""
     encoder = SceneEncoder()
     load_trainable(encoder, Path(config.pretrained))
     encoder.requires_grad_(False).eval()

@@ -44,22 +44,8 @@ QUALITY = (60, 96)
 """JPEG quality between which a picture is coded: real frames went through a lossy codec too."""
 BANDS_MM = (0.3, 0.6, 1.2, 2.4, 4.8)
 """Borders between the wavelengths whose heights are to be predicted."""
-BODIES = ("flat", "round", "bar", "wedge")
-
-QUANTITIES: tuple[str, ...] = (
-    "log10 modulus",
-    "log10 force",
-    "log10 contact radius",
-    "log10 texture",
-    "bump share",
-    "log10 depth",
-    *(f"log10 surface below {band} mm" for band in BANDS_MM),
-    *(f"log10 skin below {band} mm" for band in BANDS_MM),
-)
-"""What is to be predicted of each press as a number."""
-KINDS: tuple[str, ...] = (*LAYERS, *BODIES)
-"""What is to be predicted of each object as present or absent."""
-
+KINDS: tuple[str, ...] = (*LAYERS, "flat", "round", "bar", "wedge")
+"""Of relief and body: what is to be predicted of each object as present or absent."""
 CHUNK = 50
 """Objects that one process draws at a time, and that a killed drawing loses at most for each process."""
 
@@ -70,20 +56,19 @@ class SyntheticPictures(NamedTuple):
     pictures: npt.NDArray[np.uint8]
     """Objects x presses x size x size x RGB."""
     quantities: npt.NDArray[np.float32]
-    """Objects x presses x `QUANTITIES`."""
+    """Objects x presses x what `draw_object` measures."""
     kinds: npt.NDArray[np.uint8]
     """Objects x `KINDS`."""
 
 
 class _Job(NamedTuple):
-    first: int
-    last: int
+    numbers: range
     config: PretrainConfig
     frames: FramesConfig
     file: Path
 
     def __str__(self) -> str:
-        return f"synthetic objects {self.first} to {self.last}"
+        return f"synthetic objects {self.numbers.start} to {self.numbers.stop}"
 
 
 def draw_pictures(config: PretrainConfig, frames: FramesConfig, folder: Path) -> SyntheticPictures:
@@ -92,8 +77,8 @@ def draw_pictures(config: PretrainConfig, frames: FramesConfig, folder: Path) ->
     Object i depends on the seed and i alone.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    borders = range(0, config.objects, CHUNK)
-    jobs = [_Job(i, min(i + CHUNK, config.objects), config, frames, folder / f"{i:06d}.npz") for i in borders]
+    chunks = [range(i, min(i + CHUNK, config.objects)) for i in range(0, config.objects, CHUNK)]
+    jobs = [_Job(chunk, config, frames, folder / f"{chunk.start:06d}.npz") for chunk in chunks]
     for _ in run_parallel(_draw, [job for job in jobs if not job.file.is_file()], "synthetic pictures", "chunk"):
         pass
     parts = []
@@ -118,13 +103,13 @@ def draw_object(number: int, config: PretrainConfig, frames: FramesConfig) -> Sy
         skin, shown = (place(field, angle, centre, (WIDTH, HEIGHT)) for field in (whole, surface))
         touched = skin > 0.15 * max(float(skin.max()), 1e-6)
         quantities.append(
-            [  # In the order of `QUANTITIES`; what is added keeps logarithms finite.
+            [  # What is added keeps logarithms finite.
                 np.log10(recipe.modulus),
                 np.log10(force),
-                np.log10(area / np.pi + 0.05) / 2,
+                np.log10(area / np.pi + 0.05) / 2,  # The radius of contact.
                 np.log10(rough + 5e-4),
                 bump_share(skin, PITCH),
-                np.log10(float(skin.max()) + 1e-3),
+                np.log10(float(skin.max()) + 1e-3),  # The depth.
                 *_bands(shown, touched),
                 *_bands(skin, touched),
             ]
@@ -146,7 +131,7 @@ def sensors() -> list[Sensor]:
 
 def _draw(job: _Job) -> None:
     cv2.setNumThreads(1)
-    drawn = [draw_object(number, job.config, job.frames) for number in range(job.first, job.last)]
+    drawn = [draw_object(number, job.config, job.frames) for number in job.numbers]
     rows = SyntheticPictures(*map(np.concatenate, zip(*drawn, strict=True)))
     with atomic(job.file) as temporary, temporary.open("wb") as stream:
         np.savez(stream, **rows._asdict())

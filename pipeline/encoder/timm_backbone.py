@@ -1,8 +1,7 @@
 """The backbone `timm`: any CNN or vision transformer of timm's, read at one of its stages, from a folder and no hub.
 
 A frame's features are the mean and the deviation of each channel over the map that the stage `encoder.feature_stage`
-leaves. Fine-tuning changes that stage alone, so that all below it is computed once a picture. Batch normalisation keeps
-the statistics of the pretraining.
+leaves. Fine-tuning changes that stage alone, so that all below it is computed once a picture.
 """
 
 from __future__ import annotations
@@ -19,19 +18,14 @@ from pipeline.config import EncoderConfig
 from pipeline.core.errors import UserError
 from pipeline.core.io import load_tensors
 from pipeline.encoder.model import FrameEncoder, mean_and_deviation
-from pipeline.weights import check_finite, frame_side
+from pipeline.weights import check_finite, first_words, frame_side
 
 STAGES = "stages.safetensors"
 """In place of a network's weights those of the stages that are read, as a packaged model has them."""
 
 
 class TimmBackbone(FrameEncoder):
-    """A timm network up to one of its stages.
-
-    Args:
-        model: With `forward_intermediates`, as nearly all of timm's have it. What follows the stage is cut off.
-        stage: Index of the stage in its `feature_info`.
-    """
+    """A timm network, with `forward_intermediates` as nearly all have it, up to a stage, an index in `feature_info`."""
 
     def __init__(self, model: nn.Module, stage: int) -> None:
         self.info: dict[str, Any] = cast(Any, model).feature_info[stage]
@@ -77,6 +71,7 @@ class TimmBackbone(FrameEncoder):
         return mean_and_deviation(maps.flatten(2))
 
     def _map(self, frames: torch.Tensor) -> torch.Tensor:
+        """What the stage leaves, batch x channels x height x width, of frames in a size that the network takes."""
         pixels = frames.permute(0, 3, 1, 2).to(next(self.model.parameters()).dtype) / 255
         whole = tuple(max(p, n // p * p) for n, p in zip(pixels.shape[2:], self.patch, strict=True))
         size = self.own if self.fixed else whole
@@ -92,8 +87,7 @@ class TimmBackbone(FrameEncoder):
 def load_backbone(config: EncoderConfig, *, tuned: bool) -> TimmBackbone:
     """The network in `encoder.weights`, in timm's own layout, or `STAGES` of it; fine-tuning changes the last one.
 
-    Raises:
-        UserError: for a folder that is none, weights that do not fit, or a network or stage that cannot be read so.
+    Weights that do not fit, or a network or stage that cannot be read so, are a UserError.
     """
     import timm
     from safetensors import SafetensorError
@@ -106,8 +100,7 @@ def load_backbone(config: EncoderConfig, *, tuned: bool) -> TimmBackbone:
     try:
         model = timm.create_model(f"local-dir:{folder}", pretrained=not cut)
     except (RuntimeError, ValueError, LookupError, TypeError, AttributeError, OSError, SafetensorError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise UserError(f"encoder.weights: {folder} does not fit its config.json ({reason})") from None
+        raise UserError(f"encoder.weights: {folder} does not fit its config.json ({first_words(error)})") from None
     check_finite(folder, "encoder.weights", model.state_dict().items())
     stages = len(getattr(model, "feature_info", ()))
     if not hasattr(model, "forward_intermediates") or not stages:

@@ -2,10 +2,7 @@
 
 First a linear probe is fitted (`frame_classifier`), then the probe and what the backbones unfreeze are trained by
 gradients at a small rate: with a fitted head fine-tuning distorts the features less (LP-FT, Kumar et al. 2022, arXiv
-2202.10054). The epoch with the best combined validation accuracy is kept. The probe is epoch 0 and wins ties, so tuning
-is used only where it helped.
-
-The layers below are frozen, so their output is computed only once for each picture and flip.
+2202.10054). The layers below are frozen, so their output is computed only once for each picture and flip.
 """
 
 from __future__ import annotations
@@ -40,19 +37,12 @@ def property_classifier(config: EncoderConfig, classes: Sequence[int]) -> JointF
     return JointFrameClassifier(SideBySide(load_backbones(config, tuned=True)), classes)
 
 
-@dataclass(frozen=True)
-class Trunks:
-    """What frozen trunks make of the frames of each video's evaluation clip, under each flip."""
-
-    rows: dict[str, int]
-    """Of each video."""
-    outputs: dict[Flip, list[torch.Tensor]]
-    """Of each backbone: videos x frames x what the backbone's stage takes."""
+class Trunks(dict[tuple[str, Flip], list[torch.Tensor]]):
+    """What frozen trunks make of a video's evaluation clip under a flip: of each, frames x what its stage takes."""
 
     def of(self, video_id: str, flip: Flip = "none") -> list[torch.Tensor]:
-        """Of each backbone: frames x what its stage takes."""
-        found = [output[self.rows[video_id]] for output in self.outputs[flip]]
-        return [output.float() if output.dtype == torch.float16 else output for output in found]
+        """As the stages take it."""
+        return [output.float() if output.dtype == torch.float16 else output for output in self[video_id, flip]]
 
 
 @torch.no_grad()
@@ -60,36 +50,31 @@ def run_trunks(
     encoder: SideBySide, data: EncoderData, videos: Sequence[LabelledVideo], device: torch.device, *, mirrored: bool
 ) -> Trunks:
     """Run the trunks over the evaluation clips of these videos, as they are or also mirrored in all ways."""
-    encoder = encoder.to(device)
+    encoder, found = encoder.to(device), Trunks()
     clips = ClipDataset(data.store, videos, per_video=data.per_video)
-    outputs: dict[Flip, list[torch.Tensor]] = {flip: [] for flip in AXES if mirrored or flip == "none"}
+    flips = [flip for flip in AXES if mirrored or flip == "none"]
     for place in track(range(len(videos)), "frozen part of the encoder", "video"):
         frames = clips[place]["frames"].numpy()
-        for flip, kept in outputs.items():
+        for flip in flips:
             shown = torch.from_numpy(np.flip(frames, AXES[flip]).copy())
-            found = [output.cpu() for output in encoder.trunks(shown.to(device))]
-            if not kept:
-                size = len(videos) * len(outputs) * sum(output.nbytes for output in found)
-                for output in found:
-                    dtype = torch.float16 if output.is_floating_point() and size > MEMORY else output.dtype
-                    kept.append(torch.empty(len(videos), *output.shape, dtype=dtype))
-            for output, whole in zip(found, kept, strict=True):
-                whole[place] = output
-    return Trunks({video.video_id: row for row, video in enumerate(videos)}, outputs)
+            outputs = [output.cpu().contiguous() for output in encoder.trunks(shown.to(device))]
+            if len(videos) * len(flips) * sum(output.nbytes for output in outputs) > MEMORY:
+                outputs = [output.half() if output.is_floating_point() else output for output in outputs]
+            found[videos[place].video_id, flip] = outputs
+    return found
 
 
+@dataclass
 class TrunkDataset(EpochDataset[dict[str, Any]]):
     """Items: `outputs`, of each backbone's trunk, frames x what its stage takes; `labels`, int64.
 
     Flips depend on seed, epoch and video alone. Without a seed there are none.
     """
 
-    def __init__(
-        self, trunks: Trunks, videos: Sequence[LabelledVideo], *, seed: int | None = None, flip_probability: float = 0.0
-    ) -> None:
-        super().__init__()
-        self.trunks, self.videos = trunks, videos
-        self.seed, self.flip_probability = seed, flip_probability
+    trunks: Trunks
+    videos: Sequence[LabelledVideo]
+    seed: int | None = None
+    flip_probability: float = 0.0
 
     def __len__(self) -> int:
         return len(self.videos)

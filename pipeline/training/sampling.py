@@ -7,7 +7,6 @@ the first.
 from __future__ import annotations
 
 import random
-from collections.abc import Callable
 from typing import Generic, TypeVar
 
 from torch.utils.data import Dataset
@@ -28,20 +27,6 @@ T = TypeVar("T", covariant=True)
 
 
 class EpochDataset(Dataset[T], Generic[T]):
-    """A dataset that knows the current epoch; 0 until `follow` is called.
+    """A dataset that draws anew in each epoch; `TrainableTrainer` sets which one it is."""
 
-    It asks the training for the epoch, because a data loader that starts in mid-epoch, as when a killed training
-    resumes, would tell it that this is the first one.
-    """
-
-    def __init__(self) -> None:
-        self._asked: Callable[[], int] = int
-
-    def follow(self, asked: Callable[[], int]) -> None:
-        """From now on, ask this for the epoch."""
-        self._asked = asked
-
-    @property
-    def epoch(self) -> int:
-        """Counted from 0."""
-        return self._asked()
+    epoch = 0

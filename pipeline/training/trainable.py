@@ -13,14 +13,13 @@ from pipeline.core.io import load_tensors, save_tensors
 
 
 def trainable_state(module: nn.Module) -> dict[str, torch.Tensor]:
-    """What is trained, by name: parameters, and buffers of the modules that they are in."""
+    """What is trained, by name: parameters, and the persistent buffers of the modules that they are in."""
     state: dict[str, torch.Tensor] = {}
     kept = module.state_dict()
     for prefix, part in module.named_modules():
-        own = {n: p for n, p in part.named_parameters(prefix, recurse=False) if p.requires_grad}
-        within = any(p.requires_grad for p in part.parameters())
-        buffers = {n: b for n, b in part.named_buffers(prefix, recurse=False) if within and n in kept}
-        state |= {name: value.detach() for name, value in (own | buffers).items()}
+        state |= {n: p.detach() for n, p in part.named_parameters(prefix, recurse=False) if p.requires_grad}
+        if any(p.requires_grad for p in part.parameters()):
+            state |= {n: b.detach() for n, b in part.named_buffers(prefix, recurse=False) if n in kept}
     return state
 
 
@@ -30,7 +29,7 @@ def whole_state(module: nn.Module) -> dict[str, torch.Tensor]:
     The frozen base stays where it is: gathering that too would take its whole size of memory in each process.
     """
     state: dict[str, Any] = {**trainable_state(module)}
-    return {name: value.full_tensor() if _sharded(value) else value for name, value in state.items()}
+    return {name: value.full_tensor() if hasattr(value, "full_tensor") else value for name, value in state.items()}
 
 
 def save_trainable(module: nn.Module, path: Path) -> None:
@@ -54,13 +53,8 @@ def load_trainable(module: nn.Module, path: Path) -> None:
     with torch.no_grad():
         for name, value in own.items():
             read = loaded[name].to(value.device)
-            if _sharded(value):
+            if hasattr(value, "placements"):  # A DTensor; importing that class for the question would take a second.
                 from torch.distributed.tensor import distribute_tensor
 
                 read = distribute_tensor(read, value.device_mesh, value.placements)
             value.copy_(read)
-
-
-def _sharded(value: Any) -> bool:
-    """Whether it is a DTensor; asked by what it has, since importing that class takes a second."""
-    return hasattr(value, "placements")

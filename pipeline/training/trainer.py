@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 import os
 import shutil
 import sys
@@ -42,7 +41,6 @@ class TrainableTrainer(Trainer):
     The frozen base would otherwise be written again with each checkpoint (13 GB for Vicuna-7b).
 
     Args:
-        callbacks: They come after a `TrainingMonitor`.
         rates: Learning rate of the parameters under each name.
         constant: Names in `rates` whose learning rate is constant.
         sampler: The order of the training set, where it is not simply random.
@@ -59,12 +57,7 @@ class TrainableTrainer(Trainer):
     ) -> None:
         super().__init__(*args, callbacks=[TrainingMonitor(), *callbacks], **kwargs)
         self.remove_callback(PrinterCallback)
-        self._rates = rates
-        self._constant = constant
-        self._sampler = sampler
-        if isinstance(self.train_dataset, EpochDataset):
-            # The state's epoch has a fraction for the steps within one.
-            self.train_dataset.follow(lambda: int(self.state.epoch or 0))
+        self._rates, self._constant, self._sampler = rates, constant, sampler
         self.optimizer: torch.optim.Optimizer | None
 
     def _get_train_sampler(self, train_dataset: Any = None) -> Sampler[int] | None:
@@ -130,24 +123,27 @@ class TrainableTrainer(Trainer):
         load_trainable(model or self.model, Path(resume_from_checkpoint) / SAFE_WEIGHTS_NAME)
 
 
-def _diverged(what: str, step: int) -> UserError:
-    return UserError(
-        f"{what} at step {step}: the training diverged; lower the learning rate (earlier checkpoints are kept)"
-    )
-
-
-def check_finite(state: Mapping[str, torch.Tensor], step: int) -> None:
-    """Raise UserError where a trained parameter is not finite."""
-    broken = next((name for name, value in state.items() if not value.isfinite().all()), None)
-    if broken:
-        raise _diverged(f"{broken} is not finite", step)
+def check_finite(values: Mapping[str, torch.Tensor], step: int) -> None:
+    """Raise UserError where a trained parameter, or what is logged of a training, is not finite."""
+    if broken := next((name for name, value in values.items() if not value.isfinite().all()), None):
+        raise UserError(
+            f"{broken} is not finite at step {step}: the training diverged; lower the learning rate (earlier "
+            "checkpoints are kept)"
+        )
 
 
 class TrainingMonitor(TrainerCallback):
     """Says in a log file how far a training is, and stops it where the loss is no number any more."""
 
-    def __init__(self) -> None:
-        self._lines: LogLines | None = None
+    _lines: LogLines | None = None
+
+    def on_epoch_begin(
+        self, args: TrainingArguments, state: TrainerState, control: TrainerControl, **handled: Any
+    ) -> None:
+        """Tell the training set its epoch: a data loader that resumes in mid-epoch would call that one the first."""
+        if isinstance(data := handled["train_dataloader"].dataset, EpochDataset):
+            # The state's epoch has a fraction for the steps within one.
+            data.epoch = int(state.epoch or 0)
 
     def on_log(
         self,
@@ -159,9 +155,8 @@ class TrainingMonitor(TrainerCallback):
     ) -> None:
         """Called by the Trainer after each logging step; UserError where loss or the gradient's norm is not finite."""
         values = measured(logs or {})
-        for name in ("loss", "grad_norm", "validation_loss"):
-            if not math.isfinite(values.get(name, 0.0)):
-                raise _diverged(f"{name} is {values[name]}", state.global_step)
+        losses = {n: torch.tensor(v) for n, v in values.items() if n in ("loss", "grad_norm", "validation_loss")}
+        check_finite(losses, state.global_step)
         # At a terminal the Trainer has a bar of its own.
         if state.is_world_process_zero and args.disable_tqdm and "loss" in values:
             self._lines = self._lines or LogLines("training", state.max_steps, "step", after=state.global_step)
@@ -171,9 +166,8 @@ class TrainingMonitor(TrainerCallback):
 def checkpoint_dir(stage: str, *parts: BaseModel | str | int | Path) -> Path:
     """Where a training keeps its checkpoints, outside DVC's reach (DVC deletes a killed stage's outputs).
 
-    Args:
-        stage: As in dvc.yaml, whose code is part of the key: one version never goes on with another's training.
-        parts: Settings and input files that the training depends on.
+    The key has the stage's code, `stage` being its name in dvc.yaml, and `parts`, the settings and input files that the
+    training depends on: one version never goes on with another's training.
     """
     return CHECKPOINTS / stage / fingerprint(*parts, *code_of(stage))
 
@@ -186,25 +180,16 @@ class Trained:
     state: dict[str, torch.Tensor]
 
 
-MEANT = {
-    "ACCELERATE_MIXED_PRECISION": "no",
-    "ACCELERATE_DYNAMO_BACKEND": "no",
-    "ACCELERATE_USE_DEEPSPEED": "false",
-    "ACCELERATE_USE_MEGATRON_LM": "false",
-    "ACCELERATE_USE_PARALLELISM_CONFIG": "false",
-    "FSDP_VERSION": "2",
-}
-"""What its launcher, or a shell, may tell accelerate: with anything else another model would be trained."""
-
-
 def check_accelerate() -> None:
-    """Raise UserError where accelerate was told to compute otherwise than the parameters say."""
-    # Without a version accelerate takes FSDP 1, which renames the trained parameters: no name in `rates` would match
-    # them.
+    """Raise UserError where a launcher, or a shell, told accelerate to train otherwise than the parameters say."""
+    switches = ("USE_DEEPSPEED", "USE_MEGATRON_LM", "USE_PARALLELISM_CONFIG")
+    meant = {"ACCELERATE_MIXED_PRECISION": "no", "ACCELERATE_DYNAMO_BACKEND": "no", "FSDP_VERSION": "2"}
+    meant |= {f"ACCELERATE_{switch}": "false" for switch in switches}
+    # Without a version accelerate takes FSDP 1, which renames the trained parameters: no name in `rates` would match.
     unnamed = {"FSDP_VERSION": "1"} if "ACCELERATE_USE_FSDP" in os.environ else {}
-    for name, meant in MEANT.items():
-        found = os.environ.get(name, unnamed.get(name, meant))
-        if found.lower() != meant:
+    for name, value in meant.items():
+        found = os.environ.get(name, unnamed.get(name, value))
+        if found.lower() != value:
             raise UserError(
                 f"runtime.launcher: {name} is {found}, which would change what is trained; launch with a file of "
                 "conf/accelerate, and unset the variable in your shell"
@@ -268,18 +253,18 @@ def train(trainer: Trainer) -> Trained:
             "runtime.launcher that it was begun with, or delete the folder"
         )
     trainer.train(resume_from_checkpoint=last)
-    history = [
-        Measurement(step=entry["step"], name=name, value=value)
-        for entry in trainer.state.log_history
-        # A state that was read back has its names in order, one that was not has them as they were logged.
-        for name, value in sorted(measured(entry).items())
-    ]
     model = trainer.accelerator.unwrap_model(trainer.model)
     if trainer.state.best_model_checkpoint:
         # Not by `load_best_model_at_end`, which would warn of each frozen weight that the checkpoint lacks.
         load_trainable(model, Path(trainer.state.best_model_checkpoint) / SAFE_WEIGHTS_NAME)
     state = whole_state(model)
     check_finite(state, trainer.state.global_step)
+    history = [
+        Measurement(step=entry["step"], name=name, value=value)
+        for entry in trainer.state.log_history
+        # A state that was read back has its names in order, one that was not has them as they were logged.
+        for name, value in sorted(measured(entry).items())
+    ]
     return Trained(history, state)
 
 

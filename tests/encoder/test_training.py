@@ -212,7 +212,7 @@ def test_a_clip_depends_on_seed_epoch_and_video_alone(tmp_path: Path) -> None:
 
     def clip(seed: int, epoch: int, order: int = 1) -> tuple[list[int], bytes]:
         data = ClipDataset(store, videos[::order], per_video=3, seed=seed, flip_probability=0.5)
-        data.follow(lambda: epoch)
+        data.epoch = epoch
         item = data[0 if order > 0 else 1]
         return item["frame_indices"].tolist(), item["frames"].numpy().tobytes()
 
