@@ -105,7 +105,7 @@ def prepare(root: Path, aligned: int, asked: int) -> tuple[OctopiForCausalLM, Em
         by_question=False,
     )
     # In random order: questions are built task by task.
-    order = list(UpdateSampler(data.lengths, UPDATE, seed=0, epoch=lambda: 0))
+    order = list(UpdateSampler(data, UPDATE, seed=0))
     optimiser = torch.optim.AdamW(model.connector.parameters(), lr=3e-3)
     for start in range(0, len(order), UPDATE):
         model(**collate([data[i] for i in order[start : start + UPDATE]])).loss.backward()

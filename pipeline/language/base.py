@@ -55,33 +55,23 @@ def load_tokenizer(folder: Path) -> PreTrainedTokenizerBase:
 
 
 def load_llm(folder: Path, dtype: torch.dtype, quantization: Quantization = "none") -> PreTrainedModel:
-    """The language model, frozen and in evaluation mode.
+    """The language model, frozen and in evaluation mode; what cannot be loaded, or not so, is a UserError.
 
     Args:
         dtype: Of the weights; with `nf4`, of what is computed and of the layers that are left whole.
         quantization: `nf4` holds linear layers in four bits (Dettmers et al. 2023), on the CUDA device.
-
-    Raises:
-        UserError: for a missing folder or file, a pickle, a checkpoint that does not fit its configuration, or
-            four bits where they cannot be had.
     """
     check_language(folder, exists=True)
     own: dict[str, Any] = {}
     if quantization == "nf4":
-        needed = {
-            "bitsandbytes (`pip install bitsandbytes`)": find_spec("bitsandbytes"),
-            "a CUDA device": torch.cuda.is_available(),
-        }
+        needed = {"bitsandbytes (`pip install bitsandbytes`)": find_spec("bitsandbytes") is not None}
+        needed["a CUDA device"] = torch.cuda.is_available()
         if lacking := [name for name, found in needed.items() if not found]:
             raise UserError(
                 f"language.quantization: nf4 needs {' and '.join(lacking)}; or set language.quantization=none"
             )
-        own["quantization_config"] = BitsAndBytesConfig(
-            load_in_4bit=True,
-            bnb_4bit_quant_type="nf4",
-            bnb_4bit_use_double_quant=True,
-            bnb_4bit_compute_dtype=dtype,
-        )
+        kind = {"bnb_4bit_quant_type": "nf4", "bnb_4bit_use_double_quant": True, "bnb_4bit_compute_dtype": dtype}
+        own["quantization_config"] = BitsAndBytesConfig(load_in_4bit=True, **kind)
         own["device_map"] = {"": torch.cuda.current_device()}
     model = load_language(folder, "language.weights", dtype=dtype, use_safetensors=True, **own)
     check_finite(folder, "language.weights", model.named_parameters())
@@ -89,11 +79,7 @@ def load_llm(folder: Path, dtype: torch.dtype, quantization: Quantization = "non
 
 
 def save_adapter(llm: PreTrainedModel, folder: Path, state: Mapping[str, torch.Tensor]) -> None:
-    """Write the adapter of a PEFT model, the same bytes for the same values.
-
-    Args:
-        state: The language model's parameters by name, whole even where its own are sharded.
-    """
+    """Write the adapter of a PEFT model, whose whole parameters are `state`: the same bytes for the same values."""
     # In the base's own number format, in which it is added; it was trained in float32.
     dtype = llm.get_input_embeddings().weight.dtype
     own = {name: value.to(dtype) if "lora_" in name else value for name, value in state.items()}
@@ -107,8 +93,7 @@ def save_adapter(llm: PreTrainedModel, folder: Path, state: Mapping[str, torch.T
 def load_adapter(llm: PreTrainedModel, folder: Path) -> PreTrainedModel:
     """The language model with the adapter of a folder on it (float32, frozen).
 
-    Raises:
-        UserError: for a missing file, a pickle, or an adapter of another language model.
+    A missing file, a pickle, or an adapter of another language model is a UserError.
     """
     from peft import PeftModel, get_peft_model_state_dict
 
@@ -117,12 +102,12 @@ def load_adapter(llm: PreTrainedModel, folder: Path) -> PreTrainedModel:
             raise UserError(f"{folder / name}: no such file (pickled adapters are refused); `dvc repro` makes it")
     try:
         model = PeftModel.from_pretrained(llm, str(folder))
+        # PEFT only warns of tensors that are missing, and says nothing of those that are too many.
+        own = get_peft_model_state_dict(model, save_embedding_layers=False).keys()
+        if wrong := sorted(own ^ tensor_shapes(folder / ADAPTER_WEIGHTS).keys()):
+            raise ValueError(wrong[0])
     except (OSError, RuntimeError, ValueError, KeyError, TypeError, SafetensorError) as error:
         raise UserError(
             f"{folder}: its adapter is broken or of another language model ({first_words(error)}); run `dvc repro`"
         ) from None
-    # PEFT only warns of tensors that are missing, and says nothing of those that are too many.
-    own = get_peft_model_state_dict(model, save_embedding_layers=False).keys()
-    if wrong := sorted(own ^ tensor_shapes(folder / ADAPTER_WEIGHTS).keys()):
-        raise UserError(f"{folder}: its adapter is broken or of another language model ({wrong[0]}); run `dvc repro`")
     return model

@@ -20,10 +20,9 @@ class RoomyLayer(DynamicLayer):
 
     keys: torch.Tensor
     values: torch.Tensor
-
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self._room: tuple[torch.Tensor, torch.Tensor] | None = None
+    _room: tuple[torch.Tensor, torch.Tensor]
+    _shown: torch.Tensor | None = None
+    """The part of the room's keys that is taken."""
 
     def update(
         self, key_states: torch.Tensor, value_states: torch.Tensor, *_: Any, **__: Any
@@ -31,9 +30,9 @@ class RoomyLayer(DynamicLayer):
         """Add the newest tokens' keys and values; give back all of them."""
         if not self.is_initialized:
             self.lazy_initialization(key_states, value_states)
-            self._room = None
         old, needed = self.get_seq_length(), self.get_seq_length() + key_states.shape[-2]
-        if self._room is None or self._room[0].shape[-2] < needed:
+        # Where rows were chosen or repeated since, the keys are others.
+        if self.keys is not self._shown or self._room[0].shape[-2] < needed:
             keys, values = (s.new_empty(*s.shape[:-2], needed + AHEAD, s.shape[-1]) for s in (key_states, value_states))
             if old:
                 keys[..., :old, :], values[..., :old, :] = self.keys, self.values
@@ -41,17 +40,8 @@ class RoomyLayer(DynamicLayer):
         for room, new in zip(self._room, (key_states, value_states), strict=True):
             room[..., old:needed, :] = new
         self.keys, self.values = (room[..., :needed, :] for room in self._room)
+        self._shown = self.keys
         return self.keys, self.values
-
-    def batch_repeat_interleave(self, repeats: int) -> None:
-        """Give each row that many copies."""
-        super().batch_repeat_interleave(repeats)
-        self._room = None
-
-    def batch_select_indices(self, indices: torch.Tensor) -> None:
-        """Keep these rows."""
-        super().batch_select_indices(indices)
-        self._room = None
 
 
 def extendable(config: PretrainedConfig) -> bool:

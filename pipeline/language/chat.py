@@ -7,9 +7,8 @@ The chat format is the tokenizer's own template where it has one, else Vicuna v1
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from jinja2 import TemplateError
 
@@ -32,8 +31,7 @@ IGNORE_INDEX = -100
 """Label of a token that the loss leaves out (torch's and transformers' convention)."""
 
 
-@dataclass(frozen=True)
-class Rendered:
+class Rendered(NamedTuple):
     """A conversation as text, with the character spans that the assistant says, end token included.
 
     What a template writes of its own before an answer, such as an empty block of thoughts, belongs to the prompt.
@@ -43,8 +41,7 @@ class Rendered:
     answers: tuple[tuple[int, int], ...]
 
 
-@dataclass(frozen=True)
-class Encoded:
+class Encoded(NamedTuple):
     """Token ids of a conversation and the labels of the same length, `IGNORE_INDEX` outside the answers."""
 
     input_ids: tuple[int, ...]
@@ -63,7 +60,6 @@ def render(
     """Write a conversation out.
 
     Args:
-        turns: Exchanges in order.
         tokenizer: Whose template writes it; without one, Vicuna's with its end token.
         system_prompt: Put before the first turn. Where it is empty nothing is, or what the template puts there itself.
         frames: Tactile embeddings a video.
@@ -74,11 +70,10 @@ def render(
             model would be asked what it was not trained on), or that ends answers with no end token.
     """
     video = TACT_START + TACT_FRAME * frames + TACT_END
-    shown = [Turn(user=turn.user.replace(TACTILE, video), assistant=turn.assistant) for turn in turns]
     messages = [{"role": "system", "content": system_prompt}] if system_prompt else []
     written = []
-    for turn in shown:
-        messages.append({"role": "user", "content": turn.user})
+    for turn in turns:
+        messages.append({"role": "user", "content": turn.user.replace(TACTILE, video)})
         written.append(_templated(messages, tokenizer, ask=True))
         messages.append({"role": "assistant", "content": turn.assistant})
     if complete:
@@ -117,11 +112,9 @@ def encode(rendered: Rendered, tokenizer: PreTrainedTokenizerBase, *, bos: bool 
     """Tokenise a whole conversation at once and label the answers' tokens by their character offsets.
 
     Tokenising in one piece keeps prompt tokens equal in training and evaluation, whatever the tokenizer does at
-    the borders of pieces. The tokenizer is a fast one, since only those know offsets.
-
-    Args:
-        bos: Begin with the begin token. What a template of the tokenizer's writes has its own, where it wants one.
+    the borders of pieces. With `bos` it begins with the begin token.
     """
+    # What the tokenizer's own template writes has a begin token of its own, where it wants one.
     begin = bos and not tokenizer.chat_template
     batch = tokenizer(rendered.text, return_offsets_mapping=True, add_special_tokens=begin)
     ids: list[int] = batch["input_ids"]
@@ -141,7 +134,7 @@ def conclusions(rendered: Rendered, turns: Sequence[Turn]) -> Rendered:
             start = rendered.text.index(turn.assistant, start) + turn.described
         if turn.described < len(turn.assistant):
             spans.append((start, stop))
-    return replace(rendered, answers=tuple(spans))
+    return Rendered(rendered.text, tuple(spans))
 
 
 def _templated(messages: Sequence[dict[str, str]], tokenizer: PreTrainedTokenizerBase, *, ask: bool) -> str:

@@ -13,16 +13,12 @@ from pipeline.core.records import Question
 from pipeline.language.chat import TACTILE
 from pipeline.videos.catalogue import Catalogue
 
-COMPARED = ("PC", "PSS", "POM")
-"""Tasks of which a question can be contradicted by the property heads."""
-
 
 def classes_of(store: EmbeddingStore, catalogue: Catalogue) -> Callable[[str], list[tuple[int, float]]]:
     """A function from a video to its predicted class and expected class, property by property.
 
-    Args:
-        store: Of logits (`encoder.embedding=logits`). Those of training objects are from heads that did not see the
-            object, so that as many classes are wrong as of new objects.
+    The store has logits (`encoder.embedding=logits`); those of training objects are from heads that did not see the
+    object, so that as many classes are wrong as of new objects.
     """
     scaled = Statistics.load(store.folder / STATISTICS_FILE)
     sizes = [len(p.levels) for p in catalogue.properties]
@@ -65,23 +61,18 @@ def uncontradicted(questions: Sequence[Question], store: EmbeddingStore, catalog
 
     What touch contradicts cannot be learnt from touch: such questions teach to guess. Descriptions, which are about one
     video each, stay.
-
-    Args:
-        store: Of logits. Those of training objects are from heads that did not see the object, so that as many are
-            wrong as of new objects.
     """
     said = classes_of(store, catalogue)
-    return [q for q in questions if q.task not in COMPARED or follows(q, [said(v) for v in q.videos], catalogue)]
+    compared = ("PC", "PSS", "POM")
+    return [q for q in questions if q.task not in compared or follows(q, [said(v) for v in q.videos], catalogue)]
 
 
 def follows(question: Question, seen: Sequence[Sequence[tuple[int, float]]], catalogue: Catalogue) -> bool:
     """Whether a comparison's right answer is the one that the tasks' rules draw from these classes.
 
     The rules (`TaskDefinition.conclude`) stand beside the graders. They are written out here once more, from the right
-    answer's side, so that a changed grader does not train every model anew; a test holds them to be the same.
-
-    Args:
-        seen: By video and property, the class and the expected class.
+    answer's side, so that a changed grader does not train every model anew; a test holds them to be the same. `seen`
+    has, by video and property, the class and the expected class.
     """
     labels = question.gold.labels
     if question.task == "POM":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import torch
 from torch.nn import functional as F
@@ -29,12 +29,10 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
     training sees what an uninterrupted one does.
 
     Args:
-        positions: Tokens that the language model can read at once; None where that is unknown.
+        positions: Tokens that the language model can read at once; None where that is unknown. A question that is
+            longer is a UserError.
         given: Ids of questions whose descriptions are given: nothing of them is learnt.
         by_question: Divide the weights of a conversation by their sum, so that all conversations weigh alike.
-
-    Raises:
-        UserError: naming the question that is too long.
     """
 
     def __init__(
@@ -56,10 +54,8 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
         super().__init__()
         asked = [(q, dialogue) for q in questions if (dialogue := q.dialogue(opd))]
         self.questions = [question for question, _ in asked]
-        self.store = store
-        self.per_video = per_video
-        self.flip_probability = flip_probability
-        self.seed = seed
+        self.store, self.per_video = store, per_video
+        self.flip_probability, self.seed = flip_probability, seed
         self.written: list[dict[str, torch.Tensor]] = []
         """The tensors of each question that are the same in every epoch."""
         for question, dialogue in asked:
@@ -67,13 +63,12 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
             encoded = encode(rendered, tokenizer, bos=bos)
             check_length(question.question_id, len(encoded.input_ids), positions)
             learnt = encoded.labels
-            if question.question_id in given and any(turn.described for turn in dialogue.turns):
+            if question.question_id in given:
                 learnt = encode(conclusions(rendered, dialogue.turns), tokenizer, bos=bos).labels
+            # Given descriptions keep their labels; their weight of 0 leaves them out of the loss.
             weights = (torch.tensor(learnt) != IGNORE_INDEX).float()
             if by_question:
-                # The weights of a conversation then sum to 1, however long its answers are.
                 weights = F.normalize(weights, p=1.0, dim=0)
-            # Given descriptions keep their labels; their weight of 0 leaves them out of the loss.
             ids, labels = torch.tensor(encoded.input_ids), torch.tensor(encoded.labels)
             self.written.append({"input_ids": ids, "labels": labels, "weights": weights})
 
@@ -88,12 +83,8 @@ class ConversationDataset(EpochDataset[dict[str, torch.Tensor]]):
     def __getitem__(self, index: int) -> dict[str, torch.Tensor]:
         parts = [torch.zeros(0, self.store.dim)]
         if index == FILLER:
-            nothing = {
-                "input_ids": torch.tensor([0]),
-                "labels": torch.tensor([IGNORE_INDEX]),
-                "weights": torch.zeros(1),
-            }
-            return {**nothing, "features": parts[0]}
+            nothing = {"input_ids": torch.tensor([0]), "labels": torch.tensor([IGNORE_INDEX])}
+            return {**nothing, "weights": torch.zeros(1), "features": parts[0]}
         question = self.questions[index]
         rng = random.Random(derive_seed(self.seed, self.epoch, question.question_id))
         for video_id in question.videos:
@@ -135,24 +126,21 @@ class UpdateSampler(Sampler[int]):
     accelerate would repeat items of the first one.
 
     Args:
-        lengths: Tokens of each item.
         update: Items of an update.
         shared: Items that all devices together compute at once; 1 fills nothing up.
-        epoch: Asked whenever the order is drawn.
     """
 
-    def __init__(
-        self, lengths: Sequence[int], update: int, seed: int, epoch: Callable[[], int], shared: int = 1
-    ) -> None:
-        self.lengths, self.update, self.seed, self.epoch = lengths, update, seed, epoch
-        self.fillers = [FILLER] * (-len(lengths) % shared)
+    def __init__(self, data: ConversationDataset, update: int, seed: int, shared: int = 1) -> None:
+        self.data, self.update, self.seed = data, update, seed
+        self.fillers = [FILLER] * (-len(data.lengths) % shared)
 
     def __len__(self) -> int:
-        return len(self.lengths) + len(self.fillers)
+        return len(self.data.lengths) + len(self.fillers)
 
     def __iter__(self) -> Iterator[int]:
-        order = list(range(len(self.lengths)))
-        random.Random(derive_seed(self.seed, self.epoch(), "order")).shuffle(order)
+        lengths = self.data.lengths
+        order = list(range(len(lengths)))
+        random.Random(derive_seed(self.seed, self.data.epoch, "order")).shuffle(order)
         for start in range(0, len(order), self.update):
-            yield from sorted(order[start : start + self.update], key=self.lengths.__getitem__)
+            yield from sorted(order[start : start + self.update], key=lengths.__getitem__)
         yield from self.fillers

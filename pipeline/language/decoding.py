@@ -45,17 +45,14 @@ def greedy_tokens(
     ends: Collection[int],
     limits: Sequence[int],
 ) -> Iterator[tuple[int, int]]:
-    """Yield the most likely next token of each prompt, up to and including an end token, or up to the limit.
+    """Yield the place of a prompt and its most likely next token, up to and including an end token, or to the limit.
+
+    In float32 a row's tokens do not depend on its neighbours.
 
     Args:
-        prompts: Token ids, of like length where little is to be spent on padding.
         features: Of each prompt's frames: frames x tactile_dim.
         ends: Ids of tokens that end an answer.
         limits: Most new tokens of each, at least 1. One that is lowered meanwhile ends that row.
-
-    Yields:
-        The place of a prompt and its next token, as soon as it is known. In float32 a row's tokens do not depend on
-        its neighbours.
     """
     logits, cache, mask = _read(model, prompts, features)
     said, ended = [0] * len(prompts), [False] * len(prompts)
@@ -98,15 +95,16 @@ def _read(
     shared, parts = 0, [list(range(len(prompts)))]
     # Caches of sliding-window layers have dropped tokens, so they can neither share a prefix nor be joined.
     if extendable(config):
-        shared = _shared(prompts, model.start_id)
+        # The common prefix ends before the first video and leaves each prompt a token at least.
+        most = min(map(len, prompts)) - 1
+        while shared < most and prompts[0][shared] != model.start_id and len({p[shared] for p in prompts}) == 1:
+            shared += 1
         parts = _parts([len(p) - shared for p in prompts])
     begun = roomy_cache(config)
     if shared:
         ids = torch.tensor([prompts[0][:shared]], device=device)
         _step(model, model.embed_words(ids), torch.ones_like(ids), begun)
-    logits: list[torch.Tensor] = []
-    masks: list[torch.Tensor] = []
-    caches: list[Cache] = []
+    logits, masks, caches = [], [], []
     for rows in parts:
         cache = copy.deepcopy(begun)
         if shared:
@@ -128,14 +126,6 @@ def _read(
         keys, values = ([getattr(each, kind) for each in own] for kind in ("keys", "values"))
         layer.update(*(torch.cat([F.pad(s, (0, 0, width - s.shape[-2], 0)) for s in x]) for x in (keys, values)))
     return torch.cat(logits), whole, torch.cat([F.pad(mask, (width - mask.shape[1], 0)) for mask in masks])
-
-
-def _shared(prompts: Sequence[Sequence[int]], stop: int) -> int:
-    """Length of the prompts' common prefix; it ends before the first video and leaves each prompt a token at least."""
-    count, most = 0, min(map(len, prompts)) - 1
-    while count < most and prompts[0][count] != stop and len({p[count] for p in prompts}) == 1:
-        count += 1
-    return count
 
 
 def _parts(lengths: Sequence[int]) -> list[list[int]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -32,11 +33,10 @@ class ModelSource:
     quantization: Quantization
     device: DeviceName
     run: float = 0.0
-    """Start time of the stage. It tells runs apart: a worker may outlive one, and the next has its model in the same
-    folder."""
+    """Start time of the stage: a worker may outlive a run, and the next has its model in the same folder."""
 
     def __call__(self) -> OctopiForCausalLM:
-        """Load it, as `OctopiForCausalLM.from_pretrained` does."""
+        """Load it."""
         model = OctopiForCausalLM.from_pretrained(
             self.folder, base=self.base, dtype=self.dtype, quantization=self.quantization
         )
@@ -87,16 +87,15 @@ def answer(
             "`dvc repro`"
         )
     model.eval()
-    tokenizer = model.tokenizer
     asked = [(q, d) for q in questions if (d := q.dialogue(opd))]
     said: dict[str, list[Generated]] = {q.question_id: [] for q, _ in asked}
     for number in range(max((len(d.turns) for _, d in asked), default=0)):
         waiting = []
         for question, dialogue in asked:
             if number < len(dialogue.turns):
-                before = [s.text for s in said[question.question_id]]
-                turns = [Turn(user=t.user, assistant=a) for t, a in zip(dialogue.turns, [*before, ""], strict=False)]
-                prompt = write_prompt(turns, tokenizer, language, per_video)
+                own = [*(s.text for s in said[question.question_id]), ""]
+                turns = [Turn(user=t.user, assistant=a) for t, a in zip(dialogue.turns, own, strict=False)]
+                prompt = write_prompt(turns, model.tokenizer, language, per_video)
                 check_length(question.question_id, len(prompt) + 1, model.positions)
                 waiting.append((question, prompt))
         features = [evaluation_features(q, store, per_video) for q, _ in waiting]
@@ -131,23 +130,16 @@ def reply(
     label: str = "answers",
     source: ModelSource | None = None,
 ) -> list[Generated]:
-    """An answer to each prompt, in the prompts' order.
+    """An answer to each prompt of `write_prompt`, whose frames have these features (frames x tactile_dim).
 
-    Args:
-        prompts: Of `write_prompt`, each shorter than the language model has positions.
-        features: Of each prompt's frames in reading order: frames x tactile_dim.
-        source: Of the model, for the workers of a cluster.
+    Prompts are shorter than the language model has positions; `source` is of the model, for the workers of a cluster.
     """
-    # Neighbours of like length share a batch, so little is spent on padding.
-    order = sorted(range(len(prompts)), key=lambda place: len(prompts[place]))
-    batches = []
-    for start in range(0, len(order), language.generation_batch_size):
-        places = order[start : start + language.generation_batch_size]
-        chosen = [prompts[place] for place in places]
-        limits = [_room(model, prompt, language) for prompt in chosen]
-        batches.append(Batch(chosen, [features[place] for place in places], limits))
+    batches, places = [], list(_batches([len(prompt) for prompt in prompts], language.generation_batch_size))
+    for own in places:
+        limits = [_room(model, prompts[place], language) for place in own]
+        batches.append(Batch([prompts[place] for place in own], [features[place] for place in own], limits))
     said = [row for rows in run_with(model, source, _reply_batch, batches, label, "batch") for row in rows]
-    return [text for _, text in sorted(zip(order, said, strict=True), key=lambda pair: pair[0])]
+    return [text for _, text in sorted(zip(chain.from_iterable(places), said, strict=True), key=lambda pair: pair[0])]
 
 
 def _reply_batch(model: OctopiForCausalLM, batch: Batch) -> list[Generated]:
@@ -176,12 +168,10 @@ class Stream:
             streams: Of one model, whose first says how many a batch has (`language.generation_batch_size`).
             left: Places of streams whose client has left; the caller may add to it during generation.
         """
-        model, size = streams[0].model, streams[0].language.generation_batch_size
-        ends, tokenizer = end_ids(model.tokenizer), model.tokenizer
-        # Neighbours of like length pad little.
-        places = sorted(range(len(streams)), key=lambda place: len(streams[place].prompt))
-        for start in range(0, len(places), size):
-            order = [place for place in places[start : start + size] if place not in left]
+        model, tokenizer = streams[0].model, streams[0].model.tokenizer
+        ends = end_ids(tokenizer)
+        for places in _batches([len(s.prompt) for s in streams], streams[0].language.generation_batch_size):
+            order = [place for place in places if place not in left]
             if not order:
                 continue
             rows = [streams[place] for place in order]
@@ -203,6 +193,12 @@ class Stream:
                     given[row] = text
                 if over:
                     yield place, None
+
+
+def _batches(lengths: Sequence[int], size: int) -> Iterator[list[int]]:
+    """Places of prompts by batches; those in a batch are of like length, so that little is spent on padding."""
+    order = sorted(range(len(lengths)), key=lengths.__getitem__)
+    return (order[start : start + size] for start in range(0, len(order), size))
 
 
 def _room(model: OctopiForCausalLM, prompt: Sequence[int], language: LanguageConfig) -> int:

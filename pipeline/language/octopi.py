@@ -50,8 +50,8 @@ class OctopiConfig(Record):
 class Connector(nn.Module):
     """The paper's projection (two linear layers, GELU between) and the embeddings of the two new tokens.
 
-    The new tokens' embeddings live here, not in the language model's matrix, whether its rows are trained too or not:
-    the matrix keeps its shape, and a plain PEFT adapter stays loadable on the untouched base.
+    Their embeddings are no rows of the language model's matrix: it keeps its shape, and a plain PEFT adapter stays
+    loadable on the untouched base.
     """
 
     def __init__(self, tactile_dim: int, hidden: int) -> None:
@@ -71,34 +71,21 @@ def read_config(folder: Path) -> OctopiConfig:
 class OctopiForCausalLM(nn.Module):
     """A causal language model that reads tactile embeddings at the places of `<tact_frame>`.
 
-    It is saved and loaded by `save_pretrained` and `from_pretrained`, but is no `PreTrainedModel`: those write all of
-    their weights, and here the base (13 GB for Vicuna-7b) stays where it is, beside a connector and an adapter of some
-    megabytes, and word embeddings (half a GB) where they were trained. All that Trainer and accelerate ask of a model
-    is that its `forward` gives a loss.
+    It is no `PreTrainedModel`: those write all of their weights, and here the base (13 GB for Vicuna-7b) stays where it
+    is. All that Trainer and accelerate ask of a model is that its `forward` gives a loss.
 
     Args:
-        llm: A Llama-like model, or a PEFT model around one; frozen but for adapters.
-        tokenizer: Knows the three tactile tokens.
+        llm: A Llama-like model, frozen.
+        tokenizer: Knows the three tactile tokens. Others that the model has no embedding of are a UserError.
         tactile_dim: Length of a tactile embedding.
         base: Folder that the language model came from.
         normalize: As `language.normalize_touch`.
-
-    Attributes:
-        words: The word embeddings where they are trained (`train_words`), in place of the language model's.
-
-    Raises:
-        UserError: where the tokenizer has tokens that the model has no embedding of.
     """
 
     accepts_loss_kwargs = True  # has Trainer add up an update's weights and give their sum to `forward`
 
     def __init__(
-        self,
-        llm: PreTrainedModel,
-        tokenizer: PreTrainedTokenizerBase,
-        tactile_dim: int,
-        base: str = "",
-        normalize: bool = False,
+        self, llm: PreTrainedModel, tokenizer: PreTrainedTokenizerBase, tactile_dim: int, base: str, normalize: bool
     ) -> None:
         super().__init__()
         self.llm = llm
@@ -110,6 +97,7 @@ class OctopiForCausalLM(nn.Module):
         )
         self.word_rms = float(matrix.detach().float().square().mean().sqrt()) if normalize else None
         self.words: nn.Embedding | None = None
+        """The word embeddings where they are trained (`train_words`), in place of the language model's."""
         with torch.no_grad():
             # The mean of all words is a neutral start for a new one.
             self.connector.delimiters.copy_(matrix.float().mean(0).expand(2, -1))
@@ -150,7 +138,6 @@ class OctopiForCausalLM(nn.Module):
         """Load what `save_pretrained` wrote, ready to answer.
 
         Args:
-            folder: With config.json, connector.safetensors and, where there are such, words.safetensors and adapter/.
             base: Folder of the language model; by default the one that config.json names.
             dtype: Number format of the frozen weights; what was trained is float32 whatever it is.
             quantization: `nf4` for linear layers of four bits (bitsandbytes and CUDA).
@@ -186,10 +173,7 @@ class OctopiForCausalLM(nn.Module):
     def save_pretrained(self, folder: Path | str, state_dict: Mapping[str, torch.Tensor] | None = None) -> None:
         """Write config.json, the connector and, where there are such, word embeddings and an adapter in PEFT's format.
 
-        Args:
-            folder: Made where it is not there.
-            state_dict: The parameters by name where the model's own are sharded over processes. An adapter that is not
-                among them is not written.
+        `state_dict` has the parameters where the model's own are sharded; an adapter that it lacks is not written.
         """
         folder = Path(folder)
         parts: dict[str, dict[str, torch.Tensor]] = {"connector": {}, "words": {}, "llm": {}}
@@ -217,13 +201,9 @@ class OctopiForCausalLM(nn.Module):
         return words
 
     def embed_words(self, input_ids: torch.Tensor) -> torch.Tensor:
-        """Embeddings of words, the trained ones where there are.
+        """Embeddings of words, trained or not, in the language model's number format: batch x length x hidden.
 
-        Args:
-            input_ids: batch x length, without tactile tokens.
-
-        Returns:
-            batch x length x hidden, in the language model's number format.
+        `input_ids`, batch x length, has no tactile tokens.
         """
         own = self.llm.get_input_embeddings()
         found = own(input_ids) if self.words is None else self.words(input_ids).to(own.weight.dtype)
@@ -235,15 +215,12 @@ class OctopiForCausalLM(nn.Module):
         return cast("int | None", getattr(self.llm.config.get_text_config(), "max_position_embeddings", None))
 
     def embed(self, input_ids: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
-        """Word embeddings with the tactile ones in their places.
+        """Word embeddings with the tactile ones in their places: batch x length x hidden, in the model's number format.
 
         Args:
             input_ids: batch x length.
             features: batch x (most frames of a row) x tactile_dim; a row's frames come first, in reading order, and
                 what lies behind them is padding that is never read.
-
-        Returns:
-            batch x length x hidden, in the language model's number format.
         """
         tactile = torch.isin(input_ids, input_ids.new_tensor([self.start_id, self.frame_id, self.end_id]))
         # The tactile tokens have no row in the word matrix.
@@ -267,20 +244,15 @@ class OctopiForCausalLM(nn.Module):
         weights: torch.Tensor | None = None,
         num_items_in_batch: torch.Tensor | int | None = None,
     ) -> CausalLMOutput:
-        """Logits, or with labels the cross-entropy over the answers' tokens alone.
+        """Without labels `logits`, batch x length x vocabulary; with labels `loss`, over the answers' tokens alone.
 
         Args:
             input_ids: batch x length, padded on the right where rows differ: no token sees a later one.
             features: batch x frames x tactile_dim, as `embed` wants them.
             labels: batch x length, each token its own label; `IGNORE_INDEX` is left out.
             weights: batch x length, how much each labelled token counts; by default 1.
-            num_items_in_batch: Sum of the weights of the whole update, of which this may be a part; by default that
-                of this batch.
-
-        Returns:
-            Without labels `logits`, batch x length x vocabulary. With labels `loss`, the weighted sum over labelled
-            tokens divided by that of the weights; 0 where there is none. Logits are then computed only for columns
-            that some row needs: in long prompts that saves the larger part of them.
+            num_items_in_batch: What the weighted sum of cross-entropies is divided by: the sum of the weights of the
+                whole update, of which this may be a part; by default that of this batch.
         """
         embeddings = self.embed(input_ids, features)
         if labels is None:
@@ -294,7 +266,7 @@ class OctopiForCausalLM(nn.Module):
             self.llm(inputs_embeds=first, past_key_values=cache, use_cache=True, logits_to_keep=1)
             cache.batch_repeat_interleave(len(embeddings))
             call = {"past_key_values": cache, "use_cache": True}
-        # Each column predicts the next token.
+        # Each column predicts the next token. In long prompts few columns are needed by any row.
         targets = labels[:, shared + 1 :]
         learned = targets != IGNORE_INDEX
         columns = learned.any(0).nonzero().flatten()

@@ -8,18 +8,11 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from transformers import TrainerCallback
 
-from pipeline.config import (
-    LANGUAGE_DIR,
-    LanguageConfig,
-    LoraTrainConfig,
-    Params,
-    RuntimeConfig,
-    TrainConfig,
-)
+from pipeline.config import LANGUAGE_DIR, LanguageConfig, LoraTrainConfig, Params, RuntimeConfig, TrainConfig
 from pipeline.core.card import write_card
 from pipeline.core.embeddings import EmbeddingStore
 from pipeline.core.errors import UserError
@@ -30,13 +23,7 @@ from pipeline.language.base import ADAPTER_WEIGHTS
 from pipeline.language.classes import in_words, uncontradicted
 from pipeline.language.conversations import ConversationDataset, UpdateSampler, collate
 from pipeline.language.octopi import ADAPTER_DIR, CONFIG_FILE, OctopiForCausalLM, read_config
-from pipeline.training.trainer import (
-    TrainableTrainer,
-    Trained,
-    checkpoint_dir,
-    train,
-    training_arguments,
-)
+from pipeline.training.trainer import TrainableTrainer, Trained, checkpoint_dir, train, training_arguments
 from pipeline.videos.catalogue import Catalogue, load_catalogue
 
 logger = logging.getLogger(__name__)
@@ -45,15 +32,13 @@ logger = logging.getLogger(__name__)
 def add_lora(model: OctopiForCausalLM, config: LoraTrainConfig) -> None:
     """Add new LoRA adapters (float32) to the language model's linear layers, or train those that it has already.
 
-    Raises:
-        UserError: for layers that it lacks, or an adapter of another shape.
+    Layers that it lacks, or an adapter of another shape, are a UserError.
     """
     from peft import LoraConfig, PeftModel, get_peft_model
 
     if isinstance(model.llm, PeftModel):
         own = model.llm.peft_config["default"]
-        shape = {"rank": own.r, "alpha": own.lora_alpha, "dropout": own.lora_dropout}
-        for name, has in shape.items():
+        for name, has in {"rank": own.r, "alpha": own.lora_alpha, "dropout": own.lora_dropout}.items():
             if has != getattr(config, name):
                 raise UserError(f"lora.{name}: the adapter to train on has {has}; set lora.{name}={has}")
         for name, value in model.llm.named_parameters():
@@ -65,14 +50,8 @@ def add_lora(model: OctopiForCausalLM, config: LoraTrainConfig) -> None:
     if unknown:
         linear = ", ".join(sorted(n for n in names if n.endswith(("_proj", "lm_head"))))
         raise UserError(f"lora.target_modules: the language model has no layer {unknown[0]}; it has {linear}")
-    lora = LoraConfig(
-        r=config.rank,
-        lora_alpha=config.alpha,
-        lora_dropout=config.dropout,
-        target_modules=modules,
-        task_type="CAUSAL_LM",
-    )
-    model.llm = get_peft_model(model.llm, lora)
+    shape = {"r": config.rank, "lora_alpha": config.alpha, "lora_dropout": config.dropout}
+    model.llm = get_peft_model(model.llm, LoraConfig(**shape, target_modules=modules, task_type="CAUSAL_LM"))
 
 
 @dataclass(frozen=True)
@@ -102,14 +81,18 @@ class Material:
         dtype, start = name_dtype(params.language.dtype, params.runtime.device), params.language.start
         asked = folder / "questions" / str(seed) / "train.jsonl"
         embedded = folder / "embeddings" / f"{encoder}-{seed}"
-        catalogue = load_catalogue(Path(params.data.catalogue))
         begun = Path(start) / LANGUAGE_DIR / ADAPTER_DIR
         adapter = begun if start and begun.is_dir() else None
         words = encoder is Encoder.WORDS
+        files = [asked, embedded / TENSOR_FILE]
+        if start:
+            files.append(Path(start) / CONFIG_FILE)
+        if adapter:
+            files.append(adapter / ADAPTER_WEIGHTS)
         return cls(
             questions=read_jsonl(asked, Question),
             store=EmbeddingStore(embedded),
-            catalogue=catalogue,
+            catalogue=load_catalogue(Path(params.data.catalogue)),
             opd=opd,
             language=params.language.model_copy(update={"dtype": dtype}),
             per_video=0 if words else params.frames.per_video,
@@ -117,19 +100,14 @@ class Material:
             flip_probability=params.encoder.flip_probability,
             seed=params.seed + seed,
             source=params.data.source,
-            files=(
-                *(asked, embedded / TENSOR_FILE),
-                *([Path(start) / CONFIG_FILE] if start else []),
-                *([adapter / ADAPTER_WEIGHTS] if adapter else []),
-            ),
+            files=tuple(files),
             adapter=adapter,
         )
 
     def fingerprint(self, config: TrainConfig, *inputs: Path) -> str:
         """A short hash of all that a training depends on; `inputs` are files of what was trained before."""
-        weights = Path(self.language.weights)
         settings = (config, self.language, self.opd, self.per_video, str(self.flip_probability), self.seed)
-        return fingerprint(*settings, weights, *self.files, *inputs)
+        return fingerprint(*settings, Path(self.language.weights), *self.files, *inputs)
 
 
 def assemble(
@@ -137,16 +115,12 @@ def assemble(
 ) -> tuple[OctopiForCausalLM, ConversationDataset]:
     """A model and its training conversations: `config.samples` questions, drawn by seed and purpose.
 
-    Each OPD mode draws as many, from the questions that have a dialogue in it.
-
-    Args:
-        aligned: Folder of a model to go on with; by default that of `language.start`, or a fresh one.
-
-    Raises:
-        UserError: where no question has this OPD mode, or `language.start` does not fit.
+    Each OPD mode draws as many, from the questions that have a dialogue in it. The model is the one in the folder
+    `aligned`, else that of `language.start`, else a fresh one.
     """
     seed_everything(material.seed)
     language = material.language
+    how: dict[str, Any] = {"dtype": language.dtype, "quantization": language.quantization}
     if aligned is None and language.start:
         aligned = Path(language.start) / LANGUAGE_DIR
         dim, own = read_config(aligned).tactile_dim, material.store.dim
@@ -156,17 +130,10 @@ def assemble(
                 "encoder.backbone and encoder.embedding as its config.json has them"
             )
     if aligned is None:
-        model = OctopiForCausalLM.from_base(
-            language.weights,
-            material.store.dim,
-            dtype=language.dtype,
-            quantization=language.quantization,
-            normalize=language.normalize_touch,
-        )
+        how["normalize"] = language.normalize_touch
+        model = OctopiForCausalLM.from_base(language.weights, material.store.dim, **how)
     else:
-        model = OctopiForCausalLM.from_pretrained(
-            aligned, base=language.weights, dtype=language.dtype, quantization=language.quantization
-        )
+        model = OctopiForCausalLM.from_pretrained(aligned, base=language.weights, **how)
     usable = [q for q in material.questions if q.dialogue(material.opd)]
     if isinstance(config, LoraTrainConfig) and config.skip_contradicted:
         usable = uncontradicted(usable, material.store, material.catalogue)
@@ -199,13 +166,10 @@ def assemble(
 
 
 def with_given(questions: Sequence[Question], opd: Opd, share: float, seed: int) -> tuple[list[Question], set[str]]:
-    """Exchange the videos of a share of the questions with descriptions, among questions with equally many videos.
+    """All questions in their order, and the ids of the share with descriptions whose videos were exchanged.
 
-    Their descriptions no longer fit the videos, and are left out of the loss. So the model learns to conclude from the
-    description in the text, and not directly from touch.
-
-    Returns:
-        All questions in their order, and the ids of those whose touches were exchanged.
+    They are exchanged among questions with equally many videos. Their descriptions no longer fit, and are left out of
+    the loss. So the model learns to conclude from the description in the text, and not directly from touch.
     """
     rng = random.Random(derive_seed(seed, "given"))
     changed: dict[str, Question] = {}
@@ -230,10 +194,7 @@ class Job:
 def fit(
     model: OctopiForCausalLM, data: ConversationDataset, config: TrainConfig, runtime: RuntimeConfig, job: Job
 ) -> Trained:
-    """Train the projection, the two new tokens' vectors, all word embeddings where `model.words` is set, and adapters.
-
-    Adapters have a learning rate of their own.
-    """
+    """Train the projection, the two new tokens' vectors, word embeddings where `model.words` is set, and adapters."""
     # The new tokens' vectors are word embeddings, wherever they are kept.
     trained = ("connector.projection", "connector.delimiters", *(("words",) if model.words is not None else ()))
     adapters = {"llm": config.learning_rate} if isinstance(config, LoraTrainConfig) else {}
@@ -262,7 +223,7 @@ def fit(
         callbacks=job.callbacks,
         rates={**dict.fromkeys(trained, config.projection_learning_rate), **adapters},
         constant=("connector.projection",) if config.projection_schedule == "constant" else (),
-        sampler=UpdateSampler(data.lengths, config.batch_size, job.seed, lambda: data.epoch, shared),
+        sampler=UpdateSampler(data, config.batch_size, job.seed, shared),
     )
     return train(trainer)
 

@@ -21,9 +21,8 @@ def begin_with_words(model: OctopiForCausalLM, data: ConversationDataset, catalo
     With a random projection the language model first memorises frames object by object, and does not learn which video
     of a question they belong to. Frames that resemble words it finds by the label before them, as in a list.
 
-    Args:
-        data: Its unmirrored frames and labels are fitted. Noise is added to the frames, or the projection would
-            memorise the few objects.
+    What is fitted are the unmirrored frames and the labels of `data`. Noise is added to the frames, or the projection
+    would memorise the few objects.
     """
     tokenizer, matrix = model.tokenizer, model.llm.get_input_embeddings().weight.detach().float()
     classes = [

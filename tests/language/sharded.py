@@ -23,7 +23,7 @@ from pipeline.core.io import read_jsonl, save_tensors, write_json
 from pipeline.core.records import Question
 from pipeline.language.training import Job, Material
 from pipeline.training.trainer import TrainableTrainer, Trained
-from tests.language.shared import SMALL, material, train
+from tests.language.conftest import SMALL, material, train
 
 CONFIG = LoraTrainConfig(
     **{**SMALL.model_dump(), "samples": 9, "epochs": 2}, rank=4, alpha=8, learning_rate=1e-3, dropout=0.0

@@ -13,11 +13,7 @@ from torch.nn import functional as F
 from pipeline.core.records import Question
 from pipeline.language.training import Material, assemble
 from pipeline.language.words import begin_with_words
-from pipeline.videos.catalogue import load_catalogue
-from tests.closure import ROOT
-from tests.language.shared import DIM, taking, write_store
-
-CATALOGUE = load_catalogue(ROOT / "pipeline" / "physiclear")
+from tests.language.conftest import CATALOGUE, DIM, taking, write_store
 
 
 def felt(labels: tuple[int, ...], drawn: torch.Generator) -> torch.Tensor:

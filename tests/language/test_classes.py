@@ -14,7 +14,7 @@ from pipeline.core.records import Classification, Part, Question
 from pipeline.evaluation.grading import conclude
 from pipeline.language.classes import in_words, uncontradicted
 from pipeline.tasks.questions import build_questions
-from tests.language.shared import write_store
+from tests.language.conftest import write_store
 from tests.tasks.shared import CATALOGUE, POOL
 
 ASKED = {"OPD": 20, "PC": 60, "PSS": 60, "POM": 90}

@@ -6,6 +6,7 @@ import random
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -22,7 +23,7 @@ from pipeline.language.conversations import FILLER, UpdateSampler
 from pipeline.language.generate import write_prompt
 from pipeline.language.training import Material, assemble
 from tests.conftest import refused
-from tests.language.shared import FRAMES, generation, taking
+from tests.language.conftest import FRAMES, generation, taking
 
 
 def test_without_a_begin_token_all_else_is_the_same(held: Material) -> None:
@@ -51,7 +52,8 @@ def test_an_update_has_the_same_questions_on_any_number_of_devices(
 ) -> None:
     """Those of a random order, as accelerate deals them; in a last update that is too small fillers take part."""
     update = micro * rounds * devices
-    sampler = UpdateSampler(lengths, update, 5, lambda: epoch, shared=micro * devices if devices > 1 else 1)
+    data = SimpleNamespace(lengths=lengths, epoch=epoch)
+    sampler = UpdateSampler(data, update, 5, shared=micro * devices if devices > 1 else 1)  # type: ignore[arg-type]
     random_order = list(range(len(lengths)))
     random.Random(derive_seed(5, epoch, "order")).shuffle(random_order)
     drawn = BatchSampler(sampler, micro, drop_last=False)

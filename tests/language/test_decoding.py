@@ -16,7 +16,7 @@ from pipeline.language.chat import IGNORE_INDEX
 from pipeline.language.decoding import greedy
 from pipeline.language.octopi import OctopiForCausalLM
 from tests.checkpoints import write_llama
-from tests.language.shared import DIM, LORA, adapted
+from tests.language.conftest import DIM, LORA, adapted
 
 MANY = (5, 9, 13, 40, 41)
 """Tokens that end an answer: so many that rows end at different places."""

@@ -18,7 +18,7 @@ from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import assemble
 from tests.checkpoints import write_llama
 from tests.conftest import refused
-from tests.language.shared import DIM, FRAMES, generation, material, taking
+from tests.language.conftest import DIM, FRAMES, generation, material, taking
 
 
 def prompt(question: Question, opd: Opd, model: OctopiForCausalLM) -> list[int]:

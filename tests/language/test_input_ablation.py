@@ -12,7 +12,7 @@ from pipeline.core.records import Dialogue, Gold, Opd, Part, Question, Touch, Tu
 from pipeline.language.conversations import evaluation_features
 from pipeline.language.input_ablation import ablate_input
 from tests.conftest import refused
-from tests.language.shared import DIM, write_store
+from tests.language.conftest import DIM, write_store
 
 
 def question(objects: str, video: int = 0) -> Question:

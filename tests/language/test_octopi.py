@@ -24,7 +24,7 @@ from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import add_lora, assemble
 from tests.checkpoints import contents, cut, edit, replace, write_llama
 from tests.conftest import refused
-from tests.language.shared import DIM, LORA, adapted, assert_comes_back, call, embedded, material, taking
+from tests.language.conftest import DIM, LORA, adapted, assert_comes_back, call, embedded, material, taking
 
 CONNECTOR, WORDS = "connector.safetensors", "words.safetensors"
 ADAPTER = "adapter/adapter_model.safetensors"
