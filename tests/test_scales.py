@@ -82,7 +82,7 @@ def tower_of(layers: int, width: int, heads: int, *, quick: bool = True, **sides
 @pytest.mark.parametrize("autocast", [False, True])
 def test_a_tower_with_prompts_keeps_what_is_counted(autocast: bool, quick: bool) -> None:
     tower = tower_of(3, 64, 4, quick=quick, patch_size=4, image_size=32, output_dim=24)
-    prompts = VisualPrompts(3, 5, 64, 48)
+    prompts = VisualPrompts(tower, 5)
     prompts.attach(tower)
 
     def run() -> torch.Tensor:
@@ -207,7 +207,7 @@ class Held(TorchDispatchMode):
 def test_what_passes_is_counted_too() -> None:
     """Forward and backward through a tower: the largest sum of all tensors that exist at once, its weights aside."""
     tower = tower_of(8, 128, 4, patch_size=8, image_size=112, output_dim=32)
-    VisualPrompts(8, 8, 128, 192).attach(tower)
+    VisualPrompts(tower, 8).attach(tower)
     with Held() as held:
         for parameter in tower.parameters():
             parameter.view(-1)
@@ -224,7 +224,7 @@ def test_a_gpu_takes_what_is_counted(autocast: bool) -> None:
     """CLIP ViT-L/14 at its true shapes, four videos of five frames."""
     with torch.device("cuda"):
         tower = tower_of(24, 1024, 16, patch_size=14, image_size=224, output_dim=768)
-        prompts = VisualPrompts(24, 8, 1024, 588)
+        prompts = VisualPrompts(tower, 8)
         frames = torch.zeros(20, 3, 224, 224)
     prompts.attach(tower)
     before = torch.cuda.memory_allocated()

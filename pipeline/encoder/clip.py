@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import partial
-from math import prod
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -62,23 +61,22 @@ def load_visual_tower(folder: Path, embedding: str = "projected") -> VisionTrans
 
 
 class VisualPrompts(nn.Module):
-    """P prompts for each of L layers, and the hooks that put them there.
+    """Prompts for a tower's layers, and the hooks that put them there.
 
     Args:
-        layers: L: the transformer's depth, or fewer; then the tokens of the last prompts pass on through the remaining
-            layers.
-        count: P, prompts a layer.
-        width: Length of a token.
-        patch_area: Pixels in a patch, times channels; sets the spread of the initial values as in VPT's code.
+        count: Prompts a layer.
+        layers: How many layers get some, 0 for all; the tokens of the last prompts pass on through those that remain.
         shared: Whether all prompts pass through one linear map (the paper), or are as the published code has them.
     """
 
-    def __init__(self, layers: int, count: int, width: int, patch_area: int, *, shared: bool = True) -> None:
+    def __init__(self, tower: VisionTransformer, count: int, layers: int = 0, *, shared: bool = True) -> None:
+        deep, width = len(tower.transformer.resblocks), tower.transformer.width
         super().__init__()
-        self.prompts = nn.Parameter(torch.empty(layers, count, width))
+        self.prompts = nn.Parameter(torch.empty(min(deep, layers or deep), count, width))
         self.shared: nn.Linear | None = None
         if shared:
-            bound = math.sqrt(6.0 / (patch_area + width))
+            # As in VPT's code; a patch has its pixels times three channels.
+            bound = math.sqrt(6.0 / (3 * math.prod(tower.patch_size) + width))
             nn.init.uniform_(self.prompts, -bound, bound)
             self.shared = nn.Linear(width, width)
             nn.init.kaiming_normal_(self.shared.weight, a=0, mode="fan_out")
@@ -146,7 +144,7 @@ class TactileEncoder(FrameEncoder):
 def load_backbone(config: EncoderConfig, *, tuned: bool) -> TactileEncoder:
     """The backbone `clip`: open_clip's ViT in `encoder.weights`; fine-tuning changes prompts of its own."""
     tower = load_visual_tower(Path(config.weights), config.embedding)
-    return TactileEncoder(tower, visual_prompts(config, tower, shared=True) if tuned else None)
+    return TactileEncoder(tower, VisualPrompts(tower, config.prompts, config.prompt_layers) if tuned else None)
 
 
 def base_encoder(config: EncoderConfig) -> TactileEncoder:
@@ -158,11 +156,3 @@ def property_classifier(config: EncoderConfig, classes: Sequence[int]) -> Proper
     """The recipe `paper`: CLIP with visual prompts that pass one shared linear map, and one linear head a property."""
     encoder = load_backbone(config, tuned=True)
     return PropertyClassifier(encoder, Heads(encoder.dim, classes), classes)
-
-
-def visual_prompts(config: EncoderConfig, tower: VisionTransformer, *, shared: bool) -> VisualPrompts:
-    """Fresh prompts that fit the tower, at as many of its layers as `encoder.prompt_layers` says (0: all)."""
-    deep = len(tower.transformer.resblocks)
-    layers = min(deep, config.prompt_layers or deep)
-    # A patch has its pixels times three channels.
-    return VisualPrompts(layers, config.prompts, tower.transformer.width, 3 * prod(tower.patch_size), shared=shared)

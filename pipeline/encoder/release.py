@@ -17,7 +17,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from pipeline.config import EncoderConfig
-from pipeline.encoder.clip import TactileEncoder, VisualPrompts, load_visual_tower, visual_prompts
+from pipeline.encoder.clip import TactileEncoder, VisualPrompts, load_visual_tower
 from pipeline.encoder.model import Heads, PropertyClassifier
 
 if TYPE_CHECKING:
@@ -76,7 +76,8 @@ def base_encoder(config: EncoderConfig) -> PublishedEncoder:
 def property_classifier(config: EncoderConfig, classes: Sequence[int]) -> PropertyClassifier:
     """CLIP with visual prompts of their own at every layer, a shared hidden layer and one linear head a property."""
     tower = load_visual_tower(Path(config.weights))
-    encoder = PublishedEncoder(tower, visual_prompts(config, tower, shared=False))
+    prompts = VisualPrompts(tower, config.prompts, config.prompt_layers, shared=False)
+    encoder = PublishedEncoder(tower, prompts)
     return PropertyClassifier(encoder, PublishedHeads(encoder.dim, classes), classes)
 
 

@@ -105,8 +105,7 @@ def check_length(question_id: str, tokens: int, positions: int | None) -> None:
 
 def evaluation_features(question: Question, store: EmbeddingStore, per_video: int) -> torch.Tensor:
     """The embeddings of a question's videos at uniform intervals: (videos x per_video) x dim."""
-    parts = [store.features(v, sample_evaluation(store.count(v), per_video)) for v in question.videos]
-    return torch.cat([torch.zeros(0, store.dim), *parts])
+    return torch.cat([store.features(v, sample_evaluation(store.count(v), per_video)) for v in question.videos])
 
 
 def collate(samples: Sequence[Mapping[str, torch.Tensor]]) -> dict[str, torch.Tensor]:

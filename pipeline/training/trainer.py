@@ -145,16 +145,9 @@ class TrainingMonitor(TrainerCallback):
             # The state's epoch has a fraction for the steps within one.
             data.epoch = int(state.epoch or 0)
 
-    def on_log(
-        self,
-        args: TrainingArguments,
-        state: TrainerState,
-        control: TrainerControl,
-        logs: dict[str, float] | None = None,
-        **_: Any,
-    ) -> None:
+    def on_log(self, args: TrainingArguments, state: TrainerState, control: TrainerControl, **handled: Any) -> None:
         """Called by the Trainer after each logging step; UserError where loss or the gradient's norm is not finite."""
-        values = measured(logs or {})
+        values = measured(handled["logs"])
         losses = {n: torch.tensor(v) for n, v in values.items() if n in ("loss", "grad_norm", "validation_loss")}
         check_finite(losses, state.global_step)
         # At a terminal the Trainer has a bar of its own.

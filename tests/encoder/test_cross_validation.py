@@ -174,6 +174,18 @@ def test_with_fewer_objects_more_contain_fewer(training: Training, monkeypatch: 
     assert len(set(map(frozenset, one))) > 1, "drawn anew for each fold"
 
 
+def test_what_the_pictures_show_is_found(training: Training, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures that show the class itself."""
+    hardness = {o: training.data.catalogue.labels(o)[0] for o in OBJECTS}
+    training = painted(training, [100 * hardness[a.object_id] for a in training.data.assignments])
+    monkeypatch.setattr(module, "SideBySide", Telling)
+    monkeypatch.setattr(frame_classifier, "STRENGTHS", (10.0,))
+    found = cross_validate_model("backbone", training, CrossValidationConfig(folds=7, repeats=1))
+    shared = [r for r in found if list(hardness.values()).count(r.expected[0]) > 1]
+    assert len(shared) > 8
+    assert all(r.predicted[0] == r.expected[0] for r in shared), "classes that another object has, too"
+
+
 def test_results_are_repeatable_and_independent_of_the_order(training: Training) -> None:
     write_pretrained()
     pixels = np.load("frames/frames.npy")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -189,7 +190,8 @@ def test_classifiers_stand_on_the_mean_frame(recipe: str, weights: Path, frames:
 @pytest.mark.parametrize("shared", [False, True])
 def test_prompts_are_drawn_as_said(shared: bool) -> None:
     seed_everything(0)
-    values = float64(VisualPrompts(4, 64, 96, 768, shared=shared).prompts).ravel()
+    tower = SimpleNamespace(transformer=SimpleNamespace(width=96, resblocks=range(4)), patch_size=(16, 16))
+    values = float64(VisualPrompts(tower, 64, shared=shared).prompts).ravel()  # type: ignore[arg-type]
     bound = math.sqrt(6 / (768 + 96))
     assert kstest(values, (uniform(-bound, 2 * bound) if shared else norm(0, 0.02)).cdf).pvalue > 0.01
 

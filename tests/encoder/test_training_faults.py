@@ -249,6 +249,16 @@ def test_a_tiny_pretraining_draws_trains_and_tells_what_it_left_aside() -> None:
     assert counts == [4] * len(CHANNELS), "the object left aside has touched no statistics"
 
 
+@pytest.mark.usefixtures("noise")
+def test_other_code_does_not_go_on_with_a_pretraining(versions: Callable[[str], None], begun_in: Begun) -> None:
+    places = [begun_in(lambda: pretrained(4, 2))]
+    for file in ("report/build.py", "training/trainer.py", "encoder/model.py", "encoder/pretrain.py"):
+        versions(f"pipeline/{file}")
+        places.append(begun_in(lambda: pretrained(4, 2)))
+    assert places[0] == places[1], "it does not depend on reports"
+    assert len(set(places)) == 4
+
+
 def test_a_training_goes_on_only_with_its_own_settings_labels_and_objects(
     weights: Path, data: EncoderData, versions: Callable[[str], None], begun_in: Begun
 ) -> None:
