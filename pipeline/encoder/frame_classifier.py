@@ -81,7 +81,7 @@ class FittedHeads:
     dependence: npt.NDArray[np.float64]
 
     def linear(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """Weights, classes of all properties x features, and biases of a frame's logits, without `FARTHEST`."""
+        """Weights, classes of all properties x features, and biases that give a frame's logits, nothing clipped."""
         weights = np.concatenate(self.weights) / self.spread
         return weights, np.concatenate(self.biases) - weights @ self.centre
 

@@ -6,7 +6,6 @@ is needed: a model without an adapter is ready seconds sooner.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from safetensors import SafetensorError
 from transformers import AutoTokenizer, BitsAndBytesConfig, PreTrainedModel, PreTrainedTokenizerBase
 
 from pipeline.core.errors import UserError
-from pipeline.core.io import read_json, tensor_shapes, write_json
+from pipeline.core.io import tensor_shapes
 from pipeline.core.records import Turn
 from pipeline.core.runtime import Quantization
 from pipeline.language.chat import add_tactile_tokens, render
@@ -76,18 +75,6 @@ def load_llm(folder: Path, dtype: torch.dtype, quantization: Quantization = "non
     model = load_language(folder, "language.weights", dtype=dtype, use_safetensors=True, **own)
     check_finite(folder, "language.weights", model.named_parameters())
     return model.requires_grad_(False).eval()
-
-
-def save_adapter(llm: PreTrainedModel, folder: Path, state: Mapping[str, torch.Tensor]) -> None:
-    """Write the adapter of a PEFT model, whose whole parameters are `state`: the same bytes for the same values."""
-    # In the base's own number format, in which it is added; it was trained in float32.
-    dtype = llm.get_input_embeddings().weight.dtype
-    own = {name: value.to(dtype) if "lora_" in name else value for name, value in state.items()}
-    llm.save_pretrained(str(folder), state_dict=own)
-    # PEFT writes a set, whose order differs from process to process, and an empty model card.
-    values = read_json(folder / ADAPTER_CONFIG)
-    write_json(folder / ADAPTER_CONFIG, {**values, "target_modules": sorted(values["target_modules"])})
-    (folder / "README.md").unlink(missing_ok=True)
 
 
 def load_adapter(llm: PreTrainedModel, folder: Path) -> PreTrainedModel:

@@ -20,7 +20,7 @@ from pipeline.core.errors import UserError, first_problem
 from pipeline.core.io import read_json, save_tensors, write_json
 from pipeline.core.records import Record
 from pipeline.core.runtime import DtypeName, Quantization, resolve_dtype
-from pipeline.language.base import load_adapter, load_llm, load_tokenizer, save_adapter
+from pipeline.language.base import ADAPTER_CONFIG, load_adapter, load_llm, load_tokenizer
 from pipeline.language.cache import extendable
 from pipeline.language.chat import IGNORE_INDEX, TACTILE_TOKENS
 from pipeline.training.trainable import load_trainable
@@ -185,7 +185,14 @@ class OctopiForCausalLM(nn.Module):
         if self.words is not None:
             save_tensors(folder / WORDS_FILE, parts["words"])
         if any("lora_" in name for name in parts["llm"]):
-            save_adapter(self.llm, folder / ADAPTER_DIR, parts["llm"])
+            # In the base's own number format, in which it is added; it was trained in float32.
+            dtype, adapter = self.llm.get_input_embeddings().weight.dtype, folder / ADAPTER_DIR
+            own = {name: value.to(dtype) if "lora_" in name else value for name, value in parts["llm"].items()}
+            self.llm.save_pretrained(str(adapter), state_dict=own)
+            # PEFT writes a set, whose order differs from process to process, and an empty model card.
+            values = read_json(adapter / ADAPTER_CONFIG)
+            write_json(adapter / ADAPTER_CONFIG, {**values, "target_modules": sorted(values["target_modules"])})
+            (adapter / "README.md").unlink(missing_ok=True)
 
     def train_words(self) -> nn.Embedding:
         """Have all word embeddings trained: a copy in float32, which begins as the language model's own.

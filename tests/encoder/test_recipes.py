@@ -191,7 +191,7 @@ def test_classifiers_stand_on_the_mean_frame(recipe: str, weights: Path, frames:
 def test_prompts_are_drawn_as_said(shared: bool) -> None:
     seed_everything(0)
     tower = SimpleNamespace(transformer=SimpleNamespace(width=96, resblocks=range(4)), patch_size=(16, 16))
-    values = float64(VisualPrompts(tower, 64, shared=shared).prompts).ravel()  # type: ignore[arg-type]
+    values = float64(VisualPrompts(tower, 64, shared=shared).prompts).ravel()
     bound = math.sqrt(6 / (768 + 96))
     assert kstest(values, (uniform(-bound, 2 * bound) if shared else norm(0, 0.02)).cdf).pvalue > 0.01
 

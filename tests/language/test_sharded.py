@@ -80,12 +80,11 @@ def trained(tmp_path_factory: pytest.TempPathFactory, held: Material) -> Path:
 
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_two_processes_that_share_the_layers_train_like_one(
-    kind: str, trained: Path, held: Material, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    kind: str, trained: Path, held: Material, checkpoints: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # A sharded model reads the beginnings of questions anew for each row; a base in bfloat16 rounds otherwise then.
     monkeypatch.setattr(OctopiForCausalLM, "_shared", lambda *_: 0)
-    monkeypatch.setattr("pipeline.training.trainer.CHECKPOINTS", tmp_path)  # As `run` sets it for good.
-    one = run(kind, held, tmp_path).state
+    one = run(kind, held, checkpoints).state
     both = [load_file(trained / f"{kind}-whole-{rank}.safetensors") for rank in range(2)]
     said = [json.loads((trained / f"{kind}-{rank}.json").read_text()) for rank in range(2)]
     assert all(s["sharded"] for s in said)
@@ -111,10 +110,10 @@ def test_a_checkpoint_holds_what_is_trained_alone(trained: Path) -> None:
     assert optimizer["state"].keys() == names
 
 
-def test_one_process_does_not_go_on_with_what_two_began(trained: Path, held: Material, tmp_path: Path) -> None:
-    shutil.copytree(trained / "killed", tmp_path / "killed")
+def test_one_process_does_not_go_on_with_what_two_began(trained: Path, held: Material, checkpoints: Path) -> None:
+    shutil.copytree(trained / "killed", checkpoints / "killed")
     with pytest.raises(UserError, match=r"checkpoint-4: was written sharded.*runtime\.launcher"):
-        run("lora", held, tmp_path / "killed")
+        run("lora", held, checkpoints / "killed")
 
 
 def test_two_machines_go_on_where_two_processes_were_killed(trained: Path, held: Material) -> None:
