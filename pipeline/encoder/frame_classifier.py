@@ -27,6 +27,8 @@ FARTHEST = 5.0
 STRENGTHS = (3e-4, 1e-3, 3e-3, 1e-2)
 """Inverse weights of the penalty (scikit-learn's C) that are tried."""
 FOLDS = 5
+ROUNDS = 500
+"""Of the solver, at most."""
 ABSENT = -10.0
 """Bias of a class that training lacks: a probability of some 5e-5."""
 SMOOTHING = 1 / 6
@@ -126,7 +128,7 @@ def fit_frame_heads(
         if len(present) > 1:
             # Small matrices: threads that wait for each other were seven times slower on two busy cores.
             with threadpool_limits(1):
-                fitted = LogisticRegression(C=strength, max_iter=500).fit(scaled, wanted)
+                fitted = LogisticRegression(C=strength, max_iter=ROUNDS).fit(scaled, wanted)
             rows, offsets = fitted.coef_, fitted.intercept_
             # scikit-learn gives one row, for the second class; halves of opposite sign have the same softmax.
             if len(present) == 2:
