@@ -1,4 +1,4 @@
-"""What frames and contact models are compared by: a frozen EfficientNet-lite0 and the chain's own frame heads."""
+"""The classifier that compares frame rules and contact models: frozen EfficientNet-lite0, the chain's frame heads."""
 
 from __future__ import annotations
 

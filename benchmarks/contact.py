@@ -27,7 +27,7 @@ from pipeline.videos.frames.subtraction import subtract
 
 CELLS = (32, 64, 128, 256)
 WIDTH, HEIGHT, FRAMES, SHOWN = 160, 120, 40, 5
-"""Of a rendered video, and how many of its frames the classifier looks at."""
+"""Size and frames of a rendered video, and how many of its frames the classifier is shown."""
 
 
 def models() -> dict[str, ScenesConfig]:
@@ -44,7 +44,7 @@ def models() -> dict[str, ScenesConfig]:
 
 
 def measure(root: Path, objects: int | None = None, videos: int = 3, folds: int = 5, deals: int = 3) -> list[Row]:
-    """Both questions, on scenes of so many objects, at equal distances in the catalogue of params.yaml, or of all."""
+    """Both questions, on scenes of `objects` objects, evenly spaced in the catalogue of params.yaml; None takes all."""
     data = load_params(root / "params.yaml").data
     catalogue = load_catalogue(root / data.catalogue)
     recipes = load_recipes(root / data.catalogue, catalogue, 0)
@@ -98,7 +98,7 @@ class _Scene:
 def _look(weights: Path, job: _Job) -> _Scene:
     seed = derive_seed("bench", job.object_id, job.number)
     sensor = make_sensor(WIDTH, HEIGHT, job.number % 3)
-    # Springs first, uncounted: what all models share is in the caches for all of them.
+    # Springs first, untimed, to fill the caches with what all models share.
     springs = ScenesConfig(frames=FRAMES, width=WIDTH, height=HEIGHT, tier="winkler")
     hardest = int(np.argmax(make_scene(job.recipe, springs, FRAMES, seed).motion.force))
 

@@ -26,11 +26,11 @@ from pipeline.videos.frames.extract import extract_frames
 from pipeline.videos.frames.store import FrameStore
 
 SIDES, FRAMES = (120, 90, 60, 30), 5
-"""Pixels, of which the first are the baseline, and frames a video."""
+"""Sides of frames in pixels, the baseline first, and frames per video."""
 
 
 def measure(root: Path, timed: int = 25, repeats: int = 5, folds: int = 5, deals: int = 3) -> list[Row]:
-    """Over the videos of `frames.bench_videos`, so many of them `timed`; a UserError without pretrained weights."""
+    """Errors over all `frames.bench_videos`, costs over `timed` of them; UserError without pretrained weights."""
     folder, catalogue = bench_videos(root, folds)
     pretrained = root / PRETRAINED
     if not pretrained.is_file():

@@ -46,10 +46,10 @@ def measure(
     """Both questions.
 
     Args:
-        questions: Answered in a repeat.
-        aligned: Conversations that are trained on before.
-        limit: New tokens of an answer.
-        sizes: Of batches.
+        questions: How many are answered in each repeat.
+        aligned: Number of conversations that the model is trained on first.
+        limit: Maximum number of new tokens of an answer.
+        sizes: Batch sizes to compare.
     """
     torch.set_num_threads(1)
     model, store, asked = prepare(root, aligned, questions)
@@ -117,7 +117,7 @@ def prepare(root: Path, aligned: int, asked: int) -> tuple[OctopiForCausalLM, Em
 def _question(
     question: str, ways: Mapping[str, Way], asked: Sequence[Question], model: OctopiForCausalLM, repeats: int
 ) -> list[Row]:
-    """Milliseconds an answer by each of the ways, and how often they do not answer as the first."""
+    """One row for each way: milliseconds per answer, and how often its answers differ from those of the first."""
     said = {name: way(None) for name, way in ways.items()}
     baseline, objects, count = next(iter(ways)), [q.objects for q in asked], len(asked)
     errors, counts = {}, {}

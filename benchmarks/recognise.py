@@ -23,7 +23,7 @@ def measure(root: Path) -> list[Row]:
     """Errors of the shipped model's encoder, which was trained on none of these objects, on the videos of the chain.
 
     A sensor drifts while it records, and one object's videos are mostly recorded together: even the no-contact picture
-    recognises them. So it is measured as a baseline, and candidates are also drawn from one recording session alone.
+    recognises them. So that picture is measured too, as a baseline, and candidates are also drawn within one session.
     """
     from pipeline.use.model import Octopi
     from pipeline.videos.audit.leakage import sessions
@@ -73,15 +73,15 @@ def cosines(values: Values) -> Values:
 def wrong(alike: Values, objects: list[str], k: int, sessions: list[str] | None = None) -> Error | None:
     """The expected error over all draws of k objects and of the touch that each is remembered by.
 
-    A touch is recognised if the remembered touch of its object is more alike than those of the k - 1 others. One of
-    another object is less alike with the share p of that object's touches that are. So a draw of k - 1 of n others is
-    right with the mean product of k - 1 of their n shares, which is their elementary symmetric polynomial over the
-    number of draws, and no sample has to be taken.
+    A touch is recognised if the remembered touch of its object is more similar than those of the k - 1 others. For one
+    other object, the probability of this is the share of its touches that are less similar. For k - 1 of n others, it
+    is the product of their shares, averaged over all choices: the elementary symmetric polynomial of the n shares
+    divided by the number of choices. So it is computed exactly, without sampling.
 
     Args:
         alike: Similarity, touches x touches.
         k: 0 takes all objects.
-        sessions: Of each touch; then the candidates are objects that were touched in its session.
+        sessions: The session of each touch; candidates are then only objects that were touched in the same session.
 
     Returns:
         None where no touch has another of its object and k - 1 other objects beside it.
@@ -97,7 +97,7 @@ def wrong(alike: Values, objects: list[str], k: int, sessions: list[str] | None 
             continue
         right = []
         for kept in same:
-            # Means of products of 0, 1, ... shares of those seen so far: a draw has the next one in it or not.
+            # Mean products of 0, 1, ... shares of the objects so far; a choice contains the next one or not.
             means = np.eye(1, drawn + 1)[0]
             for seen, touches in enumerate(others, 1):
                 share = float((alike[query, touches] < alike[query, kept]).mean())

@@ -50,7 +50,7 @@ def measure(root: Path, clients: int = CLIENTS, each: int = EACH) -> list[Row]:
         once = [timed(partial(post, address, b))[1] for b in bodies]
 
         def client(number: int) -> list[tuple[bool, float]]:
-            """Of each request whether its answer is another than alone, and milliseconds."""
+            """For each request, whether its answer differs from the one given alone, and milliseconds."""
             asked = [bodies[(number + i) % len(bodies)] for i in range(each)]
             answers = [timed(partial(post, address, b)) for b in asked]
             return [(said != alone[b], spent) for b, (said, spent) in zip(asked, answers, strict=True)]
@@ -82,7 +82,7 @@ def body(video: Path) -> bytes:
 
 
 def post(address: str, data: bytes) -> str:
-    """The answer; comes again where the server says that it is full."""
+    """The answer; the request is sent again while the server says that it is full."""
     request = urllib.request.Request(
         f"{address}/chat/completions", data, headers={"Content-Type": "application/json"}, method="POST"
     )

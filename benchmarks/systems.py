@@ -69,7 +69,7 @@ def measure(root: Path, triples: int = 12, batch: int = 32) -> list[Row]:
 
 
 def tokens(octopi: Octopi, videos: list[Path], batch: int) -> list[Row]:
-    """Milliseconds of a token, its share of the question included, beside the least that the machine allows.
+    """Milliseconds per token, including its share of reading the question, beside the lower bound of the machine.
 
     A token cannot come sooner than all weights are read from memory (shared by the answers of a batch) or multiplied.
     """

@@ -36,7 +36,7 @@ def timed(run: Callable[[], R]) -> tuple[R, float]:
 def interleaved(
     settings: Mapping[str, Callable[[T], object]], items: Sequence[T], repeats: int, warm: bool = True
 ) -> dict[str, list[float]]:
-    """Milliseconds an item: of each setting one figure a repeat, the median over the items.
+    """Milliseconds per item: for each setting one value per repeat, the median over the items.
 
     All settings have their turn at an item before the next item, so that a busy machine slows all alike. Every one is
     run once before, uncounted, unless `warm` is False.
@@ -71,7 +71,7 @@ class Error:
 
     @classmethod
     def of(cls, score: ScoreRow) -> Error:
-        """One less the accuracy of a row of scores.csv."""
+        """1 - accuracy of a row of scores.csv."""
         low, high = (None if end is None else 1 - end for end in (score.high, score.low))
         return cls(1 - score.accuracy, low, high, score.n)
 
@@ -83,14 +83,14 @@ class Error:
 
 
 def share_of(wrong: Sequence[float] | np.ndarray, objects: Sequence[tuple[str, ...]]) -> Error:
-    """The share of what is wrong (from 0, right, to 1, of each question or video), with the interval of the reports."""
+    """The share of wrong answers, with the reports' interval; `wrong` is 0 (right) to 1 for each question or video."""
     values = np.array(wrong, dtype=np.float64)
     low, high = accuracy_interval(values, objects) or (None, None)
     return Error(float(values.mean()), low, high, len(values))
 
 
 def mean_of(values: Sequence[float], objects: Sequence[str]) -> Error:
-    """The mean of a quantity that is not negative, with Student's t over the objects' means, as many of each object."""
+    """The mean of a non-negative quantity, with Student's t over the objects' means; each object has as many values."""
     from scipy.stats import t
 
     means = [fmean(v for v, o in zip(values, objects, strict=True) if o == own) for own in sorted(set(objects))]
@@ -109,11 +109,11 @@ class Row(Record):
     """Median over the repeats, in `unit`."""
     unit: str
     cost_ratio: float = Field(ge=0)
-    """Median over the repeats of the cost over that of the question's baseline, whose ratio is 1."""
+    """Cost divided by that of the question's baseline: the median of this ratio over the repeats."""
     frames: float | None = None
-    """A video."""
+    """Frames per video."""
     tokens: float | None = None
-    """Generated for an answer."""
+    """Tokens generated per answer."""
     megabytes: float | None = None
     """Peak of memory, in 10^6 bytes."""
     error: float | None = None
@@ -125,7 +125,7 @@ class Row(Record):
     n: int | None = None
     """Videos, answers or scenes that the error is over."""
     front: bool | None = None
-    """Whether no other setting of the question costs as little with as little error and less of one of them."""
+    """Whether the setting is on its question's Pareto front of cost and error; None without an error."""
     machine: str = ""
 
 
@@ -149,10 +149,10 @@ def make_rows(
     """The rows of a question, each told whether it is on the front.
 
     Args:
-        costs: Of each setting in turn one figure a repeat, in `unit`; the n-th figures of all settings belong together.
+        costs: By setting, one value per repeat in `unit`; the n-th values of all settings were measured together.
         baseline: The setting whose ratio is 1.
-        errors: Of settings; those without have none, and are not on the front.
-        counts: Of settings, by the names of the counting columns.
+        errors: By setting; a setting without an error is not on the front.
+        counts: By setting, the values of count columns (`frames`, `tokens`, `megabytes`) by their names.
     """
     errors, counts = errors or {}, counts or {}
     rows = []

@@ -29,7 +29,7 @@ if __name__ == "__main__":
         out = DATA / "models" / "without" / key
         model.save_pretrained(out, trained.state)
         if material.adapter:
-            # Alignment leaves it as it is, so that it is not among what was trained.
+            # Alignment does not change the adapter, so it is not in `trained.state` and is copied.
             shutil.copytree(material.adapter, out / ADAPTER_DIR, dirs_exist_ok=True)
         write_table(out / "history.parquet", Measurement, trained.history)
         write_model_card(out, material, data, config)

@@ -1,4 +1,4 @@
-"""Show the reproduction: on the page over all reports, and in MLflow, whose dead server is a warning."""
+"""Publish the reproduction: on the page over all reports, and in MLflow; a dead server is only a warning."""
 
 import logging
 from pathlib import Path

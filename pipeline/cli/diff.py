@@ -64,7 +64,7 @@ class State(NamedTuple):
         return None if rows is None else [Graded.model_validate(row) for row in rows]
 
     def asked(self) -> dict[str, object]:
-        """By id, over all seeds, what makes a question this one: its videos and its right answer."""
+        """By question id, over all seeds, what identifies a question's content: its videos and its right answer."""
         files = self.files.glob(f"{QUESTIONS}/*/evaluation.jsonl")
         rows = (json.loads(line) for file in files for line in (self.read(file) or b"").splitlines())
         return {row["question_id"]: (row["videos"], row["gold"]) for row in rows}
@@ -123,7 +123,7 @@ def _tested(one: State, two: State) -> tuple[Rows, list[str]]:
     if lacking := " and ".join(state.name for state, found in zip((one, two), graded, strict=True) if found is None):
         return [], [f"No paired test: {GRADED} of {lacking} is not at hand; `dvc pull` or `dvc repro` there brings it."]
     asked = [one.asked(), two.asked()]
-    # Where one side's are not at hand, objects alone must tell whether a question is the same.
+    # Where one side's questions are not at hand, only the objects can tell whether a question is the same.
     meant = [
         {g.question_id: (all(asked) and own.get(g.question_id), g.objects) for g in found or ()}
         for own, found in zip(asked, graded, strict=True)

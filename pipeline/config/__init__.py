@@ -36,7 +36,7 @@ INVENTED = Path("data/invented")
 SCENES_DIR = Path("data/scenes/videos")
 """Where the chain puts the videos that it makes itself."""
 LANGUAGE_DIR = "language"
-"""Of a trained model's folder, where connector and adapter lie."""
+"""Subfolder of a trained model's folder that holds connector and adapter."""
 PRETRAINED = Path("data/pretrained/encoder.safetensors")
 """Where the chain puts the network that it pretrains on synthetic pictures, the backbone `scenes`."""
 
@@ -129,10 +129,10 @@ class SplitConfig(Section):
     test_objects: Positive = 7
     """Test objects of the development split."""
     train_objects: Annotated[int, Field(ge=0)] = 0
-    """Of kfold: train on so many of a fold's training objects, to see how many are enough; the larger of two numbers
-    has all objects of the smaller. 0: all."""
+    """`kfold`: train on this many of a fold's training objects, to see how many are enough; 0: all. A larger number
+    includes all objects of a smaller one."""
     folds: Annotated[int, Field(ge=3, le=50)] = 5
-    """Of kfold. Each seed of `ablation.seeds` has one for its test: seed s has fold s modulo `folds`."""
+    """`kfold`: number of folds. Seed s of `ablation.seeds` tests on fold s modulo `folds`."""
     missing: Literal["report", "error"] = "report"
     """What to do about validation or test objects without videos: go on and leave cells empty, or stop."""
 
@@ -147,8 +147,8 @@ class SplitConfig(Section):
         return seed % self.folds if self.name == "kfold" else None
 
     def replicate_of(self, seed: int) -> int:
-        """The replicate of a seed. The seeds of one test each object once together, so their answers are pooled as one
-        seed's."""
+        """The replicate that a seed belongs to. Together, its seeds test each object once, so their answers are pooled
+        like those of one seed."""
         return seed // self.folds if self.name == "kfold" else seed
 
 
@@ -160,8 +160,8 @@ class QuestionsConfig(Section):
     """By the task's name in lower case; a task without a number gets none. With kfold these are for each fold."""
     evaluation: QuestionCounts
     scenarios: Literal["published", "ours"] = "published"
-    """Scenario questions (PSR): whose right and wrong objects, the published code's or this project's reading of the
-    situations, with clearer contrasts. A catalogue's own scenarios are asked in any case."""
+    """Whose reading of the situations decides which objects are right in scenario questions (PSR): the published
+    code's, or this project's, which has clearer contrasts. A catalogue's own scenarios are always asked."""
     wording: Literal["object", "class"] = "object"
     """Wording of free descriptions. `object`: each object has one phrase per class, as published. `class`: every object
     has its class's first phrase, since several split a class's probability in greedy decoding."""
@@ -201,7 +201,7 @@ class EncoderConfig(Section):
     """`paper`: what is read of CLIP, for the heads and the language model (ViT-L/14: 768 or 1024 values). `projected`:
     CLIP's own embedding. `class_token`: the normalised class token before CLIP's projection. `release` reads the
     class token in any case: normalised for the heads, and before that for the language model. `logits`: with any
-    encoder, what property heads say of each frame, of training objects by heads that did not see them."""
+    encoder, the property heads' logits of each frame; for training objects, from heads that did not see them."""
     prompts: Annotated[int, Field(ge=1, le=256)] = 8
     """Learnable prompts at each layer."""
     prompt_layers: Annotated[int, Field(ge=0)] = 0
@@ -209,14 +209,14 @@ class EncoderConfig(Section):
     epochs: Positive = 30
     batch_size: Positive = 32
     micro_batch_size: Annotated[int, Field(ge=0)] = 0
-    """Videos at a time, of the `batch_size` of an update; the rest is accumulated. 0, and what is no less than
-    `batch_size`, is all of them. `octopi scale` says what memory that takes."""
+    """Videos per forward pass; gradients are accumulated up to `batch_size`. 0, or `batch_size` and more: all at once.
+    `octopi scale` says what memory that takes."""
     autocast: Literal["none", "bfloat16"] = "none"
-    """Number format that training computes in where torch holds it safe; what is trained stays in float32."""
+    """Mixed precision: the number format of torch's autocast in training. Trained weights stay in float32."""
     learning_rate: Rate = 1e-3
     weight_decay: Annotated[float, Field(ge=0, lt=1)] = 0.0
     max_grad_norm: GradNorm = 0.0
-    """Gradients longer than this are shortened to it; 0 leaves all as they are (paper, published code)."""
+    """Clip gradients to this norm; 0 does not clip (paper, published code)."""
     flip_probability: Annotated[float, Field(ge=0, le=1)] = 0.5
     """Chance of each of the two flips in training."""
     reference: Literal["none", "subtract"] = "none"
@@ -287,8 +287,8 @@ class LanguageConfig(Section):
     """Folder in transformers' format with a Llama-like model (safetensors) and a fast tokenizer. The chain makes what
     is named below data/weights/."""
     start: str = ""
-    """Folder of a trained model, such as models/finetuned-with-all-0, whose connector and adapter to train on; empty:
-    fresh ones. Encoder, language model and adapter must be as its are. DVC knows the folder by its name alone."""
+    """Folder of a trained model, such as models/finetuned-with-all-0, whose connector and adapter to start from; empty:
+    new ones. Encoder, language model and adapter must have its settings. DVC tracks only the folder's name."""
     dtype: DtypeName = "float32"
     """Number format of the frozen weights; whatever is trained stays in float32. `auto`: bfloat16 where the device
     computes it in hardware, else float32."""
@@ -301,9 +301,10 @@ class LanguageConfig(Section):
     takes it away). A chat template's own stays."""
     normalize_touch: bool = False
     """Scale each projected tactile embedding to the root mean square of the word embeddings. Otherwise alignment at a
-    high rate makes them a hundred times as long, which drowns what attention adds, such as their video."""
+    high learning rate makes them a hundred times as long, which drowns what attention adds, such as which video they
+    show."""
     max_new_tokens: Annotated[int, Field(ge=1, le=4096)] = 256
-    """Of an answer; fewer where the language model has no more positions. Longer answers are cut and marked."""
+    """Length of an answer, less where the language model has no more positions. Longer answers are cut and marked."""
     generation_batch_size: Positive = 32
 
 
@@ -313,9 +314,9 @@ class Accumulated(Section):
     batch_size: Positive = 16
     """Items an update, over all devices."""
     micro_batch_size: Positive = 16
-    """Items at a time on one device; the rest is accumulated. It changes time, memory and, by rounding, last digits."""
+    """Items per forward pass on a device; gradients accumulate. Changes time, memory and, by rounding, last digits."""
     max_grad_norm: GradNorm = 1.0
-    """Gradients longer than this are shortened to it; 0 leaves all as they are (the published code)."""
+    """Clip gradients to this norm; 0 does not clip (the published code)."""
 
     @model_validator(mode="after")
     def _batches_divide(self) -> Self:
@@ -331,12 +332,12 @@ class TrainConfig(Accumulated):
     """Questions trained on (paper: 8k for alignment, 3k end to end)."""
     epochs: Positive = 1
     weighting: Literal["question", "token"] = "question"
-    """What weighs alike in the loss of an update: each `question`, by the mean over its answer's tokens (the published
-    code, whose batches hold one), or each `token`, so that long answers count for more."""
+    """What has equal weight in the loss of an update: each `question`, by the mean over its answer's tokens (the
+    published code, whose batches hold one question), or each `token`, so that long answers count more."""
     projection_learning_rate: Rate = 2e-5
-    """Of the projection, and of word embeddings as far as they are trained."""
+    """Learning rate of the projection, and of word embeddings where they are trained."""
     projection_schedule: Literal["cosine", "constant"] = "cosine"
-    """Of the projection alone (the published code has none for it); all else that is trained has a cosine."""
+    """Schedule of the projection's learning rate (published code: `constant`); the other rates follow a cosine."""
     warmup_ratio: Annotated[float, Field(ge=0, lt=1)] = 0.0
     weight_decay: Annotated[float, Field(ge=0, lt=1)] = 0.0
 
@@ -356,7 +357,7 @@ class LoraTrainConfig(TrainConfig):
     """End-to-end fine-tuning with low-rank adapters."""
 
     learning_rate: Rate = 2e-4
-    """Of the adapters."""
+    """Learning rate of the adapters."""
     rank: Annotated[int, Field(ge=1, le=1024)] = 128
     alpha: Annotated[float, Field(gt=0)] = 256.0
     dropout: Annotated[float, Field(ge=0, lt=1)] = 0.05

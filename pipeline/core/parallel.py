@@ -36,7 +36,7 @@ MOST_SECONDS = 5.0
 
 
 def use_backend(name: Backend) -> None:
-    """Have `run_parallel` work there from now on (`runtime.parallel`); UserError where its package is missing."""
+    """Make `run_parallel` use this backend from now on (`runtime.parallel`); UserError where its package is missing."""
     global _chosen
     check_backend(name)
     _chosen = name
@@ -89,8 +89,8 @@ def run_with(
 ) -> Iterator[R]:
     """Apply `work` to a model and every job; yield results in the order of the jobs.
 
-    Here, one after another, since this machine has one device. On a cluster each worker has a model of its own, loaded
-    once, and takes a GPU of its own where there are any.
+    In this process jobs run one after another, since this machine has one device. On a cluster each worker has a model
+    of its own, loaded once, and takes a GPU of its own where there are any.
 
     Args:
         model: Used in this process.

@@ -132,13 +132,13 @@ class Probe(Video):
     hdr: bool
     """Whether its brightness follows PQ or HLG: such pictures look flat beside others."""
     rotation: int
-    """Degrees against the clock by which the metadata turn the picture; done already in what is kept."""
+    """Counterclockwise rotation in degrees that the metadata ask for; kept frames are already turned."""
     irregular: float
     """Longest over shortest time per frame between probed frames; 1 for an even rate, 0 where unknown."""
     kept: int
     """Frames that the selection kept."""
     brightness: float
-    """Mean of the reference, by its brightness plane, as all of these."""
+    """Mean of the reference's brightness plane."""
     brightness_step: float
     """Largest change of the mean brightness between neighbouring probed frames."""
     saturated: float
@@ -158,7 +158,7 @@ class Probe(Video):
     thumbnail: tuple[float, ...]
     """The reference, 6 x 8 x (brightness, two colour differences), flattened."""
     signature: tuple[float, ...]
-    """Brightness in the third of the video with most contact less the rest's, 18 x 24, flattened; mean 0, norm 1."""
+    """Mean brightness of the third of the video with most contact minus that of the rest: 18 x 24, mean 0, norm 1."""
 
 
 class Severity(StrEnum):
@@ -399,24 +399,24 @@ class ScoreRow(Record):
     task: str
     measure: str
     encoder: str
-    """Of a cross-validation, the candidate's name; of vision alone, the model's."""
+    """In a cross-validation the candidate's name, for a vision-only model the model's."""
     lora: str = ""
     opd: str = ""
     touch: str = ""
-    """Of vision alone, what the model was shown in place of touch."""
+    """For a vision-only model, what it was shown in place of touch."""
     seed: str
     """A number or `all`."""
     n: int
     """Questions, or videos; not multiplied by seeds."""
     sets: int
-    """Distinct sets of objects that these are about: many questions about one pair say little about others."""
+    """Distinct sets of objects that questions are about: many questions about one pair say little about other pairs."""
     right: Share
     """Right answers; over seeds their mean, which need not be whole."""
     unread: Share
     """Answers that could not be read, which count as wrong; over seeds their mean."""
     accuracy: Share
     low: Optional = None
-    """Of the 95 % interval over objects; None where the questions cannot show that objects differ."""
+    """Lower end of the 95 % interval over objects; None where the questions cannot show that objects differ."""
     high: Optional = None
     chance: Optional
     """None where there is nothing to guess among."""
@@ -435,11 +435,11 @@ class EffectRow(Record):
     measure: str
     difference: Share
     low: Optional = None
-    """Of the 95 % interval for new objects and, with several seeds, new seeds; None as in scores."""
+    """Lower end of the 95 % interval for new objects and, with several seeds, new seeds; None as in `ScoreRow`."""
     high: Optional = None
     p: Optional = None
-    """Two-sided, of sign flips over objects. It takes few values (with seven objects none below 2/128) and is about
-    these runs alone, so it and the interval may disagree."""
+    """Two-sided p value of the sign-flip test over objects. It takes few values (with seven objects none below 2/128)
+    and holds for these runs alone, so it may disagree with the interval."""
     p_holm: Optional = None
     """Holm's adjustment over all rows of the report."""
     smallest_effect: Optional = None

@@ -38,7 +38,7 @@ def load_visual_tower(folder: Path, embedding: str = "projected") -> VisionTrans
     import open_clip
     from safetensors import SafetensorError
 
-    frame_side(folder, "clip")  # Of another's folder open_clip would read a pickle, too.
+    frame_side(folder, "clip")  # Called for its checks: open_clip would also read a pickle.
     try:
         text = read_json(folder / CLIP_CONFIG)["model_cfg"]["text_cfg"]
         if "hf_model_name" in text:
@@ -65,7 +65,7 @@ class VisualPrompts(nn.Module):
 
     Args:
         count: Prompts a layer.
-        layers: How many layers get some, 0 for all; the tokens of the last prompts pass on through those that remain.
+        layers: How many of the first layers get prompts, 0 for all; later layers pass on the last prompts' tokens.
         shared: Whether all prompts pass through one linear map (the paper), or are as the published code has them.
     """
 
@@ -142,7 +142,7 @@ class TactileEncoder(FrameEncoder):
 
 
 def load_backbone(config: EncoderConfig, *, tuned: bool) -> TactileEncoder:
-    """The backbone `clip`: open_clip's ViT in `encoder.weights`; fine-tuning changes prompts of its own."""
+    """The backbone `clip`: open_clip's ViT in `encoder.weights`; if `tuned`, with visual prompts, which are trained."""
     tower = load_visual_tower(Path(config.weights), config.embedding)
     return TactileEncoder(tower, VisualPrompts(tower, config.prompts, config.prompt_layers) if tuned else None)
 

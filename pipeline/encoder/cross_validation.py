@@ -30,10 +30,11 @@ VALIDATION = 8
 
 
 def cross_validate_model(name: str, training: Training, config: CrossValidationConfig) -> list[OutOfFold]:
-    """Out-of-fold predictions of one model for all videos, which are unused so far; finished folds survive a kill.
+    """Out-of-fold predictions of one model for all videos; finished folds survive a kill.
 
-    Folds depend on the objects and `config` alone, so all models share them. `name` is one of `MODELS`, or with a
-    number behind it as `cross_validation.models` has it. Fewer objects than folds are a UserError.
+    All videos of `training` are in the part UNUSED, as each fold sets parts of its own. Folds depend on the objects and
+    `config` alone, so all models share them. `name` is one of `MODELS`, or with a number behind it as
+    `cross_validation.models` has it. Fewer objects than folds are a UserError.
     """
     data, (owners, labels) = training.data, _videos(training.data)
     objects = len(set(owners.tolist()))
@@ -133,7 +134,7 @@ def _tuned(training: Training) -> Predict:
         chosen = deal(trained, min(VALIDATION, len(trained)), seed)[0] if len(trained) > 1 else ()
         parts = dict.fromkeys(owners[fold.tested].tolist(), Part.TEST) | dict.fromkeys(trained, Part.TRAIN)
         parts |= dict.fromkeys(chosen, Part.VALIDATION)
-        # Objects that a model with fewer of them may not learn from stay unused.
+        # A model that is limited to fewer training objects leaves the others unused.
         dealt = [a.model_copy(update={"part": parts.get(a.object_id, a.part)}) for a in training.data.assignments]
         data = replace(training.data, assignments=dealt)
         model, _ = finetune(replace(training, data=data, seed=seed), trunks())

@@ -137,8 +137,7 @@ def statistics(embeddings: torch.Tensor, index: Sequence[Embedding], training: C
 
 
 def standardize(embeddings: torch.Tensor, known: Statistics) -> torch.Tensor:
-    """Embeddings, rows x dim, or their logits where the statistics have heads, in deviations from the training frames'
-    mean: float32."""
+    """Standardise embeddings, rows x dim, or their logits where the statistics have heads: float32."""
     values = embeddings.double()
     if known.heads is not None:
         values = values @ known.heads[0].T + known.heads[1]

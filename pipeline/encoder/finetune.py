@@ -54,15 +54,15 @@ class Training:
 
 
 def finetune(training: Training, trunks: Trunks | None = None) -> tuple[PropertyClassifier, list[Measurement]]:
-    """Train the classifier of the recipe; returned with its training's curve.
+    """Train the recipe's classifier; return it with its training curve.
 
     `tuned` fits the heads, then tunes them and what is unfrozen of the encoder. The fitted heads count as epoch 0, and
     the best epoch is kept (ties: the first). Without validation videos the heads are kept as they were fitted, since
     nothing could show that tuning helps.
 
     Args:
-        trunks: Of the recipe `tuned`, where they have been run over these videos before, with all flips where
-            `encoder.flip_probability` is above 0.
+        trunks: For the recipe `tuned`, outputs of the frozen layers that were computed for these videos before, with
+            all flips where `encoder.flip_probability` is above 0.
     """
     data, config, device = training.data, training.config, resolve_device(training.runtime.device)
     seed_everything(training.seed)
@@ -108,8 +108,8 @@ def finetune(training: Training, trunks: Trunks | None = None) -> tuple[Property
 def train_classifier(model: PropertyClassifier, training: Training, trunks: Trunks | None = None) -> list[Measurement]:
     """Train what is not frozen; the epoch of best combined validation accuracy is kept (ties: the first).
 
-    Without validation videos there is nothing to choose by, and the last epoch is kept. Where there are `trunks`, the
-    model is shown these, and not the pictures.
+    Without validation videos there is nothing to choose by, and the last epoch is kept. With `trunks`, the model is
+    given these in place of pictures.
     """
     # Imported here, since fitted heads need no Trainer, and importing it takes seconds.
     from pipeline.training.trainer import TrainableTrainer, checkpoint_dir, train, training_arguments

@@ -28,13 +28,13 @@ STRENGTHS = (3e-4, 1e-3, 3e-3, 1e-2)
 """Inverse weights of the penalty (scikit-learn's C) that are tried."""
 FOLDS = 5
 ROUNDS = 500
-"""Of the solver, at most."""
+"""Maximum number of iterations of the solver."""
 ABSENT = -10.0
 """Bias of a class that training lacks: a probability of some 5e-5."""
 SMOOTHING = 1 / 6
 """Objects added to each combination of classes, so that none is impossible."""
 MOST_COMBINATIONS = 100_000
-"""More would be tables too large to decode with."""
+"""Maximum number of combinations of classes; joint decoding of more would need too large a table."""
 
 Probabilities = npt.NDArray[np.float64]
 Clips = npt.NDArray[np.float32]
@@ -100,7 +100,7 @@ class FittedHeads:
         return decode_jointly(self.evidence(clips), self.dependence)
 
     def copy_into(self, model: JointFrameClassifier) -> None:
-        """Have a model decide as these do."""
+        """Copy the fitted heads into a model, so that it decides alike."""
         own = [model.centre, model.spread, model.dependence, *model.heads.parameters()]
         heads = [array for pair in zip(self.weights, self.biases, strict=True) for array in pair]
         with torch.no_grad():
@@ -111,7 +111,7 @@ class FittedHeads:
 def fit_frame_heads(
     clips: Clips, labels: Labels, objects: Sequence[str], classes: Sequence[int], strength: float
 ) -> FittedHeads:
-    """Fit the heads of all properties with so many classes; one that training lacks gets a probability near 0."""
+    """Fit one head per property, with `classes` classes each; a class that training lacks gets a probability near 0."""
     from sklearn.linear_model import LogisticRegression
     from threadpoolctl import threadpool_limits
 
@@ -149,8 +149,8 @@ def choose_strength(
 ) -> tuple[float, list[Measurement]]:
     """The strength with the best combined accuracy in a grouped cross-validation over these objects (ties: the first).
 
-    Beside it stands what each reached: step i is the i-th of `STRENGTHS`. With fewer than two objects there is nothing
-    to compare, and the second is taken.
+    Also returned is the accuracy of each strength: step i is the i-th of `STRENGTHS`. With fewer than two objects there
+    is nothing to compare, and the second is taken.
     """
     if len(set(objects)) < 2:
         return STRENGTHS[1], []

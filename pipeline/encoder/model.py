@@ -1,4 +1,4 @@
-"""What encoders of frames and classifiers of properties are; their backbones and recipes are modules of their own."""
+"""Base classes of frame encoders and property classifiers; backbones and recipes have modules of their own."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ class PropertyClassifier(nn.Module):
             labels: int64, batch x properties.
             num_items_in_batch: Labels of the whole update, so that accumulated batches weigh each video alike; by
                 default those of this batch.
-            outputs: In place of frames what each backbone's trunk made of them: batch x frames x what its stage takes.
+            outputs: In place of frames, the output of each backbone's `trunk`: batch x frames x (input of its `stage`).
         """
         if outputs is not None:
             entering, shape = [output.flatten(0, 1) for output in outputs], outputs[0].shape

@@ -23,7 +23,7 @@ from pipeline.training.sampling import EpochDataset
 from pipeline.training.trainer import TrainableTrainer, checkpoint_dir, train, training_arguments
 
 WEIGHTS = {"quantities": 2.0, "kinds": 0.6}
-"""Of the two parts of the loss."""
+"""Weights of the two parts of the loss."""
 STRENGTH = (0.7, 1.4)
 """How much weaker or stronger the light of a picture may be."""
 

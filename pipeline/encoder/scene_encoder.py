@@ -14,7 +14,7 @@ from pipeline.encoder.model import FrameEncoder
 from pipeline.training.trainable import load_trainable
 
 SIDE = 120
-"""Pixels of the pictures that it is pretrained on at most: as high as they are drawn. Larger ones are averaged."""
+"""Maximum side in pixels of pretraining pictures, which are drawn at this height. Larger ones are averaged."""
 
 STEPS = 12
 """Difference in 8-bit steps that is scaled to 1: about the standard deviation in contact."""

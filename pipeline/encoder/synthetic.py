@@ -34,18 +34,18 @@ WIDTH, HEIGHT = 160, 120
 """Pixels that pictures are drawn at before they are fitted to the encoder's size."""
 PITCH = IMAGE_MM[0] / WIDTH
 SIDE = int(np.hypot(WIDTH, HEIGHT) + 8 / PITCH) | 1
-"""Of the pressed patch: the view at every angle and 4 mm around it; odd, so that a pixel is in the middle."""
+"""Side of the pressed patch in pixels: the view at every angle and 4 mm around it; odd, to have a middle pixel."""
 METHOD = Method("layer", 64)
-"""Half the time of 128 cells, for frames that are off by 1.7 steps of 255 in place of 0.9 (reports/speed_error.csv)."""
+"""Takes half the time of 128 cells; frames have errors of 1.7 steps of 255, not 0.9 (reports/speed_error.csv)."""
 FORCES = (0.1, 8.0)
 """In N, drawn evenly on a logarithmic axis: wider than the real videos' range."""
 SENSORS = 24
 QUALITY = (60, 96)
-"""JPEG quality between which a picture is coded: real frames went through a lossy codec too."""
+"""Range of the JPEG quality of pictures: real frames went through a lossy codec too."""
 BANDS_MM = (0.3, 0.6, 1.2, 2.4, 4.8)
 """Borders between the wavelengths whose heights are to be predicted."""
 KINDS: tuple[str, ...] = (*LAYERS, "flat", "round", "bar", "wedge")
-"""Of relief and body: what is to be predicted of each object as present or absent."""
+"""Kinds of relief and of body; the encoder predicts for each object which of them it has."""
 CHUNK = 50
 """Objects that one process draws at a time, and that a killed drawing loses at most for each process."""
 

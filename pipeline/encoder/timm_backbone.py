@@ -21,11 +21,11 @@ from pipeline.encoder.model import FrameEncoder, mean_and_deviation
 from pipeline.weights import check_finite, first_words, frame_side
 
 STAGES = "stages.safetensors"
-"""In place of a network's weights those of the stages that are read, as a packaged model has them."""
+"""File of a packaged model that replaces the network's weights: those of the stages that are read."""
 
 
 class TimmBackbone(FrameEncoder):
-    """A timm network, with `forward_intermediates` as nearly all have it, up to a stage, an index in `feature_info`."""
+    """A timm network with `forward_intermediates` (nearly all have it), read at a stage: an index in `feature_info`."""
 
     def __init__(self, model: nn.Module, stage: int) -> None:
         self.info: dict[str, Any] = cast(Any, model).feature_info[stage]

@@ -38,10 +38,10 @@ def property_classifier(config: EncoderConfig, classes: Sequence[int]) -> JointF
 
 
 class Trunks(dict[tuple[str, Flip], list[torch.Tensor]]):
-    """What frozen trunks make of a video's evaluation clip under a flip: of each, frames x what its stage takes."""
+    """Outputs of the frozen trunks for each video's evaluation clip under each flip: frames x (input of the stage)."""
 
     def of(self, video_id: str, flip: Flip = "none") -> list[torch.Tensor]:
-        """As the stages take it."""
+        """The outputs for one clip, in float32."""
         return [output.float() if output.dtype == torch.float16 else output for output in self[video_id, flip]]
 
 

@@ -102,11 +102,11 @@ def ask_all(
     """Ask what is not in the cache yet, and write what is answered by now to `external/<report>/<model>-<shown>/`.
 
     Each reply is in the cache before the next request leaves, so a killed run goes on where it was. The chain must
-    have run up to its questions (and frames, where they are shown). The text says in a line what was done.
+    have run up to its questions (and frames, where they are shown). Returns a line that says what was done.
 
     Args:
         params: Whose questions, seeds and frames.
-        folder: Of the kept frames, or of the photos: for each object `<object>.jpg` or a folder `<object>/`.
+        folder: Folder of the kept frames, or of the photos: for each object `<object>.jpg` or a folder `<object>/`.
         limit: Most requests of this call, not counting what the client sends again; None: no limit.
         published: Only describe, by the paper's three prompts; the folder's name then ends with -published.
 
@@ -227,7 +227,7 @@ def _answer(question: Question, told: str, asker: _Asker, show: Show) -> Predict
 
 
 def _classify(question: Question, catalogue: Catalogue, asker: _Asker, show: Show) -> Prediction | None:
-    """The published prompts about one object, told as a description; what is not one of their classes stays unknown."""
+    """Ask the published prompts about one object, and word the replies as a description; other replies stay unknown."""
     ((video, object_id),) = zip(question.videos, question.objects, strict=True)
     pictures = [*map(_picture, show(video, object_id))]
     told, replies = {}, []

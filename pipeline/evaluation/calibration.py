@@ -34,7 +34,7 @@ class CalibrationRow(Record):
 
     property: str
     probability: str
-    """Of the likeliest class: "all", or a bin."""
+    """The bin of the likeliest class's probability, or "all"."""
     n: int
     mean_probability: Share
     right: Share
@@ -137,19 +137,19 @@ def calibration_rows(encoders: Sequence[Sequence[Classification]]) -> list[Calib
 
 
 def calibration_error(classified: Sequence[Classification]) -> float:
-    """Expected calibration error: the bins' mean |right - mean probability|, each weighing as many as its answers."""
+    """Expected calibration error: |right - mean probability| averaged over bins, weighted by their answers."""
     bins = reliability(classified)
     return float((bins["n"] * (bins["right"] - bins["mean_probability"])).abs().sum()) / len(classified)
 
 
 def error_interval(classified: Sequence[Classification]) -> tuple[float, float]:
-    """95 % of the calibration errors of objects drawn anew (percentile bootstrap over objects).
+    """95 % interval of the calibration error, by a percentile bootstrap over objects.
 
-    The error of few answers is biased upwards, since chance alone parts accuracy from confidence; so is this interval.
+    With few answers error and interval are biased upwards: chance alone separates accuracy from confidence.
     """
     table = _binned(classified)
     objects = table["object_id"].unique()
-    # By object and bin, how many answers more are right than their probabilities say: a sum over the objects drawn.
+    # By object and bin, the right answers minus the sum of their probabilities; these add up over the objects drawn.
     excess = (table["right"] - table["mean_probability"]).groupby([table["object_id"], table["bin"]]).sum()
     gaps = excess.unstack(fill_value=0.0).reindex(objects).to_numpy()
     sizes = table["object_id"].value_counts().reindex(objects).to_numpy()

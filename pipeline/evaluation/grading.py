@@ -78,7 +78,7 @@ def grade_vision_models(
     Args:
         folder: Of a report in `EXTERNAL`.
         questions: The file of evaluation questions of each seed.
-        replicate_of: The seed that a seed's answers count for.
+        replicate_of: Maps a seed to the replicate that its answers are pooled under.
     """
     graded = []
     for place, source in vision_models(folder).items():

@@ -48,11 +48,11 @@ class Design:
     membership: Values
     """Questions x objects: 1 where the question is about the object."""
     factors: tuple[Values, ...]
-    """Each questions x groups, 0 or 1: by object, by question, by set of objects; those that can be told apart."""
+    """Questions x groups, 0 or 1, for each factor (object, question, set of objects) that can be told apart."""
     moments: Values
-    """Factors x factors: the sum of squares of centred group sums that a unit of each variance is expected to bring."""
+    """Factors x factors: expected sum of squares of one factor's centred group sums, for a unit variance of another."""
     totals: Values
-    """By factor: by how much a unit of its variance adds to that of the sum over questions."""
+    """By factor: how much a unit of its variance adds to the variance of the sum over questions."""
     questions: int
     objects: int
     """How many there are of each."""

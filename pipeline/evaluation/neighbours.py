@@ -15,9 +15,9 @@ from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Assignment, E
 from pipeline.videos.catalogue import Catalogue
 
 MAPPED = 400
-"""Most videos on a map, evenly from all; the exact t-SNE, which gives the same on any processor, takes n squared."""
+"""Maximum number of videos on a map, taken evenly; exact t-SNE, equal on any processor, costs n squared."""
 PERPLEXITY = 30.0
-"""The usual of van der Maaten and Hinton 2008; fewer videos have a third of their number."""
+"""t-SNE's usual perplexity (van der Maaten and Hinton 2008); with few videos it is a third of their number."""
 
 
 def means(folder: Path, videos: Sequence[Assignment]) -> NDArray[np.float64]:

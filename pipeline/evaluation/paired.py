@@ -1,6 +1,6 @@
 """Paired comparison of two settings on the same questions: interval, sign-flip test, minimum detectable effect.
 
-Values are differences, (..., seeds, questions), from -1 to 1: how right the one setting is less how right the other.
+Values are differences, (..., seeds, questions), from -1 to 1: the score of one setting minus that of the other.
 
 Sources: Bonett and Price 2012 (the interval); Fisher 1935, Gail, Mark, Carroll, Green, Pee 1996 and, with few clusters,
 Canay, Romano, Shaikh 2017 (sign flips); Cameron, Gelbach, Miller 2011 (seeds across objects); Bloom 1995 and Murray

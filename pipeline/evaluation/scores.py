@@ -81,7 +81,7 @@ class Answer(NamedTuple):
 
     @classmethod
     def of(cls, score: Score) -> Answer:
-        """Of a graded measure."""
+        """From a graded measure."""
         return cls(score.correct, score.objects, score.parsed, score.strict)
 
 
@@ -185,7 +185,7 @@ def candidate_rows(
     task: str = CROSS_VALIDATION,
     properties: Sequence[str] = (),
 ) -> list[EffectRow]:
-    """Each other encoder less the reference: all properties of a video right, then each of these properties alone.
+    """Each other encoder minus the reference: all properties of a video right, then each of `properties` alone.
 
     Computed as effects are, with repeats in place of seeds and a Holm adjustment of its own. Empty where the reference
     was not run.

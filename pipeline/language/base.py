@@ -54,7 +54,7 @@ def load_tokenizer(folder: Path) -> PreTrainedTokenizerBase:
 
 
 def load_llm(folder: Path, dtype: torch.dtype, quantization: Quantization = "none") -> PreTrainedModel:
-    """The language model, frozen and in evaluation mode; what cannot be loaded, or not so, is a UserError.
+    """Load the language model, frozen and in evaluation mode; UserError where it cannot be loaded with these settings.
 
     Args:
         dtype: Of the weights; with `nf4`, of what is computed and of the layers that are left whole.

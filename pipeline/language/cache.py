@@ -1,4 +1,4 @@
-"""Keys and values of the tokens read so far, kept in room that is reserved ahead."""
+"""A KV cache: keys and values of the tokens read so far, in memory that is reserved ahead."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from transformers import Cache, DynamicCache, PretrainedConfig
 from transformers.cache_utils import DynamicLayer
 
 AHEAD = 64
-"""Tokens that room is made for at a time."""
+"""Number of tokens that memory is reserved for at a time."""
 
 
 class RoomyLayer(DynamicLayer):
@@ -31,7 +31,7 @@ class RoomyLayer(DynamicLayer):
         if not self.is_initialized:
             self.lazy_initialization(key_states, value_states)
         old, needed = self.get_seq_length(), self.get_seq_length() + key_states.shape[-2]
-        # Where rows were chosen or repeated since, the keys are others.
+        # Where rows were selected or repeated since, the keys are another tensor, and memory is reserved anew.
         if self.keys is not self._shown or self._room[0].shape[-2] < needed:
             keys, values = (s.new_empty(*s.shape[:-2], needed + AHEAD, s.shape[-1]) for s in (key_states, value_states))
             if old:

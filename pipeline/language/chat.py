@@ -126,7 +126,7 @@ def encode(rendered: Rendered, tokenizer: PreTrainedTokenizerBase, *, bos: bool 
 
 
 def conclusions(rendered: Rendered, turns: Sequence[Turn]) -> Rendered:
-    """The conversation with what is concluded from descriptions, and its end token, as all that the assistant says."""
+    """The conversation with only conclusions, each with its end token, marked as answers; descriptions are not."""
     spans = []
     for (start, stop), turn in zip(rendered.answers, turns, strict=True):
         if turn.described:
@@ -138,7 +138,7 @@ def conclusions(rendered: Rendered, turns: Sequence[Turn]) -> Rendered:
 
 
 def _templated(messages: Sequence[dict[str, str]], tokenizer: PreTrainedTokenizerBase, *, ask: bool) -> str:
-    """By the tokenizer's template, or Vicuna's; `ask`: with what it writes before an answer."""
+    """Render messages by the tokenizer's template, or Vicuna's; `ask` appends what it writes before an answer."""
     asked = {"chat_template": None if tokenizer.chat_template else VICUNA, "add_generation_prompt": ask}
     try:
         return str(tokenizer.apply_chat_template(list(messages), tokenize=False, **asked))

@@ -18,7 +18,7 @@ def classes_of(store: EmbeddingStore, catalogue: Catalogue) -> Callable[[str], l
     """A function from a video to its predicted class and expected class, property by property.
 
     The store has logits (`encoder.embedding=logits`); those of training objects are from heads that did not see the
-    object, so that as many classes are wrong as of new objects.
+    object, so they err as often as on new objects.
     """
     scaled = Statistics.load(store.folder / STATISTICS_FILE)
     sizes = [len(p.levels) for p in catalogue.properties]
@@ -35,7 +35,7 @@ def classes_of(store: EmbeddingStore, catalogue: Catalogue) -> Callable[[str], l
 def in_words(questions: Sequence[Question], store: EmbeddingStore, catalogue: Catalogue) -> list[Question]:
     """The questions with each video's predicted classes as text in its place, such as "(soft, rough, no bumps)".
 
-    A language model that is trained and asked this way need not read touch. What it lacks then is lacking in language.
+    A language model that is trained and asked this way need not read touch: what it lacks then is a matter of language.
     """
     said = classes_of(store, catalogue)
     changed = []
@@ -70,9 +70,9 @@ def uncontradicted(questions: Sequence[Question], store: EmbeddingStore, catalog
 def follows(question: Question, seen: Sequence[Sequence[tuple[int, float]]], catalogue: Catalogue) -> bool:
     """Whether a comparison's right answer is the one that the tasks' rules draw from these classes.
 
-    The rules (`TaskDefinition.conclude`) stand beside the graders. They are written out here once more, from the right
-    answer's side, so that a changed grader does not train every model anew; a test holds them to be the same. `seen`
-    has, by video and property, the class and the expected class.
+    The rules (`TaskDefinition.conclude`) stand beside the graders. They are repeated here, starting from the right
+    answer, so that a changed grader does not make every training run again; a test checks that both agree. `seen`
+    holds, by video and property, the class and the expected class.
     """
     labels = question.gold.labels
     if question.task == "POM":

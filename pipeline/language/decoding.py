@@ -52,7 +52,7 @@ def greedy_tokens(
     Args:
         features: Of each prompt's frames: frames x tactile_dim.
         ends: Ids of tokens that end an answer.
-        limits: Most new tokens of each, at least 1. One that is lowered meanwhile ends that row.
+        limits: Most new tokens of each, at least 1. Lowering a limit during generation ends its row.
     """
     logits, cache, mask = _read(model, prompts, features)
     said, ended = [0] * len(prompts), [False] * len(prompts)

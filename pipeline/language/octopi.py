@@ -173,7 +173,7 @@ class OctopiForCausalLM(nn.Module):
     def save_pretrained(self, folder: Path | str, state_dict: Mapping[str, torch.Tensor] | None = None) -> None:
         """Write config.json, the connector and, where there are such, word embeddings and an adapter in PEFT's format.
 
-        `state_dict` has the parameters where the model's own are sharded; an adapter that it lacks is not written.
+        `state_dict` replaces the model's parameters where they are sharded; an adapter that it lacks is not written.
         """
         folder = Path(folder)
         parts: dict[str, dict[str, torch.Tensor]] = {"connector": {}, "words": {}, "llm": {}}
@@ -288,8 +288,8 @@ class OctopiForCausalLM(nn.Module):
     def _shared(self, input_ids: torch.Tensor, labels: torch.Tensor) -> int:
         """Number of first columns that are equal in all rows, before any frame and any token that predicts a label.
 
-        0 in a sharded model: the prefix is another pass, for which layers are gathered again, and processes without one
-        would wait.
+        0 in a sharded model: computing the prefix is an extra forward pass, for which all processes must gather the
+        layers; if one had no prefix, the others would wait for it.
         """
         if not extendable(self.llm.config) or (self.training and self.llm.is_gradient_checkpointing):
             return 0

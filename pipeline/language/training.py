@@ -146,7 +146,7 @@ def assemble(
     if isinstance(config, LoraTrainConfig) and config.given:
         drawn, given = with_given(drawn, material.opd, config.given, material.seed)
     if material.words:
-        # Last, since until here videos may be exchanged.
+        # Done last, as videos may be exchanged until here.
         drawn = in_words(drawn, material.store, material.catalogue)
     data = ConversationDataset(
         drawn,

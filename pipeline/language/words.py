@@ -19,7 +19,7 @@ def begin_with_words(model: OctopiForCausalLM, data: ConversationDataset, catalo
     """Fit the projection so that each frame maps to the mean word embedding of its object's class names.
 
     With a random projection the language model first memorises frames object by object, and does not learn which video
-    of a question they belong to. Frames that resemble words it finds by the label before them, as in a list.
+    of a question they belong to. If frames resemble words, it finds them by the label before them, as in a list.
 
     What is fitted are the unmirrored frames and the labels of `data`. Noise is added to the frames, or the projection
     would memorise the few objects.

@@ -133,7 +133,7 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
 
 
 def without_places(text: str) -> str:
-    """params.yaml with the last part alone of paths of this machine, and no tracking server: a report is for others."""
+    """The text of params.yaml for others to read: of this machine's paths only the last part, no tracking server."""
     text = re.sub(r"(?m)^(  uri: ).*$", r"\1''", text)
     return re.sub(r"(?m)^(  \w+: )['\"]?(?:/|~|[A-Za-z]:\\).*?([^/\\'\"\n]+)[/\\]*['\"]?$", r"\1\2", text)
 
@@ -154,8 +154,8 @@ def finish_report(folder: Path) -> dict[str, float]:
 def dataset_frame(
     catalogue: Catalogue, videos: Sequence[Video], splits: Sequence[Sequence[Assignment]]
 ) -> pd.DataFrame:
-    """The paper's tables about its data set: a row a class, a combination of classes that an object has or the paper
-    counts, and a figure of lengths.
+    """The paper's tables about its data set: one row per class, per combination of classes (that an object has or the
+    paper counts), and per figure of lengths.
 
     Of several splits, an object counts in each part that any of them puts it in.
     Published figures stand beside where the catalogue is the paper's, joined by (table, row).

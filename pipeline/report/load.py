@@ -14,13 +14,13 @@ from pipeline.core.io import read_json
 from pipeline.core.records import EffectRow, ScoreRow
 
 KEYS = ("task", "measure", "encoder", "lora", "opd")
-"""What a published cell and a measured row share; "" stands for "does not apply"."""
+"""Columns that join published cells to measured rows; "" stands for "does not apply"."""
 SCORE_COLUMNS, EFFECT_COLUMNS = tuple(ScoreRow.model_fields), tuple(EffectRow.model_fields)
 TEXT = frozenset((*KEYS, "touch", "seed", "part", "change", "model", "dataset"))
 DATASET = "PhysiCLeAR"
-"""That of most of the paper's figures."""
+"""The data set that most of the paper's figures are about."""
 DATASETS = (DATASET, "avocados")
-"""What the paper has figures about, as properties.yaml names it; beside another data set's they would mislead."""
+"""Data sets of the paper's figures, as properties.yaml names them; beside results on other data they would mislead."""
 
 
 @dataclass(frozen=True)

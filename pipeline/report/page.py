@@ -62,8 +62,8 @@ BY_USER = (
     ),
     ("robot", "the arm that sorts avocados", "needs one with such a sensor; it asks a trained model (`docs/robot.md`)"),
 )
-"""What of the paper only a user can measure: what in a report on real videos would show it (its name, a task, the data
-set and what was there in place of touch), what it is, and what it needs."""
+"""Results of the paper that only a user can measure. For each: what in a report on real videos would show it (the
+report's name, a task, or the data set and what was shown in place of touch), what it is, and what it needs."""
 
 
 def write_page(root: Path) -> Path:

@@ -159,7 +159,7 @@ def _impossible(effects: pd.DataFrame) -> str:
 
 
 def _rules(rows: pd.DataFrame) -> str:
-    """How the full system stands to what its encoder's heads and plain rules answer without a language model."""
+    """The full system compared with plain rules on its encoder's heads, without a language model."""
     if not len(rows):
         return ""
     sure = rows[rows["p_holm"] < ALPHA]
@@ -173,7 +173,7 @@ def _rules(rows: pd.DataFrame) -> str:
 
 
 def _parts(rows: pd.DataFrame, solved: Collection[str], impossible: str) -> str:
-    """What encoder, LoRA and OPD bring; a gain that ends no better than chance is one of form, not of right answers."""
+    """What encoder, LoRA and OPD bring; a gain that only reaches chance is one of form, not of right answers."""
     if not len(rows):
         return ""
     form = rows["difference"].gt(0) & ~rows["task"].isin(solved)

@@ -105,10 +105,10 @@ def over_seeds(scores: pd.DataFrame) -> pd.DataFrame:
 def marked(scores: pd.DataFrame) -> pd.DataFrame:
     """Rows of scores.csv with the columns by which tables choose among them.
 
-    `by` is what answered: the language model, told real touch (`model`) or another (`other touch`), `rules` from the
-    heads' classes, the model that is `shipped`, `vision` alone, or the task where it is none of answering. `lacks` are
-    the axes in which a variant is not the full system; OPD as needed, which the paper's tables lack, is `needed`.
-    `whole` is a measure which says that an answer is right, not only a part of it; `trained` is a task that is trained.
+    `by` says what answered: the language model given real touch (`model`) or an input ablation (`other touch`), `rules`
+    on the heads' classes, the `shipped` model, a `vision`-only model, or the task's name where nothing was answered.
+    `lacks` names the axes on which a variant differs from the full system, or `needed` for that OPD mode, which the
+    paper's tables lack. `whole`: whether the measure is about the whole answer; `trained`: whether the task is trained.
     """
 
     def by(task: str, lora: str, touch: str) -> str:
@@ -261,5 +261,5 @@ COLUMNS: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
 
 _ENTRIES = yaml.safe_load(Path(__file__).with_name("tables.yaml").read_text(encoding="utf-8"))
 FIVE_TASKS, SHIPPED_TABLE, *TABLES = [Table(key, **entry) for key, entry in _ENTRIES.items()]
-"""A report's first table, two rows a task that was asked; what stands before all else where the shipped model was
+"""A report's first table, two rows per task that was asked; the table that stands before it where the shipped model was
 asked; the others."""

@@ -164,7 +164,7 @@ def layer_kept(width: int, heads: int, keys: int, queries: int, wide: int, stati
 
 
 def tower_kept(tower: VisionTransformer, frames: int, prompts: int, size: int) -> tuple[int, int]:
-    """Bytes that a training forward through a frozen tower keeps, and those that come and go at its widest place.
+    """Bytes that a forward pass in training keeps of a frozen tower, and its peak of temporary ones.
 
     Args:
         frames: Pictures at a time.
@@ -225,7 +225,7 @@ def language_uses(params: Params, llm: PreTrainedModel, embedding: int, lengths:
 
 
 def trained_parameters(params: Params, llm: PreTrainedModel, embedding: int) -> tuple[int, int, int]:
-    """What is trained: the connector with the two tactile tokens, all words where they are trained, and the adapters.
+    """Trained parameters of: the connector with the two tactile tokens, word embeddings if trained, and adapters.
 
     Words are a copy beside the frozen ones, which a tied head still needs.
     """

@@ -37,8 +37,8 @@ FORCES = 6
 VISIBLE_SLOPE = 0.01
 """What a slope must be for its light to stand out of the camera's noise."""
 RESIDUAL = 0.03
-"""Of the solver, a cell: finer grids show slopes that are a smaller part of the energy. Measured on the catalogue's
-objects at 32 to 256 cells, slopes are then within 2 % of those of a finished solution."""
+"""Tolerance of the solver, times cells across: on finer grids slopes are a smaller part of the energy. Measured on the
+catalogue's objects at 32 to 256 cells, slopes are then within 2 % of those of a finished solution."""
 
 
 @dataclass(frozen=True)
@@ -64,14 +64,14 @@ class Imprint:
     skins: npt.NDArray[np.float32]
     """How far the gel's skin is pushed in, in mm, (FORCES + 1) x side x side; the first is 0."""
     radii: npt.NDArray[np.float64]
-    """Of the circle with the contact's area, in mm."""
+    """Radius of the circle with the contact's area, in mm."""
     force: float
-    """The largest, in N."""
+    """The largest force, in N."""
     method: Method
     error: float | None
-    """What `auto` estimates of the method's relative error in slopes; None where it was not asked."""
+    """The method's relative error in slopes as `auto` estimates it; None where the method was given."""
     residual: float
-    """The solver's largest."""
+    """The largest residual of the solver."""
 
     def at(self, force: float) -> Heights:
         """The skin under a force, between the two nearest that were pressed."""
@@ -168,7 +168,7 @@ class Pressed:
     skins: npt.NDArray[np.float32]
     """As in `Imprint`."""
     areas: npt.NDArray[np.float64]
-    """Of the contacts, in mm^2."""
+    """Areas of the contacts, in mm^2."""
     residual: float
 
 
@@ -194,7 +194,7 @@ def press_by(
         return Pressed(sinks, areas, residual)
     fine = heights - _enlarge(coarse, side)
     together = series(GEL.modulus, modulus)
-    # The share of the fine part that the pressure flattens, of that what the gel and not the object gives way.
+    # The share of the fine part that the pressure flattens, and of this the gel's part, not the object's.
     flattened = math.sqrt(2) / (together * max(_rms_slope(fine, pitch), 1e-9))
     share = np.float32(together / GEL.modulus) * fine
     skins = [
@@ -206,27 +206,27 @@ def press_by(
 
 @lru_cache(maxsize=16)
 def _compliances(cells: int, pitch: float, tier: Tier) -> tuple[Kernel, Kernel]:
-    """Of the gel, and of a half-space of modulus 1."""
+    """The kernels of the gel, and of a half-space of modulus 1."""
     shape = (cells, cells)
     gel = layer_table(shape, pitch, GEL) if tier == "layer" else half_space_table(shape, pitch, GEL.modulus)
     return make_kernel(gel, np.float32), make_kernel(half_space_table(shape, pitch, 1.0), np.float32)
 
 
 def _enlarge(field: Heights, side: int) -> Heights:
-    """By cubic splines, since light shows slopes: linear interpolation makes them jump, OpenCV's cubic one ripples."""
+    """Enlarge by cubic splines, as light shows slopes: linear interpolation makes jumps, OpenCV's cubic one ripples."""
     spline = _spline(field.shape[0], side)
     return np.asarray(spline @ field @ spline.T)
 
 
 @lru_cache(maxsize=8)
 def _spline(cells: int, side: int) -> Heights:
-    """From values at the centres of cells to values at those of pixels: side x cells."""
+    """The matrix from values at the centres of cells to values at the centres of pixels: side x cells."""
     centres, pixels = (np.arange(cells) + 0.5) / cells, (np.arange(side) + 0.5) / side
     return np.asarray(CubicSpline(centres, np.eye(cells))(pixels), dtype=np.float32)
 
 
 def _rms_slope(field: Heights, pitch: float) -> float:
-    """Over the middle of the patch, which is what the camera sees."""
+    """Root mean square slope over the middle of the patch, which is what the camera sees."""
     margin = field.shape[0] // 4
     middle = field[margin:-margin, margin:-margin]
     squares = float(np.mean(np.diff(middle, axis=0) ** 2) + np.mean(np.diff(middle, axis=1) ** 2))

@@ -40,9 +40,9 @@ TEXTURE: tuple[Range, ...] = (
 BUMPS: tuple[Range, ...] = ((0.0, 0.0), (0.02, BIG_SHARE / 1.25), (BIG_SHARE * 1.25, 1.0))
 """Width of the bumps by bumpiness, as a share of the image's height: a quarter away from the border."""
 WIDTHS_MM: tuple[Range, ...] = ((0.0, math.inf), (0.7, 4.5), (3.0, math.inf))
-"""Of the widest layer of relief, by bumpiness: outside nothing measures as such, so it need not be pressed."""
+"""Width of the widest layer of relief, by bumpiness; nothing outside measures as this class, so it is not pressed."""
 ACROSS = {"plates": "size", "weave": "spacing", "creases": "spacing", "digits": "stroke"}
-"""By kind of layer, what says how wide a feature is where that is not called `width`; roughness has no width."""
+"""By kind of layer, the key for the width of a feature where it is not `width`; roughness has no width."""
 FORCES_N = (1.0, 3.0)
 """A patch is pressed with each; both must show the bumps of the class."""
 WIDTH, HEIGHT = 160, 120

@@ -61,7 +61,7 @@ class Motion:
     force: Track
     """In N; 0 before first touch, and above 0 in at least one frame."""
     angle: Track
-    """Turn of the object in the picture, in degrees against the clock, as `cv2.getRotationMatrix2D` takes it."""
+    """Turn of the object in the picture, in degrees counterclockwise, as `cv2.getRotationMatrix2D` takes it."""
     x: Track
     """Place of the object's centre in mm, from the image's centre."""
     y: Track

@@ -81,7 +81,7 @@ def render(scene: Scene, config: ScenesConfig, sensor: Sensor, seed: int) -> Ite
         skin = place(scene.imprint.at(force), angle, centre, (config.width, config.height))
         drift = None
         if angle != start:
-            # The motion's angle is against the clock; with y downwards, from x to y is with the clock.
+            # The motion's angle is counterclockwise; with y downwards, turning from x to y is clockwise.
             radius = scene.imprint.radius(force)
             most = slip_turn(force, radius, GEL.shear_modulus)
             turn = max(-most, min(most, math.radians(start - angle)))

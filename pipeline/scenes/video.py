@@ -38,15 +38,15 @@ class SceneRow(Record):
     frames: int
     fps: float
     force: float
-    """The largest, in N."""
+    """The largest force, in N."""
     method: str
-    """Of the contact."""
+    """The contact model (`pipeline.scenes.contact.Method`)."""
     error: float | None
     """`auto`'s estimate of the relative error in slopes."""
     residual: float
-    """The contact solver's."""
+    """Residual of the contact solver."""
     modulus: float
-    """The object's, in MPa; with the next two what its classes are told from (`pipeline.scenes.measure`)."""
+    """The object's modulus, in MPa. This and the next two decide its classes (`pipeline.scenes.measure`)."""
     texture: float
     """In mm."""
     bump: float

@@ -1,4 +1,4 @@
-"""What lies on disk of a reproduction: stages as DVC and runs/ know them, and accuracies."""
+"""The results of a reproduction on disk: its stages, as dvc.lock and runs/ have them, and its accuracies."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def read_stages(params: Params) -> dict[str, ChainStage]:
 
 
 def axes(title: str) -> dict[str, str]:
-    """Which of its matrix a stage is: `align@finetuned-all-0` has encoder, opd and seed."""
+    """A stage's values on the axes of its matrix: `align@finetuned-all-0` has encoder, opd and seed."""
     name, _, key = title.partition("@")
     names = _stages_in(CHAIN).get(name, {}).get("matrix", {})
     return dict(zip(names, key.split("-", len(names) - 1), strict=False))
@@ -78,13 +78,14 @@ def _stages_in(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def settings(params: Params, own: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Resolved parameters by dotted key, lists as JSON; a run's `own` come first, in place of those of their name."""
+    """Resolved parameters by dotted key, lists as JSON; a run's `own` come first, and replace those of the same
+    name."""
     return {**(own or {}), **dict(flatten(params.model_dump(mode="json"))), **(own or {})}
 
 
 def accuracies(params: Params) -> dict[str, dict[str, float]]:
-    """Metrics of each variant by its key, from the report's scores.csv; of folds, which the report pools and of which
-    each has a model of its own, from graded answers.
+    """Metrics of each variant by its key, from the report's scores.csv. With folds they come from graded answers: each
+    fold has a model of its own, but the report pools them.
 
     `PC` is the share of right answers (0 to 1), `low/PC` and `high/PC` its interval, `swapped/PC` the share
     with another object's video; parts of an answer are named like `OPD.hardness`.

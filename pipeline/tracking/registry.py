@@ -24,8 +24,8 @@ NAME, ALIAS = "octopi", "best"
 def log_model(client: Any, run: str, params: Params, variant: Variant, folder: Path) -> None:
     """Log a variant's packaged folder as a model of its run.
 
-    It asks for all that this package asks for, in the versions of today. Without an example of its input, which MLflow
-    would try: that loads the model, which takes more memory than a machine with a dashboard may have.
+    Its requirements are this package's, in the installed versions. No input example is logged: MLflow would try it, and
+    loading the model may take more memory than a machine with a dashboard has.
     """
     import mlflow.pyfunc
     from mlflow.models import ModelSignature
@@ -63,9 +63,9 @@ def log_model(client: Any, run: str, params: Params, variant: Variant, folder: P
 def register(client: Any, params: Params, runs: Sequence[tuple[Variant, str]]) -> str:
     """Give the best variant's model the alias `best` in the registry; the same one is not registered again.
 
-    Best by validation, and by nothing that test questions say: among variants that are the system as the paper proposes
-    it (else all), the one whose seed's property heads are right on most validation videos. Language models are not
-    scored on validation questions, so nothing finer is known.
+    The best is chosen by validation alone, never by test questions: among variants that are the system as the paper
+    proposes it (else all), the one whose seed's property heads are right on most validation videos. Language models are
+    not scored on validation questions, so nothing finer is known.
 
     Args:
         client: MLflow's client.

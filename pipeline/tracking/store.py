@@ -102,7 +102,7 @@ class Store:
                 self.experiment = str(found.experiment_id)
                 return
             if not tracking.uri:
-                # Or artifacts would stay behind where the folder is moved: MLflow makes absolute what a call names.
+                # MLflow makes a path in a call absolute, so artifacts would stay behind when the folder is moved.
                 self.client._tracking_client.store.artifact_root_uri = (MLRUNS / "artifacts").as_posix()
             # Without the kind, the dashboard takes the experiment for a chat application's.
             kind = {"mlflow.experimentKind": "custom_model_development"}
@@ -114,7 +114,7 @@ class Store:
         return list(self.client.search_runs([self.experiment], query, order_by=["attributes.start_time DESC"]))
 
     def fresh(self, stages: Mapping[str, ChainStage]) -> dict[str, tuple[int, int, Any | None]]:
-        """Stages whose last run here has no finished run there: start, end, and the run that was logged live."""
+        """Stages whose last run here has no finished run in MLflow: start, end, and the run that was logged live."""
         found = {}
         for title, stage in stages.items():
             if stage.ran:

@@ -24,7 +24,7 @@ def trainable_state(module: nn.Module) -> dict[str, torch.Tensor]:
 
 
 def whole_state(module: nn.Module) -> dict[str, torch.Tensor]:
-    """`trainable_state`, where it is sharded gathered from all processes: each must call it, and each gets all of it.
+    """`trainable_state`, gathered from all processes where it is sharded: each must call this, and each gets all of it.
 
     The frozen base stays where it is: gathering that too would take its whole size of memory in each process.
     """

@@ -92,7 +92,7 @@ class TrainableTrainer(Trainer):
     def create_scheduler(
         self, num_training_steps: int, optimizer: torch.optim.Optimizer | None = None
     ) -> torch.optim.lr_scheduler.LRScheduler:
-        """The Trainer's own, but for what stays constant."""
+        """The Trainer's own schedule, except that rates in `constant` do not change."""
         scheduler = cast(torch.optim.lr_scheduler.LambdaLR, super().create_scheduler(num_training_steps, optimizer))
         for place, name in enumerate(self._rates or ()):
             if name in self._constant:
@@ -255,7 +255,7 @@ def train(trainer: Trainer) -> Trained:
     history = [
         Measurement(step=entry["step"], name=name, value=value)
         for entry in trainer.state.log_history
-        # A state that was read back has its names in order, one that was not has them as they were logged.
+        # Sorted: a resumed state has its names in alphabetical order, a fresh one in the order of logging.
         for name, value in sorted(measured(entry).items())
     ]
     return Trained(history, state)

@@ -42,7 +42,7 @@ PAGE = Path(__file__).with_name("page")
 HOSTS = ["127.0.0.1", "localhost"]
 """Names that the page answers to, so that no other site's name can be pointed at it."""
 MOST_BYTES, MOST_TOUCHES = 200_000_000, 30
-"""Of one video; and touches that are remembered, the last ones."""
+"""Maximum size of one video, and how many of the last touches are remembered."""
 SCENE, SCENE_FRAMES = ScenesConfig(), 60
 GLOW = 6.0
 """Difference to the untouched sensor, in 8-bit steps, that is painted at full strength where it touches."""

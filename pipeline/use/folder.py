@@ -40,7 +40,7 @@ IDENTITY = ("*.safetensors", "tokenizer.json")
 
 M = TypeVar("M", bound=BaseModel)
 Rounded = Annotated[float, AfterValidator(lambda value: round(value, 4))]
-"""What was fitted or summed: its last bits depend on the processor, and a folder's bytes must not."""
+"""For values that are fitted or summed: their last bits depend on the processor, but a folder's bytes must not."""
 
 
 class Base(Record):

@@ -42,17 +42,17 @@ class Limits:
     """What one request may bring."""
 
     body_bytes: int = 32 * 2**20
-    """Of the whole request as sent, base64 included; the published videos have at most 0.12 MB each."""
+    """Size of the whole request as sent, base64 included; the published videos have at most 0.12 MB each."""
     videos: int = 8
-    """Of a request, those of earlier turns included."""
+    """Videos in a request, those of earlier turns included."""
     seconds: float = 120.0
-    """Of a video, by its own clock."""
+    """Length of a video, by its own time stamps."""
     frames: int = 3000
-    """Of a video."""
+    """Frames of a video."""
     pixels: int = 10_000_000
-    """Of a frame: width x height."""
+    """Pixels of a frame: width x height."""
     check_seconds: int = 20
-    """To read and decode one video."""
+    """Time to read and decode one video."""
 
 
 class Refused(UserError):

@@ -133,7 +133,7 @@ def export(folder: Path, to: Path, *, with_base: bool = False, base: Path | None
 
 
 class Score(NamedTuple):
-    """Of one task."""
+    """Accuracy on one task."""
 
     n: int
     accuracy: float

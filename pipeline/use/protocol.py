@@ -78,8 +78,8 @@ def read_request(body: bytes) -> ChatRequest:
 def read_conversation(messages: Sequence[Message]) -> list[Said]:
     """Turn messages into exchanges; the last is the question, whose answer is "".
 
-    Where a text of a message says `{tactile}`, its videos stand at those marks in order; where it has one text without
-    a mark, in front of it; else a video stands where its part stands between the texts.
+    A message's videos stand at the `{tactile}` marks in its texts, in order. Without marks they stand in front of a
+    single text; among several texts, each video stands where its part does.
 
     System messages are left out: the model was trained under its own and knows no other.
 
@@ -112,8 +112,8 @@ def read_conversation(messages: Sequence[Message]) -> list[Said]:
 class Reply:
     """The answer to one request, in OpenAI's form; token counts are left out, since the model hands out text.
 
-    `finish_reason` is `stop` also where an answer was cut at its longest, which the text does not tell. `notes`, which
-    OpenAI's has not, is what should make one doubt the answer: of a stream its last chunk has it.
+    `finish_reason` is `stop` even where an answer was cut at its maximum length, which the text does not show. `notes`,
+    an addition to OpenAI's form, says what should make one doubt the answer; in a stream the last chunk has it.
     """
 
     def __init__(self, model: str) -> None:

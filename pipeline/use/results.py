@@ -50,8 +50,8 @@ class Description(Record):
     """What the property heads and the language model say of one video."""
 
     levels: dict[str, str]
-    """By property, the class that the heads take: jointly, by what goes together in training, where the encoder's
-    recipe does so. It need not be the likeliest class of that property alone."""
+    """By property, the class that the heads choose. Where the encoder's recipe decides on all jointly, by which classes
+    occur together in training, it need not be the likeliest class of that property alone."""
     probabilities: dict[str, dict[str, float]]
     """By property, the heads' calibrated probability of each class."""
     sentence: str

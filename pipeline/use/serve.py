@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from pipeline.use.model import Octopi
 
 UPLOAD_SECONDS, DRAIN_SECONDS, LOOK_SECONDS = 30.0, 5.0, 0.1
-"""How long a client may take for a body, and for the rest of one that is not wanted; and how often is looked whether
-it is still there."""
+"""Time that a client may take to send a body, and to send the rest of a refused one; and the interval of checks whether
+the client is still connected."""
 MOST_TOKENS = 1024
 """The longest answer that a client may ask for."""
 SHORTEST_TOKEN = 16

@@ -61,7 +61,7 @@ class Worker:
 
     Attributes:
         answers: How many were given in full.
-        seconds: That the model took for them all.
+        seconds: Total time that the model took for them.
     """
 
     def __init__(self) -> None:

@@ -26,9 +26,9 @@ av.logging.set_level(av.logging.PANIC)  # Broken files are reported in a line of
 
 Image = npt.NDArray[np.uint8]
 SUFFIXES = (".avi", ".m4v", ".mjpg", ".mkv", ".mov", ".mp4", ".webm")
-"""What is a video by its name, wherever it comes from."""
+"""Suffixes of video files, wherever they come from."""
 CONTAINERS = {"format_whitelist": "avi,matroska,mjpeg,mov"}
-"""What is a video by its content, by FFmpeg's names for containers. None refers to other files, as a playlist does."""
+"""Containers that are accepted as videos, by FFmpeg's names. None can refer to other files, as a playlist does."""
 PLANAR = frozenset(f"yuv{j}{kind}p" for j in ("", "j") for kind in ("420", "422", "444", "440", "411", "410"))
 """Formats whose first plane is brightness and whose second and third are colour, 8 bits each."""
 FULL_RANGE, BT709 = 2, 1
@@ -44,9 +44,9 @@ class Header:
     """What a file says of itself."""
 
     frames: int = 0
-    """Promised; from the duration where no number is given; 0 where neither is."""
+    """Frames that the header promises; from the duration where it has no number; 0 where it has neither."""
     fps: float = 0.0
-    """0 where unknown."""
+    """Frames a second; 0 where unknown."""
     hdr: bool = False
     """Whether its brightness follows PQ or HLG, as telephones record by default."""
 
@@ -126,7 +126,8 @@ def fit(frame: av.VideoFrame, config: FramesConfig) -> Image:
 
 
 def _square(plane: Image, height: int, width: int) -> Image:
-    """The central square of a picture, in one of its planes: 4:2:2 halves colour in width alone, so no square there."""
+    """Cut a plane to the central square of its picture; in 4:2:2, with colour halved in width alone, it is no
+    square."""
     side = min(height, width)
     (top, bottom), (left, right) = (
         ((whole - side) // 2 * own // whole, -(-((whole + side) // 2) * own // whole))
@@ -136,7 +137,7 @@ def _square(plane: Image, height: int, width: int) -> Image:
 
 
 def _resize(plane: Image, size: int) -> Image:
-    """Halved by exact means of 2 x 2 pixels while it is more than twice too large, then by linear interpolation."""
+    """Resize: halve by exact means of 2 x 2 pixels while it is more than twice too large, then interpolate."""
     while min(plane.shape) >= 2 * size and plane.shape[0] % 2 == 0 and plane.shape[1] % 2 == 0:
         plane = cv2.resize(plane, (plane.shape[1] // 2, plane.shape[0] // 2), interpolation=cv2.INTER_AREA)
     if size > min(plane.shape):
@@ -159,7 +160,7 @@ def to_rgb(yuv: Image, frame: av.VideoFrame) -> Image:
 
 
 def turns(frame: av.VideoFrame) -> int:
-    """Quarter turns against the clock that the metadata ask for."""
+    """Counterclockwise quarter turns that the metadata ask for."""
     return round(frame.rotation / 90) % 4
 
 
@@ -182,5 +183,5 @@ def _colours(full: bool, bt709: bool) -> npt.NDArray[np.float64]:
 
 
 def _reformat(frame: av.VideoFrame, pixels: str) -> av.VideoFrame:
-    """In one thread: a forked process that inherits threads which are not in it waits for them for ever."""
+    """Convert in one thread: a forked process lacks the threads of its parent, but would wait for them for ever."""
     return REFORMATTER.reformat(frame, format=pixels, threads=1)

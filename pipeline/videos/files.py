@@ -24,7 +24,7 @@ SECTION = ("begin", "end")
 """Columns of a table that `octopi import video` cuts by; the chain itself takes whole files."""
 
 PASSED = "passed over"
-"""The check of what is no video."""
+"""Name of the check that lists files which are no videos."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class VideoFile:
 
     path: Path
     relative: str
-    """To the data folder, with forward slashes."""
+    """Path relative to the data folder, with forward slashes."""
     object_id: str
     video_id: str
     session: str = ""

@@ -1,7 +1,7 @@
-"""Writing videos as the real ones were written: MPEG-4 part 2, a whole picture every twelve, 200 kbit/s.
+"""Writing videos as the real ones were written: MPEG-4 part 2, a keyframe every twelve frames, 200 kbit/s.
 
-Coding is most of what is fine in a frame without contact: blocks of 8 x 8 pixels whose brightness is right to a step
-or two, copied from frame to frame until the next whole picture. PyAV's own libavcodec has this encoder in every build.
+Most fine detail of a frame without contact comes from coding: blocks of 8 x 8 pixels whose brightness is right to a
+step or two, copied from frame to frame until the next keyframe. PyAV's own libavcodec has this encoder in every build.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ import numpy.typing as npt
 from pipeline.core.errors import UserError
 
 KEY_EVERY = 12
-"""Frames from one whole picture to the next: in each of the public videos looked at, and libavcodec's own default."""
+"""Frames from one keyframe to the next: in each of the public videos looked at, and libavcodec's own default."""
 BITS_A_SECOND = 200_000
-"""libavcodec's default. Videos like the public ones need 40 to 120 thousand at the encoder's best quality, which is so
-what they get."""
+"""libavcodec's default. Videos like the public ones need 40 to 120 thousand at the encoder's best quality, so they get
+that quality."""
 
 
 def write_film(path: Path, frames: Iterable[npt.NDArray[np.uint8]], fps: float) -> None:

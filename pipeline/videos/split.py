@@ -41,9 +41,9 @@ def assign_objects(
 
     `development` tests on some of the paper's training objects and leaves the paper's test objects unused. `kfold`
     deals all objects that have videos into folds: the seed's fold is for test, so that over all folds every object is
-    tested once. One in eight of the other objects is for validation. Of the rest `train_objects` are for training, 0
-    being all. Any other name is that of a `split_` column of the catalogue. Present are the objects that have videos;
-    only kfold has another split for another seed (of `ablation.seeds`).
+    tested once. One in eight of the other objects is for validation. Of the rest, `train_objects` are for training (0:
+    all). Any other name is that of a `split_` column of the catalogue. `present` are the objects that have videos. Only
+    the split of kfold depends on `seed` (one of `ablation.seeds`).
 
     Raises:
         UserError: if there is no such split, no training video remains, there are too few objects for the test
@@ -99,7 +99,7 @@ def read_splits(data: Path, config: SplitConfig, seeds: Sequence[int]) -> dict[i
 
 
 def _deal(catalogue: Catalogue, present: Collection[str], config: SplitConfig, fold: int) -> dict[str, Part]:
-    """One fold for test, and of the other objects a few for validation, alike in classes to the rest."""
+    """Put one fold into test and a few of the other objects into validation, with classes spread as in the rest."""
     if len(present) < config.folds:
         raise UserError(f"split.folds is {config.folds}, but only {len(present)} objects have videos; lower it")
     labels = {o: catalogue.labels(o) for o in present}

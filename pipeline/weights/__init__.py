@@ -50,7 +50,7 @@ class Made(NamedTuple):
     origin: Origin | None = None
     """None where its weights are drawn at random."""
     size: int = 0
-    """Of a CLIP: side of its frames."""
+    """Side in pixels of the frames of a CLIP."""
 
 
 MADE = {
@@ -260,17 +260,17 @@ class Backbone(NamedTuple):
     """All that is known of a backbone before it is loaded: this needs no torch."""
 
     module: str
-    """With `load_backbone(config, *, tuned)`."""
+    """Module that defines `load_backbone(config, *, tuned)`."""
     words: str
     """What it is, as a report says it."""
     files: Callable[[Path], list[Path]]
-    """What its frozen weights are read from, in the folder (or the file itself) that `key` names."""
+    """The files of its frozen weights, given the folder (or the file itself) that `key` names."""
     key: Literal["weights", "pretrained"] = "weights"
-    """Of the section `encoder`."""
+    """Key in the section `encoder` that names the folder or file."""
     side: Callable[[Any], int] | None = None
-    """Pixels that frames must have at least, where the first of these files, a JSON, says so."""
+    """Minimum side of frames in pixels, read from the first of these files (a JSON) where that says it."""
     get: str = ""
-    """How the files are got."""
+    """How to get the files, for error messages."""
     settings: tuple[str, ...] = ()
     """Keys of the section `encoder` that this backbone uses and not every other does."""
 

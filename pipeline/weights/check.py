@@ -115,7 +115,7 @@ def linear(model: nn.Module) -> dict[str, tuple[int, int]]:
 
 
 def parameters(model: nn.Module) -> int:
-    """Their number; a tied one is one."""
+    """Number of parameters; tied ones count once."""
     return sum(p.numel() for p in model.parameters())
 
 

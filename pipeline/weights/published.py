@@ -39,7 +39,7 @@ CLIP_PICKLES = ("open_clip_pytorch_model.bin", "pytorch_model.bin")
 SETTINGS = (".json", ".md", ".model", ".txt", "")
 """Endings of what lies beside the weights: settings, card, licence."""
 COMPUTED = "rotary_emb.inv_freq"
-"""Once stored with each layer of a Llama; it follows from the configuration."""
+"""A tensor that older files store with each layer of a Llama; it follows from the configuration."""
 TEXTS = (
     "A chat between a curious user and an artificial intelligence assistant.",
     "USER: Which is rougher, 1 or 23?\nASSISTANT: 東京, Überraschung; \ttwo  spaces 😀",

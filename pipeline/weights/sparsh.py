@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 SIDE = 224
 """Pixels that it was trained at."""
 HEAD_WIDTH = 64
-"""Of an attention head, at every size."""
+"""Width of an attention head, the same in every size of Sparsh."""
 BANDS = "pos_embed.frequency_bands"
 LICENCE = "CC-BY-NC-4.0: research only, no commerce"
 # A picture of `subtract` is MIDDLE + GAIN * difference; (picture / 255 - MEAN) / STD is difference / 255 + .5 again.

@@ -106,9 +106,9 @@ class Kernel:
     spectrum: Array
     """Transform of the table in the doubled domain."""
     waves: Array
-    """Transform of the table as if the field were repeated without end."""
+    """Transform of the table for a periodic field."""
     shape: tuple[int, int]
-    """Of the fields."""
+    """Rows and columns of the fields."""
 
     def sink(self, pressure: Array) -> Array:
         """How far the surface sinks, in mm, under a pressure in MPa; ... x rows x columns."""
@@ -118,7 +118,7 @@ class Kernel:
         return sunk
 
     def press(self, sink: Array) -> Array:
-        """About the pressure that makes the surface sink so: exact where both repeat without end."""
+        """The approximate pressure that makes the surface sink by `sink` mm; exact for periodic fields."""
         rows, columns = self.shape
         own = _quick(self.shape)
         # A layer that keeps its volume does not sink under even pressure at all.

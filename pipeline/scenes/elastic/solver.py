@@ -54,7 +54,7 @@ def solve(
         forces: In N, one a contact; 0 is no contact.
         kernel: Of object and gel together, for fields like `gap`.
         pitch: In mm a pixel.
-        tolerance: Of the residual, an energy: errors of pressures are about its root.
+        tolerance: Largest residual. This is a share of energy, so errors of pressures are about its square root.
         iterations: At most.
 
     Raises:

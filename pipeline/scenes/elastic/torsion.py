@@ -14,7 +14,7 @@ import numpy.typing as npt
 from pipeline.scenes.grid import Heights
 
 FRICTION = 1.0
-"""Of a gel; soft rubber on dry solids has about that."""
+"""Coefficient of friction of the gel; soft rubber on dry solids has about that."""
 
 
 def share_of_turn(distance: npt.ArrayLike, radius: float) -> npt.NDArray[np.float64]:

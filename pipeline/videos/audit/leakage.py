@@ -25,13 +25,13 @@ nearest neighbours (average linkage)."""
 PERMUTATIONS = 2000
 FOLDS = 5
 RIDGE = 1.0
-"""Of the regression that predicts labels, whose features have a total variance of one."""
+"""Ridge penalty of the regression that predicts labels; its features have a total variance of one."""
 FEWEST = 16
-"""Likenesses that the tail of their distribution is fitted to, at least: with fewer than 256 pairs of videos only
-`DUPLICATE` counts."""
+"""Minimum number of similarities that the tail of their distribution is fitted to: with fewer than 256 pairs of videos
+only `DUPLICATE` counts."""
 SAMPLE = 5000
-"""Most videos that sessions are told apart by, and that labels are predicted on; of more, a random sample is taken.
-Memory and time of the first grow with the square of the number, and the second is repeated 2000 times."""
+"""Maximum number of videos for clustering sessions and for predicting labels; of more, a random sample is taken.
+Clustering takes memory and time that grow with the square of the number; prediction is repeated 2000 times."""
 ALPHA = 0.1
 """Below this p value a prediction from nothing but the untouched sensor is a warning. It is not .05, as a few dozen
 objects give the test little power, and to miss a leak costs more than to look into a false one."""
@@ -113,7 +113,7 @@ def _sampled(count: int) -> np.ndarray:
 def predictability(
     features: np.ndarray, labels: Sequence[int], objects: Sequence[str], seed: int
 ) -> tuple[float, list[float]]:
-    """The share of videos whose label features predict, of objects never seen; and the same for permuted labels.
+    """The share of videos of unseen objects whose label the features predict; and the same for permuted labels.
 
     Features are videos x dimensions; labels are classes, equal for videos of one object. Ridge regression on one-hot
     classes; objects are dealt into folds. Labels are permuted among objects, so videos of one keep a common label.
@@ -132,8 +132,8 @@ def predictability(
     scaled = StandardScaler().fit_transform(features) / np.sqrt(features.shape[1])
     for number in range(fold.max() + 1):
         test = fold[member] == number
-        # Predictions are linear in the labels, which videos of an object share. So it is predicted how much each object
-        # counts before any label is looked at, and a permutation costs one matrix product.
+        # Predictions are linear in the labels, which videos of an object share. So each object's weight in a prediction
+        # is computed once, without labels, and a permutation costs one matrix product.
         owner = np.eye(len(names))[member[~test]]
         chances = Ridge(alpha=RIDGE).fit(scaled[~test], owner).predict(scaled[test])
         scores = np.einsum("vn,onc->ovc", chances, classes, optimize=True)
@@ -203,9 +203,9 @@ def likeness_vectors(signatures: np.ndarray) -> np.ndarray:
 def likeness_bound(largest: np.ndarray, pairs: int) -> float:
     """The likeness that, by chance, one of so many pairs of different objects exceeds with probability `CHANCE`.
 
-    Their own m + 1 largest likenesses tell, the largest first: under Fisher's transformation these fall off
-    exponentially, at a rate that the m-th and the m/4-th give, m = sqrt(pairs); the largest of all may be copies. The
-    bound is where that tail expects `CHANCE` pairs, so it grows with the logarithm of their number.
+    It is extrapolated from their m + 1 largest likenesses, in descending order, with m = sqrt(pairs). Under Fisher's
+    transformation this tail is exponential; the m-th and the m/4-th give its rate, as the largest of all may be copies.
+    The bound is where the tail expects `CHANCE` pairs, so it grows with the logarithm of their number.
     """
     m = math.isqrt(pairs)
     if m < FEWEST:

@@ -32,9 +32,9 @@ class Extraction:
     """What was found in a folder; videos and references go by the same order."""
 
     videos: tuple[Video, ...]
-    """With frames to show: the published selection leaves very short videos out."""
+    """Videos with kept frames: the published selection leaves very short ones out."""
     probes: tuple[Probe, ...]
-    """Of all videos that decode."""
+    """Measurements of all videos that decode."""
     frames: tuple[Frame, ...]
 
 
@@ -103,7 +103,7 @@ def _pixels(work: Path, video_id: str) -> Path:
 
 
 def _stamp(file: VideoFile) -> str:
-    """What a file is listed as, its size and its time of change; of one that is gone, what it is listed as."""
+    """What a file is listed as, its size and its modification time; only the first where the file is gone."""
     try:
         status = file.path.stat()
         changed = (status.st_size, status.st_mtime_ns)

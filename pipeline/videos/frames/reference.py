@@ -18,11 +18,11 @@ from pipeline.videos.decoding import Image, planes
 SHARE, LONGEST = 10, 8
 """The reference spans the first tenth of a video, at most 8 frames: a third to half a second at 10 and 25 a second."""
 MOST_FRAMES = 4
-"""The mean is of at most so many of these, at equal distances: without motion, neighbours are copies of each other."""
+"""Maximum number of these frames in the mean, evenly spaced: without motion, neighbours are copies of each other."""
 THUMB = 80
 """Longer side of the small picture that contact is measured on, in pixels."""
 DETAILED = 1.12
-"""Detail of the first picture over that of the last, from which the video counts as starting in contact: contact adds
+"""A video counts as starting in contact from this ratio of detail in its first picture to its last: contact adds
 detail. Untouched real videos lie between .95 and 1.08 (99 % of them)."""
 UNSTEADY = 1.0
 """The light changes where three quarters of a picture become brighter, or darker, by more than so many 8-bit steps:

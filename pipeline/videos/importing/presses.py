@@ -47,7 +47,7 @@ ROUNDING = 0.1
 RATES = (1.0, 240.0)
 """Frames a second of a video, at least and at most."""
 SHORTEST = 3
-"""Frames of a press; what is shorter is a flicker."""
+"""Minimum number of frames of a press; what is shorter is a flicker."""
 
 
 class Recorded(Record):
@@ -233,7 +233,7 @@ def presses(strengths: npt.NDArray[np.float64], times: float = FOUND) -> list[tu
 
 
 def _measure(source: Iterator[Shot]) -> tuple[list[int], list[int], npt.NDArray[np.float64]]:
-    """Stamps, times of arrival (ns) and contact strengths of all pictures, by the untouched picture at either end.
+    """Stamps, times of arrival (ns) and contact strengths of all pictures, against the untouched picture at one end.
 
     First pictures in which the light still changes count as quiet.
     """
