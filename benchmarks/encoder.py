@@ -19,7 +19,7 @@ from benchmarks.frames import bench_videos
 from benchmarks.table import WRONG, Row, interleaved, machine, make_rows
 from pipeline.config import PRETRAINED, FramesConfig
 from pipeline.core.errors import UserError
-from pipeline.encoder.clips import ClipDataset, LabelledVideo
+from pipeline.encoder.data import ClipDataset, LabelledVideo
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.training.trainable import load_trainable
 from pipeline.videos.frames.extract import extract_frames

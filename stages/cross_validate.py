@@ -6,8 +6,8 @@ from pathlib import Path
 from pipeline.core.io import read_table, write_table
 from pipeline.core.records import Assignment, OutOfFold, Part, Video
 from pipeline.core.stage import DATA, matrix_key, stage
-from pipeline.encoder.clips import EncoderData
 from pipeline.encoder.cross_validation import MODELS, cross_validate_model, kind_of
+from pipeline.encoder.data import EncoderData
 from pipeline.encoder.finetune import Training
 from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.frames.store import REFERENCES_FILE, TABLE_FILE, FrameStore

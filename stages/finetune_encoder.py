@@ -6,7 +6,7 @@ from pipeline.core.io import read_table, write_table
 from pipeline.core.records import Assignment, Classification, Measurement, Part
 from pipeline.core.runtime import resolve_device
 from pipeline.core.stage import DATA, matrix_key, stage
-from pipeline.encoder.clips import EncoderData, classify
+from pipeline.encoder.data import EncoderData, classify
 from pipeline.encoder.finetune import Training, finetune, write_encoder_card
 from pipeline.tracking.live import live
 from pipeline.training.trainable import save_trainable

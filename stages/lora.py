@@ -9,7 +9,8 @@ if __name__ == "__main__":
     encoder, opd, seed = matrix_key(encoder=Encoder, opd=Opd, seed=None)
     key = f"{encoder}-{opd}-{seed}"
     with stage("lora", key, launched=True) as run:
-        from pipeline.language.training import Job, Material, add_lora, assemble, fit, write_model_card
+        from pipeline.language.lora import add_lora
+        from pipeline.language.training import Job, Material, assemble, fit, write_model_card
 
         config = run.params.lora
         material = Material.load(DATA, run.params, encoder, opd, seed)

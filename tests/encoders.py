@@ -13,7 +13,7 @@ from safetensors.torch import load_file, save_file
 from pipeline.config import PRETRAINED, EncoderConfig, Recipe, RuntimeConfig
 from pipeline.core.io import write_table
 from pipeline.core.records import Assignment, Frame, Part
-from pipeline.encoder.clips import EncoderData
+from pipeline.encoder.data import EncoderData
 from pipeline.encoder.finetune import Training
 from pipeline.encoder.frame_classifier import FittedHeads
 from pipeline.encoder.scene_encoder import SceneEncoder

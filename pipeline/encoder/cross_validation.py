@@ -18,7 +18,7 @@ from pipeline.core.errors import UserError
 from pipeline.core.io import code_of, fingerprint, read_json, write_json
 from pipeline.core.records import OutOfFold, Part
 from pipeline.core.runtime import CHECKPOINTS, derive_seed, progress, resolve_device
-from pipeline.encoder.clips import EncoderData, classify, describe_clips
+from pipeline.encoder.data import EncoderData, classify, describe_clips
 from pipeline.encoder.finetune import Training, finetune
 from pipeline.encoder.folds import Fold, Labels, Predict, cross_validate, deal
 from pipeline.encoder.frame_classifier import choose_strength, fit_frame_heads

@@ -18,7 +18,7 @@ from pipeline.core.errors import UserError
 from pipeline.core.parallel import run_with
 from pipeline.core.records import Assignment, Embedding, Flip, Part
 from pipeline.core.runtime import DeviceName, derive_seed, resolve_device
-from pipeline.encoder.clips import AXES
+from pipeline.encoder.data import AXES
 from pipeline.encoder.folds import Labels, deal
 from pipeline.encoder.frame_classifier import FOLDS, Clips, choose_strength, fit_frame_heads
 from pipeline.encoder.model import FrameEncoder

@@ -22,7 +22,7 @@ from pipeline.config import EncoderConfig, RuntimeConfig
 from pipeline.core.card import write_card
 from pipeline.core.records import Measurement, Part
 from pipeline.core.runtime import resolve_device, seed_everything
-from pipeline.encoder.clips import ClipDataset, EncoderData, LabelledVideo, check_finite
+from pipeline.encoder.data import ClipDataset, EncoderData, LabelledVideo, check_finite
 from pipeline.encoder.frame_classifier import JointFrameClassifier, choose_strength, fit_frame_heads
 from pipeline.encoder.model import PropertyClassifier, SideBySide
 from pipeline.encoder.recipes import property_classifier

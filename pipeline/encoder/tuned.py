@@ -18,7 +18,7 @@ import torch
 from pipeline.config import EncoderConfig
 from pipeline.core.records import Flip
 from pipeline.core.runtime import derive_seed, track
-from pipeline.encoder.clips import AXES, ClipDataset, EncoderData, LabelledVideo, draw_flip
+from pipeline.encoder.data import AXES, ClipDataset, EncoderData, LabelledVideo, draw_flip
 from pipeline.encoder.frame_classifier import JointFrameClassifier
 from pipeline.encoder.model import SideBySide, load_backbones
 from pipeline.training.sampling import EpochDataset

@@ -12,7 +12,7 @@ from torch.optim.optimizer import register_optimizer_step_pre_hook
 
 from pipeline.config import EncoderConfig, Recipe
 from pipeline.encoder import frame_classifier
-from pipeline.encoder.clips import EncoderData
+from pipeline.encoder.data import EncoderData
 from pipeline.videos.catalogue import Catalogue
 from tests.encoders import PARTS, config, encoder_data, write_timm
 

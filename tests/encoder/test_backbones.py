@@ -17,7 +17,7 @@ from pipeline.core.embeddings import FLIPS
 from pipeline.core.records import Part
 from pipeline.core.runtime import seed_everything
 from pipeline.encoder import tuned
-from pipeline.encoder.clips import ClipDataset, EncoderData
+from pipeline.encoder.data import ClipDataset, EncoderData
 from pipeline.encoder.embed import EncoderSource, Loaded, embed_videos
 from pipeline.encoder.finetune import finetune, train_classifier, write_encoder_card
 from pipeline.encoder.model import SideBySide, load_backbones

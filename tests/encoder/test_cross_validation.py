@@ -19,8 +19,8 @@ from pipeline.core.records import Assignment, Measurement, Part
 from pipeline.core.runtime import derive_seed
 from pipeline.encoder import cross_validation as module
 from pipeline.encoder import frame_classifier
-from pipeline.encoder.clips import ClipDataset, EncoderData
 from pipeline.encoder.cross_validation import cross_validate_model
+from pipeline.encoder.data import ClipDataset, EncoderData
 from pipeline.encoder.finetune import Training, finetune
 from pipeline.encoder.folds import Fold, Predict, deal
 from pipeline.encoder.model import FrameEncoder, PropertyClassifier

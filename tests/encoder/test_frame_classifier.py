@@ -18,7 +18,7 @@ from sklearn.linear_model import LogisticRegression
 
 from pipeline.core.records import Part
 from pipeline.encoder import frame_classifier
-from pipeline.encoder.clips import EncoderData
+from pipeline.encoder.data import EncoderData
 from pipeline.encoder.finetune import finetune
 from pipeline.encoder.frame_classifier import STRENGTHS, JointFrameClassifier, choose_strength, fit_frame_heads
 from pipeline.encoder.model import FrameEncoder

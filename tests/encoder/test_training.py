@@ -28,7 +28,7 @@ from pipeline.core.embeddings import Statistics
 from pipeline.core.records import Assignment, Embedding, Flip, Part
 from pipeline.core.runtime import derive_seed, seed_everything
 from pipeline.encoder import finetune as module
-from pipeline.encoder.clips import ClipDataset, EncoderData, LabelledVideo
+from pipeline.encoder.data import ClipDataset, EncoderData, LabelledVideo
 from pipeline.encoder.embed import logits_of, standardize, statistics, union
 from pipeline.encoder.finetune import accuracies, finetune, train_classifier, write_encoder_card
 from pipeline.encoder.folds import deal

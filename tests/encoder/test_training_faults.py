@@ -16,7 +16,7 @@ from safetensors.torch import load_file
 from pipeline.config import FramesConfig, PretrainConfig, Recipe, RuntimeConfig
 from pipeline.core.records import Measurement, Part
 from pipeline.encoder import pretrain as pretraining
-from pipeline.encoder.clips import EncoderData, classify, describe_clips
+from pipeline.encoder.data import EncoderData, classify, describe_clips
 from pipeline.encoder.embed import Loaded, embed_videos
 from pipeline.encoder.finetune import finetune
 from pipeline.encoder.frame_classifier import JointFrameClassifier

@@ -22,7 +22,8 @@ from pipeline.core.embeddings import EmbeddingStore
 from pipeline.core.io import read_jsonl, write_jsonl
 from pipeline.core.records import Question
 from pipeline.language.chat import IGNORE_INDEX
-from pipeline.language.training import Job, Material, add_lora, assemble, fit, write_model_card
+from pipeline.language.lora import add_lora
+from pipeline.language.training import Job, Material, assemble, fit, write_model_card
 from pipeline.training.trainer import Trained, training_arguments
 from tests.checkpoints import contents, write_llama
 from tests.conftest import Begun, refused

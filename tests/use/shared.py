@@ -30,12 +30,12 @@ from pipeline.core.records import (
     Variant,
 )
 from pipeline.core.runtime import seed_everything
-from pipeline.encoder.clips import EncoderData, classify
+from pipeline.encoder.data import EncoderData, classify
 from pipeline.encoder.embed import Loaded, embed_videos, standardize, statistics
 from pipeline.encoder.recipes import base_encoder, property_classifier
 from pipeline.language.generate import answer
+from pipeline.language.lora import add_lora
 from pipeline.language.octopi import OctopiForCausalLM
-from pipeline.language.training import add_lora
 from pipeline.tasks import TASKS
 from pipeline.tasks.questions import build_questions, pool_of
 from pipeline.training.trainable import save_trainable
