@@ -26,7 +26,7 @@ def imported(file: Path) -> set[Path]:
 def closure(script: Path, unfollowed: Collection[str] = ()) -> list[str]:
     """Project files that running `script` can import, itself included, but nothing that those in `unfollowed` import.
 
-    Packages' empty __init__ files are left out: they cannot change a result.
+    Files of a docstring alone, as most packages' __init__ are, are left out: they cannot change a result.
     """
     seen: set[Path] = set()
     waiting = [script]
@@ -36,4 +36,6 @@ def closure(script: Path, unfollowed: Collection[str] = ()) -> list[str]:
             seen.add(file)
             if file.relative_to(ROOT).as_posix() not in unfollowed:
                 waiting += imported(file)
-    return sorted(f.relative_to(ROOT).as_posix() for f in seen if f.stat().st_size > 0)
+    bodies = {file: ast.parse(file.read_text(encoding="utf-8")).body for file in seen}
+    code = [file for file, body in bodies.items() if any(not isinstance(node, ast.Expr) for node in body)]
+    return sorted(file.relative_to(ROOT).as_posix() for file in code)

@@ -1,4 +1,4 @@
-"""What all rooms stand on: records (the rows of every table), atomic files, errors, seeds, devices and work on many files.
+"""What all rooms stand on: records (rows of tables), atomic files, errors, seeds, devices, work on many files.
 
-`stage()` is what each script in stages/ runs in: it reads params.yaml, seeds, reports to MLflow and ends with one line.
+`stage()` is what each script in stages/ runs in: it reads params.yaml, reports to MLflow and ends with one line.
 """

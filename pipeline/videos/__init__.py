@@ -1,5 +1,5 @@
 """From videos to kept frames, and which objects are for training.
 
 In: `data.dir` and the catalogue of its objects. Out: data/videos.parquet and data/frames (stage `extract_frames`),
-data/splits (`split`), data/audit (`audit`). importing/ makes such videos of recordings (`octopi data import`).
+data/splits (`split`), data/audit (`audit`). importing/ makes such videos of recordings (`octopi import`).
 """
