@@ -51,7 +51,9 @@ def octopi(version: Annotated[bool, typer.Option("--version", help="Say the vers
 def scale(
     name: Annotated[
         str,
-        typer.Argument(help="smoke, small, invented, finetune, paper-7b or paper-13b (or a file you added to conf/)."),
+        typer.Argument(
+            help="smoke, small, invented, finetune, paper-7b, paper-13b or rehearsal (or your file in conf/)."
+        ),
     ],
     overrides: Annotated[list[str] | None, typer.Argument(help="key=value, for example split.name=kfold.")] = None,
     plan: Annotated[bool, typer.Option("--plan", help="Say what it would take, and write nothing.")] = False,

@@ -189,5 +189,5 @@ def _parts(rows: pd.DataFrame, solved: Collection[str], impossible: str) -> str:
         return f"None of {all_of_them} holds up.{also}"
     smallest, found = rows["smallest_effect"].min(), ""
     if smallest <= 1:
-        found = f"; even before it the smallest that this design could have found is {100 * smallest:.0f} points"
+        found = f"; before it, this design finds effects of {100 * smallest:.0f} points or more with 80 % power"
     return f"None of {all_of_them} is significant after Holm's adjustment{impossible or found}."
