@@ -14,8 +14,9 @@ from pipeline.core.embeddings import FLIPS, EmbeddingStore
 from pipeline.core.io import save_tensors, write_table
 from pipeline.core.records import INDEX_FILE, TENSOR, TENSOR_FILE, Assignment, Embedding, Opd, Part, Question
 from pipeline.core.runtime import seed_everything
+from pipeline.language.lora import add_lora
 from pipeline.language.octopi import OctopiForCausalLM
-from pipeline.language.training import Job, Material, add_lora, assemble, fit
+from pipeline.language.training import Job, Material, assemble, fit
 from pipeline.tasks.questions import build_questions, pool_of
 from pipeline.training import trainer
 from pipeline.training.trainer import Trained

@@ -20,8 +20,9 @@ from pipeline.core.records import Question
 from pipeline.language.base import load_llm, load_tokenizer
 from pipeline.language.chat import IGNORE_INDEX
 from pipeline.language.conversations import collate
+from pipeline.language.lora import add_lora
 from pipeline.language.octopi import OctopiForCausalLM
-from pipeline.language.training import add_lora, assemble
+from pipeline.language.training import assemble
 from tests.checkpoints import contents, cut, edit, replace, write_llama
 from tests.conftest import refused
 from tests.language.conftest import DIM, LORA, adapted, assert_comes_back, call, embedded, material, taking
