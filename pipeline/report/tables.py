@@ -160,7 +160,12 @@ def side_by_side(reports: Mapping[str, Report], *, every: bool) -> pd.DataFrame:
         about |= {dataset: published(dataset) for dataset in DATASETS}
     place, blocks = [*KEYS, "touch"], []
     for dataset, printed in sorted(about.items(), key=lambda pair: pair[0] != DATASET):
-        rows = printed[printed["model"].isin(PUBLISHED_MODELS)].assign(touch=str(Touch.REAL)).drop_duplicates(place)
+        rows = printed[printed["model"].isin(PUBLISHED_MODELS)].assign(touch=str(Touch.REAL))
+        if not len(printed) and not every and any(map(len, about.values())):
+            # Nothing is published about such data: below the paper's rows stand the reports' own.
+            own = [over_seeds(r.scores) for r in reports.values() if r.provenance["dataset"] == dataset]
+            rows = marked(pd.concat(own)).query("by == 'model'")
+        rows = rows.drop_duplicates(place)
         rows = ordered(rows if every else marked(rows).query("whole and lacks == ''"))
         other = "" if dataset == DATASET else f", {dataset}"
         shown = {"Task": [task_title(task) + other for task in rows["task"]]}
@@ -169,12 +174,13 @@ def side_by_side(reports: Mapping[str, Report], *, every: bool) -> pd.DataFrame:
             shown["System"] = [system(row) + (f": {part}" if part != CHOICE else "") for row, part in named]
         shown |= _beside(rows, printed)
         for name, report in reports.items():
-            own = over_seeds(report.scores).to_dict("records") if report.provenance["dataset"] == dataset else []
-            known = {tuple(row[k] for k in place): f"{measured(row)} ({row['n']:.0f})" for row in own}
+            same = over_seeds(report.scores).to_dict("records") if report.provenance["dataset"] == dataset else []
+            known = {tuple(row[k] for k in place): f"{measured(row)} ({row['n']:.0f})" for row in same}
             keys = rows[place].itertuples(index=False, name=None)
             shown[f"Measured {name} % [95 %] (n)"] = [known.get(key, "") for key in keys]
         blocks.append(pd.DataFrame(shown, dtype=object))
     table = pd.concat(blocks, ignore_index=True).fillna("")
+    table = table.loc[:, (table != "").any()]  # Without a report that has none of these rows.
     return table[sorted(table, key=lambda name: name.startswith("Measured"))]
 
 

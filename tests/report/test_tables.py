@@ -156,6 +156,8 @@ def test_reports_about_other_data_stand_beside_what_is_published_of_these() -> N
     assert list(rows.columns) == [*printed, *heads]
     assert list(rows.loc["Property Comparison (PC)"]) == ["48.10 (158)", "55.06 (158)", "", "", "", here]
     assert list(rows.loc["Ripeness Classification (RIPE), avocados"]) == ["", "63.00 (100)", "", here, "", ""]
+    assert list(rows.loc["Property Comparison (PC), Other"]) == ["", "", "", "", here, ""]
+    assert heads[1] not in side_by_side({"own": own, "paper": paper}, every=True)
     assert side_by_side({"own": own}, every=True).empty
 
 
