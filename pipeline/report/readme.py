@@ -189,5 +189,6 @@ def _parts(rows: pd.DataFrame, solved: Collection[str], impossible: str) -> str:
         return f"None of {all_of_them} holds up.{also}"
     smallest, found = rows["smallest_effect"].min(), ""
     if smallest <= 1:
-        found = f"; before it, this design finds effects of {100 * smallest:.0f} points or more with 80 % power"
+        least = f"{100 * smallest:.0f} points"
+        found = f"; before it, the smallest effect that any of them detects with 80 % power is {least}"
     return f"None of {all_of_them} is significant after Holm's adjustment{impossible or found}."

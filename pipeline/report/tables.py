@@ -163,8 +163,7 @@ def side_by_side(reports: Mapping[str, Report], *, every: bool) -> pd.DataFrame:
         rows = printed[printed["model"].isin(PUBLISHED_MODELS)].assign(touch=str(Touch.REAL))
         if not len(printed) and not every and any(map(len, about.values())):
             # Nothing is published about such data: below the paper's rows stand the reports' own.
-            own = [over_seeds(r.scores) for r in reports.values() if r.provenance["dataset"] == dataset]
-            rows = marked(pd.concat(own)).query("by == 'model'")
+            rows = pd.concat([headline(r.scores) for r in reports.values() if r.provenance["dataset"] == dataset])
         rows = rows.drop_duplicates(place)
         rows = ordered(rows if every else marked(rows).query("whole and lacks == ''"))
         other = "" if dataset == DATASET else f", {dataset}"

@@ -70,8 +70,8 @@ SWAPPED = "with real touch, against touch that was swapped"
         ([{**USED, "task": "PSS"}, USED], "In PSS real touch brings no more than chance"),
         (
             [effect(), effect("opd", "all - none", smallest_effect=0.12)],
-            "None of 2 effects of LoRA and OPD is significant after Holm's adjustment; before it, this design "
-            "finds effects of 12 points or more with 80 % power",
+            "None of 2 effects of LoRA and OPD is significant after Holm's adjustment; before it, the smallest "
+            "effect that any of them detects with 80 % power is 12 points",
         ),
         (
             [effect(p_holm=0.001), effect("opd", "all - none")],
