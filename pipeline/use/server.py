@@ -28,6 +28,9 @@ HEADER_SECONDS = 10.0
 """How long a client may take for a request's head."""
 TOGETHER = 32
 """Most questions that are begun at once; the model divides them by its own batch size."""
+PAUSE = 0.05
+"""Seconds without a new question after which a batch is begun. Clients that were answered together ask again within
+moments of each other: without a pause the first of them would be answered alone, and the others wait for that."""
 
 
 class Failed(Exception):
@@ -113,11 +116,12 @@ class Worker:
     def _work(self) -> None:
         while (job := self._jobs.get()) is not None:
             jobs = [job]
-            while len(jobs) < TOGETHER and not self._jobs.empty():
-                if (job := self._jobs.get()) is None:
-                    self._jobs.put(None)  # It ends the loop when these are answered.
-                    break
-                jobs.append(job)
+            with suppress(queue.Empty):
+                while len(jobs) < TOGETHER:
+                    if (job := self._jobs.get(timeout=PAUSE)) is None:
+                        self._jobs.put(None)  # It ends the loop when these are answered.
+                        break
+                    jobs.append(job)
             started = time.monotonic()
             self._answer(jobs)
             self.seconds += time.monotonic() - started

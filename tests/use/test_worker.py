@@ -78,6 +78,24 @@ def test_what_waits_is_one_batch_and_each_answer_is_the_one_given_alone(
     assert sorted(map(str, ended)) == sorted([*(q for q, *_ in QUESTIONS), "{tactile}", "broken", "Never?", "Halfway?"])
 
 
+def test_who_asks_moments_later_is_in_the_same_batch(
+    octopi: Octopi, files: list[Path], batches: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.use.server.PAUSE", HUNG)
+    monkeypatch.setattr("pipeline.use.server.TOGETHER", 2)
+
+    async def ask() -> None:
+        worker, found = Worker(), []
+        for _ in range(2):
+            found.append(worker.answer(lambda: octopi.stream("Why?", files[:1])))
+            await asyncio.sleep(0.2)  # The thread has taken the first one by now.
+        await asyncio.gather(*map(everything, found))
+        await asyncio.to_thread(worker.stop)
+
+    asyncio.run(ask())
+    assert batches == [2]
+
+
 def test_a_batch_that_breaks_fails_each_of_its_questions(
     octopi: Octopi, files: list[Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
