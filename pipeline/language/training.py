@@ -17,7 +17,7 @@ from pipeline.core.card import write_card
 from pipeline.core.embeddings import EmbeddingStore
 from pipeline.core.errors import UserError
 from pipeline.core.io import fingerprint, read_jsonl
-from pipeline.core.records import TENSOR_FILE, Encoder, Opd, Question
+from pipeline.core.records import Encoder, Opd, Question
 from pipeline.core.runtime import derive_seed, name_dtype, seed_everything
 from pipeline.language.base import ADAPTER_WEIGHTS
 from pipeline.language.classes import in_words, uncontradicted
@@ -46,7 +46,7 @@ class Material:
     source: str = "videos"
     """`data.source`: whether the videos are synthetic."""
     files: tuple[Path, ...] = ()
-    """Input files: questions, embeddings, and the model that training starts from."""
+    """Input files, and folders of such: questions, embeddings, catalogue, and the model that training starts from."""
     adapter: Path | None = None
     """Folder of the adapter of `language.start`, which alignment leaves as it is."""
 
@@ -59,7 +59,8 @@ class Material:
         begun = Path(start) / LANGUAGE_DIR / ADAPTER_DIR
         adapter = begun if start and begun.is_dir() else None
         words = encoder is Encoder.WORDS
-        files = [asked, embedded / TENSOR_FILE]
+        catalogue = Path(params.data.catalogue)
+        files = [asked, embedded, catalogue]
         if start:
             files.append(Path(start) / CONFIG_FILE)
         if adapter:
@@ -67,7 +68,7 @@ class Material:
         return cls(
             questions=read_jsonl(asked, Question),
             store=EmbeddingStore(embedded),
-            catalogue=load_catalogue(Path(params.data.catalogue)),
+            catalogue=load_catalogue(catalogue),
             opd=opd,
             language=params.language.model_copy(update={"dtype": dtype}),
             per_video=0 if words else params.frames.per_video,

@@ -6,6 +6,7 @@ import itertools
 import math
 import multiprocessing
 import os
+import shutil
 import signal
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -18,14 +19,16 @@ from torch.optim.optimizer import Optimizer, register_optimizer_step_pre_hook
 from transformers import TrainerCallback, TrainerState
 
 from pipeline.config import LanguageConfig, LoraTrainConfig, RuntimeConfig
-from pipeline.core.embeddings import EmbeddingStore
+from pipeline.core.embeddings import STATISTICS_FILE, EmbeddingStore
 from pipeline.core.io import read_jsonl, write_jsonl
-from pipeline.core.records import Question
+from pipeline.core.records import Encoder, Opd, Question
 from pipeline.language.chat import IGNORE_INDEX
 from pipeline.language.lora import add_lora
 from pipeline.language.training import Job, Material, assemble, fit, write_model_card
+from pipeline.scales import compose
 from pipeline.training.trainer import Trained, training_arguments
 from tests.checkpoints import contents, write_llama
+from tests.closure import ROOT
 from tests.conftest import Begun, refused
 from tests.language.conftest import (
     DIM,
@@ -110,13 +113,28 @@ def test_killed_and_resumed_ends_the_same(kind: str, when: str, left: int, held:
     assert ended.history == whole.history, "what is trained waits for the stage to write it"
 
 
-def test_another_language_model_under_the_same_name_begins_anew(held: Material, tmp_path: Path) -> None:
-    """A checkpoint holds only what is trained: gone on with on other weights, it would be neither's."""
-    held, marks = replace(held, language=LanguageConfig(weights=str(tmp_path))), []
-    for content in (b"one", b"one", b"two"):
-        (tmp_path / "model.safetensors").write_bytes(content)
-        marks.append(held.fingerprint(SMALL))
-    assert marks[0] == marks[1] != marks[2]
+def test_a_checkpoint_s_key_changes_with_each_input(held: Material, tmp_path: Path) -> None:
+    """A checkpoint holds only what is trained: gone on with on other inputs, it would be neither's."""
+    weights, data, catalogue = (tmp_path / name for name in ("weights", "data", "catalogue"))
+    embeddings, asked = data / "embeddings" / "finetuned-0", data / "questions" / "0" / "train.jsonl"
+    shutil.copytree(ROOT / "pipeline" / "physiclear", catalogue)
+    shutil.copytree(held.store.folder, embeddings)
+    weights.mkdir()
+    (weights / "model.safetensors").write_bytes(b"one")
+    write_jsonl(asked, held.questions)
+    params = compose("smoke", [f"language.weights={weights}", f"data.catalogue={catalogue}"], ROOT / "conf")
+
+    def key() -> str:
+        return Material.load(data, params, Encoder.FINETUNED, Opd.ALL, 0).fingerprint(SMALL)
+
+    keys = [key()]
+    assert key() == keys[0]
+    write_jsonl(asked, held.questions[1:])
+    keys.append(key())
+    for file in (weights / "model.safetensors", embeddings / STATISTICS_FILE, catalogue / "properties.yaml"):
+        file.write_bytes((file.read_bytes() if file.exists() else b"") + b"# another\n")
+        keys.append(key())
+    assert len(set(keys)) == 5
 
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
