@@ -79,7 +79,7 @@ def follows(question: Question, seen: Sequence[Sequence[tuple[int, float]]], cat
 
         def off(order: Sequence[int]) -> tuple[float, ...]:
             pairs = [pair for said, i in zip(seen, order, strict=True) for pair in zip(said, labels[i], strict=True)]
-            return tuple(sum(abs(said[k] - label) for said, label in pairs) for k in (0, 1))
+            return tuple(round(sum(abs(said[k] - label) for said, label in pairs), 9) for k in (0, 1))
 
         # Of equally near matchings the first one counts, in the order of object ids.
         return min(permutations(sorted(range(len(seen)), key=question.objects.__getitem__)), key=off) == (0, 1, 2)

@@ -94,7 +94,8 @@ def nearest(classes: Classes, catalogue: Catalogue, objects: Iterable[str] | Non
 
     def distance(order: Sequence[str]) -> tuple[float, ...]:
         labels = [catalogue.labels(o) for o in order]
-        return tuple(steps([[said[i] for said in video] for video in classes], labels) for i in (0, 1))
+        # Rounded, since equal distances would otherwise differ by the order that they are added up in.
+        return tuple(round(steps([[said[i] for said in video] for video in classes], labels), 9) for i in (0, 1))
 
     return min(itertools.permutations(sorted(catalogue.objects if objects is None else objects)), key=distance)
 

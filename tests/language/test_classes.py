@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-
-import numpy as np
 import pytest
 import torch
 from scipy.special import softmax
@@ -51,13 +48,6 @@ def shares(frames: torch.Tensor, place: int) -> list[float]:
     return [float(p) for p in softmax(frames[:, 3 * place : 3 * place + 3].numpy(), axis=1).mean(0)]
 
 
-def tied(question: Question, expected: dict[str, list[float]]) -> bool:
-    """Whether two matchings are equally near by expected classes, so that rounding says which one is nearest."""
-    said = np.array([expected[video] for video in question.videos])
-    far = [np.abs(said - np.array(labels)).sum() for labels in itertools.permutations(question.gold.labels)]
-    return len(np.unique(np.round(far, 9))) < len(far)
-
-
 def test_comparisons_stay_that_follow_from_the_logits_by_rule(
     questions: list[Question], logits: dict[str, torch.Tensor], store: EmbeddingStore
 ) -> None:
@@ -74,15 +64,14 @@ def test_comparisons_stay_that_follow_from_the_logits_by_rule(
         for video, frames in logits.items()
         for place, prop in enumerate(CATALOGUE.properties)
     ]
-    expected = {v: [np.arange(3) @ shares(frames, place) for place in range(3)] for v, frames in logits.items()}
-    questions = [q for q in questions if q.task != "PSR" and not (q.task == "POM" and tied(q, expected))]
+    questions = [q for q in questions if q.task != "PSR"]
     right = {s.question_id for s in conclude(questions, said, CATALOGUE) if s.measure == "choice" and s.correct}
     kept = uncontradicted(questions, store, CATALOGUE)
     assert {q.question_id for q in kept if q.task != "OPD"} == right
     assert [q for q in questions if q in kept] == kept
     counts = {task: sum(q.task == task for q in kept) for task in ASKED}
     assert counts["OPD"] == 20
-    assert all(10 < counts[task] < 50 for task in ("PC", "PSS", "POM")), counts
+    assert all(10 < counts[task] < ASKED[task] - 10 for task in ("PC", "PSS", "POM")), counts
 
 
 def test_in_words_each_video_is_what_its_heads_say(
