@@ -7,6 +7,7 @@ from pipeline.core.records import Graded, GradedVision, Prediction, Question, To
 from pipeline.core.stage import DATA, stage
 from pipeline.evaluation.grading import EXTERNAL, grade, grade_vision_models
 from pipeline.videos.catalogue import load_catalogue
+from pipeline.videos.frames.store import frames_key
 
 if __name__ == "__main__":
     with stage("grade") as run:
@@ -22,6 +23,7 @@ if __name__ == "__main__":
         write_table(DATA / "graded.parquet", Graded, graded)
         files = {s: DATA / "questions" / str(s) / "evaluation.jsonl" for s in run.params.ablation.seeds}
         outside = EXTERNAL / run.params.report_name
-        seen = grade_vision_models(outside, files, run.params.split.replicate_of, catalogue)
+        replicate_of, per_video = run.params.split.replicate_of, run.params.frames.per_video
+        seen = grade_vision_models(outside, files, replicate_of, catalogue, lambda f: (frames_key(f), per_video))
         write_table(DATA / "graded_vision.parquet", GradedVision, seen)
         run.metrics["answers"] = len({(g.variant, g.touch, g.question_id) for g in graded})

@@ -80,9 +80,21 @@ def test_stage_runs_once_at_a_time(here: Path) -> None:
         pass
 
 
-def test_parameters_that_change_while_a_stage_runs_are_no_silent_matter(here: Path) -> None:
+def test_what_people_change_while_a_stage_runs_is_no_silent_matter(here: Path) -> None:
+    """DVC would record it as what the outputs were made from."""
+    catalogue = here / "mine"
+    catalogue.mkdir()
+    (catalogue / "objects.csv").write_text("one")
+    params = compose("smoke", [f"data.catalogue={catalogue}"], conf=ROOT / "conf")
+    write_params(params, here / "params.yaml")
+    with pytest.raises(SystemExit, match=r"^split: mine/objects.csv was changed while it ran"), stage("split"):
+        (catalogue / "objects.csv").write_text("two")
+    with pytest.raises(SystemExit, match=r"^split: mine/other.yaml was changed while it ran"), stage("split"):
+        (catalogue / "other.yaml").touch()
+    with stage("invent"):
+        (catalogue / "objects.csv").write_text("its own output")
     with pytest.raises(SystemExit, match=r"params.yaml was changed while it ran"), stage("split"):
-        write_params(compose("smoke", ["seed=1"], conf=ROOT / "conf"), here / "params.yaml")
+        write_params(params.model_copy(update={"seed": 1}), here / "params.yaml")
     assert not (here / "runs/split.json").exists()
     with stage("split"):
         os.utime(here / "params.yaml")  # Written anew with the same values.
@@ -177,5 +189,5 @@ def test_a_backend_is_a_parameter_and_may_lack_its_package(here: Path, monkeypat
     monkeypatch.setattr(parallel, "_chosen", "processes")
     monkeypatch.setattr(parallel, "find_spec", lambda _: True)
     write_params(params)
-    with stage("x"):
+    with stage("split"):
         assert parallel._chosen == "ray"

@@ -321,6 +321,10 @@ class VisionModel(Record):
     another word of the endpoint's."""
     questions: dict[str, str]
     """By seed, the fingerprint of the file of questions that it answered."""
+    folder: str = ""
+    """Where its pictures lay."""
+    frames: str = ""
+    """Fingerprint of the frames that it saw (`frames_key`); empty for photos."""
 
 
 class GradedVision(Score):

@@ -22,7 +22,7 @@ from filelock import FileLock, Timeout
 from pipeline.config import Params
 from pipeline.config.params import PARAMS_FILE, load_params
 from pipeline.core.errors import UserError
-from pipeline.core.io import remove_rests, write_json
+from pipeline.core.io import code_of, remove_rests, sha256, write_json
 from pipeline.core.parallel import end_with_parent, use_backend
 from pipeline.core.records import Measurement
 from pipeline.core.runtime import CHECKPOINTS, cores, limit_threads, processor, quiet_libraries
@@ -102,8 +102,9 @@ def stage(name: str, key: str | None = None, *, launched: bool = False) -> Itera
             this process ends there.
 
     A UserError, a disk that cannot be read or written, or want of memory ends it with one line and status 1. So does a
-    params.yaml that was changed meanwhile: DVC would record the new values for what the old ones made. Metrics, time,
-    memory go to runs/, which is nobody's input, so that results stay identical from run to run; tracking shows them.
+    params.yaml, code or catalogue that was changed meanwhile: DVC would record the new for what the old made. Metrics,
+    time, memory go to runs/, which is nobody's input, so that results stay identical from run to run; tracking shows
+    them.
     """
     started = time.time()
     full = f"{name}@{key}" if key else name
@@ -123,11 +124,14 @@ def stage(name: str, key: str | None = None, *, launched: bool = False) -> Itera
                 for folder in (DATA, RUNS, Path("reports"), Path("models")):
                     remove_rests(folder)
                 print(f"{full}: starts ({params.report_name})", flush=True)
+            before = _read_by(name, params)
             yield running
-            if load_params() != params:
-                raise UserError(
-                    f"{PARAMS_FILE} was changed while it ran; what it made fits the old one, so run it again"
-                )
+            now = _read_by(name, params)
+            changed = [file for file in before.keys() | now.keys() if before.get(file) != now.get(file)]
+            changed += [PARAMS_FILE] if load_params() != params else []
+            if changed:
+                file = os.path.relpath(min(changed))
+                raise UserError(f"{file} was changed while it ran; what it made fits the old one, so run it again")
             if _main_process():
                 _write_run(running)
                 shutil.rmtree(CHECKPOINTS / full, ignore_errors=True)
@@ -141,6 +145,12 @@ def stage(name: str, key: str | None = None, *, launched: bool = False) -> Itera
         if (refused := disk_error(error)) is None:
             raise
         sys.exit(f"{full}: {refused}")
+
+
+def _read_by(name: str, params: Params) -> dict[Path, str]:
+    """Hashes of a stage's code and of the catalogue, which people edit; `invent` writes the catalogue."""
+    catalogue = [] if name == "invent" else Path(params.data.catalogue).glob("*")
+    return {file: sha256(file) for file in (*code_of(name), *catalogue) if file.is_file()}
 
 
 NO_MEMORY = ("out of memory", "can't allocate memory", "CUBLAS_STATUS_ALLOC_FAILED")

@@ -34,7 +34,7 @@ from pipeline.core.stage import DATA, alone
 from pipeline.evaluation.grading import EXTERNAL, SOURCE_FILE
 from pipeline.training.sampling import sample_evaluation
 from pipeline.videos.catalogue import Catalogue, load_catalogue
-from pipeline.videos.frames.store import FrameStore
+from pipeline.videos.frames.store import FrameStore, frames_key
 
 Show = Callable[[str, str], list[str]]
 """From a video's and its object's name to the pictures that stand for it, as data URLs."""
@@ -159,6 +159,8 @@ def ask_all(
                     shown=shown,
                     per_video=most,
                     questions={str(seed): fingerprint(file) for seed, file in files.items()},
+                    folder=str(folder),
+                    frames=frames_key(folder) if shown is Shown.FRAMES else "",
                 )
                 write_json(place / SOURCE_FILE, source.model_dump(mode="json"))
             state = f"{done} of {total} questions are answered"

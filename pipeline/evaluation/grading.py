@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from pipeline.core.errors import UserError
 from pipeline.core.io import fingerprint, read_json, read_jsonl
-from pipeline.core.records import Classification, GradedVision, Prediction, Question, Score, VisionModel
+from pipeline.core.records import Classification, GradedVision, Prediction, Question, Score, Shown, VisionModel
 from pipeline.tasks import TASKS
 from pipeline.videos.catalogue import Catalogue
 
@@ -71,17 +71,27 @@ def vision_models(folder: Path) -> dict[Path, VisionModel]:
 
 
 def grade_vision_models(
-    folder: Path, questions: Mapping[int, Path], replicate_of: Callable[[int], int], catalogue: Catalogue
+    folder: Path,
+    questions: Mapping[int, Path],
+    replicate_of: Callable[[int], int],
+    catalogue: Catalogue,
+    frames_now: Callable[[Path], tuple[str, int]],
 ) -> list[GradedVision]:
-    """Grade what `vision_models` answered; answers to other questions than these are left out with a warning.
+    """Grade what `vision_models` answered; answers to other questions, or about other frames, are left out with a
+    warning.
 
     Args:
         folder: Of a report in `EXTERNAL`.
         questions: The file of evaluation questions of each seed.
         replicate_of: Maps a seed to the replicate that its answers are pooled under.
+        frames_now: Gives the `frames_key` of a folder, and `frames.per_video`.
     """
     graded = []
     for place, source in vision_models(folder).items():
+        seen = (source.frames, source.per_video)
+        if source.shown is Shown.FRAMES and seen != frames_now(Path(source.folder)):
+            logging.warning(f"{place}: saw other frames than there are now; run `octopi answer-with` again")
+            continue
         for seed, file in questions.items():
             if source.questions.get(str(seed)) != fingerprint(file):
                 lacks = f"no answers to the questions of seed {seed} as they are now"

@@ -93,7 +93,11 @@ def write_report(params: Params, root: Path) -> dict[str, float]:
     # As the stage `questions` took it.
     taken = catalogue.asking(params.questions.scenarios).called(params.questions.names)
     for seed, classified in by_encoder.items():
-        pooled[params.split.replicate_of(seed)] += classified
+        # A video may be in the validation part of several folds, each time another encoder's.
+        pooled[params.split.replicate_of(seed)] += [
+            c.model_copy(update={"video_id": f"{c.video_id}@{seed}"}) if c.part is Part.VALIDATION else c
+            for c in classified
+        ]
         concluded[params.split.replicate_of(seed)] += conclude(asked[seed], classified, taken)
     origin = provenance(params, catalogue, videos, splits, [g.objects for g in graded], root)
     # Without those whose answers are to other questions than today's, which were not graded.

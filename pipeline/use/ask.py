@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from pipeline.core.errors import UserError, readable
-from pipeline.core.io import write_text
+from pipeline.core.io import sha256, write_text
 from pipeline.core.runtime import progress
 from pipeline.use.results import Exchange, Video
 from pipeline.videos.decoding import SUFFIXES
@@ -75,6 +75,8 @@ class Chat:
         self.model, self.say = model, say
         self.history: list[Exchange] = []
         self.waiting: list[Video] = []
+        self.added: dict[str, str] = {}
+        """Files that were added, and the hash of what they held then."""
 
     def run(self, lines: Iterable[str]) -> None:
         """Answer line by line; what is wrong is said, and the conversation goes on."""
@@ -97,6 +99,8 @@ class Chat:
         match name:
             case "/add" if file := rest.strip():
                 touch = self.model.look(file)  # Refused here where it cannot be used, and not at the next question.
+                self.added.setdefault(file, digest(Path(file)))
+                self._check_files()
                 self.waiting.append(file)
                 self.say("".join(f"{file}: {note}\n" for note in touch.notes))
                 many = len(self.waiting)
@@ -111,12 +115,19 @@ class Chat:
                 if not videos:
                     self.say("no video yet: /add FILE\n")
             case "/reset":
-                self.history, self.waiting = [], []
+                self.history, self.waiting, self.added = [], [], {}
                 self.say("a new conversation\n")
             case _:
                 self.say(f"{HELP}\n")
 
+    def _check_files(self) -> None:
+        """Raise UserError where a file was recorded anew: earlier answers are about what it held before."""
+        for file, held in self.added.items():
+            if digest(Path(file)) not in (held, ""):
+                raise UserError(f"{file} has changed since it was added; name the new one otherwise, or /reset")
+
     def _ask(self, question: str) -> None:
+        self._check_files()
         said = ""
         for piece in self.model.stream(question, self.waiting, history=self.history):
             self.say(piece)
@@ -124,6 +135,14 @@ class Chat:
         self.say("\n")
         self.history.append(Exchange(question, tuple(self.waiting), said))
         self.waiting = []
+
+
+def digest(file: Path) -> str:
+    """The SHA-256 of a file; empty where it cannot be read, which the model then says in its own words."""
+    try:
+        return sha256(file)
+    except OSError:
+        return ""
 
 
 def named_objects(text: str) -> list[str] | dict[str, list[str]]:
@@ -141,11 +160,12 @@ def describe_folder(model: Octopi, paths: Sequence[Path], out: Path) -> tuple[in
         How many rows the file has, and how many of them are videos that could not be described (column `error`).
 
     Raises:
-        UserError: for a folder without videos, or a file that another model or something else wrote.
+        UserError: for a folder without videos, or a file that another model or something else wrote, or that describes
+            another recording under the name of one of these.
     """
     files, label = videos_of(paths), f"{model.name} {model.config.digest}"
     probabilities = [f"{p.name}: {level}" for p in model.catalogue.properties for level in p.levels]
-    columns = ["file", *model.properties, *probabilities, "sentence", "frames", "notes", "error", "model"]
+    columns = ["file", "sha256", *model.properties, *probabilities, "sentence", "frames", "notes", "error", "model"]
     csv.writer(head := io.StringIO(), lineterminator="\n").writerow(columns)
     # A kill may have cut a character in two; a file that was sent may have others.
     text = out.read_text(encoding="utf-8", errors="replace") if out.is_file() else ""
@@ -153,6 +173,11 @@ def describe_folder(model: Octopi, paths: Sequence[Path], out: Path) -> tuple[in
     rows = list(csv.DictReader(io.StringIO(whole)))
     if not (text.startswith(begun) or begun.startswith(text)) or any(row["model"] != label for row in rows):
         raise UserError(f"{out}: is no description by {label}; name another file with --csv")
+    known, hashes = {row["file"]: row["sha256"] for row in rows}, {name: digest(file) for file, name in files}
+    if other := next((name for name, held in hashes.items() if known.get(name, held) != held), None):
+        raise UserError(
+            f"{out}: describes another recording as {other}; delete its row, or name another file with --csv"
+        )
     write_text(out, whole or begun)  # Without what a kill left of a last line.
     done = {row["file"]: row["error"] for row in rows}
     rest = [(file, name) for file, name in files if name not in done]
@@ -163,7 +188,7 @@ def describe_folder(model: Octopi, paths: Sequence[Path], out: Path) -> tuple[in
     ):
         writer = csv.DictWriter(stream, columns, lineterminator="\n")
         for row in _describe(model, rest):
-            writer.writerow({**row, "model": label})
+            writer.writerow({**row, "sha256": hashes[str(row["file"])], "model": label})
             stream.flush()
             failed += bool(row.get("error"))
             advance()

@@ -14,9 +14,11 @@ from pipeline.config import LANGUAGE_DIR, PRETRAINED, Params
 from pipeline.core.card import CARD_FILE, write_card
 from pipeline.core.embeddings import STATISTICS_FILE, EmbeddingStore, Statistics
 from pipeline.core.errors import UserError
-from pipeline.core.io import atomic_folder, read_csv, read_json, read_table, save_tensors, sha256, write_json
-from pipeline.core.records import Assignment, Classification, Part, Probe, ScoreRow, Touch, Variant
+from pipeline.core.io import atomic_folder, read_json, read_jsonl, read_table, save_tensors, sha256, write_json
+from pipeline.core.records import Assignment, Classification, Encoder, Graded, Part, Probe, Question, Touch, Variant
 from pipeline.evaluation.calibration import calibration_rows, fit_temperature
+from pipeline.evaluation.grading import conclude
+from pipeline.evaluation.scores import score_rows
 from pipeline.language.base import load_tokenizer
 from pipeline.language.octopi import ADAPTER_DIR, CONFIG_FILE
 from pipeline.tasks import TASKS
@@ -38,7 +40,7 @@ from pipeline.use.folder import (
     read_folder,
 )
 from pipeline.videos.audit.files import quiet_level
-from pipeline.videos.catalogue import load_catalogue
+from pipeline.videos.catalogue import Catalogue, load_catalogue
 from pipeline.videos.frames.store import PROBES_FILE
 from pipeline.weights import TIMM_WEIGHTS, backbone_files
 
@@ -68,9 +70,7 @@ def package(data: Path, params: Params, variant: Variant, base: Base, out: Path)
     temperatures = {
         p.name: fit_temperature([c for c in validated if c.property == p.name]) for p in catalogue.properties
     }
-    report, seed = Path("reports") / params.report_name, str(params.split.replicate_of(variant.seed))
-    scores = _scores(report / "scores.csv", (variant.encoder, variant.lora, variant.opd, Touch.REAL, seed))
-    ruled = _scores(report / "scores.csv", (variant.encoder, "", "", Touch.REAL, seed))
+    scores, ruled = _scores(data, params, variant, catalogue, classified)
     with atomic_folder(out) as folder:
         _copy(data / "encoder" / str(variant.seed) / TRAINED, folder / ENCODER_DIR / TRAINED)
         files, card = backbone_files(encoder), Path(encoder.weights) / CARD_FILE
@@ -113,7 +113,7 @@ def package(data: Path, params: Params, variant: Variant, base: Base, out: Path)
             versions={"python": platform.python_version(), **{name: metadata.version(name) for name in LIBRARIES}},
         )
         write_json(folder / CONFIG, config.model_dump(mode="json"))
-        known = read_json(report / "provenance.json")["settings"]
+        known = read_json(Path("reports") / params.report_name / "provenance.json")["settings"]
         _write_card(folder, config, classified, scores, ruled, params, known)
 
 
@@ -147,18 +147,27 @@ class Score(NamedTuple):
         return f"{100 * self.accuracy:.1f} [{100 * self.low:.1f}, {100 * self.high:.1f}]"
 
 
-def _scores(file: Path, wanted: tuple[str, ...]) -> dict[str, Score]:
-    """Scores on test questions that have an interval, of one encoder, lora, opd, touch and seed (of all folds)."""
-    return {
-        row.task: Score(row.n, row.accuracy, row.low, row.high, row.chance)
-        for row in read_csv(file, ScoreRow)
-        if (row.encoder, row.lora, row.opd, row.touch, row.seed) == wanted
-        and row.task in TASKS
-        and row.measure == TASKS[row.task].measure
-        and row.low is not None
-        and row.high is not None
-        and row.chance is not None
-    }
+def _scores(
+    data: Path, params: Params, variant: Variant, catalogue: Catalogue, classified: Sequence[Classification]
+) -> tuple[dict[str, Score], dict[str, Score]]:
+    """By task, the accuracy of one model and of its encoder's heads with rules, where it has an interval.
+
+    With folds this is its own fold, about objects that it was not trained on; the report pools the models of all folds.
+    """
+    graded = [
+        g.model_copy(update={"seed": g.trained})
+        for g in read_table(data / "graded.parquet", Graded)
+        if g.variant == variant and g.touch is Touch.REAL
+    ]
+    asked = read_jsonl(data / "questions" / str(variant.seed) / "evaluation.jsonl", Question)
+    taken = catalogue.asking(params.questions.scenarios).called(params.questions.names)
+    heads = {variant.seed: conclude(asked, classified, taken)} if variant.encoder is Encoder.FINETUNED else {}
+    found: dict[bool, dict[str, Score]] = {True: {}, False: {}}
+    for row in score_rows(graded, catalogue, concluded=heads):
+        whole = row.task in TASKS and row.measure == TASKS[row.task].measure and row.seed == str(variant.seed)
+        if whole and row.low is not None and row.high is not None and row.chance is not None:
+            found[bool(row.lora)][row.task] = Score(row.n, row.accuracy, row.low, row.high, row.chance)
+    return found[True], found[False]
 
 
 def _largest_distance(embeddings: Path, split: Path, params: Params) -> float:

@@ -46,10 +46,10 @@ def code(name: str) -> list[str]:
 
 
 def data_of(module: str) -> Iterator[str]:
-    """What is no code in a module's folder, and Jinja's templates there: the module may read it."""
+    """What is no code in a module's folder, and Jinja's templates there, in Markdown or not: the module may read it."""
     folder = (ROOT / module).parent
     for file in (*folder.glob("*"), *folder.glob("templates/*")) if folder != ROOT / "pipeline" else ():
-        if file.is_file() and file.suffix not in (".py", ".md"):
+        if file.is_file() and (file.suffix not in (".py", ".md") or file.parent.name == "templates"):
             yield file.relative_to(ROOT).as_posix()
 
 

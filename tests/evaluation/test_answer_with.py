@@ -490,7 +490,7 @@ def test_it_is_a_row_of_the_report_with_where_it_comes_from(project: Path, serve
     assert set(report.effects["part"]) <= {"language"}, "what parts bring is about our own system alone"
 
 
-def test_answers_to_other_questions_are_left_out_aloud(
+def test_answers_to_other_questions_or_frames_are_left_out_aloud(
     project: Path, server: Server, caplog: pytest.LogCaptureFixture
 ) -> None:
     run(server, "--limit", "2")
@@ -500,6 +500,12 @@ def test_answers_to_other_questions_are_left_out_aloud(
     report = reported()
     assert "some-maker/sees-1" not in set(report.scores["encoder"])
     assert report.provenance["vision"] == []
+    write_jsonl(Path("data/questions/0/evaluation.jsonl"), asked()[::-1])
+    run(server, "--limit", "2")
+    assert graded() != []
+    np.save("data/frames/references.npy", np.ones(3))
+    assert graded() == []
+    assert f"{PLACE}: saw other frames than there are now; run `octopi answer-with` again" in caplog.text
     Path(PLACE / "source.json").write_text("{}")
     with pytest.raises(SystemExit, match=r"source.json: does not say who answered; run `octopi answer-with` again"):
         graded()

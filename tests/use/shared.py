@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import pandas as pd
 import torch
 
 from pipeline.config import Params
@@ -21,22 +20,24 @@ from pipeline.core.records import (
     Classification,
     Embedding,
     Encoder,
+    Graded,
     Lora,
     Opd,
     Part,
     Prediction,
     Probe,
     Question,
+    Touch,
     Variant,
 )
 from pipeline.core.runtime import seed_everything
 from pipeline.encoder.data import EncoderData, classify
 from pipeline.encoder.embed import Loaded, embed_videos, standardize, statistics
 from pipeline.encoder.recipes import base_encoder, property_classifier
+from pipeline.evaluation.grading import grade
 from pipeline.language.generate import answer
 from pipeline.language.lora import add_lora
 from pipeline.language.octopi import OctopiForCausalLM
-from pipeline.tasks import TASKS
 from pipeline.tasks.questions import build_questions, pool_of
 from pipeline.training.trainable import save_trainable
 from pipeline.use.folder import Base
@@ -130,11 +131,15 @@ def make(where: Path, variant: Variant, *overrides: str) -> Made:
     questions = build_questions(pool_of(Part.TEST, parts, catalogue), ASKED, seed=0, distinct=False, facts=True)
     predictions = answer(model.eval(), embeddings, questions, variant.opd, params.language, params.frames.per_video)
     write_jsonl(data / "answers" / variant.key / "real.jsonl", predictions)
-    measured = {"touch": "real", "n": 8, "sets": 4, "chance": 0.5, "right": 5, "unread": 0}
-    measured |= {"accuracy": 0.625, "low": 0.25, "high": 0.875, **variant._asdict()}
-    (report := where / "reports" / params.report_name).mkdir(parents=True)
-    scores = pd.DataFrame([{"task": t, "measure": TASKS[t].measure, **measured} for t in ASKED])
-    scores.to_csv(report / "scores.csv", index=False)
+    write_jsonl(data / "questions" / "0" / "evaluation.jsonl", questions)
+    graded = [
+        Graded(**{**score.model_dump(), "correct": right}, **variant._asdict(), trained=fold, touch=Touch.REAL)
+        for score in grade(questions, predictions, catalogue)
+        # Another fold's model, whose answers are all right, is pooled under the same seed, and is not packaged.
+        for fold, right in ((0, score.correct), (1, True))
+    ]
+    write_table(data / "graded.parquet", Graded, graded)
+    report = where / "reports" / params.report_name
     write_json(report / "provenance.json", {"settings": "Looked at before."})
     out = where / "models" / variant.key
     package(data, params, variant, Base.of(Path("llama")), out)

@@ -92,6 +92,19 @@ def test_a_chat(octopi: Octopi, files: list[Path]) -> None:
     assert type_("/quit", "/frames") == ""
 
 
+def test_a_chat_mixes_no_recordings_of_one_name(octopi: Octopi, files: list[Path], tmp_path: Path) -> None:
+    said: list[str] = []
+    chat, touch = Chat(octopi, said.append), tmp_path / files[0].name
+    shutil.copy(files[0], touch)
+    chat.run([f"/add {touch}", "How soft is it?"])
+    shutil.copy(files[1], touch)
+    said.clear()
+    chat.run([f"/add {touch}", "And now?", "/reset", f"/add {touch}", "How soft is it?"])
+    changed = f"{touch} has changed since it was added; name the new one otherwise, or /reset"
+    assert [line for line in "".join(said).split("\n") if "changed" in line] == [changed] * 2
+    assert "".join(said).endswith(octopi.ask("{tactile} How soft is it?", files[1:2]) + "\n")
+
+
 def test_a_stopped_answer_is_forgotten(octopi: Octopi, monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
     chat = Chat(octopi, said.append)
@@ -204,6 +217,19 @@ def test_a_killed_description_goes_on(
         assert out.read_text() == text
         done = sum(".avi" in line and "broken" not in line for line in text[:end].split("\n")[:-1])
         assert sum(len(call.args[0]) for call in describe_all.mock_calls) == 3 - done
+
+
+def test_a_row_never_stands_for_another_recording(octopi: Octopi, files: list[Path], tmp_path: Path) -> None:
+    one, other, out = tmp_path / "monday" / "press.avi", tmp_path / "tuesday" / "press.avi", tmp_path / "out.csv"
+    for file, source in zip((one, other), files, strict=False):
+        file.parent.mkdir()
+        shutil.copy(source, file)
+    describe_folder(octopi, [one.parent], out)
+    content = out.read_bytes()
+    with refused("out.csv: describes another recording as press.avi; delete its row, or name another file with --csv"):
+        describe_folder(octopi, [other.parent], out)
+    assert out.read_bytes() == content
+    assert describe_folder(octopi, [one.parent], out) == (1, 0)
 
 
 @pytest.mark.parametrize(

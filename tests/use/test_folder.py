@@ -13,9 +13,12 @@ import yaml
 from typer.testing import CliRunner
 
 from pipeline.cli import app
+from pipeline.evaluation.grading import grade
+from pipeline.tasks import TASKS
 from pipeline.use.folder import FORMAT, Base, ModelConfig, read_folder
 from pipeline.use.model import Octopi
 from pipeline.use.package import export, package
+from pipeline.videos.catalogue import load_catalogue
 from tests.checkpoints import contents, edit, write_llama
 from tests.closure import ROOT
 from tests.conftest import refused
@@ -40,8 +43,13 @@ def test_it_holds_safetensors_and_text_alone_and_a_card(made: Made) -> None:
     assert "| test objects | Looked at before. |" in text, "what the report knows of them"
     front = yaml.safe_load(text.split("---\n")[1])
     assert front["base_model"][0] == "llama"
-    metric = front["model-index"][0]["results"][0]["metrics"][0]
-    assert metric == {"type": "accuracy", "value": 0.625, "args": {"low": 0.25, "high": 0.875, "n": 8}}
+    catalogue = load_catalogue(Path(ROOT / made.params.data.catalogue))
+    scores = [s for s in grade(made.questions, made.predictions, catalogue) if s.measure in ("choice", "combined")]
+    for result in front["model-index"][0]["results"]:
+        (metric,), own = result["metrics"], [s for s in scores if TASKS[s.task].title == result["task"]["name"]]
+        assert metric["value"] == pytest.approx(np.mean([s.correct for s in own]), abs=1e-6), "of its own fold"
+        assert metric["args"]["low"] <= metric["value"] <= metric["args"]["high"]
+        assert metric["args"]["n"] == len(own)
     assert next(iter(read_folder(made.folder)[0].base.files.values())) in text
 
 

@@ -18,6 +18,7 @@ import pytest
 
 from pipeline.config import FramesConfig
 from pipeline.core.io import read_table
+from pipeline.core.parallel import run_parallel
 from pipeline.core.records import Finding, Frame, Probe
 from pipeline.videos.catalogue import Catalogue
 from pipeline.videos.decoding import Decoder, Header, fit
@@ -133,6 +134,20 @@ def test_what_changed_after_a_kill_is_read_anew(place: Place) -> None:
     resumed = place.bytes()
     place.extract()
     assert place.bytes() == resumed
+
+
+def test_videos_that_come_while_others_are_read_are_no_silent_matter(place: Place) -> None:
+    """DVC hashes the folder behind the command, and would take it for what was read."""
+
+    def meanwhile(*given: Any) -> Iterator[Any]:
+        yield from run_parallel(*given)
+        write_video(place.folder / "rug_2.avi", moving_square(15, 77))
+
+    with patch.object(extract, "run_parallel", meanwhile), refused("videos were added or changed while they were read"):
+        place.extract()
+    place.decoded()
+    assert [v.video_id for v in place.extract().videos] == [*NAMES, "rug_2"]
+    assert place.decoded() == ["rug_2"]
 
 
 def test_what_videos_csv_says_after_a_kill_counts(place: Place) -> None:

@@ -63,6 +63,7 @@ def extract_frames(folder: Path, catalogue: Catalogue, config: FramesConfig, out
         log.warning("%s: %s", finding.item, finding.measured)
     work = partial / fingerprint(config, str(folder.resolve()), *code_of("extract_frames"))
     work.mkdir(parents=True, exist_ok=True)
+    stamps = [_stamp(file) for file in listing.files]
     found = {file: _finished(file, work) for file in listing.files}
     rest = [file for file, earlier in found.items() if earlier is None]
     scan_one = functools.partial(_work, config=config, work=work)
@@ -76,6 +77,9 @@ def extract_frames(folder: Path, catalogue: Catalogue, config: FramesConfig, out
             log.warning("%s: %s; is it cut off? The %d are used", file, lost, probe.frames)
         if probe.kept == 0:
             log.warning("%s: %d frames are too few for frames.selection=release; left out", file, probe.frames)
+    if [_stamp(file) for file in list_videos(folder, catalogue).files] != stamps:
+        # DVC would take the folder as it is now for the one that was read.
+        raise UserError(f"{folder}: videos were added or changed while they were read; run it again, which goes on")
     done = [each for each in found.values() if each is not None]
     used = [each for each in done if each.places]
     if not used:
@@ -124,7 +128,7 @@ def _finished(file: VideoFile, work: Path) -> _Done | None:
 
 def _work(file: VideoFile, config: FramesConfig, work: Path) -> _Done | Finding:
     """Scan one video in a process of its own, and leave its pixels in `work`."""
-    stamp = _stamp(file)  # Before it is read: what changes meanwhile is read anew by the next extraction.
+    stamp = _stamp(file)  # Before it is read: what changes meanwhile is read anew when it is run again.
     result = scan(file, config)
     if isinstance(result, Finding):
         return result

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from pipeline.core.errors import UserError
-from pipeline.core.io import read_table
+from pipeline.core.io import fingerprint, read_table
 from pipeline.core.records import Frame
 from pipeline.videos.frames.subtraction import Pictures, subtract
 
@@ -18,6 +18,11 @@ FRAMES_FILE = "frames.npy"
 REFERENCES_FILE = "references.npy"
 TABLE_FILE = "frames.parquet"
 PROBES_FILE = "probes.parquet"
+
+
+def frames_key(folder: Path) -> str:
+    """A short hash of which frames a folder holds, and of the pictures of their untouched sensor."""
+    return fingerprint(folder / TABLE_FILE, folder / REFERENCES_FILE)
 
 
 class FrameStore:
