@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.scenes.light import NOISE, Sensor, make_sensor, shade, surface
+from pipeline.scenes.light import NOISE, Sensor, make_sensor, shade
 
 WIDTH, HEIGHT, PITCH = 96, 72, 0.2
 FLAT = np.zeros((HEIGHT, WIDTH), np.float32)
@@ -81,8 +81,3 @@ def test_drift_carries_the_marks_and_nothing_else() -> None:
     shifted[:-3, 4:] = sensor.dust[3:, :-4]
     assert np.abs(moved - plain * shifted).max() <= 1.01, "right and up"
     np.testing.assert_array_equal(shown(bare, 1, 1), plain)
-
-
-def test_a_curve_is_its_polynomial() -> None:
-    x, y = np.array([0.3]), np.array([-0.7])
-    assert surface((1, 2, 3, 4, 5, 6), x, y)[0] == pytest.approx(1 + 2 * 0.3 - 3 * 0.7 + 4 * 0.09 - 5 * 0.21 + 6 * 0.49)
