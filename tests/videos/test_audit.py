@@ -75,39 +75,6 @@ def test_no_folder_or_an_empty_one_is_an_error_beside_the_labels(tmp_path: Path,
         assert [f.severity for f in check_folder(folder, catalogue)] == [ERROR]
 
 
-def pressed(times: range) -> list[np.ndarray]:
-    """Twenty-four frames in which something textured is pressed against a plain sensor at these times."""
-    rng = np.random.default_rng(3)
-    grain = cv2.GaussianBlur(rng.normal(size=(60, 80)), (0, 0), 1.2)
-    grain = 60 * (grain / np.abs(grain).max())[..., None]
-    noise = rng.normal(0, 6, (24, 60, 80, 3))
-    return [np.clip(100 + noise[t] + grain * (t in times), 0, 255).astype(np.uint8) for t in range(24)]
-
-
-def test_real_files_show_touch_size_length_and_light(tmp_path: Path, catalogue: Catalogue) -> None:
-    frames = pressed(range(8, 18))
-    for number in range(8):
-        write_video(tmp_path / f"pillow_{number}.avi", frames)
-    odd_ones = {
-        "brightness of rug_0.avi": [f // 3 for f in frames],
-        "length of rug_1.avi": frames[:10],
-        "resolution of 160x120": [cv2.resize(f, (160, 120)) for f in frames],
-        "brightness of rug_3.avi": [*frames[:12], *(f + np.uint8(40) for f in frames[12:])],
-        "saturation of rug_4.avi": [np.where(np.arange(80)[:, None] < 20, 255, f) for f in frames],
-        "contact of rug_5.avi": pressed(range(0)),
-        "contact at the end of rug_6.avi": pressed(range(8, 24)),
-        "contact at the start of rug_7.avi": pressed(range(14)),
-    }
-    for number, shown in enumerate(odd_ones.values()):
-        write_video(tmp_path / f"rug_{number}.avi", shown)
-    write_video(tmp_path / "rug_8.mkv", frames)
-    found = {f"{f.check} of {f.item}" for f in odd(check_folder(tmp_path, catalogue)) if f.check != "videos"}
-    assert found >= {*odd_ones}
-    # What is dark or cut short may seem to lack contact, too. The Matroska file promises no number of frames.
-    touch, others = {*list(odd_ones)[5:]}, ("160x120", *(f"rug_{number}.avi" for number in range(5)))
-    assert {name for name in found if not name.endswith(others)} == touch
-
-
 @pytest.fixture
 def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """What the stage reads: parameters, measurements, a split, and files that only have to have names."""

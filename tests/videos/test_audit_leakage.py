@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from pathlib import Path
 
@@ -129,31 +128,6 @@ def test_smooth_blobs_are_no_copies_however_many_there_are() -> None:
     assert named(many[:12]) == ([], leakage.DUPLICATE)
 
 
-@pytest.mark.parametrize("pairs", [30, 10_000, 200_000, 10_000_000])
-def test_the_bound_is_that_of_an_exponential_tail(pairs: int) -> None:
-    """Against its quantiles: P(z > t) = exp(-(t - 0.2) / rate), of which one in so many pairs is `CHANCE` likely."""
-    rate, m = 0.1, math.isqrt(pairs)
-    largest = np.tanh(0.2 + rate * np.log(pairs / np.arange(1, m + 2)))
-    expected = np.tanh(0.2 + rate * np.log(pairs / leakage.CHANCE)) if m >= leakage.FEWEST else 0.0
-    found = leakage.likeness_bound(largest, pairs)
-    assert found == pytest.approx(max(leakage.DUPLICATE, expected), rel=0.02)
-    copies = np.concatenate([np.full(m // 20, 0.9999), largest])[: m + 1]
-    assert leakage.likeness_bound(copies, pairs) - found < 0.03, "copies among them hardly move it"
-
-
-def test_likeness_divides_out_what_is_shared() -> None:
-    """Against the definition, by inverting the covariance. Equal ones are wholly alike; nothing is like nothing."""
-    signatures = np.random.default_rng(0).normal(size=(30, 12)) + 3 * np.linspace(-1, 1, 12)
-    signatures = np.vstack([signatures, signatures[:1], np.zeros(12)])
-    inverse = np.linalg.inv(signatures.T @ signatures + np.eye(12))
-    product = signatures @ inverse @ signatures.T
-    length = np.sqrt(np.diag(product))
-    length[-1] = 1
-    own = leakage.likeness_vectors(signatures)
-    np.testing.assert_allclose(own @ own.T, product / length / length[:, None], atol=1e-12)
-    assert own[0] @ own[30] == pytest.approx(1)
-
-
 def test_sessions_are_told_apart_by_the_untouched_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     """In whatever order the videos come, and where most of them only go with the nearest of a sample."""
     rng = np.random.default_rng(5)
@@ -263,13 +237,10 @@ def test_classes_that_are_equally_likely_are_not_told_apart_by_rounding(seed: in
         assert predictability(session + rng.normal(scale=1e-14, size=session.shape), *rest) == exact
 
 
-def test_fewer_objects_than_folds_and_constant_features() -> None:
-    share, null = predictability(*planted(0, leak=1.0, objects=3), 0)
-    assert 0 <= share <= 1
-    assert len(null) == leakage.PERMUTATIONS
+def test_constant_features_are_no_division_by_zero() -> None:
     features, labels, objects = planted(0, leak=0.0)
     share, null = predictability(np.ones_like(features), labels, objects, 0)
-    assert np.isfinite([share, *null]).all(), "what does not vary is no division by zero"
+    assert np.isfinite([share, *null]).all()
 
 
 @pytest.mark.parametrize(("sample", "leak"), [(leakage.SAMPLE, 1.0), (leakage.SAMPLE, 0.0), (50, 1.0)])

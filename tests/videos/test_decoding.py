@@ -22,15 +22,6 @@ from tests.frame_rules import frames_of, pillow
 ONE = 1 << 16
 TURNED = {90: (0, -ONE, ONE, 0), 180: (-ONE, 0, 0, -ONE), 270: (0, ONE, -ONE, 0)}
 """Degrees against the clock, and the first four numbers of a QuickTime display matrix."""
-SUBSAMPLING = {
-    "yuv420p": (2, 2),
-    "yuv422p": (1, 2),
-    "yuv444p": (1, 1),
-    "yuv410p": (4, 4),
-    "yuv411p": (1, 4),
-    "yuv440p": (2, 1),
-}
-"""By how much colour is coarser than brightness, down and across."""
 
 
 def opencv(path: Path) -> list[np.ndarray]:
@@ -145,22 +136,6 @@ def test_turned_videos_are_upright(tmp_path: Path, degrees: int, codec: str, pix
     assert turned.flags.c_contiguous
 
 
-@pytest.mark.parametrize("pixels", SUBSAMPLING)
-def test_planes_are_what_went_in(pixels: str) -> None:
-    high, wide = SUBSAMPLING[pixels]
-    for height, width in ((13, 17), (1, 1), (2, 2), (97, 17), (5, 40)):
-        frame = av.VideoFrame(width, height, pixels)
-        written = []
-        for plane in frame.planes:
-            rows = np.random.default_rng(len(written)).integers(0, 256, (plane.height, plane.line_size), np.uint8)
-            plane.update(rows.tobytes())
-            written.append(rows[:, : plane.width])
-        chroma = (-(-height // high), -(-width // wide))
-        assert [p.shape for p in planes(frame)] == [(height, width), chroma, chroma]
-        for one, other in zip(planes(frame), written, strict=True):
-            np.testing.assert_array_equal(one, other)
-
-
 @pytest.mark.parametrize("content", [b"", b"no video at all " * 40, b"RIFF\0\0\0\0AVI LIST", bytes(5000), None])
 def test_what_is_no_video_has_no_frames(tmp_path: Path, content: bytes | None) -> None:
     """Nor has what is not there."""
@@ -245,7 +220,7 @@ def test_fitted_frames_are_near_a_bicubic_resize(tmp_path: Path, height: int, wi
             assert np.quantile(error, 0.99) <= 16, (pixels, mode)
 
 
-@pytest.mark.parametrize("pixels", SUBSAMPLING)
+@pytest.mark.parametrize("pixels", ["yuv420p", "yuv444p", "yuv410p", "yuv411p"])
 @pytest.mark.parametrize("mode", ["crop", "squash"])
 def test_one_colour_fills_every_square(pixels: str, mode: str) -> None:
     expected = np.array([1.164 * 84 + 1.596 * 72, 1.164 * 84 + 0.392 * 38 - 0.813 * 72, 1.164 * 84 - 2.017 * 38])
