@@ -12,7 +12,7 @@ from benchmarks import __main__ as command
 from benchmarks.figures import FOLDER, draw
 from benchmarks.table import CSV, Error, Row, front, interleaved, make_rows, mean_of, merge, read_rows, share_of
 from pipeline.core.records import ScoreRow
-from tests.conftest import ROOT, refused
+from tests.conftest import refused
 
 POINTS = st.lists(st.tuples(st.integers(1, 6), st.integers(0, 6)), min_size=1, max_size=12)
 
@@ -81,20 +81,6 @@ def test_a_figure_a_question_and_stale_ones_go(tmp_path: Path) -> None:
     assert [p.name for p in drawn] == ["which-where.png", "no-error.png"]
     assert sorted(p.name for p in (tmp_path / FOLDER).iterdir()) == sorted(p.name for p in drawn)
     assert all(p.read_bytes().startswith(b"\x89PNG") for p in drawn)
-
-
-def test_the_committed_table_is_consistent() -> None:
-    table = read_rows(ROOT / CSV)
-    for question in {row.question for row in table}:
-        own = [row for row in table if row.question == question]
-        assert len({row.setting for row in own}) == len(own)
-        assert 1 in [row.cost_ratio for row in own], question
-        measured = [row for row in own if row.error is not None]
-        expected = front([r.cost_ratio for r in measured], [r.error or 0.0 for r in measured])
-        assert [row.front for row in measured] == expected
-        assert all(row.error_of and row.n for row in measured)
-    pictures = {p.name for p in (ROOT / CSV.parent / FOLDER).glob("*.png")}
-    assert len(pictures) == len({row.question for row in table})
 
 
 def test_settings_take_turns_at_each_item() -> None:

@@ -19,26 +19,6 @@ from tests.evaluation.conftest import About, designs, single
 RIGHT = st.lists(st.booleans(), min_size=24, max_size=24)
 
 
-def ordinary(values: np.ndarray, about: About) -> float:
-    """Cluster-robust variance of a mean with G / (G - 1)."""
-    groups = sorted({row[0] for row in about})
-    sums = [sum(v - values.mean() for v, (n,) in zip(values, about, strict=True) if n == g) for g in groups]
-    return len(groups) / (len(groups) - 1) * math.fsum(s * s for s in sums) / len(values) ** 2
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_single_objects_have_the_ordinary_cluster_robust_variance(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    about = single(7, 5)
-    values = (np.repeat(rng.random(7), 5) > rng.random(35)).astype(float)
-    found, reference = float(variance(values, design_of(about))), ordinary(values, about)
-    independent = values.var(ddof=1) / 35
-    if reference >= independent:
-        assert found == pytest.approx(reference, rel=1e-9)
-    else:
-        assert found >= independent * (1 - 1e-12)
-
-
 def test_components_are_found_on_average() -> None:
     """Pairs of seven objects, twice each: known variances of objects, questions and pairs."""
     design = design_of(tuple(itertools.combinations("abcdefg", 2)) * 2)
@@ -89,12 +69,6 @@ def test_what_cannot_show_that_objects_differ_has_no_interval() -> None:
     for about in ((), ((),)):
         with pytest.raises(ValueError, match="some object"):
             design_of(about)
-
-
-def test_the_same_object_twice_counts_once() -> None:
-    values = np.arange(9) % 2.0
-    twice = [("abc"[i % 3], "abc"[i % 3]) for i in range(9)]
-    assert accuracy_interval(values, twice) == accuracy_interval(values, [row[:1] for row in twice])
 
 
 @pytest.mark.parametrize(

@@ -40,20 +40,6 @@ def signs_of(count: int) -> list[tuple[int, ...]]:
     return list(itertools.product((1, -1), repeat=count))
 
 
-@given(better=st.integers(0, 12), worse=st.integers(0, 12), same=st.integers(0, 12))
-def test_independent_questions_have_bonett_and_prices_interval(better: int, worse: int, same: int) -> None:
-    """One question an object: both kinds of discordant questions get one more, and t stands in place of z."""
-    n = better + worse + same
-    if n < 2 or max(better, worse, same) == n:
-        return
-    gap = paired(np.array([[1.0] * better + [-1.0] * worse + [0.0] * same]), single(n, 1))
-    one, other = (better + 1) / (n + 2), (worse + 1) / (n + 2)
-    half = stats.t.ppf(0.975, n - 1) * math.sqrt((one + other - (one - other) ** 2) / (n + 2))
-    # It must hold the difference itself, which the two more questions pull towards nothing.
-    low, high = min(one - other - half, gap.difference), max(one - other + half, gap.difference)
-    assert (gap.low, gap.high) == pytest.approx((max(-1.0, low), min(1.0, high)), abs=1e-12)
-
-
 def test_without_difference_with_one_object_and_with_none() -> None:
     gap = paired(np.zeros((1, 3)), single(3, 1))
     assert (gap.difference, gap.p) == (0, 1)
@@ -106,20 +92,6 @@ def test_pairs_are_split_by_least_squares_and_all_signs_gone_through() -> None:
     assert float(sign_flip(values, design_of(about))) == pytest.approx(fmean(far), abs=1e-12)
 
 
-def test_equal_settings_are_told_apart_no_more_often_than_said() -> None:
-    """Triples of seven objects, two settings that share half of what makes a question right; 2 % are usual."""
-    rng = np.random.default_rng(3)
-    rows = tuple(tuple(f"{o}" for o in rng.choice(7, 3, replace=False)) for _ in range(70))
-    design = design_of(rows)
-    both, one, other = (
-        math.sqrt(0.7 / 3) * rng.standard_normal((2000, 7)) @ design.membership.T
-        + math.sqrt(0.3) * rng.standard_normal((2000, 70))
-        for _ in range(3)
-    )
-    values = (both + one < 0).astype(float) - (both + other < 0)
-    assert (sign_flip(values, design) <= 0.05).mean() <= 0.06
-
-
 def test_what_questions_cannot_tell_apart_is_flipped_together() -> None:
     pairs = design_of((("a", "b"), ("c", "d"), ("c", "d"), ("e", "f")))
     assert flip_units(pairs).tolist() == [[1, 0, 0, 0], [0, 1, 1, 0], [0, 0, 0, 1]]
@@ -154,14 +126,6 @@ def test_the_interval_covers_new_seeds() -> None:
 
     assert covered(gains) >= 0.93
     assert covered(gains.mean(axis=1, keepdims=True)) <= 0.88
-
-
-def test_smallest_effect_of_known_designs() -> None:
-    """Bloom 1995: 2.8 standard errors; Cohen 1988: 34 pairs for a medium effect, 15 for a large one."""
-    assert smallest_effect(1, 100_000) == pytest.approx(1.959964 + 0.841621, abs=1e-3)
-    for effect, pairs in ((0.5, 34), (0.8, 15)):
-        enough, less = (smallest_effect(1 / math.sqrt(n), n - 1) for n in (pairs, pairs - 1))
-        assert enough <= effect < less
 
 
 @pytest.mark.parametrize("freedom", [1, 2.5, 6, 59])

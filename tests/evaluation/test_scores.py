@@ -35,7 +35,7 @@ def test_one_seed_and_all_of_them() -> None:
     rows = score_rows(graded("PC", first, unread=2) + graded("PC", second, seed=3, unread=1), CATALOGUE)
     assert [r.seed for r in rows] == ["0", "3", "all"]
     for r, right, unread in zip(rows, (first, second), (2, 1), strict=False):
-        assert (r.n, r.right, r.unread) == (15, sum(right), unread)
+        assert (r.n, r.sets, r.right, r.unread) == (15, 15, sum(right), unread)
         assert r.accuracy == pytest.approx(sum(right) / 15, abs=1e-6)
         interval = accuracy_interval(np.array(right, dtype=float), PAIRS)
         assert (r.low, r.high) == pytest.approx(interval, abs=1e-6)
@@ -94,7 +94,7 @@ def test_one_object_has_an_accuracy_but_no_interval(tmp_path: Path) -> None:
     answers = graded("OPD", [True, False, True, True], measure="combined", objects=alone)
     answers += graded("OPD", [True, False, False, True], measure="combined", objects=alone, lora="without")
     rows, effects = score_rows(answers, CATALOGUE), effect_rows(answers, CATALOGUE)
-    assert {(r.lora, r.accuracy, r.low) for r in rows} == {("with", 0.75, None), ("without", 0.5, None)}
+    assert {(r.lora, r.sets, r.accuracy, r.low) for r in rows} == {("with", 1, 0.75, None), ("without", 1, 0.5, None)}
     (effect,) = effects
     assert effect.difference == 0.25
     assert {effect.low, effect.high, effect.p, effect.p_holm, effect.smallest_effect} == {None}

@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 
 import pandas as pd
 
+from tests.checkpoints import edit
 from tests.closure import ROOT
 
 STABILITY = """part,case,format,finite,error,bound,verdict
@@ -41,16 +42,6 @@ def write_reports(root: Path, *names: str) -> Path:
     shutil.copytree(ROOT / "reports" / "speed_error", reports / "speed_error")
     (reports / "stability.csv").write_text(STABILITY)
     return root
-
-
-def files_of(folder: Path) -> dict[str, bytes]:
-    """What every file of a folder and its subfolders holds."""
-    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
-
-
-def edit(file: Path, **changed: Any) -> None:
-    """Change values of a JSON file."""
-    file.write_text(json.dumps({**json.loads(file.read_text()), **changed}))
 
 
 def rows_of(file: Path) -> list[dict[str, Any]]:

@@ -23,12 +23,12 @@ from pipeline.report.build import MOST_METRICS, finish_report, without_places, w
 from pipeline.report.load import DATASET, load_report
 from pipeline.report.page import data_tables, write_page
 from pipeline.report.provenance import base_model, digest
-from pipeline.report.tables import NOT_ANSWERED, TABLES
+from pipeline.report.tables import TABLES
 from pipeline.videos.catalogue import Catalogue
+from tests.checkpoints import contents, edit
 from tests.closure import ROOT
 from tests.fake_run import fake_params, write_run
 from tests.models import model_folder
-from tests.report.shared import edit, files_of
 
 FILES = {
     *("README.md", "params.yaml", "provenance.json", "metrics.json", "samples.json", "scores.csv", "effects.csv"),
@@ -40,7 +40,7 @@ ONE = ("ablation.encoders=[finetuned]", "ablation.lora=[with]", "ablation.opd=[a
 
 
 def test_everything_that_was_promised_is_there_and_dvc_knows_of_it(written: Path) -> None:
-    assert set(files_of(written)) == FILES
+    assert set(contents(written)) == FILES
     stage = yaml.safe_load((ROOT / "dvc.yaml").read_text())["stages"]["report"]
     outs = [*stage["outs"], *stage["metrics"]]
     promised = {path.removeprefix("reports/${scale}-${data.source}/") for out in outs for path in out}
@@ -71,24 +71,6 @@ def test_classes_may_read_like_nothing_or_like_numbers(written: Path, tmp_path: 
         (report / "figures" / name).unlink()
     finish_report(report)
     assert {name for name in drawn if (report / "figures" / name).is_file()} == {*drawn}
-
-
-def test_accuracies_are_those_of_the_graded_answers(written: Path) -> None:
-    graded = read_table(written.parents[1] / "data" / "graded.parquet", Graded)
-    rows = load_report(written).scores
-    answered = rows[~rows["task"].isin(NOT_ANSWERED)]
-    by_rule = answered["lora"] == ""
-    assert set(answered.loc[by_rule, "task"]) == {"OPD", "PC", "PSS", "POM", "PSR"}
-    answered = answered[~by_rule]
-    assert len(answered)
-    keys = ("task", "measure", "encoder", "lora", "opd", "touch")
-    for row in answered.to_dict("records"):
-        over = [g for g in graded if row["seed"] in ("all", str(g.seed))]
-        mine = [g for g in over if all(getattr(g, key) == row[key] for key in keys)]
-        assert row["accuracy"] == pytest.approx(np.mean([g.correct for g in mine]))
-        assert row["unread"] / row["n"] == pytest.approx(np.mean([not g.parsed for g in mine]))
-        assert row["n"] == len({g.question_id for g in mine})
-        assert row["sets"] == len({frozenset(g.objects) for g in mine})
 
 
 def test_confusion_and_metrics_are_the_heads_on_test_videos(written: Path) -> None:
@@ -160,20 +142,6 @@ def test_samples_are_the_first_right_and_wrong_answer_of_each_task(written: Path
     assert "{tactile}" not in json.dumps(said)
 
 
-def test_the_papers_examples_come_with_their_answers(written: Path, tmp_path: Path) -> None:
-    lacking = {"rice": ["rice"], "toothbrush": ["toothbrush_handle", "toothbrush_bristles"]}
-    assert load_report(written).samples["not_asked"] == lacking
-    few = "questions.evaluation={opd:4,pc:4,pss:4,pom:4,psr:4}"
-    params = write_run(tmp_path, fake_params(few, *ONE), objects=["rice", "rug", "bath_towel", "ice_block"])
-    write_report(params, tmp_path)
-    report = load_report(tmp_path / "reports" / params.report_name)
-    told = read_jsonl(tmp_path / "data" / "answers" / "finetuned-with-all-0" / "examples.jsonl", Prediction)
-    assert [s["answered"] for s in report.samples["examples"]] == [list(p.outputs) for p in told]
-    assert [s["right"] for s in report.samples["examples"]] == [not p.truncated for p in told]
-    assert {s["part"] for s in report.samples["examples"]} == {"train"}
-    assert set(report.scores["task"]) <= set(load_report(written).scores["task"]), "no figure counts them"
-
-
 def test_the_data_sets_tables_count_objects_and_set_the_papers_beside(written: Path) -> None:
     shown = {block.key: block.frame for block in data_tables(written, DATASET)}
     counts = shown["property_counts"].set_index("")
@@ -189,7 +157,7 @@ def test_the_data_sets_tables_count_objects_and_set_the_papers_beside(written: P
 
 def test_two_writes_are_equal_to_the_byte_whatever_another_run_left(written: Path) -> None:
     """DVC removes no output of a seed that params.yaml names no more."""
-    before, root = files_of(written), written.parents[1]
+    before, root = contents(written), written.parents[1]
     (written / "figures" / "of_last_year.png").write_bytes(b"")
     places = ("encoder/9", "models/with/finetuned-all-9", "models/without/finetuned-all-9")
     left = [root / "data" / place for place in places]
@@ -197,7 +165,7 @@ def test_two_writes_are_equal_to_the_byte_whatever_another_run_left(written: Pat
         shutil.copytree(folder.with_name(f"{folder.name[:-1]}0"), folder)
     try:
         write_report(load_params(root / "params.yaml"), root)
-        assert files_of(written) == before
+        assert contents(written) == before
     finally:
         for folder in left:
             shutil.rmtree(folder)
@@ -218,7 +186,7 @@ def test_a_run_that_measured_nothing_says_so_and_shows_no_picture_of_its_videos(
     assert "Whether answers depend on touch was not tested." in text
     assert "0, 0 videos" in text
     assert json.loads((report.folder / "metrics.json").read_text()) == {}
-    assert set(files_of(report.folder)) == FILES - {f"figures/{name}.png" for name in ("effects", "confusion", "map")}
+    assert set(contents(report.folder)) == FILES - {f"figures/{name}.png" for name in ("effects", "confusion", "map")}
 
 
 def test_the_stage_does_not_load_a_network() -> None:

@@ -17,9 +17,10 @@ from pipeline.cli import app
 from pipeline.core.errors import UserError
 from pipeline.report import page as module
 from pipeline.report.page import LARGEST, PAGE, left_to_users, write_page
+from tests.checkpoints import edit
 from tests.closure import ROOT
 from tests.report.conftest import report, score
-from tests.report.shared import Page, edit, rows_of, words, write_reports, write_rows
+from tests.report.shared import Page, rows_of, words, write_reports, write_rows
 
 NUMBER = re.compile(r"[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]\d+)?")
 HOSTILE = "</style><script>alert(1)</script><img src=//evil.example onerror=alert(1)>\"'&"

@@ -67,35 +67,19 @@ def test_right_classes_lead_to_right_answers_in_the_words_of_right_answers() -> 
     assert [s for s in scores if not s.correct or s.strict is False] == []
 
 
-def test_wrong_classes_lead_to_what_a_plain_reading_of_them_leads_to() -> None:
+def test_wrong_classes_are_matched_at_the_least_cost() -> None:
+    """Against all orders of the three names; where two cost the least, neither is held to be the answer."""
     levels = shuffled(1)
     found = {s.question_id: s for s in conclude(QUESTIONS, heads(levels), CATALOGUE) if s.measure == "choice"}
-    names = CATALOGUE.property_names
-    for q in QUESTIONS:
+    for q in (q for q in QUESTIONS if q.task == "POM"):
         said = [levels[o] for o in q.objects]
-        own = [v[names.index(q.gold.properties[0])] for v in said]
-        text = q.dialogues[0].turns[-1].user
-        if q.task == "PC":
-            more = any(word in text for word in ("harder", "rougher", "bigger"))
-            expected = "same" if own[0] == own[1] else "yes" if (own[0] > own[1]) == more else "no"
-        elif q.task == "PSS":
-            most = any(word in text for word in ("hardest", "roughest", "biggest"))
-            extreme = max(own) if most else min(own)
-            if own.count(extreme) > 1:
-                continue
-            expected = "abc"[own.index(extreme)]
-        elif q.task == "POM":
-            options = sorted(q.objects, key=lambda o: CATALOGUE.objects[o].name.lower())
-            true = np.array([TRUE[o] for o in options])
-            orders = list(itertools.permutations(range(3)))
-            costs = [np.abs(said - true[list(order)]).sum() for order in orders]
-            best = ["".join(str(n + 1) for n in o) for o, cost in zip(orders, costs, strict=True) if cost == min(costs)]
-            if len(best) > 1:
-                continue
-            expected = best[0]
-        else:
-            continue
-        assert found[q.question_id].predicted == expected, q.question_id
+        options = sorted(q.objects, key=lambda o: CATALOGUE.objects[o].name.lower())
+        true = np.array([TRUE[o] for o in options])
+        orders = list(itertools.permutations(range(3)))
+        costs = [np.abs(said - true[list(order)]).sum() for order in orders]
+        best = ["".join(str(n + 1) for n in o) for o, cost in zip(orders, costs, strict=True) if cost == min(costs)]
+        if len(best) == 1:
+            assert found[q.question_id].predicted == best[0], q.question_id
 
 
 @settings(max_examples=10)
