@@ -186,20 +186,6 @@ def test_what_the_pictures_show_is_found(training: Training, monkeypatch: pytest
     assert all(r.predicted[0] == r.expected[0] for r in shared), "classes that another object has, too"
 
 
-def test_results_are_repeatable_and_independent_of_the_order(training: Training) -> None:
-    write_pretrained()
-    pixels = np.load("frames/frames.npy")
-    pixels += np.random.default_rng(0).integers(0, 20, pixels.shape, dtype=np.uint8)
-    np.save("frames/frames.npy", pixels)
-    training = encoded(training, config(Path("none"), "tuned"))
-    first = cross_validate_model("backbone", training, SMALL)
-    torch.rand(7)
-    assert cross_validate_model("backbone", training, SMALL) == first
-    data = replace(training.data, assignments=training.data.assignments[::-1])
-    turned = cross_validate_model("backbone", replace(training, data=data), SMALL)
-    assert sorted(turned, key=lambda r: r.video_id) == sorted(first, key=lambda r: r.video_id)
-
-
 def kill_after(count: int, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
     """Make all models constant and interrupt them when asked for one more fold; returns the folds begun."""
     begun: list[tuple[int, int]] = []

@@ -120,12 +120,6 @@ def test_a_class_that_training_lacks_is_all_but_impossible(kept: tuple[int, ...]
         np.testing.assert_allclose(found[:, list(kept)], probabilities(unseen).mean(axis=1), atol=3e-4)
 
 
-def test_a_single_video_fits() -> None:
-    clips = np.random.default_rng(0).normal(size=(1, 3, 4)).astype(np.float32)
-    heads = fit_frame_heads(clips, np.array([[2, 0]]), ["a"], [3, 2], STRENGTHS[0])
-    assert heads.predict(clips).tolist() == heads.predict(-1e6 * clips).tolist() == [[2, 0]]
-
-
 @pytest.mark.parametrize(("right", "chosen"), [((3, 5, 5, 2), 1), ((4, 4, 4, 4), 0), ((0, 0, 0, 1), 3)])
 def test_the_strength_is_chosen_inside(right: tuple[int, ...], chosen: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of seven objects, whose number is the first feature and whose labels are all 1, heads get as many right.

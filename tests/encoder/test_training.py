@@ -18,12 +18,11 @@ import torch
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
-from pydantic import ValidationError
 from sklearn.linear_model import LogisticRegression
 from sklearn.preprocessing import StandardScaler
 from transformers import TrainerCallback
 
-from pipeline.config import PRETRAINED, EncoderConfig, Recipe
+from pipeline.config import PRETRAINED, Recipe
 from pipeline.core.embeddings import Statistics
 from pipeline.core.records import Assignment, Embedding, Flip, Part
 from pipeline.core.runtime import derive_seed, seed_everything
@@ -32,20 +31,17 @@ from pipeline.encoder.data import ClipDataset, EncoderData, LabelledVideo
 from pipeline.encoder.embed import logits_of, standardize, statistics, union
 from pipeline.encoder.finetune import accuracies, finetune, train_classifier, write_encoder_card
 from pipeline.encoder.folds import deal
-from pipeline.encoder.frame_classifier import STRENGTHS, JointFrameClassifier
+from pipeline.encoder.frame_classifier import STRENGTHS
 from pipeline.encoder.model import Heads, PropertyClassifier
 from pipeline.encoder.recipes import RECIPES, base_encoder, property_classifier
 from pipeline.encoder.scene_encoder import SceneEncoder
 from pipeline.training.sampling import sample_evaluation, sample_training
 from pipeline.training.trainable import load_trainable, save_trainable, trainable_state
 from pipeline.videos.catalogue import Catalogue
-from pipeline.videos.frames.extract import extract_frames
 from pipeline.videos.frames.store import FrameStore
-from pipeline.videos.frames.subtraction import subtract
-from tests import frame_rules
 from tests.conftest import refused
 from tests.encoder.conftest import Hook, gradient, setting_of
-from tests.encoders import FRAME_INDICES, PARTS, config, float64, random_heads, training, write_frames, write_pretrained
+from tests.encoders import PARTS, config, float64, training, write_frames, write_pretrained
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
 
@@ -185,19 +181,6 @@ def test_evaluation_samples_are_uniform_from_the_first(count: int, k: int) -> No
     assert all(between in (count // k, -(-count // k)) for between in gaps)
 
 
-def test_the_store_gives_pictures(tiny_videos: Path, tmp_path: Path, catalogue: Catalogue) -> None:
-    found = extract_frames(tiny_videos, catalogue, frame_rules.CONFIG, tmp_path, tmp_path / "partial")
-    plain, subtracted = FrameStore(tmp_path), FrameStore(tmp_path, "subtract")
-    for name, reference in zip((v.video_id for v in found.videos), np.load(tmp_path / "references.npy"), strict=True):
-        rows = [f.row for f in found.frames if f.video_id == name]
-        assert plain.rows(name) == rows
-        np.testing.assert_array_equal(plain.pictures(name), plain.pixels[rows])
-        differences = subtract(np.asarray(plain.pixels[rows]), reference)
-        np.testing.assert_array_equal(subtracted.pictures(name), differences)
-        drawn = sample_evaluation(len(rows), 5)
-        np.testing.assert_array_equal(subtracted.pictures(name, drawn), differences[list(drawn)])
-
-
 @pytest.mark.parametrize(("file", "reference"), [("frames.npy", "none"), ("references.npy", "subtract")])
 def test_a_row_too_few_is_an_error(tmp_path: Path, file: str, reference: Literal["none", "subtract"]) -> None:
     write_frames(tmp_path, {"a_0": 4, "b_0": 1})
@@ -248,20 +231,6 @@ def test_a_recipe_is_a_module_and_a_line(
     assert base_encoder(setting).dim == 256
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"backbone": ("timm", "timm")}, "names one twice"),
-        ({"backbone": ()}, "at least 1 item"),
-        ({"backbone": ("scenes",), "reference": "none"}, "set encoder.reference=subtract"),
-        ({"backbone": ("timm",), "recipe": "paper"}, "encoder.recipe=paper is for CLIP alone"),
-    ],
-)
-def test_what_does_not_go_together_is_refused(changes: dict[str, object], message: str) -> None:
-    with pytest.raises(ValidationError, match=message):
-        EncoderConfig.model_validate({"recipe": "tuned", "weights": "w", "reference": "subtract", **changes})
-
-
 def test_the_card_names_weights_by_hash_data_and_settings(weights: Path, data: EncoderData, tmp_path: Path) -> None:
     write_encoder_card(tmp_path / "a", data, config(weights, "paper"), 3, "scenes")
     text = (tmp_path / "a" / "README.md").read_text()
@@ -285,37 +254,6 @@ def test_running_statistics_are_saved_with_what_is_trained_alone(tmp_path: Path)
     next(layer for layer in other.layers if isinstance(layer, torch.nn.BatchNorm2d)).requires_grad_(True)
     names = {"bias", "num_batches_tracked", "running_mean", "running_var", "weight"}
     assert {n.split(".")[-1] for n in trainable_state(other)} == names
-
-
-OWN = {
-    "paper": ("encoder.prompts.prompts", "encoder.prompts.shared", "heads.0", "heads.1"),
-    "release": ("encoder.prompts.prompts", "heads.shared", "heads.properties.0", "heads.properties.1"),
-    "tuned": (
-        *("centre", "spread", "dependence", "heads.0", "heads.1"),
-        *(f"encoder.backbones.0.layers.{layer}." for layer in (15, 16, 18, 19)),
-    ),
-}
-
-
-@pytest.mark.parametrize("recipe", OWN)
-def test_each_recipe_reloads_what_is_its_own(recipe: str, weights: Path, frames: torch.Tensor, tmp_path: Path) -> None:
-    write_pretrained()
-    model, other = (property_classifier(config(weights, recipe), [3, 2]).eval() for _ in range(2))
-    if isinstance(model, JointFrameClassifier):
-        random_heads(2, 256, [3, 2], 0.1).copy_into(model)
-    saved = [[own for own in OWN[recipe] if name.startswith(own)] for name in trainable_state(model)]
-    assert {own for (own,) in saved} == set(OWN[recipe])
-    save_trainable(model, tmp_path / "model.safetensors")
-    load_trainable(other, tmp_path / "model.safetensors")
-    other(frames, FRAME_INDICES, labels=torch.tensor([[0, 1]] * len(frames)))["loss"].backward()
-    assert all(p.grad is not None for p in other.parameters() if p.requires_grad), "what is constant is no parameter"
-    with torch.no_grad():
-        first, second = (m(frames, FRAME_INDICES)["logits"] for m in (model, other))
-    assert torch.equal(first, second)
-    assert torch.equal(model.decide(first), other.decide(second))
-    for wrong, classes in ((recipe, [3, 3]), ("release" if recipe == "paper" else "paper", [3, 2])):
-        with refused("does not fit the model"):
-            load_trainable(property_classifier(config(weights, wrong), classes), tmp_path / "model.safetensors")
 
 
 def indexed(keys: Iterable[tuple[str, Flip, int]]) -> list[Embedding]:

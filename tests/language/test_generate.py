@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 from pathlib import Path
 
-import pytest
 import torch
 
 from pipeline.config import LanguageConfig
@@ -80,21 +79,6 @@ def test_a_question_longer_than_the_positions_is_named_with_the_key(
     model = OctopiForCausalLM.from_base(setting.weights, DIM)
     with refused(r"^[A-Z]+-train-\d+: .*language.system_prompt.*language.weights$"):
         answer(model, store, questions, Opd.ALL, generation(2), FRAMES)
-
-
-@pytest.mark.parametrize("opd", [Opd.ALL, Opd.NONE])
-def test_batch_size_changes_no_answer(
-    model: OctopiForCausalLM, questions: list[Question], store: EmbeddingStore, opd: Opd
-) -> None:
-    asked = questions[::2]
-    assert {"OPD", "PSR"} < {q.task for q in asked}, "one and several turns"
-    one = answer(model, store, asked, opd, generation(1, 6), FRAMES)
-    mixed = answer(model, store, asked[::-1], opd, generation(len(asked), 6), FRAMES)
-    assert mixed[::-1] == one
-    turns = {q.question_id: len(d.turns) for q in asked if (d := q.dialogue(opd))}
-    assert {p.question_id: len(p.outputs) for p in one} == turns
-    if opd is Opd.NONE:
-        assert not [p for p in one if p.task == "OPD"], "without descriptions there is nothing to ask"
 
 
 def test_embeddings_of_another_length_or_of_no_such_video_are_refused(

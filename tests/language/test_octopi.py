@@ -8,8 +8,6 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from peft import PeftModel
 from safetensors.torch import load_file, save_file
 from transformers import AutoModelForCausalLM
@@ -25,40 +23,10 @@ from pipeline.language.octopi import OctopiForCausalLM
 from pipeline.language.training import assemble
 from tests.checkpoints import contents, cut, edit, replace, write_llama
 from tests.conftest import refused
-from tests.language.conftest import DIM, LORA, adapted, assert_comes_back, call, embedded, material, taking
+from tests.language.conftest import DIM, LORA, adapted, assert_comes_back, call, material, taking
 
 CONNECTOR, WORDS = "connector.safetensors", "words.safetensors"
 ADAPTER = "adapter/adapter_model.safetensors"
-
-
-@pytest.fixture(scope="module")
-def drawn(language: LanguageConfig) -> OctopiForCausalLM:
-    """One model for all examples of a property."""
-    torch.manual_seed(5)
-    made = OctopiForCausalLM.from_base(language.weights, DIM).eval()
-    torch.nn.init.normal_(made.connector.delimiters)
-    return made
-
-
-TOKENS = st.integers(0, 259) | st.sampled_from(["start", "frame", "frame", "frame", "end"])
-ROWS = st.integers(1, 12).flatmap(
-    lambda length: st.lists(st.lists(TOKENS, min_size=length, max_size=length), min_size=1, max_size=4)
-)
-
-
-@given(rows=ROWS, spare=st.integers(0, 2))
-def test_embedding_equals_a_plain_one(drawn: OctopiForCausalLM, rows: list[list[int | str]], spare: int) -> None:
-    """Rows without any tactile token, all frames in one row, frames at the very ends, rows of nothing else."""
-    special = {"start": drawn.start_id, "frame": drawn.frame_id, "end": drawn.end_id}
-    ids = torch.tensor([[special[t] if isinstance(t, str) else t for t in row] for row in rows])
-    counts = (ids == drawn.frame_id).sum(1)
-    features = torch.full((len(rows), int(counts.max()) + spare, DIM), float("nan"))
-    for row, count in enumerate(counts.tolist()):
-        features[row, :count] = torch.randn(count, DIM, generator=torch.manual_seed(row))
-    words = drawn.llm.get_input_embeddings().weight
-    with torch.no_grad():
-        expected = [embedded(drawn, row, f, words) for row, f in zip(ids.tolist(), features, strict=True)]
-        torch.testing.assert_close(drawn.embed(ids, features), torch.stack(expected), atol=2e-6, rtol=0)
 
 
 def test_normalized_touch_is_as_long_as_words(language: LanguageConfig, tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from sklearn.metrics.pairwise import cosine_similarity
 
 from pipeline.core.io import tensor_shapes
 from pipeline.core.records import Encoder, Lora, Opd, Part, Variant
@@ -18,7 +17,7 @@ from pipeline.use import encoding
 from pipeline.use import model as model_code
 from pipeline.use.encoding import VideoEncoder
 from pipeline.use.frames import read_touch
-from pipeline.use.memory import TOUCHES, Remembered, most_similar
+from pipeline.use.memory import TOUCHES
 from pipeline.use.model import Octopi
 from pipeline.videos.decoding import decode
 from tests.conftest import moving_square, refused, write_video
@@ -292,24 +291,6 @@ def test_what_is_unlike_training_is_noted_and_no_training_video_is(octopi: Octop
     assert not [note for video in trained for note in octopi.look(video).notes if "unlike" in note]
 
 
-@pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
-def test_the_most_similar_comes_first_by_its_nearest_touch(scale: float) -> None:
-    rng = np.random.default_rng(0)
-    known = rng.normal(size=(40, 16)) * scale
-    known[7] = 0  # As of a frame that says nothing: like nothing, and no division by zero.
-    names = [f"object {i % 13}" for i in range(40)]
-    remembered = [
-        Remembered(name=name, classes=("soft", "rough", "no bumps"), encoder="e", embedding=tuple(vector))
-        for name, vector in zip(names, known.tolist(), strict=True)
-    ]
-    for query in (*rng.normal(size=(5, 16)), known[3], -known[3], np.zeros(16)):
-        found = most_similar(query, remembered)
-        cosines = cosine_similarity(query[None], known)[0]
-        best = {name: max(c for c, n in zip(cosines, names, strict=True) if n == name) for name in names}
-        assert {s.name: s.similarity for s in found} == pytest.approx(best, abs=1e-12)
-        assert [s.similarity for s in found] == sorted((s.similarity for s in found), reverse=True)
-
-
 def test_a_remembered_touch_is_recognised_and_told(octopi: Octopi, files: list[Path], tmp_path: Path) -> None:
     named, memory = dict(zip(("my ice", "my millet", "my towel"), files, strict=True)), tmp_path / "touches"
     assert [octopi.remember(name, file, memory) for name, file in named.items()] == [1, 2, 3]
@@ -323,7 +304,10 @@ def test_a_remembered_touch_is_recognised_and_told(octopi: Octopi, files: list[P
         assert found.objects[0].similarity == pytest.approx(1, abs=1e-6)
         assert found.objects[0].classes == tuple(octopi.describe(file, sentence=False).levels.values())
     assert octopi.remember("my ice", files[1], memory) == 4
-    assert len(octopi.recognise(files[0], memory).objects) == 3, "an object is named once"
+    similar = octopi.recognise(files[0], memory).objects
+    assert (similar[0].name, len(similar)) == ("my ice", 3), "an object is named once"
+    assert similar[0].similarity == pytest.approx(1, abs=1e-6), "by its nearest touch"
+    assert similar == tuple(sorted(similar, key=lambda s: -s.similarity))
 
 
 def test_what_is_no_memory_is_refused_and_stays(octopi: Octopi, files: list[Path], tmp_path: Path) -> None:
