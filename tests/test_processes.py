@@ -1,6 +1,6 @@
 """What starts processes: Ctrl-C, launchers, kills, and work on many files here and on a local cluster of Ray's.
 
-That no worker outlives a parent that is killed is tests/videos/test_extract.py's.
+That no worker outlives a parent that is killed is tests/videos/test_processes.py's.
 """
 
 from __future__ import annotations

@@ -17,15 +17,13 @@ from pipeline.config import SplitConfig
 from pipeline.core.io import read_jsonl, read_table
 from pipeline.core.records import Assignment, Opd, Part, Question
 from pipeline.report.build import write_report
-from pipeline.scenes.recipe import recipe_of
 from pipeline.tasks import TASKS
 from pipeline.tasks.base import Pool
-from pipeline.videos.catalogue import Catalogue, load_catalogue
+from pipeline.videos.catalogue import load_catalogue
 from pipeline.videos.catalogue.wording import levels_named
 from pipeline.videos.files import list_videos
 from pipeline.videos.split import assign_objects
 from tests.closure import ROOT
-from tests.conftest import refused
 from tests.fake_run import fake_params, write_run
 from tests.project import OBJECTS, REDUCED, Project, copy_project
 from tests.tasks.shared import drafted, grade
@@ -119,20 +117,6 @@ def test_a_described_fourth_property_is_graded(pool: Pool) -> None:
         assert scores["surface_tack"].predicted == said
         assert [scores[m].correct for m in ("hardness", "surface_tack", "combined")] == [True, right, right]
     assert TASKS["OPD"].chance(pool.catalogue)["combined"] == pytest.approx(1 / 108)
-
-
-def test_scenes_need_three_properties_and_take_more(pool: Pool) -> None:
-    whole = pool.catalogue
-    assert recipe_of("rice", narrowed(whole, slice(3)), 0) == recipe_of("rice", whole, 0)
-    with refused(r"hardness.*data\.source=videos"):
-        recipe_of("rice", narrowed(whole, slice(1, None)), 0)
-
-
-def narrowed(catalogue: Catalogue, kept: slice) -> Catalogue:
-    """The catalogue with some of its properties."""
-    language = catalogue.language.model_copy(update={"properties": catalogue.properties[kept]})
-    few = {o.object_id: o.model_copy(update={"ratings": o.ratings[kept]}) for o in catalogue.objects.values()}
-    return Catalogue.model_construct(language=language, objects=few)
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ import yaml
 from safetensors.torch import load_file
 
 from pipeline.core.io import read_jsonl
-from pipeline.core.records import Prediction, Question
+from pipeline.core.records import Prediction
 from tests.checkpoints import write_clip, write_vicuna
 from tests.closure import ROOT
 from tests.conftest import encode, moving_square
@@ -128,13 +128,6 @@ def test_paper_13b_from_videos_to_the_report(project: Project) -> None:
     assert "1 of 3 folds (1) are in" in readme
     assert (project.folder / "models" / SYSTEM / "README.md").is_file()
     assert not list((project.folder / "checkpoints").glob("*/*")), "nothing waits any more"
-
-
-def test_a_fold_tests_objects_that_it_did_not_train_on(project: Project) -> None:
-    asked = (project.folder / "data" / "questions" / "1" / f"{part}.jsonl" for part in ("train", "evaluation"))
-    learnt, tested = ({o for q in read_jsonl(file, Question) for o in q.objects} for file in asked)
-    assert tested
-    assert not learnt & tested
 
 
 def test_paper_7b_begins_with_the_same_encoder(project: Project) -> None:
