@@ -77,10 +77,7 @@ def magnified(size: float) -> float:
 
 
 def network(fmt: Format, size: float = 1.0) -> float:
-    """condition: the model's magnification of rounded weights times roundings a layer, relative to the largest logit.
-
-    Where two ways through the model are compared it counts twice.
-    """
+    """condition: the model's magnification of rounded weights times roundings a layer, by the largest logit."""
     return rounded(magnified(size), longest_sum(made(FLOAT64)), FLOAT32 if fmt is FLOAT64 else fmt)
 
 
