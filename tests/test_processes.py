@@ -36,7 +36,7 @@ stages:
 """
 IMPORTING = "import pipeline\nprint('now', flush=True)\ntime.sleep(600)"
 RUNNING = (
-    "from pipeline.core.stage import stage\nwith stage('split'):\n    print('now', flush=True)\n    time.sleep(600)"
+    "from pipeline.core.stage import stage\nwith stage('slow'):\n    print('now', flush=True)\n    time.sleep(600)"
 )
 WORKERS = "from pipeline.core.parallel import run_parallel\n"
 SLEEPING = f"{WORKERS}print('now', flush=True)\nlist(run_parallel(time.sleep, [600] * 64, '', ''))"

@@ -253,7 +253,8 @@ def code_of(stage: str) -> list[Path]:
 
     root = Path(__file__).parents[2]
     stages = yaml.safe_load((root / "dvc.yaml").read_text(encoding="utf-8"))["stages"]
-    listed = [root / d for d in stages[stage.partition("@")[0]]["deps"] if d.startswith(("pipeline/", "stages/"))]
+    deps = stages.get(stage.partition("@")[0], {}).get("deps", [])
+    listed = [root / d for d in deps if d.startswith(("pipeline/", "stages/"))]
     files = [f for path in listed for f in ([path] if path.is_file() else sorted(path.rglob("*")))]
     return [file for file in files if file.is_file() and file.suffix != ".pyc"]
 
